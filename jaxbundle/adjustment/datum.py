@@ -1,0 +1,176 @@
+"""The datum: which similarities the observations leave open, and how they are pinned down.
+
+A similarity of object space (3 shifts, 3 rotations, 1 scale) changes no image coordinate, so the
+Jacobian of a free network is singular along the Helmert matrix G (Blaha 1971; Illner 1985).
+Which combinations of its seven columns stay open is found from the Jacobian itself: a distance
+closes the scale, control points and priors close more.
+
+The datum is imposed by an S-transformation (Baarda 1973; Teunissen 1985): with a choice B of
+datum coordinates,
+
+    δ ← δ − G(BᵀG)⁻¹Bᵀδ,      Q ← S·Q·Sᵀ,  S = I − G(BᵀG)⁻¹Bᵀ,
+
+B = G on the datum points for inner constraints (trace of their covariance smallest), B = as many
+single coordinates as there are defects for a minimal datum. After convergence the whole network
+is moved by the finite similarity that makes the datum hold exactly against the start values:
+Bᵀ(x − x_start) = 0. So the result does not depend on the path of the iterations.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from jaxbundle.adjustment.jacobian import free_tangent, zero_tangent
+from jaxbundle.adjustment.residuals import residuals
+from jaxbundle.geometry import helmert_point, helmert_pose, transform_point, transform_pose
+from jaxbundle.network.arrays import Data, Tangent, Values, retract
+from jaxbundle.network.structure import Structure
+
+OPEN = 1e-10
+"""Relative size of J·G below which a direction counts as open (rounding gives about 1e-14)."""
+
+
+def helmert(structure: Structure, values: Values) -> Tangent:
+    """The Helmert matrix G of all unknowns; its 7 columns are the last axis of every block."""
+    pose = jax.vmap(helmert_pose)(values.position, values.rotation)
+    interior = jnp.zeros((structure.images, structure.image_width - 6, 7))
+    return Tangent(
+        image=jnp.concatenate([pose, interior], 1),
+        camera=jnp.zeros((structure.cameras, structure.camera_width, 7)),
+        point=jax.vmap(helmert_point)(values.point),
+    )
+
+
+def gauge_directions(structure: Structure, values: Values) -> Tangent:
+    """The open directions only: G times the combinations found by `open_similarities`."""
+    return jax.tree.map(lambda g: g @ structure.gauge, helmert(structure, values))
+
+
+def open_similarities(structure: Structure, data: Data) -> Float[np.ndarray, "7 defect"]:
+    """The combinations of the seven similarities that change no observation and nothing held.
+
+    Found at the start values from the singular values of J·G, its columns scaled by the size of
+    their terms, so that neither units nor the number of observations matter.
+    """
+    products, terms, held = (np.asarray(x) for x in _directional_products(structure, data))
+    scale = np.sqrt((terms**2).sum(0))
+    scale = np.where(scale > 0, scale, 1.0)
+    # Singular values of a QR, not of the Gram matrix, which would lose half of the digits.
+    triangle = np.linalg.qr(np.concatenate([products / scale, held]), mode="r")
+    _, singular, directions = np.linalg.svd(triangle)
+    return directions[singular < OPEN].T / scale[:, None]
+
+
+@eqx.filter_jit
+def _directional_products(structure, data):
+    """J·G, the terms that cancel in it, and G on what is held (scaled to unit columns) [rows, 7].
+
+    By forward derivatives of the residuals along the seven columns of G.
+    """
+    G, free = helmert(structure, data.start), free_tangent(structure)
+    moving = jax.tree.map(lambda g, f: g * f[..., None], G, free)
+
+    def along(direction):
+        shifted = lambda t: residuals(structure, retract(structure, data.start, t), data)
+        change = jax.jvp(shifted, (zero_tangent(structure),), (direction,))[1]
+        return ravel_pytree(change)[0]
+
+    columns = lambda tangent: jax.vmap(along, -1, -1)(tangent)
+    still = jax.tree.map(jnp.zeros_like, moving)
+    images = columns(Tangent(moving.image, moving.camera, still.point))
+    points = columns(Tangent(still.image, still.camera, moving.point))
+    flat = lambda tree: jnp.concatenate([x.reshape(-1, 7) for x in jax.tree.leaves(tree)])
+    held = flat(jax.tree.map(lambda g, m: g - m, G, moving)) / jnp.linalg.norm(flat(G), axis=0)
+    return images + points, jnp.concatenate([images, points]), held
+
+
+def s_transform(structure: Structure, values: Values, change: Tangent) -> Tangent:
+    """A change with the datum imposed: δ − G(BᵀG)⁻¹Bᵀδ; unchanged where there is no defect."""
+    if not structure.defect:
+        return change
+    G = gauge_directions(structure, values)
+    B = G.point * structure.datum_weight[..., None]
+    gram = jnp.einsum("pik,pil->kl", B, G.point)
+    along = jnp.linalg.solve(gram, jnp.einsum("pik,pi->k", B, change.point))
+    return jax.tree.map(lambda d, g: d - g @ along, change, G)
+
+
+def move_to_datum(structure: Structure, values: Values, start: Values, steps: int = 20) -> Values:
+    """The network after the finite similarity (of the open kind) for which Bᵀ(x − x_start) = 0.
+
+    Only where the open directions are shifts and rotations, with or without scale: those form a
+    group (a rotation about one control point does not).
+    Differentiable: the seven parameters are found by Newton's method without derivatives being
+    taken, then attached by one more step (implicit function theorem).
+    """
+    if not structure.movable:
+        return values
+
+    def condition(tau, values, start):
+        moved = _transform(structure, values, structure.gauge @ tau)
+        G = jax.vmap(helmert_point)(moved.point) @ structure.gauge
+        B = G * structure.datum_weight[..., None]
+        return jnp.einsum("pik,pi->k", B, moved.point - start.point)
+
+    def newton(tau, values, start):
+        slope = jax.lax.stop_gradient(jax.jacfwd(condition)(tau, values, start))
+        return tau - jnp.linalg.solve(slope, condition(tau, values, start))
+
+    fixed = jax.lax.stop_gradient((values, start))
+    zero = jnp.zeros(structure.defect)
+    tau = jax.lax.fori_loop(0, steps, lambda _, tau: newton(tau, *fixed), zero)
+    return _transform(
+        structure, values, structure.gauge @ newton(jax.lax.stop_gradient(tau), values, start)
+    )
+
+
+def _transform(structure, values, tau):
+    position, rotation = jax.vmap(transform_pose, (None, 0, 0))(
+        tau, values.position, values.rotation
+    )
+    point = jax.vmap(transform_point, (None, 0))(tau, values.point)
+    held = lambda old, new, free: jnp.where(free > 0, new, old)
+    return Values(
+        camera=values.camera,
+        position=held(values.position, position, structure.image_free[:, :3]),
+        rotation=held(values.rotation, rotation, structure.image_free[:, 3:4]),
+        point=held(values.point, point, structure.point_free),
+    )
+
+
+def choose_minimal_coordinates(
+    structure: Structure, data: Data, candidates: Float[np.ndarray, "points 3"]
+) -> Float[np.ndarray, "points 3"]:
+    """As many coordinates of object points as there are defects, chosen well spread.
+
+    Rows of G on the candidate coordinates, by Gram–Schmidt with row pivoting: each time the
+    coordinate that the ones chosen so far determine least.
+    """
+    G = np.asarray(gauge_directions(structure, data.start).point).reshape(-1, structure.defect)
+    q, _ = np.linalg.qr(G)
+    rows = q * candidates.reshape(-1, 1)
+    chosen = np.zeros(len(rows))
+    for _ in range(structure.defect):
+        pick = np.argmax((rows**2).sum(1))
+        direction = rows[pick] / np.linalg.norm(rows[pick])
+        rows = rows - np.outer(rows @ direction, direction)
+        chosen[pick] = 1.0
+    return chosen.reshape(-1, 3)
+
+
+def is_group(gauge: Float[np.ndarray, "7 defect"]) -> bool:
+    """Whether the open directions are all similarities, or all congruences (no scale)."""
+    defect = gauge.shape[1]
+    scale = np.abs(gauge[6]).max(initial=0.0) / np.abs(gauge).max(initial=1e-300)
+    return defect == 7 or bool(defect == 6 and scale < 1e-6)
+
+
+def open_directions_in_words(gauge: Float[np.ndarray, "7 defect"]) -> str:
+    """Which of shift, rotation and scale the observations leave open, for messages."""
+    q, _ = np.linalg.qr(gauge / np.linalg.norm(gauge, axis=0)) if gauge.size else (gauge, None)
+    names = ["shift X", "shift Y", "shift Z", "rotation X", "rotation Y", "rotation Z", "scale"]
+    parts = [name for name, row in zip(names, q) if np.linalg.norm(row) > 0.1]
+    return ", ".join(parts) if parts else "none"

@@ -1,0 +1,198 @@
+"""The Jacobian of the network as blocks, and as a lineax operator.
+
+Each ray touches one image, one camera and one point, so its two rows hold at most
+6 + k + 3 derivatives. They come from reverse mode over the scalars of `image_residual`, which XLA
+turns into straight loops over the rays (measured per iteration on a BAL block of 83 718 rays:
+vmapped forward mode 29 ms, reverse mode on scalars 12, rotations prepared once an image 5 to 7).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from jaxbundle import cameras
+from jaxbundle.adjustment.residuals import (
+    Residuals,
+    distance_residual,
+    exterior_residual,
+    gather_groups,
+    image_residual,
+    image_rows,
+)
+from jaxbundle.network.arrays import Data, Tangent, Values
+from jaxbundle.network.structure import Structure
+
+
+class BundleJacobian(lx.AbstractLinearOperator):
+    """∂(residuals / σ)/∂(free unknowns) as blocks; columns of held unknowns are zero.
+
+    `image` and `camera` are the columns of the image blocks and of the shared cameras (see
+    `jaxbundle.network.structure`), `point` those of the points. Control and interior rows are
+    diagonal: they hold the weights.
+    """
+
+    structure: Structure
+    image: Float[Array, "rays 2 image_block"]
+    camera: Float[Array, "rays 2 camera_block"]
+    point: Float[Array, "rays 2 3"]
+    control: Float[Array, "control 3"]
+    exterior: Float[Array, "exterior 6 6"]
+    interior: Float[Array, "interior k"]
+    distance: Float[Array, "distances 2 3"]
+
+    def mv(self, vector: Tangent) -> Residuals:
+        """J·x."""
+        s, k = self.structure, self.structure.interior_width
+        image = jnp.einsum("nai,ni->na", self.image, vector.image[s.image])
+        image += jnp.einsum("nai,ni->na", self.point, vector.point[s.point])
+        if s.camera_width:
+            image += jnp.einsum("nai,ni->na", self.camera, vector.camera[s.camera])
+        interior = vector.image[:, 6:] if s.own_camera else vector.camera
+        rows = jnp.zeros((s.interior.shape[0], self._parameters))
+        if k and s.interior.shape[0]:
+            index = jnp.arange(s.interior.shape[0])[:, None]
+            change = self.interior * interior[s.interior]
+            rows = rows.at[index, s.camera_columns[s.interior]].add(change)
+        ends = vector.point[s.distance]
+        return Residuals(
+            image=image,
+            control=self.control * vector.point[s.control],
+            exterior=jnp.einsum("eij,ej->ei", self.exterior, vector.image[s.exterior, :6]),
+            interior=rows,
+            distance=jnp.einsum("dei,dei->d", self.distance, ends),
+        )
+
+    def transposed_mv(self, residual: Residuals) -> Tangent:
+        """Jᵀ·r."""
+        s = self.structure
+        image = jax.ops.segment_sum(
+            jnp.einsum("nai,na->ni", self.image, residual.image), s.image, s.images
+        )
+        point = jax.ops.segment_sum(
+            jnp.einsum("nai,na->ni", self.point, residual.image), s.point, s.points,
+            indices_are_sorted=True,
+        )
+        camera = jnp.zeros((s.cameras, s.camera_width))
+        if s.camera_width:
+            camera = jax.ops.segment_sum(
+                jnp.einsum("nai,na->ni", self.camera, residual.image), s.camera, s.cameras
+            )
+        point = point.at[s.control].add(self.control * residual.control)
+        point = point.at[s.distance].add(self.distance * residual.distance[:, None, None])
+        image = image.at[s.exterior, :6].add(
+            jnp.einsum("eij,ei->ej", self.exterior, residual.exterior)
+        )
+        if s.interior_width and s.interior.shape[0]:
+            rows = jnp.take_along_axis(residual.interior, s.camera_columns[s.interior], 1)
+            if s.own_camera:
+                image = image.at[s.interior, 6:].add(self.interior * rows)
+            else:
+                camera = camera.at[s.interior].add(self.interior * rows)
+        return Tangent(image, camera, point)
+
+    _parameters: int = eqx.field(static=True, default=0)
+
+    def as_matrix(self) -> Float[Array, "rows unknowns"]:
+        """The dense matrix; for small networks and tests."""
+        zero = zero_tangent(self.structure)
+        flat, unravel = ravel_pytree(zero)
+        column = lambda e: ravel_pytree(self.mv(unravel(e)))[0]
+        return jax.vmap(column, out_axes=1)(jnp.eye(flat.size))
+
+    def transpose(self) -> lx.AbstractLinearOperator:
+        return lx.FunctionLinearOperator(self.transposed_mv, self.out_structure())
+
+    def in_structure(self) -> Tangent:
+        return jax.eval_shape(lambda: zero_tangent(self.structure))
+
+    def out_structure(self) -> Residuals:
+        return jax.eval_shape(self.mv, self.in_structure())
+
+
+for _trait in (
+    lx.is_symmetric, lx.is_diagonal, lx.is_tridiagonal, lx.has_unit_diagonal,
+    lx.is_lower_triangular, lx.is_upper_triangular, lx.is_positive_semidefinite,
+    lx.is_negative_semidefinite,
+):  # fmt: skip
+    _trait.register(BundleJacobian)(lambda operator: False)
+for _same in (lx.linearise, lx.materialise, lx.conj):
+    _same.register(BundleJacobian)(lambda operator: operator)
+
+
+def zero_tangent(structure: Structure) -> Tangent:
+    """No change of any unknown."""
+    s = structure
+    return Tangent(
+        jnp.zeros((s.images, s.image_width)),
+        jnp.zeros((s.cameras, s.camera_width)),
+        jnp.zeros((s.points, 3)),
+    )
+
+
+def free_tangent(structure: Structure) -> Tangent:
+    """1 for every free unknown, 0 for every held one."""
+    s = structure
+    camera = s.camera_free if s.camera_width else jnp.zeros((s.cameras, 0))
+    return Tangent(s.image_block_free, camera, s.point_free)
+
+
+def jacobian(structure: Structure, values: Values, data: Data) -> BundleJacobian:
+    """The Jacobian of `residuals` with respect to the free unknowns, by autodiff."""
+    s = structure
+    parts = [_image_blocks(s, group, values, data) for group in s.groups]
+    exterior, interior, point = gather_groups(s, parts)
+    if not s.all_free:
+        exterior = exterior * s.image_free[s.image][:, None, :]
+        interior = interior * s.camera_free[s.camera][:, None, :]
+        point = point * s.point_free[s.point][:, None, :]
+    camera = jnp.zeros((s.rays, 2, 0))
+    if s.own_camera:
+        exterior = jnp.concatenate([exterior, interior], 2)
+    elif s.interior_width:
+        camera = interior
+    a, b = s.distance[:, 0], s.distance[:, 1]
+    zero3 = jnp.zeros(3)
+    ends = jax.vmap(jax.jacrev(distance_residual, (4, 5)), (0, 0, 0, 0, None, None))(
+        values.point[a], values.point[b], data.distance, data.distance_weight, zero3, zero3
+    )
+    return BundleJacobian(
+        structure=s,
+        image=exterior,
+        camera=camera,
+        point=point,
+        control=data.control_weight,
+        exterior=jax.vmap(jax.jacfwd(exterior_residual, 4), (0, 0, 0, 0, None))(
+            values.position[s.exterior], values.rotation[s.exterior],
+            data.exterior, data.exterior_weight, jnp.zeros(6),
+        ) * s.image_free[s.exterior][:, None, :],
+        interior=jnp.take_along_axis(data.interior_weight, s.camera_columns[s.interior], 1)
+        * s.camera_free[s.interior],
+        distance=jnp.stack(ends, 1) * s.point_free[s.distance],
+        _parameters=values.camera.shape[1],
+    )  # fmt: skip
+
+
+def _image_blocks(structure, group, values, data):
+    """Derivatives of the rays of one camera model: exterior [n,2,6], interior [n,2,k], point."""
+    model = cameras.get_model(group.model)
+    free = group.free
+    padding = structure.interior_width - len(free)
+
+    def one(*row):
+        def shifted(*change):
+            return image_residual(model, structure.domain, free, *row, change)
+
+        still = ((0.0,) * 3, (0.0,) * 3, (0.0,) * len(free), (0.0,) * 3)
+        still = jax.tree.map(lambda _: jnp.zeros_like(row[0][0]), still)
+        _, pull = jax.vjp(shifted, *still)
+        one_, nil = jnp.ones_like(row[0][0]), jnp.zeros_like(row[0][0])
+        rows = [pull((one_, nil)), pull((nil, one_))]
+        flat = [(*centre, *theta, *inner, *((nil,) * padding), *point)
+                for centre, theta, inner, point in rows]
+        return jnp.stack([jnp.stack(r) for r in flat])
+
+    blocks = jax.vmap(one)(*image_rows(structure, group, values, data))
+    return blocks[..., :6], blocks[..., 6:-3], blocks[..., -3:]

@@ -1,0 +1,126 @@
+"""A network made ready for the solver: index plan, arrays, datum and the count of its rows."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.adjustment.datum import (
+    choose_minimal_coordinates,
+    is_group,
+    open_directions_in_words,
+    open_similarities,
+)
+from jaxbundle.errors import InputError
+from jaxbundle.network.arrays import Data
+from jaxbundle.network.structure import Structure, make_structure, order_cameras
+from jaxbundle.network.tables import Network
+
+
+@dataclasses.dataclass(frozen=True)
+class Counts:
+    """Rows and columns of the adjustment; redundancy = rows + datum conditions − unknowns."""
+
+    observations: int
+    control: int
+    exterior: int
+    interior: int
+    distances: int
+    datum: int
+    unknowns: int
+
+    @property
+    def pseudo_observations(self) -> int:
+        return self.control + self.exterior + self.interior + self.distances
+
+    @property
+    def redundancy(self) -> int:
+        return self.observations + self.pseudo_observations + self.datum - self.unknowns
+
+
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """What `jaxbundle.solve` solves: structure (indices) and data (numbers) of one network.
+
+    `network` is the network as adjusted (cameras in the order of the arrays); `origin` [3] was
+    subtracted from all object coordinates.
+    """
+
+    network: Network
+    structure: Structure
+    data: Data
+    origin: Float[np.ndarray, "3"]
+    counts: Counts
+
+
+def make_problem(network: Network) -> Problem:
+    """Index plan, arrays and datum of a checked network (see `jaxbundle.network.check_network`).
+
+    **Raises:** `InputError` where the datum asked for cannot be had; `RuntimeError` without
+    64-bit floats.
+    """
+    require_x64()
+    network = order_cameras(network)
+    structure, data, origin = make_structure(network)
+    gauge = open_similarities(structure, data)
+    defect = gauge.shape[1]
+    if network.datum == "control" and defect:
+        raise InputError(
+            f"the datum is not fixed: the observations leave open {open_directions_in_words(gauge)}"
+            f" ({defect} of 7). Give control points or distances, or choose datum = \"inner\" "
+            "or \"minimal\"."
+        )
+    if defect:
+        structure = eqx.tree_at(lambda s: s.gauge, structure, jnp.asarray(gauge))
+        structure = eqx.tree_at(
+            lambda s: s.datum_weight, structure,
+            jnp.asarray(_datum_weight(network, structure, data)),
+        )  # fmt: skip
+        structure = dataclasses.replace(structure, movable=is_group(gauge))
+    return Problem(network, structure, data, origin, _counts(structure, data))
+
+
+def require_x64() -> None:
+    """Adjustment needs 64-bit floats, and says how to get them."""
+    if not jax.config.jax_enable_x64:
+        raise RuntimeError(
+            "jaxbundle computes in 64-bit floating point. Call jaxbundle.enable_x64() before the "
+            "first JAX computation, or set the environment variable JAX_ENABLE_X64=1."
+        )
+
+
+def _datum_weight(network: Network, structure: Structure, data: Data):
+    points = network.points
+    free = np.asarray(structure.point_free)
+    if network.datum_points:
+        chosen = np.isin(np.array(points.id, dtype=object), network.datum_points)
+    else:
+        chosen = points.has_role("tie")
+        chosen = chosen if chosen.any() else points.has_role("control")
+    candidates = chosen[:, None] * free
+    if network.datum == "minimal":
+        return choose_minimal_coordinates(structure, data, candidates)
+    return candidates
+
+
+def _counts(structure: Structure, data: Data) -> Counts:
+    number = lambda weight: int((np.asarray(weight) > 0).sum())
+    interior = np.take_along_axis(
+        np.asarray(data.interior_weight),
+        np.asarray(structure.camera_columns)[np.asarray(structure.interior)], 1,
+    )  # fmt: skip
+    return Counts(
+        observations=number(data.image_weight),
+        control=number(data.control_weight),
+        exterior=number(data.exterior_weight),
+        interior=number(interior * np.asarray(structure.camera_free)[structure.interior]),
+        distances=number(data.distance_weight),
+        datum=structure.defect,
+        unknowns=int(
+            np.sum(structure.image_free) + np.sum(structure.camera_free)
+            + np.sum(structure.point_free)
+        ),
+    )  # fmt: skip

@@ -1,0 +1,159 @@
+"""The observation equations, one function for one observation: v = (computed − observed) / σ.
+
+Each kind of observation is a function of small changes of the unknowns it touches (its tangent)
+around given values. That one function is evaluated for residuals and differentiated for every
+Jacobian and Hessian; nothing else in the package knows how a residual depends on an unknown.
+
+Rotation changes are exp([δθ]×) ≈ 1 + [δθ]× + ½[δθ]×², exact for the first and second derivatives
+at δθ = 0, which is the only place they are taken.
+
+| kind | rows | touches |
+|---|---|---|
+| image | x, y | image, camera, point (collinearity equations, distortion) |
+| control | X, Y, Z | point |
+| exterior | X0, Y0, Z0, ω, φ, κ | image |
+| interior | the camera's parameters | camera |
+| distance | d | two points |
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbundle import cameras
+from jaxbundle.geometry import (
+    matrix_from_quaternion,
+    omega_phi_kappa_from_matrix,
+    retract_quaternion,
+)
+from jaxbundle.network.arrays import Data, Values
+from jaxbundle.network.structure import Structure
+
+
+class Residuals(eqx.Module):
+    """Residuals divided by their σ, by kind; a kind that does not occur has no rows."""
+
+    image: Float[Array, "rays 2"]
+    control: Float[Array, "control 3"]
+    exterior: Float[Array, "exterior 6"]
+    interior: Float[Array, "interior parameters"]
+    distance: Float[Array, " distances"]
+
+
+def image_residual(model, domain, free, rotation, centre, interior, point, xy, weight, change):
+    """The two residuals of an image point, as scalars.
+
+    **Arguments:** `rotation` (9 scalars, rows of M), `centre` (3), `interior` (the model's
+    parameters), `point` (3), `xy` (2), `weight` (2, 1/σ); `change` = (δX0 (3), δθ (3), the
+    changes of the parameters `free`, δX (3)).
+    """
+    d_centre, d_theta, d_interior, d_point = change
+    interior = list(interior)
+    for column, d in zip(free, d_interior):
+        interior[column] = interior[column] + d
+    X, Y, Z = (p + d - (c + e) for p, d, c, e in zip(point, d_point, centre, d_centre))
+    ray = tuple(
+        rotation[3 * i] * X + rotation[3 * i + 1] * Y + rotation[3 * i + 2] * Z for i in range(3)
+    )
+    turn = _cross(d_theta, ray)
+    ray = tuple(a + b + 0.5 * c for a, b, c in zip(ray, turn, _cross(d_theta, turn)))
+    vx, vy = cameras.residual(model, domain, tuple(interior), ray, xy)
+    return weight[0] * vx, weight[1] * vy
+
+
+def _cross(a, b):
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+def control_residual(point, given, weight, d_point):
+    """A control point's coordinates against their given values [3]."""
+    return weight * (point + d_point - given)
+
+
+def exterior_residual(position, rotation, given, weight, d_image):
+    """An image's exterior orientation against its prior (X0, Y0, Z0, ω, φ, κ) [6]."""
+    angles = omega_phi_kappa_from_matrix(
+        matrix_from_quaternion(retract_quaternion(rotation, d_image[3:]))
+    )
+    difference = jnp.mod(angles - given[3:] + jnp.pi, 2 * jnp.pi) - jnp.pi
+    return weight * jnp.concatenate([position + d_image[:3] - given[:3], difference])
+
+
+def interior_residual(parameters, given, weight, d_parameters):
+    """A camera's parameters against their prior [parameters]."""
+    return weight * (parameters + d_parameters - given)
+
+
+def distance_residual(a, b, given, weight, d_a, d_b):
+    """A distance between two points against its measured value."""
+    difference = (a + d_a) - (b + d_b)
+    return weight * (jnp.sqrt(jnp.sum(difference**2)) - given)
+
+
+def scalars(array, rows=None):
+    """The columns of a table as a tuple, each [rows]: structure of arrays, fast under vmap."""
+    columns = array.reshape(array.shape[0], -1)
+    return tuple(
+        columns[:, i] if rows is None else columns[:, i][rows] for i in range(columns.shape[1])
+    )
+
+
+def image_rows(structure: Structure, group, values: Values, data: Data):
+    """What `image_residual` needs for the rays of one camera model, as tuples of [rays]."""
+    take = (lambda x: x) if group.rays is None else (lambda x: x[group.rays])
+    model = cameras.get_model(group.model)
+    image, camera, point = take(structure.image), take(structure.camera), take(structure.point)
+    matrices = jax.vmap(matrix_from_quaternion)(values.rotation)
+    return (
+        scalars(matrices, image),
+        scalars(values.position, image),
+        scalars(values.camera[:, : len(model.parameters)], camera),
+        scalars(values.point, point),
+        scalars(take(data.image_xy)),
+        scalars(take(data.image_weight)),
+    )
+
+
+def gather_groups(structure: Structure, parts):
+    """The results of all camera models in the order of the rays; `parts`: a pytree per group."""
+    if len(parts) == 1 and structure.groups[0].rays is None:
+        return parts[0]
+    rays = jnp.concatenate([group.rays for group in structure.groups])
+    order = jnp.argsort(rays)
+    return jax.tree.map(lambda *arrays: jnp.concatenate(arrays)[order], *parts)
+
+
+def residuals(structure: Structure, values: Values, data: Data) -> Residuals:
+    """All residuals of the network, divided by their σ."""
+    parts = []
+    for group in structure.groups:
+        model = cameras.get_model(group.model)
+        still = ((0.0,) * 3, (0.0,) * 3, (0.0,) * len(group.free), (0.0,) * 3)
+
+        def one(*row, model=model, still=still):
+            return image_residual(model, structure.domain, (), *row, still)
+
+        parts.append(jnp.stack(jax.vmap(one)(*image_rows(structure, group, values, data)), 1))
+    s = structure
+    a, b = s.distance[:, 0], s.distance[:, 1]
+    zero3 = jnp.zeros(3)
+    return Residuals(
+        image=gather_groups(structure, parts),
+        control=control_residual(values.point[s.control], data.control, data.control_weight, 0.0),
+        exterior=jax.vmap(exterior_residual, (0, 0, 0, 0, None))(
+            values.position[s.exterior], values.rotation[s.exterior],
+            data.exterior, data.exterior_weight, jnp.zeros(6),
+        ),
+        interior=interior_residual(
+            values.camera[s.interior], data.interior, data.interior_weight, 0.0
+        ),
+        distance=jax.vmap(distance_residual, (0, 0, 0, 0, None, None))(
+            values.point[a], values.point[b], data.distance, data.distance_weight, zero3, zero3
+        ),
+    )
+
+
+def half_square(r: Residuals) -> Float[Array, ""]:
+    """Half the weighted sum of squares, ½·vᵀPv."""
+    return 0.5 * sum(jnp.vdot(x, x) for x in jax.tree.leaves(r))

@@ -1,0 +1,68 @@
+"""`solve`: arrays in, adjusted arrays out, differentiable, under jit and vmap."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from jaxbundle.adjustment.datum import move_to_datum
+from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.sensitivity import Sensitivity, attach_derivatives
+from jaxbundle.adjustment.solver import BundleSolver, FullStep, Minimum, TrustRegion, minimise
+from jaxbundle.network.arrays import Data, Values
+
+METHODS = {"levenberg-marquardt": TrustRegion(), "gauss-newton": FullStep()}
+
+
+def make_solver(problem: Problem, method: str = "levenberg-marquardt", **options) -> BundleSolver:
+    """The solver of a problem; `options` are those of `BundleSolver`."""
+    if method not in METHODS:
+        raise ValueError(f"method must be one of {', '.join(METHODS)}, not {method!r}")
+    redundancy = jnp.asarray(float(problem.counts.redundancy))
+    return BundleSolver(problem.structure, redundancy, METHODS[method], **options)
+
+
+@eqx.filter_jit
+def find_minimum(solver: BundleSolver, data: Data) -> Minimum:
+    """Run the solver and put its result into the datum; compiled once for each shape."""
+    minimum = minimise(solver, data)
+    values = move_to_datum(solver.structure, minimum.values, data.start)
+    return eqx.tree_at(lambda m: m.values, minimum, values)
+
+
+def solve(
+    problem: Problem,
+    data: Data | None = None,
+    *,
+    sensitivity: Sensitivity = "exact",
+    method: str = "levenberg-marquardt",
+    max_iterations: int = 100,
+    atol: float = 1e-7,
+) -> Values:
+    """Adjusted unknowns as a differentiable function of the observations and all that is given.
+
+    Use it under `jax.jit`, `jax.vmap` (over any field of `data`), `jax.grad`, `jax.jacfwd` and
+    `jax.jacrev`.
+
+    **Arguments:**
+
+    - `problem`: from `make_problem`.
+    - `data`: numbers that replace `problem.data` (same shapes); object coordinates relative to
+      `problem.origin`.
+    - `sensitivity`: `"exact"` (implicit function theorem with the full Hessian) or
+      `"gauss-newton"` ((JᵀPJ)⁻¹JᵀP, error propagation); see `jaxbundle.adjustment.sensitivity`.
+    - `atol`: stop when no unknown would move by more than this fraction of its σ.
+
+    **Returns:** `Values`; NaN throughout where the solver did not converge, so that a failure can
+    never be taken for an answer.
+    """
+    data = problem.data if data is None else data
+    solver = make_solver(problem, method, atol=atol, max_steps=max_iterations)
+    minimum = find_minimum(solver, jax.lax.stop_gradient(data))
+    good = converged(minimum.termination)
+    values = attach_derivatives(problem.structure, minimum.values, data, sensitivity)
+    return jax.tree.map(lambda x: jnp.where(good, x, jnp.nan), values)
+
+
+def converged(termination):
+    """Whether a termination code means a minimum was reached."""
+    return (termination == 1) | (termination == 2)

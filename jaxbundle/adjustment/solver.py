@@ -1,0 +1,345 @@
+"""Levenberg–Marquardt and Gauss–Newton for networks, on optimistix's public extension points.
+
+`optimistix.least_squares` drives; the parts are ours:
+
+- `SchurDescent` builds the normal blocks once an accepted step and re-solves for each damping,
+- `TrustRegion` accepts or rejects and updates the damping λ (Nielsen 1999),
+- `BundleSolver` walks on the manifold of the unknowns and decides when to stop.
+
+Damping is Marquardt's (1963): λ·diag(JᵀPJ). Identity damping does not converge on real blocks:
+radians stand beside metres and K3 ~ 1e-8.
+
+**When it stops.** With the undamped step δ and g = JᵀPv, the decrement d² = −gᵀδ = δᵀNδ bounds
+every single unknown: |δᵢ| ≤ d/σ₀·σᵢ. The network is *settled* when d ≤ `atol`·σ₀: no unknown
+would move by more than `atol` of its own standard deviation. Near the solution the damping is
+therefore dropped altogether; a network whose undamped equations cannot be solved ends as
+*singular*, never as converged.
+"""
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxbundle.adjustment.datum import gauge_directions, s_transform
+from jaxbundle.adjustment.jacobian import jacobian
+from jaxbundle.adjustment.normal import Normal, diagonal, gradient, normal_from_jacobian
+from jaxbundle.adjustment.residuals import residuals
+from jaxbundle.adjustment.schur import factorise, solve
+from jaxbundle.network.arrays import Data, Tangent, Values, retract
+from jaxbundle.network.structure import Structure
+
+TERMINATIONS = (
+    "iteration limit",
+    "settled: no unknown would move by more than the tolerance times its standard deviation",
+    "relative cost: the sum of squares no longer decreases",
+    "singular: the undamped normal equations cannot be solved",
+    "stuck: no step reduces the sum of squares",
+    "not finite: the residuals of the start values, or of a full step, cannot be computed",
+)
+LIMIT, SETTLED, RELATIVE_COST, SINGULAR, STUCK, NOT_FINITE = range(6)
+
+ROUNDING = 2e-14
+"""A predicted decrease of vᵀPv below this fraction of it is rounding noise."""
+
+NOISE_FLOOR = 1e-14
+"""Relative precision of an image coordinate; residuals below it are noise of the arithmetic."""
+
+
+class Damped(eqx.Module):
+    """The normal equations at the accepted point, and the damping's diagonal."""
+
+    normal: Normal
+    gradient: Tangent
+    diagonal: Tangent
+    gauge: Tangent
+
+
+class SchurDescent(optx.AbstractDescent):
+    """The step −(N + λD)⁻¹g by elimination of the points. `step_size` is 1/λ."""
+
+    structure: Structure
+
+    def init(self, y: Values, f_info_struct: Any) -> Damped:
+        make = lambda values, info: self.query(values, info, None)
+        shapes = eqx.filter_eval_shape(make, y, f_info_struct)
+        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+    def query(self, y: Values, f_info: optx.FunctionInfo.ResidualJac, state: Any) -> Damped:
+        normal = normal_from_jacobian(f_info.jac)
+        return Damped(
+            normal=normal,
+            gradient=gradient(f_info.jac, f_info.residual),
+            diagonal=diagonal(self.structure, normal),
+            gauge=gauge_directions(self.structure, y),
+        )
+
+    def step(self, step_size: Float[Array, ""], state: Damped):
+        damping = jax.tree.map(lambda d: d / step_size, state.diagonal)
+        factor = factorise(self.structure, state.normal, damping, state.gauge)
+        change = solve(factor, jax.tree.map(jnp.negative, state.gradient))
+        return change, optx.RESULTS.successful
+
+
+class RegionState(eqx.Module):
+    """Radius 1/λ, the factor of the next reduction, what the pending step promises."""
+
+    radius: Float[Array, ""]
+    reduction: Float[Array, ""]
+    predicted: Float[Array, ""]
+    ratio: Float[Array, ""]
+
+
+class TrustRegion(optx.AbstractSearch):
+    """Accept what decreases vᵀPv; widen by Nielsen's rule, narrow by 2, 4, 8, …"""
+
+    initial: float = 1e4
+
+    def init(self, y: Values, f_info_struct: Any) -> RegionState:
+        start = jnp.asarray(self.initial)
+        return RegionState(start, jnp.asarray(2.0), jnp.asarray(0.0), jnp.asarray(0.0))
+
+    def step(self, first_step, y, y_eval, f_info, f_eval_info, state: RegionState):
+        gain = f_info.as_min() - f_eval_info.as_min()
+        ratio = jnp.where(state.predicted > 0, gain / state.predicted, -1.0)
+        ratio = jnp.where(jnp.isfinite(ratio), ratio, -1.0)
+        accept = first_step | (ratio > 1e-3)
+        finite_radius = jnp.minimum(state.radius, 1e16)
+        wider = jnp.minimum(1e16, finite_radius / jnp.maximum(1 / 3, 1 - (2 * ratio - 1) ** 3))
+        radius = jnp.where(accept, wider, finite_radius / state.reduction)
+        radius = jnp.where(first_step, state.radius, radius)
+        reduction = jnp.where(accept, 2.0, 2.0 * state.reduction)
+        state = RegionState(radius, reduction, state.predicted, ratio)
+        return radius, accept, optx.RESULTS.successful, state
+
+
+class FullStep(optx.AbstractSearch):
+    """Gauss–Newton: every step undamped, every step taken."""
+
+    initial: ClassVar[float] = jnp.inf
+
+    def init(self, y: Values, f_info_struct: Any) -> RegionState:
+        return RegionState(*(jnp.asarray(x) for x in (jnp.inf, 1.0, 0.0, 0.0)))
+
+    def step(self, first_step, y, y_eval, f_info, f_eval_info, state: RegionState):
+        gain = f_info.as_min() - f_eval_info.as_min()
+        state = eqx.tree_at(lambda s: s.ratio, state, gain / state.predicted)
+        return jnp.asarray(jnp.inf), jnp.asarray(True), optx.RESULTS.successful, state
+
+
+class History(eqx.Module):
+    """One row an evaluation: ½vᵀPv there, λ of the step that led to it, accepted or not."""
+
+    cost: Float[Array, " steps"]
+    damping: Float[Array, " steps"]
+    accepted: Bool[Array, " steps"]
+
+
+class SolverState(eqx.Module):
+    """What the loop carries besides the accepted unknowns."""
+
+    first: Bool[Array, ""]
+    y_eval: Values
+    accepted_info: optx.FunctionInfo.Residual
+    search: RegionState
+    descent: Damped
+    step_size: Float[Array, ""]
+    step_finite: Bool[Array, ""]
+    singular: Bool[Array, ""]
+    termination: Int[Array, ""]
+    done: Bool[Array, ""]
+    steps: Int[Array, ""]
+    history: History
+
+
+class BundleSolver(optx.AbstractLeastSquaresSolver):
+    """Least squares of a network: the Schur step under a search, on the manifold.
+
+    **Arguments:** `structure` and `redundancy` of the network (for σ₀ in the stopping rule);
+    `atol`: see the module; `rtol`: stop when an accepted step decreases vᵀPv by less than this
+    fraction (0: never for this reason); `max_steps` rows of history; `progress(step, cost, λ)`
+    is called on the host after every evaluation.
+    """
+
+    structure: Structure
+    redundancy: Float[Array, ""]
+    search: TrustRegion | FullStep = TrustRegion()
+    rtol: float = 0.0
+    atol: float = 1e-5
+    max_steps: int = eqx.field(static=True, default=100)
+    progress: Callable | None = eqx.field(static=True, default=None)
+    norm: ClassVar[Callable] = staticmethod(optx.max_norm)
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> SolverState:
+        zeros = lambda tree: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), tree)
+        descent = SchurDescent(self.structure)
+        info = lambda y, args: self._linearise(fn, y, args)
+        struct = eqx.filter_eval_shape(info, y, args)
+        f_struct = eqx.filter_eval_shape(lambda y, args: fn(y, args)[0], y, args)
+        no = jnp.asarray(False)
+        rows = self.max_steps + 1
+        return SolverState(
+            first=jnp.asarray(True),
+            y_eval=y,
+            accepted_info=optx.FunctionInfo.Residual(zeros(f_struct)),
+            search=self.search.init(y, struct),
+            descent=descent.init(y, struct),
+            step_size=jnp.asarray(float(self.search.initial)),
+            step_finite=jnp.asarray(True),
+            singular=no,
+            termination=jnp.asarray(LIMIT),
+            done=no,
+            steps=jnp.asarray(0),
+            history=History(jnp.full(rows, jnp.nan), jnp.full(rows, jnp.nan), jnp.zeros(rows, bool)),
+        )
+
+    def _linearise(self, fn, y, args):
+        residual, _ = fn(y, args)
+        jac = jacobian(self.structure, y, args)
+        return optx.FunctionInfo.ResidualJac(residual, jac)
+
+    def step(self, fn, y, args, options, state: SolverState, tags):
+        descent = SchurDescent(self.structure)
+        residual, aux = fn(state.y_eval, args)
+        info = optx.FunctionInfo.Residual(residual)
+        cost, before = info.as_min(), state.accepted_info.as_min()
+        step_size, accept, _, search = self.search.step(
+            state.first, y, state.y_eval, state.accepted_info, info, state.search
+        )
+
+        def accepted():
+            linear = optx.FunctionInfo.ResidualJac(
+                residual, jacobian(self.structure, state.y_eval, args)
+            )
+            return state.y_eval, info, descent.query(state.y_eval, linear, state.descent)
+
+        def rejected():
+            return y, state.accepted_info, state.descent
+
+        y, accepted_info, damped = jax.lax.cond(accept, accepted, rejected)
+        cost_here = jnp.where(accept, cost, before)
+
+        # Near the solution, and where the step already is one of rounding, drop the damping.
+        undamped = isinstance(self.search, FullStep)
+        if not undamped:
+            quadratic = accept & (search.ratio > 0.5) & (search.predicted < 1e-3 * cost_here)
+            quadratic = quadratic & ~state.singular & ~state.first
+            step_size = jnp.where(quadratic, jnp.inf, step_size)
+        change, _ = descent.step(step_size, damped)
+        finite = _all_finite(change)
+        change = jax.tree.map(lambda d: jnp.where(finite, d, 0.0), change)
+        decrement = -_dot(damped.gradient, change)
+        damping_term = _dot(change, jax.tree.map(jnp.multiply, damped.diagonal, change))
+        damping_term = jnp.where(jnp.isinf(step_size), 0.0, damping_term / step_size)
+        predicted = 0.5 * (decrement + damping_term)
+        change = s_transform(self.structure, y, change)
+        y_eval = retract(self.structure, y, change)
+
+        sigma0_squared = 2 * cost_here / jnp.maximum(self.redundancy, 1.0)
+        scale = args.image_xy * args.image_weight
+        floor = jnp.sum((NOISE_FLOOR * scale) ** 2)
+        limit = jnp.maximum(self.atol**2 * sigma0_squared, ROUNDING * cost_here) + floor
+        small = finite & (decrement <= limit)
+        settled = small & jnp.isinf(step_size)
+        singular = state.singular | (~finite & jnp.isinf(step_size))
+        stalled = accept & ~state.first & (before - cost < self.rtol * before)
+        stuck = step_size < 1e-20
+        broken = ~jnp.isfinite(cost_here) | (undamped & ~jnp.isfinite(cost))
+        reasons = (
+            (broken, NOT_FINITE),
+            (settled, SETTLED),
+            (stalled & ~singular, RELATIVE_COST),
+            (small & singular, SINGULAR),
+            (stalled & singular, SINGULAR),
+            (undamped & ~finite, SINGULAR),
+            (stuck & ~small, STUCK),
+        )
+        termination = jnp.asarray(LIMIT)
+        for happened, reason in reversed(reasons):
+            termination = jnp.where(happened, reason, termination)
+        done = termination != LIMIT
+        # A small step that still was damped: try it undamped before calling it settled.
+        if not undamped:
+            search = eqx.tree_at(
+                lambda s: s.radius, search, jnp.where(small & ~singular, jnp.inf, search.radius)
+            )
+        y = jax.tree.map(lambda a, b: jnp.where(settled, b, a), y, y_eval)
+        i = state.steps
+        history = History(
+            state.history.cost.at[i].set(cost),
+            state.history.damping.at[i].set(jnp.where(state.first, jnp.nan, 1 / state.step_size)),
+            state.history.accepted.at[i].set(accept),
+        )
+        if self.progress is not None:
+            jax.debug.callback(self.progress, i, cost, 1 / state.step_size)
+        search = eqx.tree_at(lambda s: s.predicted, search, predicted)
+        new = SolverState(
+            first=jnp.asarray(False), y_eval=y_eval, accepted_info=accepted_info, search=search,
+            descent=damped, step_size=step_size, step_finite=finite, singular=singular,
+            termination=termination, done=done, steps=i + 1, history=history,
+        )  # fmt: skip
+        return y, new, aux
+
+    def terminate(self, fn, y, args, options, state: SolverState, tags):
+        return state.done, optx.RESULTS.successful
+
+    def postprocess(self, fn, y, aux, args, options, state: SolverState, tags, result):
+        stats = {
+            "termination": state.termination,
+            "iterations": state.steps,
+            "history": state.history,
+        }
+        return y, aux, stats
+
+
+class NoAdjoint(optx.AbstractAdjoint):
+    """Run the loop without derivatives: they are attached to its result (`sensitivity.py`)."""
+
+    def apply(self, primal_fn, rewrite_fn, inputs, tags):
+        def loop(cond, body, init, max_steps):
+            count = lambda carry: cond(carry[0]) & (carry[1] < max_steps)
+            step = lambda carry: (body(carry[0]), carry[1] + 1)
+            return jax.lax.while_loop(count, step, (init, 0))[0]
+
+        return primal_fn((*inputs, loop))
+
+
+class Minimum(eqx.Module):
+    """Where the loop ended: unknowns, why (`TERMINATIONS`), how many steps, their history."""
+
+    values: Values
+    termination: Int[Array, ""]
+    iterations: Int[Array, ""]
+    history: History
+
+
+def minimise(solver: BundleSolver, data: Data) -> Minimum:
+    """Run the solver from `data.start` by `optimistix.least_squares`; no derivatives."""
+    structure = solver.structure
+    result = optx.least_squares(
+        lambda values, data: residuals(structure, values, data),
+        solver,
+        data.start,
+        args=data,
+        max_steps=solver.max_steps,
+        adjoint=NoAdjoint(),
+        throw=False,
+    )
+    return Minimum(
+        result.value,
+        result.stats["termination"],
+        result.stats["iterations"],
+        result.stats["history"],
+    )
+
+
+def _dot(a, b):
+    return sum(jnp.vdot(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b)))
+
+
+def _all_finite(tree):
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(tree)]))

@@ -1,0 +1,83 @@
+"""The arrays an adjustment works on: unknowns, observations, and small changes of the unknowns.
+
+Rotations live on the manifold: an image carries a unit quaternion, and its change is a rotation
+vector δθ in the camera frame, M ← exp([δθ]×)·M. Everything else adds. Object coordinates are
+relative to the network's `origin`, so that a national grid of 10⁷ m loses no digit.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbundle.geometry import retract_quaternion
+
+
+class Values(eqx.Module):
+    """All quantities of the network, the free and the fixed ones.
+
+    `camera`: interior orientation in the order of the model's parameters (padded with 0);
+    `position`: projection centres; `rotation`: unit quaternions (w, x, y, z), object → camera;
+    `point`: object coordinates. Positions and points are relative to the network's origin.
+    """
+
+    camera: Float[Array, "cameras parameters"]
+    position: Float[Array, "images 3"]
+    rotation: Float[Array, "images 4"]
+    point: Float[Array, "points 3"]
+
+
+class Data(eqx.Module):
+    """What was measured or is given; every field can be differentiated.
+
+    A weight is 1/σ (a priori), in the reciprocal unit of its value; 0 switches a row off.
+    `start` holds the start values of the unknowns, the values of what is fixed, and the
+    coordinates the datum refers to.
+    """
+
+    start: Values
+    image_xy: Float[Array, "rays 2"]
+    image_weight: Float[Array, "rays 2"]
+    control: Float[Array, "control 3"]
+    control_weight: Float[Array, "control 3"]
+    exterior: Float[Array, "exterior 6"]
+    exterior_weight: Float[Array, "exterior 6"]
+    interior: Float[Array, "interior parameters"]
+    interior_weight: Float[Array, "interior parameters"]
+    distance: Float[Array, " distances"]
+    distance_weight: Float[Array, " distances"]
+
+
+class Tangent(eqx.Module):
+    """A small change of the free unknowns, as the adjustment orders them.
+
+    `image`: δX0, δY0, δZ0, δθ (3) and, where every image has its own camera, the free interior
+    orientation; `camera`: the free interior orientation where cameras are shared; `point`: δX,
+    δY, δZ.
+    """
+
+    image: Float[Array, "images image_block"]
+    camera: Float[Array, "cameras camera_block"]
+    point: Float[Array, "points 3"]
+
+
+def split_image_block(structure, tangent: Tangent):
+    """The exterior part [images, 6] and the interior part [cameras, k] of a change."""
+    if structure.own_camera:
+        return tangent.image[:, :6], tangent.image[:, 6:]
+    return tangent.image, tangent.camera
+
+
+def retract(structure, values: Values, tangent: Tangent) -> Values:
+    """The unknowns after a small change; what is fixed must have a zero change."""
+    exterior, interior = split_image_block(structure, tangent)
+    camera = values.camera
+    if interior.shape[1]:
+        rows = jnp.arange(camera.shape[0])[:, None]
+        camera = camera.at[rows, structure.camera_columns].add(interior * structure.camera_free)
+    return Values(
+        camera=camera,
+        position=values.position + exterior[:, :3],
+        rotation=jax.vmap(retract_quaternion)(values.rotation, exterior[:, 3:]),
+        point=values.point + tangent.point,
+    )

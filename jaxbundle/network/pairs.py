@@ -1,0 +1,139 @@
+"""Lists of row pairs, grouped by the block of a matrix that their products add up to.
+
+Normal matrices of a network are sums of small products AᵀB over pairs of rows: a ray with itself
+(the block of its image), two rays of one point (the block of their two images). `Pairs` lists
+the pairs of each block in chunks of fixed lengths, so that a chunk is one small matrix product
+of depth (chunk length × rows) and the whole sum a few batched products. Measured on a BAL block
+of 16 images and 83 718 rays: a quarter of the time of outer products with scatter.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+CHUNK_LENGTHS = (256, 32, 4)
+ROWS_PER_STEP = 4096
+
+
+class Pairs(eqx.Module):
+    """Pairs (a, b) of rows and the blocks of a matrix they belong to.
+
+    A missing partner in a chunk is one past the last row: a row of zeros.
+    `row`, `column`: position of each block in the block matrix.
+    """
+
+    first: tuple[Int[Array, "chunks length"], ...]
+    second: tuple[Int[Array, "chunks length"], ...]
+    block: tuple[Int[Array, " chunks"], ...]
+    row: Int[Array, " blocks"]
+    column: Int[Array, " blocks"]
+
+    def sum(
+        self, a: Float[Array, "rows d m"], b: Float[Array, "rows d n"]
+    ) -> Float[Array, "blocks m n"]:
+        """Σ aᵀb over the pairs of every block."""
+        blocks = self.row.shape[0]
+        missing = a.shape[0], b.shape[0]
+        a, b = _with_zero_row(a), _with_zero_row(b)
+        depth, m, n = a.shape[1], a.shape[2], b.shape[2]
+        total = jnp.zeros((blocks + 1, m, n), a.dtype)
+        for first, second, block in zip(self.first, self.second, self.block):
+            length = first.shape[1]
+            step = max(1, ROWS_PER_STEP // length)
+
+            def add(total, chunk, step=step, length=length):
+                i, j, k = chunk
+                left = a[i].reshape(step, length * depth, m)
+                right = b[j].reshape(step, length * depth, n)
+                product = jnp.einsum("cki,ckj->cij", left, right)
+                return total.at[k].add(product, indices_are_sorted=True), None
+
+            total, _ = jax.lax.scan(add, total, _in_steps(first, second, block, step, missing, blocks))
+        return total[:-1]
+
+    def flat(self) -> tuple[Int[Array, " pairs"], Int[Array, " pairs"]]:
+        """All pairs in one list; the missing ones too (one past the last row)."""
+        return (
+            jnp.concatenate([i.ravel() for i in self.first]),
+            jnp.concatenate([i.ravel() for i in self.second]),
+        )
+
+
+def _with_zero_row(a):
+    return jnp.concatenate([a, jnp.zeros((1, *a.shape[1:]), a.dtype)])
+
+
+def _in_steps(first, second, block, step, missing, blocks):
+    """The chunks in portions of `step`, the last one filled with missing rows."""
+    fill = -first.shape[0] % step
+    length = first.shape[1]
+    pad = ((0, fill), (0, 0))
+    return (
+        jnp.pad(first, pad, constant_values=missing[0]).reshape(-1, step, length),
+        jnp.pad(second, pad, constant_values=missing[1]).reshape(-1, step, length),
+        jnp.pad(block, (0, fill), constant_values=blocks).reshape(-1, step),
+    )
+
+
+def make_pairs(first, second, row, column, columns: int, count: tuple[int, int]) -> Pairs:
+    """Group pairs (first, second) by their block (row, column) of a matrix.
+
+    **Arguments:** row indices `first`, `second` [pairs]; block indices `row`, `column` [pairs];
+    `columns`: number of block columns; `count`: numbers of rows `first` and `second` refer to.
+    """
+    key = np.asarray(row, np.int64) * columns + np.asarray(column, np.int64)
+    order = np.argsort(key, kind="stable")
+    first, second = np.asarray(first)[order], np.asarray(second)[order]
+    keys, start, left = np.unique(key[order], return_index=True, return_counts=True)
+    groups = []
+    for length in CHUNK_LENGTHS:
+        last = length == CHUNK_LENGTHS[-1]
+        chunks = -(-left // length) if last else left // length
+        block = np.repeat(np.arange(len(keys)), chunks)
+        within = np.arange(chunks.sum()) - np.repeat(np.cumsum(chunks) - chunks, chunks)
+        index = start[block][:, None] + within[:, None] * length + np.arange(length)
+        valid = index < (start + left)[block][:, None]
+        index = np.where(valid, index, 0)
+        if len(block):
+            groups.append((
+                np.where(valid, first[index], count[0]),
+                np.where(valid, second[index], count[1]),
+                block,
+            ))
+        taken = np.minimum(chunks * length, left)
+        start, left = start + taken, left - taken
+    as_int = lambda x: jnp.asarray(np.asarray(x), jnp.int32)
+    return Pairs(
+        first=tuple(as_int(g[0]) for g in groups),
+        second=tuple(as_int(g[1]) for g in groups),
+        block=tuple(as_int(g[2]) for g in groups),
+        row=as_int(keys // columns),
+        column=as_int(keys % columns),
+    )
+
+
+def pairs_within(group: Int[np.ndarray, " rows"]):
+    """All pairs (i ≤ j) of rows of the same group; `group` is sorted. Two index arrays."""
+    group = np.asarray(group)
+    if not len(group):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    _, start, size = np.unique(group, return_index=True, return_counts=True)
+    first, second = [], []
+    for count in np.unique(size):
+        i, j = np.triu_indices(count)
+        base = start[size == count][:, None]
+        first.append((base + i).ravel())
+        second.append((base + j).ravel())
+    return np.concatenate(first), np.concatenate(second)
+
+
+def pairs_between(group_a, group_b):
+    """All pairs (i, j) of rows with group_a[i] == group_b[j]; both are sorted."""
+    group_a, group_b = np.asarray(group_a), np.asarray(group_b)
+    start = np.searchsorted(group_b, group_a, side="left")
+    count = np.searchsorted(group_b, group_a, side="right") - start
+    first = np.repeat(np.arange(len(group_a)), count)
+    within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    return first, np.repeat(start, count) + within

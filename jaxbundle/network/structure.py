@@ -1,0 +1,320 @@
+"""The index plan of a network, made once on the host: who sees whom, what is free, who pairs.
+
+The normal equations of a network are an arrow. Object points touch only the images that see
+them, so they are eliminated point by point; what remains is the *reduced system* of
+
+    images  (6 exterior parameters each, and the interior ones where every image has its camera),
+    cameras (the free interior parameters, where cameras are shared),
+    kept points (those at the ends of a distance: a distance ties two points together, so they
+    are not eliminated).
+
+Rays are sorted by point, then camera, then image. `Incidence` is the second level of that order:
+one row for each camera a point is seen with, so that a shared camera costs one row a point, not
+one a ray.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxbundle.cameras import default_parameters, get_model
+from jaxbundle.geometry import matrix_from_omega_phi_kappa, quaternion_from_matrix
+from jaxbundle.network.arrays import Data, Values
+from jaxbundle.network.pairs import Pairs, make_pairs, pairs_between, pairs_within
+from jaxbundle.network.tables import Network
+
+
+class Group(eqx.Module):
+    """The rays of one camera model: which rays (None: all), and its free parameter columns."""
+
+    model: str = eqx.field(static=True)
+    free: tuple[int, ...] = eqx.field(static=True)
+    rays: Int[Array, " rays"] | None
+
+
+class Incidence(eqx.Module):
+    """A point seen with a shared camera: one row for each such couple, sorted by point."""
+
+    of_ray: Int[Array, " rays"]
+    point: Int[Array, " incidences"]
+    camera: Int[Array, " incidences"]
+
+
+class Structure(eqx.Module):
+    """The index plan; `*_free` are 1 where an unknown is free, 0 where it is held."""
+
+    domain: str = eqx.field(static=True)
+    own_camera: bool = eqx.field(static=True)
+    all_free: bool = eqx.field(static=True)
+    movable: bool = eqx.field(static=True)
+    groups: tuple[Group, ...]
+    image: Int[Array, " rays"]
+    camera: Int[Array, " rays"]
+    point: Int[Array, " rays"]
+    camera_of_image: Int[Array, " images"]
+    camera_columns: Int[Array, "cameras k"]
+    camera_free: Float[Array, "cameras k"]
+    image_free: Float[Array, "images 6"]
+    point_free: Float[Array, "points 3"]
+    eliminated: Float[Array, "points 1"]
+    kept: Int[Array, " kept"]
+    kept_rays: Int[Array, " kept_rays"]
+    kept_of_ray: Int[Array, " kept_rays"]
+    control: Int[Array, " control"]
+    exterior: Int[Array, " exterior"]
+    interior: Int[Array, " interior"]
+    distance: Int[Array, "distances 2"]
+    incidence: Incidence | None
+    by_image: Pairs
+    by_camera: Pairs | None
+    image_pairs: Pairs
+    image_camera_pairs: Pairs | None
+    camera_pairs: Pairs | None
+    datum_weight: Float[Array, "points 3"]
+    gauge: Float[Array, "7 defect"]
+
+    @property
+    def images(self) -> int:
+        return self.image_free.shape[0]
+
+    @property
+    def cameras(self) -> int:
+        return self.camera_free.shape[0]
+
+    @property
+    def points(self) -> int:
+        return self.point_free.shape[0]
+
+    @property
+    def rays(self) -> int:
+        return self.image.shape[0]
+
+    @property
+    def interior_width(self) -> int:
+        """Free interior parameters of a camera (the largest number over the cameras)."""
+        return self.camera_free.shape[1]
+
+    @property
+    def image_width(self) -> int:
+        """Width of an image's block in the reduced system."""
+        return 6 + (self.interior_width if self.own_camera else 0)
+
+    @property
+    def camera_width(self) -> int:
+        """Width of a shared camera's block in the reduced system; 0 where there is none."""
+        return 0 if self.own_camera else self.interior_width
+
+    @property
+    def reduced_size(self) -> int:
+        """Unknowns of the reduced system, the held ones counted."""
+        return (
+            self.images * self.image_width
+            + self.cameras * self.camera_width
+            + 3 * self.kept.shape[0]
+        )
+
+    @property
+    def defect(self) -> int:
+        """Datum defect: directions in which the network may float."""
+        return self.gauge.shape[1]
+
+    @property
+    def image_block_free(self) -> Float[Array, "images image_block"]:
+        """Which columns of the image blocks are free."""
+        if self.own_camera:
+            return jnp.concatenate([self.image_free, self.camera_free], 1)
+        return self.image_free
+
+
+def order_cameras(network: Network) -> Network:
+    """The same network with its cameras in the order of the images, where each has its own."""
+    used = network.images.camera
+    if len(used) == len(network.cameras) and len(set(used)) == len(used):
+        network = network.replace(
+            cameras=tuple(network.cameras[c] for c in used),
+            images=_with_camera(network.images, np.arange(len(used))),
+        )
+    return network
+
+
+def _with_camera(images, camera):
+    return type(images)(
+        images.id, camera, images.position, images.angles, images.sigma, images.source
+    )
+
+
+def make_structure(network: Network) -> tuple[Structure, Data, Float[np.ndarray, "3"]]:
+    """The index plan, the arrays and the origin of a checked network (`check_network`).
+
+    Check points must have been set aside. The datum is not decided here.
+    """
+    images, points, observations = network.images, network.points, network.observations
+    order = np.lexsort((
+        observations.image, images.camera[observations.image], observations.point
+    ))
+    image, point = observations.image[order], observations.point[order]
+    camera = images.camera[image]
+
+    camera_columns, camera_free, groups = _interior(network, camera)
+    k = camera_free.shape[1]
+    own_camera = bool(
+        k and len(network.cameras) == len(images)
+        and np.array_equal(images.camera, np.arange(len(images)))
+    )
+    image_free = np.where(images.sigma == 0, 0.0, 1.0)
+    fixed = points.has_role("fixed")
+    point_free = np.where(fixed[:, None], 0.0, 1.0) * np.ones((len(points), 3))
+    kept = np.setdiff1d(network.distances.points.ravel(), np.flatnonzero(fixed))
+    eliminated = ~fixed
+    eliminated[kept] = False
+
+    elim_rays = np.flatnonzero(eliminated[point])
+    kept_rays = np.flatnonzero(np.isin(point, kept))
+    incidence, camera_plans = None, (None, None, None)
+    if k and not own_camera:
+        incidence, camera_plans = _camera_plans(
+            image, camera, point, elim_rays, len(network.cameras)
+        )
+    data, origin, priors = _data(network, order)
+    as_int = lambda x: jnp.asarray(np.asarray(x), jnp.int32)
+    structure = Structure(
+        domain=network.residuals,
+        own_camera=own_camera,
+        all_free=bool(image_free.all() and camera_free.all() and point_free.all()),
+        movable=False,
+        groups=groups,
+        image=as_int(image),
+        camera=as_int(camera),
+        point=as_int(point),
+        camera_of_image=as_int(images.camera),
+        camera_columns=as_int(camera_columns),
+        camera_free=jnp.asarray(camera_free),
+        image_free=jnp.asarray(image_free),
+        point_free=jnp.asarray(point_free),
+        eliminated=jnp.asarray(eliminated[:, None].astype(float)),
+        kept=as_int(kept),
+        kept_rays=as_int(kept_rays),
+        kept_of_ray=as_int(np.searchsorted(kept, point[kept_rays])),
+        control=as_int(priors["control"]),
+        exterior=as_int(priors["exterior"]),
+        interior=as_int(priors["interior"]),
+        distance=as_int(network.distances.points),
+        incidence=incidence,
+        by_image=_plan(np.arange(len(image)), np.arange(len(image)), image, image,
+                       len(images), len(image)),
+        by_camera=camera_plans[0],
+        image_pairs=_image_pairs(image, point, elim_rays, len(images)),
+        image_camera_pairs=camera_plans[1],
+        camera_pairs=camera_plans[2],
+        datum_weight=jnp.zeros((len(points), 3)),
+        gauge=jnp.zeros((7, 0)),
+    )
+    return structure, data, origin
+
+
+def _plan(first, second, row, column, columns, count) -> Pairs:
+    return make_pairs(first, second, row[first], column[second], columns, (count, count))
+
+
+def _image_pairs(image, point, rays, images) -> Pairs:
+    """Pairs of rays of one point, once each, the lower image first."""
+    i, j = pairs_within(point[rays])
+    i, j = rays[i], rays[j]
+    swap = image[i] > image[j]
+    i, j = np.where(swap, j, i), np.where(swap, i, j)
+    twice = (i != j) & (image[i] == image[j])
+    i, j = np.concatenate([i, j[twice]]), np.concatenate([j, i[twice]])
+    return _plan(i, j, image, image, images, len(image))
+
+
+def _camera_plans(image, camera, point, elim_rays, cameras):
+    """Incidences of points and shared cameras, and the pairs in which cameras take part."""
+    key = point.astype(np.int64) * cameras + camera
+    keys, of_ray = np.unique(key, return_inverse=True)
+    inc_point, inc_camera = keys // cameras, keys % cameras
+    elim = np.zeros(len(keys), bool)
+    elim[of_ray[elim_rays]] = True
+    elim = np.flatnonzero(elim)
+    rays = np.arange(len(image))
+    r, q = pairs_between(point[elim_rays], inc_point[elim])
+    r, q = elim_rays[r], elim[q]
+    a, b = pairs_within(inc_point[elim])
+    a, b = elim[a], elim[b]
+    as_int = lambda x: jnp.asarray(np.asarray(x), jnp.int32)
+    incidence = Incidence(as_int(of_ray), as_int(inc_point), as_int(inc_camera))
+    return incidence, (
+        _plan(rays, rays, camera, camera, cameras, len(rays)),
+        make_pairs(r, q, image[r], inc_camera[q], cameras, (len(rays), len(keys))),
+        make_pairs(a, b, inc_camera[a], inc_camera[b], cameras, (len(keys), len(keys))),
+    )
+
+
+def _interior(network: Network, camera_of_ray):
+    """Free interior columns of every camera, and the rays of every camera model."""
+    models = [get_model(c.model) for c in network.cameras]
+    free_of_model: dict[str, set[int]] = {}
+    for camera, model in zip(network.cameras, models):
+        columns = free_of_model.setdefault(model.name, set())
+        columns.update(model.parameters.index(name) for name in camera.free)
+    free = {name: tuple(sorted(columns)) for name, columns in free_of_model.items()}
+    k = max((len(columns) for columns in free.values()), default=0)
+    camera_columns = np.zeros((len(models), k), np.int64)
+    camera_free = np.zeros((len(models), k))
+    for c, (camera, model) in enumerate(zip(network.cameras, models)):
+        for j, column in enumerate(free[model.name]):
+            camera_columns[c, j] = column
+            camera_free[c, j] = model.parameters[column] in camera.free
+    groups = []
+    name_of_ray = np.array([m.name for m in models], dtype=object)[camera_of_ray]
+    for name, columns in free.items():
+        rays = np.flatnonzero(name_of_ray == name)
+        if len(rays) or len(free) == 1:
+            every = len(rays) == len(camera_of_ray)
+            groups.append(Group(name, columns, None if every else jnp.asarray(rays, jnp.int32)))
+    return camera_columns, camera_free, tuple(groups)
+
+
+def _data(network: Network, order):
+    """Values and weights of the network, object coordinates relative to their origin."""
+    images, points, observations = network.images, network.points, network.observations
+    origin = np.round(points.position.mean(0)) if len(points) else np.zeros(3)
+    models = [get_model(c.model) for c in network.cameras]
+    width = max(len(m.parameters) for m in models)
+    camera = np.zeros((len(models), width))
+    camera_sigma = np.full((len(models), width), np.inf)
+    for c, (given, model) in enumerate(zip(network.cameras, models)):
+        values = {**default_parameters(model), **given.parameters}
+        for j, name in enumerate(model.parameters):
+            camera[c, j] = values[name]
+            if name in given.free:
+                camera_sigma[c, j] = given.sigma.get(name, np.inf)
+    matrices = jax.vmap(matrix_from_omega_phi_kappa)(jnp.asarray(images.angles))
+    start = Values(
+        camera=jnp.asarray(camera),
+        position=jnp.asarray(images.position - origin),
+        rotation=jax.vmap(quaternion_from_matrix)(matrices),
+        point=jnp.asarray(points.position - origin),
+    )
+    weight = lambda sigma: np.where(
+        np.isfinite(sigma) & (sigma > 0), 1 / np.where(sigma > 0, sigma, 1), 0.0
+    )
+    control = np.flatnonzero(points.has_role("control"))
+    exterior = np.flatnonzero((np.isfinite(images.sigma) & (images.sigma > 0)).any(1))
+    interior = np.flatnonzero(np.isfinite(camera_sigma).any(1))
+    exterior_value = np.concatenate([images.position - origin, images.angles], 1)
+    data = Data(
+        start=start,
+        image_xy=jnp.asarray(observations.xy[order]),
+        image_weight=jnp.asarray(1 / observations.sigma[order]),
+        control=jnp.asarray((points.position - origin)[control]),
+        control_weight=jnp.asarray(weight(points.sigma[control])),
+        exterior=jnp.asarray(exterior_value[exterior]),
+        exterior_weight=jnp.asarray(weight(images.sigma[exterior])),
+        interior=jnp.asarray(camera[interior]),
+        interior_weight=jnp.asarray(weight(camera_sigma[interior])),
+        distance=jnp.asarray(network.distances.value),
+        distance_weight=jnp.asarray(1 / network.distances.sigma),
+    )
+    return data, origin, {"control": control, "exterior": exterior, "interior": interior}

@@ -1,0 +1,175 @@
+"""The tables of a network: cameras, images, points, observations, distances.
+
+A table is a frozen dataclass of numpy columns. It knows where its rows came from (`Source`), so
+that every complaint can name the file and the row. Rows refer to each other by index; the ids
+are kept beside them for people.
+
+| column | meaning |
+|---|---|
+| `Images.angles` | ω, φ, κ in radians, M = R3(κ)·R2(φ)·R1(ω) |
+| `Images.sigma` | prior σ of X0, Y0, Z0, ω, φ, κ; NaN: no prior; 0: held fixed |
+| `Points.sigma` | σ of a control point; NaN: none; inf: this axis is not controlled |
+| `Observations.xy` | measured image coordinates, in the unit and axes of the camera's model |
+"""
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+ROLES = ("tie", "control", "fixed", "check")
+DATUMS = ("control", "inner", "minimal")
+RESIDUAL_DOMAINS = ("corrected", "measured")
+EXTERIOR = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
+
+
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """Where a table was read: a name, and the number of each row in it (None: counted from 1)."""
+
+    name: str
+    numbers: Int[np.ndarray, " rows"] | None = None
+    word: str = "row"
+
+    def __call__(self, row: int) -> str:
+        """The place of a row, as a person would look it up."""
+        number = row + 1 if self.numbers is None else self.numbers[row]
+        return f"{self.name}, {self.word} {number}"
+
+    def take(self, rows) -> "Source":
+        """The source of the chosen rows (a mask or indices)."""
+        rows = np.asarray(rows)
+        rows = np.flatnonzero(rows) if rows.dtype == bool else rows
+        numbers = rows + 1 if self.numbers is None else self.numbers[rows]
+        return Source(self.name, numbers, self.word)
+
+
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """One camera: a model of `jaxbundle.cameras`, its start values, what is free, its priors.
+
+    `parameters` not given start at 0 (or the model's own default); `sigma` gives a parameter a
+    prior: a pseudo-observation of its start value. `image_size` is (columns, rows), `pixel_size`
+    (width, height) in the unit of the image coordinates.
+    """
+
+    id: str
+    model: str = "brown"
+    parameters: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    free: tuple[str, ...] = ()
+    sigma: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    image_size: tuple[int, int] | None = None
+    pixel_size: tuple[float, float] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Images:
+    """Exposures with the start values of their exterior orientation."""
+
+    id: tuple[str, ...]
+    camera: Int[np.ndarray, " images"]
+    position: Float[np.ndarray, "images 3"]
+    angles: Float[np.ndarray, "images 3"]
+    sigma: Float[np.ndarray, "images 6"]
+    source: Source = Source("images")
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+
+@dataclasses.dataclass(frozen=True)
+class Points:
+    """Object points: role, coordinates (start values, given values) and σ."""
+
+    id: tuple[str, ...]
+    role: tuple[str, ...]
+    position: Float[np.ndarray, "points 3"]
+    sigma: Float[np.ndarray, "points 3"]
+    source: Source = Source("points")
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    def has_role(self, *roles: str) -> Bool[np.ndarray, " points"]:
+        """Which points play one of these roles."""
+        return np.isin(np.array(self.role, dtype=object), roles)
+
+
+@dataclasses.dataclass(frozen=True)
+class Observations:
+    """Measured image points: which point in which image, where, and how well (σ)."""
+
+    image: Int[np.ndarray, " rays"]
+    point: Int[np.ndarray, " rays"]
+    xy: Float[np.ndarray, "rays 2"]
+    sigma: Float[np.ndarray, "rays 2"]
+    source: Source = Source("observations")
+
+    def __len__(self) -> int:
+        return len(self.image)
+
+    def take(self, rows) -> "Observations":
+        """The chosen rows (a mask or indices), their places kept for messages."""
+        return Observations(
+            self.image[rows], self.point[rows], self.xy[rows], self.sigma[rows],
+            self.source.take(rows),
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Distances:
+    """Measured distances between two points, in the object unit."""
+
+    points: Int[np.ndarray, "distances 2"]
+    value: Float[np.ndarray, " distances"]
+    sigma: Float[np.ndarray, " distances"]
+    source: Source = Source("distances")
+
+    def __len__(self) -> int:
+        return len(self.value)
+
+    @staticmethod
+    def none() -> "Distances":
+        """No distances at all."""
+        return Distances(np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0))
+
+
+@dataclasses.dataclass(frozen=True)
+class Network:
+    """A photogrammetric network: everything an adjustment needs, checked before it is used.
+
+    `datum` is "control" (given by control points, priors), "inner" (inner constraints on
+    `datum_points`, all tie points if empty) or "minimal" (as many coordinates held as the network
+    has datum defects). `residuals` names the domain in which v = computed − observed is formed.
+    `warnings` tell what was left out and why; they end up in the report.
+    """
+
+    cameras: tuple[Camera, ...]
+    images: Images
+    points: Points
+    observations: Observations
+    distances: Distances = dataclasses.field(default_factory=Distances.none)
+    datum: str = "control"
+    datum_points: tuple[str, ...] = ()
+    residuals: str = "corrected"
+    name: str = "network"
+    object_unit: str = "m"
+    image_unit: str = "mm"
+    angle_unit: str = "rad"
+    warnings: tuple[str, ...] = ()
+
+    def replace(self, **changes) -> "Network":
+        """A copy with some fields changed."""
+        return dataclasses.replace(self, **changes)
+
+    def warn(self, *messages: str) -> "Network":
+        """A copy that carries further warnings."""
+        return self.replace(warnings=(*self.warnings, *messages))
+
+    def __str__(self) -> str:
+        return (
+            f"Network {self.name!r}: {len(self.cameras)} camera(s), {len(self.images)} images, "
+            f"{len(self.points)} points, {len(self.observations)} image points, "
+            f"{len(self.distances)} distances, datum {self.datum}"
+        )
