@@ -1,7 +1,7 @@
 """Rotation matrices from angles and from Rodrigues' parameters, and back.
 
 M turns directions of the object space into the camera frame: [r, s, q] = M·(X − X0). The
-elementary rotations turn the axes, positive when seen counter-clockwise against the axis:
+elementary rotations turn the axes, counter-clockwise as seen from the tip of the axis:
 
     R1(ω) = ⎡1    0      0  ⎤   R2(φ) = ⎡cos φ  0  −sin φ⎤   R3(κ) = ⎡ cos κ  sin κ  0⎤
             ⎢0  cos ω  sin ω⎥           ⎢  0    1     0  ⎥           ⎢−sin κ  cos κ  0⎥
@@ -26,11 +26,10 @@ this choice.
     M = (I − S)⁻¹(I + S),    S = ½[p]×        (Cayley, 1846)
 
 Written out this is the Rodrigues matrix of photogrammetry (Schut, 1959, Photogrammetria 15; Faig,
-1984), with unit Δ = 1 + ¼(a² + b² + c²) as the common denominator. To first order p is the
-rotation vector. They do not exist for a rotation by 180°.
+1984), with the common denominator Δ = 1 + ¼(a² + b² + c²). To first order p is the rotation
+vector. The parameters do not exist for a rotation by 180°.
 
-Sources: Wolf and Dewitt (2000), Elements of Photogrammetry, appendix C; McGlone (ed., 2013),
-Manual of Photogrammetry.
+Source of the angles: Wolf and Dewitt (2000), Elements of Photogrammetry, appendix C.
 """
 
 import jax.numpy as jnp

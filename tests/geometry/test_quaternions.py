@@ -99,7 +99,7 @@ def test_quaternion_of_a_matrix_on_every_branch_and_tie(M):
     np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1, atol=1e-15)
     np.testing.assert_allclose(batch(matrix_from_quaternion)(q), M, atol=2e-15)
     # Its derivative along exp([δ]×)·M is ½(0, δ)∘q, on each branch.
-    J = np.asarray(jacobians(quaternion_from_matrix, M))
+    (J,) = jacobians(quaternion_from_matrix, M)
     for k, axis in enumerate(np.eye(3)):
         turned = np.einsum("ij,njk->nik", -LEVI_CIVITA[k], M)
         quarter = np.tile([0, *axis / 2], (N, 1))
@@ -116,8 +116,8 @@ def test_exponential_against_scipy_and_the_matrix_exponential():
     for v in (rotation_vectors(), half_turns(), 5 * rotation_vectors()):
         M = batch(matrix_from_rotation_vector)(v)
         np.testing.assert_allclose(M, Rotation.from_rotvec(v).as_matrix(), atol=2e-14)
-        cross_matrices = np.cross(v[:, None, :], np.eye(3)).swapaxes(1, 2)
-        np.testing.assert_allclose(M, expm(cross_matrices), atol=1e-13)
+        cross_matrices = np.cross(v[::20, None, :], np.eye(3)).swapaxes(1, 2)
+        np.testing.assert_allclose(M[::20], expm(cross_matrices), atol=1e-13)
 
 
 def test_logarithm_returns_at_every_angle():
@@ -158,7 +158,7 @@ def test_first_and_second_derivatives_of_log_exp():
         return rotation_vector_from_quaternion(quaternion_from_rotation_vector(v))
 
     v = rotation_vectors()
-    assert_identities(jacobians(round_trip, v), 1e-12)
+    assert_identities(jacobians(round_trip, v)[0], 1e-12)
     hessian = batch(jax.jacfwd(jax.jacfwd(round_trip)))(v)
     np.testing.assert_allclose(hessian, 0, atol=1e-10)
 
@@ -170,14 +170,14 @@ def second_derivative(function, x):
 def test_derivatives_of_the_exponential_at_zero():
     """q(v) = (1 − v²/8, v/2) and exp([v]×) = I + [v]× + ½[v]×², both to second order."""
     eye, zero = np.eye(3), np.zeros((N, 3))
-    first = jacobians(quaternion_from_rotation_vector, zero)[0]
+    first = jacobians(quaternion_from_rotation_vector, zero)[0][0]
     second = second_derivative(quaternion_from_rotation_vector, zero[0])
     np.testing.assert_allclose(first, np.vstack([np.zeros(3), eye / 2]), atol=1e-16)
     np.testing.assert_allclose(second, [-eye / 4, *np.zeros((3, 3, 3))], atol=1e-16)
 
     generators = -LEVI_CIVITA  # [e_k]× is generators[:, :, k]
     products = np.einsum("abi,bcj->acij", generators, generators)
-    first = jacobians(matrix_from_rotation_vector, zero)[0]
+    first = jacobians(matrix_from_rotation_vector, zero)[0][0]
     second = second_derivative(matrix_from_rotation_vector, zero[0])
     np.testing.assert_allclose(first, generators, atol=1e-16)
     np.testing.assert_allclose(second, (products + products.swapaxes(2, 3)) / 2, atol=1e-15)
@@ -201,7 +201,7 @@ def test_difference_inverts_the_retraction():
     moved = batch(retract_quaternion)(q, v)
     np.testing.assert_allclose(batch(quaternion_difference)(moved, q), v, atol=1e-14)
     np.testing.assert_allclose(batch(quaternion_difference)(-moved, q), v, atol=1e-14)
-    J = jacobians(lambda d, q: quaternion_difference(retract_quaternion(q, d), q), v, q)
+    (J,) = jacobians(lambda d, q: quaternion_difference(retract_quaternion(q, d), q), v, q)
     assert_identities(J, 1e-12)
 
 

@@ -1,0 +1,62 @@
+"""`bingo`: radial distortion by the additional parameters 25 and 26 of the BINGO program.
+
+    ρ = R·F/100                                                       R = √(x² + y²)
+    dr = p25·S25·ρ·(1 − ρ²) + p26·S26·ρ·(1 − ρ²)·(ρ − 0.4)
+    xi = x·(1 − dr/R) − x0,  yi = y·(1 − dr/R) − y0
+
+x, y are measured from the image ORIGIN, not from the principal point: dr is the distortion of the
+measurement, so it is taken off. F, the format factor, places the zero of dr at R = 100/F. It is a
+convention, never an unknown. dr/R is written without the division, finite at R = 0.
+
+Units: the image unit of the files (in the listings of seed 002, 1 unit = 10 px); p25 and p26 in
+the same unit, listed by the program in 1/1000 of it.
+
+Source: the radial tables of the BINGO 5.5 listings (2008) in seed 002, all eight of which the
+formula reproduces; the normalising constants S25 and S26 were fitted to them. The sign follows from
+the correlation of −69 % listed between p25 and c: both enlarge computed − observed in proportion
+to the radius; with the other sign it would be positive. Parameter 17, which occurs in the
+listings, is not published there and not offered here.
+"""
+
+import jax.numpy as jnp
+
+from . import brown, perspective
+from .inverse import implicit_inverse
+from .model import CameraModel, Pair, Parameters, Scalar
+
+S25 = 0.3737850724543663
+S26 = 0.304789700626975
+
+
+def relative_distortion(p: Parameters, R: Scalar) -> Scalar:
+    """dr/R, without unit, at the radius R from the image origin, in the image unit."""
+    _, _, _, p25, p26, F = p
+    rho = R * F / 100
+    return F / 100 * (1 - rho**2) * (p25 * S25 + p26 * S26 * (rho - 0.4))
+
+
+def correct(p: Parameters, x: Scalar, y: Scalar) -> Pair:
+    """Measured to ideal coordinates, in the image unit: the own formula of `bingo`."""
+    factor = 1 - relative_distortion(p, _radius(x, y))
+    return brown.reduce(p, x * factor, y * factor)
+
+
+def _radius(x, y):
+    # √ has no derivative at 0; what is multiplied by x or y there needs none
+    square = x * x + y * y
+    inside = square > 0
+    return jnp.where(inside, jnp.sqrt(jnp.where(inside, square, 1.0)), 0.0)
+
+
+BINGO = CameraModel(
+    name="bingo",
+    parameters=("c", "x0", "y0", "p25", "p26", "format_factor"),
+    unit="mm",
+    axes="up",
+    own_formula="to_ideal",
+    ideal=perspective.ideal,
+    ray=perspective.ray,
+    to_ideal=correct,
+    from_ideal=implicit_inverse(correct, start=brown.unreduce),
+    never_free=("format_factor",),
+)

@@ -1,0 +1,91 @@
+r"""The inverse of a distortion formula, with exact derivatives of every order.
+
+Given g(p, x, y) and a target (X, Y), find (x, y) with g(p, x, y) = (X, Y) by Newton's method:
+
+    (x, y) ← (x, y) + J⁻¹·((X, Y) − g(p, x, y)),        J = ∂g/∂(x, y)
+
+The iterations are not differentiated. By the implicit function theorem the root moves with
+
+    (ẋ, ẏ) = J⁻¹·((Ẋ, Ẏ) − ∂g/∂p·ṗ),                  J taken at the root,
+
+and since the root in that rule is again this function, its second derivatives are exact as well.
+
+The number of iterations is fixed, so that a million points run without a branch. Newton doubles the
+correct digits. To be within 1e-12 of the half diagonal everywhere in the image, mapping cameras
+need 1 or 2 iterations, close-range and video cameras 3, an ordinary wide-angle lens 4, a fisheye 3
+to 6, and a fisheye whose polynomial is nearly flat at the edge 11: the default of 6, and what the
+models ask for beyond it. Unrolled, the iterations fuse into one loop over the points. 200 000
+points of `brown` on one CPU core take 13 ms (19 with `lax.fori_loop`), and with both gradients
+32 ms; differentiable Newton corrections at the frozen root would take 53, differentiating the
+iterations 660.
+
+A target outside the range of g, for example beyond the radius where the distortion turns
+(`validity.py`), has no root, or only one on a foreign branch. A wrong coordinate would enter an
+adjustment unseen; NaN cannot. The root is accepted where the remainder is rounding and where J has
+a positive determinant and trace: at the principal point J is near the identity, and along the
+branch that starts there its eigenvalues stay positive.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from .model import Pair, Parameters, Scalar
+
+Formula = Callable[[Parameters, Scalar, Scalar], Pair]
+
+
+def implicit_inverse(g: Formula, start: Formula, iterations: int = 6) -> Formula:
+    """The function (p, X, Y) -> (x, y) with g(p, x, y) = (X, Y), differentiable in all arguments.
+
+    **Arguments:** `g`, near the identity but for a shift; `start`, `(p, X, Y) -> (x, y)`, undoes
+    the shift and begins the `iterations`.
+
+    **Returns:** a function whose result is NaN where no root was found.
+    """
+
+    @jax.custom_jvp
+    def inverse(p, X, Y):
+        x, y = start(p, X, Y)
+        for _ in range(iterations):
+            (gx, gy), J = _value_and_derivative(g, p, x, y)
+            dx, dy = _solve(J, X - gx, Y - gy)
+            x, y = x + dx, y + dy
+        (gx, gy), (a, b, c, d) = _value_and_derivative(g, p, x, y)
+        remainder = jnp.abs(gx - X) + jnp.abs(gy - Y)
+        size = jnp.abs(x) + jnp.abs(y) + jnp.abs(X) + jnp.abs(Y)
+        found = remainder <= 1000 * jnp.finfo(jnp.result_type(x)).eps * size
+        found &= (a * d - b * c > 0) & (a + d > 0)
+        return jnp.where(found, x, jnp.nan), jnp.where(found, y, jnp.nan)
+
+    @inverse.defjvp
+    def _(primals, tangents):
+        (p, X, Y), (dp, dX, dY) = primals, tangents
+        x, y = inverse(p, X, Y)
+        _, J = _value_and_derivative(g, p, x, y)
+        _, (gx, gy) = jax.jvp(lambda p: g(p, x, y), (p,), (dp,))
+        return (x, y), _solve(J, dX - gx, dY - gy)
+
+    def with_floats(p, X, Y):
+        dtype = jnp.result_type(float, *p, X, Y)
+        *p, X, Y = (jnp.asarray(v, dtype) for v in (*p, X, Y))
+        return inverse(tuple(p), X, Y)
+
+    return with_floats
+
+
+def _value_and_derivative(g, p, x, y):
+    """g and its derivative J = [[a, b], [c, d]] with respect to (x, y)."""
+    one, zero = jnp.ones_like(x), jnp.zeros_like(x)
+    at_p = lambda x, y: g(p, x, y)
+    value, (a, c) = jax.jvp(at_p, (x, y), (one, zero))
+    _, (b, d) = jax.jvp(at_p, (x, y), (zero, one))
+    return value, (a, b, c, d)
+
+
+def _solve(J, u, v):
+    """J⁻¹·(u, v)."""
+    a, b, c, d = J
+    determinant = a * d - b * c
+    return (d * u - b * v) / determinant, (a * v - c * u) / determinant

@@ -1,0 +1,45 @@
+"""Start values of a camera's parameters: what may be left out, and what cannot be right."""
+
+import math
+from collections.abc import Mapping
+from numbers import Real
+
+from .model import CameraModel
+from .names import closest
+
+
+def default_parameters(model: CameraModel) -> dict[str, float]:
+    """The values of the parameters that may be left out: 0, and 1 for a format factor.
+
+    The principal distance has no default.
+    """
+    return {
+        name: 1.0 if name == "format_factor" else 0.0
+        for name in model.parameters
+        if name not in model.principal_distance
+    }
+
+
+def check_parameters(model: CameraModel, given: Mapping[str, float]) -> None:
+    """Refuses start values that cannot describe a camera of this model.
+
+    **Raises:** `ValueError`, for a name the model does not have, a value that is not a finite
+    number, and a principal distance or format factor that is missing, zero or negative.
+    """
+    where = f"Camera model {model.name!r}"
+    for name, value in given.items():
+        if name not in model.parameters:
+            raise ValueError(
+                f"{where} has no parameter {name!r}{closest(name, model.parameters)} "
+                f"Its parameters are {', '.join(model.parameters)}."
+            )
+        if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
+            raise ValueError(f"{where}: {name} must be a finite number, but is {value!r}.")
+    for name in model.principal_distance:
+        if name not in given:
+            raise ValueError(
+                f"{where}: {name} is missing; give the principal distance in {model.unit}."
+            )
+    for name in (*model.principal_distance, "format_factor"):
+        if name in given and given[name] <= 0:
+            raise ValueError(f"{where}: {name} must be positive, but is {given[name]!r}.")

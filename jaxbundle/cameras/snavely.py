@@ -1,0 +1,37 @@
+"""`snavely`: the camera of Bundler and of the BAL data sets ("bundle adjustment in the large").
+
+    [X, Y] = −[r, s]/q,  ρ² = X² + Y²
+    [x, y] = f·(1 + k1·ρ² + k2·ρ⁴)·[X, Y]
+
+Units: f in pixels, k1 and k2 without unit. Pixels here are counted from the image centre, with
+axes x right and y UP, unlike the other pixel models; there is no principal point.
+
+Source: Snavely, Seitz and Szeliski (2006), Photo Tourism; Agarwal et al. (2010), Bundle Adjustment
+in the Large.
+"""
+
+from . import perspective
+from .inverse import implicit_inverse
+from .model import CameraModel, Pair, Parameters, Scalar
+
+
+def distort(p: Parameters, xi: Scalar, yi: Scalar) -> Pair:
+    """Ideal to measured coordinates, pixels: the own formula of `snavely`."""
+    f, k1, k2 = p
+    rho2 = (xi * xi + yi * yi) / (f * f)
+    factor = 1 + rho2 * (k1 + rho2 * k2)
+    return xi * factor, yi * factor
+
+
+SNAVELY = CameraModel(
+    name="snavely",
+    parameters=("f", "k1", "k2"),
+    unit="px",
+    axes="up",
+    own_formula="from_ideal",
+    ideal=perspective.ideal,
+    ray=perspective.ray,
+    to_ideal=implicit_inverse(distort, start=lambda p, X, Y: (X, Y), iterations=8),
+    from_ideal=distort,
+    principal_distance=("f",),
+)

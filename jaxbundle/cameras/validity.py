@@ -1,0 +1,109 @@
+"""How far from the principal point a distortion formula can be trusted.
+
+A polynomial that fits a lens inside the image bends back somewhere outside. Where the determinant
+of the formula's Jacobian falls to zero, two points get the same image and the inverse ends. With K1
+alone, g = r·(1 + K1·r²), that is 1 + 3·K1·r² = 0.
+
+The formula is `to_ideal` or `from_ideal`, whichever the model states. The radius returned is always
+one of the MEASURED image, in the model's unit, so that it compares with the size of the image.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .model import CameraModel
+from .parameters import default_parameters
+
+AZIMUTHS = 36
+STEPS = 400
+BISECTIONS = 50
+
+
+def turning_radius(
+    model: CameraModel,
+    parameters: Mapping[str, float] | Sequence[float],
+    radius_max: float,
+) -> float | None:
+    """The smallest radius about the principal point where the model's formula turns back.
+
+    **Arguments:** `parameters` by name (those left out have their defaults) or in the order of the
+    model; `radius_max` how far to look, in the model's unit: the image's half diagonal.
+
+    **Returns:** the radius in the measured image, or None if the formula is one-to-one as far as
+    `radius_max`. Sampled along 36 directions, refined by bisection.
+    """
+    p = tuple(float(v) for v in _in_order(model, parameters))
+    azimuth = np.linspace(0, 2 * np.pi, AZIMUTHS, endpoint=False)
+    t = np.linspace(0, 1, STEPS)
+    if model.own_formula == "to_ideal":
+        radii = radius_max * t
+    else:
+        # an ideal point of the image may lie far outside it
+        radii = radius_max * t / (1.005 - t)
+    determinant, measured = map(np.asarray, _along(model, p, azimuth[:, None], radii[None, :]))
+    turned = ~(determinant > 0)
+    first = (turned | (measured > radius_max)).argmax(1)
+    turns = turned[np.arange(AZIMUTHS), first]
+    azimuth, first = azimuth[turns], first[turns]
+    if not len(azimuth):
+        return None
+    inner, outer = radii[np.maximum(first - 1, 0)], radii[first]
+    for _ in range(BISECTIONS):
+        middle = (inner + outer) / 2
+        good = np.asarray(_along(model, p, azimuth, middle)[0]) > 0
+        inner, outer = np.where(good, middle, inner), np.where(good, outer, middle)
+    radius = float(np.min(_along(model, p, azimuth, outer)[1]))
+    return radius if radius <= radius_max else None
+
+
+def validity_message(
+    camera: str,
+    model: CameraModel,
+    parameters: Mapping[str, float] | Sequence[float],
+    half_diagonal: float,
+) -> str | None:
+    """A sentence for people if the distortion turns back inside the image, else None.
+
+    **Arguments:** `camera` its name; `half_diagonal` of the image, in the model's unit.
+    """
+    radius = turning_radius(model, parameters, half_diagonal)
+    if radius is None:
+        return None
+    return (
+        f"Camera {camera!r}: the distortion of model {model.name!r} turns back at a radius of "
+        f"{radius:.4g} {model.unit} from the principal point, inside the image, whose half "
+        f"diagonal is {half_diagonal:.4g} {model.unit}: points farther out have no valid image. "
+        f"Free fewer distortion parameters, or measure points out to the corners."
+    )
+
+
+def _in_order(model, parameters):
+    if not isinstance(parameters, Mapping):
+        return parameters
+    values = {**default_parameters(model), **parameters}
+    return [values[name] for name in model.parameters]
+
+
+@partial(jax.jit, static_argnums=0)
+def _along(model, p, azimuth, radius):
+    """Jacobian determinant and radius in the measured image, `radius` out from the centre."""
+    formula = getattr(model, model.own_formula)
+    to_ideal = model.own_formula == "to_ideal"
+    centre = model.from_ideal(p, 0.0, 0.0)
+
+    def one(azimuth, radius):
+        x, y = radius * jnp.cos(azimuth), radius * jnp.sin(azimuth)
+        if to_ideal:
+            x, y = x + centre[0], y + centre[1]
+        at_p = partial(formula, p)
+        image, (a, c) = jax.jvp(at_p, (x, y), (jnp.ones_like(x), jnp.zeros_like(x)))
+        _, (b, d) = jax.jvp(at_p, (x, y), (jnp.zeros_like(x), jnp.ones_like(x)))
+        if not to_ideal:
+            radius = jnp.hypot(image[0] - centre[0], image[1] - centre[1])
+        return a * d - b * c, radius
+
+    return jnp.vectorize(one)(azimuth, radius)

@@ -1,0 +1,261 @@
+"""Networks from plain Python tables: data frames, dicts of columns, lists of dict rows.
+
+The columns are those of the project format:
+
+| table | columns |
+|---|---|
+| cameras | id, model, image_size, pixel_size, free, sigma, and the parameters of the model |
+| images | id, camera, X0, Y0, Z0, omega, phi, kappa, and σ: sX0, sY0, sZ0, somega, sphi, skappa |
+| points | id, role (tie, control, fixed, check), X, Y, Z, and σ: sX, sY, sZ |
+| observations | image, point, x, y, and σ: sx, sy |
+| distances | from, to, value, sigma |
+
+Missing values (None, NaN, empty text) mean: no start value, no σ. A σ of an image may be "fixed"
+(the value is held), a σ of a control point "free" (this axis is not controlled).
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxbundle.cameras import MODEL_NAMES, get_model
+from jaxbundle.errors import InputError
+from jaxbundle.network.check import (
+    AXES,
+    CHOICES,
+    check_camera,
+    check_choice,
+    check_unique,
+)
+from jaxbundle.network.columns import Columns, as_columns, did_you_mean
+from jaxbundle.network.tables import (
+    EXTERIOR,
+    Camera,
+    Distances,
+    Images,
+    Network,
+    Observations,
+    Points,
+    Source,
+)
+from jaxbundle.network.units import ANGLE_UNITS, from_image_unit
+
+CAMERA_FIELDS = ("id", "model", "image_size", "pixel_size", "free", "sigma")
+IMAGE_COLUMNS = ("id", "camera", *EXTERIOR)
+IMAGE_SIGMAS = tuple(f"s{name}" for name in EXTERIOR)
+POINT_COLUMNS = ("id", "role", *AXES)
+POINT_SIGMAS = tuple(f"s{name}" for name in AXES)
+OBSERVATION_COLUMNS = ("image", "point", "x", "y")
+OBSERVATION_SIGMAS = ("sx", "sy")
+DISTANCE_COLUMNS = ("from", "to", "value", "sigma")
+
+
+def make_network(
+    cameras: Any,
+    images: Any,
+    points: Any,
+    observations: Any,
+    distances: Any = None,
+    *,
+    datum: str = "control",
+    datum_points: Sequence[Any] = (),
+    residuals: str = "corrected",
+    sigma_image: float | None = 1.0,
+    angle_unit: str = "rad",
+    image_unit: str = "mm",
+    object_unit: str = "m",
+    name: str = "network",
+) -> Network:
+    """A network from plain tables (see the module's docstring for their columns).
+
+    **Arguments:**
+
+    - `cameras`: `Camera`s, dict rows, or a data frame; parameters in the unit of the model.
+    - `images`: exterior orientation, start values (object unit, `angle_unit`) and prior σ.
+    - `points`: object coordinates (object unit) and σ.
+    - `observations`: image coordinates and σ in `image_unit`; they are converted to the unit of
+      the camera's model, which needs its image_size and pixel_size.
+    - `sigma_image`: σ of image coordinates without their own (None: 1, with a warning).
+
+    **Raises:** `InputError` naming table, row and column. `check_network` does the rest.
+    """
+    given = {"datum": datum, "residuals": residuals,
+             "angle_unit": angle_unit, "image_unit": image_unit}  # fmt: skip
+    for key, choices in CHOICES.items():
+        check_choice(key, given[key], choices)
+    if sigma_image is not None and not (math.isfinite(sigma_image) and sigma_image > 0):
+        raise InputError(f"sigma_image is {sigma_image}; it must be finite and positive")
+
+    cameras = make_cameras(cameras)
+    images = _make_images(as_columns(images, "images"), cameras, ANGLE_UNITS[angle_unit])
+    points = _make_points(as_columns(points, "points"))
+    observations = as_columns(observations, "observations")
+    unweighted = _lacks_sigma(observations)
+    observations = _make_observations(observations, images, points, sigma_image or 1.0)
+    xy, sigma = from_image_unit(
+        cameras, images.camera[observations.image], observations.xy, observations.sigma, image_unit
+    )
+    network = Network(
+        cameras=cameras,
+        images=images,
+        points=points,
+        observations=Observations(
+            observations.image, observations.point, xy, sigma, observations.source
+        ),
+        distances=Distances.none() if distances is None else _make_distances(
+            as_columns(distances, "distances"), points
+        ),
+        datum_points=tuple(str(id) for id in datum_points),
+        object_unit=object_unit,
+        name=name,
+        **given,
+    )
+    if sigma_image is None and unweighted:
+        network = network.warn(
+            f"sigma_image is not given: image coordinates without σ have σ = 1 {image_unit}"
+        )
+    return network
+
+
+def make_cameras(cameras: Any, where: str = "") -> tuple[Camera, ...]:
+    """Checked cameras from `Camera`s, dict rows, or a table; `where` begins every message."""
+    if isinstance(cameras, Camera):
+        cameras = [cameras]
+    elif isinstance(cameras, Mapping) and isinstance(cameras.get("id"), str | int):
+        cameras = [cameras]
+    elif isinstance(cameras, Mapping) or hasattr(cameras, "columns"):
+        table = as_columns(cameras, "cameras")
+        rows = ({k: v[row] for k, v in table.values.items()} for row in range(len(table)))
+        cameras = [{k: v for k, v in row.items() if not _missing(v)} for row in rows]
+    made = tuple(
+        camera if isinstance(camera, Camera) else _camera(camera, number, where)
+        for number, camera in enumerate(cameras, 1)
+    )
+    if not made:
+        raise InputError(f"{where}no camera is given; give at least one")
+    check_unique([camera.id for camera in made], Source(f"{where}cameras"), "camera")
+    for camera in made:
+        check_camera(camera, where)
+    return made
+
+
+def _missing(value) -> bool:
+    return value is None or (isinstance(value, float) and math.isnan(value))
+
+
+def _camera(row: Mapping[str, Any], number: int, where: str) -> Camera:
+    if not isinstance(row, Mapping) or row.get("id", "") == "":
+        raise InputError(f"{where}camera {number}: id is missing")
+    id, model = str(row["id"]), row.get("model", "brown")
+    where = f"{where}camera {id!r}: "
+    parameters = {key: value for key, value in row.items() if key not in CAMERA_FIELDS}
+    if model in MODEL_NAMES:
+        known = get_model(model).parameters
+        for key in parameters:
+            if key not in known:
+                raise InputError(
+                    f"{where}unknown key {key!r}{did_you_mean(key, (*CAMERA_FIELDS, *known))}"
+                )
+    sigma = row.get("sigma", {})
+    if not isinstance(sigma, Mapping):
+        raise InputError(f"{where}sigma is {sigma!r}; expected a table such as {{ c = 0.1 }}")
+    free = row.get("free", ())
+    if isinstance(free, str):
+        free = [name.strip() for name in free.split(",") if name.strip()]
+    return Camera(
+        id=id,
+        model=model,
+        parameters={key: _number(where, key, value) for key, value in parameters.items()},
+        free=tuple(free),
+        sigma={k: _number(where, f"sigma of {k}", v) for k, v in sigma.items()},
+        image_size=_pair(where, "image_size", row.get("image_size"), int),
+        pixel_size=_pair(where, "pixel_size", row.get("pixel_size"), float),
+    )
+
+
+def _number(where: str, key: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        raise InputError(f"{where}{key} is {value!r}; a number is expected")
+    return float(value)
+
+
+def _pair(where: str, key: str, value: Any, kind: type) -> tuple | None:
+    if value is None:
+        return None
+    if isinstance(value, str) or not isinstance(value, Sequence | np.ndarray) or len(value) != 2:
+        raise InputError(f"{where}{key} is {value!r}; expected two numbers [horizontal, vertical]")
+    first, second = (_number(where, key, v) for v in value)
+    if kind is int and not (first.is_integer() and second.is_integer()):
+        raise InputError(f"{where}{key} is {list(value)}; expected whole numbers of pixels")
+    return kind(first), kind(second)
+
+
+def _index(ids: Sequence[str]) -> dict[str, int]:
+    return {id: row for row, id in enumerate(ids)}
+
+
+def _matrix(table: Columns, names, **options):
+    return np.stack([table.numbers(name, **options) for name in names], 1)
+
+
+def _make_images(table: Columns, cameras: Sequence[Camera], radians: float) -> Images:
+    table.check_names(IMAGE_COLUMNS, IMAGE_SIGMAS)
+    ids = table.ids("id")
+    check_unique(ids, table.source, "image")
+    unit = np.array([1, 1, 1, radians, radians, radians])
+    exterior = _matrix(table, EXTERIOR) * unit
+    return Images(
+        id=ids,
+        camera=table.indices("camera", "camera", _index([c.id for c in cameras]), "the cameras"),
+        position=exterior[:, :3],
+        angles=exterior[:, 3:],
+        sigma=_matrix(table, IMAGE_SIGMAS, words={"fixed": 0.0}) * unit,
+        source=table.source,
+    )
+
+
+def _make_points(table: Columns) -> Points:
+    table.check_names(POINT_COLUMNS, POINT_SIGMAS)
+    ids = table.ids("id")
+    check_unique(ids, table.source, "point")
+    return Points(
+        id=ids,
+        role=table.ids("role"),
+        position=_matrix(table, AXES),
+        sigma=_matrix(table, POINT_SIGMAS, words={"free": math.inf}),
+        source=table.source,
+    )
+
+
+def _lacks_sigma(table: Columns) -> bool:
+    return bool(np.isnan(_matrix(table, OBSERVATION_SIGMAS)).any())
+
+
+def _make_observations(
+    table: Columns, images: Images, points: Points, sigma_image: float
+) -> Observations:
+    table.check_names(OBSERVATION_COLUMNS, OBSERVATION_SIGMAS)
+    sigma = _matrix(table, OBSERVATION_SIGMAS)
+    return Observations(
+        image=table.indices("image", "image", _index(images.id), images.source.name),
+        point=table.indices("point", "point", _index(points.id), points.source.name),
+        xy=_matrix(table, ("x", "y"), required=True),
+        sigma=np.where(np.isnan(sigma), sigma_image, sigma),
+        source=table.source,
+    )
+
+
+def _make_distances(table: Columns, points: Points) -> Distances:
+    if not len(table):
+        return Distances.none()
+    table.check_names(DISTANCE_COLUMNS)
+    index = _index(points.id)
+    ends = [table.indices(name, "point", index, points.source.name) for name in ("from", "to")]
+    return Distances(
+        points=np.stack(ends, 1),
+        value=table.numbers("value", required=True),
+        sigma=table.numbers("sigma", required=True),
+        source=table.source,
+    )

@@ -1,0 +1,185 @@
+"""A table as columns of raw values, and their conversion to ids and numbers.
+
+What a user gives as a data frame, a dict of columns or a list of dicts, and what a file reader
+finds as text, all pass through `Columns`; so a bad cell is reported in the same words wherever
+it came from.
+"""
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxbundle.errors import InputError
+from jaxbundle.network.tables import Source
+
+
+@dataclasses.dataclass(frozen=True)
+class Columns:
+    """Columns of equal length: text or numbers; None, NaN and empty text are missing values."""
+
+    values: Mapping[str, Sequence[Any]]
+    source: Source
+
+    def __len__(self) -> int:
+        return min((len(column) for column in self.values.values()), default=0)
+
+    def check_names(self, required: Sequence[str], optional: Sequence[str] = ()) -> None:
+        """Refuse missing and unknown columns, and a table without rows."""
+        known = (*required, *optional)
+        for name in self.values:
+            if name not in known:
+                raise InputError(
+                    f"{self.source.name}: unknown column {name!r}{did_you_mean(name, known)}"
+                )
+        for name in required:
+            if name not in self.values:
+                raise InputError(
+                    f"{self.source.name}: column {name!r} is missing; expected columns: "
+                    f"{', '.join(required)}"
+                )
+        if len(self) == 0:
+            raise InputError(f"{self.source.name}: the table is empty; give at least one row")
+
+    def ids(self, name: str) -> tuple[str, ...]:
+        """A column of ids or words; whole numbers become text, surrounding blanks go."""
+        ids = tuple(map(_id, self.values[name]))
+        if "" in ids:
+            raise InputError(f"{self.source(ids.index(''))}: {name} is missing")
+        return ids
+
+    def numbers(
+        self, name: str, *, required: bool = False, words: Mapping[str, float] | None = None
+    ) -> Float[np.ndarray, " rows"]:
+        """A column of numbers; `words` are texts with a meaning, a missing value is NaN.
+
+        An absent column is all NaN unless it is required.
+        """
+        if name not in self.values and not required:
+            return np.full(len(self), np.nan)
+        values = self.values[name]
+        numbers = _plain_numbers(values)
+        if numbers is None:
+            numbers = np.array([
+                self._number(row, name, value, words or {}) for row, value in enumerate(values)
+            ])
+        if required and np.isnan(numbers).any():
+            raise InputError(f"{self.source(np.isnan(numbers).argmax())}: {name} is missing")
+        return numbers
+
+    def _number(self, row: int, name: str, value: Any, words: Mapping[str, float]) -> float:
+        if isinstance(value, str):
+            value = value.strip()
+            if value in words:
+                return words[value]
+        if value is None or value == "":
+            return math.nan
+        try:
+            number = float(value)
+            good = not isinstance(value, str) or (math.isfinite(number) and "_" not in value)
+        except (TypeError, ValueError):
+            good = False
+        if not good:
+            or_word = "".join(f" or {word!r}" for word in words)
+            raise InputError(
+                f"{self.source(row)}: {name} is {value!r}; a number{or_word} is expected"
+            )
+        return number
+
+    def indices(self, name: str, thing: str, of: Mapping[str, int], where: str) -> Int[
+        np.ndarray, " rows"
+    ]:
+        """A column of ids as indices into another table (`thing`s that stand in `where`)."""
+        ids = self.ids(name)
+        try:
+            return np.fromiter(map(of.__getitem__, ids), np.int64, len(ids))
+        except KeyError:
+            row = next(row for row, id in enumerate(ids) if id not in of)
+            raise InputError(
+                f"{self.source(row)}: {name} {ids[row]!r} is unknown: no such {thing} in {where}"
+                f"{did_you_mean(ids[row], list(of), listing=False)}"
+            ) from None
+
+
+def as_columns(table: Any, name: str) -> Columns:
+    """Columns of a data frame, a dict of columns, or a sequence of dict rows."""
+    if isinstance(table, Columns):
+        return table
+    source = Source(name)
+    if hasattr(table, "columns"):
+        present = table.notna()
+        return Columns({
+            str(c): table[c].astype(object).where(present[c], None).to_list()
+            for c in table.columns
+        }, source)
+    if isinstance(table, Mapping):
+        columns = {str(c): _column(values, c, name) for c, values in table.items()}
+        lengths = {c: len(values) for c, values in columns.items()}
+        if len(set(lengths.values())) > 1:
+            raise InputError(f"{name}: the columns differ in length: {lengths}")
+        return Columns(columns, source)
+    rows = list(table)
+    if not all(isinstance(row, Mapping) for row in rows):
+        raise InputError(
+            f"{name}: expected a data frame, a dict of columns, or a list of dict rows"
+        )
+    keys = dict.fromkeys(str(key) for row in rows for key in row)
+    return Columns({key: [row.get(key) for row in rows] for key in keys}, source)
+
+
+def _column(values: Any, column: str, name: str) -> Sequence[Any]:
+    if isinstance(values, str) or not isinstance(values, Iterable):
+        raise InputError(f"{name}: column {column!r} must be a sequence, not {values!r}")
+    return values if isinstance(values, np.ndarray) else list(values)
+
+
+def did_you_mean(name: str, known: Iterable[str], *, listing: bool = True) -> str:
+    """The end of a message about an unknown name: the closest known one, or all of them."""
+    known = list(known)
+    folded = {k.lower(): k for k in known}
+    close = difflib.get_close_matches(str(name).lower(), list(folded), 1)
+    if close:
+        return f"; did you mean {folded[close[0]]!r}?"
+    return f"; known: {', '.join(known)}" if listing and known else ""
+
+
+def some(names: Iterable[str], most: int = 5) -> str:
+    """The first few names of a list, and how many more there are."""
+    names = list(names)
+    text = ", ".join(repr(str(name)) for name in names[:most])
+    return f"{text} and {len(names) - most} more" if len(names) > most else text
+
+
+def count(number: int, thing: str) -> str:
+    """A number of things, in words: "1 image", "3 images"."""
+    return f"{number} {thing}{'' if number == 1 else 's'}"
+
+
+def _id(value: Any) -> str:
+    if isinstance(value, str):
+        return value.strip()
+    if value is None or value != value:
+        return ""
+    if isinstance(value, float | np.floating) and value == int(value):
+        value = int(value)
+    return str(value)
+
+
+def _plain_numbers(values: Sequence[Any]) -> np.ndarray | None:
+    """The fast way, for columns without a missing, odd or non-finite text cell; else None."""
+    if isinstance(values, np.ndarray) and values.dtype.kind in "iuf":
+        return values.astype(float)
+    try:
+        numbers = np.fromiter(map(float, values), float, len(values))
+    except (TypeError, ValueError):
+        return None
+    if len(values) and isinstance(values[0], str):
+        if not np.isfinite(numbers).all() or any("_" in str(value) for value in values):
+            return None
+    elif not np.isfinite(numbers).all() and any(isinstance(value, str) for value in values):
+        return None
+    return numbers

@@ -1,0 +1,216 @@
+"""Who sees whom: what the rays of a network can determine, and what has to be left out.
+
+A point needs three equations: two from every ray, one from every distance and every controlled
+axis. An image needs six: two from every ray, one from every prior. Parts of the network that no
+common point connects each need a datum of their own.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool
+
+from jaxbundle.errors import InputError
+from jaxbundle.network.columns import count, some
+from jaxbundle.network.tables import Distances, Network, Observations, Points
+
+
+def split_check_points(network: Network) -> tuple[Network, Points, Observations]:
+    """The network without its check points, the check points, and their observations.
+
+    Observations of the check points refer to them and to the images of the network by index.
+    """
+    check = network.points.has_role("check")
+    rows = check[network.observations.point]
+    observations = network.observations.take(rows)
+    observations = dataclasses.replace(
+        observations, point=(np.cumsum(check) - 1)[observations.point]
+    )
+    return keep_points(network, ~check), take_points(network.points, check), observations
+
+
+def take_points(points: Points, mask: Bool[np.ndarray, " points"]) -> Points:
+    """The chosen points, their places kept for messages."""
+    rows = np.flatnonzero(mask)
+    return Points(
+        tuple(points.id[row] for row in rows),
+        tuple(points.role[row] for row in rows),
+        points.position[rows],
+        points.sigma[rows],
+        points.source.take(rows),
+    )
+
+
+def keep_points(network: Network, keep: Bool[np.ndarray, " points"]) -> Network:
+    """The network with some of its points; rays and distances of the others go with them."""
+    if keep.all():
+        return network
+    index = np.cumsum(keep) - 1
+    observations = network.observations.take(keep[network.observations.point])
+    network = without_distances(network, ~keep[network.distances.points].all(1))
+    gone = {id for id, kept in zip(network.points.id, keep) if not kept}
+    return network.replace(
+        points=take_points(network.points, keep),
+        observations=dataclasses.replace(observations, point=index[observations.point]),
+        distances=dataclasses.replace(
+            network.distances, points=index[network.distances.points]
+        ),
+        datum_points=tuple(id for id in network.datum_points if id not in gone),
+    )
+
+
+def without_distances(network: Network, drop: Bool[np.ndarray, " distances"]) -> Network:
+    """The network without some of its distances."""
+    if not drop.any():
+        return network
+    d, keep = network.distances, ~drop
+    return network.replace(
+        distances=Distances(d.points[keep], d.value[keep], d.sigma[keep], d.source.take(keep))
+    )
+
+
+def with_roles(points: Points, mask: Bool[np.ndarray, " points"], role: str) -> Points:
+    """The same points, some of them in another role."""
+    if not mask.any():
+        return points
+    roles = tuple(role if new else old for new, old in zip(mask, points.role))
+    return dataclasses.replace(points, role=roles)
+
+
+def controlled_axes(points: Points):
+    """How many coordinates of each point are known: fixed 3, control those with a finite σ."""
+    axes = np.isfinite(points.sigma).sum(1)
+    return np.where(
+        points.has_role("fixed"), 3, np.where(points.has_role("control"), axes, 0)
+    )
+
+
+def leave_out_undetermined(network: Network) -> Network:
+    """The network without points that too few rays determine, with warnings that name them."""
+    points, distances = network.points, network.distances
+    fixed, check = points.has_role("fixed"), points.has_role("check")
+    rays = np.bincount(network.observations.point, minlength=len(points))
+    known = controlled_axes(points)
+    keep = np.ones(len(points), bool)
+    while True:
+        ends = distances.points[keep[distances.points].all(1)]
+        tied = np.bincount(ends.ravel(), minlength=len(points))
+        determined = fixed | (2 * rays + tied + known >= 3)
+        kept = keep & np.where(check, rays >= 2, (rays + tied > 0) & determined)
+        if (kept == keep).all():
+            break
+        keep = kept
+    out = ~keep
+    messages = [
+        f"left out {count(mask.sum(), thing)} {why}: "
+        f"{some(points.id[row] for row in np.flatnonzero(mask))}"
+        for mask, thing, why in (
+            (out & ~check & (rays == 0), "point", "without any ray"),
+            (out & ~check & (rays > 0), "tie point", "with a single ray"),
+            (out & check, "check point", "with fewer than two rays"),
+        )
+        if mask.any()
+    ]
+    lost = (~keep[distances.points].all(1)).sum()
+    if lost:
+        messages.append(f"left out {count(lost, 'distance')} to a point that was left out")
+    if network.datum_points and not keep[np.isin(points.id, network.datum_points)].any():
+        raise InputError(
+            f"datum_points: none is left ({'; '.join(messages)}); name points with two rays"
+        )
+    return keep_points(network, keep).warn(*messages)
+
+
+def check_images(before: Network, network: Network) -> None:
+    """Refuse an image with too few points; `before` is the network with nothing left out."""
+    images = network.images
+    taking_part = ~network.points.has_role("check")[network.observations.point]
+    rays = np.bincount(network.observations.image[taking_part], minlength=len(images))
+    measured = np.bincount(before.observations.image, minlength=len(images))
+    equations = 2 * rays + (~np.isnan(images.sigma)).sum(1)
+    for row in np.flatnonzero((rays == 0) | (equations < 6))[:1]:
+        place = f"{images.source(row)}: image {images.id[row]!r}: "
+        if measured[row] == 0:
+            raise InputError(
+                f"{place}an image with no rays; measure points in it or remove the image"
+            )
+        used = "" if measured[row] == rays[row] else f" of the {measured[row]} measured ones"
+        why = "" if not used else " (the others are check points or seen in one image only)"
+        raise InputError(
+            f"{place}only {count(rays[row], 'point')}{used} can be used{why}; an image needs at "
+            "least 3, or prior σ of its exterior orientation"
+        )
+
+
+def check_parts(network: Network) -> None:
+    """Refuse parts of the network that nothing connects and nothing positions."""
+    images, points, rays = network.images, network.points, network.observations
+    known = controlled_axes(points) == 3
+    ties = ~(known | points.has_role("check"))[rays.point]
+    part = connected_parts(rays.image[ties], rays.point[ties], len(images), len(points))
+    labels, part = np.unique(part, return_inverse=True)
+    if len(labels) == 1:
+        return
+    datum = np.unique(np.stack([part[rays.image], rays.point])[:, known[rays.point]], axis=1)
+    known_points = np.bincount(datum[0], minlength=len(labels))
+    priors = np.bincount(part, (~np.isnan(images.sigma)).sum(1), minlength=len(labels))
+    loose = np.flatnonzero((known_points < 3) & (priors < 6))
+    if len(loose):
+        size = np.bincount(part)
+        smallest = loose[size[loose].argmin()]
+        names = [id for id, p in zip(images.id, part) if p == smallest]
+        raise InputError(
+            f"{images.source.name}: the network falls into {len(labels)} parts with no tie point "
+            f"in common, and a part has only {count(known_points[smallest], 'known point')}: "
+            f"{count(len(names), 'image')} {some(names)}; measure common points, or at least 3 "
+            "control points in it"
+        )
+
+
+def connected_parts(image, point, images: int, points: int):
+    """A label for each image; images that share points, directly or in a chain, have the same.
+
+    Smallest labels travel along the rays, with hooking and halving, so that a strip of n images
+    needs about log n rounds.
+    """
+    label = np.arange(images)
+    while True:
+        of_point = np.full(points, images)
+        np.minimum.at(of_point, point, label[image])
+        new = label.copy()
+        np.minimum.at(new, image, of_point[point])
+        np.minimum.at(new, label[image], of_point[point])
+        new = new[new]
+        if (new == label).all():
+            return label
+        label = new
+
+
+def check_redundancy(network: Network) -> None:
+    """Refuse fewer observations, priors and datum conditions than unknowns."""
+    images, points = network.images, network.points
+    points = take_points(points, ~points.has_role("check"))
+    taking_part = ~network.points.has_role("check")[network.observations.point]
+    interior = [len(camera.sigma) for camera in network.cameras]
+    weighted = np.isfinite(points.sigma) & points.has_role("control")[:, None]
+    exterior = images.sigma > 0
+    rows = (
+        2 * taking_part.sum() + weighted.sum() + exterior.sum() + sum(interior)
+        + len(network.distances)
+    )  # fmt: skip
+    unknowns = (
+        (images.sigma != 0).sum() + sum(len(camera.free) for camera in network.cameras)
+        + 3 * (~points.has_role("fixed")).sum()
+    )  # fmt: skip
+    conditions = 0
+    if network.datum != "control":
+        known = controlled_axes(points).sum() + (~np.isnan(images.sigma)).sum()
+        conditions = max(0, 7 - known - (len(network.distances) > 0))
+    missing = unknowns - rows - conditions
+    if missing > 0:
+        with_datum = f" with {conditions} datum conditions" if conditions else ""
+        raise InputError(
+            f"{network.observations.source.name}: {rows} observations{with_datum} are too few "
+            f"for {unknowns} unknowns: {missing} missing; measure more points, or free fewer "
+            "camera parameters"
+        )

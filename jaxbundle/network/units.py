@@ -1,0 +1,92 @@
+"""Units of a project: angles, and image coordinates in millimetres or pixels.
+
+Pixel (0, 0) is the centre of the upper-left pixel, u to the right, v down; in millimetres the
+origin is the image centre, x to the right, y up:
+
+    x = (u − (w − 1)/2)·p_x        y = −(v − (h − 1)/2)·p_y
+
+with the image size (w, h) in pixels and the pixel size (p_x, p_y) in mm. Inside a network an
+image coordinate has the unit and axes of its camera's model, whatever the project's unit is.
+A model in pixels takes the pixels of a project as they are; where its y points up (`snavely`),
+they count from the image centre, as in BAL.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxbundle.cameras import get_model
+from jaxbundle.errors import InputError
+from jaxbundle.network.tables import Camera
+
+ANGLE_UNITS = {"rad": 1.0, "deg": math.pi / 180, "gon": math.pi / 200}
+"""Radians in one unit."""
+
+IMAGE_UNITS = ("mm", "px")
+
+
+def from_image_unit(
+    cameras: Sequence[Camera],
+    camera: Int[np.ndarray, " rays"],
+    xy: Float[np.ndarray, "rays 2"],
+    sigma: Float[np.ndarray, "rays 2"],
+    image_unit: str,
+) -> tuple[Float[np.ndarray, "rays 2"], Float[np.ndarray, "rays 2"]]:
+    """Image coordinates and their σ from the project's unit to that of each camera's model.
+
+    **Raises:** `InputError` where a conversion needs an image or pixel size that is not given.
+    """
+    return _convert(cameras, camera, xy, sigma, [image_unit] * len(cameras), _units(cameras))
+
+
+def to_image_unit(
+    cameras: Sequence[Camera],
+    camera: Int[np.ndarray, " rays"],
+    xy: Float[np.ndarray, "rays 2"],
+    sigma: Float[np.ndarray, "rays 2"],
+    image_unit: str,
+) -> tuple[Float[np.ndarray, "rays 2"], Float[np.ndarray, "rays 2"]]:
+    """The inverse of `from_image_unit`."""
+    return _convert(cameras, camera, xy, sigma, _units(cameras), [image_unit] * len(cameras))
+
+
+def _units(cameras):
+    return [get_model(camera.model).unit for camera in cameras]
+
+
+def _convert(cameras, camera, xy, sigma, given, wanted):
+    """Per camera: nothing, pixels to mm, or mm to pixels."""
+    if list(given) == list(wanted):
+        return xy, sigma
+    centre, pitch = np.zeros((len(cameras), 2)), np.ones((len(cameras), 2))
+    for c in np.unique(camera):
+        if given[c] != wanted[c]:
+            centre[c], pitch[c] = _pixel_grid(cameras[c])
+    centre, pitch = centre[camera], pitch[camera]
+    to_mm = np.array([(h, w) == ("px", "mm") for h, w in zip(given, wanted)])[camera, None]
+    to_px = np.array([(h, w) == ("mm", "px") for h, w in zip(given, wanted)])[camera, None]
+    xy = np.where(to_mm, (xy - centre) * pitch, np.where(to_px, xy / pitch + centre, xy))
+    size = np.abs(pitch)
+    return xy, np.where(to_mm, sigma * size, np.where(to_px, sigma / size, sigma))
+
+
+def _pixel_grid(camera: Camera):
+    """The image centre (pixels) and the pixel size (mm; negative where v runs down)."""
+    model = get_model(camera.model)
+    centred = (model.unit, model.axes) == ("px", "up")
+    if camera.pixel_size is None:
+        raise _needed(camera, "pixel_size", "[width, height] in mm")
+    if centred:
+        return np.zeros(2), np.array(camera.pixel_size)
+    if camera.image_size is None:
+        raise _needed(camera, "image_size", "[columns, rows]")
+    return (np.array(camera.image_size) - 1) / 2, np.array(camera.pixel_size) * [1, -1]
+
+
+def _needed(camera, name, meaning):
+    return InputError(
+        f"camera {camera.id!r}: {name} is needed to convert between pixels and mm; "
+        f"give {name} = {meaning}"
+    )
