@@ -80,7 +80,7 @@ def make_problem(network: Network) -> Problem:
             jnp.asarray(_datum_weight(network, structure, data)),
         )  # fmt: skip
         structure = dataclasses.replace(structure, movable=is_group(gauge))
-    return Problem(network, structure, data, origin, _counts(structure, data))
+    return Problem(network, structure, data, origin, count_rows(structure, data))
 
 
 def require_x64() -> None:
@@ -106,7 +106,8 @@ def _datum_weight(network: Network, structure: Structure, data: Data):
     return candidates
 
 
-def _counts(structure: Structure, data: Data) -> Counts:
+def count_rows(structure: Structure, data: Data) -> Counts:
+    """Rows that carry weight, datum conditions, free unknowns."""
     number = lambda weight: int((np.asarray(weight) > 0).sum())
     interior = np.take_along_axis(
         np.asarray(data.interior_weight),

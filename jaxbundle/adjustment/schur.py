@@ -44,6 +44,18 @@ def factorise(
     gauge: Tangent | None = None,
 ) -> Factor:
     """Factorise N + diag(damping), with the datum directions `gauge` (last axis) made regular."""
+    matrix, *rest = reduce(structure, normal, damping, gauge)
+    return Factor(structure, jnp.linalg.cholesky(matrix, symmetrize_input=False), *rest)
+
+
+def reduce(
+    structure: Structure,
+    normal: Normal,
+    damping: Tangent | None = None,
+    gauge: Tangent | None = None,
+):
+    """Eliminate the points: the reduced matrix scaled to unit diagonal (before elimination; its
+    lower triangle), the scale, and what substitution needs (the fields of `Factor`)."""
     s = structure
     if damping is not None:
         normal = _damped(normal, damping)
@@ -66,7 +78,7 @@ def factorise(
         directions = jax.vmap(lambda g: reduced_vector(s, g), -1, -1)(gauge) / scale[:, None]
         q, _ = jnp.linalg.qr(directions)
         S = S + q @ q.T
-    return Factor(s, jnp.linalg.cholesky(S, symmetrize_input=False), scale, point, ray, incidence)
+    return S, scale, point, ray, incidence
 
 
 def solve(factor: Factor, right: Tangent) -> Tangent:

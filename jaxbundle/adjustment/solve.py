@@ -22,9 +22,12 @@ def make_solver(problem: Problem, method: str = "levenberg-marquardt", **options
 
 
 @eqx.filter_jit
-def find_minimum(solver: BundleSolver, data: Data) -> Minimum:
-    """Run the solver and put its result into the datum; compiled once for each shape."""
-    minimum = minimise(solver, data)
+def find_minimum(solver: BundleSolver, data: Data, start: Values | None = None) -> Minimum:
+    """Run the solver and put its result into the datum; compiled once for each shape.
+
+    `start` replaces the start values of the iteration, not those the datum refers to.
+    """
+    minimum = minimise(solver, data, data.start if start is None else start)
     values = move_to_datum(solver.structure, minimum.values, data.start)
     return eqx.tree_at(lambda m: m.values, minimum, values)
 

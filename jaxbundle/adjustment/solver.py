@@ -317,13 +317,13 @@ class Minimum(eqx.Module):
     history: History
 
 
-def minimise(solver: BundleSolver, data: Data) -> Minimum:
-    """Run the solver from `data.start` by `optimistix.least_squares`; no derivatives."""
+def minimise(solver: BundleSolver, data: Data, start: Values) -> Minimum:
+    """Run the solver from `start` by `optimistix.least_squares`; no derivatives."""
     structure = solver.structure
     result = optx.least_squares(
         lambda values, data: residuals(structure, values, data),
         solver,
-        data.start,
+        start,
         args=data,
         max_steps=solver.max_steps,
         adjoint=NoAdjoint(),

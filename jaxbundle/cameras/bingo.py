@@ -13,9 +13,9 @@ the same unit, listed by the program in 1/1000 of it.
 
 Source: the radial tables of the BINGO 5.5 listings (2008) in seed 002, all eight of which the
 formula reproduces; the normalising constants S25 and S26 were fitted to them. The sign follows from
-the correlation of −69 % listed between p25 and c: both enlarge computed − observed in proportion
-to the radius; with the other sign it would be positive. Parameter 17, which occurs in the
-listings, is not published there and not offered here.
+the listed correlations of the parameters, c with 25 −69 %, 26 with 25 −13 %: a simulation of that
+network gives −71 and −13 with this sign, +73 and −48 with the other. Parameter 17, which occurs in
+the listings, is not published there and not offered here.
 """
 
 import jax.numpy as jnp

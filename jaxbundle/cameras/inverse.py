@@ -22,11 +22,12 @@ iterations 660.
 A target outside the range of g, for example beyond the radius where the distortion turns
 (`validity.py`), has no root, or only one on a foreign branch. A wrong coordinate would enter an
 adjustment unseen; NaN cannot. The root is accepted where the remainder is rounding and where J has
-a positive determinant and trace: at the principal point J is near the identity, and along the
-branch that starts there its eigenvalues stay positive.
+a positive determinant and trace: at the principal point J is near the identity, and on the branch
+that starts there its eigenvalues keep positive real parts.
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -49,10 +50,10 @@ def implicit_inverse(g: Formula, start: Formula, iterations: int = 6) -> Formula
     def inverse(p, X, Y):
         x, y = start(p, X, Y)
         for _ in range(iterations):
-            (gx, gy), J = _value_and_derivative(g, p, x, y)
+            (gx, gy), J = value_and_derivative(g, p, x, y)
             dx, dy = _solve(J, X - gx, Y - gy)
             x, y = x + dx, y + dy
-        (gx, gy), (a, b, c, d) = _value_and_derivative(g, p, x, y)
+        (gx, gy), (a, b, c, d) = value_and_derivative(g, p, x, y)
         remainder = jnp.abs(gx - X) + jnp.abs(gy - Y)
         size = jnp.abs(x) + jnp.abs(y) + jnp.abs(X) + jnp.abs(Y)
         found = remainder <= 1000 * jnp.finfo(jnp.result_type(x)).eps * size
@@ -63,7 +64,7 @@ def implicit_inverse(g: Formula, start: Formula, iterations: int = 6) -> Formula
     def _(primals, tangents):
         (p, X, Y), (dp, dX, dY) = primals, tangents
         x, y = inverse(p, X, Y)
-        _, J = _value_and_derivative(g, p, x, y)
+        _, J = value_and_derivative(g, p, x, y)
         _, (gx, gy) = jax.jvp(lambda p: g(p, x, y), (p,), (dp,))
         return (x, y), _solve(J, dX - gx, dY - gy)
 
@@ -75,10 +76,10 @@ def implicit_inverse(g: Formula, start: Formula, iterations: int = 6) -> Formula
     return with_floats
 
 
-def _value_and_derivative(g, p, x, y):
+def value_and_derivative(g, p, x, y):
     """g and its derivative J = [[a, b], [c, d]] with respect to (x, y)."""
     one, zero = jnp.ones_like(x), jnp.zeros_like(x)
-    at_p = lambda x, y: g(p, x, y)
+    at_p = partial(g, p)
     value, (a, c) = jax.jvp(at_p, (x, y), (one, zero))
     _, (b, d) = jax.jvp(at_p, (x, y), (zero, one))
     return value, (a, b, c, d)

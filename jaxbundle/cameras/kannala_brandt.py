@@ -30,10 +30,11 @@ def ideal(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
 
 
 def ray(p: Parameters, xi: Scalar, yi: Scalar) -> Triple:
-    """The ray of equidistant pixel coordinates."""
+    """The ray of equidistant pixel coordinates; NaN beyond θ = 180°, where there is none."""
     fx, fy = p[0], p[1]
     X, Y = xi / fx, yi / fy
     square = X * X + Y * Y
+    square = jnp.where(square < jnp.pi**2, square, jnp.nan)
     scale = _sine_over_angle(square)
     return scale * X, -scale * Y, -_cosine(square)
 

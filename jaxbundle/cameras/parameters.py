@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping
-from numbers import Real
 
 from .model import CameraModel
 from .names import closest
@@ -33,7 +32,7 @@ def check_parameters(model: CameraModel, given: Mapping[str, float]) -> None:
                 f"{where} has no parameter {name!r}{closest(name, model.parameters)} "
                 f"Its parameters are {', '.join(model.parameters)}."
             )
-        if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
+        if not _is_finite_number(value):
             raise ValueError(f"{where}: {name} must be a finite number, but is {value!r}.")
     for name in model.principal_distance:
         if name not in given:
@@ -43,3 +42,10 @@ def check_parameters(model: CameraModel, given: Mapping[str, float]) -> None:
     for name in (*model.principal_distance, "format_factor"):
         if name in given and given[name] <= 0:
             raise ValueError(f"{where}: {name} must be positive, but is {given[name]!r}.")
+
+
+def _is_finite_number(value) -> bool:
+    try:
+        return not isinstance(value, bool) and math.isfinite(value)
+    except TypeError:
+        return False

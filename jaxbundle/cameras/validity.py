@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .inverse import value_and_derivative
 from .model import CameraModel
 from .parameters import default_parameters
 
@@ -99,9 +100,7 @@ def _along(model, p, azimuth, radius):
         x, y = radius * jnp.cos(azimuth), radius * jnp.sin(azimuth)
         if to_ideal:
             x, y = x + centre[0], y + centre[1]
-        at_p = partial(formula, p)
-        image, (a, c) = jax.jvp(at_p, (x, y), (jnp.ones_like(x), jnp.zeros_like(x)))
-        _, (b, d) = jax.jvp(at_p, (x, y), (jnp.zeros_like(x), jnp.ones_like(x)))
+        image, (a, b, c, d) = value_and_derivative(formula, p, x, y)
         if not to_ideal:
             radius = jnp.hypot(image[0] - centre[0], image[1] - centre[1])
         return a * d - b * c, radius

@@ -22,14 +22,8 @@ import numpy as np
 
 from jaxbundle.cameras import MODEL_NAMES, get_model
 from jaxbundle.errors import InputError
-from jaxbundle.network.check import (
-    AXES,
-    CHOICES,
-    check_camera,
-    check_choice,
-    check_unique,
-)
 from jaxbundle.network.columns import Columns, as_columns, did_you_mean
+from jaxbundle.network.rules import AXES, CHOICES, check_camera, check_choice, check_unique
 from jaxbundle.network.tables import (
     EXTERIOR,
     Camera,
@@ -164,6 +158,8 @@ def _camera(row: Mapping[str, Any], number: int, where: str) -> Camera:
     free = row.get("free", ())
     if isinstance(free, str):
         free = [name.strip() for name in free.split(",") if name.strip()]
+    if not isinstance(free, Sequence | np.ndarray):
+        raise InputError(f'{where}free is {free!r}; expected names such as ["c", "x0"]')
     return Camera(
         id=id,
         model=model,

@@ -5,13 +5,13 @@ what can be determined from them: rays a point, points an image, connected parts
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from jaxbundle.cameras import MODEL_NAMES, check_parameters, default_parameters, get_model
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import count, did_you_mean, some
+from jaxbundle.network.rules import AXES, CHOICES, check_camera, check_choice, check_unique
 from jaxbundle.network.sightings import (
     check_images,
     check_parts,
@@ -21,25 +21,8 @@ from jaxbundle.network.sightings import (
     without_distances,
 )
 from jaxbundle.network.sightings import split_check_points as split_check_points
-from jaxbundle.network.tables import (
-    DATUMS,
-    EXTERIOR,
-    RESIDUAL_DOMAINS,
-    ROLES,
-    Camera,
-    Images,
-    Network,
-    Source,
-)
-from jaxbundle.network.units import ANGLE_UNITS, IMAGE_UNITS
-
-AXES = ("X", "Y", "Z")
-CHOICES = {
-    "datum": DATUMS,
-    "residuals": RESIDUAL_DOMAINS,
-    "angle_unit": tuple(ANGLE_UNITS),
-    "image_unit": IMAGE_UNITS,
-}
+from jaxbundle.network.tables import EXTERIOR, ROLES, Images, Network, Points, Source
+from jaxbundle.network.units import ANGLE_UNITS
 
 
 def check_network(network: Network) -> Network:
@@ -66,72 +49,8 @@ def check_network(network: Network) -> Network:
     _check_start_values(network)
     check_parts(network)
     check_redundancy(network)
-    return _warn_of_points_behind(network)
-
-
-def check_choice(key: str, value: str, choices: Sequence[str], where: str = "") -> None:
-    """Refuse a setting that is not one of its choices."""
-    if value not in choices:
-        raise InputError(f"{where}{key} must be one of {', '.join(choices)}, not {value!r}")
-
-
-def check_unique(ids: Sequence[str], source: Source, thing: str) -> None:
-    """Refuse an id that stands in two rows of a table."""
-    if len(set(ids)) == len(ids):
-        return
-    first: dict[str, int] = {}
-    for row, id in enumerate(ids):
-        if first.setdefault(id, row) != row:
-            raise InputError(
-                f"{source(row)}: {thing} {id!r} stands already in {source(first[id])}; "
-                "an id must be unique"
-            )
-
-
-def check_camera(camera: Camera, where: str = "") -> None:
-    """Refuse an unknown model or parameter, and impossible values, σ and sizes.
-
-    `where` begins the message: "project.toml, ".
-    """
-    where = f"{where}camera {camera.id!r}: "
-    if camera.model not in MODEL_NAMES:
-        raise InputError(
-            f"{where}unknown model {camera.model!r}{did_you_mean(camera.model, MODEL_NAMES)}"
-        )
-    model = get_model(camera.model)
-    try:
-        check_parameters(model, {**default_parameters(model), **camera.parameters})
-    except ValueError as error:
-        raise InputError(f"{where}{error}") from None
-    for name in camera.free:
-        if name not in model.parameters:
-            raise InputError(
-                f"{where}free names the unknown parameter {name!r}"
-                f"{did_you_mean(name, model.parameters)}"
-            )
-        if name in model.never_free:
-            raise InputError(f"{where}{name} cannot be estimated; take it out of free")
-        if camera.free.count(name) > 1:
-            raise InputError(f"{where}free names {name} twice")
-    for name, sigma in camera.sigma.items():
-        if name not in camera.free:
-            raise InputError(
-                f"{where}sigma is given for {name!r}, which is not free; add it to free, or take "
-                f"its sigma away (free: {', '.join(camera.free) or 'none'})"
-            )
-        if not _positive(sigma):
-            raise InputError(f"{where}sigma of {name} is {sigma}; it must be finite and positive")
-    _check_pair(where, "image_size", camera.image_size, "[columns, rows]")
-    _check_pair(where, "pixel_size", camera.pixel_size, "[width, height] in mm")
-
-
-def _check_pair(where, name, pair, meaning):
-    if pair is not None and not (len(pair) == 2 and all(map(_positive, pair))):
-        raise InputError(f"{where}{name} is {list(pair)}; expected {meaning}, both positive")
-
-
-def _positive(value) -> bool:
-    return math.isfinite(value) and value > 0
+    network = _warn_of_points_behind(network)
+    return network.replace(warnings=tuple(dict.fromkeys(network.warnings)))
 
 
 def _check_sizes(network: Network) -> None:
@@ -163,12 +82,22 @@ def _check_sizes(network: Network) -> None:
         (network.distances, "points", "points", p),
     ):
         index = np.asarray(getattr(table, name))
-        outside = ((index < 0) | (index >= size)).reshape(len(index), -1).any(1)
-        if outside.any():
+        for row, *_ in np.argwhere((index < 0) | (index >= size))[:1]:
             raise InputError(
-                f"{table.source(outside.argmax())}: {name} index {index[outside.argmax()]} is "
-                f"not among the {size} {things}"
+                f"{table.source(row)}: {name} index {index[row]} is not among the {size} {things}"
             )
+
+
+def _refuse(table: Images | Points, mask, thing: str, message: Callable[[int, int], str]) -> None:
+    """Refuse the first entry of a mask [rows, columns]; `message(row, column)` says why."""
+    for row, k in np.argwhere(mask)[:1]:
+        raise InputError(f"{table.source(row)}: {thing} {table.id[row]!r}: {message(row, k)}")
+
+
+def _sighting(network: Network, row: int) -> str:
+    rays = network.observations
+    point, image = network.points.id[rays.point[row]], network.images.id[rays.image[row]]
+    return f"point {point!r} in image {image!r}"
 
 
 def _check_cameras(network: Network) -> Network:
@@ -190,102 +119,99 @@ def _check_cameras(network: Network) -> Network:
 
 
 def _check_images(network: Network) -> None:
-    images = network.images
+    images, unit = network.images, network.angle_unit
     check_unique(images.id, images.source, "image")
-    place = lambda row: f"{images.source(row)}: image {images.id[row]!r}: "
-    values = np.concatenate([images.position, images.angles], 1)
-    for row, k in np.argwhere(np.isinf(values))[:1]:
-        raise InputError(f"{place(row)}{EXTERIOR[k]} is infinite; a number is expected")
-    for row, k in np.argwhere(np.abs(images.angles) > 2 * math.pi * 1.01)[:1]:
-        value = images.angles[row, k] / ANGLE_UNITS[network.angle_unit]
-        hint = "are these degrees? Set angle_unit" if network.angle_unit == "rad" else (
-            f"is angle_unit = {network.angle_unit!r} right?"
-        )
-        raise InputError(
-            f"{place(row)}{EXTERIOR[3 + k]} is {value:.6g} {network.angle_unit}, more than a "
-            f"full turn; {hint}"
-        )
-    sigma = images.sigma
-    for row, k in np.argwhere((sigma < 0) | np.isinf(sigma))[:1]:
-        raise InputError(
-            f"{place(row)}σ of {EXTERIOR[k]} is {sigma[row, k]:g}; it must be positive and "
-            'finite, empty (no prior), or "fixed" (0) to hold the value'
-        )
-    held = (sigma[:, 3:] == 0).sum(1)
-    for row in np.flatnonzero((held > 0) & (held < 3))[:1]:
-        raise InputError(
-            f"{place(row)}omega, phi, kappa can be held fixed only all three together; give "
-            "the others a small σ instead"
-        )
+    values, sigma = np.concatenate([images.position, images.angles], 1), images.sigma
+    _refuse(
+        images, np.isinf(values), "image",
+        lambda row, k: f"{EXTERIOR[k]} is infinite; a number is expected",
+    )  # fmt: skip
+    hint = "are these degrees?" if unit == "rad" else f"is {unit!r} right?"
+    _refuse(
+        images, np.abs(images.angles) > 2 * math.pi * 1.01, "image",
+        lambda row, k: f"{EXTERIOR[3 + k]} is {images.angles[row, k] / ANGLE_UNITS[unit]:.6g} "
+        f"{unit}, more than a full turn; {hint} Set angle_unit",
+    )  # fmt: skip
+    _refuse(
+        images, (sigma < 0) | np.isinf(sigma), "image",
+        lambda row, k: f"σ of {EXTERIOR[k]} is {sigma[row, k]:g}; it must be positive and finite, "
+        'empty (no prior), or "fixed" (0) to hold the value',
+    )  # fmt: skip
+    held = (sigma[:, 3:] == 0).sum(1, keepdims=True)
+    _refuse(
+        images, (held > 0) & (held < 3), "image",
+        lambda row, k: "omega, phi, kappa can be held fixed only all three together; give the "
+        "one to be held a small σ instead",
+    )  # fmt: skip
 
 
 def _check_points(network: Network) -> Network:
     """Also: control points without σ become fixed, those with no controlled axis tie."""
-    points = network.points
+    points, sigma = network.points, network.points.sigma
     check_unique(points.id, points.source, "point")
-    for row, role in enumerate(points.role):
-        if role not in ROLES:
-            raise InputError(
-                f"{points.source(row)}: point {points.id[row]!r}: role must be one of "
-                f"{', '.join(ROLES)}, not {role!r}"
-            )
-    place = lambda row: f"{points.source(row)}: {points.role[row]} point {points.id[row]!r}: "
-    for row, k in np.argwhere(np.isinf(points.position))[:1]:
-        raise InputError(f"{place(row)}{AXES[k]} is infinite; a number is expected")
-    missing = np.isnan(points.position) & ~points.has_role("tie")[:, None]
-    for row, k in np.argwhere(missing)[:1]:
-        raise InputError(f"{place(row)}{AXES[k]} is missing; give the known coordinate")
-
-    sigma, control = points.sigma, points.has_role("control")
-    for row, k in np.argwhere(control[:, None] & (sigma <= 0))[:1]:
-        raise InputError(
-            f"{place(row)}σ of {AXES[k]} is {sigma[row, k]:g}; it must be positive; leave all "
-            'three σ empty to hold the point, write "free" for an axis that is not controlled'
-        )
-    none = control & np.isnan(sigma).all(1)
-    for row, k in np.argwhere((control & ~none)[:, None] & np.isnan(sigma))[:1]:
-        raise InputError(
-            f"{place(row)}σ of {AXES[k]} is missing while another axis has one; give all three, "
-            'write "free" for an axis that is not controlled'
-        )
+    _refuse(
+        points, ~points.has_role(*ROLES)[:, None], "point",
+        lambda row, k: f"role must be one of {', '.join(ROLES)}, not {points.role[row]!r}",
+    )  # fmt: skip
+    _refuse(
+        points, np.isinf(points.position), "point",
+        lambda row, k: f"{AXES[k]} is infinite; a number is expected",
+    )  # fmt: skip
+    _refuse(
+        points, np.isnan(points.position) & ~points.has_role("tie")[:, None], "point",
+        lambda row, k: f"{AXES[k]} is missing; a {points.role[row]} point needs its coordinates",
+    )  # fmt: skip
+    control = points.has_role("control")
+    none, loose = control & np.isnan(sigma).all(1), control & np.isposinf(sigma).all(1)
+    _refuse(
+        points, control[:, None] & (sigma <= 0), "control point",
+        lambda row, k: f"σ of {AXES[k]} is {sigma[row, k]:g}; it must be positive; leave all "
+        'three σ empty to hold the point, write "free" for an axis that is not controlled',
+    )  # fmt: skip
+    _refuse(
+        points, (control & ~none)[:, None] & np.isnan(sigma), "control point",
+        lambda row, k: f"σ of {AXES[k]} is missing while another axis has one; give all three, "
+        'or write "free" for an axis that is not controlled',
+    )  # fmt: skip
     unused = points.has_role("tie", "fixed") & ~np.isnan(sigma).all(1)
-    loose = control & np.isposinf(sigma).all(1)
-    names = lambda mask: some(points.id[row] for row in np.flatnonzero(mask))
     network = network.replace(points=with_roles(with_roles(points, none, "fixed"), loose, "tie"))
     if unused.any():
         network = network.warn(
             f"σ of {count(unused.sum(), 'tie or fixed point')} not used (only control points "
-            f"have one): {names(unused)}"
+            f"have one): {_names(points, unused)}"
         )
     if loose.any():
         network = network.warn(
-            f"{count(loose.sum(), 'control point')} with all axes free taken as tie: {names(loose)}"
+            f"{count(loose.sum(), 'control point')} with all axes free taken as tie: "
+            f"{_names(points, loose)}"
         )
     return network
 
 
+def _names(points: Points, mask) -> str:
+    return some(points.id[row] for row in np.flatnonzero(mask))
+
+
 def _check_observations(network: Network) -> None:
     observations = network.observations
-    image = lambda row: network.images.id[observations.image[row]]
-    point = lambda row: network.points.id[observations.point[row]]
     for row, k in np.argwhere(~np.isfinite(observations.xy))[:1]:
         raise InputError(
-            f"{observations.source(row)}: {'xy'[k]} of point {point(row)!r} in image "
-            f"{image(row)!r} is {observations.xy[row, k]}; a finite number is expected"
+            f"{observations.source(row)}: {'xy'[k]} of {_sighting(network, row)} is "
+            f"{observations.xy[row, k]}; a finite number is expected"
         )
     sigma = observations.sigma
     for row, k in np.argwhere(~(np.isfinite(sigma) & (sigma > 0)))[:1]:
         raise InputError(
-            f"{observations.source(row)}: σ of {'xy'[k]} of point {point(row)!r} in image "
-            f"{image(row)!r} is {sigma[row, k]:g}; it must be finite and positive: correct it, "
-            "or leave it empty to use sigma_image"
+            f"{observations.source(row)}: σ of {'xy'[k]} of {_sighting(network, row)} is "
+            f"{sigma[row, k]:g}; it must be finite and positive: correct it, or leave it empty to "
+            "use sigma_image"
         )
     key = observations.image.astype(np.int64) * len(network.points) + observations.point
     order = np.argsort(key, kind="stable")
     for k in np.flatnonzero(np.diff(key[order]) == 0)[:1]:
         first, second = order[k], order[k + 1]
         raise InputError(
-            f"{observations.source(second)}: point {point(second)!r} in image {image(second)!r} "
+            f"{observations.source(second)}: {_sighting(network, second)} "
             f"stands already in {observations.source(first)}; remove one of them"
         )
 
@@ -293,26 +219,28 @@ def _check_observations(network: Network) -> None:
 def _check_distances(network: Network) -> Network:
     """Also: distances between two fixed points are left out."""
     distances, points = network.distances, network.points
-    ends = lambda row: " to ".join(repr(points.id[k]) for k in distances.points[row])
-    place = lambda row: f"{distances.source(row)}: distance {ends(row)}: "
+    names = [" to ".join(repr(points.id[k]) for k in ends) for ends in distances.points]
     for row in np.flatnonzero(distances.points[:, 0] == distances.points[:, 1])[:1]:
-        raise InputError(f"{place(row)}it needs two different points")
+        raise InputError(
+            f"{distances.source(row)}: distance {names[row]}: it needs two different points"
+        )
     for name in ("value", "sigma"):
         column = getattr(distances, name)
         for row in np.flatnonzero(~(np.isfinite(column) & (column > 0)))[:1]:
             raise InputError(
-                f"{place(row)}{name} is {column[row]:g}; it must be finite and positive"
+                f"{distances.source(row)}: distance {names[row]}: {name} is {column[row]:g}; it "
+                "must be finite and positive"
             )
     for row in np.flatnonzero(points.has_role("check")[distances.points].any(1))[:1]:
         raise InputError(
-            f"{place(row)}a check point takes no part in the adjustment; make it a tie point or "
-            "remove the distance"
+            f"{distances.source(row)}: distance {names[row]}: a check point takes no part in the "
+            "adjustment; make it a tie point or remove the distance"
         )
     idle = points.has_role("fixed")[distances.points].all(1)
     if idle.any():
         network = without_distances(network, idle).warn(
             f"left out {count(idle.sum(), 'distance')} between fixed points: "
-            f"{ends(idle.argmax())}{' …' if idle.sum() > 1 else ''}"
+            f"{names[idle.argmax()]}{' …' if idle.sum() > 1 else ''}"
         )
     return network
 
@@ -342,15 +270,12 @@ def _check_start_values(network: Network) -> None:
 
 def _refuse_missing(table, values, names, thing):
     missing = np.isnan(values)
-    if not missing.any():
-        return
-    row, k = np.argwhere(missing)[0]
     more = missing.any(1).sum() - 1
-    also = f" (and for {more} more)" if more else ""
-    raise InputError(
-        f"{table.source(row)}: {thing} {table.id[row]!r} has no start value of {names[k]}{also}; "
-        "give start values"
-    )
+    also = f" (and {more} more)" if more > 0 else ""
+    _refuse(
+        table, missing, thing,
+        lambda row, k: f"{names[k]} has no start value{also}; give start values",
+    )  # fmt: skip
 
 
 def _warn_of_points_behind(network: Network) -> Network:
@@ -362,10 +287,7 @@ def _warn_of_points_behind(network: Network) -> Network:
     behind = np.flatnonzero((axis[rays.image] * ray).sum(1) >= 0)
     if not len(behind):
         return network
-    first = "; ".join(
-        f"point {network.points.id[rays.point[row]]!r} in image {images.id[rays.image[row]]!r}"
-        for row in behind[:3]
-    )
+    first = "; ".join(_sighting(network, row) for row in behind[:3])
     return network.warn(
         f"the start values put {count(len(behind), 'image point')} behind the camera: {first}"
         f"{' …' if len(behind) > 3 else ''}; check the start values and the angle unit"

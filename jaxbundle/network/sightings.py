@@ -211,6 +211,6 @@ def check_redundancy(network: Network) -> None:
         with_datum = f" with {conditions} datum conditions" if conditions else ""
         raise InputError(
             f"{network.observations.source.name}: {rows} observations{with_datum} are too few "
-            f"for {unknowns} unknowns: {missing} missing; measure more points, or free fewer "
-            "camera parameters"
+            f"for {unknowns} unknowns: {missing} missing; measure more points, free fewer camera "
+            "parameters" + ("" if conditions else ', or, without control, set datum = "inner"')
         )

@@ -145,15 +145,19 @@ def _with_camera(images, camera):
     )
 
 
+def order_rays(network: Network) -> Int[np.ndarray, " rays"]:
+    """The order of the rays in the arrays: by point, then camera, then image."""
+    rows = network.observations
+    return np.lexsort((rows.image, network.images.camera[rows.image], rows.point))
+
+
 def make_structure(network: Network) -> tuple[Structure, Data, Float[np.ndarray, "3"]]:
     """The index plan, the arrays and the origin of a checked network (`check_network`).
 
     Check points must have been set aside. The datum is not decided here.
     """
     images, points, observations = network.images, network.points, network.observations
-    order = np.lexsort((
-        observations.image, images.camera[observations.image], observations.point
-    ))
+    order = order_rays(network)
     image, point = observations.image[order], observations.point[order]
     camera = images.camera[image]
 

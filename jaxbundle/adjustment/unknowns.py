@@ -1,0 +1,85 @@
+"""Names for the columns of the adjustment, for people: which image, which parameter."""
+
+import dataclasses
+
+import equinox as eqx
+import numpy as np
+
+from jaxbundle.adjustment.datum import gauge_directions
+from jaxbundle.adjustment.jacobian import jacobian
+from jaxbundle.adjustment.normal import normal_from_jacobian
+from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.schur import reduce
+from jaxbundle.cameras import get_model
+from jaxbundle.network.arrays import Data, Values
+from jaxbundle.network.tables import EXTERIOR
+
+INDETERMINATE = 1e-12
+"""Scaled eigenvalues of the normal matrix below this are rounding: nothing determines them."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Name:
+    """One unknown: kind (camera, image or point), the id of the thing, the parameter."""
+
+    kind: str
+    id: str
+    parameter: str
+
+    def __str__(self) -> str:
+        return f"{self.parameter} of {self.kind} {self.id}"
+
+
+def reduced_names(problem: Problem) -> list[Name]:
+    """Names of the reduced system's columns, in its order: images, cameras, kept points."""
+    s, network = problem.structure, problem.network
+    names = []
+    for i, image in enumerate(network.images.id):
+        names += [Name("image", image, p) for p in EXTERIOR]
+        if s.own_camera:
+            names += interior_names(problem, i)
+    if s.camera_width:
+        for c in range(s.cameras):
+            names += interior_names(problem, c)
+    for p in np.asarray(s.kept):
+        names += [Name("point", network.points.id[p], axis) for axis in "XYZ"]
+    return names
+
+
+def interior_names(problem: Problem, c: int) -> list[Name]:
+    """Names of a camera's interior columns (held ones too)."""
+    camera = problem.network.cameras[c]
+    parameters = get_model(camera.model).parameters
+    columns = np.asarray(problem.structure.camera_columns)[c]
+    return [Name("camera", camera.id, parameters[column]) for column in columns]
+
+
+def undetermined(problem: Problem, values: Values, data: Data) -> list[str]:
+    """The unknowns that the observations do not determine, most affected first."""
+    matrix, V = _scaled_reduced(problem.structure, values, data)
+    matrix = np.tril(matrix) + np.tril(matrix, -1).T
+    points = _undetermined_points(problem, np.asarray(V))
+    if not np.isfinite(matrix).all():
+        return points
+    eigenvalues, vectors = np.linalg.eigh(matrix)
+    null = vectors[:, eigenvalues < INDETERMINATE * max(1.0, eigenvalues[-1])]
+    share = (null**2).sum(1)
+    names = reduced_names(problem)
+    order = np.argsort(-share, kind="stable")
+    return [str(names[i]) for i in order if share[i] > 0.05] + points
+
+
+@eqx.filter_jit
+def _scaled_reduced(structure, values, data):
+    normal = normal_from_jacobian(jacobian(structure, values, data))
+    matrix, *_ = reduce(structure, normal, gauge=gauge_directions(structure, values))
+    return matrix, normal.point
+
+
+def _undetermined_points(problem: Problem, V) -> list[str]:
+    diagonal = np.diagonal(V, axis1=1, axis2=2)
+    free = np.asarray(problem.structure.eliminated)[:, 0] > 0
+    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    smallest = np.linalg.eigvalsh(V * scale[:, :, None] * scale[:, None, :])[:, 0]
+    weak = np.flatnonzero(free & (smallest < INDETERMINATE))
+    return [f"X, Y, Z of point {problem.network.points.id[p]}" for p in weak]

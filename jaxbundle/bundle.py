@@ -1,0 +1,202 @@
+"""`adjust`: a network in, an `Adjustment` out; data snooping, elimination, variance components."""
+
+import dataclasses
+from collections.abc import Callable
+
+import equinox as eqx
+import numpy as np
+
+from jaxbundle.adjustment.problem import Problem, count_rows, make_problem
+from jaxbundle.adjustment.solve import converged, find_minimum, make_solver
+from jaxbundle.adjustment.solver import Minimum
+from jaxbundle.adjustment.unknowns import Name, undetermined
+from jaxbundle.cameras import get_model
+from jaxbundle.errors import NotSolvedError
+from jaxbundle.network.arrays import Values
+from jaxbundle.network.check import check_network
+from jaxbundle.network.sightings import split_check_points
+from jaxbundle.network.tables import Network
+from jaxbundle.result import Adjustment
+from jaxbundle.statistics import (
+    intersect_check_points,
+    reliability,
+    rescale,
+    snoop,
+    undamped_factor,
+    variance_components,
+)
+from jaxbundle.statistics import cofactors as all_cofactors
+
+CORE_PARAMETERS = ("c", "x0", "y0", "fx", "fy", "cx", "cy", "f")
+"""Interior parameters that are never eliminated for want of significance."""
+
+
+def adjust(
+    network: Network,
+    *,
+    method: str = "levenberg-marquardt",
+    max_iterations: int = 100,
+    snooping: str | None = None,
+    significance: float = 0.001,
+    eliminate: bool = False,
+    critical_t: float = 2.0,
+    estimate_components: bool = False,
+    progress: Callable | None = None,
+) -> Adjustment:
+    """Adjust a network by least squares, with self-calibration of whatever is free.
+
+    **Arguments:**
+
+    - `network`: see `jaxbundle.make_network`, `jaxbundle.read_network`, `jaxbundle.simulate`.
+    - `method`: `"levenberg-marquardt"` or `"gauss-newton"`.
+    - `snooping`: `"pope"` or `"baarda"`: remove blunders one at a time at the level
+      `significance`.
+    - `eliminate`: fix additional parameters with t < `critical_t` at 0, the least significant
+      first, adjusting again each time.
+    - `estimate_components`: scale the σ of each group of observations until its variance
+      component is 1.
+    - `progress(step, cost, λ)`: called after every evaluation.
+
+    **Returns:** an `Adjustment`; look at `converged` before anything else.
+
+    **Raises:** `InputError` where the network cannot be adjusted as it stands.
+    """
+    network = check_network(network)
+    network, check_points, check_rays = split_check_points(network)
+    problem = make_problem(network)
+    network = problem.network
+    options = {"method": method, "max_steps": max_iterations + 1, "progress": progress}
+    minimum = _minimise(problem, problem.data.start, **options)
+
+    removed, eliminated = [], []
+    if _solved(problem, minimum):
+        again = lambda problem, values: _minimise(problem, values, **options)
+        if snooping:
+            problem, minimum, removed = _snooped(problem, minimum, again, snooping, significance)
+        if estimate_components:
+            problem, minimum = _with_components(problem, minimum, again)
+        if eliminate:
+            problem, minimum, eliminated = _eliminated(problem, minimum, again, critical_t)
+
+    names = () if _solved(problem, minimum) else _names_of_defects(problem, minimum)
+    check = None
+    if len(check_points):
+        check = lambda result: intersect_check_points(
+            problem, result.values, result.cofactors, check_points, check_rays
+        )
+    return Adjustment(
+        network, problem, minimum, removed=tuple(removed), eliminated=tuple(eliminated),
+        undetermined=tuple(names), check=check, method=method,
+    )  # fmt: skip
+
+
+def _minimise(problem: Problem, start: Values, **options) -> Minimum:
+    """Iterate from `start`; the datum and what is held stay those of the problem's own start."""
+    data = problem.data
+    if start is data.start:
+        return find_minimum(make_solver(problem, **options), data)
+    return find_minimum(make_solver(problem, **options), data, start)
+
+
+def _solved(problem: Problem, minimum: Minimum) -> bool:
+    """Converged, and no unknown so weak that its σ is rounding noise."""
+    if not bool(converged(int(minimum.termination))):
+        return False
+    factor = undamped_factor(problem.structure, minimum.values, problem.data)
+    pivots = np.abs(np.diagonal(np.asarray(factor.cholesky)))
+    return bool(np.isfinite(pivots).all() and pivots.min(initial=1.0) ** 2 > 1e-13)
+
+
+def _names_of_defects(problem: Problem, minimum: Minimum) -> list[str]:
+    values = minimum.values
+    if not all(np.isfinite(np.asarray(x)).all() for x in (values.camera, values.position)):
+        values = problem.data.start
+    return undetermined(problem, values, problem.data)
+
+
+def _snooped(problem, minimum, again, test, significance):
+    last = {}
+
+    def adjust_from(problem, values):
+        result = again(problem, values)
+        if not _solved(problem, result):
+            raise NotSolvedError(
+                "data snooping took away so much that the network is no longer determined: "
+                + ", ".join(_names_of_defects(problem, result)[:8])
+            )
+        last["minimum"] = result
+        found = _reliability(problem, result.values)
+        vtpv = sum(float((np.asarray(v) ** 2).sum()) for v in _leaves(found.residual))
+        return result.values, found, float(np.sqrt(vtpv / max(problem.counts.redundancy, 1)))
+
+    problem, _, removed = snoop(
+        problem, minimum.values, adjust_from, test=test, significance=significance
+    )
+    return problem, last["minimum"], removed
+
+
+def _leaves(residual):
+    return (
+        residual.image, residual.control, residual.exterior, residual.interior, residual.distance
+    )  # fmt: skip
+
+
+def _reliability(problem: Problem, values: Values):
+    factor = undamped_factor(problem.structure, values, problem.data)
+    Q = all_cofactors(problem.structure, values, factor)
+    return reliability(problem.structure, values, problem.data, Q)
+
+
+def _with_components(problem, minimum, again, rounds: int = 20, tolerance: float = 1e-3):
+    """Repeat Förstner's estimate until every component is 1 within `tolerance`."""
+    for _ in range(rounds):
+        found = _reliability(problem, minimum.values)
+        components = variance_components(problem, problem.data, found)
+        usable = [c.sigma for c in components.values() if c.redundancy >= 1]
+        if all(abs(sigma - 1) < tolerance for sigma in usable):
+            break
+        data = rescale(problem, problem.data, components)
+        problem = dataclasses.replace(problem, data=data)
+        minimum = again(problem, minimum.values)
+    return problem, minimum
+
+
+def _eliminated(problem, minimum, again, critical_t):
+    """Fix insignificant additional parameters at their default, the weakest first."""
+    names = []
+    while True:
+        result = Adjustment(problem.network, problem, minimum)
+        weak = [
+            name for _, name in result.insignificant(critical_t)
+            if name.parameter not in CORE_PARAMETERS
+        ]  # fmt: skip
+        if not weak:
+            return problem, minimum, names
+        names.append(weak[0])
+        problem, values = _without_parameter(problem, minimum.values, weak[0])
+        minimum = again(problem, values)
+
+
+def _without_parameter(problem: Problem, values: Values, name: Name):
+    s, data = problem.structure, problem.data
+    c = [camera.id for camera in problem.network.cameras].index(name.id)
+    model = get_model(problem.network.cameras[c].model)
+    column = model.parameters.index(name.parameter)
+    position = np.flatnonzero(
+        (np.asarray(s.camera_columns)[c] == column) & (np.asarray(s.camera_free)[c] > 0)
+    )[0]
+    s = eqx.tree_at(
+        lambda s: s.camera_free,
+        dataclasses.replace(s, all_free=False),
+        s.camera_free.at[c, position].set(0.0),
+    )
+    data = eqx.tree_at(
+        lambda d: d.start.camera, data, data.start.camera.at[c, column].set(0.0)
+    )
+    row = np.flatnonzero(np.asarray(s.interior) == c)
+    if len(row):
+        weight = data.interior_weight.at[row[0], column].set(0.0)
+        data = eqx.tree_at(lambda d: d.interior_weight, data, weight)
+    values = eqx.tree_at(lambda v: v.camera, values, values.camera.at[c, column].set(0.0))
+    counts = count_rows(s, data)
+    return dataclasses.replace(problem, structure=s, data=data, counts=counts), values

@@ -1,0 +1,92 @@
+"""Text files and tables of comma-separated values: UTF-8, a header line, `#` comments."""
+
+import csv
+import io
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.network.columns import Columns
+from jaxbundle.network.tables import Source
+
+
+def read_text(path: Path) -> str:
+    """The text of a file.
+
+    **Raises:** `InputError` if there is none, it cannot be read, or it is not UTF-8.
+    """
+    try:
+        return Path(path).read_bytes().decode("utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        line = error.object[: error.start].count(b"\n") + 1
+        raise InputError(
+            f"{path}, line {line}: not UTF-8 text; save the file as UTF-8"
+        ) from None
+
+
+def read_csv(path: Path) -> Columns:
+    """The columns of a CSV file as text, and the line of each row.
+
+    Blank lines and lines that begin with `#` are skipped.
+    """
+    lines = [
+        (number, line)
+        for number, line in enumerate(read_text(path).splitlines(), 1)
+        if (text := line.lstrip()) and text[0] != "#"
+    ]
+    try:
+        rows = list(csv.reader((line for _, line in lines), skipinitialspace=True, strict=True))
+    except csv.Error as error:
+        raise InputError(f"{path}: not a CSV table: {error}") from None
+    if not rows:
+        raise InputError(f"{path}: the file is empty; a header line and rows are expected")
+    if len(rows) != len(lines):
+        raise InputError(f"{path}: a quoted cell runs over several lines; close its quotes")
+    header, numbers = [name.strip() for name in rows[0]], [number for number, _ in lines]
+    if len(header) == 1 and (";" in header[0] or "\t" in header[0]):
+        raise InputError(f"{path}, line {numbers[0]}: separate the columns by commas")
+    for name in header:
+        if header.count(name) > 1:
+            raise InputError(f"{path}, line {numbers[0]}: the column {name!r} stands there twice")
+    width = len(header)
+    for number, row in zip(numbers, rows):
+        if len(row) != width:
+            raise InputError(
+                f"{path}, line {number}: {len(row)} cells where the header has {width} "
+                f"({', '.join(header)}); decimals need a point, empty cells their comma"
+            )
+    columns = list(zip(*rows[1:])) or [()] * width
+    return Columns(dict(zip(header, columns)), Source(str(path), np.array(numbers[1:]), "line"))
+
+
+def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Write a table that `read_csv` reads back; floats in full precision."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    for row in rows:
+        if str(row[0]).startswith("#"):
+            csv.writer(text, lineterminator="\n", quoting=csv.QUOTE_ALL).writerow(row)
+        else:
+            writer.writerow(row)
+    write_text(path, text.getvalue())
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file whole or not at all: under a temporary name, then renamed."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_text(text, encoding="utf-8", newline="\n")
+        os.replace(temporary, path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+    finally:
+        temporary.unlink(missing_ok=True)

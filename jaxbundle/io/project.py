@@ -1,0 +1,211 @@
+"""The project format: a TOML file with settings and cameras, tables in CSV files beside it.
+
+```toml
+[project]
+name = "Image 63"
+object_unit = "m"
+image_unit = "mm"                   # or "px": (0, 0) the centre of the upper-left pixel
+angle_unit = "deg"                  # rad | deg | gon
+sigma_image = 0.015                 # σ of image coordinates without their own, in image_unit
+datum = "control"                   # control | inner | minimal
+datum_points = ["1", "2", "3"]      # which points carry inner constraints; all tie points if absent
+residuals = "corrected"             # corrected | measured
+images = "images.csv"               # the columns of each table: `jaxbundle.network.build`
+points = "points.csv"
+observations = "observations.csv"
+distances = "distances.csv"         # optional
+
+[[camera]]
+id = "rc30"
+model = "brown"
+image_size = [15333, 15333]         # pixels
+pixel_size = [0.015, 0.015]         # mm
+c = 154.006                         # every parameter not given starts at 0
+free = ["c", "x0", "y0", "K1"]
+sigma = { c = 0.1 }                 # prior σ of the start value
+```
+
+Small tables may stand in the file itself, one `[[image]]`, `[[point]]`, `[[observation]]`,
+`[[distance]]` a row.
+"""
+
+import json
+import tomllib
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.csv_tables import read_csv, read_text, write_csv, write_text
+from jaxbundle.io.settings import SETTINGS, TABLES, Document, apply_overrides, network_of
+from jaxbundle.network.build import (
+    DISTANCE_COLUMNS,
+    IMAGE_COLUMNS,
+    IMAGE_SIGMAS,
+    OBSERVATION_COLUMNS,
+    OBSERVATION_SIGMAS,
+    POINT_COLUMNS,
+    POINT_SIGMAS,
+)
+from jaxbundle.network.columns import Columns, as_columns, did_you_mean
+from jaxbundle.network.tables import Camera, Network, Source
+from jaxbundle.network.units import ANGLE_UNITS, to_image_unit
+
+FILE_NAME = "project.toml"
+INLINE = {table: table.removesuffix("s") for table in TABLES}
+"""The tables and the name of one of their rows in the TOML file."""
+
+
+def read_project(path: str | Path, overrides: Sequence[str] = ()) -> Network:
+    """The network of a project file (or of `project.toml` in a folder).
+
+    `overrides` are settings `KEY=VALUE` that replace those of the file, see
+    `jaxbundle.io.settings`.
+
+    **Raises:** `InputError` naming file, line and column.
+    """
+    path = Path(path)
+    path = path / FILE_NAME if path.is_dir() else path
+    document = apply_overrides(_read_document(path), overrides, (*SETTINGS, *TABLES))
+    document["project"].setdefault("name", path.resolve().parent.name)
+    tables = {table: _read_table(document, table, path) for table in TABLES}
+    return network_of(document, {k: v for k, v in tables.items() if v is not None}, str(path))
+
+
+def _read_document(path: Path) -> Document:
+    try:
+        document = tomllib.loads(read_text(path))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from None
+    known = ("project", "camera", *INLINE.values())
+    for key, value in document.items():
+        if key not in known:
+            raise InputError(f"{path}: unknown key {key!r}{did_you_mean(key, known)}")
+        if key != "project" and not (
+            isinstance(value, list) and all(isinstance(row, dict) for row in value)
+        ):
+            raise InputError(f"{path}: write [[{key}]] in double brackets, one for each {key}")
+    if not isinstance(document.get("project"), dict):
+        raise InputError(f"{path}: the section [project] is missing")
+    return {"camera": [], **document}
+
+
+def _read_table(document: Document, table: str, path: Path) -> Columns | None:
+    """A table from its CSV file or from the document itself; None for distances not given."""
+    inline, file = document.get(INLINE[table]), document["project"].get(table)
+    if inline is not None and file is not None:
+        raise InputError(f"{path}: give either {table} = {file!r} or [[{INLINE[table]}]], not both")
+    if inline is not None:
+        columns = as_columns(inline, table)
+        return Columns(columns.values, Source(f"{path} [[{INLINE[table]}]]", None, "entry"))
+    if file is None:
+        if table == "distances":
+            return None
+        raise InputError(
+            f"{path}, [project]: {table} is missing; give {table} = \"{table}.csv\" or "
+            f"[[{INLINE[table]}]] entries"
+        )
+    if not isinstance(file, str):
+        raise InputError(f"{path}, [project]: {table} is {file!r}; the name of a file is expected")
+    if not (path.parent / file).is_file():
+        raise InputError(
+            f"{path}, [project]: {table} = {file!r}: no such file {path.parent / file}"
+        )
+    return read_csv(path.parent / file)
+
+
+def write_project(network: Network, folder: str | Path) -> Path:
+    """Write `project.toml` and its tables into a folder; returns the path of the former.
+
+    Reading it again gives the same network (its warnings stand in the file as comments). Every
+    file is written under a temporary name and renamed, `project.toml` last.
+    """
+    folder = Path(folder)
+    images, points, rays = network.images, network.points, network.observations
+    xy, sigma = to_image_unit(
+        network.cameras, images.camera[rays.image], rays.xy, rays.sigma, network.image_unit
+    )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made: {error.strerror}") from None
+    radians = ANGLE_UNITS[network.angle_unit]
+    unit = np.array([1, 1, 1, radians, radians, radians])
+    exterior = np.concatenate([images.position, images.angles], 1) / unit
+    camera_id = [network.cameras[c].id for c in images.camera]
+    _write_table(
+        folder / "images.csv", IMAGE_COLUMNS, (images.id, camera_id), exterior,
+        IMAGE_SIGMAS, images.sigma / unit, {0.0: "fixed"},
+    )  # fmt: skip
+    _write_table(
+        folder / "points.csv", POINT_COLUMNS, (points.id, points.role), points.position,
+        POINT_SIGMAS, points.sigma, {np.inf: "free"},
+    )  # fmt: skip
+    _write_table(
+        folder / "observations.csv", OBSERVATION_COLUMNS,
+        ([images.id[i] for i in rays.image], [points.id[p] for p in rays.point]), xy,
+        OBSERVATION_SIGMAS, sigma, {},
+    )  # fmt: skip
+    distances = network.distances
+    if len(distances):
+        ends = [[points.id[p] for p in column] for column in distances.points.T]
+        values = np.stack([distances.value, distances.sigma], 1)
+        _write_table(folder / "distances.csv", DISTANCE_COLUMNS, ends, values, (), values, {})
+    write_text(folder / FILE_NAME, _document_text(network))
+    return folder / FILE_NAME
+
+
+def _write_table(path, header, ids, values, sigma_header, sigma, words):
+    """Ids, numbers and, where there are any, σ; `words` stand for special values of σ."""
+    with_sigma = bool(sigma_header) and not np.isnan(sigma).all()
+    rows = (
+        (*names, *_cells(row), *(_cells(s, words) if with_sigma else ()))
+        for *names, row, s in zip(*ids, values.tolist(), sigma.tolist())
+    )
+    write_csv(path, (*header, *(sigma_header if with_sigma else ())), rows)
+
+
+def _cells(numbers, words=MappingProxyType({})):
+    return (words[x] if x in words else "" if x != x else repr(x) for x in numbers)
+
+
+def _document_text(network: Network) -> str:
+    lines = [f"# {' '.join(warning.split())}" for warning in network.warnings]
+    settings = {key: getattr(network, key) for key in SETTINGS if key != "sigma_image"}
+    settings |= {table: f"{table}.csv" for table in TABLES}
+    if not len(network.distances):
+        del settings["distances"]
+    if not network.datum_points:
+        del settings["datum_points"]
+    lines += ["[project]", *_assignments(settings)]
+    for camera in network.cameras:
+        lines += ["", "[[camera]]", *_assignments(_camera_entry(camera))]
+    return "\n".join(lines) + "\n"
+
+
+def _camera_entry(camera: Camera) -> dict:
+    entry = {"id": camera.id, "model": camera.model}
+    for name in ("image_size", "pixel_size"):
+        if getattr(camera, name) is not None:
+            entry[name] = getattr(camera, name)
+    entry |= {name: float(value) for name, value in camera.parameters.items()}
+    entry["free"] = camera.free
+    if camera.sigma:
+        entry["sigma"] = {name: float(value) for name, value in camera.sigma.items()}
+    return entry
+
+
+def _assignments(table: dict) -> Iterable[str]:
+    return (f"{key} = {_toml(value)}" for key, value in table.items())
+
+
+def _toml(value) -> str:
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, dict):
+        return f"{{ {', '.join(_assignments(value))} }}"
+    if isinstance(value, tuple | list):
+        return f"[{', '.join(map(_toml, value))}]"
+    return repr(value)

@@ -1,0 +1,123 @@
+"""The settings of a project: what keys there are, `--set KEY=VALUE`, and the network they make.
+
+A *document* is what a project file says: `{"project": {...}, "camera": [{...}, ...]}`. Every
+reader that has settings makes one, so that the same overrides work for all of them.
+"""
+
+import copy
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from jaxbundle.errors import InputError
+from jaxbundle.network.build import CAMERA_FIELDS, make_cameras, make_network
+from jaxbundle.network.columns import Columns, did_you_mean
+from jaxbundle.network.rules import CHOICES, check_choice
+from jaxbundle.network.tables import Network
+
+TABLES = ("images", "points", "observations", "distances")
+TEXT = ("name", "object_unit", "image_unit", "angle_unit", "datum", "residuals")
+SETTINGS = (*TEXT, "sigma_image", "datum_points")
+CAMERA_KEYS = ("camera.ID.PARAMETER", "camera.ID.sigma.PARAMETER") + tuple(
+    f"camera.ID.{field}" for field in CAMERA_FIELDS if field not in ("id", "sigma")
+)
+
+Document = dict[str, Any]
+
+
+def apply_overrides(
+    document: Document, overrides: Sequence[str], keys: Sequence[str] = SETTINGS
+) -> Document:
+    """The document with `KEY=VALUE` settings of the command line put in.
+
+    Keys are those of `[project]` in `keys`, `camera.ID.…` of a camera, and `free` where there
+    is one camera only.
+    """
+    document = copy.deepcopy(document)
+    for override in overrides:
+        key, equals, text = (part.strip() for part in override.partition("="))
+        if not equals:
+            raise InputError(f"--set {override}: expected KEY=VALUE")
+        if key == "free" and len(document["camera"]) == 1:
+            document["camera"][0]["free"] = _words(text)
+        elif key.startswith("camera."):
+            _override_camera(document["camera"], key, text)
+        elif key in keys:
+            document["project"][key] = _project_value(key, text)
+        else:
+            known = (*keys, *CAMERA_KEYS)
+            raise InputError(f"--set {key}: unknown key; known: {', '.join(known)}")
+    return document
+
+
+def _project_value(key: str, text: str):
+    if key == "sigma_image":
+        return _number(key, text)
+    return _words(text) if key == "datum_points" else text
+
+
+def _override_camera(cameras: list[dict], key: str, text: str) -> None:
+    rest = key.removeprefix("camera.")
+    for camera in sorted(cameras, key=lambda c: -len(str(c.get("id", "")))):
+        field = rest.removeprefix(f"{camera.get('id', '')}.")
+        if field != rest:
+            break
+    else:
+        ids = [str(camera.get("id")) for camera in cameras]
+        raise InputError(
+            f"--set {key}: no such camera; known: "
+            f"{', '.join(f'camera.{id}.PARAMETER' for id in ids)}"
+        )
+    if field == "free":
+        camera["free"] = _words(text)
+    elif field in ("image_size", "pixel_size"):
+        camera[field] = [_number(key, word) for word in _words(text)]
+    elif field == "model":
+        camera[field] = text
+    elif field.startswith("sigma."):
+        camera.setdefault("sigma", {})[field.removeprefix("sigma.")] = _number(key, text)
+    elif field in ("id", "sigma"):
+        raise InputError(f"--set {key}: cannot be set; known: {', '.join(CAMERA_KEYS)}")
+    else:
+        camera[field] = _number(key, text)
+
+
+def _words(text: str) -> list[str]:
+    return [word.strip() for word in text.strip("[]").split(",") if word.strip()]
+
+
+def _number(key: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f"--set {key}={text}: {text!r} is not a number") from None
+
+
+def network_of(document: Document, tables: Mapping[str, Columns], where: str) -> Network:
+    """The network of a document and its tables; `where` is the file, for messages."""
+    project = document["project"]
+    check_settings(project, f"{where}, [project]: ")
+    settings = {key: project[key] for key in SETTINGS if key in project}
+    settings.setdefault("sigma_image", None)
+    cameras = make_cameras(document["camera"], f"{where}, ")
+    return make_network(cameras, **tables, **settings)
+
+
+def check_settings(project: Mapping[str, Any], where: str) -> None:
+    """Refuse unknown keys and impossible values of `[project]`."""
+    for key, value in project.items():
+        if key not in (*SETTINGS, *TABLES):
+            raise InputError(
+                f"{where}unknown key {key!r}{did_you_mean(key, (*SETTINGS, *TABLES))}"
+            )
+        if key in (*TEXT, *TABLES) and not isinstance(value, str):
+            raise InputError(f"{where}{key} is {value!r}; text in quotes is expected")
+        if key in CHOICES:
+            check_choice(key, value, CHOICES[key], where)
+    sigma = project.get("sigma_image", 1.0)
+    if isinstance(sigma, bool) or not isinstance(sigma, int | float):
+        raise InputError(f"{where}sigma_image is {sigma!r}; a number is expected")
+    if not (math.isfinite(sigma) and sigma > 0):
+        raise InputError(f"{where}sigma_image is {sigma}; it must be finite and positive")
+    if not isinstance(project.get("datum_points", []), list):
+        raise InputError(f'{where}datum_points must be a list of ids, such as ["1", "2"]')

@@ -1,0 +1,461 @@
+"""The result of an adjustment: values with standard deviations, tests, tables, figures.
+
+Every σ here is a posteriori (times σ0) unless it says a priori. What is costly (cofactors,
+redundancy numbers) is computed when first asked for. A network that was not solved has no
+values to ask for: every accessor raises `NotSolvedError` and says why.
+"""
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Float
+
+from jaxbundle.adjustment.jacobian import zero_tangent
+from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.residuals import half_square, residuals
+from jaxbundle.adjustment.solve import converged
+from jaxbundle.adjustment.solver import TERMINATIONS, Minimum
+from jaxbundle.adjustment.unknowns import Name, interior_names
+from jaxbundle.cameras import get_model
+from jaxbundle.errors import NotSolvedError
+from jaxbundle.geometry import (
+    matrix_from_quaternion,
+    omega_phi_kappa_from_matrix,
+    retract_quaternion,
+)
+from jaxbundle.network.arrays import Tangent, Values, retract
+from jaxbundle.network.structure import order_rays
+from jaxbundle.network.tables import EXTERIOR, Network
+from jaxbundle.statistics import (
+    CheckPoints,
+    Component,
+    Reliability,
+    Removed,
+    chi2_quantile,
+    cofactors,
+    correlation_matrix,
+    external_reliability,
+    minimal_detectable,
+    propagate,
+    reliability,
+    total_correlation,
+    undamped_factor,
+    variance_components,
+)
+
+ANGLE_UNITS = {"rad": 1.0, "deg": 180 / np.pi, "gon": 200 / np.pi}
+
+
+class Adjustment:
+    """An adjusted network. Print it, or let a notebook show it; `report()` is the whole protocol.
+
+    **Attributes** (object unit, image unit and angle unit are the network's; angles in methods
+    that return arrays are radians):
+
+    - `converged`, `termination`, `iterations`, `sigma0`, `vtpv`, `redundancy`, `counts`
+    - `cameras`, `images`, `points`, `residuals`, `distances`: tables (dicts of numpy columns)
+    - `warnings`, `removed` (data snooping), `eliminated` (insignificant parameters),
+      `undetermined` (names, where the network is singular)
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        problem: Problem,
+        minimum: Minimum,
+        *,
+        removed: tuple[Removed, ...] = (),
+        eliminated: tuple[Name, ...] = (),
+        undetermined: tuple[str, ...] = (),
+        check: Callable[["Adjustment"], CheckPoints] | None = None,
+        method: str = "levenberg-marquardt",
+    ):
+        self.network = network
+        self.problem = problem
+        self.minimum = minimum
+        self.removed = removed
+        self.eliminated = eliminated
+        self.undetermined = undetermined
+        self.method = method
+        self._check = check
+
+    # --- how it ended -----------------------------------------------------------------------
+
+    @property
+    def converged(self) -> bool:
+        """Whether a minimum was reached and everything in it is determined."""
+        return bool(converged(int(self.minimum.termination))) and not self.undetermined
+
+    @property
+    def termination(self) -> str:
+        """Why the iterations ended, in words."""
+        if self.undetermined:
+            return TERMINATIONS[3]
+        return TERMINATIONS[int(self.minimum.termination)]
+
+    @property
+    def iterations(self) -> int:
+        """Steps tried, the rejected ones counted; the evaluation of the start is not one."""
+        return max(int(self.minimum.iterations) - 1, 0)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What was left out or looked strange, in words."""
+        return self.problem.network.warnings
+
+    @property
+    def counts(self):
+        """Rows and unknowns of the adjustment."""
+        return self.problem.counts
+
+    @property
+    def redundancy(self) -> int:
+        """Observations + pseudo-observations + datum conditions − unknowns."""
+        return self.counts.redundancy
+
+    @property
+    def values(self) -> Values:
+        """The adjusted arrays (relative to `problem.origin`)."""
+        self._require_solved()
+        return self.minimum.values
+
+    def _require_solved(self) -> None:
+        if not self.converged:
+            what = f"; not determined: {', '.join(self.undetermined[:8])}" if self.undetermined else ""
+            raise NotSolvedError(
+                f"the adjustment did not converge ({self.termination}){what}; it has no result"
+            )
+
+    # --- precision of the whole -------------------------------------------------------------
+
+    @functools.cached_property
+    def vtpv(self) -> float:
+        """vᵀPv of all observations, pseudo-observations included."""
+        s, data = self.problem.structure, self.problem.data
+        return 2 * float(half_square(residuals(s, self.values, data)))
+
+    @property
+    def sigma0(self) -> float:
+        """σ0 = √(vᵀPv/redundancy), dimensionless; NaN without redundancy."""
+        r = self.redundancy
+        return float(np.sqrt(self.vtpv / r)) if r > 0 else float("nan")
+
+    def global_test(self, significance: float = 0.05) -> dict:
+        """χ² test of vᵀPv against a variance factor of 1 (two-sided)."""
+        f = self.redundancy
+        low, high = chi2_quantile(significance / 2, f), chi2_quantile(1 - significance / 2, f)
+        return {"vtpv": self.vtpv, "low": low, "high": high, "passed": low <= self.vtpv <= high}
+
+    # --- cofactors --------------------------------------------------------------------------
+
+    @functools.cached_property
+    def _factor(self):
+        return undamped_factor(self.problem.structure, self.values, self.problem.data)
+
+    @functools.cached_property
+    def cofactors(self):
+        """Blocks of the cofactor matrix (see `jaxbundle.statistics.cofactors`)."""
+        return cofactors(self.problem.structure, self.values, self._factor)
+
+    @functools.cached_property
+    def reliability(self) -> Reliability:
+        """Redundancy numbers and w of all observations, in the order of the arrays."""
+        return reliability(
+            self.problem.structure, self.values, self.problem.data, self.cofactors
+        )
+
+    @functools.cached_property
+    def variance_components(self) -> dict[str, Component]:
+        """σ̂ over a priori σ for every group of observations."""
+        return variance_components(self.problem, self.problem.data, self.reliability)
+
+    @functools.cached_property
+    def check_points(self) -> CheckPoints | None:
+        """Check points intersected after the adjustment; None where there are none."""
+        self._require_solved()
+        return None if self._check is None else self._check(self)
+
+    # --- unknowns ---------------------------------------------------------------------------
+
+    @functools.cached_property
+    def image_values(self) -> Float[np.ndarray, "images 6"]:
+        """X0, Y0, Z0 (object unit), ω, φ, κ (radians)."""
+        values = self.values
+        angles = jax.vmap(_angles)(values.rotation, jnp.zeros((len(values.rotation), 3)))
+        position = np.asarray(values.position) + self.problem.origin
+        return np.concatenate([position, np.asarray(angles)], 1)
+
+    @functools.cached_property
+    def image_covariance(self) -> Float[np.ndarray, "images 6 6"]:
+        """Covariance of X0, Y0, Z0, ω, φ, κ, angles by their exact Jacobian; radians."""
+        s = self.problem.structure
+        n, w = s.images, s.image_width
+        at = np.arange(n)
+        Q = np.asarray(self.cofactors.reduced)[: n * w, : n * w].reshape(n, w, n, w)
+        Q = Q[at, :, at, :][:, :6, :6]
+        A = np.zeros((n, 6, 6))
+        A[:, :3, :3] = np.eye(3)
+        A[:, 3:, 3:] = jax.vmap(jax.jacfwd(_angles, 1))(self.values.rotation, jnp.zeros((n, 3)))
+        free = np.asarray(s.image_free)
+        Q = Q * free[:, :, None] * free[:, None, :]
+        return self.sigma0**2 * A @ Q @ A.transpose(0, 2, 1)
+
+    @functools.cached_property
+    def point_values(self) -> Float[np.ndarray, "points 3"]:
+        """X, Y, Z in the object unit."""
+        return np.asarray(self.values.point) + self.problem.origin
+
+    @functools.cached_property
+    def point_covariance(self) -> Float[np.ndarray, "points 3 3"]:
+        """Marginal covariance of every point; zero where it is fixed."""
+        return self.sigma0**2 * np.asarray(self.cofactors.point)
+
+    def camera_parameters(self, camera: str) -> dict[str, float]:
+        """All parameters of a camera by name."""
+        c = self._camera(camera)
+        model = get_model(self.problem.network.cameras[c].model)
+        return dict(zip(model.parameters, np.asarray(self.values.camera)[c].tolist()))
+
+    def camera_covariance(self, camera: str) -> tuple[list[str], Float[np.ndarray, "n n"]]:
+        """Names and covariance of the free parameters of a camera."""
+        c, s = self._camera(camera), self.problem.structure
+        free = np.flatnonzero(np.asarray(s.camera_free)[c])
+        start = s.images * s.image_width + c * s.camera_width
+        if s.own_camera:
+            start = c * s.image_width + 6
+        Q = np.asarray(self.cofactors.reduced)[np.ix_(start + free, start + free)]
+        names = interior_names(self.problem, c)
+        return [names[i].parameter for i in free], self.sigma0**2 * Q
+
+    def _camera(self, camera: str) -> int:
+        ids = [given.id for given in self.problem.network.cameras]
+        if camera not in ids:
+            raise KeyError(f"there is no camera {camera!r}; cameras: {', '.join(ids)}")
+        return ids.index(camera)
+
+    def insignificant(self, critical: float = 2.0) -> list[tuple[float, Name]]:
+        """Free interior parameters with t = |value|/σ below `critical`, the least first."""
+        found = [
+            (entry["t"], Name("camera", camera, parameter))
+            for camera, table in self.cameras.items()
+            for parameter, entry in table["parameters"].items()
+            if entry["free"] and entry["t"] < critical
+        ]
+        return sorted(found, key=lambda item: item[0])
+
+    def covariance(self, *names: tuple[str, str, str]) -> Float[np.ndarray, "n n"]:
+        """Covariance of any unknowns by name, e.g. `("camera", "cam", "c")`,
+        `("image", "12", "kappa")` (radians), `("point", "7", "Z")`."""
+        wanted = [Name(*map(str, name)) for name in names]
+
+        def pick(values: Values):
+            return jnp.stack([self._value_of(name, values) for name in wanted])
+
+        return self.covariance_of(pick)
+
+    def _value_of(self, name: Name, values: Values):
+        network = self.problem.network
+        if name.kind == "camera":
+            c = self._camera(name.id)
+            parameters = get_model(network.cameras[c].model).parameters
+            return values.camera[c, parameters.index(name.parameter)]
+        if name.kind == "image":
+            i = network.images.id.index(name.id)
+            angles = _angles(values.rotation[i], jnp.zeros(3))
+            return jnp.concatenate([values.position[i], angles])[EXTERIOR.index(name.parameter)]
+        if name.kind == "point":
+            return values.point[network.points.id.index(name.id), "XYZ".index(name.parameter)]
+        raise KeyError(f"an unknown is of a camera, an image or a point, not of a {name.kind!r}")
+
+    def covariance_of(self, function: Callable[[Values], jax.Array]) -> Float[np.ndarray, "n n"]:
+        """Covariance of any differentiable function of the adjusted unknowns (`Values` → [n])."""
+        s, values = self.problem.structure, self.values
+        zero = zero_tangent(s)
+        flat, unravel = ravel_pytree(zero)
+
+        def of_tangent(tangent: Tangent):
+            return jnp.atleast_1d(function(retract(s, values, tangent)))
+
+        rows = jax.jacrev(of_tangent)(zero)
+        del flat, unravel
+        Q = propagate(s, values, self._factor, rows)
+        return self.sigma0**2 * np.asarray(Q)
+
+    # --- tables -----------------------------------------------------------------------------
+
+    @property
+    def angle_scale(self) -> float:
+        """Factor from radians to the network's angle unit."""
+        return ANGLE_UNITS[self.network.angle_unit]
+
+    @functools.cached_property
+    def cameras(self) -> dict[str, dict]:
+        """Per camera: model, and per parameter value, sigma, free, t, total_correlation; and the
+        correlation matrix of the free ones."""
+        tables = {}
+        for given in self.problem.network.cameras:
+            values = self.camera_parameters(given.id)
+            free, covariance = self.camera_covariance(given.id)
+            sigma = dict(zip(free, np.sqrt(np.diagonal(covariance))))
+            total = dict(zip(free, total_correlation(covariance))) if free else {}
+            tables[given.id] = {
+                "model": given.model,
+                "parameters": {
+                    name: {
+                        "value": value,
+                        "sigma": float(sigma[name]) if name in sigma else None,
+                        "free": name in sigma,
+                        "t": abs(value) / float(sigma[name]) if name in sigma else None,
+                        "total_correlation": float(total[name]) if name in sigma else None,
+                    }
+                    for name, value in values.items()
+                },
+                "free": free,
+                "correlations": correlation_matrix(covariance),
+            }
+        return tables
+
+    @functools.cached_property
+    def images(self) -> dict[str, np.ndarray]:
+        """Columns id, X0 … kappa, sX0 … skappa (angles in the network's unit), rays, rms (of v,
+        image unit)."""
+        s = self.problem.structure
+        scale = np.array([1, 1, 1, *[self.angle_scale] * 3])
+        values = self.image_values * scale
+        sigma = np.sqrt(np.clip(np.diagonal(self.image_covariance, axis1=1, axis2=2), 0, None))
+        sigma = sigma * scale
+        image = np.asarray(s.image)
+        weight = np.asarray(self.problem.data.image_weight)
+        used = weight > 0
+        v = np.asarray(self.reliability.residual.image) / np.where(used, weight, 1.0)
+        squares = np.bincount(image, (v**2 * used).sum(1), minlength=s.images)
+        number = np.bincount(image, used.sum(1), minlength=s.images)
+        table = {"id": np.array(self.problem.network.images.id, dtype=object)}
+        table |= {name: values[:, i] for i, name in enumerate(EXTERIOR)}
+        table |= {f"s{name}": sigma[:, i] for i, name in enumerate(EXTERIOR)}
+        table["rays"] = np.bincount(image, used.any(1), minlength=s.images).astype(int)
+        table["rms"] = np.sqrt(squares / np.maximum(number, 1))
+        return table
+
+    @functools.cached_property
+    def points(self) -> dict[str, np.ndarray]:
+        """Columns id, role, X, Y, Z, sX, sY, sZ, rays."""
+        network, s = self.problem.network, self.problem.structure
+        sigma = np.sqrt(np.clip(np.diagonal(self.point_covariance, axis1=1, axis2=2), 0, None))
+        used = (np.asarray(self.problem.data.image_weight) > 0).any(1)
+        table = {
+            "id": np.array(network.points.id, dtype=object),
+            "role": np.array(network.points.role, dtype=object),
+        }
+        table |= {axis: self.point_values[:, i] for i, axis in enumerate("XYZ")}
+        table |= {f"s{axis}": sigma[:, i] for i, axis in enumerate("XYZ")}
+        table["rays"] = np.bincount(np.asarray(s.point), used, minlength=s.points).astype(int)
+        return table
+
+    @functools.cached_property
+    def residuals(self) -> dict[str, np.ndarray]:
+        """One row an observation: kind, image, point, axis, v, sigma (a priori), r, w (Baarda),
+        tau (Pope), mdb, external; image observations first, in the order they were given."""
+        s, data, found = self.problem.structure, self.problem.data, self.reliability
+        network = self.problem.network
+        images = np.array(network.images.id, dtype=object)
+        points = np.array(network.points.id, dtype=object)
+        cameras = np.array([c.id for c in network.cameras], dtype=object)
+        blank = lambda rows: np.full(rows, "", dtype=object)
+        back = np.argsort(order_rays(network), kind="stable")
+        image = np.asarray(s.image)[back]
+        point = np.asarray(s.point)[back]
+        parts = [
+            ("image", images[image], points[point], ("x", "y"), back,
+             found.residual.image, data.image_weight, found.redundancy.image, found.w.image),
+        ]  # fmt: skip
+        control = points[np.asarray(s.control)]
+        parts.append(("control", blank(len(control)), control, tuple("XYZ"), np.s_[:],
+                      found.residual.control, data.control_weight, found.redundancy.control,
+                      found.w.control))  # fmt: skip
+        exterior = images[np.asarray(s.exterior)]
+        parts.append(("prior", exterior, blank(len(exterior)), EXTERIOR, np.s_[:],
+                      found.residual.exterior, data.exterior_weight, found.redundancy.exterior,
+                      found.w.exterior))  # fmt: skip
+        for row, c in enumerate(np.asarray(s.interior)):
+            axes = get_model(network.cameras[c].model).parameters
+            one = np.s_[row : row + 1, : len(axes)]
+            parts.append(("prior", cameras[[c]], blank(1), axes, np.s_[:],
+                          found.residual.interior[one], data.interior_weight[one],
+                          found.redundancy.interior[one], found.w.interior[one]))  # fmt: skip
+        a, b = (points[np.asarray(s.distance)[:, i]] for i in range(2))
+        parts.append(("distance", a, b, ("d",), np.s_[:], found.residual.distance[:, None],
+                      data.distance_weight[:, None], found.redundancy.distance[:, None],
+                      found.w.distance[:, None]))  # fmt: skip
+        return _concatenate([_residual_rows(self, *part) for part in parts])
+
+    def table(self, name: str) -> dict[str, np.ndarray]:
+        """A table by name: images, points, residuals, cameras (one row a parameter) or checks."""
+        if name == "cameras":
+            rows = [
+                {"camera": camera, "model": given["model"], "parameter": parameter, **entry}
+                for camera, given in self.cameras.items()
+                for parameter, entry in given["parameters"].items()
+            ]
+            return {key: np.array([row[key] for row in rows], dtype=object) for key in rows[0]}
+        if name == "checks":
+            found = self.check_points
+            if found is None:
+                return {}
+            sigma = self.sigma0 * np.sqrt(np.diagonal(found.cofactor, axis1=1, axis2=2))
+            table = {"id": np.array(found.id, dtype=object)}
+            table |= {axis: found.position[:, i] for i, axis in enumerate("XYZ")}
+            table |= {f"d{axis}": found.difference[:, i] for i, axis in enumerate("XYZ")}
+            table |= {f"s{axis}": sigma[:, i] for i, axis in enumerate("XYZ")}
+            return table | {"rays": found.rays}
+        if name not in ("images", "points", "residuals"):
+            raise KeyError(f"tables are cameras, images, points, residuals, checks; not {name!r}")
+        return getattr(self, name)
+
+    def to_pandas(self, name: str):
+        """A table as a pandas data frame (extra `tables`)."""
+        try:
+            import pandas
+        except ImportError as error:
+            raise ImportError("data frames need pandas: pip install 'jaxbundle[tables]'") from error
+        return pandas.DataFrame(self.table(name))
+
+
+def _angles(rotation, d_theta):
+    return omega_phi_kappa_from_matrix(
+        matrix_from_quaternion(retract_quaternion(rotation, d_theta))
+    )
+
+
+def _residual_rows(adjustment, kind, image, point, axes, order, v, weight, r, w):
+    """The rows of one kind of observation [things × axes] as columns; weightless rows left out."""
+    v, weight, r, w = (np.asarray(x)[order] for x in (v, weight, r, w))
+    if kind == "prior" and axes == EXTERIOR:
+        unit = np.array([1, 1, 1, *[adjustment.angle_scale] * 3])
+    else:
+        unit = np.ones(weight.shape[1])
+    used = weight > 0
+    sigma = np.where(used, unit / np.where(used, weight, 1), np.nan)
+    repeat = lambda ids: np.repeat(ids, len(axes))
+    columns = {
+        "kind": np.full(weight.size, kind, dtype=object),
+        "image": repeat(image),
+        "point": repeat(point),
+        "axis": np.tile(np.array(axes, dtype=object), len(image)),
+        "v": (v * sigma).ravel(),
+        "sigma": sigma.ravel(),
+        "r": r.ravel(),
+        "w": w.ravel(),
+        "tau": (w / adjustment.sigma0).ravel(),
+        "mdb": np.asarray(minimal_detectable(sigma, r)).ravel(),
+        "external": np.asarray(external_reliability(r)).ravel(),
+    }
+    return {name: column[used.ravel()] for name, column in columns.items()}
+
+
+def _concatenate(tables):
+    return {name: np.concatenate([t[name] for t in tables]) for name in tables[0]}

@@ -1,0 +1,338 @@
+"""What the tests of the adjustment share: synthetic networks, and the dense algebra as an oracle.
+
+A network is a ring of images around a box of points, every image turned about its axis, every
+fifth ray missing. Lengths are in metres, the camera of 20 mm stands 4 m away, σ is 5 µm.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from jaxbundle import cameras
+from jaxbundle.adjustment.jacobian import free_tangent, jacobian, zero_tangent
+from jaxbundle.adjustment.problem import make_problem
+from jaxbundle.adjustment.residuals import residuals
+from jaxbundle.adjustment.solve import find_minimum, make_solver
+from jaxbundle.geometry import matrix_from_omega_phi_kappa, omega_phi_kappa_from_matrix
+from jaxbundle.network import Camera, Distances, Images, Network, Observations, Points, retract
+
+CAMERAS = {
+    "brown": dict(c=20.0, x0=0.11, y0=-0.07, K1=2e-4, K2=-1e-6, K3=4e-9, P1=3e-5, P2=-2e-5,
+                  b1=-1e-3, b2=4e-4, r0=1.5),
+    "brown-projected": dict(c=20.0, x0=0.02, y0=0.06, K1=-2e-4, K2=1e-6, K3=-2e-9, P1=2e-5,
+                            P2=-3e-5, b1=-7e-4, b2=-3e-4, r0=3.0),
+    "usgs": dict(c=150.0, x0=-0.03, y0=0.09, K0=-5e-5, K1=4e-8, K2=-3e-12, K3=1e-17, K4=-1e-21,
+                 P1=-8e-7, P2=-9e-7, P3=1e-6, P4=-1e-11),
+    "bingo": dict(c=127.0, x0=-0.05, y0=0.16, p25=16.3, p26=-1.8, format_factor=1.28),
+    "opencv": dict(fx=1000.0, fy=1004.0, cx=640.3, cy=477.6, k1=-0.2, k2=-0.04, p1=1.8e-3,
+                   p2=-3e-4, k3=0.2, k4=0.01, k5=-0.02, k6=0.03, s1=1e-3, s2=-2e-3, s3=-1e-3,
+                   s4=5e-4),
+    "kannala-brandt": dict(fx=700.0, fy=703.0, cx=642.0, cy=478.0, k1=0.1, k2=0.05, k3=-0.03,
+                           k4=6e-3),
+    "snavely": dict(f=500.0, k1=-0.12, k2=0.03),
+}  # fmt: skip
+"""A camera for every model, with all its parameters different from zero."""
+
+SELF_CALIBRATION = ("c", "x0", "y0", "K1")
+RELATIVE_SIGMA = 2.5e-4
+"""σ of image coordinates as a fraction of the principal distance."""
+
+
+def camera(id="cam", model="brown", free=SELF_CALIBRATION, sigma=None):
+    return Camera(id, model, CAMERAS[model], tuple(free), sigma or {})
+
+
+def free_parameters(model):
+    """Everything of a model that may be free."""
+    model = cameras.get_model(model)
+    return tuple(name for name in model.parameters if name not in model.never_free)
+
+
+@dataclasses.dataclass(frozen=True)
+class Truth:
+    """What a synthetic network was made from."""
+
+    camera: dict
+    position: np.ndarray
+    matrix: np.ndarray
+    point: np.ndarray
+
+
+def synthetic(
+    *,
+    cameras=(camera(),),
+    of_image=None,
+    images=6,
+    points=9,
+    control=0,
+    fixed=0,
+    distances=(),
+    held=(),
+    exterior_prior=False,
+    datum="control",
+    datum_points=(),
+    domain="corrected",
+    noise=1.0,
+    disturbance=1.0,
+    seed=0,
+):
+    """A network and the truth behind it.
+
+    **Arguments:** `of_image`: the camera of every image (all the first); `control`, `fixed`: how
+    many of the first points are control points with σ, and how many of the next are fixed;
+    `distances`: pairs of point indices; `held`: pairs (image, columns of its exterior orientation);
+    `noise`: of all observations, in σ; `disturbance`: of the start values.
+    """
+    rng = np.random.default_rng(seed)
+    truth = Truth({c.id: c.parameters for c in cameras}, *_ring(images), _box(points, rng))
+    of_image = np.zeros(images, int) if of_image is None else np.asarray(of_image)
+    image, point = np.divmod(np.arange(images * points), points)
+    seen = (image + 2 * point) % 5 != 0
+    image, point = image[seen], point[seen]
+    xy, sigma = _measure(cameras, of_image, truth, image, point, rng, noise)
+
+    position = truth.position + 0.02 * disturbance * rng.normal(size=(images, 3))
+    angles = _angles(truth.matrix) + 0.005 * disturbance * rng.normal(size=(images, 3))
+    image_sigma = np.full((images, 6), np.nan)
+    if exterior_prior:
+        prior = np.array([0.01, 0.02, 0.015, 2e-3, 1e-3, 3e-3])
+        image_sigma[:] = prior
+        position = truth.position + noise * prior[:3] * rng.normal(size=(images, 3))
+        angles = _angles(truth.matrix) + noise * prior[3:] * rng.normal(size=(images, 3))
+    for row, columns in held:
+        image_sigma[row, list(columns)] = 0.0
+    role = ["control"] * control + ["fixed"] * fixed + ["tie"] * (points - control - fixed)
+    object_point = truth.point + 0.02 * disturbance * rng.normal(size=(points, 3))
+    object_sigma = np.full((points, 3), np.nan)
+    object_sigma[:control] = [0.002, 0.003, 0.001]
+    object_point[:control] = truth.point[:control] + noise * object_sigma[:control] * rng.normal(
+        size=(control, 3)
+    )
+    object_point[control : control + fixed] = truth.point[control : control + fixed]
+    network = Network(
+        cameras=tuple(cameras),
+        images=Images(
+            tuple(f"image {i}" for i in range(images)), of_image, position, angles, image_sigma
+        ),
+        points=Points(
+            tuple(f"P{i}" for i in range(points)), tuple(role), object_point, object_sigma
+        ),
+        observations=Observations(image, point, xy, sigma),
+        distances=_distances(truth.point, distances, rng, noise),
+        datum=datum,
+        datum_points=tuple(datum_points),
+        residuals=domain,
+    )
+    return network, truth
+
+
+def _ring(count):
+    """Projection centres 4 m around the origin and rotations that look at it."""
+    i = np.arange(count)
+    azimuth, height = 2 * np.pi * i / count + 0.1, np.where(i % 2, 0.6, 1.0)
+    z = np.stack(
+        [np.cos(height) * np.cos(azimuth), np.cos(height) * np.sin(azimuth), np.sin(height)], 1
+    )
+    x = np.cross([0.0, 0.0, 1.0], z)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    y = np.cross(z, x)
+    turn = 1.3 * i
+    c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
+    return (4 + 0.2 * (i % 3))[:, None] * z, np.stack([c * x + s * y, c * y - s * x, z], 1)
+
+
+def _box(count, rng):
+    return rng.uniform([-0.8, -0.8, -0.5], [0.8, 0.8, 0.5], (count, 3))
+
+
+def _angles(matrix):
+    return np.asarray(jax.vmap(omega_phi_kappa_from_matrix)(jnp.asarray(matrix)))
+
+
+def _measure(given, of_image, truth, image, point, rng, noise):
+    xy, sigma = np.zeros((len(image), 2)), np.zeros((len(image), 2))
+    rays = np.einsum(
+        "nij,nj->ni", truth.matrix[image], truth.point[point] - truth.position[image]
+    )
+    for index, one in enumerate(given):
+        model = cameras.get_model(one.model)
+        p = [{**cameras.default_parameters(model), **one.parameters}[n] for n in model.parameters]
+        rows = of_image[image] == index
+        project = jax.vmap(lambda r, s, q, model=model, p=p: cameras.project(model, p, r, s, q))
+        xy[rows] = np.stack(project(*jnp.asarray(rays[rows].T)), 1)
+        sigma[rows] = RELATIVE_SIGMA * p[0] * rng.uniform(0.8, 1.2, (rows.sum(), 2))
+    assert np.isfinite(xy).all()
+    return xy + noise * sigma * rng.normal(size=xy.shape), sigma
+
+
+def _distances(point, ends, rng, noise):
+    if not len(ends):
+        return Distances.none()
+    ends = np.asarray(ends)
+    sigma = np.full(len(ends), 1e-3)
+    true = np.linalg.norm(point[ends[:, 0]] - point[ends[:, 1]], axis=1)
+    return Distances(ends, true + noise * sigma * rng.normal(size=len(ends)), sigma)
+
+
+SIX = range(6)
+NETWORKS = {
+    "shared camera": dict(control=4),
+    "no interior": dict(cameras=(camera(free=()),), fixed=3, domain="measured"),
+    "own cameras": dict(
+        cameras=tuple(camera(f"cam {i}", free=("c", "x0"), sigma=dict(c=0.05)) for i in SIX),
+        of_image=SIX, control=4, points=12,
+    ),
+    "own cameras, different models": dict(
+        cameras=tuple(
+            camera(f"cam {i}", ("brown", "snavely", "opencv")[i % 3],
+                   (("c", "x0", "y0"), ("f",), ("fx", "k1"))[i % 3]) for i in SIX
+        ),
+        of_image=SIX, control=5, points=12, distances=((5, 6),), domain="measured",
+    ),
+    "two models": dict(
+        cameras=(camera("a", sigma=dict(x0=0.01, K1=1e-5)), camera("b", "opencv", ("fx", "fy"))),
+        of_image=(0, 1, 1, 0, 1, 0), control=4,
+    ),
+    "fixed points, distances": dict(fixed=3, distances=((0, 5), (5, 6), (6, 7))),
+    "distances, control": dict(control=4, distances=((0, 5), (5, 6), (4, 7)), domain="measured"),
+    "held images": dict(held=((0, SIX), (1, (0, 1, 2)), (2, (2,)))),
+    "exterior priors": dict(exterior_prior=True, held=((4, (1,)),)),
+    "free": dict(datum="inner"),
+    "free, own cameras": dict(
+        cameras=tuple(camera(f"cam {i}", free=("c",)) for i in SIX), of_image=SIX, points=12,
+        datum="inner", datum_points=("P1", "P2", "P4", "P5", "P7"),
+    ),
+    "free, distance": dict(datum="inner", distances=((0, 5), (3, 4)), domain="measured"),
+    "minimal": dict(datum="minimal", domain="measured"),
+    "one fixed point": dict(fixed=1, datum="inner"),
+}  # fmt: skip
+"""Kinds of networks that every part of the solver has to handle."""
+
+DEFECTS = {
+    "free": 7, "free, own cameras": 7, "free, distance": 6, "minimal": 7, "one fixed point": 4,
+}  # fmt: skip
+
+
+def make(name, **changes):
+    """The problem of one of `NETWORKS`."""
+    return make_problem(synthetic(**{**NETWORKS[name], **changes})[0])
+
+
+def solved(problem, data=None, **options):
+    return find_minimum(make_solver(problem, **options), problem.data if data is None else data)
+
+
+def flat(tree):
+    """A tangent, residuals, … as one numpy vector, in the order of `as_matrix`."""
+    return np.asarray(ravel_pytree(tree)[0])
+
+
+def columns(tree):
+    """A tangent whose blocks have a last axis of columns, as a matrix [unknowns, columns]."""
+    return np.concatenate([np.asarray(x).reshape(-1, x.shape[-1]) for x in jax.tree.leaves(tree)])
+
+
+def of_change(structure, values, data):
+    """residuals ∘ retract as a function of a flat change of the free unknowns, and its size."""
+    zero, unravel = ravel_pytree(zero_tangent(structure))
+    free = ravel_pytree(free_tangent(structure))[0]
+
+    def function(change):
+        moved = retract(structure, values, unravel(change * free))
+        return ravel_pytree(residuals(structure, moved, data))[0]
+
+    return function, zero
+
+
+@eqx.filter_jit
+def dense_jacobian(structure, values, data):
+    """The Jacobian by forward mode through everything at once, knowing no blocks."""
+    function, zero = of_change(structure, values, data)
+    return jax.jacfwd(function)(zero)
+
+
+@eqx.filter_jit
+def block_jacobian(structure, values, data):
+    """The dense matrix of the Jacobian in blocks."""
+    return jacobian(structure, values, data).as_matrix()
+
+
+@eqx.filter_jit
+def flat_residuals(structure, values, data, change):
+    """residuals(retract(values, change)) as a vector."""
+    return of_change(structure, values, data)[0](change)
+
+
+def dense_normal(structure, normal):
+    """The blocks of a normal matrix put into a dense one, block by block, in plain loops."""
+    s, n = structure, jax.tree.map(np.asarray, normal)
+    w, k = s.image_width, s.camera_width
+    at_camera = s.images * w
+    at_point = at_camera + s.cameras * k
+    N = np.zeros((at_point + 3 * s.points,) * 2)
+    image = lambda i: slice(i * w, (i + 1) * w)
+    camera = lambda c: slice(at_camera + c * k, at_camera + (c + 1) * k)
+    point = lambda p: slice(at_point + 3 * p, at_point + 3 * p + 3)
+
+    def add(rows, columns, block):
+        N[rows, columns] += block
+        if rows != columns:
+            N[columns, rows] += block.T
+
+    for i in range(s.images):
+        add(image(i), image(i), n.image[i])
+        if k:
+            add(image(i), camera(int(s.camera_of_image[i])), n.image_camera[i])
+    for c in range(s.cameras if k else 0):
+        add(camera(c), camera(c), n.camera[c])
+    for p in range(s.points):
+        add(point(p), point(p), n.point[p])
+    for ray in range(s.rays):
+        add(point(int(s.point[ray])), image(int(s.image[ray])), n.image_point[ray])
+    for row, ray in enumerate(np.asarray(s.kept_rays)):
+        add(point(int(s.point[ray])), image(int(s.image[ray])), n.kept_image[row])
+        if k:
+            add(point(int(s.point[ray])), camera(int(s.camera[ray])), n.kept_camera[row])
+    if k:
+        for row in range(s.incidence.point.shape[0]):
+            add(point(int(s.incidence.point[row])), camera(int(s.incidence.camera[row])),
+                n.camera_point[row])  # fmt: skip
+    for row, (a, b) in enumerate(np.asarray(s.distance)):
+        add(point(int(a)), point(int(b)), n.kept_kept[row])
+    return N
+
+
+def datum_matrices(structure, values):
+    """G of the open directions and B of the datum, dense [unknowns, defect]."""
+    from jaxbundle.adjustment.datum import gauge_directions
+
+    G = gauge_directions(structure, values)
+    weighted = G.point * structure.datum_weight[..., None]
+    B = type(G)(jnp.zeros_like(G.image), jnp.zeros_like(G.camera), weighted)
+    return columns(G), columns(B)
+
+
+def bordered_inverse(N, B, free):
+    """The inverse of N with the datum conditions Bᵀδ = 0: the upper left part of [N B; Bᵀ 0]⁻¹.
+
+    Scaled to unit diagonal, held unknowns left out (zero in the result).
+    """
+    free = np.flatnonzero(np.asarray(free) > 0)
+    scale = 1 / np.sqrt(np.diag(N)[free])
+    B = B[free] * (1 / scale[:, None])
+    B = B / np.where(np.linalg.norm(B, axis=0) > 0, np.linalg.norm(B, axis=0), 1)
+    B = B[:, : B.shape[1]]
+    # δ = scale·x: Bᵀδ = (B·scale)ᵀx
+    constraint = B * scale[:, None] ** 2
+    constraint = constraint / np.linalg.norm(constraint, axis=0) if B.shape[1] else constraint
+    A = N[np.ix_(free, free)] * scale[:, None] * scale
+    d = B.shape[1]
+    full = np.block([[A, constraint], [constraint.T, np.zeros((d, d))]])
+    inverse = np.linalg.inv(full)[: len(free), : len(free)] * scale[:, None] * scale
+    result = np.zeros_like(N)
+    result[np.ix_(free, free)] = inverse
+    return result

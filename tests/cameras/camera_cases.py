@@ -1,0 +1,84 @@
+"""One real or realistic camera for every model, with all its parameters different from zero."""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbundle import cameras
+
+
+@dataclass(frozen=True)
+class Case:
+    """A camera: model, parameters by name, and the image as (centre, half width, half height)."""
+
+    name: str
+    values: dict[str, float]
+    centre: tuple[float, float]
+    half: tuple[float, float]
+
+    @property
+    def model(self):
+        return cameras.get_model(self.name)
+
+    @property
+    def p(self):
+        return tuple(self.values[name] for name in self.model.parameters)
+
+    @property
+    def half_diagonal(self):
+        return float(np.hypot(*self.half))
+
+    def grid(self, n):
+        """n × n points over the whole image, the principal point, and the image centre: [m, 2]."""
+        x = np.linspace(-1, 1, n) * self.half[0] + self.centre[0]
+        y = np.linspace(-1, 1, n) * self.half[1] + self.centre[1]
+        points = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+        principal_point = [float(v) for v in self.model.from_ideal(self.p, 0.0, 0.0)]
+        return jnp.asarray(np.vstack([points, principal_point, self.centre]))
+
+
+CASES = [
+    Case(
+        "brown",
+        dict(c=7.457, x0=3.616, y0=-2.608, K1=4.57e-3, K2=-4.26e-5, K3=-2.16e-6, P1=-6.6e-5,
+             P2=-3e-5, b1=-1.6e-3, b2=2.8e-4, r0=1.5),
+        (3.6266, -2.7188), (3.6266, 2.7188),
+    ),
+    Case(
+        "brown-projected",
+        dict(c=28.785, x0=0.0173, y0=0.0567, K1=-1.096e-4, K2=1.4957e-7, K3=-2e-11, P1=5.8e-6,
+             P2=-8.6e-6, b1=-7e-5, b2=-3.1e-5, r0=13.488),
+        (0, 0), (18, 12),
+    ),
+    Case(
+        "usgs",
+        dict(c=153.068, x0=-0.003, y0=0.009, K0=-4.894e-5, K1=4.278e-9, K2=-2.968e-14, K3=1e-19,
+             K4=-1e-24, P1=-7.9e-8, P2=-9.158e-8, P3=1e-6, P4=-1e-11),
+        (0, 0), (110, 110),
+    ),
+    Case(
+        "bingo",
+        dict(c=126.9924, x0=-0.0049, y0=0.1569, p25=16.3057, p26=-1.7983, format_factor=1.2778),
+        (0, 0), (96, 54),
+    ),
+    Case(
+        "opencv",
+        dict(fx=535.9, fy=536.2, cx=342.3, cy=235.6, k1=-0.2663, k2=-0.0386, p1=0.0018, p2=-0.0003,
+             k3=0.2386, k4=0.01, k5=-0.02, k6=0.03, s1=1e-3, s2=-2e-3, s3=-1e-3, s4=5e-4),
+        (319.5, 239.5), (320, 240),
+    ),
+    Case(
+        "kannala-brandt",
+        dict(fx=380.0, fy=381.0, cx=642.0, cy=478.0, k1=0.1, k2=0.05, k3=-0.03, k4=0.006),
+        (639.5, 479.5), (640, 480),
+    ),
+    Case("snavely", dict(f=500.0, k1=-0.12, k2=0.03), (0, 0), (320, 240)),
+]
+
+
+def each_case(test):
+    """Runs a test for every camera."""
+    import pytest
+
+    return pytest.mark.parametrize("case", CASES, ids=[c.name for c in CASES])(test)
