@@ -11,12 +11,11 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from jaxbundle.adjustment.jacobian import zero_tangent
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.adjustment.residuals import half_square, residuals
+from jaxbundle.adjustment.residuals import compiled_residuals, half_square
 from jaxbundle.adjustment.solve import converged
 from jaxbundle.adjustment.solver import TERMINATIONS, Minimum
 from jaxbundle.adjustment.unknowns import Name, interior_names
@@ -136,7 +135,7 @@ class Adjustment:
     def vtpv(self) -> float:
         """vᵀPv of all observations, pseudo-observations included."""
         s, data = self.problem.structure, self.problem.data
-        return 2 * float(half_square(residuals(s, self.values, data)))
+        return 2 * float(half_square(compiled_residuals(s, self.values, data)))
 
     @property
     def sigma0(self) -> float:
@@ -185,7 +184,7 @@ class Adjustment:
     def image_values(self) -> Float[np.ndarray, "images 6"]:
         """X0, Y0, Z0 (object unit), ω, φ, κ (radians)."""
         values = self.values
-        angles = jax.vmap(_angles)(values.rotation, jnp.zeros((len(values.rotation), 3)))
+        angles = _all_angles(values.rotation)[0]
         position = np.asarray(values.position) + self.problem.origin
         return np.concatenate([position, np.asarray(angles)], 1)
 
@@ -199,7 +198,7 @@ class Adjustment:
         Q = Q[at, :, at, :][:, :6, :6]
         A = np.zeros((n, 6, 6))
         A[:, :3, :3] = np.eye(3)
-        A[:, 3:, 3:] = jax.vmap(jax.jacfwd(_angles, 1))(self.values.rotation, jnp.zeros((n, 3)))
+        A[:, 3:, 3:] = _all_angles(self.values.rotation)[1]
         free = np.asarray(s.image_free)
         Q = Q * free[:, :, None] * free[:, None, :]
         return self.sigma0**2 * A @ Q @ A.transpose(0, 2, 1)
@@ -275,13 +274,11 @@ class Adjustment:
         """Covariance of any differentiable function of the adjusted unknowns (`Values` → [n])."""
         s, values = self.problem.structure, self.values
         zero = zero_tangent(s)
-        flat, unravel = ravel_pytree(zero)
 
         def of_tangent(tangent: Tangent):
             return jnp.atleast_1d(function(retract(s, values, tangent)))
 
         rows = jax.jacrev(of_tangent)(zero)
-        del flat, unravel
         Q = propagate(s, values, self._factor, rows)
         return self.sigma0**2 * np.asarray(Q)
 
@@ -429,6 +426,13 @@ def _angles(rotation, d_theta):
     return omega_phi_kappa_from_matrix(
         matrix_from_quaternion(retract_quaternion(rotation, d_theta))
     )
+
+
+@jax.jit
+def _all_angles(rotation):
+    """ω, φ, κ of all images, and their Jacobians by δθ."""
+    zero = jnp.zeros((rotation.shape[0], 3))
+    return jax.vmap(_angles)(rotation, zero), jax.vmap(jax.jacfwd(_angles, 1))(rotation, zero)
 
 
 def _residual_rows(adjustment, kind, image, point, axes, order, v, weight, r, w):

@@ -175,6 +175,10 @@ def jacobian(structure: Structure, values: Values, data: Data) -> BundleJacobian
     )  # fmt: skip
 
 
+compiled_jacobian = eqx.filter_jit(jacobian)
+"""`jacobian`, compiled once and shared by everything that looks at a solution."""
+
+
 def _image_blocks(structure, group, values, data):
     """Derivatives of the rays of one camera model: exterior [n,2,6], interior [n,2,k], point."""
     model = cameras.get_model(group.model)

@@ -154,6 +154,10 @@ def residuals(structure: Structure, values: Values, data: Data) -> Residuals:
     )
 
 
+compiled_residuals = eqx.filter_jit(residuals)
+"""`residuals`, compiled once and shared by everything that looks at a solution."""
+
+
 def half_square(r: Residuals) -> Float[Array, ""]:
     """Half the weighted sum of squares, ½·vᵀPv."""
     return 0.5 * sum(jnp.vdot(x, x) for x in jax.tree.leaves(r))

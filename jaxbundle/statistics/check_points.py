@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.adjustment.jacobian import jacobian
+from jaxbundle.adjustment.jacobian import compiled_jacobian
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.adjustment.residuals import residuals
+from jaxbundle.adjustment.residuals import compiled_residuals
 from jaxbundle.network.arrays import Data, Values
 from jaxbundle.network.structure import Structure, make_structure
 from jaxbundle.network.tables import Distances, Observations, Points
@@ -82,10 +82,15 @@ def _intersect(s: Structure, values: Values, data: Data):
     return values.point, np.asarray(V), np.asarray(W)
 
 
-@eqx.filter_jit
 def _newton(s, values, data):
-    jac = jacobian(s, values, data)
-    residual = residuals(s, values, data).image
+    jac = compiled_jacobian(s, values, data)
+    residual = compiled_residuals(s, values, data).image
+    return _blocks(jac, residual)
+
+
+@eqx.filter_jit
+def _blocks(jac, residual):
+    s = jac.structure
     V = jnp.zeros((s.points, 3, 3)).at[s.point].add(
         jnp.einsum("nai,naj->nij", jac.point, jac.point)
     )

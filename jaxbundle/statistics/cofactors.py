@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbundle.adjustment.datum import gauge_directions
-from jaxbundle.adjustment.jacobian import jacobian
+from jaxbundle.adjustment.jacobian import compiled_jacobian
 from jaxbundle.adjustment.normal import normal_from_jacobian
 from jaxbundle.adjustment.schur import Factor, factorise, reduced_vector, solve
 from jaxbundle.network.arrays import Data, Tangent, Values
@@ -44,11 +44,15 @@ class Cofactors(eqx.Module):
     internal_point: Float[Array, "points 3 3"]
 
 
-@eqx.filter_jit
 def undamped_factor(structure: Structure, values: Values, data: Data) -> Factor:
     """The factor of JᵀPJ at the solution, datum directions made regular."""
-    normal = normal_from_jacobian(jacobian(structure, values, data))
-    return factorise(structure, normal, gauge=gauge_directions(structure, values))
+    return _factorised(compiled_jacobian(structure, values, data), values)
+
+
+@eqx.filter_jit
+def _factorised(jac, values):
+    gauge = gauge_directions(jac.structure, values)
+    return factorise(jac.structure, normal_from_jacobian(jac), gauge=gauge)
 
 
 @eqx.filter_jit

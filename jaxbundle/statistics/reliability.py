@@ -14,8 +14,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbundle.adjustment.jacobian import BundleJacobian, jacobian
-from jaxbundle.adjustment.residuals import Residuals, residuals
+from jaxbundle.adjustment.jacobian import BundleJacobian, compiled_jacobian
+from jaxbundle.adjustment.residuals import Residuals, compiled_residuals
 from jaxbundle.network.arrays import Data, Values
 from jaxbundle.network.structure import Structure
 from jaxbundle.statistics.cofactors import Cofactors
@@ -32,13 +32,17 @@ class Reliability(eqx.Module):
     w: Residuals
 
 
-@eqx.filter_jit
 def reliability(
     structure: Structure, values: Values, data: Data, cofactors: Cofactors
 ) -> Reliability:
     """Redundancy numbers and test statistics of all observations."""
-    residual = residuals(structure, values, data)
-    hat = hat_diagonal(jacobian(structure, values, data), cofactors)
+    residual = compiled_residuals(structure, values, data)
+    return _tested(compiled_jacobian(structure, values, data), residual, data, cofactors)
+
+
+@eqx.filter_jit
+def _tested(jac, residual, data, cofactors) -> Reliability:
+    hat = hat_diagonal(jac, cofactors)
     weight = _weights(data)
     number = lambda h, weight: jnp.where(weight > 0, jnp.clip(1.0 - h, 0.0, 1.0), 0.0)
     r = Residuals(*(number(h, w) for h, w in zip(_kinds(hat), weight)))

@@ -49,11 +49,6 @@ def test_bingo_radial_tables(table):
         assert_allclose(1000 * (R - ideal), listed, atol=0.065)
 
 
-# seed 002, camera 1 indoor: photographs 1001 and 1010 (X0, Y0, Z0 in m; φ, ω, κ in gon), a few of
-# its object points, and their image coordinates in a simulation of that network, apart from ours
-BINGO_ORIENTATION = (126.9924, -0.0049, 0.1569, 16.3057, -1.7983, 1.2778)
-
-
 def test_usgs_report_of_calibration():
     values = dict(c=153.068, K0=-4.894e-5, K1=4.278e-9, K2=-2.968e-14, P1=-7.9e-8, P2=-9.158e-8)
     model = cameras.get_model("usgs")

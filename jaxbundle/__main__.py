@@ -1,0 +1,5 @@
+"""`python -m jaxbundle` is the command line."""
+
+from jaxbundle.cli import main
+
+main()

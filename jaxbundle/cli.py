@@ -1,0 +1,190 @@
+"""The command line: `jaxbundle adjust`, `jaxbundle convert`.
+
+Exit status: 0 solved; 2 bad input (one line, nothing written); 3 not solved (says why).
+"""
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+# Threads of the BLAS fight over small matrices; must be set before jax is imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import typer
+from rich.console import Console
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+import jaxbundle
+from jaxbundle import report
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.io import read_network, write_project
+from jaxbundle.io.csv_tables import write_csv, write_text
+from jaxbundle.io.result_json import result_text, write_result
+from jaxbundle.plotting import save_figures
+from jaxbundle.result import Adjustment
+
+BAD_INPUT, NOT_SOLVED = 2, 3
+
+app = typer.Typer(
+    name="jaxbundle",
+    help="Least squares for photogrammetry: self-calibrating bundle adjustment.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+Input = Annotated[Path, typer.Argument(help="project .toml, text list of photographs, …")]
+
+
+@app.callback()
+def _main() -> None:
+    """Every command has its own help: jaxbundle adjust --help."""
+
+
+@app.command()
+def adjust(
+    input: Input,
+    json: Annotated[str, typer.Option(help="write the result as JSON; - for stdout alone")] = "",
+    out: Annotated[Path | None, typer.Option(help="folder for report, JSON, tables, plots")] = None,
+    set: Annotated[list[str] | None, typer.Option(help="KEY=VALUE replaces a setting")] = None,
+    format: Annotated[str | None, typer.Option(help="kind of input, if not recognised")] = None,
+    max_iterations: Annotated[int, typer.Option(min=1)] = 100,
+    method: Annotated[
+        str, typer.Option(help="levenberg-marquardt or gauss-newton")
+    ] = "levenberg-marquardt",
+    snooping: Annotated[
+        str | None, typer.Option(help="remove blunders one at a time: pope or baarda")
+    ] = None,
+    eliminate: Annotated[
+        bool, typer.Option("--eliminate", help="fix insignificant additional parameters (t < 2)")
+    ] = False,
+    components: Annotated[
+        bool, typer.Option("--components", help="estimate variance components of the groups")
+    ] = False,
+    brief: Annotated[bool, typer.Option("--brief", help="no points and residuals in JSON")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="print nothing but errors")] = False,
+    plots: Annotated[bool, typer.Option(help="plots in the folder of --out")] = True,
+) -> None:
+    """Adjust a network and report it."""
+    jaxbundle.enable_x64()
+    network = read_network(input, format, tuple(set or ()))
+    if method not in ("levenberg-marquardt", "gauss-newton"):
+        raise InputError(f"--method {method!r}: levenberg-marquardt or gauss-newton")
+    if snooping not in (None, "pope", "baarda"):
+        raise InputError(f"--snooping {snooping!r}: pope or baarda")
+    with _progress(quiet or json == "-") as tell:
+        result = jaxbundle.adjust(
+            network,
+            method=method,
+            max_iterations=max_iterations,
+            snooping=snooping,
+            eliminate=eliminate,
+            estimate_components=components,
+            progress=tell,
+        )
+    if json == "-":
+        print(result_text(result, brief), end="")
+    elif json:
+        write_result(result, json, brief)
+    if out is not None:
+        write_folder(result, out, plots)
+    if json != "-" and not quiet and result.converged:
+        print(report.text(result))
+    if not result.converged:
+        raise NotSolvedError(_why_not(result))
+
+
+@app.command()
+def convert(
+    input: Input,
+    output: Annotated[Path, typer.Argument(help="folder of the project to write")],
+    set: Annotated[list[str] | None, typer.Option(help="KEY=VALUE replaces a setting")] = None,
+    format: Annotated[str | None, typer.Option(help="kind of input, if not recognised")] = None,
+) -> None:
+    """Write any input as a project: project.toml and CSV tables."""
+    path = write_project(read_network(input, format, tuple(set or ())), output)
+    print(path)
+
+
+def write_folder(result: Adjustment, folder: Path, plots: bool = True) -> None:
+    """Report, JSON, CSV tables and plots of a result; each file whole or not at all."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--out {folder}: cannot be made ({error.strerror})") from error
+    write_text(folder / "report.txt", report.text(result))
+    write_result(result, folder / "result.json")
+    if not result.converged:
+        return
+    for name in ("cameras", "images", "points", "residuals", "checks"):
+        table = result.table(name)
+        if table:
+            write_csv(folder / f"{name}.csv", list(table), zip(*(c.tolist() for c in table.values())))
+    if plots:
+        try:
+            save_figures(result, folder)
+        except ImportError as error:
+            print(f"no plots: {error}", file=sys.stderr)
+
+
+def _why_not(result: Adjustment) -> str:
+    parts = [f"not solved: {result.termination}"]
+    if result.undetermined:
+        names = ", ".join(result.undetermined[:12])
+        more = len(result.undetermined) - 12
+        parts.append(f"not determined: {names}" + (f" and {more} more" if more > 0 else ""))
+        parts.append("fix them, give them a prior σ, or measure what determines them")
+    elif "limit" in result.termination:
+        parts.append("raise --max-iterations or give better start values")
+    else:
+        parts.append("give better start values and look for gross errors")
+    return "; ".join(parts)
+
+
+class _progress:
+    """A line with the iteration and vᵀPv on a terminal; nothing in a pipe."""
+
+    def __init__(self, silent: bool):
+        self.console = Console(stderr=True)
+        self.silent = silent or not self.console.is_terminal
+
+    def __enter__(self):
+        if self.silent:
+            return None
+        self.bar = Progress(
+            SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn(),
+            console=self.console, transient=True,
+        )  # fmt: skip
+        self.bar.start()
+        task = self.bar.add_task("compiling")
+        return lambda step, cost, damping: self.bar.update(
+            task, description=f"iteration {int(step)}: vᵀPv {2 * float(cost):.6g}"
+        )
+
+    def __exit__(self, *_):
+        if not self.silent:
+            self.bar.stop()
+
+
+def main() -> None:
+    """Run the command line; errors of the input and of the solution end in one line."""
+    try:
+        app(standalone_mode=False)
+    except (InputError, NotSolvedError) as error:
+        print(f"jaxbundle: {error}", file=sys.stderr)
+        sys.exit(BAD_INPUT if isinstance(error, InputError) else NOT_SOLVED)
+    except typer.Exit as error:
+        sys.exit(error.exit_code)
+    except typer.Abort:
+        sys.exit(130)
+    except Exception as error:
+        # Usage errors of the command line itself (unknown option, missing argument).
+        if hasattr(error, "format_message"):
+            print(f"jaxbundle: {error.format_message()}", file=sys.stderr)
+            sys.exit(BAD_INPUT)
+        raise
+
+
+if __name__ == "__main__":
+    main()

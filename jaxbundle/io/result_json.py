@@ -1,0 +1,144 @@
+"""The result of an adjustment as JSON (the fields are listed in docs/result.md).
+
+σ are a posteriori, w uses the a priori σ. A number that does not exist (the σ of a held
+parameter, the MDB of an uncontrolled observation) is null.
+"""
+
+import json
+import math
+from pathlib import Path
+
+from jaxbundle.io.csv_tables import write_text
+from jaxbundle.network.tables import EXTERIOR
+
+
+def result_dict(adjustment, brief: bool = False) -> dict:
+    """The result as plain dicts and numbers; `brief` leaves points and residuals out."""
+    counts = adjustment.counts
+    head = {
+        "converged": adjustment.converged,
+        "termination": adjustment.termination,
+        "iterations": adjustment.iterations,
+        "observations": counts.observations,
+        "pseudo_observations": counts.pseudo_observations,
+        "unknowns": counts.unknowns,
+        "datum": adjustment.network.datum,
+        "defect": counts.datum,
+        "redundancy": counts.redundancy,
+        "residual_domain": adjustment.network.residuals,
+        "units": {
+            "object": adjustment.network.object_unit,
+            "image": adjustment.network.image_unit,
+            "angle": adjustment.network.angle_unit,
+        },
+        "warnings": list(adjustment.warnings),
+    }
+    if not adjustment.converged:
+        return head | {"undetermined": list(adjustment.undetermined)}
+    head |= {"sigma0": adjustment.sigma0, "vtpv": adjustment.vtpv, "sigma": "a posteriori"}
+    head |= {
+        "cameras": {name: _camera(table) for name, table in adjustment.cameras.items()},
+        "images": _images(adjustment),
+        "removed": [
+            {"kind": r.kind, "name": r.name, "test": r.test} for r in adjustment.removed
+        ],
+        "eliminated": [
+            {"camera": name.id, "parameter": name.parameter} for name in adjustment.eliminated
+        ],
+    }
+    if not brief:
+        head |= {
+            "points": _points(adjustment.points),
+            "residuals": _residuals(adjustment.residuals),
+            "variance_components": {
+                name: {
+                    "observations": c.observations,
+                    "redundancy": c.redundancy,
+                    "vtpv": c.vtpv,
+                    "sigma": c.sigma,
+                }
+                for name, c in adjustment.variance_components.items()
+            },
+        }
+    return head | {"check_points": _checks(adjustment)}
+
+
+def write_result(adjustment, path: str | Path, brief: bool = False) -> None:
+    """Write the JSON result; the file appears whole or not at all."""
+    write_text(Path(path), result_text(adjustment, brief))
+
+
+def result_text(adjustment, brief: bool = False) -> str:
+    """The result as JSON text, one line an image, a point and a residual."""
+    return json.dumps(_without_nan(result_dict(adjustment, brief)), ensure_ascii=False) + "\n"
+
+
+def _without_nan(value):
+    """NaN and infinity do not exist in JSON: null."""
+    if isinstance(value, dict):
+        return {key: _without_nan(v) for key, v in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _camera(table: dict) -> dict:
+    free, C = table["free"], table["correlations"]
+    correlations = {
+        a: {b: float(C[i, j]) for j, b in enumerate(free) if j != i} for i, a in enumerate(free)
+    }
+    return {
+        "model": table["model"],
+        "parameters": table["parameters"],
+        "correlations": correlations,
+    }
+
+
+def _estimate(value, sigma) -> dict:
+    return {"value": value, "sigma": sigma}
+
+
+def _images(adjustment) -> dict:
+    columns = {name: column.tolist() for name, column in adjustment.images.items()}
+    return {
+        image: {name: _estimate(columns[name][i], columns[f"s{name}"][i]) for name in EXTERIOR}
+        | {"rays": columns["rays"][i], "rms": columns["rms"][i]}
+        for i, image in enumerate(columns["id"])
+    }
+
+
+def _points(table) -> dict:
+    columns = {name: column.tolist() for name, column in table.items()}
+    return {
+        point: {"role": columns["role"][i]}
+        | {axis: _estimate(columns[axis][i], columns[f"s{axis}"][i]) for axis in "XYZ"}
+        | {"rays": columns["rays"][i]}
+        for i, point in enumerate(columns["id"])
+    }
+
+
+def _residuals(table) -> list:
+    names = ("kind", "image", "point", "axis", "v", "sigma", "r", "w", "tau", "mdb", "external")
+    columns = [table[name].tolist() for name in names]
+    return [dict(zip(names, row)) for row in zip(*columns)]
+
+
+def _checks(adjustment) -> dict:
+    table = {name: column.tolist() for name, column in adjustment.table("checks").items()}
+    if not table:
+        return {}
+    rms = adjustment.check_points.rms.tolist()
+    return {
+        "rms": dict(zip("XYZ", rms)),
+        "points": {
+            point: {
+                axis: _estimate(table[axis][i], table[f"s{axis}"][i])
+                | {"difference": table[f"d{axis}"][i]}
+                for axis in "XYZ"
+            }
+            | {"rays": table["rays"][i]}
+            for i, point in enumerate(table["id"])
+        },
+    }
