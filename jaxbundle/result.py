@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from jaxbundle.adjustment.jacobian import zero_tangent
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.adjustment.residuals import compiled_residuals, half_square
+from jaxbundle.adjustment.residuals import compiled_residuals
 from jaxbundle.adjustment.solve import converged
 from jaxbundle.adjustment.solver import TERMINATIONS, Minimum
 from jaxbundle.adjustment.unknowns import Name, interior_names
@@ -135,7 +135,8 @@ class Adjustment:
     def vtpv(self) -> float:
         """vᵀPv of all observations, pseudo-observations included."""
         s, data = self.problem.structure, self.problem.data
-        return 2 * float(half_square(compiled_residuals(s, self.values, data)))
+        rows = compiled_residuals(s, self.values, data)
+        return float(sum((np.asarray(v) ** 2).sum() for v in jax.tree.leaves(rows)))
 
     @property
     def sigma0(self) -> float:

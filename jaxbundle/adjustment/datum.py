@@ -78,10 +78,11 @@ def _directional_products(structure, data):
         change = jax.jvp(shifted, (zero_tangent(structure),), (direction,))[1]
         return ravel_pytree(change)[0]
 
-    columns = lambda tangent: jax.vmap(along, -1, -1)(tangent)
     still = jax.tree.map(jnp.zeros_like, moving)
-    images = columns(Tangent(moving.image, moving.camera, still.point))
-    points = columns(Tangent(still.image, still.camera, moving.point))
+    images = Tangent(moving.image, moving.camera, still.point)
+    points = Tangent(still.image, still.camera, moving.point)
+    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b], -1), images, points)
+    images, points = jnp.split(jax.vmap(along, -1, -1)(both), 2, -1)
     flat = lambda tree: jnp.concatenate([x.reshape(-1, 7) for x in jax.tree.leaves(tree)])
     held = flat(jax.tree.map(lambda g, m: g - m, G, moving)) / jnp.linalg.norm(flat(G), axis=0)
     return images + points, jnp.concatenate([images, points]), held

@@ -182,7 +182,7 @@ def make_structure(network: Network) -> tuple[Structure, Data, Float[np.ndarray,
             image, camera, point, elim_rays, len(network.cameras)
         )
     data, origin, priors = _data(network, order)
-    as_int = lambda x: jnp.asarray(np.asarray(x), jnp.int32)
+    as_int = lambda x: jnp.asarray(np.asarray(x, np.int32))
     structure = Structure(
         domain=network.residuals,
         own_camera=own_camera,
@@ -212,8 +212,8 @@ def make_structure(network: Network) -> tuple[Structure, Data, Float[np.ndarray,
         image_pairs=_image_pairs(image, point, elim_rays, len(images)),
         image_camera_pairs=camera_plans[1],
         camera_pairs=camera_plans[2],
-        datum_weight=jnp.zeros((len(points), 3)),
-        gauge=jnp.zeros((7, 0)),
+        datum_weight=jnp.asarray(np.zeros((len(points), 3))),
+        gauge=jnp.asarray(np.zeros((7, 0))),
     )
     return structure, data, origin
 
@@ -246,7 +246,7 @@ def _camera_plans(image, camera, point, elim_rays, cameras):
     r, q = elim_rays[r], elim[q]
     a, b = pairs_within(inc_point[elim])
     a, b = elim[a], elim[b]
-    as_int = lambda x: jnp.asarray(np.asarray(x), jnp.int32)
+    as_int = lambda x: jnp.asarray(np.asarray(x, np.int32))
     incidence = Incidence(as_int(of_ray), as_int(inc_point), as_int(inc_camera))
     return incidence, (
         _plan(rays, rays, camera, camera, cameras, len(rays)),
@@ -276,8 +276,14 @@ def _interior(network: Network, camera_of_ray):
         rays = np.flatnonzero(name_of_ray == name)
         if len(rays) or len(free) == 1:
             every = len(rays) == len(camera_of_ray)
-            groups.append(Group(name, columns, None if every else jnp.asarray(rays, jnp.int32)))
+            groups.append(Group(name, columns, None if every else jnp.asarray(rays.astype(np.int32))))
     return camera_columns, camera_free, tuple(groups)
+
+
+@jax.jit
+def _quaternions(angles):
+    one = lambda a: quaternion_from_matrix(matrix_from_omega_phi_kappa(a))
+    return jax.vmap(one)(angles)
 
 
 def _data(network: Network, order):
@@ -294,11 +300,10 @@ def _data(network: Network, order):
             camera[c, j] = values[name]
             if name in given.free:
                 camera_sigma[c, j] = given.sigma.get(name, np.inf)
-    matrices = jax.vmap(matrix_from_omega_phi_kappa)(jnp.asarray(images.angles))
     start = Values(
         camera=jnp.asarray(camera),
         position=jnp.asarray(images.position - origin),
-        rotation=jax.vmap(quaternion_from_matrix)(matrices),
+        rotation=_quaternions(jnp.asarray(images.angles)),
         point=jnp.asarray(points.position - origin),
     )
     weight = lambda sigma: np.where(
