@@ -10,7 +10,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool
 
-from jaxbundle.errors import InputError
+from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.columns import count, some
 from jaxbundle.network.tables import Distances, Network, Observations, Points
 
@@ -122,8 +122,13 @@ def leave_out_undetermined(network: Network) -> Network:
 
 
 def check_images(before: Network, network: Network) -> None:
-    """Refuse an image with too few points; `before` is the network with nothing left out."""
-    images = network.images
+    """Refuse an image with too few points; `before` is the network with nothing left out.
+
+    **Raises:** `InputError`; `NotSolvedError` where the image has points enough, but no other
+    image sees them.
+    """
+    images, points = network.images, before.points
+    rays_of_point = np.bincount(before.observations.point, minlength=len(points))
     taking_part = ~network.points.has_role("check")[network.observations.point]
     rays = np.bincount(network.observations.image[taking_part], minlength=len(images))
     measured = np.bincount(before.observations.image, minlength=len(images))
@@ -133,6 +138,14 @@ def check_images(before: Network, network: Network) -> None:
         if measured[row] == 0:
             raise InputError(
                 f"{place}an image with no rays; measure points in it or remove the image"
+            )
+        seen = before.observations.point[before.observations.image == row]
+        lone = [points.id[p] for p in seen if rays_of_point[p] == 1 and points.role[p] == "tie"]
+        if measured[row] >= 3 and lone:
+            raise NotSolvedError(
+                f"{place}not solved: it shares too few points with other images, so that neither "
+                f"X0, Y0, Z0, omega, phi, kappa of image {images.id[row]} nor X, Y, Z of points "
+                f"{some(lone)} can be determined; add images of the same points, or control points"
             )
         used = "" if measured[row] == rays[row] else f" of the {measured[row]} measured ones"
         why = "" if not used else " (the others are check points or seen in one image only)"

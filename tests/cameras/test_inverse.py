@@ -19,11 +19,12 @@ def cubic(p, x, y):
 
 def unrolled(p, X, Y):
     """The inverse of `cubic` by a contraction, every iteration differentiated."""
-    x, y = X, Y
-    for _ in range(25):
-        gx, gy = cubic(p, x, y)
-        x, y = x + X - gx, y + Y - gy
-    return x, y
+
+    def step(_, xy):
+        gx, gy = cubic(p, *xy)
+        return xy[0] + X - gx, xy[1] + Y - gy
+
+    return jax.lax.fori_loop(0, 40, step, (X, Y))
 
 
 inverse = implicit_inverse(cubic, start=lambda p, X, Y: (X, Y))

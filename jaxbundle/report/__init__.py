@@ -1,0 +1,62 @@
+"""The result of an adjustment for people: the protocol to file, and shorter forms of it.
+
+    print(jaxbundle.report.text(adjustment, date="2024-05-02"))
+
+The protocol is plain text of at most 100 characters a line: the settings and the datum, the course
+of the iterations, σ0 and the global test, cameras, images, points, residuals, reliability, variance
+components, check points, distances. σ are a posteriori. A network that was not solved gets a short
+report that says why and what to do, without any number of a solution.
+"""
+
+from jaxbundle.report import head, observations, unknowns
+from jaxbundle.report.summary import html as html
+from jaxbundle.report.summary import one_line as one_line
+from jaxbundle.report.summary import short as short
+
+
+def text(
+    adjustment,
+    residual_limit: float = 3.0,
+    *,
+    date: str | None = None,
+    test: str = "pope",
+    max_rows: int = 200,
+    accuracy_unit: float | None = None,
+) -> str:
+    """The whole protocol of an adjustment.
+
+    **Arguments:**
+
+    - `residual_limit`: residuals whose test value is larger are listed one by one.
+    - `date`: printed in the head as it is given; nothing is printed without it, so that the same
+      adjustment always gives the same report.
+    - `test`: what the limit is for, `"pope"` (τ, σ a posteriori) or `"baarda"` (w, σ a priori).
+    - `max_rows`: at most so many images, points, check points and distances are listed.
+    - `accuracy_unit`: points are counted by σ in classes of 0.1, 0.5, 1, 2 and 4 times this length
+      (object unit); None: times the RMS of all σ of the points.
+
+    **Returns:** text that ends with a line feed.
+    """
+    if test not in observations.TESTS:
+        raise ValueError(f"test must be \"pope\" or \"baarda\", not {test!r}")
+    lines = [*head.title(adjustment, date), *head.settings(adjustment), *head.counts(adjustment)]
+    if not adjustment.converged:
+        lines += [*head.why_not_solved(adjustment), *head.warnings(adjustment)]
+        return _joined(lines)
+    lines += head.convergence(adjustment)
+    lines += head.variance_factor(adjustment)
+    lines += head.warnings(adjustment)
+    lines += unknowns.cameras(adjustment)
+    lines += unknowns.images(adjustment, max_rows)
+    lines += unknowns.points(adjustment, max_rows, accuracy_unit)
+    lines += observations.check_points(adjustment, max_rows)
+    lines += observations.distances(adjustment, max_rows)
+    lines += observations.residuals(adjustment, residual_limit, test)
+    lines += observations.redundancy(adjustment)
+    lines += observations.components(adjustment)
+    lines += observations.removals(adjustment)
+    return _joined(lines)
+
+
+def _joined(lines: list[str]) -> str:
+    return "\n".join(line.rstrip() for line in lines) + "\n"

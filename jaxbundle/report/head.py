@@ -1,0 +1,301 @@
+"""The opening of a protocol: what was adjusted and how, how it ended, what σ0 says.
+
+σ0 has no unit: it is the factor between the a priori and the a posteriori standard deviations. The
+precision of an image coordinate is σ0 times its a priori σ, in the unit of the image.
+"""
+
+import numpy as np
+
+from jaxbundle.adjustment.datum import open_directions_in_words
+from jaxbundle.adjustment.solver import LIMIT, NOT_FINITE, SINGULAR, STUCK
+from jaxbundle.cameras import get_model
+from jaxbundle.network.tables import ROLES
+from jaxbundle.report.layout import (
+    WIDTH,
+    clean,
+    facts,
+    fixed,
+    heading,
+    number,
+    paragraph,
+    shortened,
+    significant,
+    some,
+    table,
+)
+
+METHODS = {
+    "levenberg-marquardt": "least squares by Levenberg–Marquardt steps, points eliminated (Schur)",
+    "gauss-newton": "least squares by Gauss–Newton steps, points eliminated (Schur)",
+}
+DOMAINS = {
+    "corrected": "corrected: the measurement freed of distortion against the ideal image",
+    "measured": "measured: the distorted image of the point against the raw measurement",
+}
+ADVICE = {
+    LIMIT: "Allow more iterations (--max-iterations), or give better start values.",
+    SINGULAR: "Measure what determines them, give them a prior σ, or hold them.",
+    STUCK: "Give better start values, and look for gross errors in observations and point names.",
+    NOT_FINITE: "Give better start values: some points lie behind their cameras or in their "
+    "plane, or outside the range of the distortion.",
+}
+ADVICE_FOR = {
+    "camera": "Free fewer camera parameters, or give them a prior σ; c needs depth or convergent "
+    "images, x0 and y0 need images turned about their axis.",
+    "image": "An image needs three or more well spread points whose coordinates are determined.",
+    "point": "A point needs rays from two directions or more.",
+}
+
+
+def image_unit(adjustment) -> str:
+    """The unit of image coordinates inside the adjustment: that of the cameras' models."""
+    units = {get_model(camera.model).unit for camera in adjustment.problem.network.cameras}
+    return "/".join(sorted(units))
+
+
+def title(adjustment, date: str | None) -> list[str]:
+    """Name of the program, its version, the date, and what was adjusted."""
+    from jaxbundle import __version__
+
+    left = f"jaxbundle {__version__}: bundle adjustment"
+    right = clean(date or "")
+    first = f"{left}{right:>{max(WIDTH - len(left), len(right) + 2)}}".rstrip()
+    return [first, "=" * WIDTH, *paragraph(clean(adjustment.network.name) or "network")]
+
+
+def settings(adjustment) -> list[str]:
+    """Method, datum, domain of the residuals, units."""
+    network = adjustment.network
+    return [
+        "",
+        *facts(
+            [
+                ("Method", METHODS.get(adjustment.method, adjustment.method)),
+                ("Datum", datum(adjustment)),
+                ("Residuals", f"v = computed − observed, {DOMAINS[network.residuals]}"),
+                (
+                    "Units",
+                    f"object {clean(network.object_unit)}, image {image_unit(adjustment)}, "
+                    f"angles {network.angle_unit}",
+                ),
+            ]
+        ),
+    ]
+
+
+def datum(adjustment) -> str:
+    """What the coordinates refer to, and what the observations leave open."""
+    network, s = adjustment.problem.network, adjustment.problem.structure
+    defect = adjustment.counts.datum
+    if not defect:
+        known = [
+            (int(network.points.has_role("control").sum()), "control point"),
+            (int(network.points.has_role("fixed").sum()), "fixed point"),
+            (len(s.exterior), "image with a prior exterior orientation"),
+            (int((np.asarray(s.image_free) == 0).any(1).sum()), "image held"),
+            (len(network.distances), "distance"),
+        ]
+        parts = [number(n, noun) for n, noun in known if n]
+        return f"{network.datum}; defect 0: given by {', '.join(parts)}"
+    open_ones = "defect 7: the observations leave open position, orientation and scale"
+    if defect < 7:
+        words = open_directions_in_words(np.asarray(s.gauge))
+        open_ones = f"defect {defect}: the observations leave open {words}"
+    weight = np.asarray(s.datum_weight) > 0
+    ids = network.points.id
+    if network.datum == "minimal":
+        held = [f"{'XYZ'[i]} of {clean(ids[p])}" for p, i in zip(*np.nonzero(weight))]
+        how = f"these coordinates keep their start values: {', '.join(held)}"
+    else:
+        how = (
+            f"inner constraints on {number(int(weight.any(1).sum()), 'datum point')}, whose start "
+            "values fix it on the whole (sum of their variances smallest)"
+        )
+    return (
+        f"{network.datum}; {open_ones}; {how}. Coordinates, exterior orientation and their σ "
+        "refer to this datum; residuals, σ0 and cameras do not depend on it."
+    )
+
+
+def counts(adjustment) -> list[str]:
+    """How many of what, and the redundancy they leave."""
+    network, s, n = adjustment.problem.network, adjustment.problem.structure, adjustment.counts
+    roles = [(role, int(network.points.has_role(role).sum())) for role in ROLES]
+    kinds = [
+        ("coordinates of control points", n.control),
+        ("exterior orientation", n.exterior),
+        ("interior orientation", n.interior),
+        ("distances", n.distances),
+    ]
+    groups = [
+        ("exterior orientation", int(np.sum(s.image_free))),
+        ("interior orientation", int(np.sum(s.camera_free))),
+        ("object coordinates", int(np.sum(s.point_free))),
+    ]
+    listed = lambda rows: ", ".join(f"{name} {count}" for name, count in rows if count)
+    used = int((np.asarray(adjustment.problem.data.image_weight) > 0).any(1).sum())
+    rows = [
+        ("Cameras", len(network.cameras), ""),
+        ("Images", len(network.images), ""),
+        ("Points", len(network.points), listed(roles)),
+        ("Image points", used, ""),
+        ("Observations", n.observations, "image coordinates"),
+        ("Pseudo-observations", n.pseudo_observations, listed(kinds)),
+        ("Datum conditions", n.datum, ""),
+        ("Unknowns", n.unknowns, listed(groups)),
+        ("Redundancy", n.redundancy, "observations + pseudo-observations + conditions − unknowns"),
+    ]
+    return [*heading("Counts"), *table(("", "", ""), [(a, str(b), c) for a, b, c in rows], "lrl")[1:]]
+
+
+def convergence(adjustment) -> list[str]:
+    """One row an evaluation; a rejected step is one that would have increased vᵀPv."""
+    minimum = adjustment.minimum
+    tried = int(minimum.iterations)
+    cost, damping, accepted = (
+        np.asarray(column)[:tried]
+        for column in (minimum.history.cost, minimum.history.damping, minimum.history.accepted)
+    )
+    rows = [
+        (
+            "start" if i == 0 else str(i),
+            f"{2 * cost[i]:.8e}" if np.isfinite(cost[i]) else "not finite",
+            "–" if i == 0 else f"{damping[i]:.1e}" if damping[i] else "0",
+            "" if i == 0 else "accepted" if accepted[i] else "rejected",
+        )
+        for i in range(tried)
+    ]
+    if len(rows) > 45:
+        rows = [*rows[:20], ("…", "", "", ""), *rows[-20:]]
+    lines = [
+        *heading("Convergence"),
+        *table(("iteration", "vᵀPv", "λ (damping)", "step"), rows, "rrrl"),
+        "",
+        *paragraph(f"Ended after {number(adjustment.iterations, 'iteration')}, "
+                   f"{adjustment.termination}."),
+    ]  # fmt: skip
+    if adjustment.removed or adjustment.eliminated:
+        lines += paragraph("The table shows the last of several adjustments: observations or "
+                           "parameters were removed in between (see below).")  # fmt: skip
+    return lines
+
+
+def image_sigmas(adjustment) -> np.ndarray:
+    """The a priori σ of the image coordinates, each once, ascending."""
+    weight = np.asarray(adjustment.problem.data.image_weight)
+    return np.unique(np.round(1 / weight[weight > 0], 12))
+
+
+def unit_weights(adjustment) -> bool:
+    """Whether every image coordinate has σ 1 mm: no statement about its precision at all."""
+    sigma = image_sigmas(adjustment)
+    return len(sigma) == 1 and sigma[0] == 1.0 and image_unit(adjustment) == "mm"
+
+
+def image_precision(adjustment) -> str:
+    """σ0 times the a priori σ of image coordinates, in their unit, in µm and in pixels."""
+    sigma, unit = image_sigmas(adjustment), image_unit(adjustment)
+    if not len(sigma) or not np.isfinite(adjustment.sigma0):
+        return "–"
+    ends = adjustment.sigma0 * sigma[[0, -1]][: min(len(sigma), 2)]
+    span = lambda values, digits=5: " to ".join(significant(v, digits) for v in values)
+    parts = [f"{span(ends)} {unit}"]
+    if unit == "mm":
+        parts.insert(0, f"{span(1e3 * ends)} µm")
+        pitch = {camera.pixel_size for camera in adjustment.problem.network.cameras}
+        if len(pitch) == 1 and None not in pitch:
+            parts.append(f"{span(ends / np.abs(next(iter(pitch))[0]), 3)} px")
+    prior = span(sigma[[0, -1]][: min(len(sigma), 2)], 4)
+    return f"{' = '.join(parts)}  (σ0 × σ a priori {prior} {unit})"
+
+
+def chi_squared(adjustment, level: float = 0.05) -> str:
+    """The global test in words."""
+    if adjustment.redundancy < 1:
+        return "no redundancy: σ0 and standard deviations cannot be estimated"
+    found = adjustment.global_test(level)
+    numbers = (
+        f"vᵀPv {significant(found['vtpv'], 5)}, {100 * (1 - level):g} % interval "
+        f"{significant(found['low'], 5)} to {significant(found['high'], 5)}"
+    )
+    if unit_weights(adjustment):
+        return f"says nothing: unit weights (σ a priori 1 mm); {numbers}"
+    if found["passed"]:
+        return f"passed: {numbers}; the a priori σ are confirmed"
+    if found["vtpv"] < found["low"]:
+        return f"not passed: {numbers}; the observations are better than their a priori σ"
+    return (
+        f"not passed: {numbers}; the a priori σ are too small, blunders are left, or the cameras "
+        "lack parameters"
+    )
+
+
+def variance_factor(adjustment) -> list[str]:
+    """σ0, what it means in the image, and the global test."""
+    rows = [
+        ("vᵀPv", significant(adjustment.vtpv, 7)),
+        ("Redundancy", str(adjustment.redundancy)),
+        ("σ0", f"{significant(adjustment.sigma0, 6)}  √(vᵀPv/redundancy), without unit"),
+        ("Image coordinate", image_precision(adjustment)),
+        ("χ² test", chi_squared(adjustment)),
+    ]
+    return [
+        *heading("Variance factor"),
+        *facts(rows),
+        "",
+        *paragraph(
+            "All standard deviations below are a posteriori, σ0 × those of the a priori weights, "
+            "unless they are said to be a priori."
+        ),
+    ]
+
+
+def warnings(adjustment) -> list[str]:
+    """What was left out or looked strange."""
+    lines = [line for text in adjustment.warnings for line in paragraph(f"- {clean(text)}", 0, 2)]
+    return [*heading("Warnings"), *shortened(lines, 60, "…")] if lines else []
+
+
+def why_not_solved(adjustment) -> list[str]:
+    """Why there is no result, what is not determined, what to do."""
+    names = adjustment.undetermined
+    reason = SINGULAR if names else int(adjustment.minimum.termination)
+    tried = int(adjustment.minimum.iterations)
+    taken = int(np.asarray(adjustment.minimum.history.accepted)[1:tried].sum())
+    rows = [
+        ("Why", adjustment.termination),
+        ("Iterations", f"{adjustment.iterations}, of which {taken} were steps taken"),
+    ]
+    if names:
+        rows.append(("Not determined", some(names, 40)))
+    advice = [ADVICE.get(reason, ADVICE[STUCK])]
+    advice += [text for kind, text in ADVICE_FOR.items() if any(f" of {kind} " in n for n in names)]
+    rows += [("What to do" if i == 0 else "", text) for i, text in enumerate(advice)]
+    return [
+        *heading("Not solved"),
+        *paragraph("The adjustment did not converge. It has no result, and none is shown."),
+        "",
+        *facts(rows),
+    ]
+
+
+def result_in_words(adjustment) -> str:
+    """Converged or not, in one line."""
+    if adjustment.converged:
+        return f"converged after {number(adjustment.iterations, 'iteration')}"
+    return f"NOT converged: {adjustment.termination}"
+
+
+def redundancy_in_words(adjustment) -> str:
+    """The sum that gives the redundancy."""
+    n = adjustment.counts
+    return (
+        f"{n.redundancy} = {n.observations} observations + {n.pseudo_observations} "
+        f"pseudo-observations + {n.datum} datum conditions − {n.unknowns} unknowns"
+    )
+
+
+def sigma0_in_words(adjustment) -> str:
+    """σ0 to five digits, a dash without redundancy."""
+    s0 = adjustment.sigma0
+    return fixed(s0, 5) if 0.1 <= s0 < 1e3 else significant(s0, 5)

@@ -1,0 +1,176 @@
+"""Plain text for protocols: headings, aligned tables, numbers with as many digits as they deserve.
+
+Lines are at most `WIDTH` characters wide; a table that would be wider closes its gaps and then
+shortens its names.
+"""
+
+import math
+import textwrap
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+WIDTH = 100
+MISSING = "–"
+
+
+# --- numbers --------------------------------------------------------------------------------
+
+
+def decimals_of(sigma: float, digits: int = 3) -> int:
+    """Decimal places that show `digits` significant digits of σ (negative: tens, hundreds, …)."""
+    exponent = int(f"{sigma:.{digits - 1}e}".split("e")[1])
+    return digits - 1 - exponent
+
+
+def estimate(value: float, sigma: float | None, digits: int = 3) -> tuple[str, str]:
+    """A value and its σ as text: σ with `digits` digits, the value to the same decimal place.
+
+    Small numbers get an exponent each; a value without σ is shown with ten digits.
+    """
+    if sigma is None or not math.isfinite(sigma) or sigma <= 0:
+        return significant(value, 10), MISSING
+    places = decimals_of(sigma, digits)
+    if 0 <= places <= 7 and max(abs(value), sigma) >= 1e-3:
+        return f"{value:.{places}f}", f"{sigma:.{places}f}"
+    if places < 0 and abs(value) < 1e9:
+        return f"{value:.0f}", f"{sigma:.0f}"
+    exponent = math.floor(math.log10(abs(value))) if value else -places
+    return f"{value:.{max(0, min(exponent + places, 15))}e}", f"{sigma:.{digits - 1}e}"
+
+
+def significant(value: float | None, digits: int = 3) -> str:
+    """A number with so many significant digits, without an exponent where it is readable so."""
+    if value is None or not math.isfinite(value):
+        return MISSING
+    if value == 0:
+        return "0"
+    if 1e-4 <= abs(value) < 10.0 ** max(digits, 6):
+        places = decimals_of(abs(value), digits)
+        text = f"{value:.{max(places, 0)}f}"
+        return text.rstrip("0").rstrip(".") if digits > 6 and "." in text else text
+    return f"{value:.{digits - 1}e}"
+
+
+def fixed(value: float | None, places: int) -> str:
+    """A number with fixed decimal places; a dash where there is none."""
+    return MISSING if value is None or not math.isfinite(value) else f"{value:.{places}f}"
+
+
+def column_decimals(sigma, digits: int = 3, most: int = 9) -> int:
+    """One number of decimal places for a whole column: `digits` digits of nearly every σ in it.
+
+    The smallest tenth of the σ may show fewer, so that one odd value does not widen all rows.
+    """
+    sigma = np.asarray(sigma, float)
+    sigma = sigma[np.isfinite(sigma) & (sigma > 0)]
+    if not len(sigma):
+        return 4
+    return int(np.clip(decimals_of(np.quantile(sigma, 0.1), digits), 0, most))
+
+
+# --- words ----------------------------------------------------------------------------------
+
+
+def clean(name: object) -> str:
+    """A name from a file without anything that would break a line of text."""
+    return "".join(c if c.isprintable() else "?" for c in str(name))
+
+
+def shorten(text: str, width: int) -> str:
+    """Text of at most this width; what is taken from its middle leaves an ellipsis."""
+    if len(text) <= width:
+        return text
+    head = (width - 1) // 2
+    return text[:head] + "…" + text[len(text) - (width - 1 - head) :]
+
+
+def number(n: int, noun: str) -> str:
+    """`1 image`, `2 images`."""
+    return f"{n} {noun}{'' if n == 1 else 's'}"
+
+
+def some(names: Sequence[str], most: int = 8) -> str:
+    """The first names of a list, and how many more there are."""
+    text = ", ".join(map(clean, names[:most]))
+    more = len(names) - most
+    return f"{text} and {more} more" if more > 0 else text
+
+
+def paragraph(text: str, indent: int = 0, hanging: int = 0) -> list[str]:
+    """Text wrapped to the width."""
+    return textwrap.wrap(
+        text,
+        WIDTH,
+        initial_indent=" " * indent,
+        subsequent_indent=" " * (indent + hanging),
+        break_on_hyphens=False,
+    )
+
+
+def heading(text: str) -> list[str]:
+    """A section's heading, set off by an empty line."""
+    return ["", text.upper(), "-" * len(text)]
+
+
+def facts(rows: Iterable[tuple[str, str]], indent: int = 0) -> list[str]:
+    """Names and what is to be said of them, in two columns."""
+    rows = list(rows)
+    width = max((len(name) for name, _ in rows), default=0)
+    lines = []
+    for name, text in rows:
+        start = f"{' ' * indent}{name:<{width}}  "
+        lines += textwrap.wrap(
+            text or MISSING,
+            WIDTH,
+            initial_indent=start,
+            subsequent_indent=" " * len(start),
+            break_on_hyphens=False,
+        )
+    return lines
+
+
+# --- tables ---------------------------------------------------------------------------------
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]], align: str) -> list[str]:
+    """Rows of text in aligned columns under a header.
+
+    `align`: one letter a column, `l` or `r`; columns aligned left are names and may be shortened
+    where the table would be wider than the page.
+    """
+    rows = [[clean(cell) for cell in row] for row in rows]
+    widths = [
+        max(len(cell) for cell in column) for column in zip(header, *rows, strict=True)
+    ]
+    gap = 2 if sum(widths) + 2 * (len(widths) - 1) <= WIDTH else 1
+    excess = sum(widths) + gap * (len(widths) - 1) - WIDTH
+    names = [i for i, kind in enumerate(align) if kind == "l"]
+    while excess > 0 and names:
+        widest = max(names, key=lambda i: widths[i])
+        if widths[widest] <= 6:
+            break
+        widths[widest] -= 1
+        excess -= 1
+
+    def line(row):
+        cells = [
+            f"{shorten(cell, width):<{width}}" if kind == "l" else f"{cell:>{width}}"
+            for cell, width, kind in zip(row, widths, align, strict=True)
+        ]
+        return (" " * gap).join(cells).rstrip()
+
+    return [line(header), *(line(row) for row in rows)]
+
+
+def shortened(lines: Sequence[str], most: int, note: str) -> list[str]:
+    """A list cut after `most` lines, with a note where something was cut."""
+    lines = list(lines)
+    return lines if len(lines) <= most else [*lines[:most], note]
+
+
+def bar(count: float, largest: float, width: int = 40) -> str:
+    """A bar of a histogram in text; never empty where there is something to count."""
+    if count <= 0 or largest <= 0:
+        return ""
+    return "#" * max(1, round(width * count / largest))

@@ -1,0 +1,231 @@
+"""The observations in a protocol: residuals, reliability, groups, blunders, check points, distances.
+
+w = (v/σ)/√r uses the a priori σ (Baarda), τ = w/σ0 the a posteriori one (Pope). Only τ is
+comparable between projects whose a priori σ are a guess, so τ is what the report sorts by unless
+it is asked for Baarda's test.
+"""
+
+import math
+
+import numpy as np
+
+from jaxbundle.report.head import image_unit
+from jaxbundle.report.layout import (
+    bar,
+    clean,
+    column_decimals,
+    facts,
+    fixed,
+    heading,
+    number,
+    paragraph,
+    significant,
+    table,
+)
+from jaxbundle.statistics import normal_quantile, tau_quantile
+
+TESTS = {"pope": "tau", "baarda": "w"}
+SYMBOLS = {"pope": "τ", "baarda": "w"}
+MOST_RESIDUALS = 100
+WEAKEST = 8
+
+
+# --- residuals ------------------------------------------------------------------------------
+
+
+def residuals(adjustment, limit: float, test: str) -> list[str]:
+    """Residuals over the limit, the largest first, then how all of them are distributed."""
+    found, symbol = adjustment.residuals, SYMBOLS[test]
+    size = np.abs(np.nan_to_num(found[TESTS[test]]))
+    order = np.argsort(-size, kind="stable")
+    over = order[size[order] > limit]
+    lines = heading(f"Residuals with |{symbol}| > {limit:g}")
+    lines += paragraph(
+        f"Test: {'Pope, τ = w/σ0, σ a posteriori' if test == 'pope' else 'Baarda, σ a priori'}; "
+        f"critical value {significant(_critical(adjustment, test), 3)} for one observation at "
+        f"0.1 %. v and σ (a priori) of image coordinates in {image_unit(adjustment)}, of control "
+        "points and distances in the object unit; r redundancy number, MDB smallest blunder found "
+        "(α 0.1 %, power 80 %), δ̄ its largest effect on an unknown, in σ of that unknown."
+    )
+    lines.append("")
+    if len(over):
+        lines += _rows(found, over[:MOST_RESIDUALS])
+        if len(over) > MOST_RESIDUALS:
+            more = len(over) - MOST_RESIDUALS
+            lines.append(f"… and {more} more: all residuals are in residuals.csv.")
+        lines += ["", f"{len(over)} of {len(size)} observations."]
+    else:
+        lines.append(f"None of {number(len(size), 'observation')}. The largest:")
+        lines += _rows(found, order[:3])
+    return lines + _histogram(found["tau"])
+
+
+def _critical(adjustment, test: str, level: float = 0.001) -> float:
+    if test == "baarda":
+        return normal_quantile(1 - level / 2)
+    return tau_quantile(1 - level / 2, adjustment.redundancy)
+
+
+def _rows(found, chosen) -> list[str]:
+    header = ("kind", "image", "point", "axis", "v", "σ", "r", "w", "τ", "MDB", "δ̄")
+    rows = [
+        (
+            found["kind"][i],
+            found["image"][i],
+            found["point"][i],
+            found["axis"][i],
+            *(significant(found[name][i], 3) for name in ("v", "sigma")),
+            fixed(found["r"][i], 3),
+            *(significant(found[name][i], 3) for name in ("w", "tau", "mdb", "external")),
+        )
+        for i in chosen
+    ]
+    return table(header, rows, "llll" + "r" * 7)
+
+
+def _histogram(tau) -> list[str]:
+    """Counts of τ in classes of ½, beside what a normal distribution would give."""
+    tau = tau[np.isfinite(tau)]
+    if not len(tau):
+        return []
+    edges = np.concatenate([[-np.inf], np.arange(-4, 4.25, 0.5), [np.inf]])
+    counted = np.histogram(tau, edges)[0]
+    normal = np.array([0.5 * (1 + math.erf(edge / math.sqrt(2))) for edge in edges])
+    expected = len(tau) * np.diff(normal)
+    largest = max(counted.max(), expected.max())
+    rows = []
+    for i, count in enumerate(counted):
+        a, b = edges[i], edges[i + 1]
+        name = f"< {b:g}" if i == 0 else f"> {a:g}" if np.isinf(b) else f"{a:g} to {b:g}"
+        rows.append((name, str(count), f"{expected[i]:.1f}", bar(count, largest, 50)))
+    return [
+        *heading("Normalised residuals τ"),
+        *table(("class", "number", "normal", ""), rows, "rrrl"),
+        "",
+        f"Mean {fixed(tau.mean(), 3)}, RMS {fixed(math.sqrt((tau**2).mean()), 3)}, "
+        f"largest |τ| {fixed(np.abs(tau).max(), 3)}, of {len(tau)} controlled observations.",
+    ]
+
+
+# --- reliability ----------------------------------------------------------------------------
+
+
+def redundancy(adjustment) -> list[str]:
+    """Redundancy numbers: their sum, their range, and the observations least controlled."""
+    found = adjustment.residuals
+    r = found["r"]
+    order = np.argsort(r, kind="stable")[:WEAKEST]
+    loose = int((r < 1e-8).sum())
+    weak = int((r < 0.1).sum())
+    rows = [
+        ("Sum", f"{r.sum():.3f} (redundancy {adjustment.redundancy})"),
+        ("Mean, min, max", f"{r.mean():.3f}, {r.min():.3f}, {r.max():.3f}"),
+        ("r < 0.1", f"{number(weak, 'observation')} weakly controlled"),
+    ]
+    if loose:
+        rows.append(("r = 0", f"{number(loose, 'observation')} not controlled at all"))
+    return [
+        *heading("Redundancy numbers"),
+        *facts(rows),
+        "",
+        "The least controlled observations:",
+        *_rows(found, order),
+    ]
+
+
+def components(adjustment) -> list[str]:
+    """Variance components: the observed over the a priori σ of every group."""
+    rows = [
+        (name, str(c.observations), f"{c.redundancy:.2f}", significant(c.vtpv, 5),
+         significant(c.sigma, 4))
+        for name, c in adjustment.variance_components.items()
+    ]  # fmt: skip
+    return [
+        *heading("Variance components"),
+        *table(("group", "observations", "Σr", "vᵀPv", "σ̂/σ a priori"), rows, "lrrrr"),
+    ]
+
+
+def removals(adjustment) -> list[str]:
+    """What data snooping took away, in that order, and the parameters fixed for lack of t."""
+    lines = []
+    if adjustment.removed:
+        rows = [
+            (str(i), item.kind, item.name, significant(item.test, 3))
+            for i, item in enumerate(adjustment.removed, 1)
+        ]
+        lines += heading("Data snooping: removed observations")
+        lines += table(("", "kind", "observation", "test"), rows, "rllr")
+        lines += ["", "They take no part in what is reported here."]
+    if adjustment.eliminated:
+        names = ", ".join(clean(name) for name in adjustment.eliminated)
+        lines += heading("Eliminated parameters")
+        lines += paragraph(f"Held at 0 because they were not significant, in this order: {names}.")
+    return lines
+
+
+# --- comparisons ----------------------------------------------------------------------------
+
+
+def check_points(adjustment, most: int) -> list[str]:
+    """Check points: differences, adjusted minus given, with their σ; RMS."""
+    found = adjustment.table("checks")
+    if not found:
+        return []
+    unit = clean(adjustment.network.object_unit)
+    total = len(found["id"])
+    places = column_decimals(np.concatenate([found[f"s{axis}"] for axis in "XYZ"]))
+    rows = [
+        (
+            found["id"][i],
+            *(fixed(found[f"d{axis}"][i], places) for axis in "XYZ"),
+            *(fixed(found[f"s{axis}"][i], places) for axis in "XYZ"),
+            str(found["rays"][i]),
+        )
+        for i in range(min(total, most))
+    ]
+    summary = lambda of: [fixed(float(of(found[f"{k}{axis}"])), places) for k in "ds" for axis in "XYZ"]
+    blank = ("",) * 8
+    rows += [
+        blank,
+        ("RMS", *summary(lambda x: math.sqrt((x**2).mean())), ""),
+        ("mean", *summary(np.mean), ""),
+        ("largest", *summary(lambda x: x[np.abs(x).argmax()]), ""),
+    ]
+    lines = [
+        *heading(f"Check points: intersected − given, in {unit}"),
+        *table(("point", "dX", "dY", "dZ", "σX", "σY", "σZ", "rays"), rows, "lrrrrrrr"),
+    ]
+    if total > most:
+        lines.append(f"{total - most} more rows are in checks.csv; the summary is of all {total}.")
+    return lines
+
+
+def distances(adjustment, most: int) -> list[str]:
+    """Measured distances against those of the adjusted points."""
+    found = adjustment.residuals
+    rows_of = np.flatnonzero(found["kind"] == "distance")
+    if not len(rows_of):
+        return []
+    names = [id for id in adjustment.points["id"]]
+    at = {id: i for i, id in enumerate(names)}
+    places = column_decimals(found["sigma"][rows_of])
+    rows = []
+    for i in rows_of[:most]:
+        a, b = (adjustment.point_values[at[found[end][i]]] for end in ("image", "point"))
+        adjusted = float(np.linalg.norm(a - b))
+        v, r = found["v"][i], found["r"][i]
+        sigma = adjustment.sigma0 * found["sigma"][i] * math.sqrt(max(1 - r, 0))
+        values = (adjusted - v, found["sigma"][i], adjusted, sigma, v)
+        rows.append(
+            (found["image"][i], found["point"][i], *(fixed(x, places) for x in values),
+             fixed(r, 3), significant(found["tau"][i], 3))
+        )  # fmt: skip
+    header = ("from", "to", "measured", "σ a priori", "adjusted", "σ", "v", "r", "τ")
+    lines = [
+        *heading(f"Distances in {clean(adjustment.network.object_unit)}"),
+        *table(header, rows, "llrrrrrrr"),
+    ]
+    if len(rows_of) > most:
+        lines.append(f"… and {len(rows_of) - most} more: all are in residuals.csv.")
+    return lines

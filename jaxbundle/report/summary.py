@@ -1,0 +1,132 @@
+"""The short forms of a result: a few lines of text, and a small HTML for notebooks."""
+
+from html import escape
+
+import numpy as np
+
+from jaxbundle.report.head import (
+    chi_squared,
+    image_precision,
+    redundancy_in_words,
+    result_in_words,
+    sigma0_in_words,
+)
+from jaxbundle.report.layout import (
+    clean,
+    estimate,
+    facts,
+    number,
+    significant,
+    some,
+)
+
+MOST_CAMERAS = 4
+
+
+def one_line(adjustment) -> str:
+    """What `repr` shows."""
+    network = adjustment.network
+    name = f"Adjustment {clean(network.name)!r}"
+    if not adjustment.converged:
+        return f"<{name}: NOT converged ({adjustment.termination})>"
+    return (
+        f"<{name}: converged, σ0 {sigma0_in_words(adjustment)}, redundancy "
+        f"{adjustment.redundancy}, {number(len(network.images), 'image')}, "
+        f"{number(len(network.points), 'point')}>"
+    )
+
+
+def summary(adjustment) -> list[tuple[str, str]]:
+    """The facts of the short forms: names and texts."""
+    network = adjustment.problem.network
+    rows = [
+        ("Result", result_in_words(adjustment)),
+        (
+            "Network",
+            f"{number(len(network.cameras), 'camera')}, {number(len(network.images), 'image')}, "
+            f"{number(len(network.points), 'point')}; datum {network.datum}, defect "
+            f"{adjustment.counts.datum}; residuals {network.residuals}",
+        ),
+        ("Redundancy", redundancy_in_words(adjustment)),
+    ]
+    if not adjustment.converged:
+        if adjustment.undetermined:
+            rows.append(("Not determined", some(adjustment.undetermined)))
+        rows.append(("", "There is no result; report() says what to do."))
+    else:
+        rows += [
+            ("σ0", f"{sigma0_in_words(adjustment)}; image coordinate {image_precision(adjustment)}"),
+            ("χ² test", chi_squared(adjustment)),
+            *_cameras(adjustment),
+            ("Points", _points(adjustment)),
+            ("Largest |τ|", _worst(adjustment)),
+        ]
+    for noun, things in (
+        ("observation removed", adjustment.removed),
+        ("parameter eliminated", adjustment.eliminated),
+        ("warning", adjustment.warnings),
+    ):
+        if things:
+            rows.append(("Note", f"{number(len(things), noun)}: see report()"))
+    return rows
+
+
+def _cameras(adjustment):
+    tables = adjustment.cameras
+    for camera, entry in list(tables.items())[:MOST_CAMERAS]:
+        parts = [
+            " ± ".join((f"{name} {value}", sigma))
+            for name, found in entry["parameters"].items()
+            if found["free"]
+            for value, sigma in [estimate(found["value"], found["sigma"])]
+        ]
+        text = ", ".join(parts) if parts else "held"
+        yield f"Camera {clean(camera)}", f"{entry['model']}: {text}"
+    if len(tables) > MOST_CAMERAS:
+        yield "", f"and {number(len(tables) - MOST_CAMERAS, 'other camera')}"
+
+
+def _points(adjustment) -> str:
+    unit = clean(adjustment.network.object_unit)
+    parts = []
+    for axis in "XYZ":
+        sigma = adjustment.points[f"s{axis}"]
+        sigma = sigma[np.isfinite(sigma) & (sigma > 0)]
+        if len(sigma):
+            rms, most = np.sqrt((sigma**2).mean()), sigma.max()
+            parts.append(f"σ{axis} {significant(rms)} (max {significant(most)})")
+    return f"RMS {', '.join(parts)} {unit}" if parts else "no coordinate is estimated with a σ"
+
+
+def _worst(adjustment) -> str:
+    found = adjustment.residuals
+    tau = np.abs(np.nan_to_num(found["tau"]))
+    if not tau.max(initial=0.0) > 0:
+        return "no observation is controlled"
+    i = int(tau.argmax())
+    what = " ".join(
+        clean(part) for part in (found["kind"][i], found["image"][i], found["point"][i]) if part
+    )
+    return f"{significant(tau[i])} ({what}, {found['axis'][i]})"
+
+
+def short(adjustment) -> str:
+    """The result in about fifteen lines; one that was not solved shows no numbers of a solution."""
+    head = f"Adjustment {clean(adjustment.network.name)!r}"
+    return "\n".join([head, *facts(summary(adjustment), indent=2)])
+
+
+def html(adjustment) -> str:
+    """The same facts as a small self-contained HTML; everything from files is escaped."""
+    cell = 'style="text-align:left;vertical-align:top;padding:2px 12px 2px 0"'
+    colour = "#2a6f4e" if adjustment.converged else "#a33b2c"
+    rows = "".join(
+        f"<tr><th {cell}>{escape(name)}</th><td {cell}>{escape(text)}</td></tr>"
+        for name, text in summary(adjustment)
+    )
+    name = escape(clean(adjustment.network.name))
+    return (
+        f'<div style="border-left:4px solid {colour};padding-left:10px">'
+        f"<b>Adjustment {name}</b>"
+        f'<table style="border-collapse:collapse;font-size:90%">{rows}</table></div>'
+    )

@@ -1,0 +1,257 @@
+"""The adjusted unknowns in a protocol: cameras, images, points, each with its precision."""
+
+import numpy as np
+
+from jaxbundle.cameras import get_model, validity_message
+from jaxbundle.network.tables import EXTERIOR
+from jaxbundle.plotting.distortion import camera_index, farthest_measurement
+from jaxbundle.report.equations import EQUATIONS
+from jaxbundle.report.head import image_unit
+from jaxbundle.report.layout import (
+    bar,
+    clean,
+    column_decimals,
+    estimate,
+    facts,
+    fixed,
+    heading,
+    number,
+    paragraph,
+    significant,
+    table,
+)
+
+CRITICAL_T = 2.0
+CLASSES = (0.0, 0.1, 0.5, 1.0, 2.0, 4.0, np.inf)
+FEW_CAMERAS = 8
+ROLE_WORDS = {"tie": "tie", "control": "ctrl", "fixed": "fix", "check": "check"}
+
+
+# --- cameras --------------------------------------------------------------------------------
+
+
+def cameras(adjustment) -> list[str]:
+    """Every camera in full; many cameras as one table a model."""
+    tables = adjustment.cameras
+    lines = []
+    if len(tables) > FEW_CAMERAS:
+        return [*heading(f"Cameras ({len(tables)})"), *_many_cameras(adjustment)]
+    for camera, entry in tables.items():
+        lines += heading(f"Camera {clean(camera)}")
+        lines += _one_camera(entry)
+        lines += ["", *paragraph(validity(adjustment, camera))]
+    return lines
+
+
+def _one_camera(entry) -> list[str]:
+    lines = _equations(entry["model"])
+    rows, held = [], []
+    for name, found in entry["parameters"].items():
+        if not found["free"]:
+            held.append(f"{name} {significant(found['value'], 10)}")
+            continue
+        value, sigma = estimate(found["value"], found["sigma"])
+        t, total = found["t"], found["total_correlation"]
+        mark = "no" if t < CRITICAL_T else "yes"
+        rows.append((name, value, sigma, significant(t, 3), mark, fixed(100 * total, 1)))
+    if rows:
+        header = ("parameter", "value", "σ", "t", "significant", "total corr. %")
+        lines += ["", *table(header, rows, "lrrrrr")]
+    if held:
+        lines += ["", *facts([("Held", ", ".join(held))])]
+    if rows:
+        lines += paragraph(
+            f"t = |value|/σ; no: t < {CRITICAL_T:g}, not different from 0 at about 95 %. Total "
+            "correlation: the share of a parameter that the others of the camera explain."
+        )
+    free = entry["free"]
+    if len(free) > 1:
+        lines += ["", "Correlations in %", *_triangle(free, entry["correlations"])]
+    return lines
+
+
+def _equations(model: str) -> list[str]:
+    first, *others = EQUATIONS.get(model, ("",))
+    rows = [(f"Model {model}", first), *(("", line) for line in others)]
+    return facts(rows)
+
+
+def _triangle(names, C) -> list[str]:
+    """The lower triangle of a correlation matrix."""
+    width = max(5, max(map(len, names)))
+    first = max(map(len, names))
+    lines = [" " * first + " " + " ".join(f"{name:>{width}}" for name in names)]
+    for i, name in enumerate(names):
+        cells = (str(round(100 * C[i, j])) for j in range(i + 1))
+        lines.append(f"{name:<{first}} " + " ".join(f"{cell:>{width}}" for cell in cells))
+    return lines
+
+
+def _many_cameras(adjustment) -> list[str]:
+    """Two lines a camera, value and σ; one table a model."""
+    lines = []
+    tables = adjustment.cameras
+    for model in dict.fromkeys(entry["model"] for entry in tables.values()):
+        chosen = {name: entry for name, entry in tables.items() if entry["model"] == model}
+        names = [
+            p for p in get_model(model).parameters
+            if any(e["parameters"][p]["free"] for e in chosen.values())
+        ]  # fmt: skip
+        rows = []
+        for camera, entry in chosen.items():
+            cells = [
+                estimate(entry["parameters"][p]["value"], entry["parameters"][p]["sigma"])
+                for p in names
+            ]
+            rows += [(camera, *(a for a, _ in cells)), ("   σ", *(b for _, b in cells))]
+        lines += [*_equations(model), ""]
+        for start in range(0, len(names), 6):
+            part = slice(start, start + 6)
+            header = ("camera", *names[part])
+            cells = [(row[0], *row[1:][part]) for row in rows]
+            lines += [*table(header, cells, "l" + "r" * (len(header) - 1)), ""]
+    warnings = [w for w in (validity(adjustment, c) for c in tables) if "turns back" in w]
+    for text in warnings[:FEW_CAMERAS]:
+        lines += paragraph(text)
+    if len(warnings) > FEW_CAMERAS:
+        lines.append(f"… and {number(len(warnings) - FEW_CAMERAS, 'other camera')} likewise.")
+    return lines if lines[-1] else lines[:-1]
+
+
+def validity(adjustment, camera: str) -> str:
+    """Whether the distortion is one-to-one over the image of a camera."""
+    network = adjustment.problem.network
+    given = network.cameras[camera_index(adjustment, camera)]
+    model = get_model(given.model)
+    size, pitch = given.image_size, given.pixel_size
+    where = "the image"
+    if size is not None and model.unit == "px":
+        half = float(np.hypot(*size)) / 2
+    elif size is not None and pitch is not None:
+        half = float(np.hypot(size[0] * pitch[0], size[1] * pitch[1])) / 2
+    else:
+        half, where = farthest_measurement(adjustment, camera), "the measurements"
+    if half <= 0:
+        return "Distortion: no measurements to compare with."
+    parameters = adjustment.camera_parameters(camera)
+    message = validity_message(camera, model, parameters, half)
+    if message is not None:
+        return message
+    return (
+        f"Distortion: one-to-one over {where}, as far as r = {significant(half, 4)} {model.unit}."
+    )
+
+
+# --- images ---------------------------------------------------------------------------------
+
+
+def images(adjustment, most: int) -> list[str]:
+    """Exterior orientation, two lines an image: values, and σ under them."""
+    found = adjustment.images
+    unit, angle = image_unit(adjustment), adjustment.network.angle_unit
+    places = [column_decimals(found[f"s{name}"]) for name in EXTERIOR]
+    scale, rms_unit = (1e3, "µm") if unit == "mm" else (1.0, unit)
+    rms_places = column_decimals(scale * found["rms"])
+    rows = []
+    for i in range(min(len(found["id"]), most)):
+        values = [fixed(found[name][i], d) for name, d in zip(EXTERIOR, places)]
+        sigma = [_sigma(found[f"s{name}"][i], d) for name, d in zip(EXTERIOR, places)]
+        rms = fixed(scale * found["rms"][i], rms_places)
+        rows += [(found["id"][i], *values, str(found["rays"][i]), rms), ("   σ", *sigma, "", "")]
+    header = ("image", "X0", "Y0", "Z0", f"ω {angle}", "φ", "κ", "rays", f"RMS v {rms_unit}")
+    lines = [*heading("Images: exterior orientation"), *table(header, rows, "lrrrrrrrr")]
+    lines += _left_out(len(found["id"]), most, "image", "images.csv")
+    return lines
+
+
+def _sigma(value: float, places: int) -> str:
+    return fixed(value, places) if value > 0 else "–"
+
+
+def _left_out(total: int, most: int, noun: str, file: str) -> list[str]:
+    if total <= most:
+        return []
+    return [f"… and {number(total - most, f'other {noun}')}: all {total} are in {file}."]
+
+
+# --- points ---------------------------------------------------------------------------------
+
+
+def points(adjustment, most: int, accuracy_unit: float | None = None) -> list[str]:
+    """Precision of the points in summary, rays a point, then the list."""
+    lines = heading("Points: precision")
+    lines += _precision(adjustment, accuracy_unit)
+    lines += _rays(adjustment.points["rays"])
+    return [*lines, *_list_of_points(adjustment, most)]
+
+
+def _precision(adjustment, accuracy_unit) -> list[str]:
+    found, unit = adjustment.points, clean(adjustment.network.object_unit)
+    sigma = np.stack([found[f"s{axis}"] for axis in "XYZ"], 1)
+    free = np.asarray(adjustment.problem.structure.point_free) > 0
+    free = free & np.isfinite(sigma) & (sigma > 0)
+    if not free.any():
+        return ["No point has an estimated coordinate with a standard deviation."]
+    columns = [sigma[free[:, i], i] for i in range(3)]
+    together = sigma[free]
+    places = column_decimals(together)
+    rms = lambda s: float(np.sqrt((s**2).mean()))
+    rows = [
+        (name, *(fixed(of(s), places) if len(s) else "–" for s in (*columns, together)))
+        for name, of in (("mean", np.mean), ("RMS", rms), ("max", np.max), ("min", np.min))
+    ]
+    scale = rms(together) if accuracy_unit is None else float(accuracy_unit)
+    meaning = "the RMS of all" if accuracy_unit is None else "as chosen"
+    rows.append(("points", *(str(len(s)) for s in columns), ""))
+    header = (f"in {unit}", "σX", "σY", "σZ", "all")
+    counted = [np.histogram(s / scale, CLASSES)[0] for s in (*columns, together)]
+    text = ["∞" if np.isinf(end) else f"{end:g}" for end in CLASSES]
+    classes = [
+        (f"{a}–{b}", *(str(count[i]) for count in counted))
+        for i, (a, b) in enumerate(zip(text, text[1:]))
+    ]
+    # one table, so that both parts have the same columns
+    head, *body = table(header, [*rows, ("", "", "", "", ""), *classes], "lrrrr")
+    first, second = body[: len(rows)], body[len(rows) + 1 :]
+    note = f"Number of σ in classes of σ/s, s = {significant(scale, 3)} {unit} ({meaning})"
+    return [head, *first, "", note, *second]
+
+
+def _rays(rays) -> list[str]:
+    """How many points have how many rays."""
+    seen = np.unique(rays)
+    groups = [(int(n), int(n)) for n in seen]
+    if len(groups) > 12:
+        edges = np.unique(np.round(np.geomspace(max(seen[0], 1), seen[-1] + 1, 11)).astype(int))
+        groups = [(int(a), int(b) - 1) for a, b in zip(edges, edges[1:])]
+    counted = [int(((rays >= a) & (rays <= b)).sum()) for a, b in groups]
+    rows = [
+        (str(a) if a == b else f"{a}–{b}", str(n), bar(n, max(counted)))
+        for (a, b), n in zip(groups, counted)
+        if n
+    ]
+    return ["", *table(("rays", "points", ""), rows, "rrl")]
+
+
+def _list_of_points(adjustment, most) -> list[str]:
+    found = adjustment.points
+    total = len(found["id"])
+    shown = np.arange(min(total, most))
+    places = [column_decimals(found[f"s{axis}"]) for axis in "XYZ"]
+    rows = [
+        (
+            found["id"][i],
+            ROLE_WORDS[found["role"][i]],
+            *(fixed(found[axis][i], d) for axis, d in zip("XYZ", places)),
+            *(_sigma(found[f"s{axis}"][i], d) for axis, d in zip("XYZ", places)),
+            str(found["rays"][i]),
+        )
+        for i in shown
+    ]
+    unit = clean(adjustment.network.object_unit)
+    header = ("point", "role", "X", "Y", "Z", "σX", "σY", "σZ", "rays")
+    return [
+        *heading(f"Points: coordinates in {unit}"),
+        *table(header, rows, "llrrrrrrr"),
+        *_left_out(total, most, "point", "points.csv"),
+    ]

@@ -1,0 +1,134 @@
+"""The command line as a person meets it: exit status, one line of error, nothing half-written."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "examples" / "convergent4"
+
+
+def run(*arguments, cwd=ROOT):
+    command = [sys.executable, "-m", "jaxbundle", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd)
+
+
+@pytest.fixture
+def project(tmp_path):
+    """A copy of the example that may be spoilt."""
+    folder = tmp_path / "network"
+    shutil.copytree(EXAMPLE, folder)
+    return folder
+
+
+def edit(path: Path, old: str, new: str):
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+@pytest.mark.slow
+def test_adjust_writes_everything(tmp_path):
+    out, file = tmp_path / "out", tmp_path / "result.json"
+    done = run("adjust", EXAMPLE / "project.toml", "--json", file, "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    result = json.loads(file.read_text())
+    assert result["converged"] is True
+    assert result["redundancy"] == 23 and result["observations"] == 80
+    assert result["unknowns"] == 64 and result["defect"] == 7
+    assert result["sigma0"] == pytest.approx(0.63128e-3, rel=1e-5)
+    c = result["cameras"]["cam"]["parameters"]["c"]
+    assert c["value"] == pytest.approx(18.528014315, abs=0.002 * 0.0453)
+    assert c["sigma"] == pytest.approx(0.0453018675, rel=1e-3)
+    assert set(result["images"]["DSC_037"]["kappa"]) == {"value", "sigma"}
+    assert len(result["residuals"]) == 80
+    assert sum(row["r"] for row in result["residuals"]) == pytest.approx(23, abs=1e-6)
+    written = {p.name for p in out.iterdir()}
+    expected = {"report.txt", "result.json", "cameras.csv", "images.csv", "points.csv",
+                "residuals.csv", "plan.png", "histogram.png"}  # fmt: skip
+    assert expected <= written
+    assert not [name for name in written if name.startswith(".")]
+    assert (out / "report.txt").read_text().strip() in done.stdout
+
+
+@pytest.mark.slow
+def test_json_alone_on_stdout():
+    done = run("adjust", EXAMPLE / "project4.toml", "--json", "-", "--brief")
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert "points" not in result and "residuals" not in result
+    assert result["sigma0"] == pytest.approx(0.65237e-3, rel=1e-5)
+    assert result["cameras"]["cam"]["correlations"]["c"]["x0"] == pytest.approx(-0.255, abs=5e-4)
+
+
+BROKEN = {
+    "missing table": ("images.csv", None, None, ["images.csv"]),
+    "missing column": ("points.csv", "id,role,X,Y,Z", "id,role,X,Y", ["points.csv", "Z"]),
+    "text in a number": ("observations.csv", "-4.98644", "minus five", ["observations.csv", "x"]),
+    "not a number": ("observations.csv", "-4.98644", "nan", ["observations.csv", "x"]),
+    "unknown point": ("observations.csv", "DSC_037,1,", "DSC_037,77,", ["observations.csv", "77"]),
+    "unknown image": ("observations.csv", "DSC_037,1,", "DSC_999,1,", ["observations", "DSC_999"]),
+    "unknown camera": ("images.csv", "DSC_037,cam", "DSC_037,cma", ["images.csv", "cma", "cam"]),
+    "unknown model": ("project.toml", '"brown"', '"brwon"', ["brwon", "brown"]),
+    "unknown key": ("project.toml", "sigma_image", "sigma_imge", ["sigma_imge", "sigma_image"]),
+    "zero principal distance": ("project.toml", "c = 18.556", "c = 0.0", ["c"]),
+    "negative sigma": ("project.toml", "sigma_image = 1.0", "sigma_image = -1.0", ["sigma_image"]),
+    "duplicate point": ("points.csv", "\n2,tie", "\n1,tie", ["points.csv", "'1'"]),
+    "unfixed datum": ("project.toml", '"inner"', '"control"', ["datum", "rotation", "scale"]),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+@pytest.mark.slow
+def test_bad_input_ends_with_one_helpful_line(project, tmp_path, case):
+    name, old, new, words = BROKEN[case]
+    if old is None:
+        (project / name).unlink()
+    else:
+        edit(project / name, old, new)
+    out = tmp_path / "out"
+    done = run("adjust", project / "project.toml", "--json", out / "r.json", "--out", out)
+    assert done.returncode == 2, done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1 and "Traceback" not in done.stderr
+    for word in words:
+        assert word in done.stderr
+    assert not out.exists() and done.stdout == ""
+
+
+def test_one_image_alone_is_not_solved(project):
+    for name in ("images.csv", "observations.csv"):
+        lines = (project / name).read_text().splitlines()
+        kept = [line for line in lines if line.startswith(("id,", "image,", "DSC_037"))]
+        (project / name).write_text("\n".join(kept) + "\n")
+    done = run("adjust", project / "project.toml")
+    assert done.returncode == 3
+    assert "DSC_037" in done.stderr and "X0" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_listed_sigmas_of_the_thesis_are_refused_with_the_way_on():
+    done = run("adjust", EXAMPLE / "convergent4.txt")
+    assert done.returncode == 2
+    for word in ("line 6", "DSC_037", "'3'", "--set sigma_image="):
+        assert word in done.stderr
+
+
+def test_unknown_option_is_bad_usage():
+    done = run("adjust", EXAMPLE / "project.toml", "--jsn", "x")
+    assert done.returncode == 2
+    assert "--jsn" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_not_converged_says_so(tmp_path):
+    file = tmp_path / "result.json"
+    done = run("adjust", EXAMPLE / "project.toml", "--max-iterations", "2", "--json", file)
+    assert done.returncode == 3
+    assert "iteration limit" in done.stderr
+    result = json.loads(file.read_text())
+    assert result["converged"] is False
+    assert "sigma0" not in result and "cameras" not in result
