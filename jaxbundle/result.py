@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle import plotting, report
 from jaxbundle.adjustment.jacobian import zero_tangent
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.adjustment.residuals import compiled_residuals
@@ -413,6 +414,45 @@ class Adjustment:
         if name not in ("images", "points", "residuals"):
             raise KeyError(f"tables are cameras, images, points, residuals, checks; not {name!r}")
         return getattr(self, name)
+
+    # --- for people -------------------------------------------------------------------------
+
+    def report(self, residual_limit: float = 3.0, **options) -> str:
+        """The whole protocol as text (options: see `jaxbundle.report.text`)."""
+        return report.text(self, residual_limit, **options)
+
+    def __str__(self) -> str:
+        return report.short(self)
+
+    def __repr__(self) -> str:
+        return report.one_line(self)
+
+    def _repr_html_(self) -> str:
+        return report.html(self)
+
+    def plot_plan(self, ax=None):
+        """The network seen from above, with error ellipses; matplotlib axes."""
+        return plotting.network_plan(self, ax)
+
+    def plot_perspective(self, ax=None):
+        """The network in perspective; matplotlib 3D axes."""
+        return plotting.network_perspective(self, ax)
+
+    def plot_residuals(self, image: str, ax=None):
+        """The residuals of an image as vectors; matplotlib axes."""
+        return plotting.residual_vectors(self, image, ax)
+
+    def plot_distortion(self, camera: str, ax=None):
+        """The distortion of a camera over the radius, with ±σ; matplotlib axes."""
+        return plotting.distortion_curve(self, camera, ax)
+
+    def plot_correlations(self, camera: str | None = None, ax=None):
+        """Correlations of the free parameters of a camera, or of all; matplotlib axes."""
+        return plotting.correlation_matrix(self, camera, ax)
+
+    def plot_histogram(self, ax=None):
+        """The normalised residuals beside the normal distribution; matplotlib axes."""
+        return plotting.residual_histogram(self, ax)
 
     def to_pandas(self, name: str):
         """A table as a pandas data frame (extra `tables`)."""

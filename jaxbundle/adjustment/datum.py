@@ -56,8 +56,14 @@ def open_similarities(structure: Structure, data: Data) -> Float[np.ndarray, "7 
     their terms, so that neither units nor the number of observations matter.
     """
     products, terms, held = (np.asarray(x) for x in _directional_products(structure, data))
+    # What cannot be computed from the start values says nothing; the solver will complain.
+    finite = np.isfinite(products).all(1)
+    products, terms = products[finite], terms[np.isfinite(terms).all(1)]
     scale = np.sqrt((terms**2).sum(0))
     scale = np.where(scale > 0, scale, 1.0)
+    held = held / scale
+    size = np.linalg.norm(held, axis=1, keepdims=True)
+    held = held / np.where(size > 0, size, 1.0)
     # Singular values of a QR, not of the Gram matrix, which would lose half of the digits.
     triangle = np.linalg.qr(np.concatenate([products / scale, held]), mode="r")
     _, singular, directions = np.linalg.svd(triangle)
@@ -66,7 +72,7 @@ def open_similarities(structure: Structure, data: Data) -> Float[np.ndarray, "7 
 
 @eqx.filter_jit
 def _directional_products(structure, data):
-    """J·G, the terms that cancel in it, and G on what is held (scaled to unit columns) [rows, 7].
+    """J·G, the terms that cancel in it, and G on what is held [rows, 7].
 
     By forward derivatives of the residuals along the seven columns of G.
     """
@@ -84,7 +90,7 @@ def _directional_products(structure, data):
     both = jax.tree.map(lambda a, b: jnp.concatenate([a, b], -1), images, points)
     images, points = jnp.split(jax.vmap(along, -1, -1)(both), 2, -1)
     flat = lambda tree: jnp.concatenate([x.reshape(-1, 7) for x in jax.tree.leaves(tree)])
-    held = flat(jax.tree.map(lambda g, m: g - m, G, moving)) / jnp.linalg.norm(flat(G), axis=0)
+    held = flat(jax.tree.map(lambda g, m: g - m, G, moving))
     return images + points, jnp.concatenate([images, points]), held
 
 
@@ -102,12 +108,12 @@ def s_transform(structure: Structure, values: Values, change: Tangent) -> Tangen
 def move_to_datum(structure: Structure, values: Values, start: Values, steps: int = 20) -> Values:
     """The network after the finite similarity (of the open kind) for which Bᵀ(x − x_start) = 0.
 
-    Only where the open directions are shifts and rotations, with or without scale: those form a
-    group (a rotation about one control point does not).
-    Differentiable: the seven parameters are found by Newton's method without derivatives being
-    taken, then attached by one more step (implicit function theorem).
+    The open similarities form a group, so their finite motions are the exponentials of the open
+    directions: a rotation about a fixed point stays one.
+    Differentiable: the parameters are found by Newton's method without derivatives being taken,
+    then attached by one more step (implicit function theorem).
     """
-    if not structure.movable:
+    if not structure.defect:
         return values
 
     def condition(tau, values, start):
@@ -128,7 +134,8 @@ def move_to_datum(structure: Structure, values: Values, start: Values, steps: in
     )
 
 
-def _transform(structure, values, tau):
+def _transform(structure, values, direction):
+    tau = _exponential(direction)
     position, rotation = jax.vmap(transform_pose, (None, 0, 0))(
         tau, values.position, values.rotation
     )
@@ -140,6 +147,24 @@ def _transform(structure, values, tau):
         rotation=held(values.rotation, rotation, structure.image_free[:, 3:4]),
         point=held(values.point, point, structure.point_free),
     )
+
+
+def _exponential(direction: Float[Array, "7"]) -> Float[Array, "7"]:
+    """The similarity reached by moving along t + ω×X + s·X for a unit of time.
+
+    Its shift is V·t with V = ∫₀¹ exp(u·B)du = 1 + B/2! + B²/3! + …, B = [ω]× + s·1; rotation and
+    scale are ω and s themselves. The series is summed for B/64 and doubled: V(2B) = V + ½B·V².
+    """
+    t, omega, s = direction[:3], direction[3:6], direction[6]
+    x, y, z = omega / 64
+    zero = jnp.zeros_like(x)
+    B = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3) + s / 64 * jnp.eye(3)
+    V = jnp.eye(3)
+    for k in range(9, 1, -1):
+        V = jnp.eye(3) + B @ V / k
+    for _ in range(6):
+        V, B = V + 0.5 * B @ V @ V, 2 * B
+    return jnp.concatenate([V @ t, direction[3:]])
 
 
 def choose_minimal_coordinates(
@@ -160,13 +185,6 @@ def choose_minimal_coordinates(
         rows = rows - np.outer(rows @ direction, direction)
         chosen[pick] = 1.0
     return chosen.reshape(-1, 3)
-
-
-def is_group(gauge: Float[np.ndarray, "7 defect"]) -> bool:
-    """Whether the open directions are all similarities, or all congruences (no scale)."""
-    defect = gauge.shape[1]
-    scale = np.abs(gauge[6]).max(initial=0.0) / np.abs(gauge).max(initial=1e-300)
-    return defect == 7 or bool(defect == 6 and scale < 1e-6)
 
 
 def open_directions_in_words(gauge: Float[np.ndarray, "7 defect"]) -> str:

@@ -10,7 +10,6 @@ from jaxtyping import Float
 
 from jaxbundle.adjustment.datum import (
     choose_minimal_coordinates,
-    is_group,
     open_directions_in_words,
     open_similarities,
 )
@@ -79,7 +78,6 @@ def make_problem(network: Network) -> Problem:
             lambda s: s.datum_weight, structure,
             jnp.asarray(_datum_weight(network, structure, data)),
         )  # fmt: skip
-        structure = dataclasses.replace(structure, movable=is_group(gauge))
     return Problem(network, structure, data, origin, count_rows(structure, data))
 
 

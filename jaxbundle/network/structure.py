@@ -48,7 +48,6 @@ class Structure(eqx.Module):
     domain: str = eqx.field(static=True)
     own_camera: bool = eqx.field(static=True)
     all_free: bool = eqx.field(static=True)
-    movable: bool = eqx.field(static=True)
     groups: tuple[Group, ...]
     image: Int[Array, " rays"]
     camera: Int[Array, " rays"]
@@ -187,7 +186,6 @@ def make_structure(network: Network) -> tuple[Structure, Data, Float[np.ndarray,
         domain=network.residuals,
         own_camera=own_camera,
         all_free=bool(image_free.all() and camera_free.all() and point_free.all()),
-        movable=False,
         groups=groups,
         image=as_int(image),
         camera=as_int(camera),

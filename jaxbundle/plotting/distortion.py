@@ -20,7 +20,10 @@ from jaxtyping import Float
 
 from jaxbundle.cameras import get_model
 
-AZIMUTHS = 24
+AZIMUTHS = 12
+
+ROUNDING = 1e-13
+"""Distortion below this fraction of an image coordinate is noise of the arithmetic."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +38,7 @@ class DistortionProfile:
     decentring_sigma: Float[np.ndarray, " radii"]
 
 
-def distortion_profile(adjustment, camera: str, radii: int = 101) -> DistortionProfile:
+def distortion_profile(adjustment, camera: str, radii: int = 81) -> DistortionProfile:
     """The distortion of a camera from its principal point to its farthest measurement.
 
     **Arguments:** `adjustment` a solved one; `camera` its id; `radii` how many values.
@@ -48,11 +51,9 @@ def distortion_profile(adjustment, camera: str, radii: int = 101) -> DistortionP
     model = _model(adjustment, camera)
     radius = np.linspace(0, farthest_measurement(adjustment, camera), radii)
     p = jnp.array(list(parameters.values()))
-    values, slopes = (np.asarray(x) for x in _profile(model, p, jnp.asarray(radius)))
-    columns = [list(parameters).index(name) for name in free]
-    slopes = slopes[:, :, columns]
+    (radial, decentring), slopes = distortion_at(model, p, radius)
+    slopes = slopes[:, :, [list(parameters).index(name) for name in free]]
     sigma = np.sqrt(np.clip(np.einsum("kri,ij,krj->kr", slopes, covariance, slopes), 0, None))
-    radial, decentring = values
     return DistortionProfile(model.unit, radius, radial, sigma[0], decentring, sigma[1])
 
 
@@ -61,10 +62,14 @@ def farthest_measurement(adjustment, camera: str) -> float:
     s, data = adjustment.problem.structure, adjustment.problem.data
     c = camera_index(adjustment, camera)
     used = (np.asarray(s.camera) == c) & (np.asarray(data.image_weight) > 0).any(1)
-    p = jnp.array(list(adjustment.camera_parameters(camera).values()))
-    centre = np.asarray(_centre(_model(adjustment, camera), p))
-    away = np.asarray(data.image_xy)[used] - centre
+    away = np.asarray(data.image_xy)[used] - principal_point(adjustment, camera)
     return float(np.linalg.norm(away, axis=1).max(initial=0.0))
+
+
+def principal_point(adjustment, camera: str) -> Float[np.ndarray, "2"]:
+    """The measured image of a camera's axis, where its distortion is centred."""
+    p = jnp.array(list(adjustment.camera_parameters(camera).values()))
+    return np.asarray(_centre(_model(adjustment, camera), p))
 
 
 def camera_index(adjustment, camera: str) -> int:
@@ -83,16 +88,60 @@ def _centre(model, p):
 
 
 @partial(jax.jit, static_argnums=0)
-def _profile(model, p, radius):
-    """[2, radii] radial and decentring, and their derivatives by all parameters."""
-    azimuth = 2 * jnp.pi * jnp.arange(AZIMUTHS) / AZIMUTHS
-    cosine, sine = jnp.cos(azimuth), jnp.sin(azimuth)
+def _ideal(model, p, xy):
+    """Ideal coordinates of measured ones [radii, azimuths, 2]."""
+    return jnp.stack(jnp.vectorize(partial(model.to_ideal, tuple(p)))(xy[..., 0], xy[..., 1]), -1)
 
-    def at(p, radius):
-        x0, y0 = model.from_ideal(tuple(p), 0.0, 0.0)
-        ideal = jax.vmap(lambda x, y: jnp.stack(model.to_ideal(tuple(p), x, y)))
-        xi, yi = ideal(x0 + radius * cosine, y0 + radius * sine).T
-        dx, dy = radius * cosine - xi, radius * sine - yi
+
+def distortion_at(model, parameters, radius):
+    """Symmetric radial distortion and decentring of a camera model.
+
+    **Arguments:** `parameters` in the model's order; `radius` [radii] from the principal point in
+    the measured image.
+
+    **Returns:** both [2, radii], in the model's unit, rounding noise set to 0, and their
+    derivatives by all parameters [2, radii, parameters].
+    """
+    p, radius = jnp.asarray(parameters, float), jnp.asarray(radius, float)
+    azimuth = 2 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS
+    out = np.stack([np.cos(azimuth), np.sin(azimuth)], -1)
+    centre = _centre(model, p)
+    ideal = _ideal(model, p, centre + radius[:, None, None] * out)
+    found = _harmonics(model, p, centre, ideal, radius, jnp.asarray(out))
+    values, slopes = (np.array(x) for x in found)
+    noise = np.abs(values) < ROUNDING * (np.abs(centre).max() + radius)
+    # the amplitude has no derivative where it is zero
+    slopes[1][noise[1]] = 0
+    values[noise] = 0
+    return values, slopes
+
+
+@partial(jax.jit, static_argnums=0)
+def _harmonics(model, p, centre, ideal, radius, out):
+    """Values and derivatives, by the model's own formula alone.
+
+    What the formula gives only as an inverse (the centre, or the ideal points) is known at p. One
+    Newton step with the Jacobian held there has its derivative by p, exactly.
+    """
+    formula = getattr(model, model.own_formula)
+
+    def own(p, xy):
+        return jnp.stack(formula(tuple(p), xy[0], xy[1]))
+
+    def moved(q, root, target):
+        """The place near `root` whose image is `target`, for parameters q near p."""
+        return root - jnp.linalg.solve(jax.jacfwd(own, 1)(p, root), own(q, root) - target)
+
+    def displacements(q, radius, ideal):
+        if model.own_formula == "to_ideal":
+            middle = moved(q, centre, jnp.zeros(2))
+            return radius * out - jax.vmap(own, (None, 0))(q, middle + radius * out)
+        middle = own(q, jnp.zeros(2))
+        return radius * out - jax.vmap(moved, (None, 0, 0))(q, ideal, middle + radius * out)
+
+    def at(q, radius, ideal):
+        dx, dy = displacements(q, radius, ideal).T
+        cosine, sine = out.T
         radial = (dx * cosine + dy * sine).mean()
         tangential = dy * cosine - dx * sine
         a, b = 2 * (tangential * cosine).mean(), 2 * (tangential * sine).mean()
@@ -101,6 +150,6 @@ def _profile(model, p, radius):
         amplitude = jnp.where(there, jnp.sqrt(jnp.where(there, square, 1.0)), 0.0)
         return jnp.stack([radial, amplitude])
 
-    values = jax.vmap(at, (None, 0), 1)(p, radius)
-    slopes = jax.vmap(jax.jacfwd(at), (None, 0), 1)(p, radius)
+    values = jax.vmap(at, (None, 0, 0), 1)(p, radius, ideal)
+    slopes = jax.vmap(jax.jacfwd(at), (None, 0, 0), 1)(p, radius, ideal)
     return values, slopes

@@ -100,6 +100,8 @@ def datum(adjustment) -> str:
     open_ones = "defect 7: the observations leave open position, orientation and scale"
     if defect < 7:
         words = open_directions_in_words(np.asarray(s.gauge))
+        if defect == 6 and "scale" not in words:
+            words = "position and orientation"
         open_ones = f"defect {defect}: the observations leave open {words}"
     weight = np.asarray(s.datum_weight) > 0
     ids = network.points.id
@@ -132,20 +134,25 @@ def counts(adjustment) -> list[str]:
         ("interior orientation", int(np.sum(s.camera_free))),
         ("object coordinates", int(np.sum(s.point_free))),
     ]
-    listed = lambda rows: ", ".join(f"{name} {count}" for name, count in rows if count)
     used = int((np.asarray(adjustment.problem.data.image_weight) > 0).any(1).sum())
     rows = [
         ("Cameras", len(network.cameras), ""),
         ("Images", len(network.images), ""),
-        ("Points", len(network.points), listed(roles)),
+        ("Points", len(network.points), _listed(roles)),
         ("Image points", used, ""),
         ("Observations", n.observations, "image coordinates"),
-        ("Pseudo-observations", n.pseudo_observations, listed(kinds)),
+        ("Pseudo-observations", n.pseudo_observations, _listed(kinds)),
         ("Datum conditions", n.datum, ""),
-        ("Unknowns", n.unknowns, listed(groups)),
+        ("Unknowns", n.unknowns, _listed(groups)),
         ("Redundancy", n.redundancy, "observations + pseudo-observations + conditions − unknowns"),
     ]
-    return [*heading("Counts"), *table(("", "", ""), [(a, str(b), c) for a, b, c in rows], "lrl")[1:]]
+    rows = [(name, str(count), detail) for name, count, detail in rows]
+    return [*heading("Counts"), *table(("", "", ""), rows, "lrl")[1:]]
+
+
+def _listed(groups) -> str:
+    """Names with their counts, the empty ones left out."""
+    return ", ".join(f"{name} {count}" for name, count in groups if count)
 
 
 def convergence(adjustment) -> list[str]:
@@ -197,16 +204,20 @@ def image_precision(adjustment) -> str:
     sigma, unit = image_sigmas(adjustment), image_unit(adjustment)
     if not len(sigma) or not np.isfinite(adjustment.sigma0):
         return "–"
-    ends = adjustment.sigma0 * sigma[[0, -1]][: min(len(sigma), 2)]
-    span = lambda values, digits=5: " to ".join(significant(v, digits) for v in values)
-    parts = [f"{span(ends)} {unit}"]
+    ends = sigma[[0, -1]] if len(sigma) > 1 else sigma
+    parts = [f"{_span(adjustment.sigma0 * ends)} {unit}"]
     if unit == "mm":
-        parts.insert(0, f"{span(1e3 * ends)} µm")
+        parts.insert(0, f"{_span(1e3 * adjustment.sigma0 * ends)} µm")
         pitch = {camera.pixel_size for camera in adjustment.problem.network.cameras}
         if len(pitch) == 1 and None not in pitch:
-            parts.append(f"{span(ends / np.abs(next(iter(pitch))[0]), 3)} px")
-    prior = span(sigma[[0, -1]][: min(len(sigma), 2)], 4)
-    return f"{' = '.join(parts)}  (σ0 × σ a priori {prior} {unit})"
+            size = abs(next(iter(pitch))[0])
+            parts.append(f"{_span(adjustment.sigma0 * ends / size, 3)} px")
+    return f"{' = '.join(parts)}  (σ0 × σ a priori {_span(ends, 4)} {unit})"
+
+
+def _span(values, digits: int = 5) -> str:
+    """One number, or from the smallest to the largest."""
+    return " to ".join(significant(value, digits) for value in values)
 
 
 def chi_squared(adjustment, level: float = 0.05) -> str:
@@ -269,6 +280,8 @@ def why_not_solved(adjustment) -> list[str]:
     if names:
         rows.append(("Not determined", some(names, 40)))
     advice = [ADVICE.get(reason, ADVICE[STUCK])]
+    if reason == LIMIT and taken < tried / 2:
+        advice.append("Most steps were rejected: hold parameters that the images hardly determine.")
     advice += [text for kind, text in ADVICE_FOR.items() if any(f" of {kind} " in n for n in names)]
     rows += [("What to do" if i == 0 else "", text) for i, text in enumerate(advice)]
     return [

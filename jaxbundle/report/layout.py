@@ -28,6 +28,8 @@ def estimate(value: float, sigma: float | None, digits: int = 3) -> tuple[str, s
 
     Small numbers get an exponent each; a value without σ is shown with ten digits.
     """
+    if not math.isfinite(value):
+        return MISSING, MISSING
     if sigma is None or not math.isfinite(sigma) or sigma <= 0:
         return significant(value, 10), MISSING
     places = decimals_of(sigma, digits)
@@ -39,13 +41,21 @@ def estimate(value: float, sigma: float | None, digits: int = 3) -> tuple[str, s
     return f"{value:.{max(0, min(exponent + places, 15))}e}", f"{sigma:.{digits - 1}e}"
 
 
+def to_place_of(value: float, sigma: float, digits: int = 3) -> str:
+    """A value to the decimal place where its σ has `digits` digits."""
+    if not (math.isfinite(value) and math.isfinite(sigma) and sigma > 0):
+        return significant(value, digits)
+    places = decimals_of(sigma, digits)
+    return f"{value:.{max(places, 0)}f}" if places <= 7 else significant(value, digits)
+
+
 def significant(value: float | None, digits: int = 3) -> str:
     """A number with so many significant digits, without an exponent where it is readable so."""
     if value is None or not math.isfinite(value):
         return MISSING
     if value == 0:
         return "0"
-    if 1e-4 <= abs(value) < 10.0 ** max(digits, 6):
+    if 1e-5 <= abs(value) < 10.0 ** max(digits, 6):
         places = decimals_of(abs(value), digits)
         text = f"{value:.{max(places, 0)}f}"
         return text.rstrip("0").rstrip(".") if digits > 6 and "." in text else text
@@ -110,7 +120,7 @@ def paragraph(text: str, indent: int = 0, hanging: int = 0) -> list[str]:
 
 def heading(text: str) -> list[str]:
     """A section's heading, set off by an empty line."""
-    return ["", text.upper(), "-" * len(text)]
+    return ["", text, "-" * len(text)]
 
 
 def facts(rows: Iterable[tuple[str, str]], indent: int = 0) -> list[str]:

@@ -1,4 +1,4 @@
-"""The observations in a protocol: residuals, reliability, groups, blunders, check points, distances.
+"""The observations in a protocol: residuals, reliability, groups, blunders, comparisons.
 
 w = (v/σ)/√r uses the a priori σ (Baarda), τ = w/σ0 the a posteriori one (Pope). Only τ is
 comparable between projects whose a priori σ are a guess, so τ is what the report sorts by unless
@@ -21,6 +21,7 @@ from jaxbundle.report.layout import (
     paragraph,
     significant,
     table,
+    to_place_of,
 )
 from jaxbundle.statistics import normal_quantile, tau_quantile
 
@@ -44,19 +45,20 @@ def residuals(adjustment, limit: float, test: str) -> list[str]:
         f"Test: {'Pope, τ = w/σ0, σ a posteriori' if test == 'pope' else 'Baarda, σ a priori'}; "
         f"critical value {significant(_critical(adjustment, test), 3)} for one observation at "
         f"0.1 %. v and σ (a priori) of image coordinates in {image_unit(adjustment)}, of control "
-        "points and distances in the object unit; r redundancy number, MDB smallest blunder found "
-        "(α 0.1 %, power 80 %), δ̄ its largest effect on an unknown, in σ of that unknown."
+        "points and distances in the object unit; r redundancy number; MDB the smallest blunder "
+        "that is found (α 0.1 %, power 80 %), σ a posteriori (σ0 times the MDB of residuals.csv); "
+        "δ̄ its largest effect on an unknown, in σ of that unknown."
     )
     lines.append("")
     if len(over):
-        lines += _rows(found, over[:MOST_RESIDUALS])
+        lines += _rows(adjustment, over[:MOST_RESIDUALS])
         if len(over) > MOST_RESIDUALS:
             more = len(over) - MOST_RESIDUALS
             lines.append(f"… and {more} more: all residuals are in residuals.csv.")
         lines += ["", f"{len(over)} of {len(size)} observations."]
     else:
         lines.append(f"None of {number(len(size), 'observation')}. The largest:")
-        lines += _rows(found, order[:3])
+        lines += _rows(adjustment, order[:3])
     return lines + _histogram(found["tau"])
 
 
@@ -66,20 +68,25 @@ def _critical(adjustment, test: str, level: float = 0.001) -> float:
     return tau_quantile(1 - level / 2, adjustment.redundancy)
 
 
-def _rows(found, chosen) -> list[str]:
+def _rows(adjustment, chosen) -> list[str]:
+    found, sigma0 = adjustment.residuals, adjustment.sigma0
+    scale = sigma0 if math.isfinite(sigma0) else 1.0
     header = ("kind", "image", "point", "axis", "v", "σ", "r", "w", "τ", "MDB", "δ̄")
-    rows = [
-        (
-            found["kind"][i],
-            found["image"][i],
-            found["point"][i],
-            found["axis"][i],
-            *(significant(found[name][i], 3) for name in ("v", "sigma")),
-            fixed(found["r"][i], 3),
-            *(significant(found[name][i], 3) for name in ("w", "tau", "mdb", "external")),
+    rows = []
+    for i in chosen:
+        sigma = found["sigma"][i]
+        rows.append(
+            (
+                *(found[name][i] for name in ("kind", "image", "point", "axis")),
+                to_place_of(found["v"][i], scale * sigma),
+                significant(sigma, 3),
+                fixed(found["r"][i], 3),
+                significant(found["w"][i], 3),
+                fixed(found["tau"][i], 2),
+                to_place_of(scale * found["mdb"][i], scale * sigma),
+                significant(found["external"][i], 3),
+            )
         )
-        for i in chosen
-    ]
     return table(header, rows, "llll" + "r" * 7)
 
 
@@ -129,7 +136,7 @@ def redundancy(adjustment) -> list[str]:
         *facts(rows),
         "",
         "The least controlled observations:",
-        *_rows(found, order),
+        *_rows(adjustment, order),
     ]
 
 
@@ -184,14 +191,14 @@ def check_points(adjustment, most: int) -> list[str]:
         )
         for i in range(min(total, most))
     ]
-    summary = lambda of: [fixed(float(of(found[f"{k}{axis}"])), places) for k in "ds" for axis in "XYZ"]
-    blank = ("",) * 8
-    rows += [
-        blank,
-        ("RMS", *summary(lambda x: math.sqrt((x**2).mean())), ""),
-        ("mean", *summary(np.mean), ""),
-        ("largest", *summary(lambda x: x[np.abs(x).argmax()]), ""),
-    ]
+    rows.append(("",) * 8)
+    for name, of in (
+        ("RMS", lambda x: math.sqrt((x**2).mean())),
+        ("mean", np.mean),
+        ("largest", lambda x: x[np.abs(x).argmax()]),
+    ):
+        columns = (found[f"{kind}{axis}"] for kind in "ds" for axis in "XYZ")
+        rows.append((name, *(fixed(float(of(column)), places) for column in columns), ""))
     lines = [
         *heading(f"Check points: intersected − given, in {unit}"),
         *table(("point", "dX", "dY", "dZ", "σX", "σY", "σZ", "rays"), rows, "lrrrrrrr"),
@@ -207,8 +214,7 @@ def distances(adjustment, most: int) -> list[str]:
     rows_of = np.flatnonzero(found["kind"] == "distance")
     if not len(rows_of):
         return []
-    names = [id for id in adjustment.points["id"]]
-    at = {id: i for i, id in enumerate(names)}
+    at = {id: i for i, id in enumerate(adjustment.points["id"])}
     places = column_decimals(found["sigma"][rows_of])
     rows = []
     for i in rows_of[:most]:
@@ -219,7 +225,7 @@ def distances(adjustment, most: int) -> list[str]:
         values = (adjusted - v, found["sigma"][i], adjusted, sigma, v)
         rows.append(
             (found["image"][i], found["point"][i], *(fixed(x, places) for x in values),
-             fixed(r, 3), significant(found["tau"][i], 3))
+             fixed(r, 3), fixed(found["tau"][i], 2))
         )  # fmt: skip
     header = ("from", "to", "measured", "σ a priori", "adjusted", "σ", "v", "r", "τ")
     lines = [

@@ -20,7 +20,7 @@ from jaxbundle.report.layout import (
     some,
 )
 
-MOST_CAMERAS = 4
+MOST_CAMERAS = 3
 
 
 def one_line(adjustment) -> str:
@@ -55,15 +55,16 @@ def summary(adjustment) -> list[tuple[str, str]]:
         rows.append(("", "There is no result; report() says what to do."))
     else:
         rows += [
-            ("σ0", f"{sigma0_in_words(adjustment)}; image coordinate {image_precision(adjustment)}"),
+            ("σ0", sigma0_in_words(adjustment)),
+            ("Image precision", image_precision(adjustment)),
             ("χ² test", chi_squared(adjustment)),
             *_cameras(adjustment),
             ("Points", _points(adjustment)),
             ("Largest |τ|", _worst(adjustment)),
         ]
     for noun, things in (
-        ("observation removed", adjustment.removed),
-        ("parameter eliminated", adjustment.eliminated),
+        ("removed observation", adjustment.removed),
+        ("eliminated parameter", adjustment.eliminated),
         ("warning", adjustment.warnings),
     ):
         if things:

@@ -158,8 +158,10 @@ def images(adjustment, most: int) -> list[str]:
         sigma = [_sigma(found[f"s{name}"][i], d) for name, d in zip(EXTERIOR, places)]
         rms = fixed(scale * found["rms"][i], rms_places)
         rows += [(found["id"][i], *values, str(found["rays"][i]), rms), ("   σ", *sigma, "", "")]
-    header = ("image", "X0", "Y0", "Z0", f"ω {angle}", "φ", "κ", "rays", f"RMS v {rms_unit}")
-    lines = [*heading("Images: exterior orientation"), *table(header, rows, "lrrrrrrrr")]
+    header = ("image", "X0", "Y0", "Z0", "ω", "φ", "κ", "rays", f"RMS v {rms_unit}")
+    unit = clean(adjustment.network.object_unit)
+    title = f"Images: exterior orientation in {unit} and {angle}"
+    lines = [*heading(title), *table(header, rows, "lrrrrrrrr")]
     lines += _left_out(len(found["id"]), most, "image", "images.csv")
     return lines
 
@@ -195,12 +197,11 @@ def _precision(adjustment, accuracy_unit) -> list[str]:
     columns = [sigma[free[:, i], i] for i in range(3)]
     together = sigma[free]
     places = column_decimals(together)
-    rms = lambda s: float(np.sqrt((s**2).mean()))
     rows = [
         (name, *(fixed(of(s), places) if len(s) else "–" for s in (*columns, together)))
-        for name, of in (("mean", np.mean), ("RMS", rms), ("max", np.max), ("min", np.min))
+        for name, of in (("mean", np.mean), ("RMS", _rms), ("max", np.max), ("min", np.min))
     ]
-    scale = rms(together) if accuracy_unit is None else float(accuracy_unit)
+    scale = _rms(together) if accuracy_unit is None else float(accuracy_unit)
     meaning = "the RMS of all" if accuracy_unit is None else "as chosen"
     rows.append(("points", *(str(len(s)) for s in columns), ""))
     header = (f"in {unit}", "σX", "σY", "σZ", "all")
@@ -215,6 +216,10 @@ def _precision(adjustment, accuracy_unit) -> list[str]:
     first, second = body[: len(rows)], body[len(rows) + 1 :]
     note = f"Number of σ in classes of σ/s, s = {significant(scale, 3)} {unit} ({meaning})"
     return [head, *first, "", note, *second]
+
+
+def _rms(values) -> float:
+    return float(np.sqrt((values**2).mean()))
 
 
 def _rays(rays) -> list[str]:

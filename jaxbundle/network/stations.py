@@ -1,0 +1,204 @@
+"""Where the cameras stand and what they look at: the design of a simulated network.
+
+Generators of stations (a ring around an object, an aerial block) and of targets (a grid, a cloud)
+for `jaxbundle.simulate`. Lengths are in the object unit, angles in radians.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry import omega_phi_kappa_from_matrix
+
+
+@dataclasses.dataclass(frozen=True)
+class Stations:
+    """Exterior orientations: projection centres [I, 3] and ω, φ, κ [I, 3] in radians.
+
+    `a + b` are the stations of both, in this order.
+    """
+
+    position: Float[np.ndarray, "images 3"]
+    angles: Float[np.ndarray, "images 3"]
+
+    def __post_init__(self):
+        for name in ("position", "angles"):
+            object.__setattr__(self, name, rows_of_three(getattr(self, name), f"stations: {name}"))
+        if len(self.position) != len(self.angles):
+            raise InputError(
+                f"stations: {len(self.position)} positions but {len(self.angles)} rows of angles; "
+                "give one for each"
+            )
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    def __add__(self, other: "Stations") -> "Stations":
+        return Stations(
+            np.concatenate([self.position, other.position]),
+            np.concatenate([self.angles, other.angles]),
+        )
+
+
+def rows_of_three(values, name: str) -> Float[np.ndarray, "rows 3"]:
+    """Finite numbers [rows, 3], or a complaint that names them."""
+    values = np.asarray(values, float)
+    if values.ndim != 2 or values.shape[1] != 3 or not len(values):
+        raise InputError(f"{name} has the shape {values.shape}; expected [rows, 3]")
+    for row, k in np.argwhere(~np.isfinite(values))[:1]:
+        raise InputError(f"{name}, row {row + 1}: {values[row, k]} is not a finite number")
+    return values
+
+
+def stations_looking_at(
+    position: Float[np.ndarray, "images 3"],
+    look_at: Float[np.ndarray, "3"] | Float[np.ndarray, "images 3"],
+    *,
+    roll: float | Sequence[float] = 0.0,
+    up: Sequence[float] = (0.0, 0.0, 1.0),
+) -> Stations:
+    """Stations whose optical axes pass through given points.
+
+    **Arguments:**
+
+    - `position`: projection centres [I, 3].
+    - `look_at`: one point [3] for all, or one each [I, 3].
+    - `roll`: rotation of the camera about its axis, radians, added to κ. Without roll the
+      image's x axis is perpendicular to `up`, and `up` points to its upper half; a camera that
+      looks along `up` has its x axis along X of the object space.
+    """
+    position = rows_of_three(position, "stations: position")
+    up = np.asarray(up, float)
+    # The camera looks along −z, so z points from the object back to the camera.
+    z = position - np.asarray(look_at, float)
+    length = np.linalg.norm(z, axis=1, keepdims=True)
+    for row in np.flatnonzero(length[:, 0] == 0)[:1]:
+        raise InputError(f"stations: station {row + 1} stands on the point it looks at")
+    z = z / length
+    x = np.cross(up, z)
+    along = np.linalg.norm(x, axis=1, keepdims=True) < 1e-9 * np.linalg.norm(up)
+    first = np.array([1.0, 0.0, 0.0])
+    x = np.where(along, first - (z @ first)[:, None] * z, x)
+    x = x / np.linalg.norm(x, axis=1, keepdims=True)
+    y = np.cross(z, x)
+    c, s = np.cos(roll), np.sin(roll)
+    c, s = (np.broadcast_to(v, len(position))[:, None] for v in (c, s))
+    matrices = np.stack([c * x + s * y, -s * x + c * y, z], 1)
+    return Stations(position, _angles(matrices))
+
+
+def ring_of_stations(
+    stations: int,
+    radius: float,
+    height: float = 0.0,
+    look_at: Sequence[float] = (0.0, 0.0, 0.0),
+    *,
+    roll_every: int = 0,
+) -> Stations:
+    """Stations evenly on a horizontal circle around the vertical through `look_at`.
+
+    **Arguments:** `radius` and `height` above `look_at`, object unit; `roll_every`: every so
+    many-th camera is turned by 90° about its axis (2: every other one; 0: none). Without turned
+    cameras, or an object with depth, the principal point is poorly determined.
+    """
+    azimuth = 2 * np.pi * np.arange(stations) / stations
+    offset = np.stack(
+        [radius * np.cos(azimuth), radius * np.sin(azimuth), np.full(stations, height)], 1
+    )
+    turned = np.arange(1, stations + 1) % roll_every == 0 if roll_every else np.zeros(stations)
+    return stations_looking_at(
+        np.asarray(look_at, float) + offset, look_at, roll=np.pi / 2 * turned
+    )
+
+
+def aerial_block(
+    strips: int,
+    images_per_strip: int,
+    *,
+    height: float,
+    footprint: tuple[float, float],
+    forward_overlap: float = 0.6,
+    side_overlap: float = 0.3,
+    centre: Sequence[float] = (0.0, 0.0, 0.0),
+    heading: float = 0.0,
+    tilt: float = 0.0,
+) -> Stations:
+    """Vertical or oblique photographs in parallel strips, every other strip flown back.
+
+    **Arguments:**
+
+    - `height`: of flight above `centre`, object unit.
+    - `footprint`: size of a photograph on the ground (along x, along y of the image), object
+      unit; strips are flown along the image's x axis.
+    - `forward_overlap`, `side_overlap`: fractions of the footprint.
+    - `heading`: direction of the first strip, radians counter-clockwise from X.
+    - `tilt`: of the optical axis forward, radians, so that strips flown in opposite directions
+      look at each other. Vertical photographs alone cannot give the principal distance: heights
+      stretched with c change no image coordinate.
+
+    **Returns:** strips × images_per_strip stations, centred above `centre`.
+    """
+    for name, overlap in (("forward_overlap", forward_overlap), ("side_overlap", side_overlap)):
+        if not overlap < 1:
+            raise InputError(f"{name} is {overlap}; it must be a fraction below 1")
+    base, spacing = footprint[0] * (1 - forward_overlap), footprint[1] * (1 - side_overlap)
+    strip, number = np.divmod(np.arange(strips * images_per_strip), images_per_strip)
+    back = strip % 2 == 1
+    along = base * (number - (images_per_strip - 1) / 2) * np.where(back, -1, 1)
+    across = spacing * (strip - (strips - 1) / 2)
+    c, s = np.cos(heading), np.sin(heading)
+    offset = np.stack(
+        [c * along - s * across, s * along + c * across, np.full(len(strip), float(height))], 1
+    )
+    direction = np.where(back, -1, 1)[:, None] * np.array([c, s, 0.0])
+    up = np.array([0.0, 0.0, 1.0])
+    x = np.cos(tilt) * direction + np.sin(tilt) * up
+    z = np.cos(tilt) * up - np.sin(tilt) * direction
+    return Stations(
+        np.asarray(centre, float) + offset, _angles(np.stack([x, np.cross(z, x), z], 1))
+    )
+
+
+def _angles(matrices: Float[np.ndarray, "images 3 3"]) -> Float[np.ndarray, "images 3"]:
+    """ω, φ, κ of rotation matrices."""
+    return np.asarray(jax.vmap(omega_phi_kappa_from_matrix)(jnp.asarray(matrices)), float)
+
+
+def grid_of_targets(
+    columns: int,
+    rows: int,
+    spacing: float | tuple[float, float],
+    *,
+    relief: float = 0.0,
+    seed: int = 0,
+    centre: Sequence[float] = (0.0, 0.0, 0.0),
+) -> Float[np.ndarray, "points 3"]:
+    """Targets on a horizontal grid, row by row: [columns·rows, 3], object unit.
+
+    **Arguments:** `spacing` along X and Y; `relief`: heights vary at random (by `seed`) within
+    ± relief; 0 gives a plane.
+    """
+    dx, dy = np.broadcast_to(spacing, 2)
+    x = dx * (np.arange(columns) - (columns - 1) / 2)
+    y = dy * (np.arange(rows) - (rows - 1) / 2)
+    xy = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    z = np.random.default_rng(seed).uniform(-relief, relief, len(xy))
+    return np.asarray(centre, float) + np.concatenate([xy, z[:, None]], 1)
+
+
+def cloud_of_targets(
+    points: int,
+    size: float | Sequence[float],
+    *,
+    seed: int = 0,
+    centre: Sequence[float] = (0.0, 0.0, 0.0),
+) -> Float[np.ndarray, "points 3"]:
+    """Targets at random in a box of the given `size` (one edge, or three): [points, 3]."""
+    half = np.broadcast_to(size, 3) / 2
+    rng = np.random.default_rng(seed)
+    return np.asarray(centre, float) + rng.uniform(-half, half, (points, 3))

@@ -1,0 +1,111 @@
+"""A camera: its distortion over the radius, the correlations of its parameters."""
+
+import numpy as np
+
+from jaxbundle.plotting.distortion import distortion_profile
+from jaxbundle.plotting.style import (
+    BLUE,
+    INK,
+    RUST,
+    axes,
+    label,
+    legend,
+    micrometres,
+    quiet,
+    title,
+)
+
+LEAST = 0.1
+"""The distortion axis reaches as far as ± this, in µm or px, lest rounding look like distortion."""
+
+ANNOTATED = 20
+"""Correlations are written into the cells of a matrix up to this size."""
+
+
+def distortion_curve(adjustment, camera: str, ax=None):
+    """Radial distortion and decentring of a camera over the radius, each with its ±σ.
+
+    measured − ideal, so that pincushion distortion is positive whatever the model; from the
+    principal point to the farthest measurement (see `distortion_profile`).
+
+    **Returns:** matplotlib `Axes`; distortion in µm for a camera in mm, else in its unit.
+    """
+    ax = axes(ax, (6.5, 4.2))
+    found = distortion_profile(adjustment, camera)
+    scale, unit = micrometres(found.unit)
+    for value, sigma, colour, name in (
+        (found.radial, found.radial_sigma, BLUE, "symmetric radial"),
+        (found.decentring, found.decentring_sigma, RUST, "decentring"),
+    ):
+        if not (np.abs(value) > 0).any() and not (sigma > 0).any() and colour == RUST:
+            continue
+        low, high = scale * (value - sigma), scale * (value + sigma)
+        if (sigma > 0).any():
+            name += f", σ up to {scale * np.nanmax(sigma):.2g} {unit}"
+        ax.fill_between(found.radius, low, high, color=colour, alpha=0.2, linewidth=0, zorder=2)
+        ax.plot(found.radius, scale * value, color=colour, linewidth=1.5, label=name, zorder=3)
+    ax.axhline(0, color=INK, linewidth=0.6, zorder=1)
+    quiet(ax)
+    ax.set_xlim(0, found.radius[-1] or 1.0)
+    bottom, top = ax.get_ylim()
+    ax.set_ylim(min(bottom, -LEAST), max(top, LEAST))
+    label(ax, "x", "distance from the principal point", found.unit)
+    label(ax, "y", "distortion, measured − ideal", unit)
+    model = adjustment.cameras[camera]["model"]
+    held = not (np.nanmax(found.radial_sigma, initial=0) > 0)
+    band = "held, no σ" if held else "bands: ±σ (a posteriori)"
+    title(ax, f"Camera {camera}: distortion ({model})", band)
+    legend(ax)
+    return ax
+
+
+def correlation_matrix(adjustment, camera: str | None = None, ax=None):
+    """Correlations of the free parameters of a camera, or of all cameras together, in %.
+
+    **Returns:** matplotlib `Axes`.
+
+    **Raises:** `ValueError` where nothing is free.
+    """
+    names, C = _correlations(adjustment, camera)
+    n = len(names)
+    if not n:
+        which = "no camera" if camera is None else f"camera {camera!r}: nothing"
+        raise ValueError(f"{which} is free: there are no correlations to show")
+    side = float(np.clip(2.2 + 0.42 * n, 4, 12))
+    ax = axes(ax, (side + 0.8, side))
+    shown = ax.imshow(100 * C, cmap="RdBu_r", vmin=-100, vmax=100)
+    ax.set_xticks(range(n), names, rotation=90 if n > 8 or camera is None else 0, parse_math=False)
+    ax.set_yticks(range(n), names, parse_math=False)
+    quiet(ax, grid=False)
+    ax.tick_params(length=0)
+    if n <= ANNOTATED:
+        for i in range(n):
+            for j in range(n):
+                colour = "white" if abs(C[i, j]) > 0.6 else INK
+                ax.text(j, i, f"{round(100 * C[i, j])}", ha="center", va="center", fontsize=7,
+                        color=colour)  # fmt: skip
+    bar = ax.figure.colorbar(shown, ax=ax, shrink=0.8, pad=0.02)
+    bar.set_label("correlation [%]", fontsize=9, color=INK)
+    bar.ax.tick_params(labelsize=8, width=0.8, length=3)
+    bar.outline.set_visible(False)
+    label(ax, "x", "parameter")
+    label(ax, "y", "parameter")
+    which = adjustment.network.name if camera is None else f"Camera {camera}"
+    title(ax, f"{which}: correlations in %")
+    return ax
+
+
+def _correlations(adjustment, camera):
+    """Names and correlation matrix of the free parameters of one camera or of all."""
+    tables = adjustment.cameras
+    if camera is None and len(tables) == 1:
+        camera = next(iter(tables))
+    if camera is not None:
+        adjustment.camera_parameters(camera)
+        return tables[camera]["free"], tables[camera]["correlations"]
+    wanted = [(name, p) for name, entry in tables.items() for p in entry["free"]]
+    if not wanted:
+        return [], np.zeros((0, 0))
+    Q = adjustment.covariance(*(("camera", name, p) for name, p in wanted))
+    sigma = np.sqrt(np.diagonal(Q))
+    return [f"{name}: {p}" for name, p in wanted], Q / np.outer(sigma, sigma)

@@ -1,0 +1,112 @@
+"""All figures of a result as PNG files, without a display and without pyplot."""
+
+import io
+import os
+import re
+import tempfile
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.plotting.cameras import correlation_matrix, distortion_curve
+from jaxbundle.plotting.images import residual_histogram, residual_vectors
+from jaxbundle.plotting.style import need_matplotlib
+from jaxbundle.plotting.views import network_perspective, network_plan
+
+MOST_IMAGES = 12
+MOST_CAMERAS = 6
+DOTS_PER_INCH = 150
+
+
+def save_figures(adjustment, folder: str | Path) -> list[Path]:
+    """Write the figures of a result into a folder, each file whole or not at all.
+
+    plan.png, perspective.png, histogram.png, residuals_IMAGE.png of at most 12 images (those with
+    the largest RMS), distortion_CAMERA.png and correlations_CAMERA.png of at most 6 cameras;
+    correlations only where two parameters are free. Ids are made safe for file names.
+
+    **Returns:** the paths written.
+
+    **Raises:** `ImportError` without matplotlib, `InputError` where the folder cannot be written,
+    `NotSolvedError` where there is no result.
+    """
+    need_matplotlib()
+    folder = Path(folder)
+    table = adjustment.images
+    worst = np.argsort(-np.nan_to_num(table["rms"]), kind="stable")[:MOST_IMAGES]
+    drawings = {
+        "plan": ((7.5, 6.5), None, network_plan, ()),
+        "perspective": ((7.5, 6.5), "3d", network_perspective, ()),
+        "histogram": ((6.5, 4.2), None, residual_histogram, ()),
+    }
+    names = _Names(drawings)
+    for image in table["id"][np.sort(worst)]:
+        drawings[names("residuals", image)] = ((7, 6), None, residual_vectors, (image,))
+    for camera, entry in list(adjustment.cameras.items())[:MOST_CAMERAS]:
+        drawings[names("distortion", camera)] = ((6.5, 4.2), None, distortion_curve, (camera,))
+        n = len(entry["free"])
+        if n > 1:
+            side = float(np.clip(2.2 + 0.42 * n, 4, 12))
+            drawings[names("correlations", camera)] = (
+                (side + 0.8, side), None, correlation_matrix, (camera,)
+            )  # fmt: skip
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made ({error.strerror})") from error
+    written = []
+    for name, (size, projection, draw, arguments) in drawings.items():
+        path = folder / f"{name}.png"
+        _write(path, _png(size, projection, lambda ax: draw(adjustment, *arguments, ax=ax)))  # noqa: B023
+        written.append(path)
+    return written
+
+
+def _png(size, projection, draw) -> bytes:
+    """One drawing as a PNG image."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, dpi=DOTS_PER_INCH, layout="constrained")
+    FigureCanvasAgg(figure)
+    draw(figure.add_subplot(projection=projection))
+    data = io.BytesIO()
+    with warnings.catch_warnings():
+        # ids in a script that the font lacks: boxes in the figure, nothing to act on
+        warnings.filterwarnings("ignore", message="Glyph .* missing")
+        figure.savefig(data, format="png", bbox_inches="tight", pad_inches=0.15)
+    return data.getvalue()
+
+
+def _write(path: Path, content: bytes) -> None:
+    try:
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+    finally:
+        Path(temporary).unlink(missing_ok=True)
+
+
+class _Names:
+    """File names from ids: letters, digits, dot, dash and underscore; each once, in any case."""
+
+    def __init__(self, taken):
+        self.taken = {name.casefold() for name in taken}
+
+    def __call__(self, kind: str, id: str) -> str:
+        safe = re.sub(r"[^\w.-]+", "_", str(id), flags=re.ASCII).strip("._")[:60] or "unnamed"
+        name, number = f"{kind}_{safe}", 1
+        while name.casefold() in self.taken:
+            number += 1
+            name = f"{kind}_{safe}_{number}"
+        self.taken.add(name.casefold())
+        return name

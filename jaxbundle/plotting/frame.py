@@ -1,0 +1,59 @@
+"""The frame of an image: where its corners are, and what was measured in it."""
+
+import numpy as np
+
+from jaxbundle.cameras import get_model
+from jaxbundle.plotting.distortion import camera_index
+
+
+def image_frame(adjustment, camera: str):
+    """The corners of a camera's image, and whether they are known.
+
+    **Returns:** lowest and highest (x, y), in the unit of the camera's model, and True if they
+    follow from the image size; else the rectangle of the measurements, and False.
+    """
+    network, s = adjustment.problem.network, adjustment.problem.structure
+    c = camera_index(adjustment, camera)
+    given, model = network.cameras[c], get_model(network.cameras[c].model)
+    size, pitch = given.image_size, given.pixel_size
+    if size is not None and model.unit == "px":
+        half = np.array(size) / 2
+        centre = half - 0.5 if model.axes == "down" else np.zeros(2)
+        return centre - half, centre + half, True
+    if size is not None and pitch is not None:
+        half = np.array(size) * np.abs(pitch) / 2
+        return -half, half, True
+    used = np.asarray(s.camera) == c
+    xy = np.asarray(adjustment.problem.data.image_xy)[used]
+    if not len(xy):
+        return -np.ones(2), np.ones(2), False
+    return xy.min(0), xy.max(0), False
+
+
+def measured(adjustment, image: str):
+    """What was measured in an image: points, coordinates [n, 2], residuals [n, 2], τ [n, 2].
+
+    Coordinates and v = computed − observed in the unit of the camera's model; τ and v of a
+    coordinate that was removed are NaN.
+    """
+    s, data = adjustment.problem.structure, adjustment.problem.data
+    i = image_index(adjustment, image)
+    weight = np.asarray(data.image_weight)
+    rows = np.flatnonzero((np.asarray(s.image) == i) & (weight > 0).any(1))
+    weight = np.where(weight[rows] > 0, weight[rows], np.nan)
+    found = adjustment.reliability
+    ids = np.array(adjustment.problem.network.points.id, dtype=object)
+    return (
+        ids[np.asarray(s.point)[rows]],
+        np.asarray(data.image_xy)[rows],
+        np.asarray(found.residual.image)[rows] / weight,
+        np.asarray(found.w.image)[rows] / adjustment.sigma0,
+    )
+
+
+def image_index(adjustment, image: str) -> int:
+    """The row of an image in the arrays."""
+    ids = adjustment.problem.network.images.id
+    if str(image) not in ids:
+        raise KeyError(f"there is no image {image!r}; images: {', '.join(ids[:20])}")
+    return ids.index(str(image))

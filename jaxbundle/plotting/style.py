@@ -1,0 +1,107 @@
+"""What all figures share: axes to draw on, colours, lengths of bars, text from files.
+
+matplotlib is imported by the functions that draw, so that the package does without it.
+"""
+
+import math
+
+import numpy as np
+
+INK = "#26323c"
+GREY = "#8d979f"
+PALE = "#d5dade"
+BLUE = "#2c6089"
+RUST = "#c2512f"
+GREEN = "#4c8267"
+
+ROLE_STYLE = {
+    "tie": {"color": BLUE, "marker": "o", "s": 12},
+    "control": {"color": RUST, "marker": "^", "s": 42},
+    "fixed": {"color": INK, "marker": "s", "s": 26},
+    "check": {"color": GREEN, "marker": "D", "s": 26},
+}
+LABELLED = 40
+"""Ids are written beside at most so many points of a plan, half of them images."""
+
+
+def need_matplotlib():
+    """matplotlib, or what to install."""
+    try:
+        import matplotlib
+    except ImportError as error:
+        raise ImportError("figures need matplotlib: pip install 'jaxbundle[plots]'") from error
+    return matplotlib
+
+
+def axes(ax, size: tuple[float, float], projection: str | None = None):
+    """The axes given, or those of a new pyplot figure (shown by notebooks and `plt.show`)."""
+    need_matplotlib()
+    if ax is None:
+        from matplotlib import pyplot
+
+        keywords = {"projection": projection} if projection else None
+        _, ax = pyplot.subplots(figsize=size, layout="constrained", subplot_kw=keywords)
+    if projection == "3d" and not hasattr(ax, "set_zlabel"):
+        raise ValueError("a perspective view needs 3D axes: add_subplot(projection=\"3d\")")
+    return ax
+
+
+def quiet(ax, grid: bool = True) -> None:
+    """Thin spines, small ticks, a pale grid behind the data."""
+    for spine in ax.spines.values():
+        spine.set_color(GREY)
+        spine.set_linewidth(0.8)
+    ax.tick_params(colors=INK, labelsize=8, width=0.8, length=3)
+    if grid:
+        ax.grid(True, color=PALE, linewidth=0.6)
+        ax.set_axisbelow(True)
+
+
+def title(ax, text: str, detail: str = "") -> None:
+    """A title with a line of detail; names from files are never read as formulas."""
+    lines = f"{plain(text)}\n{detail}" if detail else plain(text)
+    ax.set_title(lines, fontsize=10, color=INK, loc="left", parse_math=False)
+
+
+def plain(name: object) -> str:
+    """A name from a file on one line; what cannot be printed is a question mark."""
+    return "".join(c if c.isprintable() else "?" for c in str(name))
+
+
+def legend(ax, **keywords) -> None:
+    """What is what, on a pale ground."""
+    keywords = {"frameon": True, "framealpha": 0.85, "edgecolor": PALE} | keywords
+    ax.legend(fontsize=8, **keywords)
+
+
+def label(ax, axis: str, name: str, unit: str = "") -> None:
+    """An axis label with its unit in brackets."""
+    text = f"{name} [{plain(unit)}]" if unit else name
+    getattr(ax, f"set_{axis}label")(text, fontsize=9, color=INK, parse_math=False)
+
+
+def round_number(x: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is not above x."""
+    if not (math.isfinite(x) and x > 0):
+        return 1.0
+    power = 10.0 ** math.floor(math.log10(x))
+    return max(step * power for step in (1, 2, 5) if step * power <= x * (1 + 1e-12))
+
+
+def extent(xyz) -> tuple[np.ndarray, float]:
+    """Centre and size of what is to be seen: far outliers (nearly parallel rays) do not count."""
+    xyz = np.asarray(xyz, float)
+    xyz = xyz[np.isfinite(xyz).all(1)]
+    if not len(xyz):
+        return np.zeros(3), 1.0
+    low, middle, high = np.quantile(xyz, [0.02, 0.5, 0.98], axis=0)
+    reach = 3 * np.maximum(high - low, 1e-12 + 1e-3 * (high - low).max())
+    seen = xyz[(np.abs(xyz - middle) <= reach).all(1)]
+    seen = seen if len(seen) else xyz
+    low, high = seen.min(0), seen.max(0)
+    return (low + high) / 2, float(max((high - low).max(), 1e-9))
+
+
+def micrometres(unit: str) -> tuple[float, str]:
+    """Small lengths of an image are shown in µm where it is measured in mm."""
+    return (1e3, "µm") if unit == "mm" else (1.0, unit)

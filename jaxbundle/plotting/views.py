@@ -1,0 +1,256 @@
+"""The network as a map and in perspective: points by role, cameras as pyramids, error ellipses."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbundle.cameras import get_model, image_ray
+from jaxbundle.geometry import matrix_from_quaternion
+from jaxbundle.plotting.frame import image_frame
+from jaxbundle.plotting.style import (
+    BLUE,
+    GREY,
+    INK,
+    LABELLED,
+    PALE,
+    ROLE_STYLE,
+    axes,
+    extent,
+    label,
+    legend,
+    plain,
+    quiet,
+    round_number,
+    title,
+)
+
+ELLIPSES = 2000
+"""Error ellipses are drawn for at most so many points."""
+
+
+def network_plan(adjustment, ax=None):
+    """The network seen from above: points by role, cameras, error ellipses of X and Y.
+
+    The ellipses are 1σ (a posteriori) and exaggerated; the legend states the factor. A camera is
+    the pyramid of its image corners, with its projection centre and viewing direction.
+
+    **Returns:** matplotlib `Axes`, in the object unit.
+    """
+    ax = axes(ax, (7.5, 6.5))
+    from matplotlib.collections import LineCollection
+    from matplotlib.transforms import ScaledTranslation
+
+    points, centres = _points(adjustment), adjustment.image_values[:, :3]
+    _, size = extent(np.concatenate([points["xyz"], centres]))
+    pyramids = camera_pyramids(adjustment, _pyramid_size(centres, size))
+    lines = LineCollection(
+        _pyramid_lines(pyramids)[:, :, :2], colors=GREY, linewidths=0.6, zorder=2
+    )
+    ax.add_collection(lines)
+    axis = np.stack([centres, pyramids[:, 1:].mean(1)], 1)[:, :, :2]
+    ax.add_collection(LineCollection(axis, colors=INK, linewidths=1.0, zorder=3))
+    ax.scatter(centres[:, 0], centres[:, 1], s=9, color=INK, zorder=4, label="cameras")
+    for role, style in ROLE_STYLE.items():
+        chosen = points["xyz"][points["role"] == role]
+        if len(chosen):
+            ax.scatter(chosen[:, 0], chosen[:, 1], label=f"{role} points", linewidths=0, zorder=5,
+                       **_lighter(style, len(points["id"])))  # fmt: skip
+    ellipses = _draw_ellipses(adjustment, ax, size)
+    away = centres - pyramids[:, 1:].mean(1)
+    _write_ids(ax, points["id"], points["xyz"], BLUE, LABELLED)
+    _write_ids(ax, adjustment.images["id"], centres, INK, LABELLED // 2, away / size)
+    drawn = (points["xyz"][:, :2], pyramids[:, :, :2].reshape(-1, 2), ellipses.reshape(-1, 2))
+    low, high = _inside(np.concatenate(drawn))
+    ax.set_xlim(low[0], high[0])
+    ax.set_ylim(low[1], high[1])
+    ax.set_aspect("equal")
+    quiet(ax)
+    unit = adjustment.network.object_unit
+    label(ax, "x", "X", unit)
+    label(ax, "y", "Y", unit)
+    title(ax, f"{adjustment.network.name}: plan")
+    below = ax.transAxes + ScaledTranslation(0, -0.5, ax.figure.dpi_scale_trans)
+    legend(ax, loc="upper left", bbox_to_anchor=(0, 0), bbox_transform=below, ncols=5,
+           frameon=False, borderaxespad=0, handletextpad=0.3, columnspacing=1.5)  # fmt: skip
+    return ax
+
+
+def network_perspective(adjustment, ax=None):
+    """The network in perspective: cameras as pyramids of their image corners, points by role.
+
+    **Returns:** matplotlib 3D `Axes`, in the object unit.
+    """
+    ax = axes(ax, (7.5, 6.5), "3d")
+    from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+
+    points, centres = _points(adjustment), adjustment.image_values[:, :3]
+    _, size = extent(np.concatenate([points["xyz"], centres]))
+    pyramids = camera_pyramids(adjustment, _pyramid_size(centres, size))
+    faces = Poly3DCollection(pyramids[:, 1:], facecolors=BLUE, alpha=0.12, edgecolors="none")
+    ax.add_collection3d(faces)
+    ax.add_collection3d(Line3DCollection(_pyramid_lines(pyramids), colors=GREY, linewidths=0.7))
+    ax.scatter(*centres.T, s=8, color=INK, label="cameras", depthshade=False)
+    for role, style in ROLE_STYLE.items():
+        chosen = points["xyz"][points["role"] == role]
+        if len(chosen):
+            ax.scatter(*chosen.T, label=f"{role} points", linewidths=0, depthshade=False,
+                       **_lighter(style, len(points["id"])))  # fmt: skip
+    everything = np.concatenate([points["xyz"], pyramids.reshape(-1, 3)])
+    low, high = _inside(everything)
+    for name, a, b in zip("xyz", low, high):
+        getattr(ax, f"set_{name}lim")(a, b)
+    ax.set_box_aspect(np.maximum(high - low, 0.05 * (high - low).max()), zoom=0.95)
+    unit = adjustment.network.object_unit
+    for name in "xyz":
+        label(ax, name, name.upper(), unit)
+        axis = getattr(ax, f"{name}axis")
+        axis.set_pane_color((1, 1, 1, 0))
+        axis._axinfo["grid"].update(color=PALE, linewidth=0.6)
+        ax.tick_params(axis=name, labelsize=7, colors=INK, pad=0)
+        ax.locator_params(axis=name, nbins=5)
+    ax.view_init(elev=24, azim=-58)
+    title(ax, f"{adjustment.network.name}: perspective")
+    legend(ax, frameon=False, loc="upper right")
+    return ax
+
+
+# --- cameras --------------------------------------------------------------------------------
+
+
+def camera_pyramids(adjustment, size: float) -> np.ndarray:
+    """Projection centre and the four image corners in object space [images, 5, 3].
+
+    The slanted edges have the length `size` on the average; corners by the camera's own model, so
+    that the principal point and the distortion show.
+    """
+    network, values = adjustment.problem.network, adjustment.values
+    M = np.asarray(jax.vmap(matrix_from_quaternion)(values.rotation))
+    centres = adjustment.image_values[:, :3]
+    models = [get_model(given.model) for given in network.cameras]
+    frames = np.array([np.stack(image_frame(adjustment, c.id)[:2]) for c in network.cameras])
+    corners = np.zeros((len(models), 4, 3))
+    for model in dict.fromkeys(models):
+        chosen = [c for c, other in enumerate(models) if other == model]
+        p = adjustment.values.camera[np.array(chosen), : len(model.parameters)]
+        corners[chosen] = _corner_rays(model, p, frames[chosen])
+    # where a distortion turns back inside the frame there is no ray: a corner to look at instead
+    missing = ~np.isfinite(corners).all(2)
+    plain = np.array([(-1, -1, -1.4), (1, -1, -1.4), (1, 1, -1.4), (-1, 1, -1.4)])
+    corners = np.where(missing[:, :, None], plain, corners)
+    flat = (corners[:, :, 2] < -0.2).all(1)
+    corners[flat] /= -corners[flat][:, :, 2:]
+    corners /= np.linalg.norm(corners, axis=2).mean(1)[:, None, None]
+    edges = size * corners[network.images.camera]
+    return np.concatenate([centres[:, None], centres[:, None] + edges @ M], 1)
+
+
+@partial(jax.jit, static_argnums=0)
+def _corner_rays(model, parameters, frames):
+    """Rays of the four corners of every frame (lowest and highest x, y) [cameras, 4, 3]."""
+    x, y = frames[:, jnp.array([0, 1, 1, 0]), 0], frames[:, jnp.array([0, 0, 1, 1]), 1]
+
+    def ray(p, x, y):
+        return jnp.stack(image_ray(model, tuple(p), x, y))
+
+    return jax.vmap(jax.vmap(ray, (None, 0, 0)))(parameters, x, y)
+
+
+def _pyramid_lines(pyramids):
+    """The eight edges of every pyramid [images·8, 2, 3]."""
+    ends = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)]
+    return pyramids[:, np.array(ends)].reshape(-1, 2, 3)
+
+
+def _pyramid_size(centres, size: float) -> float:
+    """Large enough to be seen, small enough to leave neighbours apart."""
+    return float(np.clip(0.9 * _neighbour(centres), 0.045 * size, 0.15 * size))
+
+
+def _neighbour(places, most: int = 400) -> float:
+    """The median distance to the nearest neighbour, from a sample; infinite for a single place."""
+    if len(places) < 2:
+        return np.inf
+    sample = places[:: max(1, len(places) // most)]
+    away = np.linalg.norm(sample[:, None] - places[None], axis=2)
+    away[away == 0] = np.inf
+    return float(np.median(away.min(1)))
+
+
+# --- points ---------------------------------------------------------------------------------
+
+
+def _points(adjustment):
+    """Ids, roles and coordinates, check points included."""
+    table = adjustment.points
+    id, role, xyz = table["id"], table["role"], adjustment.point_values
+    checks = adjustment.check_points
+    if checks is not None:
+        id = np.concatenate([id, np.array(checks.id, dtype=object)])
+        role = np.concatenate([role, np.full(len(checks.id), "check", dtype=object)])
+        xyz = np.concatenate([xyz, checks.position])
+    return {"id": id, "role": role, "xyz": xyz}
+
+
+def _lighter(style, number: int):
+    """Smaller marks where there are many."""
+    return style | {"s": style["s"] / (1 if number <= 300 else 2 if number <= 3000 else 8)}
+
+
+def error_ellipses(adjustment, factor: float, corners: int = 49) -> np.ndarray:
+    """Closed polygons [points, corners, 2] of the ellipses of X and Y of the estimated points."""
+    covariance = adjustment.point_covariance[:, :2, :2]
+    covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
+    there = np.isfinite(covariance).all((1, 2)) & (np.trace(covariance, axis1=1, axis2=2) > 0)
+    square, direction = np.linalg.eigh(covariance[there])
+    t = np.linspace(0, 2 * np.pi, corners)
+    circle = np.stack([np.cos(t), np.sin(t)])
+    shape = direction * np.sqrt(np.clip(square, 0, None))[:, None, :]
+    return adjustment.point_values[there, None, :2] + factor * (shape @ circle).transpose(0, 2, 1)
+
+
+def _draw_ellipses(adjustment, ax, size: float) -> np.ndarray:
+    """Draw the error ellipses, in a size that can be seen and compared; what was drawn."""
+    from matplotlib.collections import LineCollection
+
+    covariance = adjustment.point_covariance[:, :2, :2]
+    large = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
+    large = large[np.isfinite(large) & (large > 0)]
+    if not len(large) or len(large) > ELLIPSES:
+        return np.zeros((0, 1, 2))
+    neighbour = _neighbour(adjustment.point_values[:, :2])
+    reach = np.clip(0.45 * neighbour, 0.012 * size, 0.03 * size)
+    factor = round_number(reach / np.median(large))
+    polygons = error_ellipses(adjustment, factor)
+    ellipses = LineCollection(
+        polygons, colors=BLUE, linewidths=0.8, alpha=0.8, zorder=3,
+        label=f"error ellipses (1σ) × {factor:,.12g}".replace(",", " "),
+    )  # fmt: skip
+    ax.add_collection(ellipses)
+    return polygons
+
+
+def _write_ids(ax, ids, xyz, colour, most: int, away=None) -> None:
+    """Ids beside their places; on the far side of what the images look at."""
+    if len(ids) > most:
+        return
+    away = np.full((len(ids), 2), 0.7) if away is None else away[:, :2]
+    for id, place, (dx, dy) in zip(ids, xyz, away):
+        length = np.hypot(dx, dy)
+        dx, dy = (dx / length, dy / length) if length > 0.01 else (0.7, 0.7)
+        ax.annotate(
+            plain(id), place[:2], xytext=(6 * dx, 6 * dy), textcoords="offset points", fontsize=7,
+            color=colour, parse_math=False, annotation_clip=True, zorder=6,
+            ha="right" if dx < -0.3 else "left" if dx > 0.3 else "center",
+            va="top" if dy < -0.3 else "bottom" if dy > 0.3 else "center",
+        )  # fmt: skip
+
+
+def _inside(xyz):
+    """The corners of what is to be seen, with a margin."""
+    centre, size = extent(xyz)
+    near = xyz[(np.abs(xyz - centre) <= 0.5 * size * (1 + 1e-9)).all(1)]
+    low, high = near.min(0), near.max(0)
+    margin = 0.04 * (high - low).max()
+    return low - margin, high + margin
