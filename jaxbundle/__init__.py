@@ -18,11 +18,20 @@ from jaxbundle.errors import InputError as InputError
 from jaxbundle.errors import NotSolvedError as NotSolvedError
 from jaxbundle.gradients import check_gradients as check_gradients
 from jaxbundle.io import read_network as read_network
+from jaxbundle.io import write_project as write_project
 from jaxbundle.network import Camera as Camera
 from jaxbundle.network import Network as Network
 from jaxbundle.network.arrays import Data as Data
 from jaxbundle.network.arrays import Values as Values
 from jaxbundle.network.build import make_network as make_network
+from jaxbundle.network.check import check_network as check_network
+from jaxbundle.network.simulate import simulate as simulate
+from jaxbundle.network.simulate import simulate_with_truth as simulate_with_truth
+from jaxbundle.network.stations import aerial_block as aerial_block
+from jaxbundle.network.stations import cloud_of_targets as cloud_of_targets
+from jaxbundle.network.stations import grid_of_targets as grid_of_targets
+from jaxbundle.network.stations import ring_of_stations as ring_of_stations
+from jaxbundle.network.stations import stations_looking_at as stations_looking_at
 from jaxbundle.result import Adjustment as Adjustment
 
 

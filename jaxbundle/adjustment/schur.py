@@ -21,6 +21,9 @@ from jaxbundle.adjustment.normal import Normal
 from jaxbundle.network.arrays import Tangent
 from jaxbundle.network.structure import Structure
 
+PIVOT = 1e-13
+"""A pivot below this fraction of its diagonal element is rounding: nothing determines it."""
+
 
 class Factor(eqx.Module):
     """N factorised: everything needed to solve with it, and to read blocks of its inverse.
@@ -43,9 +46,14 @@ def factorise(
     damping: Tangent | None = None,
     gauge: Tangent | None = None,
 ) -> Factor:
-    """Factorise N + diag(damping), with the datum directions `gauge` (last axis) made regular."""
+    """Factorise N + diag(damping), with the datum directions `gauge` (last axis) made regular.
+
+    NaN where a pivot is rounding, as where it is negative: chance decides between the two.
+    """
     matrix, *rest = reduce(structure, normal, damping, gauge)
-    return Factor(structure, jnp.linalg.cholesky(matrix, symmetrize_input=False), *rest)
+    cholesky = jnp.linalg.cholesky(matrix, symmetrize_input=False)
+    regular = jnp.all(jnp.diagonal(cholesky) ** 2 > PIVOT)
+    return Factor(structure, jnp.where(regular, cholesky, jnp.nan), *rest)
 
 
 def reduce(
@@ -73,7 +81,7 @@ def reduce(
     scale = jax.lax.rsqrt(jnp.where(original > 0, original, 1.0))
     S = S * scale[:, None] * scale[None, :]
     index = jnp.arange(S.shape[0])
-    S = S.at[index, index].set(jnp.where(original > 0, diagonal * scale**2, 1.0))
+    S = S.at[index, index].set(jnp.where(reduced_free(s) > 0, diagonal * scale**2, 1.0))
     if gauge is not None and s.defect:
         directions = jax.vmap(lambda g: reduced_vector(s, g), -1, -1)(gauge) / scale[:, None]
         q, _ = jnp.linalg.qr(directions)
@@ -88,7 +96,7 @@ def solve(factor: Factor, right: Tangent) -> Tangent:
     h = jnp.einsum("pij,pj->pi", f.point, point_right)
     reduced = reduced_vector(s, right) - reduced_vector(s, _gather_reduced(f, h))
     x = jax.scipy.linalg.cho_solve((f.cholesky, True), reduced * f.scale) * f.scale
-    x = jnp.where(_reduced_free(s) > 0, x, 0.0)
+    x = jnp.where(reduced_free(s) > 0, x, 0.0)
     image, camera, kept = split_reduced(s, x)
     h = h - _scatter_points(f, image, camera)
     point = jnp.einsum("pji,pj->pi", f.point, h) * s.eliminated * s.point_free
@@ -115,14 +123,13 @@ def split_reduced(structure: Structure, vector):
 
 
 def inverse_cholesky_3x3(V: Float[Array, "n 3 3"]) -> Float[Array, "n 3 3"]:
-    """L⁻¹ of V = L·Lᵀ in closed form (7 ns a point; a batched Cholesky takes 60)."""
-    l00 = jnp.sqrt(V[:, 0, 0])
-    i00 = 1 / l00
+    """L⁻¹ of V = L·Lᵀ in closed form (7 ns a point; a batched Cholesky takes 60); else NaN."""
+    root = lambda pivot, element: jnp.sqrt(jnp.where(pivot > PIVOT * element, pivot, jnp.nan))
+    i00 = 1 / root(V[:, 0, 0], 0.0)
     l10, l20 = V[:, 1, 0] * i00, V[:, 2, 0] * i00
-    l11 = jnp.sqrt(V[:, 1, 1] - l10 * l10)
-    i11 = 1 / l11
+    i11 = 1 / root(V[:, 1, 1] - l10 * l10, V[:, 1, 1])
     l21 = (V[:, 2, 1] - l20 * l10) * i11
-    i22 = 1 / jnp.sqrt(V[:, 2, 2] - l20 * l20 - l21 * l21)
+    i22 = 1 / root(V[:, 2, 2] - l20 * l20 - l21 * l21, V[:, 2, 2])
     m10 = -l10 * i00 * i11
     m21 = -l21 * i11 * i22
     m20 = -(l20 * i00 + l21 * m10) * i22
@@ -149,7 +156,8 @@ def _diagonal_of(s, normal):
     return Tangent(pick(normal.image), pick(normal.camera), pick(normal.point))
 
 
-def _reduced_free(s):
+def reduced_free(s: Structure) -> Float[Array, " reduced"]:
+    """1 for the free unknowns of the reduced system, 0 for the held ones."""
     camera = s.camera_free if s.camera_width else jnp.zeros((s.cameras, 0))
     return reduced_vector(s, Tangent(s.image_block_free, camera, s.point_free))
 

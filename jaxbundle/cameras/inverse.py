@@ -10,11 +10,11 @@ The iterations are not differentiated. By the implicit function theorem the root
 
 and since the root in that rule is again this function, its second derivatives are exact as well.
 
-The number of iterations is fixed: Newton doubles the correct digits, and points do not wait for one
-another. To be within 1e-12 of the half diagonal everywhere in the image, mapping cameras need 1 or 2
-iterations, close-range and video cameras 3, an ordinary wide-angle lens 4, a fisheye 3 to 6, and a
-fisheye whose polynomial is nearly flat at the edge 11: hence the default of 6, and what the models
-ask for beyond it. 200 000 points of `brown` take 11 ms of CPU, and 20 with both gradients;
+The number of iterations is fixed: Newton doubles the correct digits, and points do not wait for
+one another. To be within 1e-12 of the half diagonal everywhere in the image, mapping cameras need 1
+or 2 iterations, close-range and video cameras 3, an ordinary wide-angle lens 4, a fisheye 3 to 6,
+and a fisheye whose polynomial is nearly flat at the edge 11: hence the default of 6, and what the
+models ask for beyond it. 200 000 points of `brown` take 11 ms of CPU, and 20 with both gradients;
 differentiating through Newton corrections at a frozen root would take 1.7 times as long,
 differentiating all iterations 20 times. The loop is not unrolled: that saves a tenth at best, and
 for `usgs` XLA's fusion then compiled for many minutes.

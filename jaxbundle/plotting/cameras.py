@@ -52,8 +52,8 @@ def distortion_curve(adjustment, camera: str, ax=None):
     label(ax, "x", "distance from the principal point", found.unit)
     label(ax, "y", "distortion, measured − ideal", unit)
     model = adjustment.cameras[camera]["model"]
-    held = not (np.nanmax(found.radial_sigma, initial=0) > 0)
-    band = "held, no σ" if held else "bands: ±σ (a posteriori)"
+    known = np.nanmax(found.radial_sigma, initial=0) > 0
+    band = "without σ" if not known else "bands: ±σ (a posteriori)"
     title(ax, f"Camera {camera}: distortion ({model})", band)
     legend(ax)
     return ax
@@ -82,8 +82,8 @@ def correlation_matrix(adjustment, camera: str | None = None, ax=None):
         for i in range(n):
             for j in range(n):
                 colour = "white" if abs(C[i, j]) > 0.6 else INK
-                ax.text(j, i, f"{round(100 * C[i, j])}", ha="center", va="center", fontsize=7,
-                        color=colour)  # fmt: skip
+                text = f"{round(100 * C[i, j])}" if np.isfinite(C[i, j]) else "–"
+                ax.text(j, i, text, ha="center", va="center", fontsize=7, color=colour)
     bar = ax.figure.colorbar(shown, ax=ax, shrink=0.8, pad=0.02)
     bar.set_label("correlation [%]", fontsize=9, color=INK)
     bar.ax.tick_params(labelsize=8, width=0.8, length=3)

@@ -252,5 +252,5 @@ def _inside(xyz):
     centre, size = extent(xyz)
     near = xyz[(np.abs(xyz - centre) <= 0.5 * size * (1 + 1e-9)).all(1)]
     low, high = near.min(0), near.max(0)
-    margin = 0.04 * (high - low).max()
+    margin = 0.05 * (high - low).max()
     return low - margin, high + margin

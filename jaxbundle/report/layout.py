@@ -64,7 +64,10 @@ def significant(value: float | None, digits: int = 3) -> str:
 
 def fixed(value: float | None, places: int) -> str:
     """A number with fixed decimal places; a dash where there is none."""
-    return MISSING if value is None or not math.isfinite(value) else f"{value:.{places}f}"
+    if value is None or not math.isfinite(value):
+        return MISSING
+    # + 0.0: no minus before a zero
+    return f"{round(float(value), places) + 0.0:.{places}f}"
 
 
 def column_decimals(sigma, digits: int = 3, most: int = 9) -> int:

@@ -70,7 +70,6 @@ def _critical(adjustment, test: str, level: float = 0.001) -> float:
 
 def _rows(adjustment, chosen) -> list[str]:
     found, sigma0 = adjustment.residuals, adjustment.sigma0
-    scale = sigma0 if math.isfinite(sigma0) else 1.0
     header = ("kind", "image", "point", "axis", "v", "σ", "r", "w", "τ", "MDB", "δ̄")
     rows = []
     for i in chosen:
@@ -78,12 +77,12 @@ def _rows(adjustment, chosen) -> list[str]:
         rows.append(
             (
                 *(found[name][i] for name in ("kind", "image", "point", "axis")),
-                to_place_of(found["v"][i], scale * sigma),
+                to_place_of(found["v"][i], sigma0 * sigma),
                 significant(sigma, 3),
                 fixed(found["r"][i], 3),
                 significant(found["w"][i], 3),
                 fixed(found["tau"][i], 2),
-                to_place_of(scale * found["mdb"][i], scale * sigma),
+                to_place_of(sigma0 * found["mdb"][i], sigma0 * sigma),
                 significant(found["external"][i], 3),
             )
         )

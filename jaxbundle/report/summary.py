@@ -12,6 +12,7 @@ from jaxbundle.report.head import (
     sigma0_in_words,
 )
 from jaxbundle.report.layout import (
+    MISSING,
     clean,
     estimate,
     facts,
@@ -76,7 +77,7 @@ def _cameras(adjustment):
     tables = adjustment.cameras
     for camera, entry in list(tables.items())[:MOST_CAMERAS]:
         parts = [
-            " ± ".join((f"{name} {value}", sigma))
+            f"{name} {value}" + ("" if sigma == MISSING else f" ± {sigma}")
             for name, found in entry["parameters"].items()
             if found["free"]
             for value, sigma in [estimate(found["value"], found["sigma"])]

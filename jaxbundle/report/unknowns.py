@@ -52,7 +52,7 @@ def _one_camera(entry) -> list[str]:
             continue
         value, sigma = estimate(found["value"], found["sigma"])
         t, total = found["t"], found["total_correlation"]
-        mark = "no" if t < CRITICAL_T else "yes"
+        mark = "–" if np.isnan(t) else "no" if t < CRITICAL_T else "yes"
         rows.append((name, value, sigma, significant(t, 3), mark, fixed(100 * total, 1)))
     if rows:
         header = ("parameter", "value", "σ", "t", "significant", "total corr. %")
@@ -82,7 +82,7 @@ def _triangle(names, C) -> list[str]:
     first = max(map(len, names))
     lines = [" " * first + " " + " ".join(f"{name:>{width}}" for name in names)]
     for i, name in enumerate(names):
-        cells = (str(round(100 * C[i, j])) for j in range(i + 1))
+        cells = (fixed(100 * C[i, j], 0) for j in range(i + 1))
         lines.append(f"{name:<{first}} " + " ".join(f"{cell:>{width}}" for cell in cells))
     return lines
 

@@ -19,7 +19,13 @@ from jaxtyping import Array, Float
 from jaxbundle.adjustment.datum import gauge_directions
 from jaxbundle.adjustment.jacobian import compiled_jacobian
 from jaxbundle.adjustment.normal import normal_from_jacobian
-from jaxbundle.adjustment.schur import Factor, factorise, reduced_vector, solve
+from jaxbundle.adjustment.schur import (
+    Factor,
+    factorise,
+    reduced_free,
+    reduced_vector,
+    solve,
+)
 from jaxbundle.network.arrays import Data, Tangent, Values
 from jaxbundle.network.structure import Structure
 
@@ -32,7 +38,7 @@ class Cofactors(eqx.Module):
     `reduced`: images, cameras and kept points together; `point`: 3×3 of every point; `ray`: every
     point with the image block of its ray; `incidence`: with its shared camera. `ray` and
     `incidence` belong to the internal (regularised) datum: use them only for estimable
-    quantities, such as residuals.
+    quantities, such as residuals. What is held has zeros.
     """
 
     factor: Factor
@@ -61,7 +67,8 @@ def cofactors(structure: Structure, values: Values, factor: Factor) -> Cofactors
     s = structure
     identity = jnp.eye(s.reduced_size)
     Q = jax.scipy.linalg.cho_solve((factor.cholesky, True), identity)
-    Q = Q * factor.scale[:, None] * factor.scale[None, :]
+    scale = factor.scale * reduced_free(s)
+    Q = Q * scale[:, None] * scale[None, :]
     K, Kc = _couplings(factor, Q)
     inner = jnp.eye(3) + jax.ops.segment_sum(
         jnp.einsum("nij,nkj->nik", K, factor.ray), s.point, s.points, indices_are_sorted=True

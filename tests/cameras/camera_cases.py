@@ -1,9 +1,12 @@
 """One real or realistic camera for every model, with all its parameters different from zero."""
 
 from dataclasses import dataclass
+from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxbundle import cameras
 
@@ -16,6 +19,7 @@ class Case:
     values: dict[str, float]
     centre: tuple[float, float]
     half: tuple[float, float]
+    dtype: type = jnp.float64
 
     @property
     def model(self):
@@ -23,19 +27,19 @@ class Case:
 
     @property
     def p(self):
-        return tuple(self.values[name] for name in self.model.parameters)
+        return tuple(self.dtype(self.values[name]) for name in self.model.parameters)
 
     @property
     def half_diagonal(self):
         return float(np.hypot(*self.half))
 
-    def grid(self, n):
-        """n × n points over the whole image, the principal point, and the image centre: [m, 2]."""
+    def grid(self, n=9):
+        """Image coordinates [n² + 2, 2]: over the whole image, its centre, the principal point."""
         x = np.linspace(-1, 1, n) * self.half[0] + self.centre[0]
         y = np.linspace(-1, 1, n) * self.half[1] + self.centre[1]
         points = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-        principal_point = [float(v) for v in self.model.from_ideal(self.p, 0.0, 0.0)]
-        return jnp.asarray(np.vstack([points, principal_point, self.centre]))
+        principal_point = project(self, [[0.0, 0.0, -1.0]])[0]
+        return jnp.asarray(np.vstack([points, self.centre, principal_point]))
 
 
 CASES = [
@@ -77,8 +81,24 @@ CASES = [
 ]
 
 
-def each_case(test):
-    """Runs a test for every camera."""
-    import pytest
+each_case = pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
 
-    return pytest.mark.parametrize("case", CASES, ids=[c.name for c in CASES])(test)
+
+def project(case, rays):
+    """Image coordinates [n, 2] of rays [n, 3]."""
+    return _project(case.model, case.p, jnp.asarray(rays))
+
+
+def image_rays(case, xy):
+    """Rays [n, 3] of image coordinates [n, 2]."""
+    return _image_rays(case.model, case.p, jnp.asarray(xy))
+
+
+@partial(jax.jit, static_argnums=0)
+def _project(model, p, rays):
+    return jnp.stack(jax.vmap(lambda ray: cameras.project(model, p, *ray))(rays), 1)
+
+
+@partial(jax.jit, static_argnums=0)
+def _image_rays(model, p, xy):
+    return jnp.stack(jax.vmap(lambda xy: cameras.image_ray(model, p, *xy))(xy), 1)

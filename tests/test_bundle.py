@@ -1,0 +1,173 @@
+"""`adjust` around the solver: blunders, variance components, elimination, check points, names."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import jaxbundle
+from jaxbundle import Camera
+from jaxbundle.bundle import adjust
+from jaxbundle.errors import NotSolvedError
+from jaxbundle.statistics.distributions import tau_quantile
+
+pytestmark = pytest.mark.xdist_group("bundle")
+
+SIGMA = 0.002
+TRUE = {"c": 24.0, "x0": 0.05, "y0": -0.03, "K1": 1.2e-4}
+CONTROL = (0, 4, 20, 24, 62, 100, 124)
+CHECK = (2, 12, 50, 74, 110)
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    """Eight convergent images around a box of 125 points, seven of them control, five check."""
+    stations = jaxbundle.ring_of_stations(8, 6.0, 3.0, look_at=(0.0, 0.0, 0.5), roll_every=2)
+    axis = np.linspace(-1, 1, 5)
+    targets = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    camera = Camera("cam", "brown", TRUE, free=("c", "x0", "y0", "K1", "K2", "P1"))
+    return jaxbundle.simulate_with_truth(
+        stations, targets, camera, noise=SIGMA, seed=4, datum="control", control=CONTROL,
+        control_sigma=0.002, check=CHECK, disturb=0.01,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def result(simulation):
+    return adjust(simulation.network)
+
+
+def with_xy(network, rows, shift):
+    xy = network.observations.xy.copy()
+    xy[rows] += shift
+    return network.replace(observations=dataclasses.replace(network.observations, xy=xy))
+
+
+def test_sigma0_is_one_and_redundancy_adds_up(result):
+    spread = 1 / np.sqrt(2 * result.redundancy)
+    assert abs(result.sigma0 - 1) < 4 * spread
+    assert result.residuals["r"].sum() == pytest.approx(result.redundancy, abs=1e-6)
+    total = sum(c.redundancy for c in result.variance_components.values())
+    assert total == pytest.approx(result.redundancy, abs=1e-6)
+    assert result.global_test(0.001)["passed"]
+
+
+def test_parameters_are_within_their_sigma(result):
+    for name, entry in result.cameras["cam"]["parameters"].items():
+        if entry["free"]:
+            assert abs(entry["value"] - TRUE.get(name, 0.0)) < 4 * entry["sigma"]
+
+
+def test_check_points_agree_within_their_sigma(result, simulation):
+    """Intersected points against their exact coordinates: mean square of d/σ near 1."""
+    checks = result.table("checks")
+    assert list(checks["id"]) == [str(k + 1) for k in CHECK]
+    normalised = np.concatenate([checks[f"d{a}"] / checks[f"s{a}"] for a in "XYZ"])
+    # 15 values: the mean square lies within 0.3 and 2.2 with 99.8 % (χ² of 15), points alike
+    assert 0.2 < np.mean(normalised**2) < 2.5
+    assert not set(result.points["id"]) & set(checks["id"])
+
+
+def test_covariance_by_name_is_that_of_the_tables(result):
+    names = [("camera", "cam", "c"), ("image", result.images["id"][0], "kappa"), ("point", "8", "Z")]
+    covariance = result.covariance(*names)
+    sigma = np.sqrt(np.diagonal(covariance))
+    points = result.points
+    expected = [
+        result.cameras["cam"]["parameters"]["c"]["sigma"],
+        result.images["skappa"][0] / result.angle_scale,
+        points["sZ"][list(points["id"]).index("8")],
+    ]
+    assert sigma == pytest.approx(expected, rel=1e-9)
+
+
+def test_covariance_of_a_function(result):
+    """The variance of a sum of two coordinates is the sum of the block."""
+    a, b = ("point", "8", "X"), ("point", "9", "Y")
+    block = result.covariance(a, b)
+    ids = list(result.points["id"])
+    i, j = ids.index("8"), ids.index("9")
+    total = result.covariance_of(lambda v: v.point[i, 0] + v.point[j, 1])
+    assert total[0, 0] == pytest.approx(block.sum(), rel=1e-9)
+
+
+def test_snooping_finds_the_blunders_and_nothing_else(simulation):
+    network = simulation.network
+    check = np.isin(network.observations.point, CHECK)
+    rows = np.flatnonzero(~check)[[10, 200, 400]]
+    spoilt = with_xy(network, rows, [30 * SIGMA, -20 * SIGMA])
+    found = adjust(spoilt, snooping="pope", significance=1e-4)
+    ids = lambda row: (
+        network.points.id[network.observations.point[row]],
+        network.images.id[network.observations.image[row]],
+    )
+    expected = {"point {} in image {}".format(*ids(row)) for row in rows}
+    names = {r.name for r in found.removed}
+    assert expected <= names
+    assert len(names - expected) <= 1  # one in 10⁴ tests of about 900 fails by chance
+    clean = adjust(network)
+    assert found.redundancy == clean.redundancy - 2 * len(names)
+    for name, entry in clean.cameras["cam"]["parameters"].items():
+        if entry["free"]:
+            value = found.cameras["cam"]["parameters"][name]["value"]
+            assert abs(value - entry["value"]) < entry["sigma"]
+    assert found.removed[0].test > tau_quantile(1 - 0.5e-4, clean.redundancy)
+
+
+def test_elimination_fixes_what_is_insignificant(simulation):
+    """K2 and P1 are zero in truth: t < 2 with 95 %; K1 is not."""
+    found = adjust(simulation.network, eliminate=True)
+    eliminated = {name.parameter for name in found.eliminated}
+    assert "K1" not in eliminated
+    for name, entry in found.cameras["cam"]["parameters"].items():
+        if name in eliminated:
+            assert entry["value"] == 0 and not entry["free"]
+        elif entry["free"] and name not in ("c", "x0", "y0"):
+            assert entry["t"] >= 2
+    before = adjust(simulation.network)
+    assert found.redundancy == before.redundancy + len(eliminated)
+
+
+def test_variance_components_are_estimated(simulation):
+    """Image σ given twice too large, control σ half: both groups come back to their truth."""
+    network = simulation.network
+    observations = dataclasses.replace(
+        network.observations, sigma=2 * network.observations.sigma
+    )
+    found = adjust(network.replace(observations=observations), estimate_components=True)
+    sigma = found.residuals["sigma"][found.residuals["kind"] == "image"]
+    # the component of 800 coordinates is known to 1/√(2·800) = 2.5 %
+    assert sigma == pytest.approx(np.full(len(sigma), SIGMA), rel=0.1)
+    assert found.sigma0 == pytest.approx(1.0, abs=0.05)
+
+
+def test_gauss_newton_finds_the_same_minimum(simulation, result):
+    other = adjust(simulation.network, method="gauss-newton")
+    assert other.converged
+    assert other.vtpv == pytest.approx(result.vtpv, rel=1e-10)
+
+
+def test_what_is_not_solved_has_no_values(simulation):
+    found = adjust(simulation.network, max_iterations=1)
+    assert not found.converged and "limit" in found.termination
+    for ask in (lambda: found.sigma0, lambda: found.images, lambda: found.cameras):
+        with pytest.raises(NotSolvedError, match="did not converge"):
+            ask()
+
+
+def test_an_undetermined_parameter_is_named():
+    """Vertical images of a plane: the principal distance and the heights are not separable."""
+    stations = jaxbundle.aerial_block(
+        2, 3, height=100.0, footprint=(60.0, 60.0), forward_overlap=0.6, side_overlap=0.3
+    )
+    targets = jaxbundle.grid_of_targets(9, 9, 10.0)
+    camera = Camera("cam", "brown", {"c": 50.0}, free=("c",))
+    corners = [0, 8, 72, 80]
+    network = jaxbundle.simulate(
+        stations, targets, camera, noise=0, seed=0, datum="control", control=corners,
+        image_format=(30.0, 30.0),
+    )  # fmt: skip
+    found = adjust(network)
+    assert not found.converged
+    assert found.undetermined
+    assert any(name.startswith(("c of camera cam", "Z0 of image")) for name in found.undetermined)
