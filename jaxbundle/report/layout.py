@@ -37,7 +37,9 @@ def estimate(value: float, sigma: float | None, digits: int = 3) -> tuple[str, s
         return f"{value:.{places}f}", f"{sigma:.{places}f}"
     if places < 0 and abs(value) < 1e9:
         return f"{value:.0f}", f"{sigma:.0f}"
-    exponent = math.floor(math.log10(abs(value))) if value else -places
+    if value == 0:
+        return "0", f"{sigma:.{digits - 1}e}"
+    exponent = math.floor(math.log10(abs(value)))
     return f"{value:.{max(0, min(exponent + places, 15))}e}", f"{sigma:.{digits - 1}e}"
 
 

@@ -47,7 +47,7 @@ def residuals(adjustment, limit: float, test: str) -> list[str]:
         f"0.1 %. v and σ (a priori) of image coordinates in {image_unit(adjustment)}, of control "
         "points and distances in the object unit; r redundancy number; MDB the smallest blunder "
         "that is found (α 0.1 %, power 80 %), σ a posteriori (σ0 times the MDB of residuals.csv); "
-        "δ̄ its largest effect on an unknown, in σ of that unknown."
+        "ext. (external reliability) its largest effect on an unknown, in σ of that unknown."
     )
     lines.append("")
     if len(over):
@@ -70,7 +70,7 @@ def _critical(adjustment, test: str, level: float = 0.001) -> float:
 
 def _rows(adjustment, chosen) -> list[str]:
     found, sigma0 = adjustment.residuals, adjustment.sigma0
-    header = ("kind", "image", "point", "axis", "v", "σ", "r", "w", "τ", "MDB", "δ̄")
+    header = ("kind", "image", "point", "axis", "v", "σ", "r", "w", "τ", "MDB", "ext.")
     rows = []
     for i in chosen:
         sigma = found["sigma"][i]
