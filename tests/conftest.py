@@ -1,13 +1,23 @@
-"""All tests run in float64, which the package itself never switches on."""
+"""All tests run in float64, which the package itself never switches on.
 
+Compiled programs are kept in .cache/jax, so that test processes, the command line and notebooks
+share them.
+"""
+
+import os
 from pathlib import Path
 
-import jax
-import pytest
+ROOT = Path(__file__).parent.parent
+EXAMPLES = ROOT / "examples"
+
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import jax  # noqa: E402
+import pytest  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
-
-EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
 @pytest.fixture(scope="session")

@@ -13,10 +13,13 @@ from jaxbundle import report
 from jaxbundle.adjustment.solver import LIMIT, NOT_FINITE, STUCK
 from jaxbundle.adjustment.unknowns import Name
 from jaxbundle.cameras import MODEL_NAMES
+from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.report import layout, observations, unknowns
 from jaxbundle.report.equations import EQUATIONS
 from jaxbundle.result import Adjustment
 from jaxbundle.statistics import CheckPoints, Removed
+
+pytestmark = pytest.mark.xdist_group("convergent4")
 
 SECTIONS = (
     "Counts",
@@ -51,7 +54,7 @@ def section(text: str, title: str) -> list[str]:
     start = lines.index(title)
     assert set(lines[start + 1]) == {"-"}
     end = next(
-        (i for i in range(start + 2, len(lines) - 1) if lines[i + 1] and set(lines[i + 1]) == {"-"}),
+        (i for i in range(start + 2, len(lines) - 1) if set(lines[i + 1]) == {"-"}),
         len(lines),
     )
     return [line for line in lines[start + 2 : end] if line]
@@ -137,7 +140,7 @@ def test_points_and_images_are_those_of_the_tables(convergent4, text):
     found = rows(section(text, SECTIONS[4]), "image")
     for i, (values, sigma) in enumerate(zip(found[::2], found[1::2])):
         assert values[0] == images["id"][i] and sigma[0] == "σ"
-        for name, value, s in zip(("X0", "Y0", "Z0", "omega", "phi", "kappa"), values[1:], sigma[1:]):
+        for name, value, s in zip(EXTERIOR, values[1:], sigma[1:]):
             assert float(value) == pytest.approx(images[name][i], abs=0.51 * unit_of(value))
             assert float(s) == pytest.approx(images[f"s{name}"][i], abs=0.51 * unit_of(s))
             assert unit_of(s) == unit_of(value)
@@ -219,8 +222,9 @@ def test_removed_and_eliminated(convergent4):
 
 def test_check_points(convergent4):
     found = CheckPoints(
-        ("101", "102"), np.arange(6.0).reshape(2, 3), np.array([[1e-3, 2e-3, -2e-3], [-1e-3, 0, 0]]),
-        np.stack([np.eye(3), 4 * np.eye(3)]), np.array([3, 4]),
+        id=("101", "102"), position=np.arange(6.0).reshape(2, 3),
+        difference=np.array([[1e-3, 2e-3, -2e-3], [-1e-3, 0, 0]]),
+        cofactor=np.stack([np.eye(3), 4 * np.eye(3)]), rays=np.array([3, 4]),
     )  # fmt: skip
     changed = again(convergent4, check=lambda adjustment: found)
     table = rows(section(changed.report(), "Check points: intersected − given, in model"), "point")
@@ -234,7 +238,8 @@ def test_distances():
     stub = SimpleNamespace(
         residuals={
             "kind": np.array(["image", "distance"], dtype=object),
-            "image": np.array(["1", "A"], dtype=object), "point": np.array(["7", "B"], dtype=object),
+            "image": np.array(["1", "A"], dtype=object),
+            "point": np.array(["7", "B"], dtype=object),
             "v": np.array([0.0, 0.002]), "sigma": np.array([1.0, 0.001]),
             "r": np.array([0.5, 0.75]), "tau": np.array([0.0, 2.31]),
         },

@@ -42,7 +42,7 @@ EQUATIONS: dict[str, tuple[str, ...]] = {
         "fx, fy, cx, cy in px",
     ),
     "kannala-brandt": (
-        "u = cx + fx·θd·cos ψ, v = cy + fy·θd·sin ψ,   θ the angle from the axis, ψ the azimuth",
+        "u = cx + fx·θd·cos ψ, v = cy + fy·θd·sin ψ,   ψ the azimuth, θ = ∠(ray, axis)",
         "θd = θ·(1 + k1·θ² + k2·θ⁴ + k3·θ⁶ + k4·θ⁸)",
         _RAY,
         "fx, fy, cx, cy in px",

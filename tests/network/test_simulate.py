@@ -9,6 +9,7 @@ import pytest
 
 import jaxbundle
 from jaxbundle import Camera, InputError, cameras
+from jaxbundle.adjustment.residuals import compiled_residuals
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.network.simulate import simulate, simulate_with_truth
 from jaxbundle.network.stations import (
@@ -90,9 +91,7 @@ def test_the_adjustment_sees_no_residuals_either():
         control_sigma=0.01,
     )  # fmt: skip
     problem = jaxbundle.make_problem(made.truth)
-    r = jaxbundle.adjustment.residuals.compiled_residuals(
-        problem.structure, problem.data.start, problem.data
-    )
+    r = compiled_residuals(problem.structure, problem.data.start, problem.data)
     for rows in (r.image, r.control, r.distance):
         assert len(rows) and np.abs(rows).max() < 1e-9
 
@@ -110,31 +109,30 @@ def test_all_and_only_what_lies_in_the_format_is_imaged(name):
     xy = truth.observations.xy
     assert (xy >= low).all() and (xy <= low + size).all()
 
-    # the same from the formulas, one ray after the other
+    # the same from the formulas, for every target in every image
     model, p = parameters_in_order(camera)
-    centre = np.array([float(v) for v in model.from_ideal(p, 0.0, 0.0)])
-    corner = np.abs(np.array([low, low + size]) - centre).max(0)
-    turn = cameras.turning_radius(model, p, float(np.hypot(*corner)))
-    assert turn is None  # no fold inside these images: the format alone decides
     M = np.asarray(jax.vmap(matrix_from_omega_phi_kappa)(jnp.asarray(RING.angles)))
     rays = np.einsum("nij,npj->npi", M, targets - RING.position[:, None]).reshape(-1, 3)
-    front = rays[:, 2] < 0
-    project = jax.vmap(lambda ray: jnp.stack(cameras.project(model, p, *ray)))
-    image = np.asarray(project(jnp.asarray(rays)))
-    inside = front & ((image >= low) & (image <= low + size)).all(1)
-    ids = [(k // len(targets), str(k % len(targets) + 1)) for k in np.flatnonzero(inside)]
-    found = [
-        (i, truth.points.id[k]) for i, k in zip(truth.observations.image, truth.observations.point)
-    ]
-    # beyond the turning radius a far target may fold back into the image: never taken
-    extra = set(ids) - set(found)
-    assert set(found) <= set(ids)
+
+    @jax.jit
+    @jax.vmap
+    def there_and_back(ray):
+        xy = cameras.project(model, p, *ray)
+        return jnp.stack(xy), jnp.stack(cameras.image_ray(model, p, *xy))
+
+    image, back = (np.asarray(x) for x in there_and_back(jnp.asarray(rays)))
+    inside = (rays[:, 2] < 0) & ((image >= low) & (image <= low + size)).all(1)
+    found = np.zeros((len(RING), len(targets)), bool)
+    numbers = np.array([int(id) - 1 for id in truth.points.id])
+    found[truth.observations.image, numbers[truth.observations.point]] = True
+    found = found.ravel()
+    assert not (found & ~inside).any()
+    # what is missing was folded back into the image from far outside
+    lost = inside & ~found
+    direction = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    assert not (np.linalg.norm(back - direction, axis=1)[lost] < 1e-6).any()
     if name == "brown":
-        assert not extra
-    for i, id in extra:
-        ray = rays[i * len(targets) + int(id) - 1]
-        back = np.array(cameras.image_ray(model, p, *image[i * len(targets) + int(id) - 1]))
-        assert not np.linalg.norm(back - ray / np.linalg.norm(ray)) < 1e-6
+        assert not lost.any()
 
 
 def test_a_folded_distortion_images_nothing_twice():
@@ -145,7 +143,7 @@ def test_a_folded_distortion_images_nothing_twice():
     first = truth.observations.take(truth.observations.image == 0)
     # f·ρ·(1 − 0.4·ρ²) turns at ρ = √(1/1.2); ρ = X/10 here
     X = truth.points.position[first.point, 0]
-    assert X.max() < 10 * np.sqrt(1 / 1.2) < X.max() + 0.6
+    assert 8 < X.max() < 10 * np.sqrt(1 / 1.2)
     assert (np.diff(first.xy[np.argsort(X), 0]) > 0).all()
 
 
@@ -240,34 +238,36 @@ def test_incidence_is_limited():
     assert 45 < angle.max() <= 50
 
 
-@pytest.mark.parametrize("residuals", ["corrected", "measured"])
-def test_the_adjustment_finds_the_truth(residuals):
-    nominal = dataclasses.replace(BROWN, parameters={"c": 20.5})
-    true = {"c": 20.0, "x0": 0.11, "y0": -0.07, "K1": 2e-4}
-    camera = dataclasses.replace(BROWN, parameters=true)
+TRUE = {"c": 20.0, "x0": 0.11, "y0": -0.07, "K1": 2e-4}
+
+
+@pytest.fixture(scope="module")
+def adjusted():
+    """A ring of five photographs with ten fixed points, from poor start values: truth, result."""
     made = simulate_with_truth(
-        RING, TARGETS, camera, start=nominal, noise=0.002, seed=11, image_format=(24, 16),
-        disturb=0.01, distances=[(0, 1), (2, 3)], distance_sigma=1e-3, residuals=residuals,
+        RING, TARGETS, dataclasses.replace(BROWN, parameters=TRUE),
+        start=dataclasses.replace(BROWN, parameters={"c": 20.5}), noise=0.002, seed=11,
+        image_format=(24, 16), disturb=0.01, datum="control", control=range(0, 60, 6),
     )  # fmt: skip
     result = jaxbundle.adjust(made.network)
     assert result.converged and result.warnings == ()
+    return made.truth, result
+
+
+def test_the_adjustment_finds_the_true_camera(adjusted):
+    _, result = adjusted
     assert abs(result.sigma0 - 1) < 4 / np.sqrt(2 * result.redundancy)
-    for name, value in true.items():
+    for name, value in TRUE.items():
         entry = result.cameras["cam"]["parameters"][name]
         assert abs(entry["value"] - value) < 4 * entry["sigma"], name
         # a useful network: the parameter really is determined
-        assert entry["sigma"] < 0.05 * max(abs(value), 0.1)
+        assert entry["sigma"] < 0.1 * abs(value), name
 
 
-def test_points_agree_within_their_standard_deviations():
-    control = list(range(0, 60, 6))
-    made = simulate_with_truth(
-        RING, TARGETS, BROWN, noise=0.003, seed=8, image_format=(24, 16), datum="control",
-        control=control, disturb=0.005,
-    )  # fmt: skip
-    result = jaxbundle.adjust(made.network)
-    tie = made.network.points.has_role("tie")
-    difference = (result.point_values - made.truth.points.position)[tie]
+def test_the_adjustment_finds_the_true_points_and_stations(adjusted):
+    truth, result = adjusted
+    tie = truth.points.has_role("tie")
+    difference = (result.point_values - truth.points.position)[tie]
     w = np.einsum(
         "pi,pij,pj->p", difference, np.linalg.inv(result.point_covariance[tie]), difference
     )
