@@ -14,10 +14,10 @@ The number of iterations is fixed: Newton doubles the correct digits, and points
 one another. To be within 1e-12 of the half diagonal everywhere in the image, mapping cameras need 1
 or 2 iterations, close-range and video cameras 3, an ordinary wide-angle lens 4, a fisheye 3 to 6,
 and a fisheye whose polynomial is nearly flat at the edge 11: hence the default of 6, and what the
-models ask for beyond it. 200 000 points of `brown` take 11 ms of CPU, and 20 with both gradients;
-differentiating through Newton corrections at a frozen root would take 1.7 times as long,
-differentiating all iterations 20 times. The loop is not unrolled: that saves a tenth at best, and
-for `usgs` XLA's fusion then compiled for many minutes.
+models ask for beyond it. In milliseconds of CPU for 200 000 points of `brown`, value / with both
+gradients: this way 19 / 38; differentiating two Newton corrections at a frozen root 20 / 60;
+differentiating all iterations 6 / 665. With the loop unrolled it would be 13 / 32, but for `usgs`
+XLA's fusion then compiles for many minutes.
 
 A target outside the range of g, for example beyond the radius where the distortion turns
 (`validity.py`), has no root, or only one on a foreign branch. A wrong coordinate would enter an

@@ -5,6 +5,7 @@ fifth ray missing. Lengths are in metres, the camera of 20 mm stands 4 m away, �
 """
 
 import dataclasses
+from functools import cache, partial
 
 import equinox as eqx
 import jax
@@ -14,12 +15,22 @@ from jax.flatten_util import ravel_pytree
 
 from jaxbundle import cameras
 from jaxbundle.adjustment.datum import gauge_directions
-from jaxbundle.adjustment.jacobian import free_tangent, jacobian, zero_tangent
-from jaxbundle.adjustment.problem import make_problem
-from jaxbundle.adjustment.residuals import residuals
+from jaxbundle.adjustment.jacobian import BundleJacobian, free_tangent, jacobian, zero_tangent
+from jaxbundle.adjustment.normal import Normal, gradient, hessian, normal_from_jacobian
+from jaxbundle.adjustment.problem import Problem, make_problem
+from jaxbundle.adjustment.residuals import Residuals, residuals
 from jaxbundle.adjustment.solve import find_minimum, make_solver
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, omega_phi_kappa_from_matrix
-from jaxbundle.network import Camera, Distances, Images, Network, Observations, Points, retract
+from jaxbundle.network import (
+    Camera,
+    Distances,
+    Images,
+    Network,
+    Observations,
+    Points,
+    Tangent,
+    retract,
+)
 
 CAMERAS = {
     "brown": dict(c=20.0, x0=0.11, y0=-0.07, K1=2e-4, K2=-1e-6, K3=4e-9, P1=3e-5, P2=-2e-5,
@@ -159,15 +170,25 @@ def _measure(given, of_image, truth, image, point, rng, noise):
     rays = np.einsum(
         "nij,nj->ni", truth.matrix[image], truth.point[point] - truth.position[image]
     )
-    for index, one in enumerate(given):
-        model = cameras.get_model(one.model)
-        p = [{**cameras.default_parameters(model), **one.parameters}[n] for n in model.parameters]
-        rows = of_image[image] == index
-        project = jax.vmap(lambda r, s, q, model=model, p=p: cameras.project(model, p, r, s, q))
-        xy[rows] = np.stack(project(*jnp.asarray(rays[rows].T)), 1)
-        sigma[rows] = RELATIVE_SIGMA * p[0] * rng.uniform(0.8, 1.2, (rows.sum(), 2))
+    of_ray = of_image[image]
+    for name in dict.fromkeys(one.model for one in given):
+        model = cameras.get_model(name)
+        default = cameras.default_parameters(model)
+        p = np.array([
+            [{**default, **one.parameters}[n] for n in model.parameters]
+            if one.model == name else np.zeros(len(model.parameters)) for one in given
+        ])  # fmt: skip
+        rows = np.array([one.model == name for one in given])[of_ray]
+        parameters = p[of_ray[rows]]
+        xy[rows] = np.stack(_projection(name)(tuple(parameters.T), *rays[rows].T), 1)
+        sigma[rows] = RELATIVE_SIGMA * parameters[:, :1] * rng.uniform(0.8, 1.2, (rows.sum(), 2))
     assert np.isfinite(xy).all()
     return xy + noise * sigma * rng.normal(size=xy.shape), sigma
+
+
+@cache
+def _projection(name):
+    return jax.jit(jax.vmap(partial(cameras.project, cameras.get_model(name))))
 
 
 def _distances(point, ends, rng, noise):
@@ -209,13 +230,56 @@ NETWORKS = {
 DEFECTS = {"free": 7, "minimal": 7, "free with distances": 6, "one fixed point": 4}
 
 
-def make(name, **changes):
+@cache
+def make(name):
     """The problem of one of `NETWORKS`."""
-    return make_problem(synthetic(**{**NETWORKS[name], **changes})[0])
+    return make_problem(synthetic(**NETWORKS[name])[0])
 
 
-def solved(problem, data=None, **options):
-    return find_minimum(make_solver(problem, **options), problem.data if data is None else data)
+@cache
+def adjusted(name):
+    """The problem of one of `NETWORKS`, and its solution."""
+    return make(name), solved(make(name))
+
+
+def solved(problem, data=None, start=None, **options):
+    return find_minimum(make_solver(problem, **options), data or problem.data, start)
+
+
+@dataclasses.dataclass(frozen=True)
+class Linear:
+    """A network linearised at its start values: in blocks, and the Jacobian as a dense matrix."""
+
+    problem: Problem
+    jac: BundleJacobian
+    J: np.ndarray
+    rows: Residuals
+    gradient: Tangent
+    normal: Normal
+    curved: Normal
+    gauge: Tangent
+
+    @property
+    def N(self):
+        """JᵀJ, dense."""
+        return self.J.T @ self.J
+
+
+@cache
+def linearised(name):
+    """One of `NETWORKS`, linearised; compiled once for all tests."""
+    problem = make(name)
+    jac, J, *rest = _linearise(problem.structure, problem.data)
+    return Linear(problem, jac, np.asarray(J), *rest)
+
+
+@eqx.filter_jit
+def _linearise(s, data):
+    jac, rows = jacobian(s, data.start, data), residuals(s, data.start, data)
+    return (
+        jac, jac.as_matrix(), rows, gradient(jac, rows), normal_from_jacobian(jac),
+        hessian(s, data.start, data), gauge_directions(s, data.start),
+    )  # fmt: skip
 
 
 def flat(tree):
@@ -241,22 +305,37 @@ def of_change(structure, values, data):
 
 
 @eqx.filter_jit
-def dense_jacobian(structure, values, data):
-    """The Jacobian by forward mode through everything at once, knowing no blocks."""
-    function, zero = of_change(structure, values, data)
-    return jax.jacfwd(function)(zero)
+def residuals_of_changes(structure, values, data, changes):
+    """residuals(retract(values, change)) as vectors, for many flat changes [changes, unknowns]."""
+    return jax.vmap(of_change(structure, values, data)[0])(changes)
 
 
 @eqx.filter_jit
-def block_jacobian(structure, values, data):
-    """The dense matrix of the Jacobian in blocks."""
-    return jacobian(structure, values, data).as_matrix()
+def gradients_of_changes(structure, values, data, changes):
+    """The gradients of ½vᵀPv after many flat changes [changes, unknowns], by reverse mode."""
+    function, _ = of_change(structure, values, data)
+    return jax.vmap(jax.grad(lambda change: 0.5 * jnp.sum(function(change) ** 2)))(changes)
 
 
-@eqx.filter_jit
-def flat_residuals(structure, values, data, change):
-    """residuals(retract(values, change)) as a vector."""
-    return of_change(structure, values, data)[0](change)
+def differences(function, structure, values, data, J):
+    """Central differences of a function of changes: its derivative, one column an unknown.
+
+    The steps move the residuals by 0.01 σ, 2.5e-6 of the principal distance: truncation and
+    rounding of the residuals (1e-13) both stay below 1e-8 of a column.
+    """
+    size = np.linalg.norm(J, axis=0)
+    step = 0.01 / np.where(size > 0, size, np.inf)
+    ends = [function(structure, values, data, sign * np.diag(step)) for sign in (1, -1)]
+    difference = (np.asarray(ends[0]) - np.asarray(ends[1])).T / 2
+    return difference / np.where(size > 0, step, 1)
+
+
+def assert_columns_agree(J, other, tolerance):
+    """Two matrices agree to a fraction of the norm of each column."""
+    assert np.isfinite(J).all()
+    size = np.maximum(np.linalg.norm(other, axis=0), np.linalg.norm(J, axis=0))
+    difference = np.linalg.norm(J - other, axis=0) / np.where(size > 0, size, 1)
+    assert difference.max() <= tolerance, difference
 
 
 def dense_normal(structure, normal):

@@ -1,6 +1,7 @@
 """Simulated networks: the truth fits the image coordinates, and adjustment finds it again."""
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -55,13 +56,15 @@ def parameters_in_order(camera):
     return model, tuple(values[name] for name in model.parameters)
 
 
+@partial(jax.jit, static_argnums=(0, 1))
+@partial(jax.vmap, in_axes=(None, None, None, 0, 0))
+def residual(model, domain, p, ray, xy):
+    return jnp.stack(cameras.residual(model, domain, p, tuple(ray), tuple(xy)))
+
+
 def image_residuals(network, domain):
     model, p = parameters_in_order(network.cameras[0])
-
-    def one(ray, xy):
-        return jnp.stack(cameras.residual(model, domain, p, tuple(ray), tuple(xy)))
-
-    return np.asarray(jax.vmap(one)(camera_rays(network), network.observations.xy))
+    return np.asarray(residual(model, domain, p, camera_rays(network), network.observations.xy))
 
 
 @pytest.mark.parametrize("domain", ["corrected", "measured"])
