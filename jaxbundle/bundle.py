@@ -17,6 +17,7 @@ from jaxbundle.network.check import check_network
 from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.tables import Network
 from jaxbundle.result import Adjustment
+from jaxbundle.statistics import cofactors as all_cofactors
 from jaxbundle.statistics import (
     intersect_check_points,
     reliability,
@@ -25,10 +26,12 @@ from jaxbundle.statistics import (
     undamped_factor,
     variance_components,
 )
-from jaxbundle.statistics import cofactors as all_cofactors
 
 CORE_PARAMETERS = ("c", "x0", "y0", "fx", "fy", "cx", "cy", "f")
 """Interior parameters that are never eliminated for want of significance."""
+
+RUNAWAY = 20.0
+"""A principal distance that changed by more than this factor belongs to no camera."""
 
 
 def adjust(
@@ -99,16 +102,34 @@ def _minimise(problem: Problem, start: Values, **options) -> Minimum:
 
 
 def _solved(problem: Problem, minimum: Minimum) -> bool:
-    """Converged, and no unknown so weak that its σ is rounding noise."""
-    if not bool(converged(int(minimum.termination))):
+    """Converged, no camera collapsed, and no unknown so weak that its σ is rounding noise."""
+    if not bool(converged(int(minimum.termination))) or _collapsed(problem, minimum.values):
         return False
     factor = undamped_factor(problem.structure, minimum.values, problem.data)
     pivots = np.abs(np.diagonal(np.asarray(factor.cholesky)))
     return bool(np.isfinite(pivots).all() and pivots.min(initial=1.0) ** 2 > 1e-13)
 
 
+def _collapsed(problem: Problem, values: Values) -> list[str]:
+    """Principal distances that ran away from their start values by a factor of `RUNAWAY`.
+
+    Where c and a scale of the image are free together, c = 0 makes all corrected residuals zero.
+    """
+    names = []
+    for c, camera in enumerate(problem.network.cameras):
+        model = get_model(camera.model)
+        for parameter in model.principal_distance:
+            column = model.parameters.index(parameter)
+            ratio = values.camera[c, column] / problem.data.start.camera[c, column]
+            if not 1 / RUNAWAY < float(ratio) < RUNAWAY:
+                names.append(f"{parameter} of camera {camera.id} (it ran away from its start)")
+    return names
+
+
 def _names_of_defects(problem: Problem, minimum: Minimum) -> list[str]:
     values = minimum.values
+    if bool(converged(int(minimum.termination))) and _collapsed(problem, values):
+        return _collapsed(problem, values)
     if not all(np.isfinite(np.asarray(x)).all() for x in (values.camera, values.position)):
         values = problem.data.start
     return undetermined(problem, values, problem.data)

@@ -120,7 +120,8 @@ def write_folder(result: Adjustment, folder: Path, plots: bool = True) -> None:
     for name in ("cameras", "images", "points", "residuals", "checks"):
         table = result.table(name)
         if table:
-            write_csv(folder / f"{name}.csv", list(table), zip(*(c.tolist() for c in table.values())))
+            rows = zip(*(column.tolist() for column in table.values()))
+            write_csv(folder / f"{name}.csv", list(table), rows)
     if plots:
         try:
             save_figures(result, folder)

@@ -83,7 +83,7 @@ def check_gradients(
         d = jnp.asarray(random.normal(size=x.shape)) * sizes
         c = jnp.asarray(random.normal(size=y.shape))
         along = forward(x, d)
-        difference = lambda h: (f(x + h * d) - f(x - h * d)) / (2 * h)
+        difference = lambda h, d=d: (f(x + h * d) - f(x - h * d)) / (2 * h)
         extrapolated = (4 * difference(step / 2) - difference(step)) / 3
         scale = float(jnp.linalg.norm(along))
         worst = max(worst, float(jnp.linalg.norm(along - extrapolated)) / max(scale, 1e-300))

@@ -125,7 +125,8 @@ class Adjustment:
 
     def _require_solved(self) -> None:
         if not self.converged:
-            what = f"; not determined: {', '.join(self.undetermined[:8])}" if self.undetermined else ""
+            names = ", ".join(self.undetermined[:8])
+            what = f"; not determined: {names}" if names else ""
             raise NotSolvedError(
                 f"the adjustment did not converge ({self.termination}){what}; it has no result"
             )

@@ -69,7 +69,8 @@ def test_check_points_agree_within_their_sigma(result, simulation):
 
 
 def test_covariance_by_name_is_that_of_the_tables(result):
-    names = [("camera", "cam", "c"), ("image", result.images["id"][0], "kappa"), ("point", "8", "Z")]
+    image = result.images["id"][0]
+    names = [("camera", "cam", "c"), ("image", image, "kappa"), ("point", "8", "Z")]
     covariance = result.covariance(*names)
     sigma = np.sqrt(np.diagonal(covariance))
     points = result.points

@@ -116,7 +116,7 @@ def _probe(s: Structure, operator) -> tuple[BundleJacobian, jax.Array]:
     rays = (s.rays, 2)
     interior = camera if s.camera_width else image[6:]
     rows = jnp.arange(s.interior.shape[0])
-    diagonal_of = lambda column, j: getattr(column, "interior")[
+    diagonal_of = lambda column, j: column.interior[
         rows, s.camera_columns[s.interior, j]
     ]
     jac = BundleJacobian(
@@ -138,7 +138,7 @@ def _probe(s: Structure, operator) -> tuple[BundleJacobian, jax.Array]:
 
 
 def _distance_rows(s: Structure, operator, damped: bool):
-    """Derivatives of every distance by its two ends [distances, 2, 3], a transposed product each."""
+    """Derivatives of every distance by its two ends [distances, 2, 3], by transposed products."""
     transposed = operator.transpose()
     zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), operator.out_structure())
 

@@ -127,8 +127,20 @@ def move_to_datum(structure: Structure, values: Values, start: Values, steps: in
         return tau - jnp.linalg.solve(slope, condition(tau, values, start))
 
     fixed = jax.lax.stop_gradient((values, start))
-    zero = jnp.zeros(structure.defect)
-    tau = jax.lax.fori_loop(0, steps, lambda _, tau: newton(tau, *fixed), zero)
+    G = jax.lax.stop_gradient(gauge_directions(structure, values).point)
+    size = jnp.abs(fixed[0].point).max()
+
+    def moving(state):
+        _, step, count = state
+        return (jnp.abs(G @ step).max() > 1e-15 * size) & (count < steps)
+
+    def move(state):
+        tau, _, count = state
+        new = newton(tau, *fixed)
+        return new, new - tau, count + 1
+
+    first = newton(jnp.zeros(structure.defect), *fixed)
+    tau, _, _ = jax.lax.while_loop(moving, move, (first, first, 1))
     return _transform(
         structure, values, structure.gauge @ newton(jax.lax.stop_gradient(tau), values, start)
     )

@@ -46,8 +46,11 @@ LIMIT, SETTLED, RELATIVE_COST, SINGULAR, STUCK, NOT_FINITE = range(6)
 ROUNDING = 2e-14
 """A predicted decrease of vᵀPv below this fraction of it is rounding noise."""
 
-NOISE_FLOOR = 1e-14
+NOISE_FLOOR = 1e-12
 """Relative precision of an image coordinate; residuals below it are noise of the arithmetic."""
+
+REFUSALS = 2
+"""So many undamped steps refused where the damped ones have settled: singular, if not exactly."""
 
 
 class Damped(eqx.Module):
@@ -148,8 +151,10 @@ class SolverState(eqx.Module):
     search: RegionState
     descent: Damped
     step_size: Float[Array, ""]
-    step_finite: Bool[Array, ""]
     singular: Bool[Array, ""]
+    trial: Bool[Array, ""]
+    tried: Bool[Array, ""]
+    refusals: Int[Array, ""]
     termination: Int[Array, ""]
     done: Bool[Array, ""]
     steps: Int[Array, ""]
@@ -189,12 +194,14 @@ class BundleSolver(optx.AbstractLeastSquaresSolver):
             search=self.search.init(y, struct),
             descent=descent.init(y, struct),
             step_size=jnp.asarray(float(self.search.initial)),
-            step_finite=jnp.asarray(True),
             singular=no,
+            trial=no,
+            tried=no,
+            refusals=jnp.asarray(0),
             termination=jnp.asarray(LIMIT),
             done=no,
             steps=jnp.asarray(0),
-            history=History(jnp.full(rows, jnp.nan), jnp.full(rows, jnp.nan), jnp.zeros(rows, bool)),
+            history=History(*(jnp.full(rows, jnp.nan) for _ in range(2)), jnp.zeros(rows, bool)),
         )
 
     def _linearise(self, fn, y, args):
@@ -228,7 +235,7 @@ class BundleSolver(optx.AbstractLeastSquaresSolver):
         if not undamped:
             quadratic = accept & (search.ratio > 0.5) & (search.predicted < 1e-3 * cost_here)
             quadratic = quadratic & ~state.singular & ~state.first
-            step_size = jnp.where(quadratic, jnp.inf, step_size)
+            step_size = jnp.where(quadratic | state.trial, jnp.inf, step_size)
         change, _ = descent.step(step_size, damped)
         finite = _all_finite(change)
         change = jax.tree.map(lambda d: jnp.where(finite, d, 0.0), change)
@@ -245,7 +252,8 @@ class BundleSolver(optx.AbstractLeastSquaresSolver):
         limit = jnp.maximum(self.atol**2 * sigma0_squared, ROUNDING * cost_here) + floor
         small = finite & (decrement <= limit)
         settled = small & jnp.isinf(step_size)
-        singular = state.singular | (~finite & jnp.isinf(step_size))
+        refusals = state.refusals + (state.tried & ~accept)
+        singular = state.singular | (~finite & jnp.isinf(step_size)) | (refusals >= REFUSALS)
         stalled = accept & ~state.first & (before - cost < self.rtol * before)
         stuck = step_size < 1e-20
         broken = ~jnp.isfinite(cost_here) | (undamped & ~jnp.isfinite(cost))
@@ -263,10 +271,7 @@ class BundleSolver(optx.AbstractLeastSquaresSolver):
             termination = jnp.where(happened, reason, termination)
         done = termination != LIMIT
         # A small step that still was damped: try it undamped before calling it settled.
-        if not undamped:
-            search = eqx.tree_at(
-                lambda s: s.radius, search, jnp.where(small & ~singular, jnp.inf, search.radius)
-            )
+        trial = small & ~singular & ~settled
         y = jax.tree.map(lambda a, b: jnp.where(settled, b, a), y, y_eval)
         i = state.steps
         history = History(
@@ -279,8 +284,9 @@ class BundleSolver(optx.AbstractLeastSquaresSolver):
         search = eqx.tree_at(lambda s: s.predicted, search, predicted)
         new = SolverState(
             first=jnp.asarray(False), y_eval=y_eval, accepted_info=accepted_info, search=search,
-            descent=damped, step_size=step_size, step_finite=finite, singular=singular,
-            termination=termination, done=done, steps=i + 1, history=history,
+            descent=damped, step_size=step_size, singular=singular, trial=trial,
+            tried=state.trial, refusals=refusals, termination=termination, done=done,
+            steps=i + 1, history=history,
         )  # fmt: skip
         return y, new, aux
 

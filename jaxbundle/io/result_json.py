@@ -8,6 +8,7 @@ import json
 import math
 from pathlib import Path
 
+from jaxbundle.cameras import get_model
 from jaxbundle.io.csv_tables import write_text
 from jaxbundle.network.tables import EXTERIOR
 
@@ -30,6 +31,9 @@ def result_dict(adjustment, brief: bool = False) -> dict:
             "object": adjustment.network.object_unit,
             "image": adjustment.network.image_unit,
             "angle": adjustment.network.angle_unit,
+            "residuals": {
+                camera.id: get_model(camera.model).unit for camera in adjustment.network.cameras
+            },
         },
         "warnings": list(adjustment.warnings),
     }

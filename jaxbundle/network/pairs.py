@@ -53,7 +53,8 @@ class Pairs(eqx.Module):
                 product = jnp.einsum("cki,ckj->cij", left, right)
                 return total.at[k].add(product, indices_are_sorted=True), None
 
-            total, _ = jax.lax.scan(add, total, _in_steps(first, second, block, step, missing, blocks))
+            chunks = _in_steps(first, second, block, step, missing, blocks)
+            total, _ = jax.lax.scan(add, total, chunks)
         return total[:-1]
 
     def flat(self) -> tuple[Int[Array, " pairs"], Int[Array, " pairs"]]:

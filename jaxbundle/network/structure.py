@@ -274,7 +274,8 @@ def _interior(network: Network, camera_of_ray):
         rays = np.flatnonzero(name_of_ray == name)
         if len(rays) or len(free) == 1:
             every = len(rays) == len(camera_of_ray)
-            groups.append(Group(name, columns, None if every else jnp.asarray(rays.astype(np.int32))))
+            rows = None if every else jnp.asarray(rays.astype(np.int32))
+            groups.append(Group(name, columns, rows))
     return camera_columns, camera_free, tuple(groups)
 
 

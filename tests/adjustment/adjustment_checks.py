@@ -227,6 +227,9 @@ NETWORKS = {
 }  # fmt: skip
 """Kinds of networks that every part of the solver has to handle."""
 
+LINEARISED = tuple(name for name in NETWORKS if name != "one fixed point")
+"""Those that differ in the blocks of their equations."""
+
 DEFECTS = {"free": 7, "minimal": 7, "free with distances": 6, "one fixed point": 4}
 
 

@@ -1,0 +1,88 @@
+"""Projects with the answer of an independent adjustment, where the folder of cases stands beside
+the checkout (the data of most belong to others and are not in the repository)."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jaxbundle
+from jaxbundle.bundle import adjust
+
+CASES = Path(__file__).parents[2] / "shared" / "cases"
+PROJECTS = (
+    "convergent4/project",
+    "convergent4/project4",
+    "convergent4/project4m",
+    "resection63/project",
+    "camcal/project",
+    "sxb_weighted_control/project",
+    "riva_3dfield/project",
+    "aicon_free_scalebar/project",
+)
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not CASES.is_dir(), reason="the folder ../shared/cases is not here"),
+]
+
+
+@pytest.fixture(scope="module", params=PROJECTS)
+def case(request):
+    """(adjustment, reference, whether object coordinates are comparable as they are)."""
+    path = CASES / f"{request.param}.toml"
+    network = jaxbundle.read_network(path)
+    reference = json.loads(path.with_suffix(".reference.json").read_text())
+    return adjust(network), reference, not request.param.startswith("convergent4")
+
+
+def pairs(reference):
+    return np.array([[np.nan if x is None else x for x in entry] for entry in reference]).T
+
+
+def test_sigma0_and_redundancy(case):
+    result, reference, _ = case
+    assert result.redundancy == reference["redundancy"]
+    assert result.sigma0 == pytest.approx(reference["sigma0"], rel=1e-6)
+    assert result.vtpv == pytest.approx(reference["vtpv"], rel=1e-6)
+    assert result.counts.observations == reference["observations"]
+    assert result.counts.unknowns == reference["unknowns"]
+
+
+def test_redundancy_numbers(case):
+    result, reference, _ = case
+    image = result.residuals["kind"] == "image"
+    np.testing.assert_allclose(result.residuals["r"][image], reference["r"], atol=1e-6)
+    assert result.residuals["r"].sum() == pytest.approx(result.redundancy, abs=1e-6)
+
+
+def test_camera_parameters(case):
+    result, reference, _ = case
+    for camera, parameters in reference["cameras"].items():
+        for name, (value, sigma) in parameters.items():
+            entry = result.cameras[camera]["parameters"][name]
+            if sigma is None:
+                assert not entry["free"]
+                continue
+            assert abs(entry["value"] - value) < 0.002 * sigma
+            assert entry["sigma"] == pytest.approx(sigma, rel=1e-3)
+
+
+def test_images_and_points(case):
+    """In a free network without a scale of its own only σ can be compared as they stand."""
+    result, reference, comparable = case
+    ids = [list(result.images["id"]), list(result.points["id"])]
+    for table, names, listed, order in (
+        (result.images, ("X0", "Y0", "Z0", "omega", "phi", "kappa"), reference["images"], ids[0]),
+        (result.points, tuple("XYZ"), reference["points"], ids[1]),
+    ):
+        for id, entries in listed.items():
+            value, sigma = pairs(entries)
+            row = order.index(id)
+            free = np.isfinite(sigma) & (sigma > 0)
+            found = np.array([table[name][row] for name in names])
+            found_sigma = np.array([table[f"s{name}"][row] for name in names])
+            np.testing.assert_allclose(found_sigma[free], sigma[free], rtol=1e-3)
+            if comparable:
+                assert np.all(np.abs(found - value)[free] < 0.002 * sigma[free])
