@@ -185,11 +185,26 @@ class Adjustment:
 
     @functools.cached_property
     def image_values(self) -> Float[np.ndarray, "images 6"]:
-        """X0, Y0, Z0 (object unit), ω, φ, κ (radians)."""
+        """X0, Y0, Z0 (object unit), ω, φ, κ (radians, on the turn and branch of the start)."""
         values = self.values
-        angles = _all_angles(values.rotation)[0]
+        angles, _ = self._angles_like_start
         position = np.asarray(values.position) + self.problem.origin
         return np.concatenate([position, np.asarray(angles)], 1)
+
+    @functools.cached_property
+    def _angles_like_start(self):
+        """ω, φ, κ of all images and their Jacobians by δθ, next to the angles that were given.
+
+        (ω, φ, κ) and (ω + π, π − φ, κ + π) are one rotation, and so are whole turns.
+        """
+        angles, jacobian = (np.asarray(x) for x in _all_angles(self.values.rotation))
+        start = self.problem.network.images.angles
+        other = angles * [1, -1, 1] + np.pi
+        turn = lambda a: a + 2 * np.pi * np.round((start - a) / (2 * np.pi))
+        angles, other = turn(angles), turn(other)
+        flip = ((other - start) ** 2).sum(1) < ((angles - start) ** 2).sum(1)
+        sign = np.where(flip[:, None], [1.0, -1.0, 1.0], 1.0)
+        return np.where(flip[:, None], other, angles), jacobian * sign[:, :, None]
 
     @functools.cached_property
     def image_covariance(self) -> Float[np.ndarray, "images 6 6"]:
@@ -201,7 +216,7 @@ class Adjustment:
         Q = Q[at, :, at, :][:, :6, :6]
         A = np.zeros((n, 6, 6))
         A[:, :3, :3] = np.eye(3)
-        A[:, 3:, 3:] = _all_angles(self.values.rotation)[1]
+        A[:, 3:, 3:] = self._angles_like_start[1]
         free = np.asarray(s.image_free)
         Q = Q * free[:, :, None] * free[:, None, :]
         return self.sigma0**2 * A @ Q @ A.transpose(0, 2, 1)

@@ -172,3 +172,18 @@ def test_an_undetermined_parameter_is_named():
     assert not found.converged
     assert found.undetermined
     assert any(name.startswith(("c of camera cam", "Z0 of image")) for name in found.undetermined)
+
+
+def test_angles_come_back_on_the_branch_they_were_given(simulation, result):
+    """(ω, φ, κ), a turn more, and (ω + π, π − φ, κ + π) are one rotation: one σ each, same v."""
+    images = simulation.network.images
+    angles = images.angles.copy()
+    angles[0] += [2 * np.pi, 0, 0]
+    angles[1] = [angles[1, 0] + np.pi, np.pi - angles[1, 1], angles[1, 2] - np.pi]
+    other = adjust(
+        simulation.network.replace(images=dataclasses.replace(images, angles=angles))
+    )
+    assert np.abs(other.image_values[:2, 3:] - angles[:2]).max() < 0.1
+    for name in ("omega", "phi", "kappa"):
+        np.testing.assert_allclose(other.images[f"s{name}"], result.images[f"s{name}"], rtol=1e-6)
+    assert other.vtpv == pytest.approx(result.vtpv, rel=1e-9)

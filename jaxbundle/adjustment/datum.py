@@ -61,7 +61,7 @@ def open_similarities(structure: Structure, data: Data) -> Float[np.ndarray, "7 
     products, terms = products[finite], terms[np.isfinite(terms).all(1)]
     scale = np.sqrt((terms**2).sum(0))
     scale = np.where(scale > 0, scale, 1.0)
-    held = held / scale
+    held = held[np.isfinite(held).all(1)] / scale
     size = np.linalg.norm(held, axis=1, keepdims=True)
     held = held / np.where(size > 0, size, 1.0)
     # Singular values of a QR, not of the Gram matrix, which would lose half of the digits.

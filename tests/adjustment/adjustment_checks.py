@@ -245,8 +245,14 @@ def adjusted(name):
     return make(name), solved(make(name))
 
 
-def solved(problem, data=None, start=None, **options):
-    return find_minimum(make_solver(problem, **options), data or problem.data, start)
+def solved(problem, data=None, **options):
+    """Iterated to the last digits: one solver, one compilation for each kind of network."""
+    solver = make_solver(problem, **{"atol": 1e-9, **options})
+    return find_minimum(solver, problem.data if data is None else data)
+
+
+def vtpv(problem, values):
+    return float((flat(residuals(problem.structure, values, problem.data)) ** 2).sum())
 
 
 @dataclasses.dataclass(frozen=True)
