@@ -115,49 +115,43 @@ def move_to_datum(structure: Structure, values: Values, start: Values, steps: in
     """
     if not structure.defect:
         return values
+    s = structure
+    held = lambda old, new, free: jnp.where(free > 0, new, old)
 
-    def condition(tau, values, start):
-        moved = _transform(structure, values, structure.gauge @ tau)
-        G = jax.vmap(helmert_point)(moved.point) @ structure.gauge
-        B = G * structure.datum_weight[..., None]
-        return jnp.einsum("pik,pi->k", B, moved.point - start.point)
+    def moved(tau, point):
+        move = _exponential(s.gauge @ tau)
+        return held(point, jax.vmap(transform_point, (None, 0))(move, point), s.point_free)
 
-    def newton(tau, values, start):
-        slope = jax.lax.stop_gradient(jax.jacfwd(condition)(tau, values, start))
-        return tau - jnp.linalg.solve(slope, condition(tau, values, start))
+    def condition(tau, point, start):
+        x = moved(tau, point)
+        G = jax.vmap(helmert_point)(x) @ s.gauge
+        c = jnp.einsum("pik,pi->k", G * s.datum_weight[..., None], x - start)
+        return c, (c, G)
 
-    fixed = jax.lax.stop_gradient((values, start))
-    G = jax.lax.stop_gradient(gauge_directions(structure, values).point)
-    size = jnp.abs(fixed[0].point).max()
+    point, target = jax.lax.stop_gradient((values.point, start.point))
+    size = jnp.abs(point).max()
 
     def moving(state):
-        _, step, count = state
-        return (jnp.abs(G @ step).max() > 1e-15 * size) & (count < steps)
+        _, _, distance, count = state
+        return (distance > 1e-12 * size) & (count < steps)
 
-    def move(state):
-        tau, _, count = state
-        new = newton(tau, *fixed)
-        return new, new - tau, count + 1
+    def newton(state):
+        tau, _, _, count = state
+        slope, (c, G) = jax.jacfwd(condition, has_aux=True)(tau, point, target)
+        step = jnp.linalg.solve(slope, c)
+        return tau - step, slope, jnp.abs(G @ step).max(), count + 1
 
-    first = newton(jnp.zeros(structure.defect), *fixed)
-    tau, _, _ = jax.lax.while_loop(moving, move, (first, first, 1))
-    return _transform(
-        structure, values, structure.gauge @ newton(jax.lax.stop_gradient(tau), values, start)
-    )
-
-
-def _transform(structure, values, direction):
-    tau = _exponential(direction)
+    begin = (jnp.zeros(s.defect), jnp.eye(s.defect), jnp.asarray(jnp.inf), 0)
+    tau, slope, _, _ = jax.lax.while_loop(moving, newton, begin)
+    tau = tau - jnp.linalg.solve(slope, condition(tau, values.point, start.point)[0])
     position, rotation = jax.vmap(transform_pose, (None, 0, 0))(
-        tau, values.position, values.rotation
+        _exponential(s.gauge @ tau), values.position, values.rotation
     )
-    point = jax.vmap(transform_point, (None, 0))(tau, values.point)
-    held = lambda old, new, free: jnp.where(free > 0, new, old)
     return Values(
         camera=values.camera,
-        position=held(values.position, position, structure.image_free[:, :3]),
-        rotation=held(values.rotation, rotation, structure.image_free[:, 3:4]),
-        point=held(values.point, point, structure.point_free),
+        position=held(values.position, position, s.image_free[:, :3]),
+        rotation=held(values.rotation, rotation, s.image_free[:, 3:4]),
+        point=moved(tau, values.point),
     )
 
 
@@ -167,15 +161,12 @@ def _exponential(direction: Float[Array, "7"]) -> Float[Array, "7"]:
     Its shift is V·t with V = ∫₀¹ exp(u·B)du = 1 + B/2! + B²/3! + …, B = [ω]× + s·1; rotation and
     scale are ω and s themselves. The series is summed for B/64 and doubled: V(2B) = V + ½B·V².
     """
-    t, omega, s = direction[:3], direction[3:6], direction[6]
-    x, y, z = omega / 64
-    zero = jnp.zeros_like(x)
-    B = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3) + s / 64 * jnp.eye(3)
-    V = jnp.eye(3)
-    for k in range(9, 1, -1):
-        V = jnp.eye(3) + B @ V / k
-    for _ in range(6):
-        V, B = V + 0.5 * B @ V @ V, 2 * B
+    t, omega, s = direction[:3], direction[3:6] / 64, direction[6] / 64
+    one = jnp.eye(3)
+    B = jnp.cross(omega, one, axisb=0, axisc=0) + s * one
+    V = jax.lax.fori_loop(0, 8, lambda k, V: one + B @ V / (9 - k), one)
+    double = lambda _, VB: (VB[0] + 0.5 * VB[1] @ VB[0] @ VB[0], 2 * VB[1])
+    V, _ = jax.lax.fori_loop(0, 6, double, (V, B))
     return jnp.concatenate([V @ t, direction[3:]])
 
 
