@@ -68,7 +68,7 @@ def test_json_alone_on_stdout():
 
 BROKEN = {
     "missing table": ("images.csv", None, None, ["images.csv"]),
-    "missing column": ("points.csv", "id,role,X,Y,Z", "id,role,X,Y", ["points.csv", "Z"]),
+    "missing column": ("points.csv", "id,role,X,Y,Z", "id,role,X,Y,H", ["points.csv", "H"]),
     "text in a number": ("observations.csv", "-4.98644", "minus five", ["observations.csv", "x"]),
     "not a number": ("observations.csv", "-4.98644", "nan", ["observations.csv", "x"]),
     "unknown point": ("observations.csv", "DSC_037,1,", "DSC_037,77,", ["observations.csv", "77"]),
