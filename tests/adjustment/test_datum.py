@@ -173,7 +173,7 @@ def test_s_transformation(name):
     np.testing.assert_allclose(B.T @ found, 0, atol=1e-11 * np.abs(B).sum(0).max())
 
 
-SOLVED_FREE = ["free", "minimal", "free with distances"]
+SOLVED_FREE = ["free", "minimal", pytest.param("free with distances", marks=pytest.mark.slow)]
 
 
 @pytest.mark.parametrize("name", SOLVED_FREE)

@@ -29,6 +29,8 @@ from jaxbundle.geometry import (
 )
 from jaxbundle.statistics.cofactors import cofactors, undamped_factor
 
+SLOW = ("held images, exterior priors", "free with distances", "own cameras of two models")
+
 SAME = 1e-8
 """Two runs to the same minimum differ by rounding of vᵀPv, √1e-15 of σ at most."""
 
@@ -53,7 +55,13 @@ def assert_same_values(a, b, tolerance=SAME):
     np.testing.assert_allclose(a.camera, b.camera, atol=tolerance, rtol=tolerance)
 
 
-@pytest.mark.parametrize("name", LINEARISED)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name
+        for name in LINEARISED
+    ],
+)
 def test_the_minimum_is_one(name):
     problem, minimum = adjusted(name)
     assert int(minimum.termination) == SETTLED
@@ -112,7 +120,7 @@ def test_gauss_newton_finds_the_same():
     other = solved(problem, method="gauss-newton")
     assert int(other.termination) == SETTLED
     assert_same_values(other.values, minimum.values)
-    assert not np.isfinite(other.history.damping[0]) or other.history.accepted[:2].all()
+    assert (np.asarray(other.history.damping)[1 : int(other.iterations)] == 0).all()
 
 
 def test_methods_are_named():
