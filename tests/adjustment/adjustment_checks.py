@@ -20,7 +20,7 @@ from jaxbundle.adjustment.normal import Normal, gradient, hessian, normal_from_j
 from jaxbundle.adjustment.problem import Problem, make_problem
 from jaxbundle.adjustment.residuals import Residuals, residuals
 from jaxbundle.adjustment.solve import find_minimum, make_solver
-from jaxbundle.geometry import matrix_from_omega_phi_kappa, omega_phi_kappa_from_matrix
+from jaxbundle.geometry import omega_phi_kappa_from_matrix
 from jaxbundle.network import (
     Camera,
     Distances,
