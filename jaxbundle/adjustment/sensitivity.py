@@ -16,6 +16,7 @@ value, right in first derivatives (forward and reverse), not in second ones.
 
 from typing import Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 
@@ -30,6 +31,7 @@ from jaxbundle.network.structure import Structure
 Sensitivity = Literal["exact", "gauss-newton"]
 
 
+@eqx.filter_jit
 def attach_derivatives(
     structure: Structure, values: Values, data: Data, sensitivity: Sensitivity = "exact"
 ) -> Values:

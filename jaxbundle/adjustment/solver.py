@@ -294,8 +294,10 @@ class BundleSolver(optx.AbstractLeastSquaresSolver):
         return state.done, optx.RESULTS.successful
 
     def postprocess(self, fn, y, aux, args, options, state: SolverState, tags, result):
+        # optimistix itself ends the loop where unknowns are not finite, before any step.
+        termination = jnp.where(_all_finite(y), state.termination, NOT_FINITE)
         stats = {
-            "termination": state.termination,
+            "termination": termination,
             "iterations": state.steps,
             "history": state.history,
         }

@@ -68,7 +68,6 @@ def free_parameters(model):
 class Truth:
     """What a synthetic network was made from."""
 
-    camera: dict
     position: np.ndarray
     matrix: np.ndarray
     point: np.ndarray
@@ -88,6 +87,7 @@ def synthetic(
     datum="control",
     datum_points=(),
     domain="corrected",
+    scene="ring",
     noise=1.0,
     disturbance=1.0,
     seed=0,
@@ -97,10 +97,14 @@ def synthetic(
     **Arguments:** `of_image`: the camera of every image (all the first); `control`, `fixed`: how
     many of the first points are control points with σ, and how many of the next are fixed;
     `distances`: pairs of point indices; `held`: pairs (image, columns of its exterior orientation);
-    `noise`: of all observations, in σ; `disturbance`: of the start values.
+    `scene`: "ring", or two that determine too little: "vertical" images above flat ground, and
+    images from "one centre"; `noise`: of all observations, in σ; `disturbance`: of the start
+    values.
     """
     rng = np.random.default_rng(seed)
-    truth = Truth({c.id: c.parameters for c in cameras}, *_ring(images), _box(points, rng))
+    truth = Truth(*SCENES[scene](images), _box(points, rng))
+    if scene == "vertical":
+        truth.point[:, 2] = 0.0
     of_image = np.zeros(images, int) if of_image is None else np.asarray(of_image)
     image, point = np.divmod(np.arange(images * points), points)
     seen = (image + 2 * point) % 5 != 0
@@ -155,6 +159,26 @@ def _ring(count):
     turn = 1.3 * i
     c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
     return (4 + 0.2 * (i % 3))[:, None] * z, np.stack([c * x + s * y, c * y - s * x, z], 1)
+
+
+def _one_centre(count):
+    position, matrix = _ring(count)
+    turn = np.arange(count) * 1.3
+    return np.repeat(position[:1], count, 0), _about_z(turn) @ matrix[0]
+
+
+def _vertical(count):
+    i = np.arange(count)
+    position = np.stack([0.8 * (i % 3) - 0.8, 0.9 * (i // 3) - 0.4, np.full(count, 4.0)], 1)
+    return position, _about_z(1.3 * i)
+
+
+def _about_z(angle):
+    c, s, zero, one = np.cos(angle), np.sin(angle), 0 * angle, 1 + 0 * angle
+    return np.stack([c, s, zero, -s, c, zero, zero, zero, one], 1).reshape(-1, 3, 3)
+
+
+SCENES = {"ring": _ring, "vertical": _vertical, "one centre": _one_centre}
 
 
 def _box(count, rng):

@@ -1,0 +1,182 @@
+"""Cofactors and reliability from blocks, against the dense inverse with the datum conditions."""
+
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from adjustment_checks import (
+    LINEARISED,
+    adjusted,
+    bordered_inverse,
+    datum_matrices,
+    flat,
+    linearised,
+    make_problem,
+    synthetic,
+)
+
+from jaxbundle.adjustment.jacobian import free_tangent
+from jaxbundle.adjustment.residuals import residuals
+from jaxbundle.adjustment.solve import find_minimum, make_solver
+from jaxbundle.adjustment.solver import SETTLED
+from jaxbundle.geometry import quaternion_difference
+from jaxbundle.network.arrays import Tangent
+from jaxbundle.statistics.cofactors import cofactors, propagate, undamped_factor
+from jaxbundle.statistics.reliability import (
+    external_reliability,
+    hat_diagonal,
+    minimal_detectable,
+    reliability,
+)
+
+
+@cache
+def both(name):
+    """The cofactors in blocks and dense, and the hat matrix's diagonal from blocks."""
+    net = linearised(name)
+    s, values = net.problem.structure, net.problem.data.start
+    factor = undamped_factor(s, values, net.problem.data)
+    blocks = cofactors(s, values, factor)
+    hat = eqx.filter_jit(hat_diagonal)(net.jac, blocks)
+    _, B = datum_matrices(s, values)
+    return net, factor, blocks, bordered_inverse(net.N, B, flat(free_tangent(s))), hat
+
+
+def assert_close(found, dense, sigma_rows, sigma_columns, tolerance=1e-8):
+    """In units of the standard deviations of rows and columns."""
+    size = np.outer(sigma_rows, sigma_columns)
+    size = np.where(size > 0, size, 1)
+    assert (np.abs(found - dense) / size).max() < tolerance
+
+
+@pytest.mark.parametrize("name", LINEARISED)
+def test_blocks(name):
+    net, _, blocks, Q, _ = both(name)
+    s = net.problem.structure
+    first = s.images * s.image_width + s.cameras * s.camera_width
+    at_point = lambda p: first + 3 * p + np.arange(3)
+    kept = np.concatenate([np.arange(0), *(at_point(int(p)) for p in s.kept)]).astype(int)
+    reduced = np.concatenate([np.arange(first), kept])
+    sigma = np.sqrt(np.diag(Q))
+    assert_close(blocks.reduced, Q[np.ix_(reduced, reduced)], sigma[reduced], sigma[reduced])
+    for p in range(s.points):
+        rows = at_point(p)
+        assert_close(blocks.point[p], Q[np.ix_(rows, rows)], sigma[rows], sigma[rows])
+
+
+@pytest.mark.parametrize("name", LINEARISED)
+def test_propagation_to_any_function(name):
+    net, factor, _, Q, _ = both(name)
+    s, values = net.problem.structure, net.problem.data.start
+    rng = np.random.default_rng(4)
+    scale = np.sqrt(np.where(np.diag(Q) > 0, 1 / np.where(np.diag(Q) > 0, np.diag(Q), 1), 0))
+    F = rng.normal(size=(5, len(Q))) * scale
+    F[:3, : s.images * s.image_width] = 0  # some of points and cameras alone
+    unravel = jax.flatten_util.ravel_pytree(free_tangent(s))[1]
+    rows = jax.vmap(unravel)(jnp.asarray(F))
+    found = propagate(s, values, factor, rows)
+    dense = F @ Q @ F.T
+    sigma = np.sqrt(np.diag(dense))
+    assert_close(found, dense, sigma, sigma)
+
+
+@pytest.mark.parametrize("name", LINEARISED)
+def test_redundancy_numbers(name):
+    net, _, _, Q, hat = both(name)
+    dense = ((net.J @ Q) * net.J).sum(1)
+    np.testing.assert_allclose(flat(hat), dense, atol=1e-9)
+    counts = net.problem.counts
+    rows = counts.observations + counts.pseudo_observations
+    assert rows - flat(hat).sum() == pytest.approx(counts.redundancy, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", ["shared cameras of two models", "own cameras of two models"])
+def test_reliability(name):
+    net, _, blocks, Q, _ = both(name)
+    s, data = net.problem.structure, net.problem.data
+    found = reliability(s, data.start, data, blocks)
+    r, v, w = flat(found.redundancy), flat(found.residual), flat(found.w)
+    np.testing.assert_allclose(v, flat(net.rows), rtol=1e-12, atol=1e-12)
+    assert r.sum() == pytest.approx(net.problem.counts.redundancy, abs=1e-9)
+    controlled = r > 1e-8
+    np.testing.assert_allclose(w[controlled], v[controlled] / np.sqrt(r[controlled]))
+    assert np.isnan(w[~controlled]).all()
+    # A blunder of the smallest size moves its own w by δ0, and no unknown by more than δ̄·σ.
+    row, delta0 = int(np.argmax(r)), 4.13
+    blunder = float(minimal_detectable(1.0, r[row], delta0))
+    change = -Q @ net.J.T[:, row] * blunder
+    residual = net.J[row] @ change + blunder
+    assert residual / np.sqrt(r[row]) == pytest.approx(delta0, rel=1e-8)
+    effect = float(external_reliability(r[row], delta0))
+    assert np.sqrt(change @ net.N @ change) == pytest.approx(effect, rel=1e-7)
+    sigma = np.sqrt(np.where(np.diag(Q) > 0, np.diag(Q), np.inf))
+    assert (np.abs(change) / sigma).max() <= effect * (1 + 1e-9)
+
+
+def test_what_is_not_controlled_has_no_finite_bound():
+    assert np.isinf(minimal_detectable(0.01, jnp.asarray(0.0)))
+    assert np.isinf(external_reliability(jnp.asarray(1e-12)))
+
+
+DRAWS = 300
+
+
+def assert_between(value, expected, standard_deviation, times=4.0):
+    assert abs(value - expected) < times * standard_deviation, (value, expected)
+
+
+@pytest.mark.slow
+def test_predicted_uncertainty_is_that_of_a_sample():
+    """300 adjustments of a free self-calibrating network with fresh noise."""
+    problem = make_problem(synthetic(datum="inner", noise=0.0)[0])
+    s, data = problem.structure, problem.data
+    centre, _ = adjusted("free")[0], None
+    assert centre.structure.defect == s.defect
+    rng = np.random.default_rng(12)
+    noise = rng.normal(size=(DRAWS, *data.image_xy.shape)) / np.asarray(data.image_weight)
+    solver = make_solver(problem, max_steps=30)
+
+    @eqx.filter_jit
+    def sample(xy):
+        def one(xy):
+            from dataclasses import replace
+
+            drawn = replace(data, image_xy=xy)
+            minimum = find_minimum(solver, drawn)
+            rows = residuals(s, minimum.values, drawn)
+            return minimum.termination, minimum.values, jnp.sum(rows.image**2)
+
+        return jax.vmap(one)(xy)
+
+    termination, values, vtpv = sample(data.image_xy + noise)
+    assert (np.asarray(termination) == SETTLED).all()
+    true = sample(data.image_xy[None])[1]
+    true = jax.tree.map(lambda x: x[0], true)
+
+    turn = jax.vmap(jax.vmap(quaternion_difference), (0, None))(values.rotation, true.rotation)
+    exterior = jnp.concatenate([values.position - true.position, turn], 2)
+    camera = (values.camera - true.camera)[:, :, np.asarray(s.camera_columns[0])]
+    change = Tangent(exterior, camera, values.point - true.point)
+    x = np.concatenate([np.asarray(part).reshape(DRAWS, -1) for part in jax.tree.leaves(change)], 1)
+
+    identity = jax.vmap(jax.flatten_util.ravel_pytree(free_tangent(s))[1])(jnp.eye(x.shape[1]))
+    Q = np.asarray(propagate(s, true, undamped_factor(s, true, data), identity))
+    sigma = np.sqrt(np.diag(Q))
+    # Every σ: 67 of them, each with a relative error of 1/√(2·300) = 4.1 %.
+    ratio = np.sqrt((x**2).mean(0)) / sigma
+    assert np.abs(ratio - 1).max() < 4.5 / np.sqrt(2 * DRAWS)
+    assert_between(ratio.mean(), 1, 1 / np.sqrt(2 * DRAWS))
+    # No bias beyond sampling: the means of 300, their χ² in the 60 dimensions outside the datum.
+    mean = x.mean(0) * np.sqrt(DRAWS)
+    rank = x.shape[1] - s.defect
+    scaled = Q / np.outer(sigma, sigma)
+    square = lambda y: (y / sigma) @ np.linalg.pinv(scaled, rcond=1e-9, hermitian=True) @ (y / sigma)
+    assert_between(square(mean), rank, np.sqrt(2 * rank))
+    # The whole covariance: the mean of xᵀQ⁻x is its rank, and vᵀPv is χ² of the redundancy.
+    assert_between(np.mean([square(y) for y in x]), rank, np.sqrt(2 * rank / DRAWS))
+    f = problem.counts.redundancy
+    assert_between(np.mean(vtpv), f, np.sqrt(2 * f / DRAWS))
+    assert_between(np.var(vtpv) / (2 * f), 1, np.sqrt((2 + 12 / f) / DRAWS), times=4.5)
