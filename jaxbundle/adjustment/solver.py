@@ -46,8 +46,11 @@ LIMIT, SETTLED, RELATIVE_COST, SINGULAR, STUCK, NOT_FINITE = range(6)
 ROUNDING = 2e-14
 """A predicted decrease of vᵀPv below this fraction of it is rounding noise."""
 
-NOISE_FLOOR = 1e-12
-"""Relative precision of an image coordinate; residuals below it are noise of the arithmetic."""
+NOISE_FLOOR, NOISE_FLOOR_WITHOUT_REDUNDANCY = 1e-14, 1e-12
+"""Relative precision of an image coordinate; residuals below it are noise of the arithmetic.
+
+Without redundancy all residuals vanish and no σ0 says when to stop: the wider floor does.
+"""
 
 REFUSALS = 2
 """So many undamped steps refused where the damped ones have settled: singular, if not exactly."""
@@ -248,7 +251,10 @@ class BundleSolver(optx.AbstractLeastSquaresSolver):
 
         sigma0_squared = 2 * cost_here / jnp.maximum(self.redundancy, 1.0)
         scale = args.image_xy * args.image_weight
-        floor = jnp.sum((NOISE_FLOOR * scale) ** 2)
+        precision = jnp.where(
+            self.redundancy > 0, NOISE_FLOOR, NOISE_FLOOR_WITHOUT_REDUNDANCY
+        )
+        floor = jnp.sum((precision * scale) ** 2)
         limit = jnp.maximum(self.atol**2 * sigma0_squared, ROUNDING * cost_here) + floor
         small = finite & (decrement <= limit)
         settled = small & jnp.isinf(step_size)

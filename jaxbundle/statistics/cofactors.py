@@ -117,7 +117,8 @@ def _couplings(factor, Q):
 def _add_pairs(K_a, K_b, pairs, Z_a, Z_b, Q, block_a, block_b, same):
     """Add Z_b·Q[b, a] to K_a and Z_a·Q[a, b] to K_b over pairs (a, b).
 
-    `same`: both sides are one table; a pair of a row with itself then counts once.
+    `same`: both sides are one table; pairs within a block are then listed in both orders (a row
+    with itself once).
     """
     if not pairs.first:
         return K_a, K_b
@@ -135,7 +136,7 @@ def _add_pairs(K_a, K_b, pairs, Z_a, Z_b, Q, block_a, block_b, same):
         weight = jnp.where(missing, 0.0, 1.0)[:, None, None]
         block = Q[block_a[a], :, block_b[b], :] * weight
         to_a = jnp.einsum("cij,ckj->cik", Z_b[b], block)
-        once = jnp.where(a == b, 0.0, 1.0)[:, None, None] if same else 1.0
+        once = jnp.where(block_a[a] == block_b[b], 0.0, 1.0)[:, None, None] if same else 1.0
         to_b = jnp.einsum("cij,cjk->cik", Z_a[a], block) * once
         K_a = K_a.at[a].add(to_a)
         if same:

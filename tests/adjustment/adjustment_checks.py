@@ -322,7 +322,8 @@ def flat(tree):
 
 def columns(tree):
     """A tangent whose blocks have a last axis of columns, as a matrix [unknowns, columns]."""
-    return np.concatenate([np.asarray(x).reshape(-1, x.shape[-1]) for x in jax.tree.leaves(tree)])
+    blocks = [np.asarray(x) for x in jax.tree.leaves(tree)]
+    return np.concatenate([x.reshape(x.shape[0] * x.shape[1], x.shape[2]) for x in blocks])
 
 
 def of_change(structure, values, data):
