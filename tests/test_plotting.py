@@ -233,7 +233,8 @@ def test_error_ellipses_lean_as_the_covariance(convergent4):
     polygons = error_ellipses(convergent4, 1.0)[:, :-1]
     away = polygons - polygons.mean(1, keepdims=True)
     moment = np.einsum("pni,pnj->pij", away, away) / away.shape[1]
-    np.testing.assert_allclose(2 * moment, convergent4.point_covariance[:, :2, :2], rtol=1e-6, atol=1e-14)
+    expected = convergent4.point_covariance[:, :2, :2]
+    np.testing.assert_allclose(2 * moment, expected, rtol=1e-6, atol=1e-14)
 
 
 def test_pyramids_are_the_corners_of_the_images(convergent4):
