@@ -1,7 +1,8 @@
 """All tests run in float64, which the package itself never switches on.
 
 Compiled programs are kept in .cache/jax, so that test processes, the command line and notebooks
-share them.
+share them; a process drops its own after every file, because each holds memory maps, of which
+the system allows 65 530 a process.
 """
 
 import os
@@ -18,6 +19,12 @@ import jax  # noqa: E402
 import pytest  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def drop_compiled_programs():
+    yield
+    jax.clear_caches()
 
 
 @pytest.fixture(scope="session")
