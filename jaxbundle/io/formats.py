@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from jaxbundle.errors import InputError
+from jaxbundle.io.bal import is_bal, read_bal
 from jaxbundle.io.photo_list import read_photo_list
 from jaxbundle.io.project import FILE_NAME, read_project
 from jaxbundle.network.columns import did_you_mean
@@ -42,6 +43,7 @@ FORMATS: dict[str, Format] = {
     "photo-list": Format(
         _is_photo_list, read_photo_list, "a .txt file whose first line is the focal length"
     ),
+    "bal": Format(is_bal, read_bal, "a text file (.gz, .bz2) whose first line is three numbers"),
 }
 
 

@@ -53,7 +53,7 @@ def apply_overrides(
 def _project_value(key: str, text: str):
     if key == "sigma_image":
         return _number(key, text)
-    return _words(text) if key == "datum_points" else text
+    return _words(text) if key in ("datum_points", "free") else text
 
 
 def _override_camera(cameras: list[dict], key: str, text: str) -> None:

@@ -47,7 +47,10 @@ class Columns:
 
     def ids(self, name: str) -> tuple[str, ...]:
         """A column of ids or words; whole numbers become text, surrounding blanks go."""
-        ids = tuple(map(_id, self.values[name]))
+        values = self.values[name]
+        if isinstance(values, np.ndarray) and values.dtype.kind in "iu":
+            return tuple(map(str, values.tolist()))
+        ids = tuple(map(_id, values))
         if "" in ids:
             raise InputError(f"{self.source(ids.index(''))}: {name} is missing")
         return ids

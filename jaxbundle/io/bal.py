@@ -1,0 +1,160 @@
+"""Problems of "bundle adjustment in the large" (BAL), plain or compressed (.gz, .bz2).
+
+    cameras points observations         three whole numbers
+    camera point x y                    an image point, px; x right, y up, from the image centre
+    …
+    r1 r2 r3 t1 t2 t3 f k1 k2           nine numbers for every camera
+    X Y Z                               three for every point
+
+Cameras and points are counted from 0; these numbers become their ids. Every image has its own
+camera of model `snavely`, all of it free; residuals are formed in the image as measured, σ is
+1 px, and the datum is given by inner constraints. [r] is a rotation vector and t a shift:
+M = exp([r]×), X0 = −Mᵀt.
+
+Source: Agarwal, Snavely, Seitz and Szeliski (2010), Bundle Adjustment in the Large.
+"""
+
+import bz2
+import gzip
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jaxbundle.cameras import get_model
+from jaxbundle.errors import InputError
+from jaxbundle.geometry import matrix_from_rotation_vector, omega_phi_kappa_from_matrix
+from jaxbundle.io.settings import SETTINGS, apply_overrides, check_settings
+from jaxbundle.network.build import make_cameras, make_network
+from jaxbundle.network.columns import Columns
+from jaxbundle.network.tables import EXTERIOR, Network, Source
+
+OPENERS = {".gz": gzip.open, ".bz2": bz2.open}
+MODEL = get_model("snavely")
+
+
+def is_bal(path: Path) -> bool:
+    """Whether the first line of a text file is three whole numbers."""
+    if not path.is_file():
+        return False
+    try:
+        with OPENERS.get(path.suffix.lower(), open)(path, "rb") as file:
+            words = file.readline(200).split()
+    except (OSError, EOFError):
+        return False
+    return len(words) == 3 and all(word.isdigit() for word in words)
+
+
+def read_bal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
+    """The network of a BAL problem; `overrides` as for a project file.
+
+    **Raises:** `InputError` where numbers are missing, too many, or not numbers.
+    """
+    path = Path(path)
+    (cameras, points, rows), numbers = _numbers(path)
+    observed, numbers = np.split(numbers, [4 * rows])
+    given, position = np.split(numbers, [9 * cameras])
+    observed, given = observed.reshape(-1, 4), given.reshape(-1, 9)
+    for column, count, what in ((0, cameras, "camera"), (1, points, "point")):
+        index = observed[:, column]
+        wrong = (index < 0) | (index >= count) | (index % 1 != 0)
+        if wrong.any():
+            row = int(wrong.argmax())
+            raise InputError(
+                f"{path}, line {row + 2}: {what} {index[row]:g} does not exist; the first line "
+                f"announces {count}, counted from 0"
+            )
+    document = {
+        "project": {"name": path.name.split(".")[0], "datum": "inner", "image_unit": "px",
+                    "residuals": "measured", "object_unit": "model", "sigma_image": 1.0},
+        "camera": [
+            {"id": str(c), "model": MODEL.name, "free": list(MODEL.parameters),
+             **dict(zip(MODEL.parameters, map(float, row)))}
+            for c, row in enumerate(given[:, 6:])
+        ],
+    }  # fmt: skip
+    document = apply_overrides(document, overrides, (*SETTINGS, "free"))
+    project = document["project"]
+    free = project.pop("free", None)
+    for camera in document["camera"] if free is not None else ():
+        camera["free"] = free
+    check_settings(project, f"{path}: ")
+    return make_network(
+        make_cameras(document["camera"], f"{path}, "),
+        _table(path, "camera", _images(given[:, :6])),
+        _table(path, "point", {
+            "id": np.arange(points), "role": np.full(points, "tie"),
+            **dict(zip("XYZ", position.reshape(-1, 3).T)),
+        }),
+        Columns(
+            {
+                "image": observed[:, 0].astype(np.int64), "point": observed[:, 1].astype(np.int64),
+                "x": observed[:, 2], "y": observed[:, 3],
+            },
+            Source(str(path), np.arange(rows) + 2, "line"),
+        ),
+        **project,
+    )  # fmt: skip
+
+
+def _numbers(path: Path):
+    """The three counts of the first line, and all numbers after it."""
+    try:
+        with OPENERS.get(path.suffix.lower(), open)(path, "rb") as file:
+            first, text = file.readline().split(), file.read()
+    except (OSError, EOFError) as error:
+        raise InputError(f"{path}: cannot be read: {error}") from None
+    if len(first) != 3 or not all(word.isdigit() for word in first):
+        raise InputError(
+            f"{path}, line 1: three whole numbers are expected: cameras, points, observations"
+        )
+    cameras, points, rows = counts = tuple(map(int, first))
+    expected = 4 * rows + 9 * cameras + 3 * points
+    try:
+        numbers = np.array(text.split(), float)
+    except ValueError:
+        raise _not_a_number(path, text) from None
+    if len(numbers) != expected:
+        raise InputError(
+            f"{path}: {len(numbers)} numbers follow the first line; {expected} are expected "
+            f"(4 for each of {rows} observations, 9 for each of {cameras} cameras, 3 for each of "
+            f"{points} points)"
+        )
+    finite = np.isfinite(numbers)
+    if not finite.all():
+        raise _not_a_number(path, text)
+    return counts, numbers
+
+
+def _not_a_number(path: Path, text: bytes) -> InputError:
+    for line, row in enumerate(text.splitlines(), 2):
+        for word in row.split():
+            try:
+                good = np.isfinite(float(word))
+            except ValueError:
+                good = False
+            if not good:
+                word = word.decode(errors="replace")
+                return InputError(f"{path}, line {line}: {word!r} where a number is expected")
+    raise AssertionError("every word is a number")
+
+
+def _images(pose) -> dict:
+    """Exterior orientation of the images from rotation vectors and shifts."""
+
+    def exterior(pose):
+        M = matrix_from_rotation_vector(pose[:3])
+        return -M.T @ pose[3:], omega_phi_kappa_from_matrix(M)
+
+    with jax.enable_x64(True):
+        centre, angles = jax.jit(jax.vmap(exterior))(pose)
+    columns = np.concatenate([centre, angles], 1).T
+    ids = np.arange(len(pose))
+    return {"id": ids, "camera": ids, **dict(zip(EXTERIOR, columns))}
+
+
+def _table(path: Path, word: str, columns: dict) -> Columns:
+    """A table whose rows are known by their number, from 0."""
+    first = next(iter(columns.values()))
+    return Columns(columns, Source(str(path), np.arange(len(first)), word))
