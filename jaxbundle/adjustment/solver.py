@@ -25,12 +25,12 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxbundle.adjustment.datum import gauge_directions, s_transform
+from jaxbundle.adjustment.datum import gauge_directions
 from jaxbundle.adjustment.jacobian import jacobian
 from jaxbundle.adjustment.normal import Normal, diagonal, gradient, normal_from_jacobian
 from jaxbundle.adjustment.residuals import residuals
 from jaxbundle.adjustment.schur import factorise, solve
-from jaxbundle.network.arrays import Data, Tangent, Values, retract
+from jaxbundle.network.arrays import Data, Tangent, Values, retract_about
 from jaxbundle.network.structure import Structure
 
 TERMINATIONS = (
@@ -51,6 +51,9 @@ NOISE_FLOOR, NOISE_FLOOR_WITHOUT_REDUNDANCY = 1e-14, 1e-12
 
 Without redundancy all residuals vanish and no σ0 says when to stop: the wider floor does.
 """
+
+NEAR = 1e-3
+"""Near the solution: the last step promised to decrease vᵀPv by less than this fraction."""
 
 REFUSALS = 2
 """So many undamped steps refused where the damped ones have settled: singular, if not exactly."""
@@ -155,6 +158,7 @@ class SolverState(eqx.Module):
     descent: Damped
     step_size: Float[Array, ""]
     singular: Bool[Array, ""]
+    near: Float[Array, ""]
     trial: Bool[Array, ""]
     tried: Bool[Array, ""]
     refusals: Int[Array, ""]
@@ -198,6 +202,7 @@ class BundleSolver(optx.AbstractLeastSquaresSolver):
             descent=descent.init(y, struct),
             step_size=jnp.asarray(float(self.search.initial)),
             singular=no,
+            near=jnp.asarray(NEAR),
             trial=no,
             tried=no,
             refusals=jnp.asarray(0),
@@ -233,11 +238,13 @@ class BundleSolver(optx.AbstractLeastSquaresSolver):
         y, accepted_info, damped = jax.lax.cond(accept, accepted, rejected)
         cost_here = jnp.where(accept, cost, before)
 
+        # An undamped step that was refused was tried too early.
+        near = jnp.where(jnp.isinf(state.step_size) & ~accept, 0.1 * state.near, state.near)
         # Near the solution, and where the step already is one of rounding, drop the damping.
         undamped = isinstance(self.search, FullStep)
         if not undamped:
-            quadratic = accept & (search.ratio > 0.5) & (search.predicted < 1e-3 * cost_here)
-            quadratic = quadratic & ~state.singular & ~state.first
+            quadratic = accept & (search.ratio > 0.5) & ~state.singular & ~state.first
+            quadratic = quadratic & (search.predicted < near * cost_here)
             step_size = jnp.where(quadratic | state.trial, jnp.inf, step_size)
         change, _ = descent.step(step_size, damped)
         finite = _all_finite(change)
@@ -246,8 +253,7 @@ class BundleSolver(optx.AbstractLeastSquaresSolver):
         damping_term = _dot(change, jax.tree.map(jnp.multiply, damped.diagonal, change))
         damping_term = jnp.where(jnp.isinf(step_size), 0.0, damping_term / step_size)
         predicted = 0.5 * (decrement + damping_term)
-        change = s_transform(self.structure, y, change)
-        y_eval = retract(self.structure, y, change)
+        y_eval = retract_about(self.structure, y, change)
 
         sigma0_squared = 2 * cost_here / jnp.maximum(self.redundancy, 1.0)
         scale = args.image_xy * args.image_weight
@@ -290,8 +296,8 @@ class BundleSolver(optx.AbstractLeastSquaresSolver):
         search = eqx.tree_at(lambda s: s.predicted, search, predicted)
         new = SolverState(
             first=jnp.asarray(False), y_eval=y_eval, accepted_info=accepted_info, search=search,
-            descent=damped, step_size=step_size, singular=singular, trial=trial,
-            tried=state.trial, refusals=refusals, termination=termination, done=done,
+            descent=damped, step_size=step_size, singular=singular, near=near,
+            trial=trial, tried=state.trial, refusals=refusals, termination=termination, done=done,
             steps=i + 1, history=history,
         )  # fmt: skip
         return y, new, aux

