@@ -28,7 +28,6 @@ from jaxbundle.geometry import (
     retract_quaternion,
 )
 from jaxbundle.network.arrays import Tangent, Values, retract
-from jaxbundle.network.structure import order_rays
 from jaxbundle.network.tables import EXTERIOR, Network
 from jaxbundle.statistics import (
     CheckPoints,
@@ -381,7 +380,7 @@ class Adjustment:
         points = np.array(network.points.id, dtype=object)
         cameras = np.array([c.id for c in network.cameras], dtype=object)
         blank = lambda rows: np.full(rows, "", dtype=object)
-        back = np.argsort(order_rays(network), kind="stable")
+        back = self.problem.rays
         image = np.asarray(s.image)[back]
         point = np.asarray(s.point)[back]
         parts = [

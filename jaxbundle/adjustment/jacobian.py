@@ -20,7 +20,7 @@ from jaxbundle.adjustment.residuals import (
     exterior_residual,
     gather_groups,
     image_residual,
-    image_rows,
+    over_rays,
 )
 from jaxbundle.network.arrays import Data, Tangent, Values
 from jaxbundle.network.structure import Structure
@@ -46,7 +46,7 @@ class BundleJacobian(lx.AbstractLinearOperator):
     def mv(self, vector: Tangent) -> Residuals:
         """J·x."""
         s, k = self.structure, self.structure.interior_width
-        image = jnp.einsum("nai,ni->na", self.image, vector.image[s.image])
+        image = s.table.times_image(self.image, vector.image)
         image += jnp.einsum("nai,ni->na", self.point, vector.point[s.point])
         if s.camera_width:
             image += jnp.einsum("nai,ni->na", self.camera, vector.camera[s.camera])
@@ -66,19 +66,17 @@ class BundleJacobian(lx.AbstractLinearOperator):
         )
 
     def transposed_mv(self, residual: Residuals) -> Tangent:
-        """Jᵀ·r."""
+        """Jᵀ·r, of all devices."""
         s = self.structure
-        image = jax.ops.segment_sum(
-            jnp.einsum("nai,na->ni", self.image, residual.image), s.image, s.images
-        )
-        point = jax.ops.segment_sum(
-            jnp.einsum("nai,na->ni", self.point, residual.image), s.point, s.points,
-            indices_are_sorted=True,
-        )
+        column = residual.image[:, :, None]
+        times = lambda blocks: s.table.products_by_image(blocks, column)[:, :, 0]
+        image = times(self.image)
+        point = self.point[:, 0] * column[:, 0] + self.point[:, 1] * column[:, 1]
+        point = jax.ops.segment_sum(point, s.point, s.points)
         camera = jnp.zeros((s.cameras, s.camera_width))
         if s.camera_width:
             camera = jax.ops.segment_sum(
-                jnp.einsum("nai,na->ni", self.camera, residual.image), s.camera, s.cameras
+                times(self.camera), s.camera_of_image, s.cameras
             )
         point = point.at[s.control].add(self.control * residual.control)
         point = point.at[s.distance].add(self.distance * residual.distance[:, None, None])
@@ -91,7 +89,7 @@ class BundleJacobian(lx.AbstractLinearOperator):
                 image = image.at[s.interior, 6:].add(self.interior * rows)
             else:
                 camera = camera.at[s.interior].add(self.interior * rows)
-        return Tangent(image, camera, point)
+        return Tangent(*s.total((image, camera)), point)
 
     _parameters: int = eqx.field(static=True, default=0)
 
@@ -143,16 +141,13 @@ def jacobian(structure: Structure, values: Values, data: Data) -> BundleJacobian
     """The Jacobian of `residuals` with respect to the free unknowns, by autodiff."""
     s = structure
     parts = [_image_blocks(s, group, values, data) for group in s.groups]
-    exterior, interior, point = gather_groups(s, parts)
+    image, camera, point = gather_groups(s, parts)
     if not s.all_free:
-        exterior = exterior * s.image_free[s.image][:, None, :]
-        interior = interior * s.camera_free[s.camera][:, None, :]
+        free = s.image_block_free
+        image = image * s.table.of_image(free)[:, None, :]
+        if s.camera_width:
+            camera = camera * s.table.of_image(s.camera_free[s.camera_of_image])[:, None, :]
         point = point * s.point_free[s.point][:, None, :]
-    camera = jnp.zeros((s.rays, 2, 0))
-    if s.own_camera:
-        exterior = jnp.concatenate([exterior, interior], 2)
-    elif s.interior_width:
-        camera = interior
     a, b = s.distance[:, 0], s.distance[:, 1]
     zero3 = jnp.zeros(3)
     ends = jax.vmap(jax.jacrev(distance_residual, (4, 5)), (0, 0, 0, 0, None, None))(
@@ -160,7 +155,7 @@ def jacobian(structure: Structure, values: Values, data: Data) -> BundleJacobian
     )
     return BundleJacobian(
         structure=s,
-        image=exterior,
+        image=image,
         camera=camera,
         point=point,
         control=data.control_weight,
@@ -180,23 +175,34 @@ compiled_jacobian = eqx.filter_jit(jacobian)
 
 
 def _image_blocks(structure, group, values, data):
-    """Derivatives of the rays of one camera model: exterior [n,2,6], interior [n,2,k], point."""
-    model = cameras.get_model(group.model)
-    free = group.free
+    """Derivatives of the rays of one camera model by image block, shared camera and point."""
+    model, free = cameras.get_model(group.model), group.free
     padding = structure.interior_width - len(free)
 
     def one(*row):
         def shifted(*change):
             return image_residual(model, structure.domain, free, *row, change)
 
-        still = ((0.0,) * 3, (0.0,) * 3, (0.0,) * len(free), (0.0,) * 3)
-        still = jax.tree.map(lambda _: jnp.zeros_like(row[0][0]), still)
+        nil = jnp.zeros_like(row[3][0])
+        still = ((nil,) * 3, (nil,) * 3, (nil,) * len(free), (nil,) * 3)
         _, pull = jax.vjp(shifted, *still)
-        one_, nil = jnp.ones_like(row[0][0]), jnp.zeros_like(row[0][0])
-        rows = [pull((one_, nil)), pull((nil, one_))]
-        flat = [(*centre, *theta, *inner, *((nil,) * padding), *point)
-                for centre, theta, inner, point in rows]
-        return jnp.stack([jnp.stack(r) for r in flat])
+        one_ = jnp.ones_like(nil)
+        return pull((one_, nil)), pull((nil, one_))
 
-    blocks = jax.vmap(one)(*image_rows(structure, group, values, data))
-    return blocks[..., :6], blocks[..., 6:-3], blocks[..., -3:]
+    rows = over_rays(structure, group, one, values, data)
+    nil = jnp.zeros_like(rows[0][0][0])
+    rows = [(centre, theta, (*interior, *(nil,) * padding), point)
+            for centre, theta, interior, point in rows]  # fmt: skip
+    own = structure.own_camera
+    image = [(*centre, *theta, *(interior if own else ())) for centre, theta, interior, _ in rows]
+    camera = [() if own else interior for _, _, interior, _ in rows]
+    point = [point for *_, point in rows]
+    return tuple(_as_blocks(part, nil.shape) for part in (image, camera, point))
+
+
+def _as_blocks(rows, shape):
+    """Two rows of scalars, each an array of this shape, as blocks [..., 2, columns]."""
+    columns = [column for row in rows for column in row]
+    if not columns:
+        return jnp.zeros((*shape, 2, 0))
+    return jnp.stack(columns, -1).reshape(*shape, 2, len(rows[0]))

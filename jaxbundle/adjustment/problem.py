@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxbundle.adjustment.datum import (
     choose_minimal_coordinates,
@@ -45,13 +45,15 @@ class Problem:
     """What `jaxbundle.solve` solves: structure (indices) and data (numbers) of one network.
 
     `network` is the network as adjusted (cameras in the order of the arrays); `origin` [3] was
-    subtracted from all object coordinates.
+    subtracted from all object coordinates; `rays` [observations]: the row of every observation of
+    the network in the arrays (big blocks have some empty rows there, of weight 0).
     """
 
     network: Network
     structure: Structure
     data: Data
     origin: Float[np.ndarray, "3"]
+    rays: Int[np.ndarray, " observations"]
     counts: Counts
 
 
@@ -63,7 +65,7 @@ def make_problem(network: Network) -> Problem:
     """
     require_x64()
     network = order_cameras(network)
-    structure, data, origin = make_structure(network)
+    structure, data, origin, rays = make_structure(network)
     gauge = open_similarities(structure, data)
     defect = gauge.shape[1]
     if network.datum == "control" and defect:
@@ -78,7 +80,7 @@ def make_problem(network: Network) -> Problem:
             lambda s: s.datum_weight, structure,
             jnp.asarray(_datum_weight(network, structure, data)),
         )  # fmt: skip
-    return Problem(network, structure, data, origin, count_rows(structure, data))
+    return Problem(network, structure, data, origin, rays, count_rows(structure, data))
 
 
 def require_x64() -> None:

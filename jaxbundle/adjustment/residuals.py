@@ -91,37 +91,50 @@ def distance_residual(a, b, given, weight, d_a, d_b):
     return weight * (jnp.sqrt(jnp.sum(difference**2)) - given)
 
 
-def scalars(array, rows=None):
-    """The columns of a table as a tuple, each [rows]: structure of arrays, fast under vmap."""
-    columns = array.reshape(array.shape[0], -1)
-    return tuple(
-        columns[:, i] if rows is None else columns[:, i][rows] for i in range(columns.shape[1])
-    )
+def scalars(table):
+    """The elements of every item of a table as a tuple: structure of arrays, fast under vmap."""
+    columns = table.reshape(table.shape[0], -1)
+    return tuple(columns[:, i] for i in range(columns.shape[1]))
 
 
-def image_rows(structure: Structure, group, values: Values, data: Data):
-    """What `image_residual` needs for the rays of one camera model, as tuples of [rays]."""
-    take = (lambda x: x) if group.rays is None else (lambda x: x[group.rays])
-    model = cameras.get_model(group.model)
-    image, camera, point = take(structure.image), take(structure.camera), take(structure.point)
+def over_rays(structure: Structure, group, function, values: Values, data: Data):
+    """`function(rotation, centre, interior, point, xy, weight)` of every ray of one camera model.
+
+    Each argument is a tuple of scalars; what belongs to the image is looked up once a chunk.
+    **Returns:** the results of the function, whose arrays get the axes [chunks, chunk length].
+    """
+    table, model = structure.table, cameras.get_model(group.model)
+    take = (lambda x: x) if group.chunks is None else (lambda x: x[group.chunks])
+    image, camera = take(table.chunk_image), take(table.chunk_camera)
+    of_chunk = lambda rows, index: tuple(column[index] for column in scalars(rows))
     matrices = jax.vmap(matrix_from_quaternion)(values.rotation)
-    return (
-        scalars(matrices, image),
-        scalars(values.position, image),
-        scalars(values.camera[:, : len(model.parameters)], camera),
-        scalars(values.point, point),
-        scalars(take(data.image_xy)),
-        scalars(take(data.image_weight)),
+    in_chunks = lambda rows: take(table.in_chunks(rows))
+    point = in_chunks(structure.point)
+    arguments = (
+        of_chunk(matrices, image),
+        of_chunk(values.position, image),
+        of_chunk(values.camera[:, : len(model.parameters)], camera),
+        of_chunk(values.point, point),
+        tuple(in_chunks(column) for column in scalars(data.image_xy)),
+        tuple(in_chunks(column) for column in scalars(data.image_weight)),
     )
+    return jax.vmap(jax.vmap(function, (None, None, None, 0, 0, 0)))(*arguments)
 
 
 def gather_groups(structure: Structure, parts):
     """The results of all camera models in the order of the rays; `parts`: a pytree per group."""
-    if len(parts) == 1 and structure.groups[0].rays is None:
-        return parts[0]
-    rays = jnp.concatenate([group.rays for group in structure.groups])
-    order = jnp.argsort(rays)
-    return jax.tree.map(lambda *arrays: jnp.concatenate(arrays)[order], *parts)
+    flat = lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:])
+    groups, chunks = structure.groups, structure.table.chunk_image.shape[0]
+    if len(parts) == 1 and groups[0].chunks is None:
+        return jax.tree.map(flat, parts[0])
+
+    def together(*arrays):
+        whole = jnp.zeros((chunks, *arrays[0].shape[1:]))
+        for group, part in zip(groups, arrays):
+            whole = whole.at[group.chunks].set(part)
+        return flat(whole)
+
+    return jax.tree.map(together, *parts)
 
 
 def residuals(structure: Structure, values: Values, data: Data) -> Residuals:
@@ -134,7 +147,7 @@ def residuals(structure: Structure, values: Values, data: Data) -> Residuals:
         def one(*row, model=model, still=still):
             return image_residual(model, structure.domain, (), *row, still)
 
-        parts.append(jnp.stack(jax.vmap(one)(*image_rows(structure, group, values, data)), 1))
+        parts.append(jnp.stack(over_rays(structure, group, one, values, data), -1))
     s = structure
     a, b = s.distance[:, 0], s.distance[:, 1]
     zero3 = jnp.zeros(3)
@@ -156,6 +169,11 @@ def residuals(structure: Structure, values: Values, data: Data) -> Residuals:
 
 compiled_residuals = eqx.filter_jit(residuals)
 """`residuals`, compiled once and shared by everything that looks at a solution."""
+
+
+def cost(structure: Structure, values: Values, data: Data) -> Float[Array, ""]:
+    """½·vᵀPv of the network on all devices."""
+    return structure.total(half_square(residuals(structure, values, data)))
 
 
 def half_square(r: Residuals) -> Float[Array, ""]:

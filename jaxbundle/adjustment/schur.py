@@ -68,9 +68,8 @@ def reduce(
     if damping is not None:
         normal = _damped(normal, damping)
     held = 1.0 - s.point_free * s.eliminated
-    i3 = jnp.arange(3)
-    V = normal.point * s.eliminated[:, :, None]
-    point = inverse_cholesky_3x3(V.at[:, i3, i3].add(held))
+    V = normal.point * s.eliminated[:, :, None] + held[:, :, None] * jnp.eye(3)
+    point = inverse_cholesky_3x3(V)
     ray = jnp.einsum("nij,njk->nik", point[s.point], normal.image_point)
     incidence = normal.camera_point
     if s.camera_width:
@@ -100,14 +99,14 @@ def solve(factor: Factor, right: Tangent) -> Tangent:
     image, camera, kept = split_reduced(s, x)
     h = h - _scatter_points(f, image, camera)
     point = jnp.einsum("pji,pj->pi", f.point, h) * s.eliminated * s.point_free
-    return Tangent(image, camera, point.at[s.kept].add(kept))
+    return Tangent(image, camera, point.at[s.kept].add(kept * s.point_free[s.kept]))
 
 
 def reduced_vector(structure: Structure, tangent: Tangent) -> Float[Array, " reduced"]:
     """The part of a tangent that belongs to the reduced system: images, cameras, kept points."""
-    return jnp.concatenate([
-        tangent.image.ravel(), tangent.camera.ravel(), tangent.point[structure.kept].ravel()
-    ])
+    kept = structure.kept
+    kept = structure.total(tangent.point[kept] * structure.point_free[kept])
+    return jnp.concatenate([tangent.image.ravel(), tangent.camera.ravel(), kept.ravel()])
 
 
 def split_reduced(structure: Structure, vector):
@@ -139,10 +138,7 @@ def inverse_cholesky_3x3(V: Float[Array, "n 3 3"]) -> Float[Array, "n 3 3"]:
 
 
 def _damped(normal: Normal, damping: Tangent) -> Normal:
-    def add(blocks, d):
-        i = jnp.arange(d.shape[1])
-        return blocks.at[:, i, i].add(d)
-
+    add = lambda blocks, d: blocks + d[:, :, None] * jnp.eye(d.shape[1])
     return eqx.tree_at(
         lambda n: (n.image, n.camera, n.point),
         normal,
@@ -164,51 +160,52 @@ def reduced_free(s: Structure) -> Float[Array, " reduced"]:
 
 def _reduced_matrix(s, normal, ray, incidence):
     """S = A − ZᵀZ, dense; only its lower triangle needs to be right."""
-    images = -s.image_pairs.sum(ray, ray)
     I, w = s.images, s.image_width
-    i, j = s.image_pairs.row, s.image_pairs.column
-    S = jnp.zeros((I, I, w, w)).at[j, i].add(images.transpose(0, 2, 1))
-    index = jnp.arange(I)
-    S = S.at[index, index].add(normal.image).transpose(0, 2, 1, 3).reshape(I * w, I * w)
-    rows = [[S, None, None]]
     C, k, K = s.cameras, s.camera_width, s.kept.shape[0]
+    index = jnp.arange(I)
+    pairs = s.image_pairs
+    S = jnp.zeros((I, I, w, w))
+    S = S.at[pairs.column, pairs.row].add(-pairs.sum(ray, ray).transpose(0, 2, 1))
+    S = S.at[index, index].add(-s.table.products_by_image(ray, ray))
+    rows = [[S, None, None]]
     if k:
-        B = jnp.zeros((C, I, k, w))
-        B = B.at[s.camera_of_image, index].add(normal.image_camera.transpose(0, 2, 1))
         pairs = s.image_camera_pairs
         coupling = -pairs.sum(ray, incidence)
-        B = B.at[pairs.column, pairs.row].add(coupling.transpose(0, 2, 1))
-        D = jnp.zeros((C, C, k, k))
+        B = jnp.zeros((C, I, k, w)).at[pairs.column, pairs.row].add(coupling.transpose(0, 2, 1))
         pairs = s.camera_pairs
         coupling = -pairs.sum(incidence, incidence)
-        D = D.at[pairs.column, pairs.row].add(coupling.transpose(0, 2, 1))
-        D = D.at[jnp.arange(C), jnp.arange(C)].add(normal.camera)
-        rows.append([_matrix(B), _matrix(D), None])
+        D = jnp.zeros((C, C, k, k)).at[pairs.column, pairs.row].add(coupling.transpose(0, 2, 1))
+        rows.append([B, D, None])
     if K:
         kr, ki = s.kept_rays, s.kept_of_ray
         E = jnp.zeros((K, I, 3, w)).at[ki, s.image[kr]].add(normal.kept_image)
         F = jnp.zeros((K, C, 3, k)).at[ki, s.camera[kr]].add(normal.kept_camera)
         H = jnp.zeros((K, K, 3, 3))
-        index = jnp.arange(K)
-        H = H.at[index, index].add(normal.point[s.kept])
         place = jnp.searchsorted(s.kept, s.distance)
         inside = (s.kept[jnp.minimum(place, K - 1)] == s.distance).all(1)
         ends = normal.kept_kept * inside[:, None, None]
         a, b = jnp.minimum(place, K - 1).T
         H = H.at[a, b].add(ends).at[b, a].add(ends.transpose(0, 2, 1))
-        rows.append([_matrix(E), _matrix(F), _matrix(H)])
+        own = normal.point[s.kept] * s.point_free[s.kept][:, :, None]
+        H = H.at[jnp.arange(K), jnp.arange(K)].add(own)
+        rows.append([E, F, H])
+    rows = s.total(rows)
+    rows[0][0] = rows[0][0].at[index, index].add(normal.image)
+    if k:
+        image_camera = normal.image_camera.transpose(0, 2, 1)
+        rows[1][0] = rows[1][0].at[s.camera_of_image, index].add(image_camera)
+        rows[1][1] = rows[1][1].at[jnp.arange(C), jnp.arange(C)].add(normal.camera)
+    rows = [[_matrix(block) for block in row if block is not None] for row in rows]
     if len(rows) == 1:
-        return S
+        return rows[0][0]
     n = s.reduced_size
     full, at = jnp.zeros((n, n)), 0
     for row in rows:
         left = 0
-        height = next(b.shape[0] for b in row if b is not None)
         for block in row:
-            if block is not None:
-                full = jax.lax.dynamic_update_slice(full, block, (at, left))
-                left += block.shape[1]
-        at += height
+            full = jax.lax.dynamic_update_slice(full, block, (at, left))
+            left += block.shape[1]
+        at += row[0].shape[0]
     return full
 
 
@@ -221,25 +218,22 @@ def _matrix(blocks):
 def _gather_reduced(f, h):
     """Zᵀh as a tangent of the reduced system."""
     s = f.structure
-    image = jax.ops.segment_sum(
-        jnp.einsum("nij,ni->nj", f.ray, h[s.point]), s.image, s.images
-    )
+    image = s.table.products_by_image(f.ray, h[s.point][:, :, None])[:, :, 0]
     camera = jnp.zeros((s.cameras, s.camera_width))
     if s.camera_width:
         camera = jax.ops.segment_sum(
             jnp.einsum("qij,qi->qj", f.incidence, h[s.incidence.point]),
             s.incidence.camera, s.cameras,
         )  # fmt: skip
-    return Tangent(image, camera, jnp.zeros((s.points, 3)))
+    return Tangent(*s.total((image, camera)), jnp.zeros((s.points, 3)))
 
 
 def _scatter_points(f, image, camera):
     """Z·δ for changes of images and cameras, [points, 3]."""
     s = f.structure
     total = jax.ops.segment_sum(
-        jnp.einsum("nij,nj->ni", f.ray, image[s.image]), s.point, s.points,
-        indices_are_sorted=True,
-    )  # fmt: skip
+        s.table.times_image(f.ray, image), s.point, s.points
+    )
     if s.camera_width:
         total += jax.ops.segment_sum(
             jnp.einsum("qij,qj->qi", f.incidence, camera[s.incidence.camera]),

@@ -2,7 +2,7 @@
 
 `optimistix.least_squares` drives; the parts are ours:
 
-- `SchurDescent` builds the normal blocks once an accepted step and re-solves for each damping,
+- `SchurDescent` builds the normal blocks and solves them,
 - `TrustRegion` accepts or rejects and updates the damping λ (Nielsen 1999),
 - `BundleSolver` walks on the manifold of the unknowns and decides when to stop.
 
@@ -28,7 +28,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxbundle.adjustment.datum import gauge_directions
 from jaxbundle.adjustment.jacobian import jacobian
 from jaxbundle.adjustment.normal import Normal, diagonal, gradient, normal_from_jacobian
-from jaxbundle.adjustment.residuals import residuals
+from jaxbundle.adjustment.residuals import half_square, residuals
 from jaxbundle.adjustment.schur import factorise, solve
 from jaxbundle.network.arrays import Data, Tangent, Values, retract_about
 from jaxbundle.network.structure import Structure
@@ -73,10 +73,8 @@ class SchurDescent(optx.AbstractDescent):
 
     structure: Structure
 
-    def init(self, y: Values, f_info_struct: Any) -> Damped:
-        make = lambda values, info: self.query(values, info, None)
-        shapes = eqx.filter_eval_shape(make, y, f_info_struct)
-        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    def init(self, y: Values, f_info_struct: Any) -> None:
+        return None
 
     def query(self, y: Values, f_info: optx.FunctionInfo.ResidualJac, state: Any) -> Damped:
         normal = normal_from_jacobian(f_info.jac)
@@ -153,9 +151,8 @@ class SolverState(eqx.Module):
 
     first: Bool[Array, ""]
     y_eval: Values
-    accepted_info: optx.FunctionInfo.Residual
+    accepted_info: optx.FunctionInfo.Eval
     search: RegionState
-    descent: Damped
     step_size: Float[Array, ""]
     singular: Bool[Array, ""]
     near: Float[Array, ""]
@@ -187,19 +184,13 @@ class BundleSolver(optx.AbstractLeastSquaresSolver):
     norm: ClassVar[Callable] = staticmethod(optx.max_norm)
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> SolverState:
-        zeros = lambda tree: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), tree)
-        descent = SchurDescent(self.structure)
-        info = lambda y, args: self._linearise(fn, y, args)
-        struct = eqx.filter_eval_shape(info, y, args)
-        f_struct = eqx.filter_eval_shape(lambda y, args: fn(y, args)[0], y, args)
-        no = jnp.asarray(False)
+        no, zero = jnp.asarray(False), jnp.asarray(0.0)
         rows = self.max_steps + 1
         return SolverState(
             first=jnp.asarray(True),
             y_eval=y,
-            accepted_info=optx.FunctionInfo.Residual(zeros(f_struct)),
-            search=self.search.init(y, struct),
-            descent=descent.init(y, struct),
+            accepted_info=optx.FunctionInfo.Eval(zero),
+            search=self.search.init(y, optx.FunctionInfo.Eval(zero)),
             step_size=jnp.asarray(float(self.search.initial)),
             singular=no,
             near=jnp.asarray(NEAR),
@@ -212,31 +203,20 @@ class BundleSolver(optx.AbstractLeastSquaresSolver):
             history=History(*(jnp.full(rows, jnp.nan) for _ in range(2)), jnp.zeros(rows, bool)),
         )
 
-    def _linearise(self, fn, y, args):
-        residual, _ = fn(y, args)
-        jac = jacobian(self.structure, y, args)
-        return optx.FunctionInfo.ResidualJac(residual, jac)
-
     def step(self, fn, y, args, options, state: SolverState, tags):
-        descent = SchurDescent(self.structure)
+        s, descent = self.structure, SchurDescent(self.structure)
+        dot = lambda a, b: _dot(s, a, b)
         residual, aux = fn(state.y_eval, args)
-        info = optx.FunctionInfo.Residual(residual)
+        info = optx.FunctionInfo.Eval(s.total(half_square(residual)))
         cost, before = info.as_min(), state.accepted_info.as_min()
         step_size, accept, _, search = self.search.step(
             state.first, y, state.y_eval, state.accepted_info, info, state.search
         )
-
-        def accepted():
-            linear = optx.FunctionInfo.ResidualJac(
-                residual, jacobian(self.structure, state.y_eval, args)
-            )
-            return state.y_eval, info, descent.query(state.y_eval, linear, state.descent)
-
-        def rejected():
-            return y, state.accepted_info, state.descent
-
-        y, accepted_info, damped = jax.lax.cond(accept, accepted, rejected)
-        cost_here = jnp.where(accept, cost, before)
+        choose = lambda new, old: jax.tree.map(lambda a, b: jnp.where(accept, a, b), new, old)
+        y, accepted_info = choose((state.y_eval, info), (y, state.accepted_info))
+        linear = optx.FunctionInfo.ResidualJac(fn(y, args)[0], jacobian(s, y, args))
+        damped = descent.query(y, linear, None)
+        cost_here = accepted_info.as_min()
 
         # An undamped step that was refused was tried too early.
         near = jnp.where(jnp.isinf(state.step_size) & ~accept, 0.1 * state.near, state.near)
@@ -247,10 +227,10 @@ class BundleSolver(optx.AbstractLeastSquaresSolver):
             quadratic = quadratic & (search.predicted < near * cost_here)
             step_size = jnp.where(quadratic | state.trial, jnp.inf, step_size)
         change, _ = descent.step(step_size, damped)
-        finite = _all_finite(change)
+        finite = s.total(1 - _all_finite(change).astype(int)) == 0
         change = jax.tree.map(lambda d: jnp.where(finite, d, 0.0), change)
-        decrement = -_dot(damped.gradient, change)
-        damping_term = _dot(change, jax.tree.map(jnp.multiply, damped.diagonal, change))
+        decrement = -dot(damped.gradient, change)
+        damping_term = dot(change, jax.tree.map(jnp.multiply, damped.diagonal, change))
         damping_term = jnp.where(jnp.isinf(step_size), 0.0, damping_term / step_size)
         predicted = 0.5 * (decrement + damping_term)
         y_eval = retract_about(self.structure, y, change)
@@ -260,7 +240,7 @@ class BundleSolver(optx.AbstractLeastSquaresSolver):
         precision = jnp.where(
             self.redundancy > 0, NOISE_FLOOR, NOISE_FLOOR_WITHOUT_REDUNDANCY
         )
-        floor = jnp.sum((precision * scale) ** 2)
+        floor = s.total(jnp.sum((precision * scale) ** 2))
         limit = jnp.maximum(self.atol**2 * sigma0_squared, ROUNDING * cost_here) + floor
         small = finite & (decrement <= limit)
         settled = small & jnp.isinf(step_size)
@@ -296,7 +276,7 @@ class BundleSolver(optx.AbstractLeastSquaresSolver):
         search = eqx.tree_at(lambda s: s.predicted, search, predicted)
         new = SolverState(
             first=jnp.asarray(False), y_eval=y_eval, accepted_info=accepted_info, search=search,
-            descent=damped, step_size=step_size, singular=singular, near=near,
+            step_size=step_size, singular=singular, near=near,
             trial=trial, tried=state.trial, refusals=refusals, termination=termination, done=done,
             steps=i + 1, history=history,
         )  # fmt: skip
@@ -357,8 +337,9 @@ def minimise(solver: BundleSolver, data: Data, start: Values) -> Minimum:
     )
 
 
-def _dot(a, b):
-    return sum(jnp.vdot(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b)))
+def _dot(s: Structure, a: Tangent, b: Tangent):
+    own = jnp.vdot(a.image, b.image) + jnp.vdot(a.camera, b.camera)
+    return own + s.total(jnp.vdot(a.point, b.point))
 
 
 def _all_finite(tree):

@@ -92,9 +92,10 @@ def retract_about(structure, values: Values, tangent: Tangent) -> Values:
     the minimum instead of 21.) Images whose position is held turn about it.
     """
     s, moved = structure, retract(structure, values, tangent)
-    rays = jax.ops.segment_sum(jnp.ones(s.rays), s.image, s.images)
-    pivot = jax.ops.segment_sum(values.point[s.point], s.image, s.images)
-    pivot = pivot / jnp.maximum(rays, 1.0)[:, None]
+    one = jnp.ones((s.rays, 1))
+    seen = s.table.sum_by_image(jnp.concatenate([values.point[s.point], one], 1))
+    seen = s.total(seen)
+    pivot = seen[:, :3] / jnp.maximum(seen[:, 3:], 1.0)
 
     def position(old, M, new_M, change, pivot):
         Y = M @ (pivot - old)

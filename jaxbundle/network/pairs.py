@@ -1,7 +1,7 @@
 """Lists of row pairs, grouped by the block of a matrix that their products add up to.
 
-Normal matrices of a network are sums of small products AᵀB over pairs of rows: a ray with itself
-(the block of its image), two rays of one point (the block of their two images). `Pairs` lists
+The reduced normal matrix of a network is a sum of small products AᵀB over pairs of rows: two rays
+of one point (the block of their two images). `Pairs` lists
 the pairs of each block in chunks of fixed lengths, so that a chunk is one small matrix product
 of depth (chunk length × rows) and the whole sum a few batched products. Measured on a BAL block
 of 16 images and 83 718 rays: a quarter of the time of outer products with scatter.
@@ -17,13 +17,14 @@ CHUNK_LENGTHS = (256, 32, 4)
 SMALL_CHUNK_LENGTHS = (8,)
 """For lists under `SMALL` pairs: one length compiles in a third of the time."""
 SMALL = 50_000
-ROWS_PER_STEP = 4096
+ROWS_PER_STEP = 8192
 
 
 class Pairs(eqx.Module):
     """Pairs (a, b) of rows and the blocks of a matrix they belong to.
 
-    A missing partner in a chunk is one past the last row: a row of zeros.
+    A missing partner in a chunk is a row of zeros: one past the last row, or the last row itself
+    where that is known to be empty (`empty`: for the first and the second table).
     `row`, `column`: position of each block in the block matrix.
     """
 
@@ -32,17 +33,22 @@ class Pairs(eqx.Module):
     block: tuple[Int[Array, " chunks"], ...]
     row: Int[Array, " blocks"]
     column: Int[Array, " blocks"]
+    empty: tuple[bool, bool] = eqx.field(static=True, default=(False, False))
 
     def sum(
         self, a: Float[Array, "rows d m"], b: Float[Array, "rows d n"]
     ) -> Float[Array, "blocks m n"]:
         """Σ aᵀb over the pairs of every block."""
         blocks = self.row.shape[0]
-        missing = a.shape[0], b.shape[0]
-        a, b = _with_zero_row(a), _with_zero_row(b)
+        same = a is b
+        a = a if self.empty[0] else _with_zero_row(a)
+        b = a if same else b if self.empty[1] else _with_zero_row(b)
+        missing = a.shape[0] - 1, b.shape[0] - 1
         depth, m, n = a.shape[1], a.shape[2], b.shape[2]
         total = jnp.zeros((blocks + 1, m, n), a.dtype)
         for first, second, block in zip(self.first, self.second, self.block):
+            if not first.shape[0]:
+                continue
             length = first.shape[1]
             step = max(1, ROWS_PER_STEP // length)
 
@@ -58,7 +64,7 @@ class Pairs(eqx.Module):
         return total[:-1]
 
     def flat(self) -> tuple[Int[Array, " pairs"], Int[Array, " pairs"]]:
-        """All pairs in one list; the missing ones too (one past the last row)."""
+        """All pairs in one list; the missing ones too."""
         return (
             jnp.concatenate([i.ravel() for i in self.first]),
             jnp.concatenate([i.ravel() for i in self.second]),
@@ -81,18 +87,24 @@ def _in_steps(first, second, block, step, missing, blocks):
     )
 
 
-def make_pairs(first, second, row, column, columns: int, count: tuple[int, int]) -> Pairs:
+def make_pairs(
+    first, second, row, column, columns: int, missing: tuple[int, int], lengths=None,
+    empty: tuple[bool, bool] = (False, False),
+) -> Pairs:  # fmt: skip
     """Group pairs (first, second) by their block (row, column) of a matrix.
 
     **Arguments:** row indices `first`, `second` [pairs]; block indices `row`, `column` [pairs];
-    `columns`: number of block columns; `count`: numbers of rows `first` and `second` refer to.
+    `columns`: number of block columns; `missing`: the rows that stand for a missing partner, and
+    whether they are the last ones of their tables (`empty`) or one past them;
+    `lengths` of chunks, the longest first (None: by the number of pairs).
     """
     key = np.asarray(row, np.int64) * columns + np.asarray(column, np.int64)
     order = np.argsort(key, kind="stable")
     first, second = np.asarray(first)[order], np.asarray(second)[order]
     keys, start, left = np.unique(key[order], return_index=True, return_counts=True)
     groups = []
-    lengths = SMALL_CHUNK_LENGTHS if len(key) < SMALL else CHUNK_LENGTHS
+    if lengths is None:
+        lengths = SMALL_CHUNK_LENGTHS if len(key) < SMALL else CHUNK_LENGTHS
     for length in lengths:
         last = length == lengths[-1]
         chunks = -(-left // length) if last else left // length
@@ -101,12 +113,11 @@ def make_pairs(first, second, row, column, columns: int, count: tuple[int, int])
         index = start[block][:, None] + within[:, None] * length + np.arange(length)
         valid = index < (start + left)[block][:, None]
         index = np.where(valid, index, 0)
-        if len(block):
-            groups.append((
-                np.where(valid, first[index], count[0]),
-                np.where(valid, second[index], count[1]),
-                block,
-            ))
+        groups.append((
+            np.where(valid, first[index], missing[0]),
+            np.where(valid, second[index], missing[1]),
+            block,
+        ))
         taken = np.minimum(chunks * length, left)
         start, left = start + taken, left - taken
     as_int = lambda x: jnp.asarray(np.asarray(x, np.int32))
@@ -116,18 +127,19 @@ def make_pairs(first, second, row, column, columns: int, count: tuple[int, int])
         block=tuple(as_int(g[2]) for g in groups),
         row=as_int(keys // columns),
         column=as_int(keys % columns),
+        empty=empty,
     )
 
 
 def pairs_within(group: Int[np.ndarray, " rows"]):
-    """All pairs (i ≤ j) of rows of the same group; `group` is sorted. Two index arrays."""
+    """All pairs (i < j) of rows of the same group; `group` is sorted. Two index arrays."""
     group = np.asarray(group)
     if not len(group):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     _, start, size = np.unique(group, return_index=True, return_counts=True)
     first, second = [], []
     for count in np.unique(size):
-        i, j = np.triu_indices(count)
+        i, j = np.triu_indices(count, 1)
         base = start[size == count][:, None]
         first.append((base + i).ravel())
         second.append((base + j).ravel())

@@ -8,30 +8,30 @@ them, so they are eliminated point by point; what remains is the *reduced system
     kept points (those at the ends of a distance: a distance ties two points together, so they
     are not eliminated).
 
-Rays are sorted by point, then camera, then image. `Incidence` is the second level of that order:
-one row for each camera a point is seen with, so that a shared camera costs one row a point, not
-one a ray.
+Rays stand in the order of the images (`jaxbundle.network.rays`). `Incidence` has one row for each
+camera a point is seen with, so that a shared camera costs one row a point, not one a ray.
 """
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, quaternion_from_matrix
 from jaxbundle.network.arrays import Data, Values
 from jaxbundle.network.pairs import Pairs, make_pairs, pairs_between, pairs_within
+from jaxbundle.network.rays import RayTable, lay_out, make_ray_table
 from jaxbundle.network.tables import Network
 
 
 class Group(eqx.Module):
-    """The rays of one camera model: which rays (None: all), and its free parameter columns."""
+    """The rays of one camera model: which chunks (None: all), and its free parameter columns."""
 
     model: str = eqx.field(static=True)
     free: tuple[int, ...] = eqx.field(static=True)
-    rays: Int[Array, " rays"] | None
+    chunks: Int[Array, " chunks"] | None
 
 
 class Incidence(eqx.Module):
@@ -43,15 +43,19 @@ class Incidence(eqx.Module):
 
 
 class Structure(eqx.Module):
-    """The index plan; `*_free` are 1 where an unknown is free, 0 where it is held."""
+    """The index plan; `*_free` are 1 where an unknown is free, 0 where it is held.
+
+    `axis`: the name of the device axis over which points and their rays are distributed, each
+    device holding the plan of its own; images and cameras are on all. None: one device.
+    """
 
     domain: str = eqx.field(static=True)
+    axis: str | None = eqx.field(static=True)
     own_camera: bool = eqx.field(static=True)
     all_free: bool = eqx.field(static=True)
+    all_eliminated: bool = eqx.field(static=True)
     groups: tuple[Group, ...]
-    image: Int[Array, " rays"]
-    camera: Int[Array, " rays"]
-    point: Int[Array, " rays"]
+    table: RayTable
     camera_of_image: Int[Array, " images"]
     camera_columns: Int[Array, "cameras k"]
     camera_free: Float[Array, "cameras k"]
@@ -66,13 +70,26 @@ class Structure(eqx.Module):
     interior: Int[Array, " interior"]
     distance: Int[Array, "distances 2"]
     incidence: Incidence | None
-    by_image: Pairs
-    by_camera: Pairs | None
     image_pairs: Pairs
     image_camera_pairs: Pairs | None
     camera_pairs: Pairs | None
     datum_weight: Float[Array, "points 3"]
     gauge: Float[Array, "7 defect"]
+
+    @property
+    def image(self) -> Int[Array, " rays"]:
+        """The image of every ray."""
+        return self.table.image
+
+    @property
+    def camera(self) -> Int[Array, " rays"]:
+        """The camera of every ray."""
+        return self.table.camera
+
+    @property
+    def point(self) -> Int[Array, " rays"]:
+        """The point of every ray."""
+        return self.table.point
 
     @property
     def images(self) -> int:
@@ -88,7 +105,8 @@ class Structure(eqx.Module):
 
     @property
     def rays(self) -> int:
-        return self.image.shape[0]
+        """Rows of the table of rays, the empty ones counted."""
+        return self.table.rays
 
     @property
     def interior_width(self) -> int:
@@ -119,6 +137,10 @@ class Structure(eqx.Module):
         """Datum defect: directions in which the network may float."""
         return self.gauge.shape[1]
 
+    def total(self, parts: PyTree[Array]) -> PyTree[Array]:
+        """The sum over the devices of what each has found for its own points and rays."""
+        return parts if self.axis is None else jax.lax.psum(parts, self.axis)
+
     @property
     def image_block_free(self) -> Float[Array, "images image_block"]:
         """Which columns of the image blocks are free."""
@@ -144,23 +166,23 @@ def _with_camera(images, camera):
     )
 
 
-def order_rays(network: Network) -> Int[np.ndarray, " rays"]:
-    """The order of the rays in the arrays: by point, then camera, then image."""
-    rows = network.observations
-    return np.lexsort((rows.image, network.images.camera[rows.image], rows.point))
+def make_structure(
+    network: Network, *, chunk: int | None = None, pair_lengths: tuple[int, ...] | None = None
+) -> tuple[Structure, Data, Float[np.ndarray, "3"], Int[np.ndarray, " observations"]]:
+    """The index plan, the arrays, the origin and the ray of every observation of a checked network
+    (`check_network`).
 
-
-def make_structure(network: Network) -> tuple[Structure, Data, Float[np.ndarray, "3"]]:
-    """The index plan, the arrays and the origin of a checked network (`check_network`).
-
-    Check points must have been set aside. The datum is not decided here.
+    Check points must have been set aside. The datum is not decided here. `chunk` and `pair_lengths`
+    are the lengths of chunks of rays and of pairs of rays, if not chosen by size.
     """
     images, points, observations = network.images, network.points, network.observations
-    order = order_rays(network)
-    image, point = observations.image[order], observations.point[order]
+    source, used, chunk = lay_out(observations.image, observations.point, chunk)
+    image, point = observations.image[source], observations.point[source]
     camera = images.camera[image]
+    row = np.empty(len(observations), np.int64)
+    row[source[used]] = np.flatnonzero(used)
 
-    camera_columns, camera_free, groups = _interior(network, camera)
+    camera_columns, camera_free, groups = _interior(network, camera[::chunk])
     k = camera_free.shape[1]
     own_camera = bool(
         k and len(network.cameras) == len(images)
@@ -173,23 +195,25 @@ def make_structure(network: Network) -> tuple[Structure, Data, Float[np.ndarray,
     eliminated = ~fixed
     eliminated[kept] = False
 
-    elim_rays = np.flatnonzero(eliminated[point])
-    kept_rays = np.flatnonzero(np.isin(point, kept))
-    incidence, camera_plans = None, (None, None, None)
+    rays = np.flatnonzero(used)
+    rays = rays[np.argsort(point[rays], kind="stable")]
+    elim_rays = rays[eliminated[point[rays]]]
+    kept_rays = rays[np.isin(point[rays], kept)]
+    incidence, camera_plans = None, (None, None)
     if k and not own_camera:
         incidence, camera_plans = _camera_plans(
-            image, camera, point, elim_rays, len(network.cameras)
+            image, camera, point, elim_rays, len(network.cameras), chunk > 1, pair_lengths
         )
-    data, origin, priors = _data(network, order)
+    data, origin, priors = _data(network, source, used)
     as_int = lambda x: jnp.asarray(np.asarray(x, np.int32))
     structure = Structure(
         domain=network.residuals,
+        axis=None,
         own_camera=own_camera,
         all_free=bool(image_free.all() and camera_free.all() and point_free.all()),
+        all_eliminated=bool(eliminated.all()),
         groups=groups,
-        image=as_int(image),
-        camera=as_int(camera),
-        point=as_int(point),
+        table=make_ray_table(image, camera, point, chunk, len(images)),
         camera_of_image=as_int(images.camera),
         camera_columns=as_int(camera_columns),
         camera_free=jnp.asarray(camera_free),
@@ -204,34 +228,32 @@ def make_structure(network: Network) -> tuple[Structure, Data, Float[np.ndarray,
         interior=as_int(priors["interior"]),
         distance=as_int(network.distances.points),
         incidence=incidence,
-        by_image=_plan(np.arange(len(image)), np.arange(len(image)), image, image,
-                       len(images), len(image)),
-        by_camera=camera_plans[0],
-        image_pairs=_image_pairs(image, point, elim_rays, len(images)),
-        image_camera_pairs=camera_plans[1],
-        camera_pairs=camera_plans[2],
+        image_pairs=_image_pairs(
+            image, point, elim_rays, len(images), chunk > 1, pair_lengths
+        ),
+        image_camera_pairs=camera_plans[0],
+        camera_pairs=camera_plans[1],
         datum_weight=jnp.asarray(np.zeros((len(points), 3))),
         gauge=jnp.asarray(np.zeros((7, 0))),
     )
-    return structure, data, origin
+    return structure, data, origin, row
 
 
-def _plan(first, second, row, column, columns, count) -> Pairs:
-    return make_pairs(first, second, row[first], column[second], columns, (count, count))
-
-
-def _image_pairs(image, point, rays, images) -> Pairs:
-    """Pairs of rays of one point, once each, the lower image first."""
+def _image_pairs(image, point, rays, images, empty, lengths=None) -> Pairs:
+    """Pairs of two rays of one point, the lower image first; both ways round if it is the same."""
     i, j = pairs_within(point[rays])
     i, j = rays[i], rays[j]
     swap = image[i] > image[j]
     i, j = np.where(swap, j, i), np.where(swap, i, j)
-    twice = (i != j) & (image[i] == image[j])
+    twice = image[i] == image[j]
     i, j = np.concatenate([i, j[twice]]), np.concatenate([j, i[twice]])
-    return _plan(i, j, image, image, images, len(image))
+    missing = len(image) - empty
+    return make_pairs(
+        i, j, image[i], image[j], images, (missing, missing), lengths, (empty, empty)
+    )
 
 
-def _camera_plans(image, camera, point, elim_rays, cameras):
+def _camera_plans(image, camera, point, elim_rays, cameras, empty, lengths):
     """Incidences of points and shared cameras, and the pairs in which cameras take part."""
     key = point.astype(np.int64) * cameras + camera
     keys, of_ray = np.unique(key, return_inverse=True)
@@ -239,22 +261,23 @@ def _camera_plans(image, camera, point, elim_rays, cameras):
     elim = np.zeros(len(keys), bool)
     elim[of_ray[elim_rays]] = True
     elim = np.flatnonzero(elim)
-    rays = np.arange(len(image))
     r, q = pairs_between(point[elim_rays], inc_point[elim])
     r, q = elim_rays[r], elim[q]
     a, b = pairs_within(inc_point[elim])
-    a, b = elim[a], elim[b]
+    a, b = (elim[np.concatenate([x, np.arange(len(elim))])] for x in (a, b))
     as_int = lambda x: jnp.asarray(np.asarray(x, np.int32))
     incidence = Incidence(as_int(of_ray), as_int(inc_point), as_int(inc_camera))
-    return incidence, (
-        _plan(rays, rays, camera, camera, cameras, len(rays)),
-        make_pairs(r, q, image[r], inc_camera[q], cameras, (len(rays), len(keys))),
-        make_pairs(a, b, inc_camera[a], inc_camera[b], cameras, (len(keys), len(keys))),
+    return incidence, (  # fmt: skip
+        make_pairs(
+            r, q, image[r], inc_camera[q], cameras, (len(image) - empty, len(keys)), lengths,
+            (empty, False),
+        ),
+        make_pairs(a, b, inc_camera[a], inc_camera[b], cameras, (len(keys), len(keys)), lengths),
     )
 
 
-def _interior(network: Network, camera_of_ray):
-    """Free interior columns of every camera, and the rays of every camera model."""
+def _interior(network: Network, camera_of_chunk):
+    """Free interior columns of every camera, and the chunks of rays of every camera model."""
     models = [get_model(c.model) for c in network.cameras]
     free_of_model: dict[str, set[int]] = {}
     for camera, model in zip(network.cameras, models):
@@ -269,13 +292,11 @@ def _interior(network: Network, camera_of_ray):
             camera_columns[c, j] = column
             camera_free[c, j] = model.parameters[column] in camera.free
     groups = []
-    name_of_ray = np.array([m.name for m in models], dtype=object)[camera_of_ray]
+    name_of_chunk = np.array([m.name for m in models], dtype=object)[camera_of_chunk]
     for name, columns in free.items():
-        rays = np.flatnonzero(name_of_ray == name)
-        if len(rays) or len(free) == 1:
-            every = len(rays) == len(camera_of_ray)
-            rows = None if every else jnp.asarray(rays.astype(np.int32))
-            groups.append(Group(name, columns, rows))
+        chunks = np.flatnonzero(name_of_chunk == name)
+        rows = None if len(free) == 1 else jnp.asarray(chunks.astype(np.int32))
+        groups.append(Group(name, columns, rows))
     return camera_columns, camera_free, tuple(groups)
 
 
@@ -285,7 +306,7 @@ def _quaternions(angles):
     return jax.vmap(one)(angles)
 
 
-def _data(network: Network, order):
+def _data(network: Network, source, used):
     """Values and weights of the network, object coordinates relative to their origin."""
     images, points, observations = network.images, network.points, network.observations
     origin = np.round(points.position.mean(0)) if len(points) else np.zeros(3)
@@ -314,8 +335,8 @@ def _data(network: Network, order):
     exterior_value = np.concatenate([images.position - origin, images.angles], 1)
     data = Data(
         start=start,
-        image_xy=jnp.asarray(observations.xy[order]),
-        image_weight=jnp.asarray(1 / observations.sigma[order]),
+        image_xy=jnp.asarray(observations.xy[source]),
+        image_weight=jnp.asarray(used[:, None] / observations.sigma[source]),
         control=jnp.asarray((points.position - origin)[control]),
         control_weight=jnp.asarray(weight(points.sigma[control])),
         exterior=jnp.asarray(exterior_value[exterior]),

@@ -91,6 +91,14 @@ class Points:
     def __len__(self) -> int:
         return len(self.id)
 
+    def take(self, rows) -> "Points":
+        """The chosen points (a mask or indices), their places kept for messages."""
+        rows = np.flatnonzero(rows) if np.asarray(rows).dtype == bool else np.asarray(rows)
+        return Points(
+            tuple(self.id[row] for row in rows), tuple(self.role[row] for row in rows),
+            self.position[rows], self.sigma[rows], self.source.take(rows),
+        )
+
     def has_role(self, *roles: str) -> Bool[np.ndarray, " points"]:
         """Which points play one of these roles."""
         return np.isin(np.array(self.role, dtype=object), roles)

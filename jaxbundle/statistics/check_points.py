@@ -54,7 +54,7 @@ def intersect_check_points(
         observations=observations,
         distances=Distances.none(),
     )
-    structure, data, origin = make_structure(network)
+    structure, data, origin, _ = make_structure(network)
     shift = jnp.asarray(problem.origin - origin)
     values = Values(
         values.camera, values.position + shift, values.rotation, data.start.point

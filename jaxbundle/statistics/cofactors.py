@@ -71,7 +71,7 @@ def cofactors(structure: Structure, values: Values, factor: Factor) -> Cofactors
     Q = Q * scale[:, None] * scale[None, :]
     K, Kc = _couplings(factor, Q)
     inner = jnp.eye(3) + jax.ops.segment_sum(
-        jnp.einsum("nij,nkj->nik", K, factor.ray), s.point, s.points, indices_are_sorted=True
+        jnp.einsum("nij,nkj->nik", K, factor.ray), s.point, s.points
     )
     if s.camera_width:
         inner += jax.ops.segment_sum(
@@ -98,7 +98,8 @@ def _couplings(factor, Q):
     n = s.images * w
     m = n + s.cameras * k
     QII = Q[:n, :n].reshape(s.images, w, s.images, w)
-    K = jnp.zeros_like(factor.ray)
+    at = jnp.arange(s.images)
+    K = jnp.einsum("nij,njk->nik", factor.ray, s.table.of_image(QII[at, :, at, :]))
     Kc = jnp.zeros_like(factor.incidence)
     K = _add_pairs(K, K, s.image_pairs, factor.ray, factor.ray, QII, s.image, s.image, True)[0]
     if k:
@@ -123,7 +124,7 @@ def _add_pairs(K_a, K_b, pairs, Z_a, Z_b, Q, block_a, block_b, same):
     if not pairs.first:
         return K_a, K_b
     a, b = pairs.flat()
-    missing = a >= K_a.shape[0]
+    missing = a >= K_a.shape[0] - pairs.empty[0]
     a, b = jnp.where(missing, 0, a), jnp.where(missing, 0, b)
     fill = -a.shape[0] % PAIRS_PER_STEP
     step = lambda x, value: jnp.pad(x, (0, fill), constant_values=value).reshape(

@@ -104,7 +104,7 @@ def moved(network, scale, shift):
 @pytest.mark.parametrize("name", CASES)
 def test_defect(name, scale, shift):
     network, defect = CASES[name]
-    structure, data, _ = make_structure(moved(network, scale, shift))
+    structure, data, *_ = make_structure(moved(network, scale, shift))
     gauge = open_similarities(structure, data)
     assert gauge.shape == (7, defect)
     # What is held does not move along the open directions.

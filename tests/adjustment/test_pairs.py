@@ -37,7 +37,7 @@ def test_pairs_within_and_between_groups():
     group, other = np.array([0, 0, 0, 2, 5, 5]), np.array([0, 2, 2, 3, 5])
     found = set(zip(*pairs.pairs_within(group)))
     rows = range(len(group))
-    assert found == {(i, j) for i in rows for j in rows if i <= j and group[i] == group[j]}
+    assert found == {(i, j) for i in rows for j in rows if i < j and group[i] == group[j]}
     found = set(zip(*pairs.pairs_between(group, other)))
     expected = {(i, j) for i in rows for j in range(len(other)) if group[i] == other[j]}
     assert found == expected
