@@ -4,9 +4,12 @@ import dataclasses
 from collections.abc import Callable
 
 import equinox as eqx
+import jax
 import numpy as np
 
+from jaxbundle.adjustment.datum import move_to_datum
 from jaxbundle.adjustment.problem import Problem, count_rows, make_problem
+from jaxbundle.adjustment.sharding import distribute, find_minimum_of_shards
 from jaxbundle.adjustment.solve import converged, find_minimum, make_solver
 from jaxbundle.adjustment.solver import Minimum
 from jaxbundle.adjustment.unknowns import Name, undetermined
@@ -29,6 +32,9 @@ from jaxbundle.statistics import (
 
 CORE_PARAMETERS = ("c", "x0", "y0", "fx", "fy", "cx", "cy", "f")
 """Interior parameters that are never eliminated for want of significance."""
+
+RAYS_TO_SHARE = 10_000
+"""Networks with so many rays are distributed over the devices, where there are several."""
 
 RUNAWAY = 20.0
 """A principal distance that changed by more than this factor belongs to no camera."""
@@ -95,10 +101,12 @@ def adjust(
 
 def _minimise(problem: Problem, start: Values, **options) -> Minimum:
     """Iterate from `start`; the datum and what is held stay those of the problem's own start."""
-    data = problem.data
-    if start is data.start:
-        return find_minimum(make_solver(problem, **options), data)
-    return find_minimum(make_solver(problem, **options), data, start)
+    solver, data = make_solver(problem, **options), problem.data
+    if len(jax.devices()) > 1 and problem.structure.rays >= RAYS_TO_SHARE:
+        minimum = find_minimum_of_shards(solver, distribute(problem), start)
+        values = move_to_datum(problem.structure, minimum.values, data.start)
+        return eqx.tree_at(lambda m: m.values, minimum, values)
+    return find_minimum(solver, data, None if start is data.start else start)
 
 
 def _solved(problem: Problem, minimum: Minimum) -> bool:
@@ -106,7 +114,7 @@ def _solved(problem: Problem, minimum: Minimum) -> bool:
     if not bool(converged(int(minimum.termination))) or _collapsed(problem, minimum.values):
         return False
     factor = undamped_factor(problem.structure, minimum.values, problem.data)
-    pivots = np.abs(np.diagonal(np.asarray(factor.cholesky)))
+    pivots = np.abs(np.asarray(factor.reduced.pivots))
     return bool(np.isfinite(pivots).all() and pivots.min(initial=1.0) ** 2 > 1e-13)
 
 

@@ -178,16 +178,28 @@ def choose_minimal_coordinates(
     Rows of G on the candidate coordinates, by Gram–Schmidt with row pivoting: each time the
     coordinate that the ones chosen so far determine least.
     """
-    G = np.asarray(gauge_directions(structure, data.start).point).reshape(-1, structure.defect)
+    G = np.asarray(gauge_directions(structure, data.start).point)
+    return _pick_rows(G.reshape(-1, structure.defect), candidates.ravel()).reshape(-1, 3)
+
+
+def choose_pins(structure: Structure, data: Data) -> Float[np.ndarray, "images image_block"]:
+    """As many coordinates of projection centres as there are defects, chosen well spread."""
+    G = np.asarray(gauge_directions(structure, data.start).image)
+    free = np.asarray(structure.image_block_free) * (np.arange(G.shape[1]) < 3)
+    return _pick_rows(G.reshape(-1, structure.defect), free.ravel()).reshape(G.shape[:2])
+
+
+def _pick_rows(G, candidates):
+    """1 for as many rows of G as it has columns, the independent ones, 0 for the others."""
     q, _ = np.linalg.qr(G)
-    rows = q * candidates.reshape(-1, 1)
+    rows = q * candidates[:, None]
     chosen = np.zeros(len(rows))
-    for _ in range(structure.defect):
+    for _ in range(G.shape[1]):
         pick = np.argmax((rows**2).sum(1))
         direction = rows[pick] / np.linalg.norm(rows[pick])
         rows = rows - np.outer(rows @ direction, direction)
         chosen[pick] = 1.0
-    return chosen.reshape(-1, 3)
+    return chosen
 
 
 def open_directions_in_words(gauge: Float[np.ndarray, "7 defect"]) -> str:

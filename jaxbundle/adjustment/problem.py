@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 
 from jaxbundle.adjustment.datum import (
     choose_minimal_coordinates,
+    choose_pins,
     open_directions_in_words,
     open_similarities,
 )
@@ -80,6 +81,9 @@ def make_problem(network: Network) -> Problem:
             lambda s: s.datum_weight, structure,
             jnp.asarray(_datum_weight(network, structure, data)),
         )  # fmt: skip
+        if structure.band is not None:
+            pins = choose_pins(structure, data)
+            structure = eqx.tree_at(lambda s: s.pins, structure, jnp.asarray(pins))
     return Problem(network, structure, data, origin, rays, count_rows(structure, data))
 
 

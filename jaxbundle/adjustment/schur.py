@@ -4,20 +4,26 @@ With N = [A W; Wᵀ V] and V block diagonal (Brown 1958; Triggs et al. 2000, sec
 
     V_p = L_p·L_pᵀ,   Z = L⁻¹·Wᵀ,   h = L⁻¹·g_p
     S   = A − ZᵀZ                    (once per damping; sums over pairs of rays of a point)
-    S·δ = −(g − Zᵀh)                 (dense Cholesky, scaled to unit diagonal)
+    S·δ = −(g − Zᵀh)                 (`reduced.py`)
     δ_p = −L⁻ᵀ·(h + Z·δ)
 
-A free network is singular along its datum directions G (similarities). They are made regular by
-adding q·qᵀ to the scaled S, q an orthonormal basis of G's part in the reduced system: the step
-changes along G only, and the datum is then imposed by an S-transformation (`datum.py`).
+In a free network the step is arbitrary along the datum directions; the datum is imposed afterwards
+(`datum.py`).
 """
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxbundle.adjustment.normal import Normal
+from jaxbundle.adjustment.reduced import (
+    BandFactor,
+    DenseFactor,
+    Parts,
+    dense_matrix,
+    factorise_reduced,
+)
 from jaxbundle.network.arrays import Tangent
 from jaxbundle.network.structure import Structure
 
@@ -28,13 +34,11 @@ PIVOT = 1e-13
 class Factor(eqx.Module):
     """N factorised: everything needed to solve with it, and to read blocks of its inverse.
 
-    `cholesky`: lower factor of the reduced system scaled by `scale` on both sides;
-    `point`: L_p⁻¹; `ray`, `incidence`: Z.
+    `reduced`: the factor of S; `point`: L_p⁻¹; `ray`, `incidence`: Z.
     """
 
     structure: Structure
-    cholesky: Float[Array, "reduced reduced"]
-    scale: Float[Array, " reduced"]
+    reduced: DenseFactor | BandFactor
     point: Float[Array, "points 3 3"]
     ray: Float[Array, "rays 3 image_block"]
     incidence: Float[Array, "incidences 3 camera_block"]
@@ -45,25 +49,50 @@ def factorise(
     normal: Normal,
     damping: Tangent | None = None,
     gauge: Tangent | None = None,
+    regular: Bool[Array, ""] | bool = True,
 ) -> Factor:
     """Factorise N + diag(damping), with the datum directions `gauge` (last axis) made regular.
 
+    `regular`: whether a banded system needs that (a dense one gets it always: there it does no
+    harm to a damped step).
+
     NaN where a pivot is rounding, as where it is negative: chance decides between the two.
     """
-    matrix, *rest = reduce(structure, normal, damping, gauge)
-    cholesky = jnp.linalg.cholesky(matrix, symmetrize_input=False)
-    regular = jnp.all(jnp.diagonal(cholesky) ** 2 > PIVOT)
-    return Factor(structure, jnp.where(regular, cholesky, jnp.nan), *rest)
+    parts, point, ray, incidence = eliminate(structure, normal, damping)
+    frame = _frame(structure, normal, damping, gauge)
+    factor = factorise_reduced(structure, parts, *frame, regular)
+    sound = jnp.all(factor.pivots**2 > PIVOT)
+    factor = jax.tree.map(lambda x: _where_floating(sound, x), factor)
+    return Factor(structure, factor, point, ray, incidence)
 
 
-def reduce(
-    structure: Structure,
-    normal: Normal,
-    damping: Tangent | None = None,
-    gauge: Tangent | None = None,
-):
-    """Eliminate the points: the reduced matrix scaled to unit diagonal (before elimination; its
-    lower triangle), the scale, and what substitution needs (the fields of `Factor`)."""
+def scaled_matrix(
+    structure: Structure, normal: Normal, gauge: Tangent | None = None
+) -> Float[Array, "reduced reduced"]:
+    """The reduced matrix scaled to a unit diagonal, datum directions made regular; its lower
+    triangle."""
+    parts, *_ = eliminate(structure, normal)
+    return dense_matrix(structure, parts, *_frame(structure, normal, None, gauge))
+
+
+def _where_floating(sound, x):
+    return jnp.where(sound, x, jnp.nan) if jnp.issubdtype(x.dtype, jnp.floating) else x
+
+
+def _frame(s: Structure, normal: Normal, damping, gauge):
+    """Scale, free unknowns and datum directions of the reduced system."""
+    normal = normal if damping is None else _damped(normal, damping)
+    diagonal = reduced_vector(s, _diagonal_of(normal))
+    scale = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1.0))
+    directions = jnp.zeros((s.reduced_size, 0))
+    if gauge is not None and s.defect:
+        directions = jax.vmap(lambda g: reduced_vector(s, g), -1, -1)(gauge)
+    return scale, reduced_free(s), directions
+
+
+def eliminate(structure: Structure, normal: Normal, damping: Tangent | None = None):
+    """Eliminate the points: the parts of the reduced matrix, and what substitution needs (the
+    last fields of `Factor`)."""
     s = structure
     if damping is not None:
         normal = _damped(normal, damping)
@@ -74,18 +103,7 @@ def reduce(
     incidence = normal.camera_point
     if s.camera_width:
         incidence = jnp.einsum("qij,qjk->qik", point[s.incidence.point], incidence)
-    S = _reduced_matrix(s, normal, ray, incidence)
-    diagonal = jnp.diagonal(S)
-    original = reduced_vector(s, _diagonal_of(s, normal))
-    scale = jax.lax.rsqrt(jnp.where(original > 0, original, 1.0))
-    S = S * scale[:, None] * scale[None, :]
-    index = jnp.arange(S.shape[0])
-    S = S.at[index, index].set(jnp.where(reduced_free(s) > 0, diagonal * scale**2, 1.0))
-    if gauge is not None and s.defect:
-        directions = jax.vmap(lambda g: reduced_vector(s, g), -1, -1)(gauge) / scale[:, None]
-        q, _ = jnp.linalg.qr(directions)
-        S = S + q @ q.T
-    return S, scale, point, ray, incidence
+    return _reduced_parts(s, normal, ray, incidence), point, ray, incidence
 
 
 def solve(factor: Factor, right: Tangent) -> Tangent:
@@ -94,7 +112,7 @@ def solve(factor: Factor, right: Tangent) -> Tangent:
     point_right = right.point * s.eliminated * s.point_free
     h = jnp.einsum("pij,pj->pi", f.point, point_right)
     reduced = reduced_vector(s, right) - reduced_vector(s, _gather_reduced(f, h))
-    x = jax.scipy.linalg.cho_solve((f.cholesky, True), reduced * f.scale) * f.scale
+    x = s.agreed(f.reduced.solve(reduced))
     x = jnp.where(reduced_free(s) > 0, x, 0.0)
     image, camera, kept = split_reduced(s, x)
     h = h - _scatter_points(f, image, camera)
@@ -147,7 +165,7 @@ def _damped(normal: Normal, damping: Tangent) -> Normal:
     )  # fmt: skip
 
 
-def _diagonal_of(s, normal):
+def _diagonal_of(normal):
     pick = lambda blocks: jnp.diagonal(blocks, axis1=1, axis2=2)
     return Tangent(pick(normal.image), pick(normal.camera), pick(normal.point))
 
@@ -158,55 +176,40 @@ def reduced_free(s: Structure) -> Float[Array, " reduced"]:
     return reduced_vector(s, Tangent(s.image_block_free, camera, s.point_free))
 
 
-def _reduced_matrix(s, normal, ray, incidence):
-    """S = A − ZᵀZ, dense; only its lower triangle needs to be right."""
+def _reduced_parts(s, normal, ray, incidence) -> Parts:
+    """S = A − ZᵀZ, in parts."""
     I, w = s.images, s.image_width
     C, k, K = s.cameras, s.camera_width, s.kept.shape[0]
-    index = jnp.arange(I)
-    pairs = s.image_pairs
-    S = jnp.zeros((I, I, w, w))
-    S = S.at[pairs.column, pairs.row].add(-pairs.sum(ray, ray).transpose(0, 2, 1))
-    S = S.at[index, index].add(-s.table.products_by_image(ray, ray))
-    rows = [[S, None, None]]
+    pairs = -s.image_pairs.sum(ray, ray)
+    own = -s.table.products_by_image(ray, ray)
+    B, D = jnp.zeros((C, I, k, w)), jnp.zeros((C, C, k, k))
     if k:
-        pairs = s.image_camera_pairs
-        coupling = -pairs.sum(ray, incidence)
-        B = jnp.zeros((C, I, k, w)).at[pairs.column, pairs.row].add(coupling.transpose(0, 2, 1))
-        pairs = s.camera_pairs
-        coupling = -pairs.sum(incidence, incidence)
-        D = jnp.zeros((C, C, k, k)).at[pairs.column, pairs.row].add(coupling.transpose(0, 2, 1))
-        rows.append([B, D, None])
+        at = s.image_camera_pairs
+        B = B.at[at.column, at.row].add(-at.sum(ray, incidence).transpose(0, 2, 1))
+        at = s.camera_pairs
+        D = D.at[at.column, at.row].add(-at.sum(incidence, incidence).transpose(0, 2, 1))
+    E, F, H = (jnp.zeros((K, n, 3, m)) for n, m in ((I, w), (C, k), (K, 3)))
     if K:
         kr, ki = s.kept_rays, s.kept_of_ray
-        E = jnp.zeros((K, I, 3, w)).at[ki, s.image[kr]].add(normal.kept_image)
-        F = jnp.zeros((K, C, 3, k)).at[ki, s.camera[kr]].add(normal.kept_camera)
-        H = jnp.zeros((K, K, 3, 3))
+        E = E.at[ki, s.image[kr]].add(normal.kept_image)
+        F = F.at[ki, s.camera[kr]].add(normal.kept_camera)
         place = jnp.searchsorted(s.kept, s.distance)
         inside = (s.kept[jnp.minimum(place, K - 1)] == s.distance).all(1)
         ends = normal.kept_kept * inside[:, None, None]
         a, b = jnp.minimum(place, K - 1).T
         H = H.at[a, b].add(ends).at[b, a].add(ends.transpose(0, 2, 1))
-        own = normal.point[s.kept] * s.point_free[s.kept][:, :, None]
-        H = H.at[jnp.arange(K), jnp.arange(K)].add(own)
-        rows.append([E, F, H])
-    rows = s.total(rows)
-    rows[0][0] = rows[0][0].at[index, index].add(normal.image)
+        index = jnp.arange(K)
+        H = H.at[index, index].add(normal.point[s.kept] * s.point_free[s.kept][:, :, None])
+    pairs, own, B, D, E, F, H = s.total((pairs, own, B, D, E, F, H))
+    own = own + normal.image
     if k:
-        image_camera = normal.image_camera.transpose(0, 2, 1)
-        rows[1][0] = rows[1][0].at[s.camera_of_image, index].add(image_camera)
-        rows[1][1] = rows[1][1].at[jnp.arange(C), jnp.arange(C)].add(normal.camera)
-    rows = [[_matrix(block) for block in row if block is not None] for row in rows]
-    if len(rows) == 1:
-        return rows[0][0]
-    n = s.reduced_size
-    full, at = jnp.zeros((n, n)), 0
-    for row in rows:
-        left = 0
-        for block in row:
-            full = jax.lax.dynamic_update_slice(full, block, (at, left))
-            left += block.shape[1]
-        at += row[0].shape[0]
-    return full
+        B = B.at[s.camera_of_image, jnp.arange(I)].add(normal.image_camera.transpose(0, 2, 1))
+        D = D.at[jnp.arange(C), jnp.arange(C)].add(normal.camera)
+    B, D, E, F, H = (_matrix(x) for x in (B, D, E, F, H))
+    corner = jnp.concatenate([
+        jnp.concatenate([D, F.T], 1), jnp.concatenate([F, H], 1)
+    ])  # fmt: skip
+    return Parts(pairs, own, jnp.concatenate([B, E]), corner)
 
 
 def _matrix(blocks):

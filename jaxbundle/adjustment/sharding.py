@@ -142,11 +142,13 @@ def _part(problem: Problem, chosen, first: bool) -> tuple[Structure, Data]:
             distances=distances,
         ),
         chunk=s.table.chunk, pair_lengths=CHUNK_LENGTHS,
+        pair_blocks=(s.image_pairs.row, s.image_pairs.column),
     )  # fmt: skip
     structure = dataclasses.replace(
         structure, all_free=s.all_free, all_eliminated=s.all_eliminated,
         camera_free=s.camera_free, image_free=s.image_free, point_free=s.point_free[chosen],
         eliminated=s.eliminated[chosen], datum_weight=s.datum_weight[chosen], gauge=s.gauge,
+        band=s.band, pins=s.pins,
     )  # fmt: skip
     placed = lambda column: _at_rows(structure.rays, rays, column[problem.rays[rows]])
     control = np.isin(np.asarray(s.control), chosen)

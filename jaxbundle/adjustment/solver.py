@@ -52,6 +52,9 @@ NOISE_FLOOR, NOISE_FLOOR_WITHOUT_REDUNDANCY = 1e-14, 1e-12
 Without redundancy all residuals vanish and no σ0 says when to stop: the wider floor does.
 """
 
+WIDE = 1e8
+"""Steps less damped than this need the datum directions made regular."""
+
 NEAR = 1e-3
 """Near the solution: the last step promised to decrease vᵀPv by less than this fraction."""
 
@@ -87,7 +90,8 @@ class SchurDescent(optx.AbstractDescent):
 
     def step(self, step_size: Float[Array, ""], state: Damped):
         damping = jax.tree.map(lambda d: d / step_size, state.diagonal)
-        factor = factorise(self.structure, state.normal, damping, state.gauge)
+        regular = step_size > WIDE
+        factor = factorise(self.structure, state.normal, damping, state.gauge, regular)
         change = solve(factor, jax.tree.map(jnp.negative, state.gradient))
         return change, optx.RESULTS.successful
 
@@ -338,7 +342,7 @@ def minimise(solver: BundleSolver, data: Data, start: Values) -> Minimum:
 
 
 def _dot(s: Structure, a: Tangent, b: Tangent):
-    own = jnp.vdot(a.image, b.image) + jnp.vdot(a.camera, b.camera)
+    own = s.agreed(jnp.vdot(a.image, b.image) + jnp.vdot(a.camera, b.camera))
     return own + s.total(jnp.vdot(a.point, b.point))
 
 

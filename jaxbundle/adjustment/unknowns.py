@@ -9,7 +9,7 @@ from jaxbundle.adjustment.datum import gauge_directions
 from jaxbundle.adjustment.jacobian import jacobian
 from jaxbundle.adjustment.normal import normal_from_jacobian
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.adjustment.schur import reduce
+from jaxbundle.adjustment.schur import scaled_matrix
 from jaxbundle.cameras import get_model
 from jaxbundle.network.arrays import Data, Values
 from jaxbundle.network.tables import EXTERIOR
@@ -72,7 +72,7 @@ def undetermined(problem: Problem, values: Values, data: Data) -> list[str]:
 @eqx.filter_jit
 def _scaled_reduced(structure, values, data):
     normal = normal_from_jacobian(jacobian(structure, values, data))
-    matrix, *_ = reduce(structure, normal, gauge=gauge_directions(structure, values))
+    matrix = scaled_matrix(structure, normal, gauge_directions(structure, values))
     return matrix, normal.point
 
 

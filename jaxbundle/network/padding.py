@@ -132,6 +132,7 @@ def pad(structure: Structure, data: Data, sizes: Sizes) -> tuple[Structure, Data
             s.image_camera_pairs, sizes.image_camera_pairs, (0, 1), old, new
         ),
         camera_pairs=_pairs(s.camera_pairs, sizes.camera_pairs, (1, 1), old, new),
+        pins=_fill(s.pins, sizes.images, 0),
         datum_weight=_fill(s.datum_weight, sizes.points, 0),
     )
     return padded, _pad_data(data, sizes, rays)

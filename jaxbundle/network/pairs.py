@@ -89,19 +89,25 @@ def _in_steps(first, second, block, step, missing, blocks):
 
 def make_pairs(
     first, second, row, column, columns: int, missing: tuple[int, int], lengths=None,
-    empty: tuple[bool, bool] = (False, False),
+    empty: tuple[bool, bool] = (False, False), blocks=None,
 ) -> Pairs:  # fmt: skip
     """Group pairs (first, second) by their block (row, column) of a matrix.
 
     **Arguments:** row indices `first`, `second` [pairs]; block indices `row`, `column` [pairs];
     `columns`: number of block columns; `missing`: the rows that stand for a missing partner, and
     whether they are the last ones of their tables (`empty`) or one past them;
-    `lengths` of chunks, the longest first (None: by the number of pairs).
+    `lengths` of chunks, the longest first (None: by the number of pairs); `blocks`: rows and
+    columns of all blocks, in order, if these pairs are only some of those of the network.
     """
     key = np.asarray(row, np.int64) * columns + np.asarray(column, np.int64)
     order = np.argsort(key, kind="stable")
     first, second = np.asarray(first)[order], np.asarray(second)[order]
     keys, start, left = np.unique(key[order], return_index=True, return_counts=True)
+    if blocks is not None:
+        whole = np.asarray(blocks[0], np.int64) * columns + np.asarray(blocks[1], np.int64)
+        place = np.searchsorted(whole, keys)
+        spread = lambda x: np.bincount(place, x, len(whole)).astype(np.int64)
+        keys, start, left = whole, spread(start), spread(left)
     groups = []
     if lengths is None:
         lengths = SMALL_CHUNK_LENGTHS if len(key) < SMALL else CHUNK_LENGTHS

@@ -21,6 +21,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, quaternion_from_matrix
 from jaxbundle.network.arrays import Data, Values
+from jaxbundle.network.band import Band, find_band
 from jaxbundle.network.pairs import Pairs, make_pairs, pairs_between, pairs_within
 from jaxbundle.network.rays import RayTable, lay_out, make_ray_table
 from jaxbundle.network.tables import Network
@@ -45,8 +46,9 @@ class Incidence(eqx.Module):
 class Structure(eqx.Module):
     """The index plan; `*_free` are 1 where an unknown is free, 0 where it is held.
 
-    `axis`: the name of the device axis over which points and their rays are distributed, each
-    device holding the plan of its own; images and cameras are on all. None: one device.
+    `pins`: see `jaxbundle.adjustment.reduced`. `axis`: the name of the device axis over which
+    points and their rays are distributed, each device holding the plan of its own; images and
+    cameras are on all. None: one device.
     """
 
     domain: str = eqx.field(static=True)
@@ -73,6 +75,8 @@ class Structure(eqx.Module):
     image_pairs: Pairs
     image_camera_pairs: Pairs | None
     camera_pairs: Pairs | None
+    band: Band | None
+    pins: Float[Array, "images image_block"]
     datum_weight: Float[Array, "points 3"]
     gauge: Float[Array, "7 defect"]
 
@@ -141,6 +145,11 @@ class Structure(eqx.Module):
         """The sum over the devices of what each has found for its own points and rays."""
         return parts if self.axis is None else jax.lax.psum(parts, self.axis)
 
+    def agreed(self, value: Array) -> Array:
+        """The mean over the devices of what should be the same on all, so that it is, to the last
+        digit: devices that decide differently would wait for each other for ever."""
+        return value if self.axis is None else jax.lax.pmean(value, self.axis)
+
     @property
     def image_block_free(self) -> Float[Array, "images image_block"]:
         """Which columns of the image blocks are free."""
@@ -167,13 +176,18 @@ def _with_camera(images, camera):
 
 
 def make_structure(
-    network: Network, *, chunk: int | None = None, pair_lengths: tuple[int, ...] | None = None
+    network: Network,
+    *,
+    chunk: int | None = None,
+    pair_lengths: tuple[int, ...] | None = None,
+    pair_blocks: tuple | None = None,
 ) -> tuple[Structure, Data, Float[np.ndarray, "3"], Int[np.ndarray, " observations"]]:
     """The index plan, the arrays, the origin and the ray of every observation of a checked network
     (`check_network`).
 
     Check points must have been set aside. The datum is not decided here. `chunk` and `pair_lengths`
-    are the lengths of chunks of rays and of pairs of rays, if not chosen by size.
+    are the lengths of chunks of rays and of pairs of rays, if not chosen by size; `pair_blocks` the
+    pairs of images with common points, if these are not all of the network's points.
     """
     images, points, observations = network.images, network.points, network.observations
     source, used, chunk = lay_out(observations.image, observations.point, chunk)
@@ -206,6 +220,10 @@ def make_structure(
         )
     data, origin, priors = _data(network, source, used)
     as_int = lambda x: jnp.asarray(np.asarray(x, np.int32))
+    pairs = _image_pairs(
+        image, point, elim_rays, len(images), chunk > 1, pair_lengths, pair_blocks
+    )
+    width = 6 + (k if own_camera else 0)
     structure = Structure(
         domain=network.residuals,
         axis=None,
@@ -228,18 +246,18 @@ def make_structure(
         interior=as_int(priors["interior"]),
         distance=as_int(network.distances.points),
         incidence=incidence,
-        image_pairs=_image_pairs(
-            image, point, elim_rays, len(images), chunk > 1, pair_lengths
-        ),
+        image_pairs=pairs,
         image_camera_pairs=camera_plans[0],
         camera_pairs=camera_plans[1],
+        band=find_band(pairs.row, pairs.column, len(images), width),
+        pins=jnp.zeros((len(images), width)),
         datum_weight=jnp.asarray(np.zeros((len(points), 3))),
         gauge=jnp.asarray(np.zeros((7, 0))),
     )
     return structure, data, origin, row
 
 
-def _image_pairs(image, point, rays, images, empty, lengths=None) -> Pairs:
+def _image_pairs(image, point, rays, images, empty, lengths=None, blocks=None) -> Pairs:
     """Pairs of two rays of one point, the lower image first; both ways round if it is the same."""
     i, j = pairs_within(point[rays])
     i, j = rays[i], rays[j]
@@ -249,7 +267,7 @@ def _image_pairs(image, point, rays, images, empty, lengths=None) -> Pairs:
     i, j = np.concatenate([i, j[twice]]), np.concatenate([j, i[twice]])
     missing = len(image) - empty
     return make_pairs(
-        i, j, image[i], image[j], images, (missing, missing), lengths, (empty, empty)
+        i, j, image[i], image[j], images, (missing, missing), lengths, (empty, empty), blocks
     )
 
 

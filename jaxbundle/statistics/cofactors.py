@@ -65,10 +65,8 @@ def _factorised(jac, values):
 def cofactors(structure: Structure, values: Values, factor: Factor) -> Cofactors:
     """All cofactor blocks of a solved network."""
     s = structure
-    identity = jnp.eye(s.reduced_size)
-    Q = jax.scipy.linalg.cho_solve((factor.cholesky, True), identity)
-    scale = factor.scale * reduced_free(s)
-    Q = Q * scale[:, None] * scale[None, :]
+    free = reduced_free(s)
+    Q = jax.vmap(factor.reduced.solve, 1, 1)(jnp.diag(free)) * free[:, None]
     K, Kc = _couplings(factor, Q)
     inner = jnp.eye(3) + jax.ops.segment_sum(
         jnp.einsum("nij,nkj->nik", K, factor.ray), s.point, s.points
