@@ -7,32 +7,71 @@
     result = jaxbundle.adjust(network)
     print(result)
 
-Importing configures nothing; `enable_x64` switches JAX to the 64-bit floats adjustment needs.
+Importing configures nothing; `enable_x64` switches JAX to the 64-bit floats adjustment needs,
+`use_cores` lets it work on big networks with all cores.
 """
 
-from jaxbundle.adjustment import Problem as Problem
-from jaxbundle.adjustment import make_problem as make_problem
-from jaxbundle.adjustment import solve as solve
-from jaxbundle.bundle import adjust as adjust
-from jaxbundle.errors import InputError as InputError
-from jaxbundle.errors import NotSolvedError as NotSolvedError
-from jaxbundle.gradients import check_gradients as check_gradients
-from jaxbundle.io import read_network as read_network
-from jaxbundle.io import write_project as write_project
-from jaxbundle.network import Camera as Camera
-from jaxbundle.network import Network as Network
-from jaxbundle.network.arrays import Data as Data
-from jaxbundle.network.arrays import Values as Values
-from jaxbundle.network.build import make_network as make_network
-from jaxbundle.network.check import check_network as check_network
-from jaxbundle.network.simulate import simulate as simulate
-from jaxbundle.network.simulate import simulate_with_truth as simulate_with_truth
-from jaxbundle.network.stations import aerial_block as aerial_block
-from jaxbundle.network.stations import cloud_of_targets as cloud_of_targets
-from jaxbundle.network.stations import grid_of_targets as grid_of_targets
-from jaxbundle.network.stations import ring_of_stations as ring_of_stations
-from jaxbundle.network.stations import stations_looking_at as stations_looking_at
-from jaxbundle.result import Adjustment as Adjustment
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from jaxbundle.adjustment import Problem as Problem
+    from jaxbundle.adjustment import make_problem as make_problem
+    from jaxbundle.adjustment import solve as solve
+    from jaxbundle.bundle import adjust as adjust
+    from jaxbundle.errors import InputError as InputError
+    from jaxbundle.errors import NotSolvedError as NotSolvedError
+    from jaxbundle.gradients import check_gradients as check_gradients
+    from jaxbundle.io import read_network as read_network
+    from jaxbundle.io import write_project as write_project
+    from jaxbundle.network import Camera as Camera
+    from jaxbundle.network import Network as Network
+    from jaxbundle.network.arrays import Data as Data
+    from jaxbundle.network.arrays import Values as Values
+    from jaxbundle.network.build import make_network as make_network
+    from jaxbundle.network.check import check_network as check_network
+    from jaxbundle.network.simulate import simulate as simulate
+    from jaxbundle.network.simulate import simulate_with_truth as simulate_with_truth
+    from jaxbundle.network.stations import aerial_block as aerial_block
+    from jaxbundle.network.stations import cloud_of_targets as cloud_of_targets
+    from jaxbundle.network.stations import grid_of_targets as grid_of_targets
+    from jaxbundle.network.stations import ring_of_stations as ring_of_stations
+    from jaxbundle.network.stations import stations_looking_at as stations_looking_at
+    from jaxbundle.result import Adjustment as Adjustment
+
+_HOME = {
+    "jaxbundle.adjustment": ("Problem", "make_problem", "solve",),
+    "jaxbundle.bundle": ("adjust",),
+    "jaxbundle.errors": ("InputError", "NotSolvedError",),
+    "jaxbundle.gradients": ("check_gradients",),
+    "jaxbundle.io": ("read_network", "write_project",),
+    "jaxbundle.network": ("Camera", "Network",),
+    "jaxbundle.network.arrays": ("Data", "Values",),
+    "jaxbundle.network.build": ("make_network",),
+    "jaxbundle.network.check": ("check_network",),
+    "jaxbundle.network.simulate": ("simulate", "simulate_with_truth",),
+    "jaxbundle.network.stations": (
+        "aerial_block", "cloud_of_targets", "grid_of_targets", "ring_of_stations",
+        "stations_looking_at",
+    ),
+    "jaxbundle.result": ("Adjustment",),
+}
+_MODULE = {name: module for module, names in _HOME.items() for name in names}
+__all__ = [*_MODULE, "enable_x64", "use_cores"]
+
+
+def __getattr__(name: str):
+    """Public names are imported when first used (PEP 562), so that the command line can say how JAX
+    and the linear algebra library are to start before they do."""
+    if name not in _MODULE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(_MODULE[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(set(globals()) | set(__all__))
 
 
 def enable_x64() -> None:
@@ -40,6 +79,18 @@ def enable_x64() -> None:
     import jax
 
     jax.config.update("jax_enable_x64", True)
+
+
+def use_cores(number: int | None = None) -> None:
+    """Let the cores of the processor (all, or so many) share the work on big networks, as devices
+    of JAX; call it before the first JAX computation."""
+    import os
+
+    import jax
+
+    if number is None:
+        number = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
+    jax.config.update("jax_num_cpu_devices", number or os.cpu_count() or 1)
 
 
 __version__ = "0.1.0"

@@ -3,13 +3,9 @@
 Exit status: 0 solved; 2 bad input (one line, nothing written); 3 not solved (says why).
 """
 
-import os
 import sys
 from pathlib import Path
 from typing import Annotated
-
-# Threads of the BLAS fight over small matrices; must be set before jax is imported.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import typer
 from rich.console import Console
@@ -68,6 +64,7 @@ def adjust(
 ) -> None:
     """Adjust a network and report it."""
     jaxbundle.enable_x64()
+    jaxbundle.use_cores()
     network = read_network(input, format, tuple(set or ()))
     if method not in ("levenberg-marquardt", "gauss-newton"):
         raise InputError(f"--method {method!r}: levenberg-marquardt or gauss-newton")
@@ -185,7 +182,3 @@ def main() -> None:
             print(f"jaxbundle: {error.format_message()}", file=sys.stderr)
             sys.exit(BAD_INPUT)
         raise
-
-
-if __name__ == "__main__":
-    main()

@@ -132,17 +132,20 @@ def move_to_datum(structure: Structure, values: Values, start: Values, steps: in
     size = jnp.abs(point).max()
 
     def moving(state):
-        _, _, distance, count = state
-        return (distance > 1e-12 * size) & (count < steps)
+        # Until rounding: no move at all, or none smaller than the one before.
+        _, _, distance, before, count = state
+        return (distance > 1e-12 * size) & (distance < 0.5 * before) & (count < steps)
 
     def newton(state):
-        tau, _, _, count = state
+        tau, _, before, _, count = state
         slope, (c, G) = jax.jacfwd(condition, has_aux=True)(tau, point, target)
         step = jnp.linalg.solve(slope, c)
-        return tau - step, slope, jnp.abs(G @ step).max(), count + 1
+        distance = jnp.abs(G @ step).max()
+        return tau - step, slope, distance, before, count + 1
 
-    begin = (jnp.zeros(s.defect), jnp.eye(s.defect), jnp.asarray(jnp.inf), 0)
-    tau, slope, _, _ = jax.lax.while_loop(moving, newton, begin)
+    far = jnp.asarray([1e300, jnp.inf])
+    begin = (jnp.zeros(s.defect), jnp.eye(s.defect), far[0], far[1], 0)
+    tau, slope, *_ = jax.lax.while_loop(moving, newton, begin)
     tau = tau - jnp.linalg.solve(slope, condition(tau, values.point, start.point)[0])
     position, rotation = jax.vmap(transform_pose, (None, 0, 0))(
         _exponential(s.gauge @ tau), values.position, values.rotation

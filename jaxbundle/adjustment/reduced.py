@@ -97,8 +97,8 @@ class BandFactor(eqx.Module):
 def factorise_reduced(structure: Structure, parts: Parts, scale, free, gauge, regular=True):
     """The factor of S; NaN where it is not positive definite.
 
-    **Arguments:** `scale` [n], `free` [n] (0: held), `gauge` [n, defect]; `regular`: whether to make
-    the datum directions of a banded system regular.
+    **Arguments:** `scale` [n], `free` [n] (0: held), `gauge` [n, defect]; `regular`: whether to
+    make the datum directions of a banded system regular.
     """
     if structure.band is not None:
         return _factorise_band(structure, parts, scale, free, regular)

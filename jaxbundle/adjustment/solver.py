@@ -46,6 +46,9 @@ LIMIT, SETTLED, RELATIVE_COST, SINGULAR, STUCK, NOT_FINITE = range(6)
 ROUNDING = 2e-14
 """A predicted decrease of vᵀPv below this fraction of it is rounding noise."""
 
+COST_ROUNDING = 1e-15
+"""Relative precision of an image coordinate, to estimate that of vᵀPv."""
+
 NOISE_FLOOR, NOISE_FLOOR_WITHOUT_REDUNDANCY = 1e-14, 1e-12
 """Relative precision of an image coordinate; residuals below it are noise of the arithmetic.
 
@@ -97,11 +100,13 @@ class SchurDescent(optx.AbstractDescent):
 
 
 class RegionState(eqx.Module):
-    """Radius 1/λ, the factor of the next reduction, what the pending step promises."""
+    """Radius 1/λ, the factor of the next reduction, what the pending step promises, and how much
+    of a change of the cost is rounding."""
 
     radius: Float[Array, ""]
     reduction: Float[Array, ""]
     predicted: Float[Array, ""]
+    noise: Float[Array, ""]
     ratio: Float[Array, ""]
 
 
@@ -111,20 +116,22 @@ class TrustRegion(optx.AbstractSearch):
     initial: float = 1e4
 
     def init(self, y: Values, f_info_struct: Any) -> RegionState:
-        start = jnp.asarray(self.initial)
-        return RegionState(start, jnp.asarray(2.0), jnp.asarray(0.0), jnp.asarray(0.0))
+        return RegionState(*(jnp.asarray(x) for x in (self.initial, 2.0, 0.0, 0.0, 0.0)))
 
     def step(self, first_step, y, y_eval, f_info, f_eval_info, state: RegionState):
         gain = f_info.as_min() - f_eval_info.as_min()
         ratio = jnp.where(state.predicted > 0, gain / state.predicted, -1.0)
         ratio = jnp.where(jnp.isfinite(ratio), ratio, -1.0)
+        # A promise smaller than rounding is kept unless the cost visibly grows.
+        unseen = (state.predicted < state.noise) & (gain > -state.noise)
+        ratio = jnp.where(unseen & (state.predicted > 0), 1.0, ratio)
         accept = first_step | (ratio > 1e-3)
         finite_radius = jnp.minimum(state.radius, 1e16)
         wider = jnp.minimum(1e16, finite_radius / jnp.maximum(1 / 3, 1 - (2 * ratio - 1) ** 3))
         radius = jnp.where(accept, wider, finite_radius / state.reduction)
         radius = jnp.where(first_step, state.radius, radius)
         reduction = jnp.where(accept, 2.0, 2.0 * state.reduction)
-        state = RegionState(radius, reduction, state.predicted, ratio)
+        state = RegionState(radius, reduction, state.predicted, state.noise, ratio)
         return radius, accept, optx.RESULTS.successful, state
 
 
@@ -134,7 +141,7 @@ class FullStep(optx.AbstractSearch):
     initial: ClassVar[float] = jnp.inf
 
     def init(self, y: Values, f_info_struct: Any) -> RegionState:
-        return RegionState(*(jnp.asarray(x) for x in (jnp.inf, 1.0, 0.0, 0.0)))
+        return RegionState(*(jnp.asarray(x) for x in (jnp.inf, 1.0, 0.0, 0.0, 0.0)))
 
     def step(self, first_step, y, y_eval, f_info, f_eval_info, state: RegionState):
         gain = f_info.as_min() - f_eval_info.as_min()
@@ -244,7 +251,9 @@ class BundleSolver(optx.AbstractLeastSquaresSolver):
         precision = jnp.where(
             self.redundancy > 0, NOISE_FLOOR, NOISE_FLOOR_WITHOUT_REDUNDANCY
         )
-        floor = s.total(jnp.sum((precision * scale) ** 2))
+        squares = s.total(jnp.sum(scale**2))
+        floor = precision**2 * squares
+        noise = COST_ROUNDING * jnp.sqrt(squares * 2 * cost_here)
         limit = jnp.maximum(self.atol**2 * sigma0_squared, ROUNDING * cost_here) + floor
         small = finite & (decrement <= limit)
         settled = small & jnp.isinf(step_size)
@@ -277,7 +286,7 @@ class BundleSolver(optx.AbstractLeastSquaresSolver):
         )
         if self.progress is not None:
             jax.debug.callback(self.progress, i, cost, 1 / state.step_size)
-        search = eqx.tree_at(lambda s: s.predicted, search, predicted)
+        search = eqx.tree_at(lambda s: (s.predicted, s.noise), search, (predicted, noise))
         new = SolverState(
             first=jnp.asarray(False), y_eval=y_eval, accepted_info=accepted_info, search=search,
             step_size=step_size, singular=singular, near=near,
