@@ -28,7 +28,6 @@ PACKAGE = Path(__file__).parent.parent / "jaxbundle"
 FILES = sorted(p for p in PACKAGE.rglob("*.py") if p != PACKAGE / "__init__.py")
 OPTIONAL = {
     "matplotlib", "pandas", "cv2", "pyproj", "rasterio", "erfa", "ezdxf", "laspy", "plotly",
-    "scipy",
 }  # fmt: skip
 LIGHT = {"geometry", "cameras"}
 

@@ -103,12 +103,14 @@ def factorise_reduced(structure: Structure, parts: Parts, scale, free, gauge, re
     if structure.band is not None:
         return _factorise_band(structure, parts, scale, free, regular)
     lower = jnp.linalg.cholesky(
-        dense_matrix(structure, parts, scale, free, gauge), symmetrize_input=False
+        dense_matrix(structure, parts, scale, free, gauge, regular), symmetrize_input=False
     )
     return DenseFactor(lower, scale)
 
 
-def dense_matrix(structure: Structure, parts: Parts, scale, free, gauge) -> Float[Array, "n n"]:
+def dense_matrix(
+    structure: Structure, parts: Parts, scale, free, gauge, regular=True
+) -> Float[Array, "n n"]:
     """S scaled, its datum directions made regular; only its lower triangle is right."""
     s = structure
     I, w, q = s.images, s.image_width, parts.corner.shape[0]
@@ -124,7 +126,7 @@ def dense_matrix(structure: Structure, parts: Parts, scale, free, gauge) -> Floa
     S = S.at[index, index].set(jnp.where(free > 0, jnp.diagonal(S), 1.0))
     if gauge.shape[1]:
         directions, _ = jnp.linalg.qr(gauge / scale[:, None])
-        S = S + directions @ directions.T
+        S = S + regular * directions @ directions.T
     return S
 
 

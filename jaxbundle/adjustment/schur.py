@@ -51,10 +51,8 @@ def factorise(
     gauge: Tangent | None = None,
     regular: Bool[Array, ""] | bool = True,
 ) -> Factor:
-    """Factorise N + diag(damping), with the datum directions `gauge` (last axis) made regular.
-
-    `regular`: whether a banded system needs that (a dense one gets it always: there it does no
-    harm to a damped step).
+    """Factorise N + diag(damping), with the datum directions `gauge` (last axis) made regular if
+    `regular`: damping does that too, and the damped step should be no other.
 
     NaN where a pivot is rounding, as where it is negative: chance decides between the two.
     """

@@ -69,11 +69,13 @@ def find_minimum_of_shards(solver: BundleSolver, shards: Shards, start: Values) 
         point=_placed(mesh, np.stack([p.point for p in parts]), PartitionSpec(AXIS)),
     )  # fmt: skip
     solver = dataclasses.replace(solver, structure=shards.structure)
-    minimum = _run(solver, shards.data, start_parts, mesh)
+    # What comes back is the same on all devices: every process keeps its own copy.
+    minimum = jax.tree.map(np.asarray, _run(solver, shards.data, start_parts, mesh))
     point = np.array(start.point)
-    for part, chosen in zip(np.asarray(minimum.values.point), shards.points):
+    for part, chosen in zip(minimum.values.point, shards.points):
         point[chosen] = part[: len(chosen)]
-    return eqx.tree_at(lambda m: m.values.point, minimum, jnp.asarray(point))
+    minimum = eqx.tree_at(lambda m: m.values.point, minimum, point)
+    return jax.tree.map(jnp.asarray, minimum)
 
 
 @eqx.filter_jit

@@ -93,8 +93,8 @@ def retract_about(structure, values: Values, tangent: Tangent) -> Values:
     """
     s, moved = structure, retract(structure, values, tangent)
     one = jnp.ones((s.rays, 1))
-    seen = s.table.sum_by_image(jnp.concatenate([values.point[s.point], one], 1))
-    seen = s.total(seen)
+    seen = jnp.concatenate([values.point[s.point], one], 1) * s.table.used[:, None]
+    seen = s.total(s.table.sum_by_image(seen))
     pivot = seen[:, :3] / jnp.maximum(seen[:, 3:], 1.0)
 
     def position(old, M, new_M, change, pivot):

@@ -78,7 +78,9 @@ def common_sizes(all_sizes) -> Sizes:
         for field in dataclasses.fields(Sizes)
     }  # fmt: skip
     found["chunks"] += 1
-    found["groups"] = tuple(g + 1 for g in found["groups"])
+    # Filled chunks are listed with the model of the last chunk, whichever that is.
+    groups = [np.add(sizes.groups, found["chunks"] - sizes.chunks) for sizes in all_sizes]
+    found["groups"] = tuple(np.max(groups, 0).tolist())
     found["points"] += SPARE_POINTS
     return Sizes(**found)
 
@@ -90,6 +92,7 @@ def pad(structure: Structure, data: Data, sizes: Sizes) -> tuple[Structure, Data
     rays = sizes.chunks * chunk
     table = RayTable(
         *(_edge(x, rays) for x in (s.table.image, s.table.camera, s.table.point)),
+        _fill(s.table.used, rays, 0),
         *(_edge(x, sizes.chunks) for x in (s.table.chunk_image, s.table.chunk_camera)),
         sizes.images,
     )

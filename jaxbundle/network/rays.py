@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, Shaped
+from jaxtyping import Array, Float, Int, Shaped
 
 CHUNK_LENGTHS = (256, 64, 16)
 MOST_EMPTY = 0.1
@@ -21,11 +21,13 @@ SMALL = 2000
 
 
 class RayTable(eqx.Module):
-    """Which image, camera and point every row belongs to; `chunk_image`: the image of a chunk."""
+    """Which image, camera and point every row belongs to; `used`: 0 for an empty row, else 1;
+    `chunk_image`, `chunk_camera`: those of a chunk."""
 
     image: Int[Array, " rays"]
     camera: Int[Array, " rays"]
     point: Int[Array, " rays"]
+    used: Float[Array, " rays"]
     chunk_image: Int[Array, " chunks"]
     chunk_camera: Int[Array, " chunks"]
     images: int = eqx.field(static=True)
@@ -105,10 +107,10 @@ def lay_out(
     return source, within <= last, length
 
 
-def make_ray_table(image, camera, point, chunk: int, images: int) -> RayTable:
+def make_ray_table(image, camera, point, used, chunk: int, images: int) -> RayTable:
     """The table of rays already laid out."""
     as_int = lambda x: jnp.asarray(np.asarray(x, np.int32))
     return RayTable(
-        as_int(image), as_int(camera), as_int(point), as_int(image[::chunk]),
-        as_int(camera[::chunk]), images,
+        as_int(image), as_int(camera), as_int(point), jnp.asarray(used.astype(float)),
+        as_int(image[::chunk]), as_int(camera[::chunk]), images,
     )  # fmt: skip

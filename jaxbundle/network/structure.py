@@ -231,7 +231,7 @@ def make_structure(
         all_free=bool(image_free.all() and camera_free.all() and point_free.all()),
         all_eliminated=bool(eliminated.all()),
         groups=groups,
-        table=make_ray_table(image, camera, point, chunk, len(images)),
+        table=make_ray_table(image, camera, point, used, chunk, len(images)),
         camera_of_image=as_int(images.camera),
         camera_columns=as_int(camera_columns),
         camera_free=jnp.asarray(camera_free),

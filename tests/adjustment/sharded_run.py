@@ -1,0 +1,53 @@
+"""Adjusts networks on several devices and processes, and prints what it found as JSON.
+
+    python sharded_run.py DEVICES [PROCESSES ID PORT [ABANDON]]
+
+DEVICES are those of this process; with PROCESSES, it is number ID of so many. ABANDON: this process
+leaves without a word when the others rely on it.
+"""
+
+import json
+import os
+import sys
+
+devices, *rest = map(int, sys.argv[1:])
+processes, rank, port, abandon = (*rest, *(1, 0, 0, 0)[len(rest) :])
+os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={devices}"
+
+import jax  # noqa: E402
+
+jax.config.update("jax_enable_x64", True)
+if processes > 1:
+    jax.config.update("jax_cpu_collectives_implementation", "gloo")
+    jax.distributed.initialize(
+        f"127.0.0.1:{port}", processes, rank, heartbeat_timeout_seconds=10
+    )
+
+import numpy as np  # noqa: E402
+from adjustment_checks import make  # noqa: E402
+
+from jaxbundle.adjustment.sharding import distribute, find_minimum_of_shards  # noqa: E402
+from jaxbundle.adjustment.solve import make_solver  # noqa: E402
+
+COUNTS = {
+    "shared cameras of two models": (2,),
+    "own cameras of two models": (2,),
+    "free with distances": (1, 2, 4),
+}
+
+found = {}
+for name, counts in COUNTS.items() if processes == 1 else [("free with distances", None)]:
+    problem = make(name)
+    solver = make_solver(problem, atol=1e-9)
+    for count in counts or (jax.device_count(),):
+        shards = distribute(problem, jax.devices()[:count])
+        if abandon:
+            os._exit(1)
+        minimum = find_minimum_of_shards(solver, shards, problem.data.start)
+        cost = np.asarray(minimum.history.cost)[: int(minimum.iterations)]
+        found[f"{name}, {count}"] = {
+            "termination": int(minimum.termination),
+            "cost": cost.tolist(),
+            "camera": np.asarray(minimum.values.camera).tolist(),
+        }
+print(json.dumps(found))

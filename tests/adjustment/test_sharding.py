@@ -1,0 +1,77 @@
+"""One adjustment on several devices and processes: the same costs and the same answer as on one."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from adjustment_checks import make, solved
+
+SCRIPT = Path(__file__).with_name("sharded_run.py")
+pytestmark = pytest.mark.slow
+
+
+def start(*arguments):
+    return subprocess.Popen(
+        [sys.executable, SCRIPT, *map(str, arguments)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=dict(os.environ),
+    )  # fmt: skip
+
+
+def finish(process, timeout=240):
+    out, error = process.communicate(timeout=timeout)
+    assert process.returncode == 0, error[-2000:]
+    return json.loads(out.splitlines()[-1])
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@cache
+def on_one_processor():
+    return finish(start(4))
+
+
+@pytest.mark.parametrize(
+    "name, devices",
+    [("shared cameras of two models", 2), ("own cameras of two models", 2)]
+    + [("free with distances", devices) for devices in (1, 2, 4)],
+)
+def test_on_several_devices(name, devices):
+    found = on_one_processor()[f"{name}, {devices}"]
+    expected = solved(make(name))
+    assert found["termination"] == int(expected.termination)
+    cost = np.asarray(expected.history.cost)[: int(expected.iterations)]
+    same = min(len(cost), len(found["cost"]))  # the last steps are steps of rounding
+    np.testing.assert_allclose(found["cost"][: same - 2], cost[: same - 2], rtol=1e-9)
+    assert found["cost"][-1] == pytest.approx(cost[-1], rel=1e-9)
+    np.testing.assert_allclose(found["camera"], expected.values.camera, rtol=1e-7, atol=1e-10)
+
+
+@pytest.mark.parametrize("processes", [2, 4])
+def test_in_several_processes(processes):
+    port = free_port()
+    running = [start(1, processes, k, port) for k in range(processes)]
+    found = [finish(process) for process in running]
+    name = f"free with distances, {processes}"
+    expected = on_one_processor()[name]["cost"]
+    for one in found:
+        assert one[name]["cost"] == found[0][name]["cost"]
+        assert one[name]["cost"][-1] == pytest.approx(expected[-1], rel=1e-9)
+
+
+def test_a_lost_process_ends_the_others():
+    port = free_port()
+    running = [start(1, 2, k, port, int(k == 1)) for k in range(2)]
+    running[1].communicate(timeout=120)
+    out, error = running[0].communicate(timeout=120)
+    assert running[0].returncode != 0
+    assert error and not out
