@@ -89,13 +89,17 @@ def retract_about(structure, values: Values, tangent: Tangent) -> Values:
     To first order the same. A long step that turns an image and shifts it, so that it keeps its
     points, keeps them only if the turn is about them: about its own projection centre they leave
     the image by the second-order terms. (A problem of 16 images of close-up scenes: 12 steps to
-    the minimum instead of 21.) Images whose position is held turn about it.
+    the minimum instead of 21.) The middle is that of the points weighted by 1/distance², as much as
+    they say about the position; so far ones do not pull it away. Images whose position is held
+    turn about it.
     """
     s, moved = structure, retract(structure, values, tangent)
-    one = jnp.ones((s.rays, 1))
-    seen = jnp.concatenate([values.point[s.point], one], 1) * s.table.used[:, None]
+    point = values.point[s.point]
+    square = jnp.sum((point - s.table.of_image(values.position)) ** 2, 1, keepdims=True)
+    weight = s.table.used[:, None] / jnp.maximum(square, 1e-300)
+    seen = jnp.concatenate([weight * point, weight], 1)
     seen = s.total(s.table.sum_by_image(seen))
-    pivot = seen[:, :3] / jnp.maximum(seen[:, 3:], 1.0)
+    pivot = seen[:, :3] / jnp.where(seen[:, 3:] > 0, seen[:, 3:], 1.0)
 
     def position(old, M, new_M, change, pivot):
         Y = M @ (pivot - old)
