@@ -51,7 +51,7 @@ def factorise(
     gauge: Tangent | None = None,
     regular: Bool[Array, ""] | bool = True,
 ) -> Factor:
-    """Factorise N + diag(damping), with the datum directions `gauge` (last axis) made regular if
+    """Factorise N + `damping` (diagonals; for images also matrices), with the datum directions `gauge` (last axis) made regular if
     `regular`: damping does that too, and the damped step should be no other.
 
     NaN where a pivot is rounding, as where it is negative: chance decides between the two.
@@ -154,7 +154,8 @@ def inverse_cholesky_3x3(V: Float[Array, "n 3 3"]) -> Float[Array, "n 3 3"]:
 
 
 def _damped(normal: Normal, damping: Tangent) -> Normal:
-    add = lambda blocks, d: blocks + d[:, :, None] * jnp.eye(d.shape[1])
+    matrices = lambda d: d if d.ndim == 3 else d[:, :, None] * jnp.eye(d.shape[1])
+    add = lambda blocks, d: blocks + matrices(d)
     return eqx.tree_at(
         lambda n: (n.image, n.camera, n.point),
         normal,

@@ -6,8 +6,8 @@
 - `TrustRegion` accepts or rejects and updates the damping λ (Nielsen 1999),
 - `BundleSolver` walks on the manifold of the unknowns and decides when to stop.
 
-Damping is Marquardt's (1963): λ·diag(JᵀPJ). Identity damping does not converge on real blocks:
-radians stand beside metres and K3 ~ 1e-8.
+Damping is Marquardt's (1963): λ·diag(JᵀPJ), see `damping.py`. Identity damping does not converge on
+real blocks: radians stand beside metres and K3 ~ 1e-8.
 
 **When it stops.** With the undamped step δ and g = JᵀPv, the decrement d² = −gᵀδ = δᵀNδ bounds
 every single unknown: |δᵢ| ≤ d/σ₀·σᵢ. The network is *settled* when d ≤ `atol`·σ₀: no unknown
@@ -25,9 +25,10 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxbundle.adjustment.damping import metric, times
 from jaxbundle.adjustment.datum import gauge_directions
 from jaxbundle.adjustment.jacobian import jacobian
-from jaxbundle.adjustment.normal import Normal, diagonal, gradient, normal_from_jacobian
+from jaxbundle.adjustment.normal import Normal, gradient, normal_from_jacobian
 from jaxbundle.adjustment.residuals import half_square, residuals
 from jaxbundle.adjustment.schur import factorise, solve
 from jaxbundle.network.arrays import Data, Tangent, Values, retract_about
@@ -66,11 +67,11 @@ REFUSALS = 2
 
 
 class Damped(eqx.Module):
-    """The normal equations at the accepted point, and the damping's diagonal."""
+    """The normal equations at the accepted point, and the metric of the damping."""
 
     normal: Normal
     gradient: Tangent
-    diagonal: Tangent
+    metric: Tangent
     gauge: Tangent
 
 
@@ -87,12 +88,12 @@ class SchurDescent(optx.AbstractDescent):
         return Damped(
             normal=normal,
             gradient=gradient(f_info.jac, f_info.residual),
-            diagonal=diagonal(self.structure, normal),
+            metric=metric(y, normal),
             gauge=gauge_directions(self.structure, y),
         )
 
     def step(self, step_size: Float[Array, ""], state: Damped):
-        damping = jax.tree.map(lambda d: d / step_size, state.diagonal)
+        damping = jax.tree.map(lambda d: d / step_size, state.metric)
         regular = step_size > WIDE
         factor = factorise(self.structure, state.normal, damping, state.gauge, regular)
         change = solve(factor, jax.tree.map(jnp.negative, state.gradient))
@@ -241,7 +242,7 @@ class BundleSolver(optx.AbstractLeastSquaresSolver):
         finite = s.total(1 - _all_finite(change).astype(int)) == 0
         change = jax.tree.map(lambda d: jnp.where(finite, d, 0.0), change)
         decrement = -dot(damped.gradient, change)
-        damping_term = dot(change, jax.tree.map(jnp.multiply, damped.diagonal, change))
+        damping_term = dot(change, times(damped.metric, change))
         damping_term = jnp.where(jnp.isinf(step_size), 0.0, damping_term / step_size)
         predicted = 0.5 * (decrement + damping_term)
         y_eval = retract_about(self.structure, y, change)

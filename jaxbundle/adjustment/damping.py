@@ -1,0 +1,50 @@
+"""The metric of the damping: λ·D is added to N, and the step becomes shorter as λ grows.
+
+Marquardt (1963) takes D = diag(N), which depends on what the unknowns are. For a pose it matters:
+a turn δθ about the projection centre and a shift δX0 move the image nearly alike, and with both
+damped lightly long steps of one against the other are tried and refused. In the unknowns of
+programs that store [R t],
+
+    δθ   a turn,
+    δt   of t = −M·X0, the place of the origin of object space in the camera frame,
+
+a turn is about that origin and weighs the more the farther away it is. D is diag(N) in these,
+carried back to (δX0, δθ): D = Tᵀ·diag(T⁻ᵀ·N·T⁻¹)·T with T = ∂(δt, δθ)/∂(δX0, δθ), a block for each
+image. Cameras and points have their diagonal. (Measured to 1.0001 × the final cost: 4 steps instead
+of 5 for 16 images of a relief, 20 instead of 21 for 49 along a street, and on a street of 200 with
+bad start values 38 instead of more than 80.)
+"""
+
+import jax
+import jax.numpy as jnp
+
+from jaxbundle.adjustment.normal import Normal
+from jaxbundle.geometry import matrix_from_quaternion, retract_quaternion
+from jaxbundle.network.arrays import Tangent, Values
+
+
+def metric(values: Values, normal: Normal) -> Tangent:
+    """D: matrices [images, w, w] for the images, diagonals for cameras and points; 1 for what is
+    held."""
+    pick = lambda blocks: jnp.diagonal(blocks, axis1=1, axis2=2)
+    positive = lambda d: jnp.where(d > 0, d, 1.0)
+    image = jax.vmap(_of_image)(values.position, values.rotation, normal.image)
+    return Tangent(image, positive(pick(normal.camera)), positive(pick(normal.point)))
+
+
+def times(D: Tangent, change: Tangent) -> Tangent:
+    """D·δ."""
+    image = jnp.einsum("nij,nj->ni", D.image, change.image)
+    return Tangent(image, D.camera * change.camera, D.point * change.point)
+
+
+def _of_image(position, rotation, N):
+    def shift(change):
+        M = matrix_from_quaternion(retract_quaternion(rotation, change[3:]))
+        return -M @ (position + change[:3])
+
+    T = jnp.eye(N.shape[0]).at[:3, :6].set(jax.jacfwd(shift)(jnp.zeros(6)))
+    A, B = T[:3, :3], T[:3, 3:6]  # A = −M is orthogonal
+    inverse = T.at[:3, :3].set(A.T).at[:3, 3:6].set(-A.T @ B)
+    D = T.T @ (jnp.diagonal(inverse.T @ N @ inverse)[:, None] * T)
+    return D + jnp.diag(jnp.where(jnp.diagonal(D) > 0, 0.0, 1.0))
