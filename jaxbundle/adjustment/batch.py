@@ -10,35 +10,34 @@ an accelerator a portion is a `vmap` over many cameras.
 """
 
 import dataclasses
-import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from jaxbundle.adjustment.batch_camera import CONVERGED, STATUS, Solved, solve_camera
-from jaxbundle.adjustment.batch_normal import Calibration, Sightings
+from jaxbundle.adjustment.batch_camera import (
+    CONVERGED,
+    NOT_FINITE,
+    STATUS,
+    Solved,
+    solve_camera,
+)
+from jaxbundle.adjustment.batch_input import Batch, Portion
 from jaxbundle.adjustment.batch_start import start_values
 from jaxbundle.adjustment.problem import require_x64
-from jaxbundle.cameras import CameraModel, default_parameters, get_model
-from jaxbundle.errors import InputError
-from jaxbundle.geometry import matrix_from_quaternion, omega_phi_kappa_from_matrix
-from jaxbundle.geometry import matrix_from_rotation_vector
+from jaxbundle.cameras import CameraModel, get_model
+from jaxbundle.geometry import (
+    matrix_from_quaternion,
+    matrix_from_rotation_vector,
+    omega_phi_kappa_from_matrix,
+)
 
-FREE = {"opencv": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")}
-"""What is free if nothing is said; of other models everything."""
-
-FLAT = 0.02
-"""A smaller extent across than this fraction of the second largest: the object starts as flat."""
-
-CAMERAS_A_PORTION = {"cpu": 32}
-CAMERAS_ON_ACCELERATOR = 512
+OF_A_VIEW = ("position", "angles", "sigma_position", "sigma_angles", "rotation")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,207 +127,49 @@ def calibrate_batch(
     floats. What is wrong with the numbers of one camera stands in its status.
     """
     require_x64()
-    batch = _Batch.of(object_points, image_points, image_size, model, visible, free, start)
+    batch = Batch.of(object_points, image_points, image_size, model, visible, free, start)
     camera_model = get_model(model)
     on_cpu = jax.default_backend() == "cpu"
-    results = [None] * len(batch)
     portions = list(batch.portions(on_cpu))
     run = lambda portion: _solve_portion(
-        camera_model, batch.free, batch.known, max_iterations, max(image_size), on_cpu, portion
+        camera_model, batch.free, batch.known, max_iterations, float(max(image_size)), on_cpu, portion
     )
-    done = 0
+    parts = []
     with ThreadPoolExecutor((threads or _cores()) if on_cpu else 1) as pool:
         for portion, solved in zip(portions, pool.map(run, portions)):
-            for i, camera in enumerate(portion.cameras):
-                results[camera] = {name: rows[i] for name, rows in solved.items()}
-            done += len(portion.cameras)
+            parts.append({name: rows[: len(portion.cameras)] for name, rows in solved.items()})
             if progress is not None:
-                progress(done, len(batch))
-    return batch.result(model, results)
+                progress(sum(len(part["status"]) for part in parts), len(batch))
+    order = np.argsort(np.concatenate([portion.cameras for portion in portions]))
+    rows = {name: np.concatenate([p[name] for p in parts])[order] for name in parts[0]}
+    return _result(camera_model, batch, rows)
 
 
-def bucket(n: int) -> int:
-    """The next size to pad to: 4, 5, 6, 7, 8, 10, 12, 14, 16, 20, 24, 28, 32, …"""
-    step = 2 ** max(0, math.ceil(math.log2(max(n, 4))) - 3)
-    return max(4, math.ceil(n / step) * step)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Portion:
-    """Padded arrays of some cameras, for one call of the compiled program."""
-
-    cameras: np.ndarray
-    flat: bool
-    seen: Sightings
-    interior: np.ndarray
-    axes: np.ndarray
-    middle: np.ndarray
-
-
-@dataclasses.dataclass(frozen=True)
-class _Batch:
-    """The checked input. Object points are turned into their principal axes, about their mean."""
-
-    point: np.ndarray
-    middle: np.ndarray
-    axes: np.ndarray
-    flat: np.ndarray
-    xy: np.ndarray
-    visible: np.ndarray
-    interior: np.ndarray
-    free: tuple[int, ...]
-    known: bool
-
-    def __len__(self) -> int:
-        return len(self.xy)
-
-    @classmethod
-    def of(cls, object_points, image_points, image_size, model, visible, free, start):
-        model = _pixel_model(model)
-        xy = np.asarray(image_points, float)
-        if xy.ndim != 4 or xy.shape[3] != 2:
-            raise InputError(
-                f"image_points must have the shape [cameras, views, points, 2], but has {xy.shape}"
-            )
-        cameras, views, points, _ = xy.shape
-        X = np.asarray(object_points, float)
-        if X.shape not in ((points, 3), (cameras, points, 3)):
-            raise InputError(
-                f"object_points must have the shape [{points}, 3] or [{cameras}, {points}, 3], as "
-                f"image_points has {points} points a view, but has {X.shape}"
-            )
-        visible = np.ones(xy.shape[:3], bool) if visible is None else np.asarray(visible)
-        if visible.shape != xy.shape[:3]:
-            raise InputError(
-                f"visible must have the shape {xy.shape[:3]} of image_points, "
-                f"but has {visible.shape}"
-            )
-        size = np.asarray(image_size, float)
-        if size.shape != (2,) or not (np.isfinite(size) & (size > 0)).all():
-            raise InputError(
-                f"image_size must be width and height in pixels, but is {image_size!r}"
-            )
-        free = _free(model, free)
-        interior, known = _interior(model, free, start, size, cameras)
-        return cls(
-            *_principal_axes(np.broadcast_to(X, (cameras, points, 3))),
-            xy=xy, visible=visible.astype(bool), interior=interior,
-            free=tuple(model.parameters.index(name) for name in free), known=known,
-        )  # fmt: skip
-
-    def portions(self, on_cpu: bool) -> Iterator[_Portion]:
-        """Cameras in portions, flat and solid objects apart."""
-        _, views, points, _ = self.xy.shape
-        shape = (bucket(views), bucket(points) if points > 128 else -(-points // 8) * 8)
-        size = 32 if on_cpu else min(512, 2 ** math.ceil(math.log2(max(len(self), 1))))
-        for flat in (True, False):
-            cameras = np.flatnonzero(self.flat == flat)
-            for first in range(0, len(cameras), size):
-                yield self._portion(cameras[first : first + size], flat, size, shape)
-
-    def _portion(self, cameras, flat, size, shape) -> _Portion:
-        wide = lambda rows, *axes: np.pad(
-            rows, [(0, n - old) for n, old in zip(axes, rows.shape)] + [(0, 0)] * (rows.ndim - len(axes))
-        )
-        visible = self.visible[cameras]
-        seen = Sightings(
-            point=wide(self.point[cameras], size, shape[1]),
-            xy=wide(np.where(visible[..., None], self.xy[cameras], 0.0), size, *shape),
-            weight=wide(visible.astype(float), size, *shape),
-        )
-        interior = np.pad(self.interior[cameras], [(0, size - len(cameras)), (0, 0)], mode="edge")
-        return _Portion(
-            cameras, flat, seen, interior,
-            wide(self.axes[cameras], size), wide(self.middle[cameras], size),
-        )  # fmt: skip
-
-    def result(self, model: str, results: list[dict]) -> BatchCalibration:
-        views = self.xy.shape[1]
-        names = tuple(get_model(model).parameters[column] for column in self.free)
-        if not results:
-            raise InputError("image_points has no camera")
-        of = {name: np.stack([row[name] for row in results]) for name in results[0]}
-        good = of["status"] == CONVERGED
-        for name, rows in of.items():
-            if np.issubdtype(rows.dtype, np.floating):
-                rows[~good] = np.nan
-        for name in ("views", "position", "angles", "sigma_position", "sigma_angles", "rotation"):
-            of[name] = of[name][:, :views]
-        for name in ("position", "angles", "sigma_position", "sigma_angles", "rotation"):
-            of[name][~of["views"]] = np.nan
-        status = np.array(STATUS, dtype=object)[of.pop("status")].astype(str)
-        return BatchCalibration(model=model, parameters=names, status=status, **of)
-
-
-def _pixel_model(name: str) -> CameraModel:
-    model = get_model(name)
-    if model.unit != "px":
-        raise InputError(f"model {name!r} is in {model.unit}; a batch needs a camera in pixels")
-    return model
-
-
-def _free(model: CameraModel, free) -> tuple[str, ...]:
-    if free is None:
-        free = FREE.get(model.name) or model.parameters
-    for name in free:
-        if name not in model.parameters or name in model.never_free:
-            raise InputError(
-                f"free: camera model {model.name!r} has no free parameter {name!r}; "
-                f"its parameters are {', '.join(model.parameters)}"
-            )
-    if not free or len({*free}) < len(free):
-        raise InputError("free: name at least one parameter, and each once")
-    return tuple(free)
-
-
-def _interior(model: CameraModel, free, start, size, cameras):
-    """Start values [cameras, parameters]; are the focal lengths among them?"""
-    values = {name: 1.0 for name in model.principal_distance} | default_parameters(model)
-    values |= {name: (n - 1) / 2 for name, n in zip(("cx", "cy"), size) if name in values}
-    start = dict(start or {})
-    for name in start:
-        if name not in values:
-            raise InputError(
-                f"start: camera model {model.name!r} has no parameter {name!r}; "
-                f"its parameters are {', '.join(model.parameters)}"
-            )
-    given = [name for name in model.principal_distance if name in start]
-    missing = [name for name in model.principal_distance if name not in start]
-    held = [name for name in missing if name not in free]
-    if (given and missing) or held:
-        raise InputError(f"start: give {', '.join(missing)} as well")
-    try:
-        columns = [
-            np.broadcast_to(np.asarray((values | start)[name], float), (cameras,))
-            for name in model.parameters
-        ]
-    except (ValueError, TypeError) as error:
-        raise InputError(f"start: a number, or one for each of {cameras} cameras") from error
-    return np.stack(columns, 1), bool(given)
-
-
-def _principal_axes(X):
-    """Points [cameras, points, 3] about their mean and along their principal axes; mean; axes
-    (rows) [cameras, 3, 3]; is the object flat?"""
-    middle = X.mean(1)
-    centred = X - middle[:, None]
-    moments = np.einsum("cpi,cpj->cij", centred, centred)
-    usable = np.isfinite(moments).all((1, 2))
-    values, vectors = np.linalg.eigh(np.where(usable[:, None, None], moments, np.eye(3)))
-    axes = vectors[:, :, ::-1].swapaxes(1, 2)
-    axes = axes * np.linalg.det(axes)[:, None, None]
-    flat = values[:, 0] < FLAT**2 * values[:, 1]
-    return centred @ axes.swapaxes(1, 2), middle, axes, flat | ~usable
+def _result(model: CameraModel, batch: Batch, rows: dict) -> BatchCalibration:
+    """Rows of the portions in the order of the cameras, without padding; NaN for no result."""
+    rows["status"][~batch.finite] = NOT_FINITE
+    rows["views"] = rows["views"][:, : batch.xy.shape[1]]
+    good = rows["status"] == CONVERGED
+    for name, values in rows.items():
+        if name in OF_A_VIEW:
+            rows[name] = values = values[:, : batch.xy.shape[1]]
+            values[~rows["views"]] = np.nan
+        if np.issubdtype(values.dtype, np.floating):
+            values[~good] = np.nan
+    rows["status"] = np.array(STATUS)[rows["status"]]
+    free = tuple(model.parameters[column] for column in batch.free)
+    return BatchCalibration(model=model.name, parameters=free, **rows)
 
 
 def _cores() -> int:
+    """Cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
 
 
-def _solve_portion(model, free, known, max_steps, size, on_cpu, portion: _Portion) -> dict:
+def _solve_portion(model, free, known, max_steps, size, on_cpu, portion: Portion) -> dict:
     """The rows of a `BatchCalibration`, with the status as its number."""
     result = _portion_program(
-        model, free, known, portion.flat, max_steps, float(size), on_cpu,
+        model, free, known, portion.flat, max_steps, size, on_cpu,
         portion.seen, portion.interior, portion.axes, portion.middle,
     )  # fmt: skip
     return jax.tree.map(np.array, result)
