@@ -13,6 +13,8 @@ Importing configures nothing; `enable_x64` switches JAX to the 64-bit floats adj
 from jaxbundle.adjustment import Problem as Problem
 from jaxbundle.adjustment import make_problem as make_problem
 from jaxbundle.adjustment import solve as solve
+from jaxbundle.adjustment.batch import BatchCalibration as BatchCalibration
+from jaxbundle.adjustment.batch import calibrate_batch as calibrate_batch
 from jaxbundle.bundle import adjust as adjust
 from jaxbundle.errors import InputError as InputError
 from jaxbundle.errors import NotSolvedError as NotSolvedError

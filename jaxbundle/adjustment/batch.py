@@ -132,7 +132,7 @@ def calibrate_batch(
     on_cpu = jax.default_backend() == "cpu"
     portions = list(batch.portions(on_cpu))
     run = lambda portion: _solve_portion(
-        camera_model, batch.free, batch.known, max_iterations, float(max(image_size)), on_cpu, portion
+        camera_model, batch.free, batch.known, max_iterations, batch.size, on_cpu, portion
     )
     parts = []
     with ThreadPoolExecutor((threads or _cores()) if on_cpu else 1) as pool:

@@ -55,6 +55,7 @@ class Batch:
     interior: np.ndarray
     free: tuple[int, ...]
     known: bool
+    size: float
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -99,6 +100,7 @@ class Batch:
         return cls(
             finite, *_principal_axes(X, seen), xy=xy, visible=visible, interior=interior,
             free=tuple(model.parameters.index(name) for name in free), known=known,
+            size=float(size.max()),
         )  # fmt: skip
 
     def portions(self, on_cpu: bool) -> Iterator[Portion]:
@@ -131,7 +133,10 @@ class Batch:
         )  # fmt: skip
 
 def _pixel_model(name: str) -> CameraModel:
-    model = get_model(name)
+    try:
+        model = get_model(name)
+    except ValueError as error:
+        raise InputError(str(error)) from None
     if model.unit != "px":
         raise InputError(f"model {name!r} is in {model.unit}; a batch needs a camera in pixels")
     return model
