@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from jaxbundle.adjustment.batch import BatchCalibration, calibrate_batch
+from jaxbundle.adjustment.batch_input import free_parameters, pixel_model
 from jaxbundle.bundle import adjust
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io import read_network
@@ -57,6 +58,8 @@ def run_batch(
         if not Path(path).exists():
             raise InputError(f"{path}: no such file or folder")
     stacks = {path: read_camera_stack(path) for path in inputs if path.endswith(".npz")}
+    if stacks:
+        free_parameters(pixel_model(model), free)
     total = sum(len(stacks[path].keys) if path in stacks else 1 for path in inputs)
     options = dict(model=model, free=free, max_iterations=max_iterations)
     lines = JsonLines(file, retry)

@@ -169,15 +169,15 @@ def _cores() -> int:
 def _solve_portion(model, free, known, max_steps, size, on_cpu, portion: Portion) -> dict:
     """The rows of a `BatchCalibration`, with the status as its number."""
     result = _portion_program(
-        model, free, known, portion.flat, max_steps, size, on_cpu,
+        model, free, known, portion.flat, on_cpu, max_steps, size,
         portion.seen, portion.interior, portion.axes, portion.middle,
     )  # fmt: skip
     return jax.tree.map(np.array, result)
 
 
-@partial(jax.jit, static_argnums=range(7))
+@partial(jax.jit, static_argnums=range(5))
 def _portion_program(
-    model, free, known, flat, max_steps, size, on_cpu, seen, interior, axes, middle
+    model, free, known, flat, on_cpu, max_steps, size, seen, interior, axes, middle
 ):
     def one(arguments):
         seen, interior = arguments

@@ -62,7 +62,7 @@ class Batch:
 
     @classmethod
     def of(cls, object_points, image_points, image_size, model, visible, free, start):
-        model = _pixel_model(model)
+        model = pixel_model(model)
         xy = np.asarray(image_points, float)
         if xy.ndim != 4 or xy.shape[3] != 2:
             raise InputError(
@@ -88,7 +88,7 @@ class Batch:
             raise InputError(
                 f"image_size must be width and height in pixels, but is {image_size!r}"
             )
-        free = _free(model, free)
+        free = free_parameters(model, free)
         interior, known = _interior(model, free, start, size, cameras)
         visible = visible.astype(bool)
         seen = visible.any(1)
@@ -132,7 +132,8 @@ class Batch:
             wide(self.axes[cameras], size), wide(self.middle[cameras], size),
         )  # fmt: skip
 
-def _pixel_model(name: str) -> CameraModel:
+def pixel_model(name: str) -> CameraModel:
+    """The camera model of this name, if its unit is the pixel."""
     try:
         model = get_model(name)
     except ValueError as error:
@@ -142,7 +143,8 @@ def _pixel_model(name: str) -> CameraModel:
     return model
 
 
-def _free(model: CameraModel, free) -> tuple[str, ...]:
+def free_parameters(model: CameraModel, free) -> tuple[str, ...]:
+    """The parameters to estimate, checked."""
     if free is None:
         free = FREE.get(model.name) or model.parameters
     for name in free:
