@@ -60,6 +60,7 @@ def keys_of(path: Path):
     return [f"{path}#serial {i}" for i in range(CAMERAS)]
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_where_it_was(cameras, tmp_path):
     file = tmp_path / "results.jsonl"
     arguments = (cameras, "--json-lines", file, "--portion", "1", "--free", "fx,fy,k1")
