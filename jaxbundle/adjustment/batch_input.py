@@ -193,5 +193,5 @@ def _principal_axes(X, seen):
     values, vectors = np.linalg.eigh(np.einsum("cpi,cpj->cij", centred, centred))
     axes = vectors[:, :, ::-1].swapaxes(1, 2)
     axes = axes * np.linalg.det(axes)[:, None, None]
-    flat = values[:, 0] < FLAT**2 * values[:, 1]
+    flat = values[:, 0] <= np.maximum(FLAT**2 * values[:, 1], 1e-12 * values[:, 2])
     return centred @ axes.swapaxes(1, 2), middle, axes, flat

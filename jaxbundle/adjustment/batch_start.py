@@ -37,8 +37,9 @@ def start_values(model, flat, known, seen: Sightings, interior, size):
     **Arguments:** `flat`: the object is a plane Z = 0; `known`: `interior` [parameters] is a
     camera to begin with, otherwise its focal lengths are sought; `size`: a length of the image.
     """
-    x, y = _ideal(model, known, seen, interior)
-    columns, usable = _fit(seen, x, y, 2, FLAT) if flat else _fit(seen, x, y, 3, SOLID)
+    x, y, front = _ideal(model, known, seen, interior)
+    fitted = Sightings(seen.point, seen.xy, seen.weight * front)
+    columns, usable = _fit(fitted, x, y, 2, FLAT) if flat else _fit(fitted, x, y, 3, SOLID)
     weight = seen.weight * usable[:, None]
     seen = Sightings(seen.point, seen.xy, weight)
     if known:
@@ -63,15 +64,17 @@ def start_values(model, flat, known, seen: Sightings, interior, size):
 
 
 def _ideal(model, known, seen: Sightings, interior):
-    """Image points without distortion: directions if the camera is known, else pixels."""
+    """Image points without distortion: directions if the camera is known, else pixels; and which
+    have a plane coordinate (those of a fisheye beyond 90° have none)."""
     u, v = seen.xy[..., 0], seen.xy[..., 1]
     if known:
         r, s, q = cameras.image_ray(model, tuple(interior), u, v)
-        return -r / q, s / q
+        front = q < -0.05
+        return *(jnp.where(front, c, 0.0) for c in (-r / q, s / q)), front
     names = model.parameters
     value = lambda name: interior[names.index(name)] if name in names else 0.0
     x, y = u - value("cx"), v - value("cy")
-    return (x, y) if model.axes == "down" else (x, -y)
+    return x, y if model.axes == "down" else -y, jnp.isfinite(x)
 
 
 def _fit(seen, x, y, axes, least_points):

@@ -210,6 +210,13 @@ def test_progress_is_told_and_portions_keep_the_order(three, solved):
         same(found, solved, camera, camera % 3)
 
 
+def test_the_way_of_accelerators_gives_the_same(three, solved, monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    found = jaxbundle.calibrate_batch(BOARD, three[0], SIZE)
+    for camera in range(3):
+        same(found, solved, camera, camera, rtol=1e-6)
+
+
 def test_a_solid_object_with_some_parameters_held():
     rng = np.random.default_rng(5)
     X = rng.uniform(-0.12, 0.12, (40, 3)) + BOARD.mean(0)
