@@ -31,7 +31,7 @@ def run_batch(
     *,
     model: str = "opencv",
     free: Sequence[str] | None = None,
-    max_iterations: int = 50,
+    max_iterations: int = 100,
     brief: bool = False,
     retry: bool = False,
     portion: int = CAMERAS_A_WRITE,

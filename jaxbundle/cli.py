@@ -108,7 +108,7 @@ def batch(
     json_lines: Annotated[str, typer.Option(help="file of results, one a line; is continued")],
     model: Annotated[str, typer.Option(help="camera model of the .npz files")] = "opencv",
     free: Annotated[str, typer.Option(help="parameters to estimate: fx,fy,…")] = "",
-    max_iterations: Annotated[int, typer.Option(min=1)] = 50,
+    max_iterations: Annotated[int, typer.Option(min=1)] = 100,
     portion: Annotated[int, typer.Option(min=1, help="cameras between two writes")] = 256,
     brief: Annotated[bool, typer.Option("--brief", help="no poses, no covariances")] = False,
     retry: Annotated[bool, typer.Option("--retry", help="again what did not converge")] = False,

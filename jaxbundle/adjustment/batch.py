@@ -101,7 +101,7 @@ def calibrate_batch(
     *,
     free: Sequence[str] | None = None,
     start: Mapping[str, float | Float[np.ndarray, " cameras"]] | None = None,
-    max_iterations: int = 50,
+    max_iterations: int = 100,
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> BatchCalibration:

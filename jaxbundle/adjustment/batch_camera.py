@@ -3,7 +3,8 @@
 Damping is Marquardt's (1963), λ·diag(N); λ follows Nielsen (1999). Near the minimum it is dropped:
 the last steps are Gauss–Newton's. A camera has converged when the undamped step promises to move
 no unknown by more than `TOLERANCE` of its standard deviation, d² = δᵀNδ ≤ (`TOLERANCE`·σ₀)²
-(compare `solver.py`); that step is still taken.
+(compare `solver.py`); that step is still taken. Where the damped steps have settled and the
+undamped one cannot be computed, the camera is singular.
 """
 
 import equinox as eqx
@@ -34,8 +35,8 @@ ROUNDING, NOISE_FLOOR = 2e-14, 1e-14
 """Below these a decrease of vᵀv, relative, and a residual, relative to the image, are noise."""
 LEAST_PIVOT = 1e-13
 """A scaled pivot of the undamped equations below this is rounding: singular."""
-REFUSALS = 3
-"""So many undamped steps are tried where the minimum seemed near and was not."""
+NEARER = 1e-2
+"""Each undamped step that was refused, or could not be computed, asks for so much nearer."""
 
 
 class Solved(eqx.Module):
@@ -91,7 +92,7 @@ def solve_camera(model, free, max_steps, size, seen: Sightings, start: Calibrati
         damping = jnp.where(first, FIRST_DAMPING, jnp.maximum(damping, LEAST_DAMPING))
         growth = jnp.where(accept, 2.0, 2.0 * loop.growth)
         refusals = loop.refusals + (loop.near & ~accept)
-        near = accept & ~first & (loop.predicted < NEAR * cost) & (refusals < REFUSALS)
+        near = accept & ~first & (loop.predicted < NEAR * NEARER**refusals * cost)
         near |= accept & (cost <= floor)
 
         used = jnp.where(near, 0.0, damping)
@@ -108,12 +109,15 @@ def solve_camera(model, free, max_steps, size, seen: Sightings, start: Calibrati
         small = jnp.maximum(TOLERANCE**2 * variance, jnp.maximum(2 * ROUNDING * cost, floor))
         solvable = jnp.isfinite(slope) & (factor.smallest > LEAST_PIVOT)
         status = jnp.where(loop.steps + 1 >= max_steps, LIMIT, RUNNING)
-        status = jnp.where(near & (slope <= small), CONVERGED, status)
-        status = jnp.where(near & ~solvable, SINGULAR, status)
+        status = jnp.where(near & solvable & (slope <= small), CONVERGED, status)
+        unsolved = near & ~solvable
+        settled = (loop.predicted <= small) & ~first
+        status = jnp.where(unsolved & settled, SINGULAR, status)
         status = jnp.where(first & ~finite, NOT_FINITE, status)
         return _Loop(
             at=at, trial=retract(free, at, d_pose, d_interior), N=N, cost=cost,
-            predicted=0.5 * (slope + used * damped), damping=damping, growth=growth, near=near,
+            predicted=jnp.where(unsolved, jnp.nan, 0.5 * (slope + used * damped)),
+            damping=damping, growth=growth, near=near,
             refusals=refusals, status=status, steps=loop.steps + 1,
         )  # fmt: skip
 
