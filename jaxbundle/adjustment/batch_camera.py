@@ -28,7 +28,7 @@ CONVERGED, LIMIT, SINGULAR, NOT_FINITE, TOO_FEW = range(5)
 RUNNING = -1
 
 TOLERANCE = 1e-5
-FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-9
+FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-14
 NEAR = 1e-2
 """Near the minimum: the last step promised to decrease vᵀv by less than this fraction."""
 ROUNDING, NOISE_FLOOR = 2e-14, 1e-14
