@@ -50,7 +50,7 @@ class JsonLines:
     def append(self, rows: Iterable[dict]) -> None:
         """Add rows; they are on the disk when this returns."""
         rows = list(rows)
-        lines = [json.dumps(without_nan(row), ensure_ascii=False) + "\n" for row in rows]
+        lines = [_text(row) + "\n" for row in rows]
         try:
             with self.path.open("a", encoding="utf-8", newline="\n") as file:
                 file.write("".join(lines))
@@ -68,6 +68,13 @@ class JsonLines:
             return ""
         except OSError as error:
             raise InputError(f"{self.path}: cannot be read: {error.strerror}") from None
+
+
+def _text(row: dict) -> str:
+    try:
+        return json.dumps(row, ensure_ascii=False, allow_nan=False)
+    except ValueError:
+        return json.dumps(without_nan(row), ensure_ascii=False)
 
 
 def _row(line: str) -> dict | None:
