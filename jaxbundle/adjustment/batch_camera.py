@@ -4,7 +4,7 @@ Damping is Marquardt's (1963), λ·diag(N); λ follows Nielsen (1999). Near the 
 the last steps are Gauss–Newton's. A camera has converged when the undamped step promises to move
 no unknown by more than `TOLERANCE` of its standard deviation, d² = δᵀNδ ≤ (`TOLERANCE`·σ₀)²
 (compare `solver.py`); that step is still taken. Where the damped steps have settled and the
-undamped one cannot be computed, the camera is singular.
+undamped one cannot be computed, or is rounding, the camera is singular.
 """
 
 import equinox as eqx
@@ -33,8 +33,11 @@ NEAR = 1e-2
 """Near the minimum: the last step promised to decrease vᵀv by less than this fraction."""
 ROUNDING, NOISE_FLOOR = 2e-14, 1e-14
 """Below these a decrease of vᵀv, relative, and a residual, relative to the image, are noise."""
-LEAST_PIVOT = 1e-13
-"""A scaled pivot of the undamped equations below this is rounding: singular."""
+INDETERMINATE = 1e-13
+"""A parameter of which so little is left beside all others is determined by rounding: singular.
+
+(5 coefficients: 1e-8 to 1e-4; 8, where 5 are enough: 1e-13 to 1e-11; one view repeated: 1e-15.)
+"""
 NEARER = 1e-2
 """Each undamped step that was refused, or could not be computed, asks for so much nearer."""
 
@@ -107,7 +110,7 @@ def solve_camera(model, free, max_steps, size, seen: Sightings, start: Calibrati
 
         variance = 2 * cost / jnp.maximum(redundancy, 1)
         small = jnp.maximum(TOLERANCE**2 * variance, jnp.maximum(2 * ROUNDING * cost, floor))
-        solvable = jnp.isfinite(slope) & (factor.smallest > LEAST_PIVOT)
+        solvable = jnp.isfinite(slope)
         status = jnp.where(loop.steps + 1 >= max_steps, LIMIT, RUNNING)
         status = jnp.where(near & solvable & (slope <= small), CONVERGED, status)
         unsolved = near & ~solvable
@@ -133,7 +136,7 @@ def solve_camera(model, free, max_steps, size, seen: Sightings, start: Calibrati
             status=jnp.where(few, TOO_FEW, RUNNING), steps=jnp.asarray(0),
         ),
     )  # fmt: skip
-    Q_interior, Q_pose = cofactors(factorise(loop.N, views, 0.0))
-    return Solved(
-        loop.trial, loop.cost, Q_interior, Q_pose, redundancy, views, loop.status, loop.steps
-    )
+    Q_interior, Q_pose, weakest = cofactors(factorise(loop.N, views, 0.0))
+    lost = (loop.status == CONVERGED) & ~(weakest > INDETERMINATE)
+    status = jnp.where(lost, SINGULAR, loop.status)
+    return Solved(loop.trial, loop.cost, Q_interior, Q_pose, redundancy, views, status, loop.steps)
