@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from jaxbundle.adjustment import Problem as Problem
     from jaxbundle.adjustment import make_problem as make_problem
     from jaxbundle.adjustment import solve as solve
+    from jaxbundle.adjustment.batch import BatchCalibration as BatchCalibration
+    from jaxbundle.adjustment.batch import calibrate_batch as calibrate_batch
     from jaxbundle.bundle import adjust as adjust
     from jaxbundle.errors import InputError as InputError
     from jaxbundle.errors import NotSolvedError as NotSolvedError
@@ -40,16 +42,17 @@ if TYPE_CHECKING:
     from jaxbundle.result import Adjustment as Adjustment
 
 _HOME = {
-    "jaxbundle.adjustment": ("Problem", "make_problem", "solve",),
+    "jaxbundle.adjustment": ("Problem", "make_problem", "solve"),
+    "jaxbundle.adjustment.batch": ("BatchCalibration", "calibrate_batch"),
     "jaxbundle.bundle": ("adjust",),
-    "jaxbundle.errors": ("InputError", "NotSolvedError",),
+    "jaxbundle.errors": ("InputError", "NotSolvedError"),
     "jaxbundle.gradients": ("check_gradients",),
-    "jaxbundle.io": ("read_network", "write_project",),
-    "jaxbundle.network": ("Camera", "Network",),
-    "jaxbundle.network.arrays": ("Data", "Values",),
+    "jaxbundle.io": ("read_network", "write_project"),
+    "jaxbundle.network": ("Camera", "Network"),
+    "jaxbundle.network.arrays": ("Data", "Values"),
     "jaxbundle.network.build": ("make_network",),
     "jaxbundle.network.check": ("check_network",),
-    "jaxbundle.network.simulate": ("simulate", "simulate_with_truth",),
+    "jaxbundle.network.simulate": ("simulate", "simulate_with_truth"),
     "jaxbundle.network.stations": (
         "aerial_block", "cloud_of_targets", "grid_of_targets", "ring_of_stations",
         "stations_looking_at",

@@ -1,4 +1,4 @@
-"""The command line: `jaxbundle adjust`, `jaxbundle convert`.
+"""The command line: `jaxbundle adjust`, `jaxbundle batch`, `jaxbundle convert`.
 
 Exit status: 0 solved; 2 bad input (one line, nothing written); 3 not solved (says why).
 """
@@ -9,10 +9,17 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+)
 
 import jaxbundle
 from jaxbundle import report
+from jaxbundle.batches import run_batch
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io import read_network, write_project
 from jaxbundle.io.csv_tables import write_csv, write_text
@@ -90,6 +97,36 @@ def adjust(
         print(report.text(result))
     if not result.converged:
         raise NotSolvedError(_why_not(result))
+
+
+@app.command()
+def batch(
+    inputs: Annotated[list[str], typer.Argument(help=".npz of many cameras; projects")],
+    json_lines: Annotated[str, typer.Option(help="file of results, one a line; is continued")],
+    model: Annotated[str, typer.Option(help="camera model of the .npz files")] = "opencv",
+    free: Annotated[str, typer.Option(help="parameters to estimate: fx,fy,…")] = "",
+    max_iterations: Annotated[int, typer.Option(min=1)] = 100,
+    portion: Annotated[int, typer.Option(min=1, help="cameras between two writes")] = 256,
+    brief: Annotated[bool, typer.Option("--brief", help="no poses, no covariances")] = False,
+    retry: Annotated[bool, typer.Option("--retry", help="again what did not converge")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="print nothing but errors")] = False,
+) -> None:
+    """Calibrate many cameras and adjust many networks; interrupted, it takes up where it was."""
+    jaxbundle.enable_x64()
+    console = Console(stderr=True)
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
+    with Progress(
+        *columns, console=console, transient=True, disable=quiet or not console.is_terminal
+    ) as bar:
+        task = bar.add_task("batch", total=None)
+        counts = run_batch(
+            inputs, json_lines, model=model, free=free.split(",") if free else None,
+            max_iterations=max_iterations, portion=portion, brief=brief, retry=retry,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )  # fmt: skip
+    if not quiet:
+        said = ", ".join(f"{number} {status}" for status, number in counts.items() if number)
+        print(f"{json_lines}: {said or 'nothing to do'}")
 
 
 @app.command()

@@ -21,6 +21,7 @@ LAYERS = (
     "report",
     "result",
     "bundle",
+    "batches",
     "cli",
     "__main__",
 )

@@ -51,8 +51,9 @@ def factorise(
     gauge: Tangent | None = None,
     regular: Bool[Array, ""] | bool = True,
 ) -> Factor:
-    """Factorise N + `damping` (diagonals; for images also matrices), with the datum directions `gauge` (last axis) made regular if
-    `regular`: damping does that too, and the damped step should be no other.
+    """Factorise N + `damping` (diagonals; for images also matrices), with the datum directions
+    `gauge` (last axis) made regular if `regular`: damping does that too, and the damped step
+    should be no other.
 
     NaN where a pivot is rounding, as where it is negative: chance decides between the two.
     """

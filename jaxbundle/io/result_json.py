@@ -74,15 +74,15 @@ def write_result(adjustment, path: str | Path, brief: bool = False) -> None:
 
 def result_text(adjustment, brief: bool = False) -> str:
     """The result as JSON text, one line an image, a point and a residual."""
-    return json.dumps(_without_nan(result_dict(adjustment, brief)), ensure_ascii=False) + "\n"
+    return json.dumps(without_nan(result_dict(adjustment, brief)), ensure_ascii=False) + "\n"
 
 
-def _without_nan(value):
+def without_nan(value):
     """NaN and infinity do not exist in JSON: null."""
     if isinstance(value, dict):
-        return {key: _without_nan(v) for key, v in value.items()}
+        return {key: without_nan(v) for key, v in value.items()}
     if isinstance(value, list):
-        return [_without_nan(v) for v in value]
+        return [without_nan(v) for v in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

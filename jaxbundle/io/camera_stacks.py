@@ -1,0 +1,85 @@
+"""Many cameras in one file: an `.npz` with the arrays of `calibrate_batch`.
+
+| array | shape | |
+|---|---|---|
+| `object_points` | [points, 3] or [cameras, points, 3] | known coordinates |
+| `image_points` | [cameras, views, points, 2] | pixels |
+| `image_size` | [2] | width, height |
+| `visible` | [cameras, views, points] | optional: what was measured |
+| `ids` | [cameras] | optional: names; otherwise 0, 1, 2, … |
+"""
+
+import dataclasses
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+
+NEEDED = ("object_points", "image_points", "image_size")
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraStack:
+    """The cameras of a file; `keys`: one a camera, made of the file's name and its id."""
+
+    keys: tuple[str, ...]
+    object_points: np.ndarray
+    image_points: np.ndarray
+    image_size: tuple[float, ...]
+    visible: np.ndarray | None
+
+    def arguments(self, chosen: np.ndarray) -> dict:
+        """Arguments of `calibrate_batch` for some of the cameras."""
+        single = self.object_points.ndim == 2
+        return dict(
+            object_points=self.object_points if single else self.object_points[chosen],
+            image_points=self.image_points[chosen],
+            image_size=self.image_size,
+            visible=None if self.visible is None else self.visible[chosen],
+        )
+
+
+def read_camera_stack(path: str | Path) -> CameraStack:
+    """The cameras of an `.npz` file.
+
+    **Raises:** `InputError` if an array is missing or its shape does not fit the others.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in (*NEEDED, "visible", "ids") if name in file}
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path}: not a readable .npz file of plain arrays ({error})") from None
+    missing = [name for name in NEEDED if name not in arrays]
+    if missing:
+        raise InputError(
+            f"{path}: no array {missing[0]!r}; expected {', '.join(NEEDED)} and, if needed, "
+            "visible and ids"
+        )
+    X, xy, size = (arrays[name] for name in NEEDED)
+    if xy.ndim != 4 or xy.shape[3] != 2:
+        _refuse(path, "image_points", xy, "[cameras, views, points, 2]")
+    cameras, _, points, _ = xy.shape
+    if X.shape not in ((points, 3), (cameras, points, 3)):
+        _refuse(path, "object_points", X, f"[{points}, 3] or [{cameras}, {points}, 3]")
+    if size.shape != (2,):
+        _refuse(path, "image_size", size, "[2], width and height in pixels")
+    visible, ids = arrays.get("visible"), arrays.get("ids", np.arange(cameras))
+    if visible is not None and visible.shape != xy.shape[:3]:
+        _refuse(path, "visible", visible, f"{list(xy.shape[:3])}")
+    if ids.shape != (cameras,):
+        _refuse(path, "ids", ids, f"[{cameras}]")
+    if len({*ids.tolist()}) < cameras:
+        raise InputError(f"{path}: ids must differ, but some occur twice")
+    for name in ("object_points", "image_points", "image_size"):
+        if arrays[name].dtype.kind not in "fiu":
+            raise InputError(f"{path}: {name} must be numbers, but is {arrays[name].dtype}")
+    keys = tuple(f"{path}#{id}" for id in ids.tolist())
+    return CameraStack(keys, X, xy, tuple(size.tolist()), visible)
+
+
+def _refuse(path, name, array, expected):
+    raise InputError(f"{path}: {name} has the shape {list(array.shape)}, expected {expected}")
