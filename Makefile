@@ -32,6 +32,7 @@ test: install
 bench: install
 	$(BIN)/python benchmarks/big_block.py
 	$(BIN)/python benchmarks/calibration.py
+	$(BIN)/python benchmarks/bal.py --street 100 10000 --arc 40 10000
 
 clean:
 	rm -rf $(VENV) out

@@ -28,7 +28,11 @@ pytestmark = [
 ]
 
 
-@pytest.fixture(scope="module", params=PROJECTS)
+# All tests of a project on one worker, which adjusts it once.
+EACH = [pytest.param(name, marks=pytest.mark.xdist_group(name)) for name in PROJECTS]
+
+
+@pytest.fixture(scope="module", params=EACH)
 def case(request):
     """(adjustment, reference, whether object coordinates are comparable as they are)."""
     path = CASES / f"{request.param}.toml"

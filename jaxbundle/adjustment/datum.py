@@ -132,9 +132,10 @@ def move_to_datum(structure: Structure, values: Values, start: Values, steps: in
     size = jnp.abs(point).max()
 
     def moving(state):
-        # Until rounding: no move at all, or none smaller than the one before.
+        # Until rounding: no move at all, or a small one that is no smaller than the one before.
         _, _, distance, before, count = state
-        return (distance > 1e-12 * size) & (distance < 0.5 * before) & (count < steps)
+        falling = (distance > 1e-6 * size) | (distance < 0.5 * before)
+        return (distance > 1e-12 * size) & falling & (count < steps)
 
     def newton(state):
         tau, _, before, _, count = state

@@ -168,7 +168,6 @@ def directions(problem, rng):
         "shared cameras of two models",
         "own cameras of two models",
         "held images, exterior priors",
-        "free",
         "free with distances",
         "minimal",
     ],

@@ -13,7 +13,7 @@ import pytest
 from adjustment_checks import make, solved
 
 SCRIPT = Path(__file__).with_name("sharded_run.py")
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("sharding")]  # one worker, one cache
 
 
 def start(*arguments):
