@@ -23,7 +23,7 @@ def start(*arguments):
     )  # fmt: skip
 
 
-def finish(process, timeout=240):
+def finish(process, timeout=600):
     out, error = process.communicate(timeout=timeout)
     assert process.returncode == 0, error[-2000:]
     return json.loads(out.splitlines()[-1])
@@ -71,7 +71,7 @@ def test_in_several_processes(processes):
 def test_a_lost_process_ends_the_others():
     port = free_port()
     running = [start(1, 2, k, port, int(k == 1)) for k in range(2)]
-    running[1].communicate(timeout=120)
-    out, error = running[0].communicate(timeout=120)
+    running[1].communicate(timeout=300)
+    out, error = running[0].communicate(timeout=300)
     assert running[0].returncode != 0
     assert error and not out
