@@ -31,7 +31,6 @@ from jaxbundle.adjustment.solve import make_solver  # noqa: E402
 
 COUNTS = {
     "shared cameras of two models": (2,),
-    "own cameras of two models": (2,),
     "free with distances": (1, 2, 4),
 }
 

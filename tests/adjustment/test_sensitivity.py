@@ -166,9 +166,7 @@ def directions(problem, rng):
     "name",
     [
         "shared cameras of two models",
-        "own cameras of two models",
         "held images, exterior priors",
-        "free with distances",
         "minimal",
     ],
 )

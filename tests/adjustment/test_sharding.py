@@ -42,7 +42,7 @@ def on_one_processor():
 
 @pytest.mark.parametrize(
     "name, devices",
-    [("shared cameras of two models", 2), ("own cameras of two models", 2)]
+    [("shared cameras of two models", 2)]
     + [("free with distances", devices) for devices in (1, 2, 4)],
 )
 def test_on_several_devices(name, devices):
