@@ -2,11 +2,10 @@
 
 from pathlib import Path
 
+import nbclient
+import nbformat
 import pytest
-
-nbformat = pytest.importorskip("nbformat", reason="notebooks need nbformat")
-nbclient = pytest.importorskip("nbclient", reason="notebooks need nbclient")
-kernelspec = pytest.importorskip("ipykernel.kernelspec", reason="notebooks need ipykernel")
+from ipykernel import kernelspec
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))

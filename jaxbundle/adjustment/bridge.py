@@ -80,7 +80,10 @@ class SchurLinearSolver(lx.AbstractLinearSolver):
         return solve(factor, right), lx.RESULTS.successful, {}
 
     def transpose(self, state, options):
-        raise NotImplementedError("the adjustment's Jacobian is not square")
+        raise NotImplementedError(
+            "a stock solver with the Schur step has no derivatives of its own (the Jacobian is not "
+            "square); differentiate jaxbundle.solve instead"
+        )
 
     def conj(self, state, options):
         return state, options

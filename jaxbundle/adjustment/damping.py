@@ -10,9 +10,7 @@ programs that store [R t],
 
 a turn is about that origin and weighs the more the farther away it is. D is diag(N) in these,
 carried back to (δX0, δθ): D = Tᵀ·diag(T⁻ᵀ·N·T⁻¹)·T with T = ∂(δt, δθ)/∂(δX0, δθ), a block for each
-image. Cameras and points have their diagonal. (Measured to 1.0001 × the final cost: 4 steps instead
-of 5 for 16 images of a relief, 20 instead of 21 for 49 along a street, and on a street of 200 with
-bad start values 38 instead of more than 80.)
+image. Cameras and points have their diagonal.
 """
 
 import jax

@@ -119,7 +119,7 @@ def _add_pairs(K_a, K_b, pairs, Z_a, Z_b, Q, block_a, block_b, same):
     `same`: both sides are one table; pairs within a block are then listed in both orders (a row
     with itself once).
     """
-    if not pairs.first:
+    if not pairs.row.shape[0]:
         return K_a, K_b
     a, b = pairs.flat()
     missing = a >= K_a.shape[0] - pairs.empty[0]

@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy import optimize
 
 import jaxbundle
 from jaxbundle import cameras
@@ -64,7 +65,6 @@ def solved(three):
 
 
 def test_equals_a_dense_solution_with_its_standard_deviations(three, solved):
-    optimize = pytest.importorskip("scipy.optimize")
     assert list(solved.status) == ["converged"] * 3 and solved.parameters == NAMES
     xy, p, turn, shift = (column[0] for column in three)
 

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pandas
 import pytest
 
 from jaxbundle.errors import InputError
@@ -62,7 +63,6 @@ def test_columns_make_the_same_network():
 
 
 def test_data_frames_make_the_same_network():
-    pandas = pytest.importorskip("pandas")
     frames = build(
         cameras=pandas.DataFrame(CAMERAS),
         images=pandas.DataFrame(IMAGES),
@@ -76,7 +76,6 @@ def test_data_frames_make_the_same_network():
 
 def test_a_data_frame_may_number_its_points_with_gaps():
     """A column of whole numbers with a missing value is float in pandas."""
-    pandas = pytest.importorskip("pandas")
     points = pandas.DataFrame({"id": [7.0, 8.0], "role": "tie", "X": 0, "Y": 0, "Z": 0})
     observations = {"image": [1], "point": [8], "x": [0.0], "y": [0.0]}
     network = build(points=points, observations=observations)
