@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from jaxbundle.adjustment.datum import move_to_datum
-from jaxbundle.adjustment.problem import Problem, count_rows, make_problem
+from jaxbundle.adjustment.problem import Problem, count_rows, make_problem, with_factor
 from jaxbundle.adjustment.sharding import distribute, find_minimum_of_shards
 from jaxbundle.adjustment.solve import converged, find_minimum, make_solver
 from jaxbundle.adjustment.solver import Minimum
@@ -44,6 +44,7 @@ def adjust(
     network: Network,
     *,
     method: str = "levenberg-marquardt",
+    reduction: str | None = None,
     max_iterations: int = 100,
     snooping: str | None = None,
     significance: float = 0.001,
@@ -58,6 +59,8 @@ def adjust(
 
     - `network`: see `jaxbundle.make_network`, `jaxbundle.read_network`, `jaxbundle.simulate`.
     - `method`: `"levenberg-marquardt"` or `"gauss-newton"`.
+    - `reduction`: how the reduced system of images and cameras is solved: `"dense"`, `"banded"` or
+      `"iterative"`; chosen by its size and fill if not given.
     - `snooping`: `"pope"` or `"baarda"`: remove blunders one at a time at the level
       `significance`.
     - `eliminate`: fix additional parameters with t < `critical_t` at 0, the least significant
@@ -72,10 +75,11 @@ def adjust(
     """
     network = check_network(network)
     network, check_points, check_rays = split_check_points(network)
-    problem = make_problem(network)
-    network = problem.network
+    problem = make_problem(network, reduction)
+    network, used = problem.network, problem.structure.reduction
     options = {"method": method, "max_steps": max_iterations + 1, "progress": progress}
     minimum = _minimise(problem, problem.data.start, **options)
+    problem = with_factor(problem)
 
     removed, eliminated = [], []
     if _solved(problem, minimum):
@@ -91,11 +95,11 @@ def adjust(
     check = None
     if len(check_points):
         check = lambda result: intersect_check_points(
-            problem, result.values, result.cofactors, check_points, check_rays
+            problem, result.values, result.factor, check_points, check_rays
         )
     return Adjustment(
         network, problem, minimum, removed=tuple(removed), eliminated=tuple(eliminated),
-        undetermined=tuple(names), check=check, method=method,
+        undetermined=tuple(names), check=check, method=method, reduction=used,
     )  # fmt: skip
 
 

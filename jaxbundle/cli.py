@@ -24,6 +24,7 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io import read_network, write_project
 from jaxbundle.io.csv_tables import write_csv, write_text
 from jaxbundle.io.result_json import result_text, write_result
+from jaxbundle.network.reduction import REDUCTIONS
 from jaxbundle.plotting import save_figures
 from jaxbundle.result import Adjustment
 
@@ -56,6 +57,10 @@ def adjust(
     method: Annotated[
         str, typer.Option(help="levenberg-marquardt or gauss-newton")
     ] = "levenberg-marquardt",
+    reduction: Annotated[
+        str | None,
+        typer.Option(help="of the reduced system: dense, banded or iterative; chosen if not given"),
+    ] = None,
     snooping: Annotated[
         str | None, typer.Option(help="remove blunders one at a time: pope or baarda")
     ] = None,
@@ -75,12 +80,15 @@ def adjust(
     network = read_network(input, format, tuple(set or ()))
     if method not in ("levenberg-marquardt", "gauss-newton"):
         raise InputError(f"--method {method!r}: levenberg-marquardt or gauss-newton")
+    if reduction not in (None, *REDUCTIONS):
+        raise InputError(f"--reduction {reduction!r}: {', '.join(REDUCTIONS)}")
     if snooping not in (None, "pope", "baarda"):
         raise InputError(f"--snooping {snooping!r}: pope or baarda")
     with _progress(quiet or json == "-") as tell:
         result = jaxbundle.adjust(
             network,
             method=method,
+            reduction=reduction,
             max_iterations=max_iterations,
             snooping=snooping,
             eliminate=eliminate,

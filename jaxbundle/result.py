@@ -28,6 +28,7 @@ from jaxbundle.geometry import (
     retract_quaternion,
 )
 from jaxbundle.network.arrays import Tangent, Values, retract
+from jaxbundle.network.reduction import FACTORS
 from jaxbundle.network.tables import EXTERIOR, Network
 from jaxbundle.statistics import (
     CheckPoints,
@@ -57,6 +58,7 @@ class Adjustment:
 
     - `converged`, `termination`, `iterations`, `sigma0`, `vtpv`, `redundancy`, `counts`
     - `cameras`, `images`, `points`, `residuals`, `distances`: tables (dicts of numpy columns)
+    - `method`, `reduction`: of the solution; the latter of the reduced system of images and cameras
     - `warnings`, `removed` (data snooping), `eliminated` (insignificant parameters),
       `undetermined` (names, where the network is singular)
     """
@@ -72,6 +74,7 @@ class Adjustment:
         undetermined: tuple[str, ...] = (),
         check: Callable[["Adjustment"], CheckPoints] | None = None,
         method: str = "levenberg-marquardt",
+        reduction: str | None = None,
     ):
         self.network = network
         self.problem = problem
@@ -80,6 +83,7 @@ class Adjustment:
         self.eliminated = eliminated
         self.undetermined = undetermined
         self.method = method
+        self.reduction = reduction or problem.structure.reduction
         self._check = check
 
     # --- how it ended -----------------------------------------------------------------------
@@ -154,13 +158,20 @@ class Adjustment:
     # --- cofactors --------------------------------------------------------------------------
 
     @functools.cached_property
-    def _factor(self):
+    def factor(self):
+        """The normal equations at the solution, factorised (see `jaxbundle.adjustment.schur`)."""
         return undamped_factor(self.problem.structure, self.values, self.problem.data)
 
     @functools.cached_property
     def cofactors(self):
         """Blocks of the cofactor matrix (see `jaxbundle.statistics.cofactors`)."""
-        return cofactors(self.problem.structure, self.values, self._factor)
+        if self.problem.structure.reduction not in FACTORS:
+            raise NotSolvedError(
+                f"the reduced system of {self.problem.structure.reduced_size} unknowns was solved "
+                "by iteration and its factor does not fit into memory: there are coordinates, σ0 "
+                "and covariances of single unknowns (`covariance`), but no others"
+            )
+        return cofactors(self.problem.structure, self.values, self.factor)
 
     @functools.cached_property
     def reliability(self) -> Reliability:
@@ -209,11 +220,8 @@ class Adjustment:
     def image_covariance(self) -> Float[np.ndarray, "images 6 6"]:
         """Covariance of X0, Y0, Z0, ω, φ, κ, angles by their exact Jacobian; radians."""
         s = self.problem.structure
-        n, w = s.images, s.image_width
-        at = np.arange(n)
-        Q = np.asarray(self.cofactors.reduced)[: n * w, : n * w].reshape(n, w, n, w)
-        Q = Q[at, :, at, :][:, :6, :6]
-        A = np.zeros((n, 6, 6))
+        Q = np.asarray(self.cofactors.image)[:, :6, :6]
+        A = np.zeros((s.images, 6, 6))
         A[:, :3, :3] = np.eye(3)
         A[:, 3:, 3:] = self._angles_like_start[1]
         free = np.asarray(s.image_free)
@@ -240,10 +248,8 @@ class Adjustment:
         """Names and covariance of the free parameters of a camera."""
         c, s = self._camera(camera), self.problem.structure
         free = np.flatnonzero(np.asarray(s.camera_free)[c])
-        start = s.images * s.image_width + c * s.camera_width
-        if s.own_camera:
-            start = c * s.image_width + 6
-        Q = np.asarray(self.cofactors.reduced)[np.ix_(start + free, start + free)]
+        Q = self.cofactors.image[c, 6:, 6:] if s.own_camera else self.cofactors.camera[c]
+        Q = np.asarray(Q)[np.ix_(free, free)]
         names = interior_names(self.problem, c)
         return [names[i].parameter for i in free], self.sigma0**2 * Q
 
@@ -296,7 +302,7 @@ class Adjustment:
             return jnp.atleast_1d(function(retract(s, values, tangent)))
 
         rows = jax.jacrev(of_tangent)(zero)
-        Q = propagate(s, values, self._factor, rows)
+        Q = propagate(s, values, self.factor, rows)
         return self.sigma0**2 * np.asarray(Q)
 
     # --- tables -----------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from jaxbundle.adjustment.datum import (
 )
 from jaxbundle.errors import InputError
 from jaxbundle.network.arrays import Data
+from jaxbundle.network.reduction import FACTORS, REDUCTIONS
 from jaxbundle.network.structure import Structure, make_structure, order_cameras
 from jaxbundle.network.tables import Network
 
@@ -58,15 +59,19 @@ class Problem:
     counts: Counts
 
 
-def make_problem(network: Network) -> Problem:
+def make_problem(network: Network, reduction: str | None = None) -> Problem:
     """Index plan, arrays and datum of a checked network (see `jaxbundle.network.check_network`).
+
+    `reduction`: how the reduced system is solved, "dense", "banded" or "iterative"; chosen by its
+    size and fill if not given.
 
     **Raises:** `InputError` where the datum asked for cannot be had; `RuntimeError` without
     64-bit floats.
     """
     require_x64()
     network = order_cameras(network)
-    structure, data, origin, rays = make_structure(network)
+    ways = REDUCTIONS if reduction is None else (reduction,)
+    structure, data, origin, rays = make_structure(network, ways=ways)
     gauge = open_similarities(structure, data)
     defect = gauge.shape[1]
     if network.datum == "control" and defect:
@@ -81,10 +86,30 @@ def make_problem(network: Network) -> Problem:
             lambda s: s.datum_weight, structure,
             jnp.asarray(_datum_weight(network, structure, data)),
         )  # fmt: skip
-        if structure.band is not None:
-            pins = choose_pins(structure, data)
-            structure = eqx.tree_at(lambda s: s.pins, structure, jnp.asarray(pins))
+        structure = _pinned(structure, data)
     return Problem(network, structure, data, origin, rays, count_rows(structure, data))
+
+
+def _pinned(structure: Structure, data: Data) -> Structure:
+    if not (structure.defect and structure.reduction == "banded"):
+        return structure
+    pins = choose_pins(structure, data)
+    return eqx.tree_at(lambda s: s.pins, structure, jnp.asarray(pins))
+
+
+def with_factor(problem: Problem) -> Problem:
+    """The problem with a reduced system that can be factorised, as statistics need it; the same
+    where no factor fits into memory."""
+    s = problem.structure
+    if s.reduction in FACTORS:
+        return problem
+    plan, *_ = make_structure(problem.network, chunk=s.table.chunk, ways=FACTORS)
+    if plan.reduction is None:
+        return problem
+    s = dataclasses.replace(
+        s, reduction=plan.reduction, image_pairs=plan.image_pairs, band=plan.band
+    )
+    return dataclasses.replace(problem, structure=_pinned(s, problem.data))
 
 
 def require_x64() -> None:

@@ -16,17 +16,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxbundle.adjustment.banded import BandFactor
+from jaxbundle.adjustment.iterative import ConjugateGradients, precondition
 from jaxbundle.adjustment.normal import Normal
-from jaxbundle.adjustment.reduced import (
-    BandFactor,
-    DenseFactor,
-    Parts,
-    dense_matrix,
-    factorise_reduced,
-)
+from jaxbundle.adjustment.parts import Parts, to_images, to_points
+from jaxbundle.adjustment.reduced import DenseFactor, dense_matrix, factorise_reduced
 from jaxbundle.network.arrays import Tangent
 from jaxbundle.network.structure import Structure
 
+EXACT = 1e-13
+"""Relative residual of a reduced system solved by iteration, where it must be as good as exact."""
 PIVOT = 1e-13
 """A pivot below this fraction of its diagonal element is rounding: nothing determines it."""
 
@@ -38,7 +37,7 @@ class Factor(eqx.Module):
     """
 
     structure: Structure
-    reduced: DenseFactor | BandFactor
+    reduced: DenseFactor | BandFactor | ConjugateGradients
     point: Float[Array, "points 3 3"]
     ray: Float[Array, "rays 3 image_block"]
     incidence: Float[Array, "incidences 3 camera_block"]
@@ -50,16 +49,22 @@ def factorise(
     damping: Tangent | None = None,
     gauge: Tangent | None = None,
     regular: Bool[Array, ""] | bool = True,
+    tolerance: float = EXACT,
 ) -> Factor:
     """Factorise N + `damping` (diagonals; for images also matrices), with the datum directions
     `gauge` (last axis) made regular if `regular`: damping does that too, and the damped step
-    should be no other.
+    should be no other. `tolerance`: of a reduced system solved by iteration.
 
     NaN where a pivot is rounding, as where it is negative: chance decides between the two.
     """
-    parts, point, ray, incidence = eliminate(structure, normal, damping)
-    frame = _frame(structure, normal, damping, gauge)
-    factor = factorise_reduced(structure, parts, *frame, regular)
+    if damping is not None:
+        normal = _damped(normal, damping)
+    parts, point, ray, incidence = eliminate(structure, normal)
+    scale, free, directions = _frame(structure, normal, gauge)
+    if structure.reduction == "iterative":
+        factor = precondition(structure, parts, normal.image, ray, scale, free, tolerance)
+    else:
+        factor = factorise_reduced(structure, parts, scale, free, directions, regular)
     sound = jnp.all(factor.pivots**2 > PIVOT)
     factor = jax.tree.map(lambda x: _where_floating(sound, x), factor)
     return Factor(structure, factor, point, ray, incidence)
@@ -71,16 +76,15 @@ def scaled_matrix(
     """The reduced matrix scaled to a unit diagonal, datum directions made regular; its lower
     triangle."""
     parts, *_ = eliminate(structure, normal)
-    return dense_matrix(structure, parts, *_frame(structure, normal, None, gauge))
+    return dense_matrix(structure, parts, *_frame(structure, normal, gauge))
 
 
 def _where_floating(sound, x):
     return jnp.where(sound, x, jnp.nan) if jnp.issubdtype(x.dtype, jnp.floating) else x
 
 
-def _frame(s: Structure, normal: Normal, damping, gauge):
+def _frame(s: Structure, normal: Normal, gauge):
     """Scale, free unknowns and datum directions of the reduced system."""
-    normal = normal if damping is None else _damped(normal, damping)
     diagonal = reduced_vector(s, _diagonal_of(normal))
     scale = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1.0))
     directions = jnp.zeros((s.reduced_size, 0))
@@ -89,12 +93,10 @@ def _frame(s: Structure, normal: Normal, damping, gauge):
     return scale, reduced_free(s), directions
 
 
-def eliminate(structure: Structure, normal: Normal, damping: Tangent | None = None):
+def eliminate(structure: Structure, normal: Normal):
     """Eliminate the points: the parts of the reduced matrix, and what substitution needs (the
     last fields of `Factor`)."""
     s = structure
-    if damping is not None:
-        normal = _damped(normal, damping)
     held = 1.0 - s.point_free * s.eliminated
     V = normal.point * s.eliminated[:, :, None] + held[:, :, None] * jnp.eye(3)
     point = inverse_cholesky_3x3(V)
@@ -180,7 +182,7 @@ def _reduced_parts(s, normal, ray, incidence) -> Parts:
     """S = A − ZᵀZ, in parts."""
     I, w = s.images, s.image_width
     C, k, K = s.cameras, s.camera_width, s.kept.shape[0]
-    pairs = -s.image_pairs.sum(ray, ray)
+    pairs = -s.image_pairs.sum(ray, ray)  # none where S is only applied
     own = -s.table.products_by_image(ray, ray)
     B, D = jnp.zeros((C, I, k, w)), jnp.zeros((C, C, k, k))
     if k:
@@ -221,7 +223,7 @@ def _matrix(blocks):
 def _gather_reduced(f, h):
     """Zᵀh as a tangent of the reduced system."""
     s = f.structure
-    image = s.table.products_by_image(f.ray, h[s.point][:, :, None])[:, :, 0]
+    image = to_images(s, f.ray, h)
     camera = jnp.zeros((s.cameras, s.camera_width))
     if s.camera_width:
         camera = jax.ops.segment_sum(
@@ -234,9 +236,7 @@ def _gather_reduced(f, h):
 def _scatter_points(f, image, camera):
     """Z·δ for changes of images and cameras, [points, 3]."""
     s = f.structure
-    total = jax.ops.segment_sum(
-        s.table.times_image(f.ray, image), s.point, s.points
-    )
+    total = to_points(s, f.ray, image)
     if s.camera_width:
         total += jax.ops.segment_sum(
             jnp.einsum("qij,qj->qi", f.incidence, camera[s.incidence.camera]),

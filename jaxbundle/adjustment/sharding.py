@@ -144,7 +144,7 @@ def _part(problem: Problem, chosen, first: bool) -> tuple[Structure, Data]:
             distances=distances,
         ),
         chunk=s.table.chunk, pair_lengths=CHUNK_LENGTHS,
-        pair_blocks=(s.image_pairs.row, s.image_pairs.column),
+        pair_blocks=(s.image_pairs.row, s.image_pairs.column), ways=(s.reduction,),
     )  # fmt: skip
     structure = dataclasses.replace(
         structure, all_free=s.all_free, all_eliminated=s.all_eliminated,

@@ -59,6 +59,9 @@ Without redundancy all residuals vanish and no σ0 says when to stop: the wider 
 WIDE = 1e8
 """Steps less damped than this need the datum directions made regular."""
 
+INEXACT = 1e-2
+"""Relative residual of a reduced system solved by iteration, in the steps of the solver."""
+
 NEAR = 1e-3
 """Near the solution: the last step promised to decrease vᵀPv by less than this fraction."""
 
@@ -95,7 +98,9 @@ class SchurDescent(optx.AbstractDescent):
     def step(self, step_size: Float[Array, ""], state: Damped):
         damping = jax.tree.map(lambda d: d / step_size, state.metric)
         regular = step_size > WIDE
-        factor = factorise(self.structure, state.normal, damping, state.gauge, regular)
+        factor = factorise(
+            self.structure, state.normal, damping, state.gauge, regular, INEXACT
+        )
         change = solve(factor, jax.tree.map(jnp.negative, state.gradient))
         return change, optx.RESULTS.successful
 

@@ -20,6 +20,8 @@ def result_dict(adjustment, brief: bool = False) -> dict:
         "converged": adjustment.converged,
         "termination": adjustment.termination,
         "iterations": adjustment.iterations,
+        "method": adjustment.method,
+        "reduction": adjustment.reduction,
         "observations": counts.observations,
         "pseudo_observations": counts.pseudo_observations,
         "unknowns": counts.unknowns,

@@ -63,12 +63,39 @@ class Pairs(eqx.Module):
             total, _ = jax.lax.scan(add, total, chunks)
         return total[:-1]
 
-    def flat(self) -> tuple[Int[Array, " pairs"], Int[Array, " pairs"]]:
-        """All pairs in one list; the missing ones too."""
-        return (
-            jnp.concatenate([i.ravel() for i in self.first]),
-            jnp.concatenate([i.ravel() for i in self.second]),
-        )
+    def spread(
+        self,
+        a: Float[Array, "rows d m"],
+        b: Float[Array, "rows d n"],
+        Q: Float[Array, "blocks m n"],
+        same: bool,
+    ) -> tuple[Float[Array, "rows d m"], Float[Array, "rows d n"]]:
+        """The other way round: Σ b·Qᵀ for every row of the first table over its partners b in the
+        second, and Σ a·Q for every row of the second; Q is the block of each pair.
+
+        `same`: both are one table, and pairs within a block are listed in both orders, a row with
+        itself once; they count for the first table only."""
+        twice = same & (self.row == self.column)
+        Q_second = jnp.where(twice[:, None, None], 0.0, Q)
+        rows = a.shape[0], b.shape[0]
+        a = a if self.empty[0] else _with_zero_row(a)
+        b = b if self.empty[1] else _with_zero_row(b)
+        missing = a.shape[0] - 1, b.shape[0] - 1
+        totals = jnp.zeros_like(a), jnp.zeros_like(b)
+        for first, second, block in zip(self.first, self.second, self.block):
+            if not first.shape[0]:
+                continue
+            step = max(1, ROWS_PER_STEP // first.shape[1])
+
+            def add(totals, chunk):
+                i, j, k = chunk
+                to_first = jnp.einsum("cldn,cmn->cldm", b[j], Q[k])
+                to_second = jnp.einsum("cldm,cmn->cldn", a[i], Q_second[k])
+                return (totals[0].at[i].add(to_first), totals[1].at[j].add(to_second)), None
+
+            chunks = _in_steps(first, second, block, step, missing, self.row.shape[0])
+            totals, _ = jax.lax.scan(add, totals, chunks)
+        return totals[0][: rows[0]], totals[1][: rows[1]]
 
 
 def _with_zero_row(a):

@@ -21,9 +21,15 @@ from jaxtyping import Array, Float, Int, PyTree
 from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, quaternion_from_matrix
 from jaxbundle.network.arrays import Data, Values
-from jaxbundle.network.band import Band, find_band
 from jaxbundle.network.pairs import Pairs, make_pairs, pairs_between, pairs_within
 from jaxbundle.network.rays import RayTable, lay_out, make_ray_table
+from jaxbundle.network.reduction import (
+    MOST_PAIRS,
+    REDUCTIONS,
+    Band,
+    choose_reduction,
+    find_band,
+)
 from jaxbundle.network.tables import Network
 
 
@@ -46,9 +52,10 @@ class Incidence(eqx.Module):
 class Structure(eqx.Module):
     """The index plan; `*_free` are 1 where an unknown is free, 0 where it is held.
 
-    `pins`: see `jaxbundle.adjustment.reduced`. `axis`: the name of the device axis over which
-    points and their rays are distributed, each device holding the plan of its own; images and
-    cameras are on all. None: one device.
+    `reduction`: "dense", "banded" or "iterative", how the reduced system is solved; `band` is there
+    where it is banded. `pins`: see `jaxbundle.adjustment.reduced`. `axis`: the name of the device
+    axis over which points and their rays are distributed, each device holding the plan of its own;
+    images and cameras are on all. None: one device.
     """
 
     domain: str = eqx.field(static=True)
@@ -56,6 +63,7 @@ class Structure(eqx.Module):
     own_camera: bool = eqx.field(static=True)
     all_free: bool = eqx.field(static=True)
     all_eliminated: bool = eqx.field(static=True)
+    reduction: str = eqx.field(static=True)
     groups: tuple[Group, ...]
     table: RayTable
     camera_of_image: Int[Array, " images"]
@@ -181,13 +189,15 @@ def make_structure(
     chunk: int | None = None,
     pair_lengths: tuple[int, ...] | None = None,
     pair_blocks: tuple | None = None,
+    ways: tuple[str, ...] = REDUCTIONS,
 ) -> tuple[Structure, Data, Float[np.ndarray, "3"], Int[np.ndarray, " observations"]]:
     """The index plan, the arrays, the origin and the ray of every observation of a checked network
     (`check_network`).
 
     Check points must have been set aside. The datum is not decided here. `chunk` and `pair_lengths`
     are the lengths of chunks of rays and of pairs of rays, if not chosen by size; `pair_blocks` the
-    pairs of images with common points, if these are not all of the network's points.
+    pairs of images with common points, if these are not all of the network's points; `ways`: how
+    the reduced system may be solved (`reduction` is None where none of them fits into memory).
     """
     images, points, observations = network.images, network.points, network.observations
     source, used, chunk = lay_out(observations.image, observations.point, chunk)
@@ -220,16 +230,29 @@ def make_structure(
         )
     data, origin, priors = _data(network, source, used)
     as_int = lambda x: jnp.asarray(np.asarray(x, np.int32))
-    pairs = _image_pairs(
-        image, point, elim_rays, len(images), chunk > 1, pair_lengths, pair_blocks
-    )
     width = 6 + (k if own_camera else 0)
+    number = np.bincount(point[elim_rays])
+    if len(ways) > 1 and (number * (number - 1.0)).sum() / 2 > MOST_PAIRS:
+        ways = ("iterative",)
+    paired = elim_rays[:0] if ways == ("iterative",) else elim_rays
+    pairs = _image_pairs(
+        image, point, paired, len(images), chunk > 1, pair_lengths, pair_blocks
+    )
+    reduction, band = ways[0], None
+    if "banded" in ways:
+        band = find_band(pairs.row, pairs.column, len(images))
+    if len(ways) > 1:
+        others = (0 if own_camera else k * len(network.cameras)) + 3 * len(kept)
+        reduction = choose_reduction(
+            band, len(images), width, others, len(observations), ways
+        )
     structure = Structure(
         domain=network.residuals,
         axis=None,
         own_camera=own_camera,
         all_free=bool(image_free.all() and camera_free.all() and point_free.all()),
         all_eliminated=bool(eliminated.all()),
+        reduction=reduction,
         groups=groups,
         table=make_ray_table(image, camera, point, used, chunk, len(images)),
         camera_of_image=as_int(images.camera),
@@ -249,7 +272,7 @@ def make_structure(
         image_pairs=pairs,
         image_camera_pairs=camera_plans[0],
         camera_pairs=camera_plans[1],
-        band=find_band(pairs.row, pairs.column, len(images), width),
+        band=band if reduction == "banded" else None,
         pins=jnp.zeros((len(images), width)),
         datum_weight=jnp.asarray(np.zeros((len(points), 3))),
         gauge=jnp.asarray(np.zeros((7, 0))),

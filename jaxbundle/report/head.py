@@ -28,6 +28,11 @@ METHODS = {
     "levenberg-marquardt": "least squares by Levenberg–Marquardt steps, points eliminated (Schur)",
     "gauss-newton": "least squares by Gauss–Newton steps, points eliminated (Schur)",
 }
+REDUCTIONS = {
+    "dense": "dense Cholesky factor",
+    "banded": "Cholesky factor of blocks along a band",
+    "iterative": "conjugate gradients",
+}
 DOMAINS = {
     "corrected": "corrected: the measurement freed of distortion against the ideal image",
     "measured": "measured: the distorted image of the point against the raw measurement",
@@ -71,6 +76,7 @@ def settings(adjustment) -> list[str]:
         *facts(
             [
                 ("Method", METHODS.get(adjustment.method, adjustment.method)),
+                ("Reduced system", reduced_system(adjustment)),
                 ("Datum", datum(adjustment)),
                 ("Residuals", f"v = computed − observed, {DOMAINS[network.residuals]}"),
                 (
@@ -81,6 +87,15 @@ def settings(adjustment) -> list[str]:
             ]
         ),
     ]
+
+
+def reduced_system(adjustment) -> str:
+    """How large the system of images and cameras is, and how it was solved."""
+    s = adjustment.problem.structure
+    how = REDUCTIONS[adjustment.reduction]
+    if adjustment.reduction == "banded":
+        how += f" of {s.band.width * s.image_width} unknowns"
+    return f"{s.reduced_size} unknowns, {how}"
 
 
 def datum(adjustment) -> str:

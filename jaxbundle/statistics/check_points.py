@@ -9,6 +9,7 @@ orientations and cameras: with V and W of their own rays and Q of the adjustment
 import dataclasses
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -16,10 +17,11 @@ from jaxtyping import Float
 from jaxbundle.adjustment.jacobian import compiled_jacobian
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.adjustment.residuals import compiled_residuals
-from jaxbundle.network.arrays import Data, Values
+from jaxbundle.adjustment.schur import Factor
+from jaxbundle.network.arrays import Tangent, Values
 from jaxbundle.network.structure import Structure, make_structure
 from jaxbundle.network.tables import Distances, Observations, Points
-from jaxbundle.statistics.cofactors import Cofactors
+from jaxbundle.statistics.cofactors import propagate
 
 STEPS = 20
 
@@ -43,7 +45,7 @@ class CheckPoints:
 def intersect_check_points(
     problem: Problem,
     values: Values,
-    cofactors: Cofactors,
+    factor: Factor,
     points: Points,
     observations: Observations,
 ) -> CheckPoints:
@@ -56,15 +58,14 @@ def intersect_check_points(
     )
     structure, data, origin, _ = make_structure(network)
     shift = jnp.asarray(problem.origin - origin)
-    values = Values(
+    shifted = Values(
         values.camera, values.position + shift, values.rotation, data.start.point
     )
-    point, V, W = _intersect(structure, values, data)
-    inverse = np.linalg.inv(V)
-    n = W.shape[2]
-    spread = np.einsum("pij,pjn->pin", inverse, W)
-    cofactor = inverse + spread @ np.asarray(cofactors.reduced)[:n, :n] @ spread.transpose(0, 2, 1)
-    position = np.asarray(point) + origin
+    for _ in range(STEPS):
+        step, inverse, spread = _newton(structure, shifted, data)
+        shifted = eqx.tree_at(lambda v: v.point, shifted, shifted.point + step)
+    cofactor = np.asarray(inverse + _propagated(problem.structure, values, factor, spread))
+    position = np.asarray(shifted.point) + origin
     return CheckPoints(
         points.id,
         position,
@@ -72,14 +73,6 @@ def intersect_check_points(
         cofactor,
         np.bincount(observations.point, minlength=len(points)),
     )
-
-
-def _intersect(s: Structure, values: Values, data: Data):
-    """Coordinates, V [points, 3, 3] and W [points, 3, reduced] of points seen by known images."""
-    for _ in range(STEPS):
-        step, V, W = _newton(s, values, data)
-        values = eqx.tree_at(lambda v: v.point, values, values.point + step)
-    return values.point, np.asarray(V), np.asarray(W)
 
 
 def _newton(s, values, data):
@@ -95,14 +88,19 @@ def _blocks(jac, residual):
         jnp.einsum("nai,naj->nij", jac.point, jac.point)
     )
     g = jnp.zeros((s.points, 3)).at[s.point].add(jnp.einsum("nai,na->ni", jac.point, residual))
-    width = s.image_width
-    W = jnp.zeros((s.points, 3, s.images, width))
+    W = jnp.zeros((s.points, 3, s.images, s.image_width))
     W = W.at[s.point, :, s.image].add(jnp.einsum("nai,naj->nij", jac.point, jac.image))
-    W = W.reshape(s.points, 3, -1)
+    Wc = jnp.zeros((s.points, 3, s.cameras, s.camera_width))
     if s.camera_width:
-        shared = jnp.zeros((s.points, 3, s.cameras, s.camera_width))
-        shared = shared.at[s.point, :, s.camera].add(
-            jnp.einsum("nai,naj->nij", jac.point, jac.camera)
-        )
-        W = jnp.concatenate([W, shared.reshape(s.points, 3, -1)], 2)
-    return -jnp.linalg.solve(V, g[..., None])[..., 0], V, W
+        Wc = Wc.at[s.point, :, s.camera].add(jnp.einsum("nai,naj->nij", jac.point, jac.camera))
+    inverse = jnp.linalg.inv(V)
+    spread = tuple(jnp.einsum("pij,pj...->pi...", inverse, rows) for rows in (W, Wc))
+    return -jnp.einsum("pij,pj->pi", inverse, g), inverse, spread
+
+
+@eqx.filter_jit
+def _propagated(s: Structure, values: Values, factor: Factor, spread):
+    """The part of the adjusted orientations in the cofactors of the check points."""
+    still = jnp.zeros((3, s.points, 3))
+    one = lambda rows: propagate(s, values, factor, Tangent(*rows, still))
+    return jax.lax.map(one, spread)

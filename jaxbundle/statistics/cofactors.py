@@ -19,35 +19,28 @@ from jaxtyping import Array, Float
 from jaxbundle.adjustment.datum import gauge_directions
 from jaxbundle.adjustment.jacobian import compiled_jacobian
 from jaxbundle.adjustment.normal import normal_from_jacobian
-from jaxbundle.adjustment.schur import (
-    Factor,
-    factorise,
-    reduced_free,
-    reduced_vector,
-    solve,
-)
+from jaxbundle.adjustment.parts import Parts
+from jaxbundle.adjustment.schur import Factor, factorise, reduced_free, solve
 from jaxbundle.network.arrays import Data, Tangent, Values
 from jaxbundle.network.structure import Structure
 
-PAIRS_PER_STEP = 8192
-
 
 class Cofactors(eqx.Module):
-    """Blocks of Q = N⁻¹ in the datum of the network, and what is needed for any others.
+    """Blocks of Q = N⁻¹, of every image, shared camera and point in the datum of the network.
 
-    `reduced`: images, cameras and kept points together; `point`: 3×3 of every point; `ray`: every
-    point with the image block of its ray; `incidence`: with its shared camera. `ray` and
-    `incidence` belong to the internal (regularised) datum: use them only for estimable
-    quantities, such as residuals. What is held has zeros.
+    The internal ones are what the others and the residuals need, in the regularised datum of the
+    factor: the blocks of the reduced system, `ray` (every point with the image of its ray) and
+    `incidence` (with its shared camera). Use them only for estimable quantities. What is held has
+    zeros.
     """
 
-    factor: Factor
-    reduced: Float[Array, "reduced reduced"]
+    image: Float[Array, "images image_block image_block"]
+    camera: Float[Array, "cameras camera_block camera_block"]
     point: Float[Array, "points 3 3"]
+    internal: Parts
+    internal_point: Float[Array, "points 3 3"]
     ray: Float[Array, "rays 3 image_block"]
     incidence: Float[Array, "incidences 3 camera_block"]
-    internal_reduced: Float[Array, "reduced reduced"]
-    internal_point: Float[Array, "points 3 3"]
 
 
 def undamped_factor(structure: Structure, values: Values, data: Data) -> Factor:
@@ -65,8 +58,7 @@ def _factorised(jac, values):
 def cofactors(structure: Structure, values: Values, factor: Factor) -> Cofactors:
     """All cofactor blocks of a solved network."""
     s = structure
-    free = reduced_free(s)
-    Q = jax.vmap(factor.reduced.solve, 1, 1)(jnp.diag(free)) * free[:, None]
+    Q = _without_held(s, factor.reduced.inverse())
     K, Kc = _couplings(factor, Q)
     inner = jnp.eye(3) + jax.ops.segment_sum(
         jnp.einsum("nij,nkj->nik", K, factor.ray), s.point, s.points
@@ -85,89 +77,66 @@ def cofactors(structure: Structure, values: Values, factor: Factor) -> Cofactors
         incidence = -jnp.einsum("qji,qjk->qik", L[s.incidence.point], Kc)
     if s.kept.shape[0]:
         point, ray, incidence = _with_kept(s, Q, point, ray, incidence)
-    reduced, in_datum = _transformed(s, values, factor, Q, point)
-    return Cofactors(factor, reduced, in_datum, ray, incidence, Q, point)
+    image, in_datum = _transformed(s, values, factor, Q.own, point)
+    return Cofactors(image, _camera_blocks(s, Q), in_datum, Q, point, ray, incidence)
+
+
+def _without_held(s, Q: Parts) -> Parts:
+    """The inverse of S with zeros, where S had ones, for what is held."""
+    n = s.images * s.image_width
+    free = reduced_free(s)
+    images, rest = free[:n].reshape(s.images, -1), free[n:]
+    own = Q.own * images[:, :, None] * images[:, None, :]
+    corner = Q.corner * rest[:, None] * rest[None, :]
+    return Parts(Q.pairs, own, Q.border, corner)
+
+
+def _camera_blocks(s, Q: Parts) -> Float[Array, "cameras k k"]:
+    """The block of each shared camera; it has no part in the datum."""
+    C, k = s.cameras, s.camera_width
+    at = jnp.arange(C)
+    return Q.corner[: C * k, : C * k].reshape(C, k, C, k)[at, :, at, :]
 
 
 def _couplings(factor, Q):
     """K of every ray and of every incidence (zero for points that are not eliminated)."""
     s = factor.structure
-    w, k = s.image_width, s.camera_width
-    n = s.images * w
-    m = n + s.cameras * k
-    QII = Q[:n, :n].reshape(s.images, w, s.images, w)
-    at = jnp.arange(s.images)
-    K = jnp.einsum("nij,njk->nik", factor.ray, s.table.of_image(QII[at, :, at, :]))
-    Kc = jnp.zeros_like(factor.incidence)
-    K = _add_pairs(K, K, s.image_pairs, factor.ray, factor.ray, QII, s.image, s.image, True)[0]
+    C, k, I, w = s.cameras, s.camera_width, s.images, s.image_width
+    Z, Zc = factor.ray, factor.incidence
+    K = jnp.einsum("nij,njk->nik", Z, s.table.of_image(Q.own))
+    Kc = jnp.zeros_like(Zc)
+    K += sum(s.image_pairs.spread(Z, Z, Q.pairs, True))
     if k:
-        camera = s.incidence.camera
-        QIC = Q[:n, n:m].reshape(s.images, w, s.cameras, k)
-        QCC = Q[n:m, n:m].reshape(s.cameras, k, s.cameras, k)
-        K, Kc = _add_pairs(
-            K, Kc, s.image_camera_pairs, factor.ray, factor.incidence, QIC, s.image, camera, False
-        )
-        Kc = _add_pairs(
-            Kc, Kc, s.camera_pairs, factor.incidence, factor.incidence, QCC, camera, camera, True
-        )[0]
+        at = s.image_camera_pairs
+        with_images = Q.border[: C * k].reshape(C, k, I, w)[at.column, :, at.row, :]
+        to_ray, to_incidence = at.spread(Z, Zc, with_images.transpose(0, 2, 1), False)
+        at = s.camera_pairs
+        cameras = Q.corner[: C * k, : C * k].reshape(C, k, C, k)[at.row, :, at.column, :]
+        K += to_ray
+        Kc += to_incidence + sum(at.spread(Zc, Zc, cameras, True))
     return K, Kc
-
-
-def _add_pairs(K_a, K_b, pairs, Z_a, Z_b, Q, block_a, block_b, same):
-    """Add Z_b·Q[b, a] to K_a and Z_a·Q[a, b] to K_b over pairs (a, b).
-
-    `same`: both sides are one table; pairs within a block are then listed in both orders (a row
-    with itself once).
-    """
-    if not pairs.row.shape[0]:
-        return K_a, K_b
-    a, b = pairs.flat()
-    missing = a >= K_a.shape[0] - pairs.empty[0]
-    a, b = jnp.where(missing, 0, a), jnp.where(missing, 0, b)
-    fill = -a.shape[0] % PAIRS_PER_STEP
-    step = lambda x, value: jnp.pad(x, (0, fill), constant_values=value).reshape(
-        -1, PAIRS_PER_STEP
-    )
-
-    def add(carry, chunk):
-        K_a, K_b = carry
-        a, b, missing = chunk
-        weight = jnp.where(missing, 0.0, 1.0)[:, None, None]
-        block = Q[block_a[a], :, block_b[b], :] * weight
-        to_a = jnp.einsum("cij,ckj->cik", Z_b[b], block)
-        once = jnp.where(block_a[a] == block_b[b], 0.0, 1.0)[:, None, None] if same else 1.0
-        to_b = jnp.einsum("cij,cjk->cik", Z_a[a], block) * once
-        K_a = K_a.at[a].add(to_a)
-        if same:
-            return (K_a.at[b].add(to_b), K_b), None
-        return (K_a, K_b.at[b].add(to_b)), None
-
-    chunks = (step(a, 0), step(b, 0), step(missing, True))
-    return jax.lax.scan(add, (K_a, K_b), chunks)[0]
 
 
 def _with_kept(s, Q, point, ray, incidence):
     """Cofactors of the points that stayed in the reduced system, read from it."""
     w, k, K = s.image_width, s.camera_width, s.kept.shape[0]
-    n = s.images * w
-    m = n + s.cameras * k
-    kept = Q[m:, m:].reshape(K, 3, K, 3)
+    m = s.cameras * k
     index = jnp.arange(K)
-    point = point.at[s.kept].set(kept[index, :, index, :])
-    with_image = Q[m:, :n].reshape(K, 3, s.images, w)
+    point = point.at[s.kept].set(Q.corner[m:, m:].reshape(K, 3, K, 3)[index, :, index, :])
+    with_image = Q.border[m:].reshape(K, 3, s.images, w)
     ray = ray.at[s.kept_rays].set(with_image[s.kept_of_ray, :, s.image[s.kept_rays], :])
     if k:
-        with_camera = Q[m:, n:m].reshape(K, 3, s.cameras, k)
+        with_camera = Q.corner[m:, :m].reshape(K, 3, s.cameras, k)
         incidence = incidence.at[s.incidence.of_ray[s.kept_rays]].set(
             with_camera[s.kept_of_ray, :, s.camera[s.kept_rays], :]
         )
     return point, ray, incidence
 
 
-def _transformed(s, values, factor, Q, point):
-    """Reduced and point cofactors in the datum of the network: S·Q·Sᵀ."""
+def _transformed(s, values, factor, image, point):
+    """The blocks of images and points in the datum of the network: S·Q·Sᵀ."""
     if not s.defect:
-        return Q, point
+        return image, point
     G = gauge_directions(s, values)
     B = Tangent(
         jnp.zeros_like(G.image), jnp.zeros_like(G.camera), G.point * s.datum_weight[..., None]
@@ -176,12 +145,13 @@ def _transformed(s, values, factor, Q, point):
     M = jnp.linalg.inv(jnp.einsum("pik,pil->kl", B.point, G.point))
     A = jax.tree.map(lambda h: h @ M.T, H)
     C = M @ jnp.einsum("pik,pil->kl", B.point, A.point)
-    stacked = lambda t: jax.vmap(lambda x: reduced_vector(s, x), -1, -1)(t)
-    g, a = stacked(G), stacked(A)
-    reduced = Q - g @ a.T - a @ g.T + g @ C @ g.T
-    cross = jnp.einsum("pik,pjk->pij", G.point, A.point)
-    own = jnp.einsum("pik,kl,pjl->pij", G.point, C, G.point)
-    return reduced, point - cross - cross.transpose(0, 2, 1) + own
+
+    def moved(Q, g, a):
+        cross = jnp.einsum("pik,pjk->pij", g, a)
+        own = jnp.einsum("pik,kl,pjl->pij", g, C, g)
+        return Q - cross - cross.transpose(0, 2, 1) + own
+
+    return moved(image, G.image, A.image), moved(point, G.point, A.point)
 
 
 @eqx.filter_jit

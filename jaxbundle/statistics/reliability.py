@@ -64,29 +64,25 @@ def _weights(data: Data):
 
 def hat_diagonal(jac: BundleJacobian, cofactors: Cofactors) -> Residuals:
     """h = diag(J·Q·Jᵀ), from the blocks of Q that each observation touches."""
-    s, Q = jac.structure, cofactors.internal_reduced
+    s, Q = jac.structure, cofactors.internal
     w, k, K = s.image_width, s.camera_width, s.kept.shape[0]
-    n = s.images * w
-    m = n + s.cameras * k
-    at = jnp.arange(s.images)
-    QII = Q[:n, :n].reshape(s.images, w, s.images, w)[at, :, at, :]
+    m = s.cameras * k
     points = cofactors.internal_point
     form = lambda a, block, b: jnp.einsum("nai,nij,naj->na", a, block, b)
-    image = form(jac.image, QII[s.image], jac.image)
+    image = form(jac.image, Q.own[s.image], jac.image)
     image += form(jac.point, points[s.point], jac.point)
     image += 2 * form(jac.point, cofactors.ray, jac.image)
-    interior = QII
+    interior = Q.own
     first = 6
     if k:
-        cameras = jnp.arange(s.cameras)
-        QCC = Q[n:m, n:m].reshape(s.cameras, k, s.cameras, k)[cameras, :, cameras, :]
-        QIC = Q[:n, n:m].reshape(s.images, w, s.cameras, k)[at, :, s.camera_of_image, :]
-        image += form(jac.camera, QCC[s.camera], jac.camera)
-        image += 2 * form(jac.image, QIC[s.image], jac.camera)
+        at = jnp.arange(s.images)
+        with_camera = Q.border[:m].reshape(s.cameras, k, s.images, w)[s.camera_of_image, :, at, :]
+        image += form(jac.camera, cofactors.camera[s.camera], jac.camera)
+        image += 2 * form(jac.camera, with_camera[s.image], jac.image)
         image += 2 * form(jac.point, cofactors.incidence[s.incidence.of_ray], jac.camera)
-        interior, first = QCC, 0
+        interior, first = cofactors.camera, 0
     control = jac.control**2 * jnp.diagonal(points[s.control], axis1=1, axis2=2)
-    exterior = jnp.einsum("eij,ejk,eik->ei", jac.exterior, QII[s.exterior, :6, :6], jac.exterior)
+    exterior = jnp.einsum("eij,ejk,eik->ei", jac.exterior, Q.own[s.exterior, :6, :6], jac.exterior)
     variances = jnp.diagonal(interior, axis1=1, axis2=2)[s.interior, first:]
     rows = jnp.arange(s.interior.shape[0])[:, None]
     parameters = jnp.zeros((s.interior.shape[0], jac._parameters))
@@ -96,7 +92,7 @@ def hat_diagonal(jac: BundleJacobian, cofactors: Cofactors) -> Residuals:
         )
     distance = jnp.zeros(s.distance.shape[0])
     if K:
-        both = Q[m:, m:].reshape(K, 3, K, 3)
+        both = Q.corner[m:, m:].reshape(K, 3, K, 3)
         place = jnp.clip(jnp.searchsorted(s.kept, s.distance), 0, K - 1)
         a, b = place[:, 0], place[:, 1]
         ja, jb = jac.distance[:, 0], jac.distance[:, 1]
