@@ -57,7 +57,7 @@ def _values(s, data, scale, y):
 def _column_scale(s, data):
     normal = normal_from_jacobian(jacobian(s, data.start, data))
     return jax.tree.map(
-        lambda d, free: free / jnp.sqrt(d), diagonal(s, normal), free_tangent(s)
+        lambda d, free: free / jnp.sqrt(d), diagonal(normal), free_tangent(s)
     )
 
 

@@ -16,18 +16,17 @@ image. Cameras and points have their diagonal.
 import jax
 import jax.numpy as jnp
 
-from jaxbundle.adjustment.normal import Normal
-from jaxbundle.geometry import matrix_from_quaternion, retract_quaternion
+from jaxbundle.adjustment.normal import Normal, diagonal
+from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.network.arrays import Tangent, Values
 
 
 def metric(values: Values, normal: Normal) -> Tangent:
     """D: matrices [images, w, w] for the images, diagonals for cameras and points; 1 for what is
     held."""
-    pick = lambda blocks: jnp.diagonal(blocks, axis1=1, axis2=2)
-    positive = lambda d: jnp.where(d > 0, d, 1.0)
+    D = diagonal(normal)
     image = jax.vmap(_of_image)(values.position, values.rotation, normal.image)
-    return Tangent(image, positive(pick(normal.camera)), positive(pick(normal.point)))
+    return Tangent(image, D.camera, D.point)
 
 
 def times(D: Tangent, change: Tangent) -> Tangent:
@@ -37,9 +36,12 @@ def times(D: Tangent, change: Tangent) -> Tangent:
 
 
 def _of_image(position, rotation, N):
+    M = matrix_from_quaternion(rotation)
+
     def shift(change):
-        M = matrix_from_quaternion(retract_quaternion(rotation, change[3:]))
-        return -M @ (position + change[:3])
+        # exp([δθ]×) ≈ 1 + [δθ]×: the derivative is taken at 0 only.
+        t = -M @ (position + change[:3])
+        return t + jnp.cross(change[3:], t)
 
     T = jnp.eye(N.shape[0]).at[:3, :6].set(jax.jacfwd(shift)(jnp.zeros(6)))
     A, B = T[:3, :3], T[:3, 3:6]  # A = −M is orthogonal

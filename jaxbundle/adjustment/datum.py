@@ -23,10 +23,15 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from jaxbundle.adjustment.jacobian import free_tangent, zero_tangent
-from jaxbundle.adjustment.residuals import residuals
-from jaxbundle.geometry import helmert_point, helmert_pose, transform_point, transform_pose
-from jaxbundle.network.arrays import Data, Tangent, Values, retract
+from jaxbundle.adjustment.jacobian import BundleJacobian, compiled_jacobian, free_tangent
+from jaxbundle.geometry import (
+    helmert_point,
+    helmert_pose,
+    similarity,
+    transform_point,
+    transform_pose,
+)
+from jaxbundle.network.arrays import Data, Tangent, Values
 from jaxbundle.network.structure import Structure
 
 OPEN = 1e-10
@@ -49,13 +54,18 @@ def gauge_directions(structure: Structure, values: Values) -> Tangent:
     return jax.tree.map(lambda g: g @ structure.gauge, helmert(structure, values))
 
 
+compiled_directions = eqx.filter_jit(gauge_directions)
+"""`gauge_directions`, compiled."""
+
+
 def open_similarities(structure: Structure, data: Data) -> Float[np.ndarray, "7 defect"]:
     """The combinations of the seven similarities that change no observation and nothing held.
 
     Found at the start values from the singular values of J·G, its columns scaled by the size of
     their terms, so that neither units nor the number of observations matter.
     """
-    products, terms, held = (np.asarray(x) for x in _directional_products(structure, data))
+    jac = compiled_jacobian(structure, data.start, data)
+    products, terms, held = (np.asarray(x) for x in _directional_products(jac, data.start))
     # What cannot be computed from the start values says nothing; the solver will complain.
     finite = np.isfinite(products).all(1)
     products, terms = products[finite], terms[np.isfinite(terms).all(1)]
@@ -71,24 +81,14 @@ def open_similarities(structure: Structure, data: Data) -> Float[np.ndarray, "7 
 
 
 @eqx.filter_jit
-def _directional_products(structure, data):
-    """J·G, the terms that cancel in it, and G on what is held [rows, 7].
-
-    By forward derivatives of the residuals along the seven columns of G.
-    """
-    G, free = helmert(structure, data.start), free_tangent(structure)
+def _directional_products(jac: BundleJacobian, values: Values):
+    """J·G, the terms that cancel in it, and G on what is held [rows, 7]."""
+    G, free = helmert(jac.structure, values), free_tangent(jac.structure)
     moving = jax.tree.map(lambda g, f: g * f[..., None], G, free)
-
-    def along(direction):
-        shifted = lambda t: residuals(structure, retract(structure, data.start, t), data)
-        change = jax.jvp(shifted, (zero_tangent(structure),), (direction,))[1]
-        return ravel_pytree(change)[0]
-
     still = jax.tree.map(jnp.zeros_like, moving)
-    images = Tangent(moving.image, moving.camera, still.point)
-    points = Tangent(still.image, still.camera, moving.point)
-    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b], -1), images, points)
-    images, points = jnp.split(jax.vmap(along, -1, -1)(both), 2, -1)
+    along = jax.vmap(lambda direction: ravel_pytree(jac.mv(direction))[0], -1, -1)
+    images = along(Tangent(moving.image, moving.camera, still.point))
+    points = along(Tangent(still.image, still.camera, moving.point))
     flat = lambda tree: jnp.concatenate([x.reshape(-1, 7) for x in jax.tree.leaves(tree)])
     held = flat(jax.tree.map(lambda g, m: g - m, G, moving))
     return images + points, jnp.concatenate([images, points]), held
@@ -105,73 +105,90 @@ def s_transform(structure: Structure, values: Values, change: Tangent) -> Tangen
     return jax.tree.map(lambda d, g: d - g @ along, change, G)
 
 
-def move_to_datum(structure: Structure, values: Values, start: Values, steps: int = 20) -> Values:
+def move_to_datum(
+    structure: Structure, values: Values, start: Values, *, derivatives: bool = False
+) -> Values:
     """The network after the finite similarity (of the open kind) for which Bᵀ(x − x_start) = 0.
 
-    The open similarities form a group, so their finite motions are the exponentials of the open
-    directions: a rotation about a fixed point stays one.
-    Differentiable: the parameters are found by Newton's method without derivatives being taken,
-    then attached by one more step (implicit function theorem).
-    """
-    if not structure.defect:
-        return values
+    `derivatives`: those of the motion are attached to it (implicit function theorem)."""
     s = structure
-    held = lambda old, new, free: jnp.where(free > 0, new, old)
-
-    def moved(tau, point):
-        move = _exponential(s.gauge @ tau)
-        return held(point, jax.vmap(transform_point, (None, 0))(move, point), s.point_free)
-
-    def condition(tau, point, start):
-        x = moved(tau, point)
-        G = jax.vmap(helmert_point)(x) @ s.gauge
-        c = jnp.einsum("pik,pi->k", G * s.datum_weight[..., None], x - start)
-        return c, (c, G)
-
+    if not s.defect:
+        return values
     point, target = jax.lax.stop_gradient((values.point, start.point))
+    values = _moved(s, _motion_to_datum(s, point, target), values)
+    if not derivatives:
+        return values
+    return _moved(s, s.gauge @ _newton_step(s, values.point, start.point), values)
+
+
+def _motion_to_datum(s: Structure, point, target, steps: int = 20):
+    """The similarity that puts the points into their datum, by motions along the open directions.
+
+    They form a group, so that the whole motion is one of them: a rotation about a fixed point stays
+    one."""
     size = jnp.abs(point).max()
 
     def moving(state):
         # Until rounding: no move at all, or a small one that is no smaller than the one before.
-        _, _, distance, before, count = state
+        _, distance, before, count = state
         falling = (distance > 1e-6 * size) | (distance < 0.5 * before)
         return (distance > 1e-12 * size) & falling & (count < steps)
 
-    def newton(state):
-        tau, _, before, _, count = state
-        slope, (c, G) = jax.jacfwd(condition, has_aux=True)(tau, point, target)
-        step = jnp.linalg.solve(slope, c)
-        distance = jnp.abs(G @ step).max()
-        return tau - step, slope, distance, before, count + 1
+    def further(state):
+        motion, before, _, count = state
+        x = _moved_points(s, motion, point)
+        step = _exponential(s.gauge @ _newton_step(s, x, target))
+        distance = jnp.abs(_moved_points(s, step, x) - x).max()
+        return similarity.compose(step, motion), distance, before, count + 1
 
-    far = jnp.asarray([1e300, jnp.inf])
-    begin = (jnp.zeros(s.defect), jnp.eye(s.defect), far[0], far[1], 0)
-    tau, slope, *_ = jax.lax.while_loop(moving, newton, begin)
-    tau = tau - jnp.linalg.solve(slope, condition(tau, values.point, start.point)[0])
+    begin = (jnp.zeros(7), jnp.asarray(1e300), jnp.asarray(jnp.inf), 0)
+    return jax.lax.while_loop(moving, further, begin)[0]
+
+
+def _newton_step(s: Structure, point, target) -> Float[Array, " defect"]:
+    """The motion that meets Bᵀ(x − x_start) = 0 to first order; its slope is held constant."""
+
+    def missing(x, target):
+        G = jax.vmap(helmert_point)(x) @ s.gauge
+        return jnp.einsum("pik,pi->k", G * s.datum_weight[..., None], x - target)
+
+    x, fixed_target = jax.lax.stop_gradient((point, target))
+    after = lambda tau: missing(_moved_points(s, s.gauge @ tau, x), fixed_target)
+    slope = jax.jacfwd(after)(jnp.zeros(s.defect))
+    return -jnp.linalg.solve(slope, missing(point, target))
+
+
+def _moved(s: Structure, motion, values: Values) -> Values:
+    """A network moved by a similarity; what is held stays."""
     position, rotation = jax.vmap(transform_pose, (None, 0, 0))(
-        _exponential(s.gauge @ tau), values.position, values.rotation
+        motion, values.position, values.rotation
     )
+    held = lambda old, new, free: jnp.where(free > 0, new, old)
     return Values(
         camera=values.camera,
         position=held(values.position, position, s.image_free[:, :3]),
         rotation=held(values.rotation, rotation, s.image_free[:, 3:4]),
-        point=moved(tau, values.point),
+        point=_moved_points(s, motion, values.point),
     )
+
+
+def _moved_points(s: Structure, motion, point):
+    moved = jax.vmap(transform_point, (None, 0))(motion, point)
+    return jnp.where(s.point_free > 0, moved, point)
+
+
+NODES, WEIGHTS = (np.asarray(x) / 2 for x in np.polynomial.legendre.leggauss(20))
 
 
 def _exponential(direction: Float[Array, "7"]) -> Float[Array, "7"]:
     """The similarity reached by moving along t + ω×X + s·X for a unit of time.
 
-    Its shift is V·t with V = ∫₀¹ exp(u·B)du = 1 + B/2! + B²/3! + …, B = [ω]× + s·1; rotation and
-    scale are ω and s themselves. The series is summed for B/64 and doubled: V(2B) = V + ½B·V².
+    Its shift is ∫₀¹ exp(u·s)·exp(u·[ω]×)·t du, by Gauss–Legendre quadrature (to rounding up to two
+    turns and a scale of e⁵); rotation and scale are ω and s themselves.
     """
-    t, omega, s = direction[:3], direction[3:6] / 64, direction[6] / 64
-    one = jnp.eye(3)
-    B = jnp.cross(omega, one, axisb=0, axisc=0) + s * one
-    V = jax.lax.fori_loop(0, 8, lambda k, V: one + B @ V / (9 - k), one)
-    double = lambda _, VB: (VB[0] + 0.5 * VB[1] @ VB[0] @ VB[0], 2 * VB[1])
-    V, _ = jax.lax.fori_loop(0, 6, double, (V, B))
-    return jnp.concatenate([V @ t, direction[3:]])
+    still = direction.at[:3].set(0.0)
+    moved = jax.vmap(lambda u: transform_point(u * still, direction[:3]))(NODES + 0.5)
+    return still.at[:3].set(WEIGHTS @ moved)
 
 
 def choose_minimal_coordinates(
@@ -182,14 +199,20 @@ def choose_minimal_coordinates(
     Rows of G on the candidate coordinates, by Gram–Schmidt with row pivoting: each time the
     coordinate that the ones chosen so far determine least.
     """
-    G = np.asarray(gauge_directions(structure, data.start).point)
+    G = np.asarray(compiled_directions(structure, data.start).point)
     return _pick_rows(G.reshape(-1, structure.defect), candidates.ravel()).reshape(-1, 3)
 
 
 def choose_pins(structure: Structure, data: Data) -> Float[np.ndarray, "images image_block"]:
-    """As many coordinates of projection centres as there are defects, chosen well spread."""
-    G = np.asarray(gauge_directions(structure, data.start).image)
-    free = np.asarray(structure.image_block_free) * (np.arange(G.shape[1]) < 3)
+    """As many elements of the exterior orientation as there are defects, chosen well spread.
+
+    Angles count times the size of the network, so that they compare with positions.
+    """
+    G = np.array(compiled_directions(structure, data.start).image)
+    places = np.concatenate([np.asarray(data.start.position), np.asarray(data.start.point)])
+    places = places[np.isfinite(places).all(1)]
+    G[:, 3:] *= np.sqrt(places.var(0).sum()) if len(places) else 1.0
+    free = np.asarray(structure.image_block_free)
     return _pick_rows(G.reshape(-1, structure.defect), free.ravel()).reshape(G.shape[:2])
 
 

@@ -21,6 +21,7 @@ from jaxbundle.adjustment.residuals import (
     gather_groups,
     image_residual,
     over_rays,
+    split_change,
 )
 from jaxbundle.network.arrays import Data, Tangent, Values
 from jaxbundle.network.structure import Structure
@@ -131,8 +132,7 @@ def _image_hessian(structure, group, values, data):
 
     def one(*row):
         def loss(x):
-            change = (x[:3], x[3:6], x[6 : 6 + n], x[6 + k :])
-            change = tuple(tuple(part[i] for i in range(part.shape[0])) for part in change)
+            change = split_change(x, n, k)
             vx, vy = image_residual(model, structure.domain, group.free, *row, change)
             return 0.5 * (vx**2 + vy**2)
 
@@ -197,7 +197,7 @@ def _assemble(
     )
 
 
-def diagonal(structure: Structure, normal: Normal) -> Tangent:
+def diagonal(normal: Normal) -> Tangent:
     """The diagonal of N, 1 where an unknown is held."""
     pick = lambda blocks: jnp.diagonal(blocks, axis1=1, axis2=2)
     diagonal = Tangent(pick(normal.image), pick(normal.camera), pick(normal.point))

@@ -86,15 +86,9 @@ def make_problem(network: Network, reduction: str | None = None) -> Problem:
             lambda s: s.datum_weight, structure,
             jnp.asarray(_datum_weight(network, structure, data)),
         )  # fmt: skip
-        structure = _pinned(structure, data)
+        pins = jnp.asarray(choose_pins(structure, data))
+        structure = eqx.tree_at(lambda s: s.pins, structure, pins)
     return Problem(network, structure, data, origin, rays, count_rows(structure, data))
-
-
-def _pinned(structure: Structure, data: Data) -> Structure:
-    if not (structure.defect and structure.reduction == "banded"):
-        return structure
-    pins = choose_pins(structure, data)
-    return eqx.tree_at(lambda s: s.pins, structure, jnp.asarray(pins))
 
 
 def with_factor(problem: Problem) -> Problem:
@@ -109,7 +103,7 @@ def with_factor(problem: Problem) -> Problem:
     s = dataclasses.replace(
         s, reduction=plan.reduction, image_pairs=plan.image_pairs, band=plan.band
     )
-    return dataclasses.replace(problem, structure=_pinned(s, problem.data))
+    return dataclasses.replace(problem, structure=s)
 
 
 def require_x64() -> None:
@@ -138,6 +132,7 @@ def _datum_weight(network: Network, structure: Structure, data: Data):
 def count_rows(structure: Structure, data: Data) -> Counts:
     """Rows that carry weight, datum conditions, free unknowns."""
     number = lambda weight: int((np.asarray(weight) > 0).sum())
+    free = (structure.image_free, structure.camera_free, structure.point_free)
     interior = np.take_along_axis(
         np.asarray(data.interior_weight),
         np.asarray(structure.camera_columns)[np.asarray(structure.interior)], 1,
@@ -146,11 +141,10 @@ def count_rows(structure: Structure, data: Data) -> Counts:
         observations=number(data.image_weight),
         control=number(data.control_weight),
         exterior=number(data.exterior_weight),
-        interior=number(interior * np.asarray(structure.camera_free)[structure.interior]),
+        interior=number(
+            interior * np.asarray(structure.camera_free)[np.asarray(structure.interior)]
+        ),
         distances=number(data.distance_weight),
         datum=structure.defect,
-        unknowns=int(
-            np.sum(structure.image_free) + np.sum(structure.camera_free)
-            + np.sum(structure.point_free)
-        ),
+        unknowns=sum(number(x) for x in free),
     )  # fmt: skip

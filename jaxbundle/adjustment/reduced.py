@@ -4,10 +4,9 @@ Dense, by one Cholesky factorisation, here; or banded (`banded.py`); or not at a
 gradients (`iterative.py`). S is scaled to a unit diagonal (before elimination of the points). What
 is held gets a one there.
 
-A free network is singular along its datum directions G (similarities). Dense, they are made
-regular by adding q·qᵀ, q an orthonormal basis of G's part in the scaled system; banded, by adding
-a one to as many diagonal elements, positions of images far apart. Either way the solution changes
-along G only.
+A free network is singular along its datum directions G (similarities). They are made regular by
+adding a one to as many diagonal elements, those of images far apart (`Structure.pins`): the
+solution changes along G only.
 """
 
 import equinox as eqx
@@ -42,22 +41,21 @@ class DenseFactor(eqx.Module):
         return jnp.diagonal(self.lower)
 
 
-def factorise_reduced(structure: Structure, parts: Parts, scale, free, gauge, regular=True):
+def factorise_reduced(structure: Structure, parts: Parts, scale, free, regular=True):
     """The factor of S; NaN where it is not positive definite.
 
-    **Arguments:** `scale` [n], `free` [n] (0: held), `gauge` [n, defect]; `regular`: whether to
-    make the datum directions of a banded system regular.
+    **Arguments:** `scale` [n], `free` [n] (0: held); `regular`: whether to make the datum
+    directions regular.
     """
     if structure.reduction == "banded":
         return factorise_band(structure, parts, scale, free, regular)
-    lower = jnp.linalg.cholesky(
-        dense_matrix(structure, parts, scale, free, gauge, regular), symmetrize_input=False
-    )
+    S = dense_matrix(structure, parts, scale, free, regular)
+    lower = jnp.linalg.cholesky(S, symmetrize_input=False)
     return DenseFactor(structure, lower, scale)
 
 
 def dense_matrix(
-    structure: Structure, parts: Parts, scale, free, gauge, regular=True
+    structure: Structure, parts: Parts, scale, free, regular=True
 ) -> Float[Array, "n n"]:
     """S scaled, its datum directions made regular; only its lower triangle is right."""
     s = structure
@@ -70,9 +68,7 @@ def dense_matrix(
         S = jnp.concatenate([jnp.pad(S, ((0, 0), (0, q))),
                              jnp.concatenate([parts.border, parts.corner], 1)])  # fmt: skip
     S = S * scale[:, None] * scale[None, :]
-    index = jnp.arange(S.shape[0])
-    S = S.at[index, index].set(jnp.where(free > 0, jnp.diagonal(S), 1.0))
-    if gauge.shape[1]:
-        directions, _ = jnp.linalg.qr(gauge / scale[:, None])
-        S = S + regular * directions @ directions.T
-    return S
+    more = jnp.where(free > 0, 0.0, 1.0)
+    if s.defect:
+        more = more.at[: I * w].add(regular * s.pins.ravel())
+    return S + jnp.diag(more)

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 from jaxbundle import cameras
 from jaxbundle.geometry import (
     matrix_from_quaternion,
-    omega_phi_kappa_from_matrix,
+    omega_phi_kappa_near,
     retract_quaternion,
 )
 from jaxbundle.network.arrays import Data, Values
@@ -62,6 +62,15 @@ def image_residual(model, domain, free, rotation, centre, interior, point, xy, w
     return weight[0] * vx, weight[1] * vy
 
 
+def split_change(x, free: int, width: int):
+    """A vector of 9 + `width` changes as `image_residual` takes them: δX0, δθ, `free` parameters
+    (the rest of the width is not used), δX."""
+    return tuple(
+        tuple(x[i] for i in range(start, start + number))
+        for start, number in ((0, 3), (3, 3), (6, free), (6 + width, 3))
+    )
+
+
 def _cross(a, b):
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
@@ -73,11 +82,10 @@ def control_residual(point, given, weight, d_point):
 
 def exterior_residual(position, rotation, given, weight, d_image):
     """An image's exterior orientation against its prior (X0, Y0, Z0, ω, φ, κ) [6]."""
-    angles = omega_phi_kappa_from_matrix(
-        matrix_from_quaternion(retract_quaternion(rotation, d_image[3:]))
-    )
-    difference = jnp.mod(angles - given[3:] + jnp.pi, 2 * jnp.pi) - jnp.pi
-    return weight * jnp.concatenate([position + d_image[:3] - given[:3], difference])
+    M = matrix_from_quaternion(retract_quaternion(rotation, d_image[3:]))
+    angles = omega_phi_kappa_near(M, given[3:])
+    change = jnp.concatenate([position + d_image[:3], angles]) - given
+    return weight * change
 
 
 def interior_residual(parameters, given, weight, d_parameters):

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxbundle.adjustment.banded import BandFactor
 from jaxbundle.adjustment.iterative import ConjugateGradients, precondition
-from jaxbundle.adjustment.normal import Normal
+from jaxbundle.adjustment.normal import Normal, diagonal
 from jaxbundle.adjustment.parts import Parts, to_images, to_points
 from jaxbundle.adjustment.reduced import DenseFactor, dense_matrix, factorise_reduced
 from jaxbundle.network.arrays import Tangent
@@ -47,50 +47,43 @@ def factorise(
     structure: Structure,
     normal: Normal,
     damping: Tangent | None = None,
-    gauge: Tangent | None = None,
     regular: Bool[Array, ""] | bool = True,
     tolerance: float = EXACT,
 ) -> Factor:
     """Factorise N + `damping` (diagonals; for images also matrices), with the datum directions
-    `gauge` (last axis) made regular if `regular`: damping does that too, and the damped step
-    should be no other. `tolerance`: of a reduced system solved by iteration.
+    made regular if `regular`: damping does that too, and the damped step should be no other.
+    `tolerance`: of a reduced system solved by iteration.
 
     NaN where a pivot is rounding, as where it is negative: chance decides between the two.
     """
     if damping is not None:
         normal = _damped(normal, damping)
     parts, point, ray, incidence = eliminate(structure, normal)
-    scale, free, directions = _frame(structure, normal, gauge)
+    scale, free = _scale(structure, normal), reduced_free(structure)
     if structure.reduction == "iterative":
         factor = precondition(structure, parts, normal.image, ray, scale, free, tolerance)
     else:
-        factor = factorise_reduced(structure, parts, scale, free, directions, regular)
+        factor = factorise_reduced(structure, parts, scale, free, regular)
     sound = jnp.all(factor.pivots**2 > PIVOT)
     factor = jax.tree.map(lambda x: _where_floating(sound, x), factor)
     return Factor(structure, factor, point, ray, incidence)
 
 
-def scaled_matrix(
-    structure: Structure, normal: Normal, gauge: Tangent | None = None
-) -> Float[Array, "reduced reduced"]:
+def scaled_matrix(structure: Structure, normal: Normal) -> Float[Array, "reduced reduced"]:
     """The reduced matrix scaled to a unit diagonal, datum directions made regular; its lower
     triangle."""
     parts, *_ = eliminate(structure, normal)
-    return dense_matrix(structure, parts, *_frame(structure, normal, gauge))
+    return dense_matrix(structure, parts, _scale(structure, normal), reduced_free(structure))
 
 
 def _where_floating(sound, x):
     return jnp.where(sound, x, jnp.nan) if jnp.issubdtype(x.dtype, jnp.floating) else x
 
 
-def _frame(s: Structure, normal: Normal, gauge):
-    """Scale, free unknowns and datum directions of the reduced system."""
-    diagonal = reduced_vector(s, _diagonal_of(normal))
-    scale = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1.0))
-    directions = jnp.zeros((s.reduced_size, 0))
-    if gauge is not None and s.defect:
-        directions = jax.vmap(lambda g: reduced_vector(s, g), -1, -1)(gauge)
-    return scale, reduced_free(s), directions
+def _scale(s: Structure, normal: Normal) -> Float[Array, " reduced"]:
+    """What brings the diagonal of A to 1."""
+    D = reduced_vector(s, diagonal(normal))
+    return jax.lax.rsqrt(jnp.where(D > 0, D, 1.0))
 
 
 def eliminate(structure: Structure, normal: Normal):
@@ -165,11 +158,6 @@ def _damped(normal: Normal, damping: Tangent) -> Normal:
         (add(normal.image, damping.image), add(normal.camera, damping.camera),
          add(normal.point, damping.point)),
     )  # fmt: skip
-
-
-def _diagonal_of(normal):
-    pick = lambda blocks: jnp.diagonal(blocks, axis1=1, axis2=2)
-    return Tangent(pick(normal.image), pick(normal.camera), pick(normal.point))
 
 
 def reduced_free(s: Structure) -> Float[Array, " reduced"]:

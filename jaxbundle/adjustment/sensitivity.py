@@ -20,7 +20,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jaxbundle.adjustment.datum import gauge_directions, move_to_datum, s_transform
+from jaxbundle.adjustment.datum import move_to_datum, s_transform
 from jaxbundle.adjustment.jacobian import free_tangent, jacobian, zero_tangent
 from jaxbundle.adjustment.normal import hessian, normal_from_jacobian
 from jaxbundle.adjustment.residuals import half_square, residuals
@@ -37,10 +37,9 @@ def attach_derivatives(
 ) -> Values:
     """The solution `values` for `data`, differentiable with respect to every field of `data`."""
     values, constant = jax.lax.stop_gradient((values, data))
-    gauge = gauge_directions(structure, values)
     exact = sensitivity == "exact"
     blocks = hessian if exact else _gauss_newton
-    factor = factorise(structure, blocks(structure, values, constant), gauge=gauge)
+    factor = factorise(structure, blocks(structure, values, constant))
     free = free_tangent(structure)
     given = _with_given(structure, values, data)
 
@@ -59,7 +58,7 @@ def attach_derivatives(
     step = s_transform(structure, values, step)
     moved = retract(structure, given, step)
     # The datum is exact through its own finite transformation; to first order, through S.
-    return move_to_datum(structure, moved, data.start) if exact else moved
+    return move_to_datum(structure, moved, data.start, derivatives=True) if exact else moved
 
 
 def _gauss_newton(structure, values, data):

@@ -26,7 +26,6 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxbundle.adjustment.damping import metric, times
-from jaxbundle.adjustment.datum import gauge_directions
 from jaxbundle.adjustment.jacobian import jacobian
 from jaxbundle.adjustment.normal import Normal, gradient, normal_from_jacobian
 from jaxbundle.adjustment.residuals import half_square, residuals
@@ -75,7 +74,6 @@ class Damped(eqx.Module):
     normal: Normal
     gradient: Tangent
     metric: Tangent
-    gauge: Tangent
 
 
 class SchurDescent(optx.AbstractDescent):
@@ -92,15 +90,12 @@ class SchurDescent(optx.AbstractDescent):
             normal=normal,
             gradient=gradient(f_info.jac, f_info.residual),
             metric=metric(y, normal),
-            gauge=gauge_directions(self.structure, y),
         )
 
     def step(self, step_size: Float[Array, ""], state: Damped):
         damping = jax.tree.map(lambda d: d / step_size, state.metric)
         regular = step_size > WIDE
-        factor = factorise(
-            self.structure, state.normal, damping, state.gauge, regular, INEXACT
-        )
+        factor = factorise(self.structure, state.normal, damping, regular, INEXACT)
         change = solve(factor, jax.tree.map(jnp.negative, state.gradient))
         return change, optx.RESULTS.successful
 
@@ -265,7 +260,9 @@ class BundleSolver(optx.AbstractLeastSquaresSolver):
         settled = small & jnp.isinf(step_size)
         refusals = state.refusals + (state.tried & ~accept)
         singular = state.singular | (~finite & jnp.isinf(step_size)) | (refusals >= REFUSALS)
+        # The full steps of Gauss-Newton are all accepted: what grows visibly has not stalled.
         stalled = accept & ~state.first & (before - cost < self.rtol * before)
+        stalled = stalled & (cost - before <= state.search.noise)
         stuck = step_size < 1e-20
         broken = ~jnp.isfinite(cost_here) | (undamped & ~jnp.isfinite(cost))
         reasons = (

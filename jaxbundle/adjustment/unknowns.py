@@ -5,7 +5,6 @@ import dataclasses
 import equinox as eqx
 import numpy as np
 
-from jaxbundle.adjustment.datum import gauge_directions
 from jaxbundle.adjustment.jacobian import jacobian
 from jaxbundle.adjustment.normal import normal_from_jacobian
 from jaxbundle.adjustment.problem import Problem
@@ -72,8 +71,7 @@ def undetermined(problem: Problem, values: Values, data: Data) -> list[str]:
 @eqx.filter_jit
 def _scaled_reduced(structure, values, data):
     normal = normal_from_jacobian(jacobian(structure, values, data))
-    matrix = scaled_matrix(structure, normal, gauge_directions(structure, values))
-    return matrix, normal.point
+    return scaled_matrix(structure, normal), normal.point
 
 
 def _undetermined_points(problem: Problem, V) -> list[str]:

@@ -25,6 +25,7 @@ from .rotations import matrix_from_omega_phi_kappa as matrix_from_omega_phi_kapp
 from .rotations import matrix_from_phi_omega_kappa as matrix_from_phi_omega_kappa
 from .rotations import matrix_from_rodrigues as matrix_from_rodrigues
 from .rotations import omega_phi_kappa_from_matrix as omega_phi_kappa_from_matrix
+from .rotations import omega_phi_kappa_near as omega_phi_kappa_near
 from .rotations import phi_omega_kappa_from_matrix as phi_omega_kappa_from_matrix
 from .rotations import rodrigues_from_matrix as rodrigues_from_matrix
 from .similarity import helmert_point as helmert_point

@@ -81,6 +81,19 @@ def omega_phi_kappa_from_matrix(M: Float[Array, "3 3"]) -> Float[Array, "3"]:
     return jnp.stack([omega, phi, kappa])
 
 
+def omega_phi_kappa_near(M: Float[Array, "3 3"], given: Float[Array, "3"]) -> Float[Array, "3"]:
+    """(ω, φ, κ) of M in radians, of all its representations the one nearest to the given angles.
+
+    (ω, φ, κ) and (ω + π, π − φ, κ + π) are one rotation, and so are whole turns of each.
+    """
+    angles = omega_phi_kappa_from_matrix(M)
+    other = angles * jnp.array([1.0, -1.0, 1.0]) + jnp.pi
+    turned = lambda a: a + 2 * jnp.pi * jnp.round((given - a) / (2 * jnp.pi))
+    angles, other = turned(angles), turned(other)
+    distance = lambda a: jnp.sum((a - given) ** 2)
+    return jnp.where(distance(other) < distance(angles), other, angles)
+
+
 def matrix_from_phi_omega_kappa(angles: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """M = R3(κ)·R1(ω)·R2(φ) of (φ, ω, κ), in this order, in radians.
 

@@ -23,9 +23,9 @@ from jax import Array
 from jaxtyping import Float
 
 from .quaternions import (
+    matrix_from_quaternion,
     matrix_from_rotation_vector,
     quaternion_conjugate,
-    quaternion_difference,
     quaternion_from_rotation_vector,
     quaternion_multiply,
     rotation_vector_from_quaternion,
@@ -80,11 +80,9 @@ def helmert_point(X: Float[Array, "3"]) -> Float[Array, "3 7"]:
 def helmert_pose(X0: Float[Array, "3"], q: Float[Array, "4"]) -> Float[Array, "6 7"]:
     """The rows of the Helmert matrix of a pose, ∂(δX0, δθ)/∂τ at τ = 0.
 
-    δX0 in the object unit; δθ in radians in the camera frame, as in `retract_quaternion`.
+    δX0 in the object unit; δθ in radians in the camera frame, as in `retract_quaternion`: there a
+    small turn r of the object is −M·r, because M·exp([r]×)ᵀ = exp([−M·r]×)·M.
     """
-
-    def change(tau):
-        moved_X0, moved_q = transform_pose(tau, X0, q)
-        return jnp.concatenate([moved_X0 - X0, quaternion_difference(moved_q, q)])
-
+    M = matrix_from_quaternion(q)
+    change = lambda tau: jnp.concatenate([transform_point(tau, X0), -M @ tau[3:6]])
     return jax.jacfwd(change)(jnp.zeros(7, X0.dtype))

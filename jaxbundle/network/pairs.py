@@ -47,20 +47,14 @@ class Pairs(eqx.Module):
         depth, m, n = a.shape[1], a.shape[2], b.shape[2]
         total = jnp.zeros((blocks + 1, m, n), a.dtype)
         for first, second, block in zip(self.first, self.second, self.block):
-            if not first.shape[0]:
-                continue
-            length = first.shape[1]
-            step = max(1, ROWS_PER_STEP // length)
 
-            def add(total, chunk, step=step, length=length):
+            def add(total, chunk, rows=first.shape[1] * depth):
                 i, j, k = chunk
-                left = a[i].reshape(step, length * depth, m)
-                right = b[j].reshape(step, length * depth, n)
+                left, right = a[i].reshape(-1, rows, m), b[j].reshape(-1, rows, n)
                 product = jnp.einsum("cki,ckj->cij", left, right)
-                return total.at[k].add(product, indices_are_sorted=True), None
+                return total.at[k].add(product, indices_are_sorted=True)
 
-            chunks = _in_steps(first, second, block, step, missing, blocks)
-            total, _ = jax.lax.scan(add, total, chunks)
+            total = _over_steps(add, total, (first, second, block), (*missing, blocks))
         return total[:-1]
 
     def spread(
@@ -83,18 +77,15 @@ class Pairs(eqx.Module):
         missing = a.shape[0] - 1, b.shape[0] - 1
         totals = jnp.zeros_like(a), jnp.zeros_like(b)
         for first, second, block in zip(self.first, self.second, self.block):
-            if not first.shape[0]:
-                continue
-            step = max(1, ROWS_PER_STEP // first.shape[1])
 
             def add(totals, chunk):
                 i, j, k = chunk
                 to_first = jnp.einsum("cldn,cmn->cldm", b[j], Q[k])
                 to_second = jnp.einsum("cldm,cmn->cldn", a[i], Q_second[k])
-                return (totals[0].at[i].add(to_first), totals[1].at[j].add(to_second)), None
+                return totals[0].at[i].add(to_first), totals[1].at[j].add(to_second)
 
-            chunks = _in_steps(first, second, block, step, missing, self.row.shape[0])
-            totals, _ = jax.lax.scan(add, totals, chunks)
+            missing_chunk = (*missing, self.row.shape[0])
+            totals = _over_steps(add, totals, (first, second, block), missing_chunk)
         return totals[0][: rows[0]], totals[1][: rows[1]]
 
 
@@ -102,16 +93,17 @@ def _with_zero_row(a):
     return jnp.concatenate([a, jnp.zeros((1, *a.shape[1:]), a.dtype)])
 
 
-def _in_steps(first, second, block, step, missing, blocks):
-    """The chunks in portions of `step`, the last one filled with missing rows."""
-    fill = -first.shape[0] % step
-    length = first.shape[1]
-    pad = ((0, fill), (0, 0))
-    return (
-        jnp.pad(first, pad, constant_values=missing[0]).reshape(-1, step, length),
-        jnp.pad(second, pad, constant_values=missing[1]).reshape(-1, step, length),
-        jnp.pad(block, (0, fill), constant_values=blocks).reshape(-1, step),
-    )
+def _over_steps(add, total, chunks, missing):
+    """`add` all chunks to the total in portions; the last portion is filled with missing ones."""
+    number, length = chunks[0].shape
+    step = max(1, ROWS_PER_STEP // length)
+    if number <= step:
+        return add(total, chunks) if number else total
+    fill = lambda x, value: jnp.concatenate(
+        [x, jnp.full((-number % step, *x.shape[1:]), value, x.dtype)]
+    ).reshape(-1, step, *x.shape[1:])
+    portions = tuple(fill(x, value) for x, value in zip(chunks, missing))
+    return jax.lax.scan(lambda total, chunk: (add(total, chunk), None), total, portions)[0]
 
 
 def make_pairs(

@@ -45,13 +45,12 @@ class Cofactors(eqx.Module):
 
 def undamped_factor(structure: Structure, values: Values, data: Data) -> Factor:
     """The factor of JᵀPJ at the solution, datum directions made regular."""
-    return _factorised(compiled_jacobian(structure, values, data), values)
+    return _factorised(compiled_jacobian(structure, values, data))
 
 
 @eqx.filter_jit
-def _factorised(jac, values):
-    gauge = gauge_directions(jac.structure, values)
-    return factorise(jac.structure, normal_from_jacobian(jac), gauge=gauge)
+def _factorised(jac):
+    return factorise(jac.structure, normal_from_jacobian(jac))
 
 
 @eqx.filter_jit

@@ -28,9 +28,16 @@ def test_sum_over_blocks(small, monkeypatch):
         jnp.asarray(a), jnp.asarray(b)
     )
     np.testing.assert_allclose(found, expected, atol=1e-11)
-    i, j = (np.asarray(x) for x in table.flat())
-    listed = sorted(zip(i[i < 300], j[i < 300]))
-    assert listed == sorted(zip(first, second))
+    # The other way round: partners times the block of the pair.
+    Q = rng.normal(size=expected.shape)
+    to_a, to_b = np.zeros_like(a), np.zeros_like(b)
+    for i, j, r, c in zip(first, second, row, column):
+        to_a[i] += b[j] @ Q[r, c].T
+        to_b[j] += a[i] @ Q[r, c]
+    blocks = jnp.asarray(Q[np.asarray(table.row), np.asarray(table.column)])
+    found = table.spread(jnp.asarray(a), jnp.asarray(b), blocks, False)
+    np.testing.assert_allclose(found[0], to_a, atol=1e-11)
+    np.testing.assert_allclose(found[1], to_b, atol=1e-11)
 
 
 def test_pairs_within_and_between_groups():

@@ -92,9 +92,8 @@ def test_the_step_is_that_of_the_dense_system(reduction, free, damped):
         def step(s, data):
             jac = jacobian(s, data.start, data)
             normal = normal_from_jacobian(jac)
-            damping = jax.tree.map(lambda d: damped * 1e-3 * d, diagonal(s, normal))
-            gauge = gauge_directions(s, data.start)
-            factor = factorise(s, normal, damping, gauge, not damped)
+            damping = jax.tree.map(lambda d: damped * 1e-3 * d, diagonal(normal))
+            factor = factorise(s, normal, damping, not damped)
             right = gradient(jac, residuals(s, data.start, data))
             change = solve(factor, right)
             # What the step does to the observations does not depend on the datum.
