@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from jaxbundle.adjustment.batch import BatchCalibration as BatchCalibration
     from jaxbundle.adjustment.batch import calibrate_batch as calibrate_batch
     from jaxbundle.bundle import adjust as adjust
+    from jaxbundle.configuration import enable_x64 as enable_x64
+    from jaxbundle.configuration import use_cores as use_cores
     from jaxbundle.errors import InputError as InputError
     from jaxbundle.errors import NotSolvedError as NotSolvedError
     from jaxbundle.gradients import check_gradients as check_gradients
@@ -45,6 +47,7 @@ _HOME = {
     "jaxbundle.adjustment": ("Problem", "make_problem", "solve"),
     "jaxbundle.adjustment.batch": ("BatchCalibration", "calibrate_batch"),
     "jaxbundle.bundle": ("adjust",),
+    "jaxbundle.configuration": ("enable_x64", "use_cores"),
     "jaxbundle.errors": ("InputError", "NotSolvedError"),
     "jaxbundle.gradients": ("check_gradients",),
     "jaxbundle.io": ("read_network", "write_project"),
@@ -60,7 +63,7 @@ _HOME = {
     "jaxbundle.result": ("Adjustment",),
 }
 _MODULE = {name: module for module, names in _HOME.items() for name in names}
-__all__ = [*_MODULE, "enable_x64", "use_cores"]
+__all__ = [*_MODULE]
 
 
 def __getattr__(name: str):
@@ -75,25 +78,6 @@ def __getattr__(name: str):
 
 def __dir__() -> list[str]:
     return sorted(set(globals()) | set(__all__))
-
-
-def enable_x64() -> None:
-    """Switch JAX to 64-bit floats; call it before the first JAX computation."""
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
-
-
-def use_cores(number: int | None = None) -> None:
-    """Let the cores of the processor (all, or so many) share the work on big networks, as devices
-    of JAX; call it before the first JAX computation."""
-    import os
-
-    import jax
-
-    if number is None:
-        number = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
-    jax.config.update("jax_num_cpu_devices", number or os.cpu_count() or 1)
 
 
 __version__ = "0.1.0"

@@ -18,7 +18,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import jax  # noqa: E402
 import pytest  # noqa: E402
 
-jax.config.update("jax_enable_x64", True)
+import jaxbundle  # noqa: E402
+
+jaxbundle.enable_x64()
 
 
 MAPS = Path("/proc/self/maps")
@@ -35,6 +37,4 @@ def drop_compiled_programs():
 @pytest.fixture(scope="session")
 def convergent4():
     """The four convergent photographs, all ten parameters free, adjusted once."""
-    import jaxbundle
-
     return jaxbundle.adjust(jaxbundle.read_network(EXAMPLES / "convergent4" / "project.toml"))

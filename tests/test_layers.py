@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 LAYERS = (
+    "configuration",
     "errors",
     "geometry",
     "cameras",

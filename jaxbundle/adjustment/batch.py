@@ -11,7 +11,6 @@ many cameras.
 """
 
 import dataclasses
-import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -32,6 +31,7 @@ from jaxbundle.adjustment.batch_input import Batch, Portion
 from jaxbundle.adjustment.batch_start import start_values
 from jaxbundle.adjustment.problem import require_x64
 from jaxbundle.cameras import CameraModel, get_model
+from jaxbundle.configuration import available_cores
 from jaxbundle.geometry import (
     matrix_from_quaternion,
     matrix_from_rotation_vector,
@@ -136,7 +136,7 @@ def calibrate_batch(
         camera_model, batch.free, batch.known, max_iterations, batch.size, on_cpu, portion
     )
     parts = []
-    with ThreadPoolExecutor((threads or _cores()) if on_cpu else 1) as pool:
+    with ThreadPoolExecutor((threads or available_cores()) if on_cpu else 1) as pool:
         for portion, solved in zip(portions, pool.map(run, portions)):
             parts.append({name: rows[: len(portion.cameras)] for name, rows in solved.items()})
             if progress is not None:
@@ -160,11 +160,6 @@ def _result(model: CameraModel, batch: Batch, rows: dict) -> BatchCalibration:
     rows["status"] = np.array(STATUS)[rows["status"]]
     free = tuple(model.parameters[column] for column in batch.free)
     return BatchCalibration(model=model.name, parameters=free, **rows)
-
-
-def _cores() -> int:
-    """Cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
 
 
 def _solve_portion(model, free, known, max_steps, size, on_cpu, portion: Portion) -> dict:

@@ -4,7 +4,6 @@ import dataclasses
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -81,12 +80,12 @@ def make_problem(network: Network, reduction: str | None = None) -> Problem:
             "or \"minimal\"."
         )
     if defect:
-        structure = eqx.tree_at(lambda s: s.gauge, structure, jnp.asarray(gauge))
+        structure = eqx.tree_at(lambda s: s.gauge, structure, jax.device_put(gauge))
         structure = eqx.tree_at(
             lambda s: s.datum_weight, structure,
-            jnp.asarray(_datum_weight(network, structure, data)),
+            jax.device_put(_datum_weight(network, structure, data)),
         )  # fmt: skip
-        pins = jnp.asarray(choose_pins(structure, data))
+        pins = jax.device_put(choose_pins(structure, data))
         structure = eqx.tree_at(lambda s: s.pins, structure, pins)
     return Problem(network, structure, data, origin, rays, count_rows(structure, data))
 

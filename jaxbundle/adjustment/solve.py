@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxbundle.adjustment.datum import move_to_datum
 from jaxbundle.adjustment.problem import Problem
@@ -17,7 +18,7 @@ def make_solver(problem: Problem, method: str = "levenberg-marquardt", **options
     """The solver of a problem; `options` are those of `BundleSolver`."""
     if method not in METHODS:
         raise ValueError(f"method must be one of {', '.join(METHODS)}, not {method!r}")
-    redundancy = jnp.asarray(float(problem.counts.redundancy))
+    redundancy = jax.device_put(np.float64(problem.counts.redundancy))
     return BundleSolver(problem.structure, redundancy, METHODS[method], **options)
 
 

@@ -145,7 +145,7 @@ def make_pairs(
         ))
         taken = np.minimum(chunks * length, left)
         start, left = start + taken, left - taken
-    as_int = lambda x: jnp.asarray(np.asarray(x, np.int32))
+    as_int = lambda x: np.asarray(x, np.int32)
     return Pairs(
         first=tuple(as_int(g[0]) for g in groups),
         second=tuple(as_int(g[1]) for g in groups),

@@ -109,8 +109,8 @@ def lay_out(
 
 def make_ray_table(image, camera, point, used, chunk: int, images: int) -> RayTable:
     """The table of rays already laid out."""
-    as_int = lambda x: jnp.asarray(np.asarray(x, np.int32))
+    as_int = lambda x: np.asarray(x, np.int32)
     return RayTable(
-        as_int(image), as_int(camera), as_int(point), jnp.asarray(used.astype(float)),
+        as_int(image), as_int(camera), as_int(point), used.astype(float),
         as_int(image[::chunk]), as_int(camera[::chunk]), images,
     )  # fmt: skip

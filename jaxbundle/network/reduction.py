@@ -11,7 +11,6 @@ which need no pairs of rays at all.
 """
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sparse
 from jaxtyping import Array, Int
@@ -48,7 +47,7 @@ def find_band(row, column, images: int) -> Band:
     place = np.empty(images, np.int64)
     place[order] = np.arange(images)
     width = max(int(np.abs(place[row] - place[column]).max(initial=0)), 1)
-    return Band(jnp.asarray(place.astype(np.int32)), width, -(-images // width))
+    return Band(place.astype(np.int32), width, -(-images // width))
 
 
 def choose_reduction(

@@ -229,7 +229,7 @@ def make_structure(
             image, camera, point, elim_rays, len(network.cameras), chunk > 1, pair_lengths
         )
     data, origin, priors = _data(network, source, used)
-    as_int = lambda x: jnp.asarray(np.asarray(x, np.int32))
+    as_int = lambda x: np.asarray(x, np.int32)
     width = 6 + (k if own_camera else 0)
     number = np.bincount(point[elim_rays])
     if len(ways) > 1 and (number * (number - 1.0)).sum() / 2 > MOST_PAIRS:
@@ -257,10 +257,10 @@ def make_structure(
         table=make_ray_table(image, camera, point, used, chunk, len(images)),
         camera_of_image=as_int(images.camera),
         camera_columns=as_int(camera_columns),
-        camera_free=jnp.asarray(camera_free),
-        image_free=jnp.asarray(image_free),
-        point_free=jnp.asarray(point_free),
-        eliminated=jnp.asarray(eliminated[:, None].astype(float)),
+        camera_free=camera_free,
+        image_free=image_free,
+        point_free=point_free,
+        eliminated=eliminated[:, None].astype(float),
         kept=as_int(kept),
         kept_rays=as_int(kept_rays),
         kept_of_ray=as_int(np.searchsorted(kept, point[kept_rays])),
@@ -273,10 +273,12 @@ def make_structure(
         image_camera_pairs=camera_plans[0],
         camera_pairs=camera_plans[1],
         band=band if reduction == "banded" else None,
-        pins=jnp.zeros((len(images), width)),
-        datum_weight=jnp.asarray(np.zeros((len(points), 3))),
-        gauge=jnp.asarray(np.zeros((7, 0))),
+        pins=np.zeros((len(images), width)),
+        datum_weight=np.zeros((len(points), 3)),
+        gauge=np.zeros((7, 0)),
     )
+    # Straight to the device: `jnp.asarray` compiles a little program for every shape.
+    structure, data = jax.device_put((structure, data))
     return structure, data, origin, row
 
 
@@ -306,7 +308,7 @@ def _camera_plans(image, camera, point, elim_rays, cameras, empty, lengths):
     r, q = elim_rays[r], elim[q]
     a, b = pairs_within(inc_point[elim])
     a, b = (elim[np.concatenate([x, np.arange(len(elim))])] for x in (a, b))
-    as_int = lambda x: jnp.asarray(np.asarray(x, np.int32))
+    as_int = lambda x: np.asarray(x, np.int32)
     incidence = Incidence(as_int(of_ray), as_int(inc_point), as_int(inc_camera))
     return incidence, (  # fmt: skip
         make_pairs(
@@ -336,7 +338,7 @@ def _interior(network: Network, camera_of_chunk):
     name_of_chunk = np.array([m.name for m in models], dtype=object)[camera_of_chunk]
     for name, columns in free.items():
         chunks = np.flatnonzero(name_of_chunk == name)
-        rows = None if len(free) == 1 else jnp.asarray(chunks.astype(np.int32))
+        rows = None if len(free) == 1 else chunks.astype(np.int32)
         groups.append(Group(name, columns, rows))
     return camera_columns, camera_free, tuple(groups)
 
@@ -362,10 +364,10 @@ def _data(network: Network, source, used):
             if name in given.free:
                 camera_sigma[c, j] = given.sigma.get(name, np.inf)
     start = Values(
-        camera=jnp.asarray(camera),
-        position=jnp.asarray(images.position - origin),
-        rotation=_quaternions(jnp.asarray(images.angles)),
-        point=jnp.asarray(points.position - origin),
+        camera=camera,
+        position=images.position - origin,
+        rotation=_quaternions(images.angles),
+        point=points.position - origin,
     )
     weight = lambda sigma: np.where(
         np.isfinite(sigma) & (sigma > 0), 1 / np.where(sigma > 0, sigma, 1), 0.0
@@ -376,15 +378,15 @@ def _data(network: Network, source, used):
     exterior_value = np.concatenate([images.position - origin, images.angles], 1)
     data = Data(
         start=start,
-        image_xy=jnp.asarray(observations.xy[source]),
-        image_weight=jnp.asarray(used[:, None] / observations.sigma[source]),
-        control=jnp.asarray((points.position - origin)[control]),
-        control_weight=jnp.asarray(weight(points.sigma[control])),
-        exterior=jnp.asarray(exterior_value[exterior]),
-        exterior_weight=jnp.asarray(weight(images.sigma[exterior])),
-        interior=jnp.asarray(camera[interior]),
-        interior_weight=jnp.asarray(weight(camera_sigma[interior])),
-        distance=jnp.asarray(network.distances.value),
-        distance_weight=jnp.asarray(1 / network.distances.sigma),
+        image_xy=observations.xy[source],
+        image_weight=used[:, None] / observations.sigma[source],
+        control=(points.position - origin)[control],
+        control_weight=weight(points.sigma[control]),
+        exterior=exterior_value[exterior],
+        exterior_weight=weight(images.sigma[exterior]),
+        interior=camera[interior],
+        interior_weight=weight(camera_sigma[interior]),
+        distance=network.distances.value,
+        distance_weight=1 / network.distances.sigma,
     )
     return data, origin, {"control": control, "exterior": exterior, "interior": interior}

@@ -11,6 +11,7 @@ With the residuals divided by their a priori σ (v/σ) and h = diag(J·Q·Jᵀ) 
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -101,6 +102,7 @@ def hat_diagonal(jac: BundleJacobian, cofactors: Cofactors) -> Residuals:
     return Residuals(image, control, exterior, parameters, distance)
 
 
+@jax.jit
 def minimal_detectable(sigma, redundancy, delta0: float = 4.13) -> Float[Array, "..."]:
     """Smallest blunder found by the w-test, in the unit of σ (δ0 = 4.13: α 0.1 %, power 80 %)."""
     return jnp.where(
@@ -110,6 +112,7 @@ def minimal_detectable(sigma, redundancy, delta0: float = 4.13) -> Float[Array, 
     )
 
 
+@jax.jit
 def external_reliability(redundancy, delta0: float = 4.13) -> Float[Array, "..."]:
     """Largest effect of an undetected blunder on any unknown, in units of that unknown's σ."""
     r = jnp.maximum(redundancy, UNCONTROLLED)
