@@ -2,7 +2,7 @@
 
 A similarity of object space (3 shifts, 3 rotations, 1 scale) changes no image coordinate, so the
 Jacobian of a free network is singular along the Helmert matrix G (Blaha 1971; Illner 1985).
-Which combinations of its seven columns stay open is found from the Jacobian itself: a distance
+Which combinations of its seven columns stay open is found from the other observations: a distance
 closes the scale, control points and priors close more.
 
 The datum is imposed by an S-transformation (Baarda 1973; Teunissen 1985): with a choice B of
@@ -20,10 +20,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from jaxbundle.adjustment.jacobian import BundleJacobian, compiled_jacobian, free_tangent
+from jaxbundle.adjustment.jacobian import distance_blocks, exterior_blocks, free_tangent
 from jaxbundle.geometry import (
     helmert_point,
     helmert_pose,
@@ -54,44 +53,49 @@ def gauge_directions(structure: Structure, values: Values) -> Tangent:
     return jax.tree.map(lambda g: g @ structure.gauge, helmert(structure, values))
 
 
-compiled_directions = eqx.filter_jit(gauge_directions)
-"""`gauge_directions`, compiled."""
+compiled_helmert = eqx.filter_jit(helmert)
 
 
 def open_similarities(structure: Structure, data: Data) -> Float[np.ndarray, "7 defect"]:
     """The combinations of the seven similarities that change no observation and nothing held.
 
-    Found at the start values from the singular values of J·G, its columns scaled by the size of
-    their terms, so that neither units nor the number of observations matter.
+    An image point is the same after any similarity, so only control points, priors of exterior
+    orientations and distances are asked, and what is held. Found at the start values from the
+    singular values of their products with G, its columns scaled by the size of their terms, so that
+    neither units nor the number of observations matter.
     """
-    jac = compiled_jacobian(structure, data.start, data)
-    products, terms, held = (np.asarray(x) for x in _directional_products(jac, data.start))
+    products, terms, held = _directional_products(structure, data)
     # What cannot be computed from the start values says nothing; the solver will complain.
-    finite = np.isfinite(products).all(1)
-    products, terms = products[finite], terms[np.isfinite(terms).all(1)]
-    scale = np.sqrt((terms**2).sum(0))
+    products, terms, held = (x[np.isfinite(x).all(1)] for x in (products, terms, held))
+    scale = np.sqrt((np.concatenate([terms, held]) ** 2).sum(0))
     scale = np.where(scale > 0, scale, 1.0)
-    held = held[np.isfinite(held).all(1)] / scale
+    held = held / scale
     size = np.linalg.norm(held, axis=1, keepdims=True)
     held = held / np.where(size > 0, size, 1.0)
     # Singular values of a QR, not of the Gram matrix, which would lose half of the digits.
-    triangle = np.linalg.qr(np.concatenate([products / scale, held]), mode="r")
-    _, singular, directions = np.linalg.svd(triangle)
+    rows = np.concatenate([products / scale, held, np.zeros((7, 7))])
+    _, singular, directions = np.linalg.svd(np.linalg.qr(rows, mode="r"))
     return directions[singular < OPEN].T / scale[:, None]
 
 
+def _directional_products(s: Structure, data: Data):
+    """What control points, priors and distances change along G [rows, 7], the terms that cancel in
+    it, and G on what is held."""
+    G = jax.tree.map(np.asarray, compiled_helmert(s, data.start))
+    exterior, distance = (np.asarray(x) for x in _prior_blocks(s, data))
+    control = np.asarray(data.control_weight)[..., None] * G.point[np.asarray(s.control)]
+    exterior = exterior @ G.image[np.asarray(s.exterior), :6]
+    ends = np.einsum("dei,deik->edk", distance, G.point[np.asarray(s.distance)])
+    flat = lambda *rows: np.concatenate([x.reshape(-1, 7) for x in rows])
+    held = [
+        g[np.asarray(f) == 0] for g, f in zip(jax.tree.leaves(G), jax.tree.leaves(free_tangent(s)))
+    ]
+    return flat(control, exterior, ends.sum(0)), flat(control, exterior, ends), flat(*held)
+
+
 @eqx.filter_jit
-def _directional_products(jac: BundleJacobian, values: Values):
-    """J·G, the terms that cancel in it, and G on what is held [rows, 7]."""
-    G, free = helmert(jac.structure, values), free_tangent(jac.structure)
-    moving = jax.tree.map(lambda g, f: g * f[..., None], G, free)
-    still = jax.tree.map(jnp.zeros_like, moving)
-    along = jax.vmap(lambda direction: ravel_pytree(jac.mv(direction))[0], -1, -1)
-    images = along(Tangent(moving.image, moving.camera, still.point))
-    points = along(Tangent(still.image, still.camera, moving.point))
-    flat = lambda tree: jnp.concatenate([x.reshape(-1, 7) for x in jax.tree.leaves(tree)])
-    held = flat(jax.tree.map(lambda g, m: g - m, G, moving))
-    return images + points, jnp.concatenate([images, points]), held
+def _prior_blocks(s: Structure, data: Data):
+    return exterior_blocks(s, data.start, data), distance_blocks(s, data.start, data)
 
 
 def s_transform(structure: Structure, values: Values, change: Tangent) -> Tangent:
@@ -199,7 +203,7 @@ def choose_minimal_coordinates(
     Rows of G on the candidate coordinates, by Gram–Schmidt with row pivoting: each time the
     coordinate that the ones chosen so far determine least.
     """
-    G = np.asarray(compiled_directions(structure, data.start).point)
+    G = np.asarray(compiled_helmert(structure, data.start).point) @ np.asarray(structure.gauge)
     return _pick_rows(G.reshape(-1, structure.defect), candidates.ravel()).reshape(-1, 3)
 
 
@@ -208,7 +212,7 @@ def choose_pins(structure: Structure, data: Data) -> Float[np.ndarray, "images i
 
     Angles count times the size of the network, so that they compare with positions.
     """
-    G = np.array(compiled_directions(structure, data.start).image)
+    G = np.asarray(compiled_helmert(structure, data.start).image) @ np.asarray(structure.gauge)
     places = np.concatenate([np.asarray(data.start.position), np.asarray(data.start.point)])
     places = places[np.isfinite(places).all(1)]
     G[:, 3:] *= np.sqrt(places.var(0).sum()) if len(places) else 1.0

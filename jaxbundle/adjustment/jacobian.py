@@ -152,26 +152,36 @@ def jacobian(structure: Structure, values: Values, data: Data) -> BundleJacobian
         if s.camera_width:
             camera = camera * s.table.of_image(s.camera_free[s.camera_of_image])[:, None, :]
         point = point * s.point_free[s.point][:, None, :]
-    a, b = s.distance[:, 0], s.distance[:, 1]
-    zero3 = jnp.zeros(3)
-    ends = jax.vmap(jax.jacrev(distance_residual, (4, 5)), (0, 0, 0, 0, None, None))(
-        values.point[a], values.point[b], data.distance, data.distance_weight, zero3, zero3
-    )
     return BundleJacobian(
         structure=s,
         image=image,
         camera=camera,
         point=point,
         control=data.control_weight,
-        exterior=jax.vmap(jax.jacfwd(exterior_residual, 4), (0, 0, 0, 0, None))(
-            values.position[s.exterior], values.rotation[s.exterior],
-            data.exterior, data.exterior_weight, jnp.zeros(6),
-        ) * s.image_free[s.exterior][:, None, :],
+        exterior=exterior_blocks(s, values, data) * s.image_free[s.exterior][:, None, :],
         interior=jnp.take_along_axis(data.interior_weight, s.camera_columns[s.interior], 1)
         * s.camera_free[s.interior],
-        distance=jnp.stack(ends, 1) * s.point_free[s.distance],
+        distance=distance_blocks(s, values, data) * s.point_free[s.distance],
         _parameters=values.camera.shape[1],
     )  # fmt: skip
+
+
+def exterior_blocks(s: Structure, values: Values, data: Data) -> Float[Array, "exterior 6 6"]:
+    """Derivatives of the priors of exterior orientations by the change of their images."""
+    return jax.vmap(jax.jacfwd(exterior_residual, 4), (0, 0, 0, 0, None))(
+        values.position[s.exterior], values.rotation[s.exterior],
+        data.exterior, data.exterior_weight, jnp.zeros(6),
+    )  # fmt: skip
+
+
+def distance_blocks(s: Structure, values: Values, data: Data) -> Float[Array, "distances 2 3"]:
+    """Derivatives of the distances by their two ends."""
+    a, b = values.point[s.distance[:, 0]], values.point[s.distance[:, 1]]
+    still = jnp.zeros(3)
+    ends = jax.vmap(jax.jacrev(distance_residual, (4, 5)), (0, 0, 0, 0, None, None))(
+        a, b, data.distance, data.distance_weight, still, still
+    )
+    return jnp.stack(ends, 1)
 
 
 def compiled_jacobian(structure: Structure, values: Values, data: Data) -> BundleJacobian:
