@@ -7,6 +7,7 @@ import pytest
 
 import jaxbundle
 from jaxbundle import Camera
+from jaxbundle.adjustment.solve import find_minimum, make_solver
 from jaxbundle.bundle import adjust
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.statistics.distributions import tau_quantile
@@ -146,6 +147,21 @@ def test_gauss_newton_finds_the_same_minimum(simulation, result):
     other = adjust(simulation.network, method="gauss-newton")
     assert other.converged
     assert other.vtpv == pytest.approx(result.vtpv, rel=1e-10)
+
+
+def test_gauss_newton_that_strays_is_not_taken_for_a_minimum(simulation):
+    """It may end in another minimum, or not at all, but never where vᵀPv could still fall."""
+    rng = np.random.default_rng(0)
+    points = simulation.network.points
+    for size in (0.1, 0.3, 1.0):
+        moved = points.position + size * rng.uniform(-1, 1, points.position.shape)
+        network = simulation.network.replace(points=dataclasses.replace(points, position=moved))
+        found = adjust(network, method="gauss-newton", max_iterations=30)
+        if found.converged:
+            solver = make_solver(found.problem, max_steps=101)
+            again = find_minimum(solver, found.problem.data, found.values)
+            lowest = 2 * np.nanmin(again.history.cost)
+            assert found.vtpv == pytest.approx(lowest, rel=1e-8)
 
 
 def test_what_is_not_solved_has_no_values(simulation):

@@ -33,6 +33,10 @@ from jaxbundle.geometry import (
 from jaxbundle.network.arrays import Data, Tangent, Values
 from jaxbundle.network.structure import Structure
 
+NEAR = 1e-3
+"""A motion into the datum by less than this fraction of the network is near its end."""
+HELD = 1e-7
+"""Relative size of the least motion of datum points that hold the datum."""
 OPEN = 1e-10
 """Relative size of J·G below which a direction counts as open (rounding gives about 1e-14)."""
 
@@ -125,11 +129,11 @@ def move_to_datum(
     return _moved(s, s.gauge @ _newton_step(s, values.point, start.point), values)
 
 
-def _motion_to_datum(s: Structure, point, target, steps: int = 20):
+def _motion_to_datum(s: Structure, point, target, steps: int = 50):
     """The similarity that puts the points into their datum, by motions along the open directions.
 
     They form a group, so that the whole motion is one of them: a rotation about a fixed point stays
-    one."""
+    one. Gauss–Newton steps, of a radian and a factor e at most, until near; then Newton's."""
     size = jnp.abs(point).max()
 
     def moving(state):
@@ -141,7 +145,11 @@ def _motion_to_datum(s: Structure, point, target, steps: int = 20):
     def further(state):
         motion, before, _, count = state
         x = _moved_points(s, motion, point)
-        step = _exponential(s.gauge @ _newton_step(s, x, target))
+        missing, gram = _datum_equations(s, x, target)
+        far = before > NEAR * size
+        step = jnp.where(far, -jnp.linalg.solve(gram, missing), _newton_step(s, x, target))
+        step = s.gauge @ step
+        step = _exponential(step / jnp.maximum(jnp.abs(step[3:]).max(), 1.0))
         distance = jnp.abs(_moved_points(s, step, x) - x).max()
         return similarity.compose(step, motion), distance, before, count + 1
 
@@ -151,15 +159,17 @@ def _motion_to_datum(s: Structure, point, target, steps: int = 20):
 
 def _newton_step(s: Structure, point, target) -> Float[Array, " defect"]:
     """The motion that meets Bᵀ(x − x_start) = 0 to first order; its slope is held constant."""
-
-    def missing(x, target):
-        G = jax.vmap(helmert_point)(x) @ s.gauge
-        return jnp.einsum("pik,pi->k", G * s.datum_weight[..., None], x - target)
-
-    x, fixed_target = jax.lax.stop_gradient((point, target))
-    after = lambda tau: missing(_moved_points(s, s.gauge @ tau, x), fixed_target)
+    x, still = jax.lax.stop_gradient((point, target))
+    after = lambda tau: _datum_equations(s, _moved_points(s, s.gauge @ tau, x), still)[0]
     slope = jax.jacfwd(after)(jnp.zeros(s.defect))
-    return -jnp.linalg.solve(slope, missing(point, target))
+    return -jnp.linalg.solve(slope, _datum_equations(s, point, target)[0])
+
+
+def _datum_equations(s: Structure, x, target):
+    """Bᵀ(x − x_start) and BᵀG."""
+    G = jax.vmap(helmert_point)(x) @ s.gauge
+    B = G * s.datum_weight[..., None]
+    return jnp.einsum("pik,pi->k", B, x - target), jnp.einsum("pik,pil->kl", B, G)
 
 
 def _moved(s: Structure, motion, values: Values) -> Values:
@@ -193,6 +203,20 @@ def _exponential(direction: Float[Array, "7"]) -> Float[Array, "7"]:
     still = direction.at[:3].set(0.0)
     moved = jax.vmap(lambda u: transform_point(u * still, direction[:3]))(NODES + 0.5)
     return still.at[:3].set(WEIGHTS @ moved)
+
+
+def hold_the_datum(
+    structure: Structure, data: Data, candidates: Float[np.ndarray, "points 3"]
+) -> bool:
+    """Whether the open similarities move these coordinates in independent ways."""
+    G = np.asarray(compiled_helmert(structure, data.start).point) @ np.asarray(structure.gauge)
+    chosen = (G * candidates[..., None]).reshape(-1, structure.defect)
+    finite = np.isfinite(chosen).all(1)
+    if not finite.all():
+        return True  # The solver will complain.
+    size = np.linalg.norm(G.reshape(-1, structure.defect), axis=0)
+    singular = np.linalg.svd(chosen / size, compute_uv=False)
+    return len(singular) == structure.defect and singular[-1] > HELD * singular[0]
 
 
 def choose_minimal_coordinates(
@@ -233,8 +257,12 @@ def _pick_rows(G, candidates):
     return chosen
 
 
-def open_directions_in_words(gauge: Float[np.ndarray, "7 defect"]) -> str:
-    """Which of shift, rotation and scale the observations leave open, for messages."""
+def open_directions_in_words(gauge: Float[np.ndarray, "7 defect"], about=(0.0, 0.0, 0.0)) -> str:
+    """Which of shift, rotation and scale the observations leave open, for messages.
+
+    Rotation and scale are about the place `about`: with one point known, no shift is open."""
+    gauge = np.array(gauge)
+    gauge[:3] += np.cross(gauge[3:6].T, about).T + np.outer(about, gauge[6])
     q, _ = np.linalg.qr(gauge / np.linalg.norm(gauge, axis=0)) if gauge.size else (gauge, None)
     names = ["shift X", "shift Y", "shift Z", "rotation X", "rotation Y", "rotation Z", "scale"]
     parts = [name for name, row in zip(names, q) if np.linalg.norm(row) > 0.1]

@@ -10,12 +10,14 @@ from jaxtyping import Float, Int
 from jaxbundle.adjustment.datum import (
     choose_minimal_coordinates,
     choose_pins,
+    hold_the_datum,
     open_directions_in_words,
     open_similarities,
 )
 from jaxbundle.errors import InputError
 from jaxbundle.network.arrays import Data
 from jaxbundle.network.reduction import FACTORS, REDUCTIONS
+from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.structure import Structure, make_structure, order_cameras
 from jaxbundle.network.tables import Network
 
@@ -61,6 +63,8 @@ class Problem:
 def make_problem(network: Network, reduction: str | None = None) -> Problem:
     """Index plan, arrays and datum of a checked network (see `jaxbundle.network.check_network`).
 
+    Check points take no part: they and their rays are left out.
+
     `reduction`: how the reduced system is solved, "dense", "banded" or "iterative"; chosen by its
     size and fill if not given.
 
@@ -68,14 +72,17 @@ def make_problem(network: Network, reduction: str | None = None) -> Problem:
     64-bit floats.
     """
     require_x64()
-    network = order_cameras(network)
+    network = order_cameras(split_check_points(network)[0])
     ways = REDUCTIONS if reduction is None else (reduction,)
     structure, data, origin, rays = make_structure(network, ways=ways)
     gauge = open_similarities(structure, data)
     defect = gauge.shape[1]
     if network.datum == "control" and defect:
+        known = network.points.has_role("control") | network.points.has_role("fixed")
+        about = (network.points.position - origin)[known]
+        words = open_directions_in_words(gauge, about.mean(0) if len(about) else np.zeros(3))
         raise InputError(
-            f"the datum is not fixed: the observations leave open {open_directions_in_words(gauge)}"
+            f"the datum is not fixed: the observations leave open {words}"
             f" ({defect} of 7). Give control points or distances, or choose datum = \"inner\" "
             "or \"minimal\"."
         )
@@ -123,6 +130,12 @@ def _datum_weight(network: Network, structure: Structure, data: Data):
         chosen = points.has_role("tie")
         chosen = chosen if chosen.any() else points.has_role("control")
     candidates = chosen[:, None] * free
+    if not hold_the_datum(structure, data, candidates):
+        raise InputError(
+            f"the {int(chosen.sum())} datum points cannot hold the datum, of which "
+            f"{structure.defect} of 7 parameters are open: give at least three free points that "
+            "are not on one line (datum_points), or leave the choice to the program"
+        )
     if network.datum == "minimal":
         return choose_minimal_coordinates(structure, data, candidates)
     return candidates

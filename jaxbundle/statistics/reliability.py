@@ -70,7 +70,7 @@ def hat_diagonal(jac: BundleJacobian, cofactors: Cofactors) -> Residuals:
     m = s.cameras * k
     points = cofactors.internal_point
     form = lambda a, block, b: jnp.einsum("nai,nij,naj->na", a, block, b)
-    image = form(jac.image, Q.own[s.image], jac.image)
+    image = s.table.forms(jac.image, Q.own, jac.image)
     image += form(jac.point, points[s.point], jac.point)
     image += 2 * form(jac.point, cofactors.ray, jac.image)
     interior = Q.own
@@ -78,8 +78,9 @@ def hat_diagonal(jac: BundleJacobian, cofactors: Cofactors) -> Residuals:
     if k:
         at = jnp.arange(s.images)
         with_camera = Q.border[:m].reshape(s.cameras, k, s.images, w)[s.camera_of_image, :, at, :]
-        image += form(jac.camera, cofactors.camera[s.camera], jac.camera)
-        image += 2 * form(jac.camera, with_camera[s.image], jac.image)
+        own_camera = cofactors.camera[s.camera_of_image]
+        image += s.table.forms(jac.camera, own_camera, jac.camera)
+        image += 2 * s.table.forms(jac.camera, with_camera, jac.image)
         image += 2 * form(jac.point, cofactors.incidence[s.incidence.of_ray], jac.camera)
         interior, first = cofactors.camera, 0
     control = jac.control**2 * jnp.diagonal(points[s.control], axis1=1, axis2=2)

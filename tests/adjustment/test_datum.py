@@ -131,6 +131,27 @@ def test_an_open_datum_is_refused_unless_asked_for():
     assert make_problem(network.replace(datum="minimal")).counts.datum == 4
 
 
+def test_what_is_open_is_named_about_what_is_known():
+    # About its one fixed point a network can only turn and grow.
+    network = CASES["a fixed point"][0]
+    with pytest.raises(InputError, match="leave open rotation X, rotation Y, rotation Z, scale "):
+        make_problem(network.replace(datum="control"))
+
+
+@pytest.mark.parametrize("chosen", [1, 2])
+@pytest.mark.parametrize("datum", ["inner", "minimal"])
+def test_datum_points_that_cannot_hold_the_datum_are_refused(datum, chosen):
+    network = FREE.replace(datum=datum, datum_points=FREE.points.id[:chosen])
+    with pytest.raises(InputError, match="cannot hold the datum"):
+        make_problem(network)
+    # Three on one line hold it no better.
+    position = FREE.points.position.copy()
+    position[2] = 0.3 * position[0] + 0.7 * position[1]
+    points = dataclasses.replace(FREE.points, position=position)
+    with pytest.raises(InputError, match="not on one line"):
+        make_problem(network.replace(points=points, datum_points=FREE.points.id[:3]))
+
+
 def test_start_values_that_cannot_be_computed_are_left_to_the_solver():
     structure, data = _arrays(FREE)
     point = data.start.point.at[0].set(jnp.nan)

@@ -20,7 +20,9 @@ from adjustment_checks import (
 )
 
 from jaxbundle.adjustment.jacobian import free_tangent, jacobian
+from jaxbundle.adjustment.residuals import exterior_residual
 from jaxbundle.cameras import MODEL_NAMES
+from jaxbundle.geometry import matrix_from_omega_phi_kappa, quaternion_from_matrix
 from jaxbundle.network import make_structure
 
 DIFFERENCES = 1e-7
@@ -103,3 +105,16 @@ def test_forward_mode_through_everything_gives_the_same_digits():
     function, zero = of_change(problem.structure, problem.data.start, problem.data)
     # The same derivatives in another order of operations: rounding only.
     assert_columns_agree(net.J, np.asarray(jax.jit(jax.jacfwd(function))(zero)), 1e-11)
+
+
+def test_a_prior_of_angles_counts_from_the_representation_it_is_given_in():
+    # φ beyond 90°: (ω, φ, κ) and (ω + π, π − φ, κ + π) are one rotation.
+    given = jnp.asarray([1.0, 2.0, 3.0, 0.2, 1.9, -0.4])
+    q = quaternion_from_matrix(matrix_from_omega_phi_kappa(given[3:]))
+    still = exterior_residual(given[:3], q, given, jnp.ones(6), jnp.zeros(6))
+    np.testing.assert_allclose(still, 0, atol=1e-12)
+    # One degree in ω is one degree of residual.
+    turned = given.at[3].add(jnp.pi / 180)
+    q = quaternion_from_matrix(matrix_from_omega_phi_kappa(turned[3:]))
+    moved = exterior_residual(given[:3], q, given, jnp.ones(6), jnp.zeros(6))
+    np.testing.assert_allclose(moved, [0, 0, 0, np.pi / 180, 0, 0], atol=1e-12)

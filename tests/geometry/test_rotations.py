@@ -195,3 +195,12 @@ def test_dtype_follows_the_input(name, dtype):
         p = jax.eval_shape(geometry.rodrigues_from_matrix, M)
         assert M.dtype == jax.eval_shape(from_matrix, M).dtype == dtype
         assert p.dtype == jax.eval_shape(geometry.matrix_from_rodrigues, p).dtype == dtype
+
+
+@pytest.mark.parametrize("given", [(0.3, 1.2, -2.0), (0.3, 2.0, -2.0), (4.0, -1.8, 9.0)])
+def test_the_representation_nearest_to_given_angles(given):
+    # A rotation near the given one, whichever of its representations the given angles are.
+    given = np.array(given)
+    M = geometry.matrix_from_omega_phi_kappa(jnp.asarray(given + [0.01, -0.02, 0.03]))
+    found = geometry.omega_phi_kappa_near(M, jnp.asarray(given))
+    np.testing.assert_allclose(found, given + [0.01, -0.02, 0.03], atol=1e-12)
