@@ -113,18 +113,17 @@ def run(images: int, points: int, spacing: float, repeat: int) -> dict:
 
     (result, *_), first_statistics_s = timed(statistics)
     memory["statistics"] = peak_mb()
+    summary = {name: getattr(result, name) for name in ("redundancy", "converged", "termination")}
+    summary["sigma0"], parameters = result.sigma0, result.cameras["cam"]["parameters"]
+    del result, _  # else there would be two of them at a time
     statistics_s = best(statistics, repeat)
 
     evaluations = int(minimum.iterations)
-    parameters = result.cameras["cam"]["parameters"]
-    return {
+    return summary | {
         "images": len(problem.network.images),
         "points": len(problem.network.points),
         "image_coordinates": problem.counts.observations,
         "unknowns": problem.counts.unknowns,
-        "redundancy": result.redundancy,
-        "converged": result.converged,
-        "termination": result.termination,
         "evaluations": evaluations,
         "clock_processor_s": {
             "simulate": simulate_s.tolist(),
@@ -137,7 +136,6 @@ def run(images: int, points: int, spacing: float, repeat: int) -> dict:
             "statistics": statistics_s.tolist(),
         },
         "peak_mb": memory,
-        "sigma0": result.sigma0,
         "errors_in_sigma": {
             name: (parameters[name]["value"] - TRUE[name]) / parameters[name]["sigma"]
             for name in FREE

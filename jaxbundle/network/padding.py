@@ -13,12 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbundle.network.arrays import Data, Values
+from jaxbundle.network.arrays import Data, Tangent, Values
 from jaxbundle.network.pairs import Pairs
 from jaxbundle.network.rays import RayTable
 from jaxbundle.network.structure import Group, Incidence, Structure
 
 SPARE_POINTS = 2
+
+STEPS = 8
+"""Sizes of buckets between one power of two and the next: at most an eighth is filled in."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,6 +86,30 @@ def common_sizes(all_sizes) -> Sizes:
     found["groups"] = tuple(np.max(groups, 0).tolist())
     found["points"] += SPARE_POINTS
     return Sizes(**found)
+
+
+def bucket_of(structure: Structure) -> Sizes:
+    """Round sizes that hold this structure, the same for all of nearly its size.
+
+    A table without rows stays one. The images of a band keep their number, on which it depends."""
+    exact = sizes_of(structure)
+    least = common_sizes([exact])
+    chunks = _rounded(least.chunks)
+    filled = np.add(exact.groups, chunks - exact.chunks)
+    found = {
+        field.name: jax.tree.map(_rounded, getattr(least, field.name))
+        for field in dataclasses.fields(Sizes)
+    }
+    found |= {"chunks": chunks, "groups": tuple(_rounded(int(n)) for n in filled)}
+    if structure.band is not None:
+        found["images"] = exact.images
+    return Sizes(**found)
+
+
+def _rounded(number: int) -> int:
+    """The next number of the form m·2ⁿ with STEPS ≤ m < 2·STEPS; small ones as they are."""
+    step = 1 << max(number.bit_length() - STEPS.bit_length(), 0)
+    return -(-number // step) * step
 
 
 def pad(structure: Structure, data: Data, sizes: Sizes) -> tuple[Structure, Data]:
@@ -156,6 +183,16 @@ def pad_values(values: Values, sizes: Sizes) -> Values:
 def unpad_values(values: Values, like: Values) -> Values:
     """The values without what was filled in."""
     return jax.tree.map(lambda x, l: x[: l.shape[0]], values, like)
+
+
+def pad_tangents(rows: Tangent, sizes: Sizes) -> Tangent:
+    """Changes of these sizes, zero for what is filled in; their first axis numbers them."""
+    number = (sizes.images, sizes.cameras, sizes.points)
+    filled = (
+        jnp.pad(x, ((0, 0), (0, n - x.shape[1]), (0, 0)))
+        for x, n in zip((rows.image, rows.camera, rows.point), number)
+    )
+    return Tangent(*filled)
 
 
 def _pad_data(data: Data, sizes: Sizes, rays: int) -> Data:

@@ -62,31 +62,41 @@ class Pairs(eqx.Module):
         a: Float[Array, "rows d m"],
         b: Float[Array, "rows d n"],
         Q: Float[Array, "blocks m n"],
-        same: bool,
+        totals: tuple[Float[Array, "rows d m"], Float[Array, "rows d n"]],
     ) -> tuple[Float[Array, "rows d m"], Float[Array, "rows d n"]]:
-        """The other way round: Σ b·Qᵀ for every row of the first table over its partners b in the
-        second, and Σ a·Q for every row of the second; Q is the block of each pair.
+        """The other way round: to the first of the totals is added b·Qᵀ for every partner b of its
+        row, to the second a·Q; Q is the block of each pair."""
+        add = lambda totals, i, to_first, j, to_second: (
+            totals[0].at[i].add(to_first), totals[1].at[j].add(to_second)
+        )  # fmt: skip
+        return self._spread(a, b, Q, Q, totals, add)
 
-        `same`: both are one table, and pairs within a block are listed in both orders, a row with
-        itself once; they count for the first table only."""
-        twice = same & (self.row == self.column)
-        Q_second = jnp.where(twice[:, None, None], 0.0, Q)
-        rows = a.shape[0], b.shape[0]
-        a = a if self.empty[0] else _with_zero_row(a)
-        b = b if self.empty[1] else _with_zero_row(b)
-        missing = a.shape[0] - 1, b.shape[0] - 1
-        totals = jnp.zeros_like(a), jnp.zeros_like(b)
-        for first, second, block in zip(self.first, self.second, self.block):
+    def spread_within(
+        self, a: Float[Array, "rows d m"], Q: Float[Array, "blocks m m"], total
+    ) -> Float[Array, "rows d m"]:
+        """The same where both tables are one. Pairs within a block are then listed in both orders,
+        a row with itself once: they count one way only."""
+        once = jnp.where((self.row == self.column)[:, None, None], 0.0, Q)
+        add = lambda total, i, to_first, j, to_second: (
+            total.at[i].add(to_first).at[j].add(to_second)
+        )  # fmt: skip
+        return self._spread(a, a, Q, once, total, add)
 
-            def add(totals, chunk):
-                i, j, k = chunk
-                to_first = jnp.einsum("cldn,cmn->cldm", b[j], Q[k])
-                to_second = jnp.einsum("cldm,cmn->cldn", a[i], Q_second[k])
-                return totals[0].at[i].add(to_first), totals[1].at[j].add(to_second)
+    def _spread(self, a, b, Q_first, Q_second, total, add):
+        # Missing rows are past the end of the totals, where nothing is added.
+        first_table = a if self.empty[0] else _with_zero_row(a)
+        second_table = b if self.empty[1] else _with_zero_row(b)
+        missing = (first_table.shape[0] - 1, second_table.shape[0] - 1, self.row.shape[0])
 
-            missing_chunk = (*missing, self.row.shape[0])
-            totals = _over_steps(add, totals, (first, second, block), missing_chunk)
-        return totals[0][: rows[0]], totals[1][: rows[1]]
+        def add_chunk(total, chunk):
+            i, j, k = chunk
+            to_first = jnp.einsum("cldn,cmn->cldm", second_table[j], Q_first[k])
+            to_second = jnp.einsum("cldm,cmn->cldn", first_table[i], Q_second[k])
+            return add(total, i, to_first, j, to_second)
+
+        for chunks in zip(self.first, self.second, self.block):
+            total = _over_steps(add_chunk, total, chunks, missing)
+        return total
 
 
 def _with_zero_row(a):

@@ -64,17 +64,14 @@ class RayTable(eqx.Module):
         rows = blocks.reshape(chunks, self.chunk * blocks.shape[1], blocks.shape[2])
         return jnp.einsum("cki,ci->ck", rows, vectors[self.chunk_image]).reshape(blocks.shape[:2])
 
-    def forms(
-        self,
-        a: Shaped[Array, "rays d m"],
-        matrices: Shaped[Array, "images m n"],
-        b: Shaped[Array, "rays d n"],
-    ) -> Shaped[Array, "rays d"]:
-        """aᵀ·M·b for every row d of every ray, M that of its image."""
-        chunks = self.chunk_image.shape[0]
-        stack = lambda x: x.reshape(chunks, self.chunk * x.shape[1], x.shape[2])
-        products = jnp.einsum("cki,cij->ckj", stack(a), matrices[self.chunk_image])
-        return jnp.sum(products * stack(b), 2).reshape(a.shape[:2])
+    def times_matrix(
+        self, blocks: Shaped[Array, "rays d m"], matrices: Shaped[Array, "images m n"]
+    ) -> Shaped[Array, "rays d n"]:
+        """Every block times the matrix of its image."""
+        chunks, depth = self.chunk_image.shape[0], blocks.shape[1]
+        rows = blocks.reshape(chunks, self.chunk * depth, blocks.shape[2])
+        products = jnp.einsum("cki,cij->ckj", rows, matrices[self.chunk_image])
+        return products.reshape(-1, depth, matrices.shape[2])
 
     def products_by_image(
         self, a: Shaped[Array, "rays d m"], b: Shaped[Array, "rays d n"]

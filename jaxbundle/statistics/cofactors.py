@@ -102,17 +102,15 @@ def _couplings(factor, Q):
     s = factor.structure
     C, k, I, w = s.cameras, s.camera_width, s.images, s.image_width
     Z, Zc = factor.ray, factor.incidence
-    K = jnp.einsum("nij,njk->nik", Z, s.table.of_image(Q.own))
+    K = s.image_pairs.spread_within(Z, Q.pairs, s.table.times_matrix(Z, Q.own))
     Kc = jnp.zeros_like(Zc)
-    K += sum(s.image_pairs.spread(Z, Z, Q.pairs, True))
     if k:
         at = s.image_camera_pairs
         with_images = Q.border[: C * k].reshape(C, k, I, w)[at.column, :, at.row, :]
-        to_ray, to_incidence = at.spread(Z, Zc, with_images.transpose(0, 2, 1), False)
+        K, Kc = at.spread(Z, Zc, with_images.transpose(0, 2, 1), (K, Kc))
         at = s.camera_pairs
         cameras = Q.corner[: C * k, : C * k].reshape(C, k, C, k)[at.row, :, at.column, :]
-        K += to_ray
-        Kc += to_incidence + sum(at.spread(Zc, Zc, cameras, True))
+        Kc = at.spread_within(Zc, cameras, Kc)
     return K, Kc
 
 

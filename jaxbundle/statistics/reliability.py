@@ -70,7 +70,8 @@ def hat_diagonal(jac: BundleJacobian, cofactors: Cofactors) -> Residuals:
     m = s.cameras * k
     points = cofactors.internal_point
     form = lambda a, block, b: jnp.einsum("nai,nij,naj->na", a, block, b)
-    image = s.table.forms(jac.image, Q.own, jac.image)
+    at_images = lambda a, block, b: jnp.sum(s.table.times_matrix(a, block) * b, 2)
+    image = at_images(jac.image, Q.own, jac.image)
     image += form(jac.point, points[s.point], jac.point)
     image += 2 * form(jac.point, cofactors.ray, jac.image)
     interior = Q.own
@@ -79,8 +80,8 @@ def hat_diagonal(jac: BundleJacobian, cofactors: Cofactors) -> Residuals:
         at = jnp.arange(s.images)
         with_camera = Q.border[:m].reshape(s.cameras, k, s.images, w)[s.camera_of_image, :, at, :]
         own_camera = cofactors.camera[s.camera_of_image]
-        image += s.table.forms(jac.camera, own_camera, jac.camera)
-        image += 2 * s.table.forms(jac.camera, with_camera, jac.image)
+        image += at_images(jac.camera, own_camera, jac.camera)
+        image += 2 * at_images(jac.camera, with_camera, jac.image)
         image += 2 * form(jac.point, cofactors.incidence[s.incidence.of_ray], jac.camera)
         interior, first = cofactors.camera, 0
     control = jac.control**2 * jnp.diagonal(points[s.control], axis1=1, axis2=2)

@@ -35,7 +35,8 @@ def test_sum_over_blocks(small, monkeypatch):
         to_a[i] += b[j] @ Q[r, c].T
         to_b[j] += a[i] @ Q[r, c]
     blocks = jnp.asarray(Q[np.asarray(table.row), np.asarray(table.column)])
-    found = table.spread(jnp.asarray(a), jnp.asarray(b), blocks, False)
+    nothing = jnp.zeros(a.shape), jnp.zeros(b.shape)
+    found = table.spread(jnp.asarray(a), jnp.asarray(b), blocks, nothing)
     np.testing.assert_allclose(found[0], to_a, atol=1e-11)
     np.testing.assert_allclose(found[1], to_b, atol=1e-11)
 
