@@ -20,8 +20,8 @@ from jaxbundle.network.check import check_network
 from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.tables import Network
 from jaxbundle.result import Adjustment
-from jaxbundle.statistics import cofactors as all_cofactors
 from jaxbundle.statistics import (
+    Component,
     intersect_check_points,
     reliability,
     rescale,
@@ -29,6 +29,7 @@ from jaxbundle.statistics import (
     undamped_factor,
     variance_components,
 )
+from jaxbundle.statistics import cofactors as all_cofactors
 
 CORE_PARAMETERS = ("c", "x0", "y0", "fx", "fy", "cx", "cy", "f")
 """Interior parameters that are never eliminated for want of significance."""
@@ -38,6 +39,9 @@ RAYS_TO_SHARE = 10_000
 
 RUNAWAY = 20.0
 """A principal distance that changed by more than this factor belongs to no camera."""
+
+ROUNDS = 20
+"""Variance components are estimated at most so many times."""
 
 
 def adjust(
@@ -66,7 +70,7 @@ def adjust(
     - `eliminate`: fix additional parameters with t < `critical_t` at 0, the least significant
       first, adjusting again each time.
     - `estimate_components`: scale the σ of each group of observations until its variance
-      component is 1.
+      component is 1; `Adjustment.sigma_factors` says by how much.
     - `progress(step, cost, λ)`: called after every evaluation.
 
     **Returns:** an `Adjustment`; look at `converged` before anything else.
@@ -81,13 +85,13 @@ def adjust(
     minimum = _minimise(problem, problem.data.start, **options)
     problem = with_factor(problem)
 
-    removed, eliminated = [], []
+    removed, eliminated, factors = [], [], {}
     if _solved(problem, minimum):
         again = lambda problem, values: _minimise(problem, values, **options)
         if snooping:
             problem, minimum, removed = _snooped(problem, minimum, again, snooping, significance)
         if estimate_components:
-            problem, minimum = _with_components(problem, minimum, again)
+            problem, minimum, factors = _with_components(problem, minimum, again)
         if eliminate:
             problem, minimum, eliminated = _eliminated(problem, minimum, again, critical_t)
 
@@ -95,11 +99,12 @@ def adjust(
     check = None
     if len(check_points):
         check = lambda result: intersect_check_points(
-            problem, result.values, result.factor, check_points, check_rays
+            problem, result.values, result.factor, check_points, check_rays, factors
         )
     return Adjustment(
         network, problem, minimum, removed=tuple(removed), eliminated=tuple(eliminated),
         undetermined=tuple(names), check=check, method=method, reduction=used,
+        sigma_factors=factors,
     )  # fmt: skip
 
 
@@ -180,18 +185,45 @@ def _reliability(problem: Problem, values: Values):
     return reliability(problem.structure, values, problem.data, Q)
 
 
-def _with_components(problem, minimum, again, rounds: int = 20, tolerance: float = 1e-3):
-    """Repeat Förstner's estimate until every component is 1 within `tolerance`."""
-    for _ in range(rounds):
+def _with_components(problem, minimum, again, tolerance: float = 1e-3):
+    """Repeat Förstner's estimate until every component is 1 within `tolerance`.
+
+    Also returned: by group, what its σ have been multiplied by.
+    """
+    factors: dict[str, float] = {}
+    for done in range(ROUNDS + 1):
         found = _reliability(problem, minimum.values)
-        components = variance_components(problem, problem.data, found)
-        usable = [c.sigma for c in components.values() if c.redundancy >= 1]
-        if all(abs(sigma - 1) < tolerance for sigma in usable):
+        components = variance_components(problem, problem.data, found, factors)
+        estimable = {name: c for name, c in components.items() if c.usable}
+        factors = {name: c.factor for name, c in estimable.items()} | factors
+        open_ones = [name for name, c in estimable.items() if abs(c.ratio - 1) >= tolerance]
+        if done == ROUNDS or not open_ones:
             break
-        data = rescale(problem, problem.data, components)
+        ratios = {name: c.ratio for name, c in estimable.items()}
+        data = rescale(problem.network.cameras, problem.structure, problem.data, ratios)
         problem = dataclasses.replace(problem, data=data)
         minimum = again(problem, minimum.values)
-    return problem, minimum
+        if not _solved(problem, minimum):
+            raise NotSolvedError(
+                "with the estimated variance components the network is no longer determined: "
+                + ", ".join(_names_of_defects(problem, minimum)[:8])
+            )
+        factors |= {name: c.sigma for name, c in estimable.items()}
+    network = problem.network.warn(*_doubts(components, open_ones))
+    return dataclasses.replace(problem, network=network), minimum, factors
+
+
+def _doubts(components: dict[str, Component], open_ones: list[str]):
+    """What is to be said of an estimate of variance components."""
+    if open_ones:
+        yield (
+            f"the variance components did not settle in {ROUNDS} rounds ({', '.join(open_ones)}): "
+            "their σ are not final"
+        )
+    for name, component in components.items():
+        if not component.usable:
+            why = "fit exactly" if component.redundancy >= 1 else "have too little redundancy"
+            yield f"variance components: {name} {why}; their σ are left as they are"
 
 
 def _eliminated(problem, minimum, again, critical_t):

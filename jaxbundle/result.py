@@ -6,7 +6,7 @@ values to ask for: every accessor raises `NotSolvedError` and says why.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -61,6 +61,9 @@ class Adjustment:
     - `method`, `reduction`: of the solution; the latter of the reduced system of images and cameras
     - `warnings`, `removed` (data snooping), `eliminated` (insignificant parameters),
       `undetermined` (names, where the network is singular)
+    - `sigma_factors`: where variance components were estimated, by group of observations, what its
+      a priori σ have been multiplied by; empty otherwise. Everything called a priori then means
+      the estimated σ, except in `variance_components`.
     """
 
     def __init__(
@@ -75,6 +78,7 @@ class Adjustment:
         check: Callable[["Adjustment"], CheckPoints] | None = None,
         method: str = "levenberg-marquardt",
         reduction: str | None = None,
+        sigma_factors: Mapping[str, float] | None = None,
     ):
         self.network = network
         self.problem = problem
@@ -84,6 +88,7 @@ class Adjustment:
         self.undetermined = undetermined
         self.method = method
         self.reduction = reduction or problem.structure.reduction
+        self.sigma_factors = dict(sigma_factors or {})
         self._check = check
 
     # --- how it ended -----------------------------------------------------------------------
@@ -150,10 +155,14 @@ class Adjustment:
         return float(np.sqrt(self.vtpv / r)) if r > 0 else float("nan")
 
     def global_test(self, significance: float = 0.05) -> dict:
-        """χ² test of vᵀPv against a variance factor of 1 (two-sided)."""
+        """χ² test of vᵀPv against a variance factor of 1 (two-sided).
+
+        `passed` is None where variance components were estimated, which makes σ0 = 1.
+        """
         f = self.redundancy
         low, high = chi2_quantile(significance / 2, f), chi2_quantile(1 - significance / 2, f)
-        return {"vtpv": self.vtpv, "low": low, "high": high, "passed": low <= self.vtpv <= high}
+        passed = None if self.sigma_factors else low <= self.vtpv <= high
+        return {"vtpv": self.vtpv, "low": low, "high": high, "passed": passed}
 
     # --- cofactors --------------------------------------------------------------------------
 
@@ -182,8 +191,10 @@ class Adjustment:
 
     @functools.cached_property
     def variance_components(self) -> dict[str, Component]:
-        """σ̂ over a priori σ for every group of observations."""
-        return variance_components(self.problem, self.problem.data, self.reliability)
+        """For every group of observations σ̂ over the a priori σ it was given, and σ̂ itself."""
+        return variance_components(
+            self.problem, self.problem.data, self.reliability, self.sigma_factors
+        )
 
     @functools.cached_property
     def check_points(self) -> CheckPoints | None:

@@ -42,6 +42,7 @@ def result_dict(adjustment, brief: bool = False) -> dict:
     if not adjustment.converged:
         return head | {"undetermined": list(adjustment.undetermined)}
     head |= {"sigma0": adjustment.sigma0, "vtpv": adjustment.vtpv, "sigma": "a posteriori"}
+    head |= {"sigma_factors": adjustment.sigma_factors}
     head |= {
         "cameras": {name: _camera(table) for name, table in adjustment.cameras.items()},
         "images": _images(adjustment),
@@ -62,6 +63,8 @@ def result_dict(adjustment, brief: bool = False) -> dict:
                     "redundancy": c.redundancy,
                     "vtpv": c.vtpv,
                     "sigma": c.sigma,
+                    "factor": c.factor,
+                    "estimated": list(c.estimated),
                 }
                 for name, c in adjustment.variance_components.items()
             },

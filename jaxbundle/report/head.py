@@ -196,9 +196,11 @@ def convergence(adjustment) -> list[str]:
         *paragraph(f"Ended after {number(adjustment.iterations, 'iteration')}, "
                    f"{adjustment.termination}."),
     ]  # fmt: skip
-    if adjustment.removed or adjustment.eliminated:
-        lines += paragraph("The table shows the last of several adjustments: observations or "
-                           "parameters were removed in between (see below).")  # fmt: skip
+    if adjustment.removed or adjustment.eliminated or adjustment.sigma_factors:
+        lines += paragraph(
+            "The table shows the last of several adjustments: observations or parameters were "
+            "removed, or σ estimated, in between (see below)."
+        )
     return lines
 
 
@@ -219,26 +221,29 @@ def image_precision(adjustment) -> str:
     sigma, unit = image_sigmas(adjustment), image_unit(adjustment)
     if not len(sigma) or not np.isfinite(adjustment.sigma0):
         return "–"
-    ends = sigma[[0, -1]] if len(sigma) > 1 else sigma
-    parts = [f"{_span(adjustment.sigma0 * ends)} {unit}"]
+    ends = sigma[[0, -1]]
+    parts = [f"{span(adjustment.sigma0 * ends)} {unit}"]
     if unit == "mm":
-        parts.insert(0, f"{_span(1e3 * adjustment.sigma0 * ends)} µm")
+        parts.insert(0, f"{span(1e3 * adjustment.sigma0 * ends)} µm")
         pitch = {camera.pixel_size for camera in adjustment.problem.network.cameras}
         if len(pitch) == 1 and None not in pitch:
             size = abs(next(iter(pitch))[0])
-            parts.append(f"{_span(adjustment.sigma0 * ends / size, 3)} px")
-    return f"{' = '.join(parts)}  (σ0 × σ a priori {_span(ends, 4)} {unit})"
+            parts.append(f"{span(adjustment.sigma0 * ends / size, 3)} px")
+    kind = "estimated" if adjustment.sigma_factors else "a priori"
+    return f"{' = '.join(parts)}  (σ0 × σ {kind} {span(ends, 4)} {unit})"
 
 
-def _span(values, digits: int = 5) -> str:
-    """One number, or from the smallest to the largest."""
-    return " to ".join(significant(value, digits) for value in values)
+def span(values, digits: int = 5) -> str:
+    """From the smallest to the largest; one number where they are the same to these digits."""
+    return " to ".join(dict.fromkeys(significant(value, digits) for value in values))
 
 
 def chi_squared(adjustment, level: float = 0.05) -> str:
     """The global test in words."""
     if adjustment.redundancy < 1:
         return "no redundancy: σ0 and standard deviations cannot be estimated"
+    if adjustment.sigma_factors:
+        return "not made: the σ of the groups were estimated from these residuals, so that σ0 is 1"
     found = adjustment.global_test(level)
     numbers = (
         f"vᵀPv {significant(found['vtpv'], 5)}, {100 * (1 - level):g} % interval "
@@ -265,15 +270,16 @@ def variance_factor(adjustment) -> list[str]:
         ("Image coordinate", image_precision(adjustment)),
         ("χ² test", chi_squared(adjustment)),
     ]
-    return [
-        *heading("Variance factor"),
-        *facts(rows),
-        "",
-        *paragraph(
-            "All standard deviations below are a posteriori, σ0 × those of the a priori weights, "
-            "unless they are said to be a priori."
-        ),
-    ]
+    text = (
+        "All standard deviations below are a posteriori, σ0 × those of the a priori weights, "
+        "unless they are said to be a priori."
+    )
+    if adjustment.sigma_factors:
+        text += (
+            " The a priori σ of the groups of observations are those estimated, not those given: "
+            "see Variance components."
+        )
+    return [*heading("Variance factor"), *facts(rows), "", *paragraph(text)]
 
 
 def warnings(adjustment) -> list[str]:

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from jaxbundle.report.head import image_unit
+from jaxbundle.report.head import image_unit, span
 from jaxbundle.report.layout import (
     bar,
     clean,
@@ -140,16 +140,24 @@ def redundancy(adjustment) -> list[str]:
 
 
 def components(adjustment) -> list[str]:
-    """Variance components: the observed over the a priori σ of every group."""
+    """Variance components: the observed σ of every group, over those given and as they are."""
     rows = [
         (name, str(c.observations), f"{c.redundancy:.2f}", significant(c.vtpv, 5),
-         significant(c.sigma, 4))
+         significant(c.sigma, 4), span(c.estimated, 3))
         for name, c in adjustment.variance_components.items()
     ]  # fmt: skip
-    return [
-        *heading("Variance components"),
-        *table(("group", "observations", "Σr", "vᵀPv", "σ̂/σ a priori"), rows, "lrrrr"),
-    ]
+    header = ("group", "observations", "Σr", "vᵀPv", "σ̂/σ given", "σ̂")
+    lines = [*heading("Variance components"), *table(header, rows, "lrrrrr")]
+    if adjustment.sigma_factors:
+        names = ", ".join(
+            f"{clean(name)} by {significant(factor, 4)}"
+            for name, factor in adjustment.sigma_factors.items()
+        )
+        lines += ["", *paragraph(
+            f"Estimated: the σ given were multiplied, {names}. What is called a priori elsewhere "
+            "in this report are these estimated σ."
+        )]  # fmt: skip
+    return lines
 
 
 def removals(adjustment) -> list[str]:
