@@ -340,7 +340,7 @@ class Adjustment:
                         "value": value,
                         "sigma": float(sigma[name]) if name in sigma else None,
                         "free": name in sigma,
-                        "t": abs(value) / float(sigma[name]) if name in sigma else None,
+                        "t": _ratio(abs(value), sigma[name]) if name in sigma else None,
                         "total_correlation": float(total[name]) if name in sigma else None,
                     }
                     for name, value in values.items()
@@ -527,11 +527,18 @@ def _residual_rows(adjustment, kind, image, point, axes, order, v, weight, r, w)
         "sigma": sigma.ravel(),
         "r": r.ravel(),
         "w": w.ravel(),
-        "tau": (w / adjustment.sigma0).ravel(),
+        "tau": _ratio(w, adjustment.sigma0).ravel(),
         "mdb": np.asarray(minimal_detectable(sigma, r)).ravel(),
         "external": np.asarray(external_reliability(r)).ravel(),
     }
     return {name: column[used.ravel()] for name, column in columns.items()}
+
+
+def _ratio(value, sigma):
+    """value/σ; where σ is 0, as after an exact fit, infinite, and NaN for a value of 0."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.divide(value, sigma)
+    return ratio if np.ndim(ratio) else float(ratio)
 
 
 def _concatenate(tables):

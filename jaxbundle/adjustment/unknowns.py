@@ -80,6 +80,8 @@ def _undetermined_points(problem: Problem, V) -> list[str]:
     diagonal = np.diagonal(V, axis1=1, axis2=2)
     free = np.asarray(problem.structure.eliminated)[:, 0] > 0
     scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    smallest = np.linalg.eigvalsh(V * scale[:, :, None] * scale[:, None, :])[:, 0]
-    weak = np.flatnonzero(free & (smallest < INDETERMINATE))
+    scaled = V * scale[:, :, None] * scale[:, None, :]
+    finite = np.isfinite(scaled).all((1, 2))
+    smallest = np.linalg.eigvalsh(np.where(finite[:, None, None], scaled, np.eye(3)))[:, 0]
+    weak = np.flatnonzero(free & finite & (smallest < INDETERMINATE))
     return [f"X, Y, Z of point {problem.network.points.id[p]}" for p in weak]

@@ -22,8 +22,15 @@ import numpy as np
 
 from jaxbundle.cameras import MODEL_NAMES, get_model
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import Columns, as_columns, did_you_mean
-from jaxbundle.network.rules import AXES, CHOICES, check_camera, check_choice, check_unique
+from jaxbundle.network.columns import Columns, as_columns, did_you_mean, shown
+from jaxbundle.network.rules import (
+    AXES,
+    CHOICES,
+    check_camera,
+    check_choice,
+    check_sigma_image,
+    check_unique,
+)
 from jaxbundle.network.tables import (
     EXTERIOR,
     Camera,
@@ -79,8 +86,8 @@ def make_network(
              "angle_unit": angle_unit, "image_unit": image_unit}  # fmt: skip
     for key, choices in CHOICES.items():
         check_choice(key, given[key], choices)
-    if sigma_image is not None and not (math.isfinite(sigma_image) and sigma_image > 0):
-        raise InputError(f"sigma_image is {sigma_image}; it must be finite and positive")
+    if sigma_image is not None:
+        check_sigma_image(sigma_image)
 
     cameras = make_cameras(cameras)
     images = _make_images(as_columns(images, "images"), cameras, ANGLE_UNITS[angle_unit])
@@ -173,8 +180,11 @@ def _camera(row: Mapping[str, Any], number: int, where: str) -> Camera:
 
 def _number(where: str, key: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
-        raise InputError(f"{where}{key} is {value!r}; a number is expected")
-    return float(value)
+        raise InputError(f"{where}{key} is {shown(value)}; a number is expected")
+    try:
+        return float(value)
+    except OverflowError:
+        raise InputError(f"{where}{key} is {shown(value)}; that is too large") from None
 
 
 def _pair(where: str, key: str, value: Any, kind: type) -> tuple | None:

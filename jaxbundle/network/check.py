@@ -206,6 +206,13 @@ def _check_observations(network: Network) -> None:
             f"{sigma[row, k]:g}; it must be finite and positive: correct it, or leave it empty to "
             "use sigma_image"
         )
+    least = np.finfo(float).eps * np.abs(observations.xy).max()
+    for row, k in np.argwhere(sigma < least)[:1]:
+        raise InputError(
+            f"{observations.source(row)}: σ of {'xy'[k]} of {_sighting(network, row)} is "
+            f"{sigma[row, k]:g}, less than the last digit of the image coordinates ({least:.1g}); "
+            "give it, or sigma_image, in the unit of the coordinates"
+        )
     key = observations.image.astype(np.int64) * len(network.points) + observations.point
     order = np.argsort(key, kind="stable")
     for k in np.flatnonzero(np.diff(key[order]) == 0)[:1]:

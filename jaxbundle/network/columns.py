@@ -17,6 +17,9 @@ from jaxtyping import Float, Int
 from jaxbundle.errors import InputError
 from jaxbundle.network.tables import Source
 
+BOOLEAN = (bool, np.bool_)
+"""No numbers, although Python converts them."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Columns:
@@ -84,12 +87,12 @@ class Columns:
         try:
             number = float(value)
             good = not isinstance(value, str) or (math.isfinite(number) and "_" not in value)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             good = False
-        if not good:
+        if not good or isinstance(value, BOOLEAN):
             or_word = "".join(f" or {word!r}" for word in words)
             raise InputError(
-                f"{self.source(row)}: {name} is {value!r}; a number{or_word} is expected"
+                f"{self.source(row)}: {name} is {shown(value)}; a number{or_word} is expected"
             )
         return number
 
@@ -150,6 +153,12 @@ def did_you_mean(name: str, known: Iterable[str], *, listing: bool = True) -> st
     return f"; known: {', '.join(known)}" if listing and known else ""
 
 
+def shown(value: Any) -> str:
+    """A value as a message shows it: what is long is cut."""
+    text = repr(value.item() if isinstance(value, np.generic) else value)
+    return text if len(text) <= 60 else f"{text[:58]}…"
+
+
 def some(names: Iterable[str], most: int = 5) -> str:
     """The first few names of a list, and how many more there are."""
     names = list(names)
@@ -167,7 +176,7 @@ def _id(value: Any) -> str:
         return value.strip()
     if value is None or value != value:
         return ""
-    if isinstance(value, float | np.floating) and value == int(value):
+    if isinstance(value, float | np.floating) and float(value).is_integer():
         value = int(value)
     return str(value)
 
@@ -178,8 +187,8 @@ def _plain_numbers(values: Sequence[Any]) -> np.ndarray | None:
         return values.astype(float)
     try:
         numbers = np.fromiter(map(float, values), float, len(values))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return None
     texts = [value for value in values if isinstance(value, str)]
     odd = texts and (not np.isfinite(numbers).all() or any("_" in text for text in texts))
-    return None if odd else numbers
+    return None if odd or any(isinstance(value, BOOLEAN) for value in values) else numbers

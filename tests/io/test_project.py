@@ -134,6 +134,7 @@ def test_overrides(folder):
 
 @pytest.mark.parametrize("override, said", [
     ("sigma", "expected KEY=VALUE"),
+    (f"images={'a' * 300}.csv", "no such file"),
     ("sigm_image=1", "unknown key; known: name, .*sigma_image.*camera.ID.PARAMETER"),
     ("sigma_image=small", "'small' is not a number"),
     ("sigma_image=-1", "sigma_image is -1.0; it must be finite and positive"),
@@ -154,6 +155,12 @@ def test_a_bad_override_is_refused(folder, override, said):
     ("project.toml", '"deg"', '"degrees"', "angle_unit must be one of rad, deg, gon"),
     ("project.toml", "0.01", '"0.01"', "[project]: sigma_image is '0.01'; a number is expected"),
     ("project.toml", "0.01", "0", "[project]: sigma_image is 0; it must be finite and positive"),
+    ("project.toml", "0.01", "1" + "0" * 400, "…; it must be finite and positive"),
+    ("project.toml", "0.01", "1" + "0" * 5000, "not valid TOML: Exceeds the limit"),
+    ("project.toml", "0.01", "[" * 3000 + "]" * 3000, "not valid TOML: brackets are nested too"),
+    ("project.toml", "c = 50.0", "c = 5" + "0" * 400, "camera 'cam.1': c is 5000"),
+    ("project.toml", "c = 0.1", "c = 1" + "0" * 400, "sigma of c is 1000"),
+    ("project.toml", '"images.csv"', f'"{"a" * 300}.csv"', "[project]: images = 'aaa"),
     ("project.toml", 'name = "small"', "name = 5", "[project]: name is 5; text in quotes"),
     ("project.toml", 'name = "small"', "datum_points = 1", "datum_points must be a list of ids"),
     ("project.toml", 'name = "small"', "name = small", "not valid TOML"),
@@ -245,6 +252,27 @@ def test_tables_in_the_project_file_itself(folder):
         read_project(folder)
 
 
+def test_an_override_of_a_sigma_that_is_no_table_is_refused(folder):
+    edit(folder, "project.toml", "sigma = { c = 0.1 }", "sigma = 5")
+    with pytest.raises(InputError, match="--set camera.cam.1.sigma.c: sigma of the camera is 5; e"):
+        read_project(folder, ["camera.cam.1.sigma.c=1"])
+
+
+@pytest.mark.parametrize("id, X, said", [
+    ('"a"', "1" + "0" * 400, "entry 1: X is 1000"),
+    ('"a"', "true", "entry 1: X is True; a number is expected"),
+    ("inf", "0", "point 'a' is unknown"),
+])  # fmt: skip
+def test_odd_values_in_the_project_file_are_refused(folder, id, X, said):
+    edit(folder, "project.toml", 'points = "points.csv"\n', "")
+    text = (folder / "project.toml").read_text()
+    text += f'\n[[point]]\nid = {id}\nrole = "tie"\nX = {X}\nY = 0\nZ = 0\n'
+    (folder / "project.toml").write_text(text)
+    with pytest.raises(InputError) as error:
+        read_project(folder)
+    assert said in str(error.value) and len(str(error.value)) < 300 + 2 * len(str(folder))
+
+
 def test_the_default_sigma_is_told(folder):
     edit(folder, "project.toml", "sigma_image = 0.01\n", "")
     network = read_project(folder)
@@ -304,8 +332,9 @@ def test_nothing_is_written_when_something_cannot_be(folder, tmp_path):
 def test_the_kind_of_input_is_recognised(folder):
     assert read_network(folder).name == "small"
     assert read_network(folder / "project.toml", overrides=["name=x"]).name == "x"
-    with pytest.raises(InputError, match="no such file or folder"):
-        read_network(folder / "none.toml")
+    for name in ("none.toml", 300 * "a", "a\0b"):
+        with pytest.raises(InputError, match="no such file or folder"):
+            read_network(folder / name)
     with pytest.raises(InputError, match="not recognised; known formats: project: a .toml file"):
         read_network(folder / "points.csv")
     with pytest.raises(InputError, match="unknown format 'toml'; known: project, photo-list"):

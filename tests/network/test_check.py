@@ -84,6 +84,7 @@ SIGMA = {"sX": 0.1, "sY": 0.1, "sZ": 0.1}
     ("points", 2, {**CONTROL, **SIGMA, "sZ": None}, ["row 3", "'p2'", "σ of Z", "free"]),
     ("observations", 9, {"sy": -3.1},
      ["observations, row 10", "σ of y", "'p1'", "'i1'", "-3.1", "finite and positive"]),
+    ("observations", 9, {"sx": 1e-200}, ["row 10", "σ of x", "1e-200", "less than the last digit"]),
     ("observations", 9, {"sx": np.inf}, ["observations, row 10", "σ of x", "'p1'", "'i1'"]),
     ("observations", 9, {"x": -np.inf}, ["observations, row 10", "x of point 'p1'", "'i1'"]),
     ("observations", 9, {"point": "p0"},
