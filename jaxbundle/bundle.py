@@ -11,7 +11,7 @@ from jaxbundle.adjustment.datum import move_to_datum
 from jaxbundle.adjustment.problem import Problem, count_rows, make_problem, with_factor
 from jaxbundle.adjustment.sharding import distribute, find_minimum_of_shards
 from jaxbundle.adjustment.solve import converged, find_minimum, make_solver
-from jaxbundle.adjustment.solver import Minimum
+from jaxbundle.adjustment.solver import SINGULAR, TERMINATIONS, Minimum
 from jaxbundle.adjustment.unknowns import Name, undetermined
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import NotSolvedError
@@ -75,7 +75,9 @@ def adjust(
 
     **Returns:** an `Adjustment`; look at `converged` before anything else.
 
-    **Raises:** `InputError` where the network cannot be adjusted as it stands.
+    **Raises:** `InputError` where the network cannot be adjusted as it stands; `NotSolvedError`
+    where it, or what data snooping, elimination or variance components leave of it, determines no
+    answer.
     """
     network = check_network(network)
     network, check_points, check_rays = split_check_points(network)
@@ -152,16 +154,23 @@ def _names_of_defects(problem: Problem, minimum: Minimum) -> list[str]:
     return undetermined(problem, values, problem.data)
 
 
+def _require_solved(problem: Problem, minimum: Minimum, when: str) -> None:
+    """Refuse to go on from an adjustment repeated that was not solved."""
+    if not _solved(problem, minimum):
+        names = _names_of_defects(problem, minimum)
+        reason = int(minimum.termination)
+        why = TERMINATIONS[SINGULAR if bool(converged(reason)) else reason]
+        if names:
+            why = f"the network is no longer determined: {', '.join(names[:8])}"
+        raise NotSolvedError(f"not solved {when}: {why}", names)
+
+
 def _snooped(problem, minimum, again, test, significance):
     last = {}
 
     def adjust_from(problem, values):
         result = again(problem, values)
-        if not _solved(problem, result):
-            raise NotSolvedError(
-                "data snooping took away so much that the network is no longer determined: "
-                + ", ".join(_names_of_defects(problem, result)[:8])
-            )
+        _require_solved(problem, result, "after data snooping")
         last["minimum"] = result
         found = _reliability(problem, result.values)
         vtpv = sum(float((np.asarray(v) ** 2).sum()) for v in _leaves(found.residual))
@@ -203,11 +212,7 @@ def _with_components(problem, minimum, again, tolerance: float = 1e-3):
         data = rescale(problem.network.cameras, problem.structure, problem.data, ratios)
         problem = dataclasses.replace(problem, data=data)
         minimum = again(problem, minimum.values)
-        if not _solved(problem, minimum):
-            raise NotSolvedError(
-                "with the estimated variance components the network is no longer determined: "
-                + ", ".join(_names_of_defects(problem, minimum)[:8])
-            )
+        _require_solved(problem, minimum, "with the estimated variance components")
         factors |= {name: c.sigma for name, c in estimable.items()}
     network = problem.network.warn(*_doubts(components, open_ones))
     return dataclasses.replace(problem, network=network), minimum, factors
@@ -227,7 +232,7 @@ def _doubts(components: dict[str, Component], open_ones: list[str]):
 
 
 def _eliminated(problem, minimum, again, critical_t):
-    """Fix insignificant additional parameters at their default, the weakest first."""
+    """Fix insignificant additional parameters at 0, the weakest first."""
     names = []
     while True:
         result = Adjustment(problem.network, problem, minimum)
@@ -240,6 +245,7 @@ def _eliminated(problem, minimum, again, critical_t):
         names.append(weak[0])
         problem, values = _without_parameter(problem, minimum.values, weak[0])
         minimum = again(problem, values)
+        _require_solved(problem, minimum, f"without {weak[0]}")
 
 
 def _without_parameter(problem: Problem, values: Values, name: Name):

@@ -154,6 +154,10 @@ class Adjustment:
         r = self.redundancy
         return float(np.sqrt(self.vtpv / r)) if r > 0 else float("nan")
 
+    def pope(self, w: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """Pope's τ = w/σ0 of Baarda's w; NaN where all observations fit exactly."""
+        return w / (self.sigma0 or float("nan"))
+
     def global_test(self, significance: float = 0.05) -> dict:
         """χ² test of vᵀPv against a variance factor of 1 (two-sided).
 
@@ -257,12 +261,16 @@ class Adjustment:
 
     def camera_covariance(self, camera: str) -> tuple[list[str], Float[np.ndarray, "n n"]]:
         """Names and covariance of the free parameters of a camera."""
+        names, Q = self._camera_cofactor(camera)
+        return names, self.sigma0**2 * Q
+
+    def _camera_cofactor(self, camera: str):
         c, s = self._camera(camera), self.problem.structure
         free = np.flatnonzero(np.asarray(s.camera_free)[c])
         Q = self.cofactors.image[c, 6:, 6:] if s.own_camera else self.cofactors.camera[c]
         Q = np.asarray(Q)[np.ix_(free, free)]
         names = interior_names(self.problem, c)
-        return [names[i].parameter for i in free], self.sigma0**2 * Q
+        return [names[i].parameter for i in free], Q
 
     def _camera(self, camera: str) -> int:
         ids = [given.id for given in self.problem.network.cameras]
@@ -330,9 +338,9 @@ class Adjustment:
         tables = {}
         for given in self.problem.network.cameras:
             values = self.camera_parameters(given.id)
-            free, covariance = self.camera_covariance(given.id)
-            sigma = dict(zip(free, np.sqrt(np.diagonal(covariance))))
-            total = dict(zip(free, total_correlation(covariance))) if free else {}
+            free, Q = self._camera_cofactor(given.id)
+            sigma = dict(zip(free, self.sigma0 * np.sqrt(np.diagonal(Q))))
+            total = dict(zip(free, total_correlation(Q))) if free else {}
             tables[given.id] = {
                 "model": given.model,
                 "parameters": {
@@ -340,13 +348,13 @@ class Adjustment:
                         "value": value,
                         "sigma": float(sigma[name]) if name in sigma else None,
                         "free": name in sigma,
-                        "t": _ratio(abs(value), sigma[name]) if name in sigma else None,
+                        "t": _significance(value, sigma[name]) if name in sigma else None,
                         "total_correlation": float(total[name]) if name in sigma else None,
                     }
                     for name, value in values.items()
                 },
                 "free": free,
-                "correlations": correlation_matrix(covariance),
+                "correlations": correlation_matrix(Q),
             }
         return tables
 
@@ -527,18 +535,18 @@ def _residual_rows(adjustment, kind, image, point, axes, order, v, weight, r, w)
         "sigma": sigma.ravel(),
         "r": r.ravel(),
         "w": w.ravel(),
-        "tau": _ratio(w, adjustment.sigma0).ravel(),
+        "tau": adjustment.pope(w).ravel(),
         "mdb": np.asarray(minimal_detectable(sigma, r)).ravel(),
         "external": np.asarray(external_reliability(r)).ravel(),
     }
     return {name: column[used.ravel()] for name, column in columns.items()}
 
 
-def _ratio(value, sigma):
-    """value/σ; where σ is 0, as after an exact fit, infinite, and NaN for a value of 0."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.divide(value, sigma)
-    return ratio if np.ndim(ratio) else float(ratio)
+def _significance(value: float, sigma: float) -> float:
+    """t = |value|/σ; where σ is 0, as after an exact fit, infinite, or NaN for the value 0."""
+    if sigma == 0:
+        return float("inf") if value else float("nan")
+    return abs(value) / float(sigma)
 
 
 def _concatenate(tables):

@@ -22,6 +22,7 @@ LAYERS = (
     "result",
     "bundle",
     "batches",
+    "targets",
     "cli",
     "__main__",
 )

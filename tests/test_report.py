@@ -1,6 +1,7 @@
 """The protocol says what was computed, to the digits it deserves, and nothing where nothing is."""
 
 import dataclasses
+import json
 import re
 from types import SimpleNamespace
 
@@ -18,6 +19,7 @@ from jaxbundle.report import layout, observations, unknowns
 from jaxbundle.report.equations import EQUATIONS
 from jaxbundle.result import Adjustment
 from jaxbundle.statistics import CheckPoints, Removed
+from jaxbundle.targets import write_targets
 
 pytestmark = pytest.mark.xdist_group("convergent4")
 
@@ -284,6 +286,22 @@ def test_without_redundancy_there_is_no_sigma(convergent4):
     assert_plain(text)
     assert "no redundancy" in text and "no redundancy" in str(changed)
     assert_plain(str(changed))
+
+
+def test_an_exact_fit_has_no_sigma(convergent4, tmp_path):
+    """vᵀPv = 0: σ are 0, t infinite, τ unknown, correlations as ever; nothing divides by zero."""
+    changed = again(convergent4)
+    changed.__dict__["vtpv"] = 0.0
+    assert changed.sigma0 == 0
+    entry = changed.cameras["cam"]
+    assert entry["parameters"]["c"]["t"] == np.inf and changed.insignificant() == []
+    np.testing.assert_allclose(entry["correlations"], convergent4.cameras["cam"]["correlations"])
+    assert np.isnan(changed.residuals["tau"]).all()
+    assert_plain(str(changed))
+    write_targets(changed, str(tmp_path / "r.json"), tmp_path / "out", brief=False, plots=True)
+    assert_plain((tmp_path / "out" / "report.txt").read_text())
+    told = json.loads((tmp_path / "r.json").read_text())
+    assert told["sigma0"] == 0 and told["cameras"]["cam"]["parameters"]["c"]["t"] is None
 
 
 def test_warnings_are_printed(convergent4):

@@ -12,7 +12,7 @@ from jaxtyping import Bool
 
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.columns import count, some
-from jaxbundle.network.tables import Distances, Network, Observations, Points
+from jaxbundle.network.tables import EXTERIOR, Distances, Network, Observations, Points
 
 
 def split_check_points(network: Network) -> tuple[Network, Points, Observations]:
@@ -145,7 +145,9 @@ def check_images(before: Network, network: Network) -> None:
             raise NotSolvedError(
                 f"{place}not solved: it shares too few points with other images, so that neither "
                 f"X0, Y0, Z0, omega, phi, kappa of image {images.id[row]} nor X, Y, Z of points "
-                f"{some(lone)} can be determined; add images of the same points, or control points"
+                f"{some(lone)} can be determined; add images of the same points, or control points",
+                [f"{name} of image {images.id[row]}" for name in EXTERIOR]
+                + [f"X, Y, Z of point {id}" for id in lone],
             )
         used = "" if measured[row] == rays[row] else f" of the {measured[row]} measured ones"
         why = "" if not used else " (the others are check points or seen in one image only)"
