@@ -7,6 +7,7 @@ import pytest
 
 import jaxbundle
 from jaxbundle import Camera
+from jaxbundle.adjustment.unknowns import undetermined
 from jaxbundle.bundle import adjust
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.io.result_json import result_dict
@@ -218,6 +219,17 @@ def test_what_is_not_solved_has_no_values(simulation):
     for ask in (lambda: found.sigma0, lambda: found.images, lambda: found.cameras):
         with pytest.raises(NotSolvedError, match="did not converge"):
             ask()
+
+
+def test_a_wild_coordinate_ends_without_a_result(simulation):
+    found = adjust(with_xy(simulation.network, [7], 1e10))
+    assert not found.converged and "Not solved" in found.report()
+
+
+def test_numbers_that_overflow_have_no_names(result):
+    problem = result.problem
+    data = dataclasses.replace(problem.data, image_weight=1e200 * problem.data.image_weight)
+    assert undetermined(problem, data.start, data) == []
 
 
 def test_an_undetermined_parameter_is_named():
