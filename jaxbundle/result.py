@@ -33,11 +33,13 @@ from jaxbundle.network.tables import EXTERIOR, Network
 from jaxbundle.statistics import (
     CheckPoints,
     Component,
+    Reach,
     Reliability,
     Removed,
     chi2_quantile,
     cofactors,
     correlation_matrix,
+    distortion_reach,
     external_reliability,
     minimal_detectable,
     propagate,
@@ -112,8 +114,15 @@ class Adjustment:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What was left out or looked strange, in words."""
-        return self.problem.network.warnings
+        """What was left out or looked strange, in words; also distortions that turn back."""
+        found = self.distortion_reach.values() if self.converged else ()
+        turns = (reach.message for reach in found if reach.message is not None)
+        return (*self.problem.network.warnings, *turns)
+
+    @functools.cached_property
+    def distortion_reach(self) -> dict[str, Reach]:
+        """By camera, how far its distortion was looked at, and whether it turns back there."""
+        return distortion_reach(self.problem, self.values)
 
     @property
     def counts(self):
