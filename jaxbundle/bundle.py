@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxbundle.adjustment.datum import move_to_datum
 from jaxbundle.adjustment.problem import Problem, count_rows, make_problem, with_factor
+from jaxbundle.adjustment.residuals import half_square
 from jaxbundle.adjustment.sharding import distribute, find_minimum_of_shards
 from jaxbundle.adjustment.solve import converged, find_minimum, make_solver
 from jaxbundle.adjustment.solver import SINGULAR, TERMINATIONS, Minimum
@@ -17,6 +18,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.check import check_network
+from jaxbundle.network.columns import some
 from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.tables import Network
 from jaxbundle.result import Adjustment
@@ -161,7 +163,7 @@ def _require_solved(problem: Problem, minimum: Minimum, when: str) -> None:
         reason = int(minimum.termination)
         why = TERMINATIONS[SINGULAR if bool(converged(reason)) else reason]
         if names:
-            why = f"the network is no longer determined: {', '.join(names[:8])}"
+            why = f"the network is no longer determined: {some(names, 8, str)}"
         raise NotSolvedError(f"not solved {when}: {why}", names)
 
 
@@ -173,19 +175,13 @@ def _snooped(problem, minimum, again, test, significance):
         _require_solved(problem, result, "after data snooping")
         last["minimum"] = result
         found = _reliability(problem, result.values)
-        vtpv = sum(float((np.asarray(v) ** 2).sum()) for v in _leaves(found.residual))
+        vtpv = 2 * float(half_square(found.residual))
         return result.values, found, float(np.sqrt(vtpv / max(problem.counts.redundancy, 1)))
 
     problem, _, removed = snoop(
         problem, minimum.values, adjust_from, test=test, significance=significance
     )
     return problem, last["minimum"], removed
-
-
-def _leaves(residual):
-    return (
-        residual.image, residual.control, residual.exterior, residual.interior, residual.distance
-    )  # fmt: skip
 
 
 def _reliability(problem: Problem, values: Values):

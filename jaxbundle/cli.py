@@ -22,6 +22,7 @@ from jaxbundle import report
 from jaxbundle.batches import run_batch
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io import read_network, write_project
+from jaxbundle.network.columns import some
 from jaxbundle.network.reduction import REDUCTIONS
 from jaxbundle.result import Adjustment
 from jaxbundle.targets import check_targets, write_targets
@@ -170,9 +171,7 @@ def convert(
 def _why_not(result: Adjustment) -> str:
     parts = [f"not solved: {result.termination}"]
     if result.undetermined:
-        names = ", ".join(result.undetermined[:12])
-        more = len(result.undetermined) - 12
-        parts.append(f"not determined: {names}" + (f" and {more} more" if more > 0 else ""))
+        parts.append(f"not determined: {some(result.undetermined, 12, str)}")
         parts.append("fix them, give them a prior σ, or measure what determines them")
     elif "limit" in result.termination:
         parts.append("raise --max-iterations or give better start values")

@@ -6,7 +6,7 @@ values to ask for: every accessor raises `NotSolvedError` and says why.
 """
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from jaxtyping import Float
 from jaxbundle import plotting, report
 from jaxbundle.adjustment.jacobian import zero_tangent
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.adjustment.residuals import compiled_residuals
+from jaxbundle.adjustment.residuals import compiled_residuals, half_square
 from jaxbundle.adjustment.solve import converged
 from jaxbundle.adjustment.solver import TERMINATIONS, Minimum
 from jaxbundle.adjustment.unknowns import Name, interior_names
@@ -28,8 +28,10 @@ from jaxbundle.geometry import (
     retract_quaternion,
 )
 from jaxbundle.network.arrays import Tangent, Values, retract
+from jaxbundle.network.columns import did_you_mean, some
 from jaxbundle.network.reduction import FACTORS
 from jaxbundle.network.tables import EXTERIOR, Network
+from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.statistics import (
     CheckPoints,
     Component,
@@ -48,8 +50,6 @@ from jaxbundle.statistics import (
     undamped_factor,
     variance_components,
 )
-
-ANGLE_UNITS = {"rad": 1.0, "deg": 180 / np.pi, "gon": 200 / np.pi}
 
 
 class Adjustment:
@@ -142,7 +142,7 @@ class Adjustment:
 
     def _require_solved(self) -> None:
         if not self.converged:
-            names = ", ".join(self.undetermined[:8])
+            names = some(self.undetermined, 8, str)
             what = f"; not determined: {names}" if names else ""
             raise NotSolvedError(
                 f"the adjustment did not converge ({self.termination}){what}; it has no result"
@@ -155,7 +155,7 @@ class Adjustment:
         """vᵀPv of all observations, pseudo-observations included."""
         s, data = self.problem.structure, self.problem.data
         rows = compiled_residuals(s, self.values, data)
-        return float(sum((np.asarray(v) ** 2).sum() for v in jax.tree.leaves(rows)))
+        return float(2 * half_square(rows))
 
     @property
     def sigma0(self) -> float:
@@ -221,13 +221,14 @@ class Adjustment:
     def image_values(self) -> Float[np.ndarray, "images 6"]:
         """X0, Y0, Z0 (object unit), ω, φ, κ (radians, on the turn and branch of the start)."""
         values = self.values
-        angles, _ = self._angles_like_start
+        angles, *_ = self._angles_like_start
         position = np.asarray(values.position) + self.problem.origin
         return np.concatenate([position, np.asarray(angles)], 1)
 
     @functools.cached_property
     def _angles_like_start(self):
-        """ω, φ, κ of all images and their Jacobians by δθ, next to the angles that were given.
+        """ω, φ, κ of all images and their Jacobians by δθ, next to the angles that were given;
+        and what the derivatives have been multiplied by.
 
         (ω, φ, κ) and (ω + π, π − φ, κ + π) are one rotation, and so are whole turns.
         """
@@ -238,7 +239,7 @@ class Adjustment:
         angles, other = turn(angles), turn(other)
         flip = ((other - start) ** 2).sum(1) < ((angles - start) ** 2).sum(1)
         sign = np.where(flip[:, None], [1.0, -1.0, 1.0], 1.0)
-        return np.where(flip[:, None], other, angles), jacobian * sign[:, :, None]
+        return np.where(flip[:, None], other, angles), jacobian * sign[:, :, None], sign
 
     @functools.cached_property
     def image_covariance(self) -> Float[np.ndarray, "images 6 6"]:
@@ -282,10 +283,7 @@ class Adjustment:
         return [names[i].parameter for i in free], Q
 
     def _camera(self, camera: str) -> int:
-        ids = [given.id for given in self.problem.network.cameras]
-        if camera not in ids:
-            raise KeyError(f"there is no camera {camera!r}; cameras: {', '.join(ids)}")
-        return ids.index(camera)
+        return _place(camera, [given.id for given in self.problem.network.cameras], "camera")
 
     def insignificant(self, critical: float = 2.0) -> list[tuple[float, Name]]:
         """Free interior parameters with t = |value|/σ below `critical`, the least first."""
@@ -299,8 +297,12 @@ class Adjustment:
 
     def covariance(self, *names: tuple[str, str, str]) -> Float[np.ndarray, "n n"]:
         """Covariance of any unknowns by name, e.g. `("camera", "cam", "c")`,
-        `("image", "12", "kappa")` (radians), `("point", "7", "Z")`."""
+        `("image", "12", "kappa")` (radians), `("point", "7", "Z")`.
+
+        **Raises:** `KeyError` for a name that is not there."""
         wanted = [Name(*map(str, name)) for name in names]
+        for name in wanted:
+            self._value_of(name, self.values)  # refuses what is not there
 
         def pick(values: Values):
             return jnp.stack([self._value_of(name, values) for name in wanted])
@@ -308,17 +310,20 @@ class Adjustment:
         return self.covariance_of(pick)
 
     def _value_of(self, name: Name, values: Values):
+        """The unknown of this name; of an angle, what changes as it does on its branch."""
         network = self.problem.network
         if name.kind == "camera":
             c = self._camera(name.id)
             parameters = get_model(network.cameras[c].model).parameters
-            return values.camera[c, parameters.index(name.parameter)]
+            return values.camera[c, _place(name.parameter, parameters, "camera parameter")]
         if name.kind == "image":
-            i = network.images.id.index(name.id)
-            angles = _angles(values.rotation[i], jnp.zeros(3))
-            return jnp.concatenate([values.position[i], angles])[EXTERIOR.index(name.parameter)]
+            i = _place(name.id, network.images.id, "image")
+            angles = _angles(values.rotation[i], jnp.zeros(3)) * self._angles_like_start[2][i]
+            pose = jnp.concatenate([values.position[i], angles])
+            return pose[_place(name.parameter, EXTERIOR, "image parameter")]
         if name.kind == "point":
-            return values.point[network.points.id.index(name.id), "XYZ".index(name.parameter)]
+            p = _place(name.id, network.points.id, "point")
+            return values.point[p, _place(name.parameter, ("X", "Y", "Z"), "coordinate")]
         raise KeyError(f"an unknown is of a camera, an image or a point, not of a {name.kind!r}")
 
     def covariance_of(self, function: Callable[[Values], jax.Array]) -> Float[np.ndarray, "n n"]:
@@ -338,7 +343,7 @@ class Adjustment:
     @property
     def angle_scale(self) -> float:
         """Factor from radians to the network's angle unit."""
-        return ANGLE_UNITS[self.network.angle_unit]
+        return 1 / ANGLE_UNITS[self.network.angle_unit]
 
     @functools.cached_property
     def cameras(self) -> dict[str, dict]:
@@ -510,6 +515,13 @@ class Adjustment:
         except ImportError as error:
             raise ImportError("data frames need pandas: pip install 'jaxbundle[tables]'") from error
         return pandas.DataFrame(self.table(name))
+
+
+def _place(name: str, names: Sequence[str], thing: str) -> int:
+    if name not in names:
+        known = did_you_mean(name, names, listing=len(names) <= 20)
+        raise KeyError(f"there is no {thing} {name!r}{known}")
+    return names.index(name)
 
 
 def _angles(rotation, d_theta):

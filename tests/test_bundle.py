@@ -11,6 +11,7 @@ from jaxbundle.adjustment.unknowns import undetermined
 from jaxbundle.bundle import adjust
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.io.result_json import result_dict
+from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.statistics.distributions import tau_quantile
 
 pytestmark = pytest.mark.xdist_group("bundle")
@@ -263,3 +264,27 @@ def test_angles_come_back_on_the_branch_they_were_given(simulation, result):
     for name in ("omega", "phi", "kappa"):
         np.testing.assert_allclose(other.images[f"s{name}"], result.images[f"s{name}"], rtol=1e-6)
     assert other.vtpv == pytest.approx(result.vtpv, rel=1e-9)
+    names = ("X0", "phi", "kappa")
+    columns = [EXTERIOR.index(name) for name in names]
+    for i, sign in ((0, 1), (1, -1)):
+        image = images.id[i]
+        block = other.covariance(*(("image", image, name) for name in names))
+        np.testing.assert_allclose(
+            block, other.image_covariance[i][np.ix_(columns, columns)], rtol=1e-7, atol=1e-20
+        )
+        before = result.image_covariance[i][np.ix_(columns, columns)]
+        assert block[0, 1] == pytest.approx(sign * before[0, 1], rel=1e-6)
+
+
+@pytest.mark.parametrize("name, said", [
+    (("camera", "cam2", "c"), "there is no camera 'cam2'; did you mean 'cam'"),
+    (("camera", "cam", "K9"), "there is no camera parameter 'K9'; known: c, x0, y0, K1"),
+    (("image", "777", "phi"), "there is no image '777'"),
+    (("image", "1", "Phi"), "there is no image parameter 'Phi'; did you mean 'phi'"),
+    (("point", "x", "X"), "there is no point 'x'"),
+    (("point", "8", "x"), "there is no coordinate 'x'; did you mean 'X'"),
+    (("station", "8", "X"), "of a camera, an image or a point"),
+])  # fmt: skip
+def test_an_unknown_of_no_such_name(result, name, said):
+    with pytest.raises(KeyError, match=said):
+        result.covariance(name)

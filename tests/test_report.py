@@ -15,6 +15,7 @@ from jaxbundle.adjustment.solver import LIMIT, NOT_FINITE, STUCK
 from jaxbundle.adjustment.unknowns import Name
 from jaxbundle.cameras import MODEL_NAMES, get_model
 from jaxbundle.io.result_json import result_dict
+from jaxbundle.network.columns import count
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.report import layout, observations, unknowns
 from jaxbundle.report.equations import EQUATIONS
@@ -427,6 +428,15 @@ def test_wide_tables_shorten_their_names():
     assert max(map(len, lines)) == layout.WIDTH
     assert "…" in lines[1] and len({len(line) for line in lines[1:]}) == 1
     assert lines[1].endswith(" 1.00") and lines[2].endswith("22.00")
+
+
+@pytest.mark.parametrize(
+    "words,expected",
+    [((1, "image", " held"), "1 image held"), ((4, "image", " held"), "4 images held"),
+     ((0, "point"), "0 points")],
+)  # fmt: skip
+def test_plurals(words, expected):
+    assert count(*words) == expected
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import csv
 import io
 import os
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -39,7 +40,7 @@ def read_csv(path: Path) -> Columns:
     """
     lines = [
         (number, line)
-        for number, line in enumerate(read_text(path).splitlines(), 1)
+        for number, line in enumerate(re.split(r"\r\n?|\n", read_text(path)), 1)
         if (text := line.lstrip()) and text[0] != "#"
     ]
     try:

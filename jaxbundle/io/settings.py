@@ -57,12 +57,12 @@ def _project_value(key: str, text: str):
 
 def _override_camera(cameras: list[dict], key: str, text: str) -> None:
     rest = key.removeprefix("camera.")
-    for camera in sorted(cameras, key=lambda c: -len(str(c.get("id", "")))):
-        field = rest.removeprefix(f"{camera.get('id', '')}.")
+    ids = [str(camera.get("id", "")).strip() for camera in cameras]
+    for c in sorted(range(len(ids)), key=lambda c: -len(ids[c])):
+        field, camera = rest.removeprefix(f"{ids[c]}."), cameras[c]
         if field != rest:
             break
     else:
-        ids = [str(camera.get("id")) for camera in cameras]
         raise InputError(
             f"--set {key}: no such camera; known: "
             f"{', '.join(f'camera.{id}.PARAMETER' for id in ids)}"

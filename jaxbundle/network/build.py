@@ -147,9 +147,10 @@ def _missing(value) -> bool:
 
 
 def _camera(row: Mapping[str, Any], number: int, where: str) -> Camera:
-    if not isinstance(row, Mapping) or row.get("id", "") == "":
+    id = str(row.get("id", "")).strip() if isinstance(row, Mapping) else ""
+    if not id:
         raise InputError(f"{where}camera {number}: id is missing")
-    id, model = str(row["id"]), row.get("model", "brown")
+    model = row.get("model", "brown")
     where = f"{where}camera {id!r}: "
     parameters = {key: value for key, value in row.items() if key not in CAMERA_FIELDS}
     if model in MODEL_NAMES:

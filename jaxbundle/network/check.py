@@ -42,7 +42,7 @@ def check_network(network: Network) -> Network:
     network = _check_points(network)
     _check_observations(network)
     network = _check_distances(network)
-    _check_datum_points(network)
+    network = _check_datum_points(network)
     everything = network
     network = leave_out_undetermined(network)
     check_images(everything, network)
@@ -252,7 +252,7 @@ def _check_distances(network: Network) -> Network:
     return network
 
 
-def _check_datum_points(network: Network) -> None:
+def _check_datum_points(network: Network) -> Network:
     roles: Mapping[str, str] = dict(zip(network.points.id, network.points.role))
     for id in network.datum_points:
         if id not in roles:
@@ -265,6 +265,12 @@ def _check_datum_points(network: Network) -> None:
                 f"datum_points: point {id!r} is a {roles[id]} point; name tie points (or "
                 "control points with σ)"
             )
+    if network.datum_points and network.datum == "control":
+        return network.warn(
+            "datum_points are not used: the datum is given by control; choose datum = \"inner\" or "
+            "\"minimal\" for them"
+        )
+    return network
 
 
 def _check_start_values(network: Network) -> None:

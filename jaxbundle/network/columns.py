@@ -6,14 +6,14 @@ it came from.
 """
 
 import dataclasses
-import difflib
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxbundle.cameras.names import closest_name
 from jaxbundle.errors import InputError
 from jaxbundle.network.tables import Source
 
@@ -146,10 +146,9 @@ def _column(values: Any, column: str, name: str) -> Sequence[Any]:
 def did_you_mean(name: str, known: Iterable[str], *, listing: bool = True) -> str:
     """The end of a message about an unknown name: the closest known one, or all of them."""
     known = list(known)
-    folded = {k.lower(): k for k in known}
-    close = difflib.get_close_matches(str(name).lower(), list(folded), 1)
-    if close:
-        return f"; did you mean {folded[close[0]]!r}?"
+    close = closest_name(name, known)
+    if close is not None:
+        return f"; did you mean {close!r}?"
     return f"; known: {', '.join(known)}" if listing and known else ""
 
 
@@ -159,16 +158,21 @@ def shown(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:58]}…"
 
 
-def some(names: Iterable[str], most: int = 5) -> str:
+def quoted(name: Any) -> str:
+    """A name in quotes."""
+    return repr(str(name))
+
+
+def some(names: Iterable[Any], most: int = 5, as_text: Callable[[Any], str] = quoted) -> str:
     """The first few names of a list, and how many more there are."""
     names = list(names)
-    text = ", ".join(repr(str(name)) for name in names[:most])
+    text = ", ".join(map(as_text, names[:most]))
     return f"{text} and {len(names) - most} more" if len(names) > most else text
 
 
-def count(number: int, thing: str) -> str:
-    """A number of things, in words: "1 image", "3 images"."""
-    return f"{number} {thing}{'' if number == 1 else 's'}"
+def count(number: int, thing: str, rest: str = "") -> str:
+    """A number of things, in words: "1 image", "3 images", "3 images held"."""
+    return f"{number} {thing}{'' if number == 1 else 's'}{rest}"
 
 
 def _id(value: Any) -> str:

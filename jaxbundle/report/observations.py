@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 
+from jaxbundle.network.columns import count
 from jaxbundle.report.head import image_unit, span
 from jaxbundle.report.layout import (
     bar,
@@ -17,7 +18,6 @@ from jaxbundle.report.layout import (
     facts,
     fixed,
     heading,
-    number,
     paragraph,
     significant,
     table,
@@ -57,7 +57,7 @@ def residuals(adjustment, limit: float, test: str) -> list[str]:
             lines.append(f"… and {more} more: all residuals are in residuals.csv.")
         lines += ["", f"{len(over)} of {len(size)} observations."]
     else:
-        lines.append(f"None of {number(len(size), 'observation')}. The largest:")
+        lines.append(f"None of {count(len(size), 'observation')}. The largest:")
         lines += _rows(adjustment, order[:3])
     return lines + _histogram(found["tau"])
 
@@ -100,10 +100,10 @@ def _histogram(tau) -> list[str]:
     expected = len(tau) * np.diff(normal)
     largest = max(counted.max(), expected.max())
     rows = []
-    for i, count in enumerate(counted):
+    for i, found in enumerate(counted):
         a, b = edges[i], edges[i + 1]
         name = f"< {b:g}" if i == 0 else f"> {a:g}" if np.isinf(b) else f"{a:g} to {b:g}"
-        rows.append((name, str(count), f"{expected[i]:.1f}", bar(count, largest, 50)))
+        rows.append((name, str(found), f"{expected[i]:.1f}", bar(found, largest, 50)))
     return [
         *heading("Normalised residuals τ"),
         *table(("class", "number", "normal", ""), rows, "rrrl"),
@@ -126,10 +126,10 @@ def redundancy(adjustment) -> list[str]:
     rows = [
         ("Sum", f"{r.sum():.3f} (redundancy {adjustment.redundancy})"),
         ("Mean, min, max", f"{r.mean():.3f}, {r.min():.3f}, {r.max():.3f}"),
-        ("r < 0.1", f"{number(weak, 'observation')} weakly controlled"),
+        ("r < 0.1", f"{count(weak, 'observation')} weakly controlled"),
     ]
     if loose:
-        rows.append(("r = 0", f"{number(loose, 'observation')} not controlled at all"))
+        rows.append(("r = 0", f"{count(loose, 'observation')} not controlled at all"))
     return [
         *heading("Redundancy numbers"),
         *facts(rows),

@@ -3,6 +3,7 @@
 import numpy as np
 
 from jaxbundle.cameras import get_model
+from jaxbundle.network.columns import count
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.report.equations import EQUATIONS
 from jaxbundle.report.head import image_unit
@@ -14,7 +15,6 @@ from jaxbundle.report.layout import (
     facts,
     fixed,
     heading,
-    number,
     paragraph,
     significant,
     table,
@@ -156,7 +156,7 @@ def _sigma(value: float, places: int) -> str:
 def _left_out(total: int, most: int, noun: str, file: str) -> list[str]:
     if total <= most:
         return []
-    return [f"… and {number(total - most, f'other {noun}')}: all {total} are in {file}."]
+    return [f"… and {count(total - most, f'other {noun}')}: all {total} are in {file}."]
 
 
 # --- points ---------------------------------------------------------------------------------
@@ -191,7 +191,7 @@ def _precision(adjustment, accuracy_unit) -> list[str]:
     counted = [np.histogram(s / scale, CLASSES)[0] for s in (*columns, together)]
     text = ["∞" if np.isinf(end) else f"{end:g}" for end in CLASSES]
     classes = [
-        (f"{a}–{b}", *(str(count[i]) for count in counted))
+        (f"{a}–{b}", *(str(column[i]) for column in counted))
         for i, (a, b) in enumerate(zip(text, text[1:]))
     ]
     # one table, so that both parts have the same columns

@@ -273,6 +273,26 @@ def test_odd_values_in_the_project_file_are_refused(folder, id, X, said):
     assert said in str(error.value) and len(str(error.value)) < 300 + 2 * len(str(folder))
 
 
+def test_only_ends_of_lines_end_a_line(folder):
+    """Separators that Unicode knows may stand in an id; LF, CR LF and CR end a line."""
+    edit(folder, "points.csv", '"e, far"', '"e,\u2028far"')
+    edit(folder, "distances.csv", '"e, far"', '"e,\u2028far"')
+    text = (folder / "observations.csv").read_text().replace("e, far", "e,\u2028far")
+    (folder / "observations.csv").write_text(text.replace("\n", "\r"), newline="")
+    text = (folder / "images.csv").read_text()
+    (folder / "images.csv").write_text(text, newline="\r\n")
+    network = read_project(folder)
+    assert network.points.id[4] == "e,\u2028far"
+    assert network.images.source(1).endswith("images.csv, line 5")
+    assert len(network.observations) == 10
+
+
+def test_blanks_about_the_id_of_a_camera_go(folder):
+    edit(folder, "project.toml", '"cam.1"', '" cam.1 "')
+    camera = read_project(folder, ["camera.cam.1.c=51"]).cameras[0]
+    assert (camera.id, camera.parameters["c"]) == ("cam.1", 51.0)
+
+
 def test_the_default_sigma_is_told(folder):
     edit(folder, "project.toml", "sigma_image = 0.01\n", "")
     network = read_project(folder)

@@ -138,6 +138,14 @@ def test_datum_points_must_be_free_points():
         check_network(broken("points", 3, role="fixed").replace(datum_points=("p3",)))
 
 
+def test_datum_points_of_a_datum_by_control_are_warned_of():
+    given = tables()
+    for k in range(4):
+        given["points"][k] |= {"role": "control", **SIGMA}
+    checked = check_network(make_network(**{**given, "datum": "control", "datum_points": ["p5"]}))
+    assert any("datum_points are not used" in warning for warning in checked.warnings)
+
+
 @pytest.mark.parametrize("table", ["images", "points"])
 def test_duplicate_ids_are_refused_with_both_rows(table):
     good = network()
