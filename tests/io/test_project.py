@@ -1,6 +1,7 @@
 """The project format: what it says, what it refuses, and that writing is the inverse of reading."""
 
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,21 @@ import pytest
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_network, read_project, write_project
 from jaxbundle.io.formats import FORMATS
-from jaxbundle.network.build import make_network
+from jaxbundle.io.settings import CAMERA_KEYS, SETTINGS, TABLES
+from jaxbundle.network.build import (
+    CAMERA_FIELDS,
+    DISTANCE_COLUMNS,
+    IMAGE_COLUMNS,
+    IMAGE_SIGMAS,
+    OBSERVATION_COLUMNS,
+    OBSERVATION_SIGMAS,
+    POINT_COLUMNS,
+    POINT_SIGMAS,
+    make_network,
+)
 from jaxbundle.network.check import check_network
+from jaxbundle.network.tables import DATUMS, RESIDUAL_DOMAINS, ROLES
+from jaxbundle.network.units import ANGLE_UNITS, IMAGE_UNITS
 
 ROOT = Path(__file__).parents[2]
 CASES = ROOT.parent / "shared" / "cases"
@@ -360,6 +374,36 @@ def test_the_kind_of_input_is_recognised(folder):
     with pytest.raises(InputError, match="unknown format 'toml'; known: project, photo-list"):
         read_network(folder, "toml")
     assert list(FORMATS)[:2] == ["project", "photo-list"]
+
+
+DOCS = ROOT / "docs" / "project.md"
+
+
+def test_the_project_of_the_documentation(tmp_path):
+    """Its files can be adjusted as they stand there; its row of a table can be added to them."""
+    text = DOCS.read_text(encoding="utf-8")
+    first, row = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
+    (tmp_path / "project.toml").write_text(first, encoding="utf-8")
+    for name, content in re.findall(r"`(\w+\.csv)`:\n\n```\n(.*?)```", text, re.DOTALL):
+        (tmp_path / name).write_text(content, encoding="utf-8")
+    network = check_network(read_project(tmp_path, ["free=c", "sigma_image=0.003"]))
+    assert network.warnings == ()
+    assert [len(network.images), len(network.points), len(network.observations)] == [2, 6, 12]
+    points = "".join(row.replace('"7"', f'"{id}"') for id in [*network.points.id])
+    edit(tmp_path, "project.toml", 'points = "points.csv"\n', "")
+    with (tmp_path / "project.toml").open("a", encoding="utf-8") as file:
+        file.write(points)
+    assert np.isposinf(read_project(tmp_path).points.sigma[:, 2]).all()
+
+
+def test_the_documentation_names_everything():
+    text = DOCS.read_text(encoding="utf-8")
+    columns = (*IMAGE_COLUMNS, *IMAGE_SIGMAS, *POINT_COLUMNS, *POINT_SIGMAS, *OBSERVATION_COLUMNS,
+               *OBSERVATION_SIGMAS, *DISTANCE_COLUMNS)  # fmt: skip
+    for name in (*SETTINGS, *TABLES, *CAMERA_FIELDS, *CAMERA_KEYS, *columns, *ROLES, *FORMATS):
+        assert f"`{name}`" in text, name
+    for name in (*DATUMS, *RESIDUAL_DOMAINS, *IMAGE_UNITS, *ANGLE_UNITS):
+        assert f'`"{name}"`' in text, name
 
 
 EXAMPLES = sorted(p.relative_to(ROOT) for p in (ROOT / "examples").glob("*/project*.toml"))
