@@ -4,6 +4,7 @@ Every camera and every network has a key. Results are written as JSON lines, por
 and what is already in the file is not computed again: a run can be interrupted at any moment.
 """
 
+import os
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -55,7 +56,7 @@ def run_batch(
     """
     inputs = list(dict.fromkeys(map(str, inputs)))
     for path in inputs:
-        if not Path(path).exists():
+        if not os.path.exists(path):
             raise InputError(f"{path}: no such file or folder")
     stacks = {path: read_camera_stack(path) for path in inputs if path.endswith(".npz")}
     if stacks:

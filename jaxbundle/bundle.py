@@ -9,19 +9,21 @@ import numpy as np
 
 from jaxbundle.adjustment.datum import move_to_datum
 from jaxbundle.adjustment.problem import Problem, count_rows, make_problem, with_factor
+from jaxbundle.adjustment.residuals import half_square
 from jaxbundle.adjustment.sharding import distribute, find_minimum_of_shards
 from jaxbundle.adjustment.solve import converged, find_minimum, make_solver
-from jaxbundle.adjustment.solver import Minimum
+from jaxbundle.adjustment.solver import SINGULAR, TERMINATIONS, Minimum
 from jaxbundle.adjustment.unknowns import Name, undetermined
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.check import check_network
+from jaxbundle.network.columns import some
 from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.tables import Network
 from jaxbundle.result import Adjustment
-from jaxbundle.statistics import cofactors as all_cofactors
 from jaxbundle.statistics import (
+    Component,
     intersect_check_points,
     reliability,
     rescale,
@@ -29,6 +31,7 @@ from jaxbundle.statistics import (
     undamped_factor,
     variance_components,
 )
+from jaxbundle.statistics import cofactors as all_cofactors
 
 CORE_PARAMETERS = ("c", "x0", "y0", "fx", "fy", "cx", "cy", "f")
 """Interior parameters that are never eliminated for want of significance."""
@@ -38,6 +41,9 @@ RAYS_TO_SHARE = 10_000
 
 RUNAWAY = 20.0
 """A principal distance that changed by more than this factor belongs to no camera."""
+
+ROUNDS = 20
+"""Variance components are estimated at most so many times."""
 
 
 def adjust(
@@ -66,12 +72,14 @@ def adjust(
     - `eliminate`: fix additional parameters with t < `critical_t` at 0, the least significant
       first, adjusting again each time.
     - `estimate_components`: scale the σ of each group of observations until its variance
-      component is 1.
+      component is 1; `Adjustment.sigma_factors` says by how much.
     - `progress(step, cost, λ)`: called after every evaluation.
 
     **Returns:** an `Adjustment`; look at `converged` before anything else.
 
-    **Raises:** `InputError` where the network cannot be adjusted as it stands.
+    **Raises:** `InputError` where the network cannot be adjusted as it stands; `NotSolvedError`
+    where it, or what data snooping, elimination or variance components leave of it, determines no
+    answer.
     """
     network = check_network(network)
     network, check_points, check_rays = split_check_points(network)
@@ -81,13 +89,13 @@ def adjust(
     minimum = _minimise(problem, problem.data.start, **options)
     problem = with_factor(problem)
 
-    removed, eliminated = [], []
+    removed, eliminated, factors = [], [], {}
     if _solved(problem, minimum):
         again = lambda problem, values: _minimise(problem, values, **options)
         if snooping:
             problem, minimum, removed = _snooped(problem, minimum, again, snooping, significance)
         if estimate_components:
-            problem, minimum = _with_components(problem, minimum, again)
+            problem, minimum, factors = _with_components(problem, minimum, again)
         if eliminate:
             problem, minimum, eliminated = _eliminated(problem, minimum, again, critical_t)
 
@@ -95,11 +103,12 @@ def adjust(
     check = None
     if len(check_points):
         check = lambda result: intersect_check_points(
-            problem, result.values, result.factor, check_points, check_rays
+            problem, result.values, result.factor, check_points, check_rays, factors
         )
     return Adjustment(
         network, problem, minimum, removed=tuple(removed), eliminated=tuple(eliminated),
         undetermined=tuple(names), check=check, method=method, reduction=used,
+        sigma_factors=factors,
     )  # fmt: skip
 
 
@@ -147,19 +156,26 @@ def _names_of_defects(problem: Problem, minimum: Minimum) -> list[str]:
     return undetermined(problem, values, problem.data)
 
 
+def _require_solved(problem: Problem, minimum: Minimum, when: str) -> None:
+    """Refuse to go on from an adjustment repeated that was not solved."""
+    if not _solved(problem, minimum):
+        names = _names_of_defects(problem, minimum)
+        reason = int(minimum.termination)
+        why = TERMINATIONS[SINGULAR if bool(converged(reason)) else reason]
+        if names:
+            why = f"the network is no longer determined: {some(names, 8, str)}"
+        raise NotSolvedError(f"not solved {when}: {why}", names)
+
+
 def _snooped(problem, minimum, again, test, significance):
     last = {}
 
     def adjust_from(problem, values):
         result = again(problem, values)
-        if not _solved(problem, result):
-            raise NotSolvedError(
-                "data snooping took away so much that the network is no longer determined: "
-                + ", ".join(_names_of_defects(problem, result)[:8])
-            )
+        _require_solved(problem, result, "after data snooping")
         last["minimum"] = result
         found = _reliability(problem, result.values)
-        vtpv = sum(float((np.asarray(v) ** 2).sum()) for v in _leaves(found.residual))
+        vtpv = 2 * float(half_square(found.residual))
         return result.values, found, float(np.sqrt(vtpv / max(problem.counts.redundancy, 1)))
 
     problem, _, removed = snoop(
@@ -168,34 +184,51 @@ def _snooped(problem, minimum, again, test, significance):
     return problem, last["minimum"], removed
 
 
-def _leaves(residual):
-    return (
-        residual.image, residual.control, residual.exterior, residual.interior, residual.distance
-    )  # fmt: skip
-
-
 def _reliability(problem: Problem, values: Values):
     factor = undamped_factor(problem.structure, values, problem.data)
     Q = all_cofactors(problem.structure, values, factor)
     return reliability(problem.structure, values, problem.data, Q)
 
 
-def _with_components(problem, minimum, again, rounds: int = 20, tolerance: float = 1e-3):
-    """Repeat Förstner's estimate until every component is 1 within `tolerance`."""
-    for _ in range(rounds):
+def _with_components(problem, minimum, again, tolerance: float = 1e-3):
+    """Repeat Förstner's estimate until every component is 1 within `tolerance`.
+
+    Also returned: by group, what its σ have been multiplied by.
+    """
+    factors: dict[str, float] = {}
+    for done in range(ROUNDS + 1):
         found = _reliability(problem, minimum.values)
-        components = variance_components(problem, problem.data, found)
-        usable = [c.sigma for c in components.values() if c.redundancy >= 1]
-        if all(abs(sigma - 1) < tolerance for sigma in usable):
+        components = variance_components(problem, problem.data, found, factors)
+        estimable = {name: c for name, c in components.items() if c.usable}
+        factors = {name: c.factor for name, c in estimable.items()} | factors
+        open_ones = [name for name, c in estimable.items() if abs(c.ratio - 1) >= tolerance]
+        if done == ROUNDS or not open_ones:
             break
-        data = rescale(problem, problem.data, components)
+        ratios = {name: c.ratio for name, c in estimable.items()}
+        data = rescale(problem.network.cameras, problem.structure, problem.data, ratios)
         problem = dataclasses.replace(problem, data=data)
         minimum = again(problem, minimum.values)
-    return problem, minimum
+        _require_solved(problem, minimum, "with the estimated variance components")
+        factors |= {name: c.sigma for name, c in estimable.items()}
+    network = problem.network.warn(*_doubts(components, open_ones))
+    return dataclasses.replace(problem, network=network), minimum, factors
+
+
+def _doubts(components: dict[str, Component], open_ones: list[str]):
+    """What is to be said of an estimate of variance components."""
+    if open_ones:
+        yield (
+            f"the variance components did not settle in {ROUNDS} rounds ({', '.join(open_ones)}): "
+            "their σ are not final"
+        )
+    for name, component in components.items():
+        if not component.usable:
+            why = "fit exactly" if component.redundancy >= 1 else "have too little redundancy"
+            yield f"variance components: {name} {why}; their σ are left as they are"
 
 
 def _eliminated(problem, minimum, again, critical_t):
-    """Fix insignificant additional parameters at their default, the weakest first."""
+    """Fix insignificant additional parameters at 0, the weakest first."""
     names = []
     while True:
         result = Adjustment(problem.network, problem, minimum)
@@ -208,6 +241,7 @@ def _eliminated(problem, minimum, again, critical_t):
         names.append(weak[0])
         problem, values = _without_parameter(problem, minimum.values, weak[0])
         minimum = again(problem, values)
+        _require_solved(problem, minimum, f"without {weak[0]}")
 
 
 def _without_parameter(problem: Problem, values: Values, name: Name):

@@ -22,18 +22,17 @@ from jaxbundle import report
 from jaxbundle.batches import run_batch
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io import read_network, write_project
-from jaxbundle.io.csv_tables import write_csv, write_text
-from jaxbundle.io.result_json import result_text, write_result
+from jaxbundle.network.columns import some
 from jaxbundle.network.reduction import REDUCTIONS
-from jaxbundle.plotting import save_figures
 from jaxbundle.result import Adjustment
+from jaxbundle.targets import check_targets, write_targets
 
 BAD_INPUT, NOT_SOLVED = 2, 3
 
 app = typer.Typer(
     name="jaxbundle",
     help="Least squares for photogrammetry: self-calibrating bundle adjustment.",
-    no_args_is_help=True,
+    invoke_without_command=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
@@ -41,9 +40,23 @@ app = typer.Typer(
 Input = Annotated[Path, typer.Argument(help="project .toml, text list of photographs, …")]
 
 
+def _version(asked: bool) -> None:
+    if asked:
+        print(f"jaxbundle {jaxbundle.__version__}")
+        raise typer.Exit
+
+
 @app.callback()
-def _main() -> None:
+def _main(
+    context: typer.Context,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="print the version")
+    ] = False,
+) -> None:
     """Every command has its own help: jaxbundle adjust --help."""
+    if context.invoked_subcommand is None:
+        print(context.get_help())
+        raise typer.Exit(BAD_INPUT)
 
 
 @app.command()
@@ -64,6 +77,9 @@ def adjust(
     snooping: Annotated[
         str | None, typer.Option(help="remove blunders one at a time: pope or baarda")
     ] = None,
+    significance: Annotated[
+        float, typer.Option(help="level of one test of data snooping, two-sided")
+    ] = 0.001,
     eliminate: Annotated[
         bool, typer.Option("--eliminate", help="fix insignificant additional parameters (t < 2)")
     ] = False,
@@ -84,23 +100,26 @@ def adjust(
         raise InputError(f"--reduction {reduction!r}: {', '.join(REDUCTIONS)}")
     if snooping not in (None, "pope", "baarda"):
         raise InputError(f"--snooping {snooping!r}: pope or baarda")
-    with _progress(quiet or json == "-") as tell:
-        result = jaxbundle.adjust(
-            network,
-            method=method,
-            reduction=reduction,
-            max_iterations=max_iterations,
-            snooping=snooping,
-            eliminate=eliminate,
-            estimate_components=components,
-            progress=tell,
-        )
-    if json == "-":
-        print(result_text(result, brief), end="")
-    elif json:
-        write_result(result, json, brief)
-    if out is not None:
-        write_folder(result, out, plots)
+    if not 0 < significance < 1:
+        raise InputError(f"--significance {significance:g}: a number between 0 and 1")
+    check_targets(input, network, json, out)
+    try:
+        with _progress(quiet or json == "-") as tell:
+            result = jaxbundle.adjust(
+                network,
+                method=method,
+                reduction=reduction,
+                max_iterations=max_iterations,
+                snooping=snooping,
+                significance=significance,
+                eliminate=eliminate,
+                estimate_components=components,
+                progress=tell,
+            )
+    except NotSolvedError as error:
+        write_targets(error, json, out, brief, plots)
+        raise
+    write_targets(result, json, out, brief, plots)
     if json != "-" and not quiet and result.converged:
         print(report.text(result))
     if not result.converged:
@@ -149,34 +168,10 @@ def convert(
     print(path)
 
 
-def write_folder(result: Adjustment, folder: Path, plots: bool = True) -> None:
-    """Report, JSON, CSV tables and plots of a result; each file whole or not at all."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"--out {folder}: cannot be made ({error.strerror})") from error
-    write_text(folder / "report.txt", report.text(result))
-    write_result(result, folder / "result.json")
-    if not result.converged:
-        return
-    for name in ("cameras", "images", "points", "residuals", "checks"):
-        table = result.table(name)
-        if table:
-            rows = zip(*(column.tolist() for column in table.values()))
-            write_csv(folder / f"{name}.csv", list(table), rows)
-    if plots:
-        try:
-            save_figures(result, folder)
-        except ImportError as error:
-            print(f"no plots: {error}", file=sys.stderr)
-
-
 def _why_not(result: Adjustment) -> str:
     parts = [f"not solved: {result.termination}"]
     if result.undetermined:
-        names = ", ".join(result.undetermined[:12])
-        more = len(result.undetermined) - 12
-        parts.append(f"not determined: {names}" + (f" and {more} more" if more > 0 else ""))
+        parts.append(f"not determined: {some(result.undetermined, 12, str)}")
         parts.append("fix them, give them a prior σ, or measure what determines them")
     elif "limit" in result.termination:
         parts.append("raise --max-iterations or give better start values")
@@ -211,14 +206,18 @@ class _progress:
 
 
 def main() -> None:
-    """Run the command line; errors of the input and of the solution end in one line."""
+    """Run the command line; errors of the input, the solution, the machine end in one line."""
     try:
-        app(standalone_mode=False)
+        sys.exit(app(standalone_mode=False))
     except (InputError, NotSolvedError) as error:
         print(f"jaxbundle: {error}", file=sys.stderr)
         sys.exit(BAD_INPUT if isinstance(error, InputError) else NOT_SOLVED)
-    except typer.Exit as error:
-        sys.exit(error.exit_code)
+    except MemoryError:
+        print("jaxbundle: not enough memory for this network", file=sys.stderr)
+        sys.exit(NOT_SOLVED)
+    except (OSError, OverflowError, RecursionError) as error:
+        print(f"jaxbundle: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(BAD_INPUT)
     except typer.Abort:
         sys.exit(130)
     except Exception as error:

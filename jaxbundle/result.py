@@ -6,7 +6,7 @@ values to ask for: every accessor raises `NotSolvedError` and says why.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from jaxtyping import Float
 from jaxbundle import plotting, report
 from jaxbundle.adjustment.jacobian import zero_tangent
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.adjustment.residuals import compiled_residuals
+from jaxbundle.adjustment.residuals import compiled_residuals, half_square
 from jaxbundle.adjustment.solve import converged
 from jaxbundle.adjustment.solver import TERMINATIONS, Minimum
 from jaxbundle.adjustment.unknowns import Name, interior_names
@@ -28,16 +28,20 @@ from jaxbundle.geometry import (
     retract_quaternion,
 )
 from jaxbundle.network.arrays import Tangent, Values, retract
+from jaxbundle.network.columns import did_you_mean, some
 from jaxbundle.network.reduction import FACTORS
 from jaxbundle.network.tables import EXTERIOR, Network
+from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.statistics import (
     CheckPoints,
     Component,
+    Reach,
     Reliability,
     Removed,
     chi2_quantile,
     cofactors,
     correlation_matrix,
+    distortion_reach,
     external_reliability,
     minimal_detectable,
     propagate,
@@ -46,8 +50,6 @@ from jaxbundle.statistics import (
     undamped_factor,
     variance_components,
 )
-
-ANGLE_UNITS = {"rad": 1.0, "deg": 180 / np.pi, "gon": 200 / np.pi}
 
 
 class Adjustment:
@@ -61,6 +63,9 @@ class Adjustment:
     - `method`, `reduction`: of the solution; the latter of the reduced system of images and cameras
     - `warnings`, `removed` (data snooping), `eliminated` (insignificant parameters),
       `undetermined` (names, where the network is singular)
+    - `sigma_factors`: where variance components were estimated, by group of observations, what its
+      a priori σ have been multiplied by; empty otherwise. Everything called a priori then means
+      the estimated σ, except in `variance_components`.
     """
 
     def __init__(
@@ -75,6 +80,7 @@ class Adjustment:
         check: Callable[["Adjustment"], CheckPoints] | None = None,
         method: str = "levenberg-marquardt",
         reduction: str | None = None,
+        sigma_factors: Mapping[str, float] | None = None,
     ):
         self.network = network
         self.problem = problem
@@ -84,6 +90,7 @@ class Adjustment:
         self.undetermined = undetermined
         self.method = method
         self.reduction = reduction or problem.structure.reduction
+        self.sigma_factors = dict(sigma_factors or {})
         self._check = check
 
     # --- how it ended -----------------------------------------------------------------------
@@ -107,8 +114,15 @@ class Adjustment:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What was left out or looked strange, in words."""
-        return self.problem.network.warnings
+        """What was left out or looked strange, in words; also distortions that turn back."""
+        found = self.distortion_reach.values() if self.converged else ()
+        turns = (reach.message for reach in found if reach.message is not None)
+        return (*self.problem.network.warnings, *turns)
+
+    @functools.cached_property
+    def distortion_reach(self) -> dict[str, Reach]:
+        """By camera, how far its distortion was looked at, and whether it turns back there."""
+        return distortion_reach(self.problem, self.values)
 
     @property
     def counts(self):
@@ -128,7 +142,7 @@ class Adjustment:
 
     def _require_solved(self) -> None:
         if not self.converged:
-            names = ", ".join(self.undetermined[:8])
+            names = some(self.undetermined, 8, str)
             what = f"; not determined: {names}" if names else ""
             raise NotSolvedError(
                 f"the adjustment did not converge ({self.termination}){what}; it has no result"
@@ -141,7 +155,7 @@ class Adjustment:
         """vᵀPv of all observations, pseudo-observations included."""
         s, data = self.problem.structure, self.problem.data
         rows = compiled_residuals(s, self.values, data)
-        return float(sum((np.asarray(v) ** 2).sum() for v in jax.tree.leaves(rows)))
+        return float(2 * half_square(rows))
 
     @property
     def sigma0(self) -> float:
@@ -149,11 +163,19 @@ class Adjustment:
         r = self.redundancy
         return float(np.sqrt(self.vtpv / r)) if r > 0 else float("nan")
 
+    def pope(self, w: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """Pope's τ = w/σ0 of Baarda's w; NaN where all observations fit exactly."""
+        return w / (self.sigma0 or float("nan"))
+
     def global_test(self, significance: float = 0.05) -> dict:
-        """χ² test of vᵀPv against a variance factor of 1 (two-sided)."""
+        """χ² test of vᵀPv against a variance factor of 1 (two-sided).
+
+        `passed` is None where variance components were estimated, which makes σ0 = 1.
+        """
         f = self.redundancy
         low, high = chi2_quantile(significance / 2, f), chi2_quantile(1 - significance / 2, f)
-        return {"vtpv": self.vtpv, "low": low, "high": high, "passed": low <= self.vtpv <= high}
+        passed = None if self.sigma_factors else low <= self.vtpv <= high
+        return {"vtpv": self.vtpv, "low": low, "high": high, "passed": passed}
 
     # --- cofactors --------------------------------------------------------------------------
 
@@ -182,8 +204,10 @@ class Adjustment:
 
     @functools.cached_property
     def variance_components(self) -> dict[str, Component]:
-        """σ̂ over a priori σ for every group of observations."""
-        return variance_components(self.problem, self.problem.data, self.reliability)
+        """For every group of observations σ̂ over the a priori σ it was given, and σ̂ itself."""
+        return variance_components(
+            self.problem, self.problem.data, self.reliability, self.sigma_factors
+        )
 
     @functools.cached_property
     def check_points(self) -> CheckPoints | None:
@@ -197,13 +221,14 @@ class Adjustment:
     def image_values(self) -> Float[np.ndarray, "images 6"]:
         """X0, Y0, Z0 (object unit), ω, φ, κ (radians, on the turn and branch of the start)."""
         values = self.values
-        angles, _ = self._angles_like_start
+        angles, *_ = self._angles_like_start
         position = np.asarray(values.position) + self.problem.origin
         return np.concatenate([position, np.asarray(angles)], 1)
 
     @functools.cached_property
     def _angles_like_start(self):
-        """ω, φ, κ of all images and their Jacobians by δθ, next to the angles that were given.
+        """ω, φ, κ of all images and their Jacobians by δθ, next to the angles that were given;
+        and what the derivatives have been multiplied by.
 
         (ω, φ, κ) and (ω + π, π − φ, κ + π) are one rotation, and so are whole turns.
         """
@@ -214,7 +239,7 @@ class Adjustment:
         angles, other = turn(angles), turn(other)
         flip = ((other - start) ** 2).sum(1) < ((angles - start) ** 2).sum(1)
         sign = np.where(flip[:, None], [1.0, -1.0, 1.0], 1.0)
-        return np.where(flip[:, None], other, angles), jacobian * sign[:, :, None]
+        return np.where(flip[:, None], other, angles), jacobian * sign[:, :, None], sign
 
     @functools.cached_property
     def image_covariance(self) -> Float[np.ndarray, "images 6 6"]:
@@ -246,18 +271,19 @@ class Adjustment:
 
     def camera_covariance(self, camera: str) -> tuple[list[str], Float[np.ndarray, "n n"]]:
         """Names and covariance of the free parameters of a camera."""
+        names, Q = self._camera_cofactor(camera)
+        return names, self.sigma0**2 * Q
+
+    def _camera_cofactor(self, camera: str):
         c, s = self._camera(camera), self.problem.structure
         free = np.flatnonzero(np.asarray(s.camera_free)[c])
         Q = self.cofactors.image[c, 6:, 6:] if s.own_camera else self.cofactors.camera[c]
         Q = np.asarray(Q)[np.ix_(free, free)]
         names = interior_names(self.problem, c)
-        return [names[i].parameter for i in free], self.sigma0**2 * Q
+        return [names[i].parameter for i in free], Q
 
     def _camera(self, camera: str) -> int:
-        ids = [given.id for given in self.problem.network.cameras]
-        if camera not in ids:
-            raise KeyError(f"there is no camera {camera!r}; cameras: {', '.join(ids)}")
-        return ids.index(camera)
+        return _place(camera, [given.id for given in self.problem.network.cameras], "camera")
 
     def insignificant(self, critical: float = 2.0) -> list[tuple[float, Name]]:
         """Free interior parameters with t = |value|/σ below `critical`, the least first."""
@@ -271,8 +297,12 @@ class Adjustment:
 
     def covariance(self, *names: tuple[str, str, str]) -> Float[np.ndarray, "n n"]:
         """Covariance of any unknowns by name, e.g. `("camera", "cam", "c")`,
-        `("image", "12", "kappa")` (radians), `("point", "7", "Z")`."""
+        `("image", "12", "kappa")` (radians), `("point", "7", "Z")`.
+
+        **Raises:** `KeyError` for a name that is not there."""
         wanted = [Name(*map(str, name)) for name in names]
+        for name in wanted:
+            self._value_of(name, self.values)  # refuses what is not there
 
         def pick(values: Values):
             return jnp.stack([self._value_of(name, values) for name in wanted])
@@ -280,17 +310,20 @@ class Adjustment:
         return self.covariance_of(pick)
 
     def _value_of(self, name: Name, values: Values):
+        """The unknown of this name; of an angle, what changes as it does on its branch."""
         network = self.problem.network
         if name.kind == "camera":
             c = self._camera(name.id)
             parameters = get_model(network.cameras[c].model).parameters
-            return values.camera[c, parameters.index(name.parameter)]
+            return values.camera[c, _place(name.parameter, parameters, "camera parameter")]
         if name.kind == "image":
-            i = network.images.id.index(name.id)
-            angles = _angles(values.rotation[i], jnp.zeros(3))
-            return jnp.concatenate([values.position[i], angles])[EXTERIOR.index(name.parameter)]
+            i = _place(name.id, network.images.id, "image")
+            angles = _angles(values.rotation[i], jnp.zeros(3)) * self._angles_like_start[2][i]
+            pose = jnp.concatenate([values.position[i], angles])
+            return pose[_place(name.parameter, EXTERIOR, "image parameter")]
         if name.kind == "point":
-            return values.point[network.points.id.index(name.id), "XYZ".index(name.parameter)]
+            p = _place(name.id, network.points.id, "point")
+            return values.point[p, _place(name.parameter, ("X", "Y", "Z"), "coordinate")]
         raise KeyError(f"an unknown is of a camera, an image or a point, not of a {name.kind!r}")
 
     def covariance_of(self, function: Callable[[Values], jax.Array]) -> Float[np.ndarray, "n n"]:
@@ -310,7 +343,7 @@ class Adjustment:
     @property
     def angle_scale(self) -> float:
         """Factor from radians to the network's angle unit."""
-        return ANGLE_UNITS[self.network.angle_unit]
+        return 1 / ANGLE_UNITS[self.network.angle_unit]
 
     @functools.cached_property
     def cameras(self) -> dict[str, dict]:
@@ -319,9 +352,9 @@ class Adjustment:
         tables = {}
         for given in self.problem.network.cameras:
             values = self.camera_parameters(given.id)
-            free, covariance = self.camera_covariance(given.id)
-            sigma = dict(zip(free, np.sqrt(np.diagonal(covariance))))
-            total = dict(zip(free, total_correlation(covariance))) if free else {}
+            free, Q = self._camera_cofactor(given.id)
+            sigma = dict(zip(free, self.sigma0 * np.sqrt(np.diagonal(Q))))
+            total = dict(zip(free, total_correlation(Q))) if free else {}
             tables[given.id] = {
                 "model": given.model,
                 "parameters": {
@@ -329,13 +362,13 @@ class Adjustment:
                         "value": value,
                         "sigma": float(sigma[name]) if name in sigma else None,
                         "free": name in sigma,
-                        "t": abs(value) / float(sigma[name]) if name in sigma else None,
+                        "t": _significance(value, sigma[name]) if name in sigma else None,
                         "total_correlation": float(total[name]) if name in sigma else None,
                     }
                     for name, value in values.items()
                 },
                 "free": free,
-                "correlations": correlation_matrix(covariance),
+                "correlations": correlation_matrix(Q),
             }
         return tables
 
@@ -484,6 +517,13 @@ class Adjustment:
         return pandas.DataFrame(self.table(name))
 
 
+def _place(name: str, names: Sequence[str], thing: str) -> int:
+    if name not in names:
+        known = did_you_mean(name, names, listing=len(names) <= 20)
+        raise KeyError(f"there is no {thing} {name!r}{known}")
+    return names.index(name)
+
+
 def _angles(rotation, d_theta):
     return omega_phi_kappa_from_matrix(
         matrix_from_quaternion(retract_quaternion(rotation, d_theta))
@@ -516,11 +556,18 @@ def _residual_rows(adjustment, kind, image, point, axes, order, v, weight, r, w)
         "sigma": sigma.ravel(),
         "r": r.ravel(),
         "w": w.ravel(),
-        "tau": (w / adjustment.sigma0).ravel(),
+        "tau": adjustment.pope(w).ravel(),
         "mdb": np.asarray(minimal_detectable(sigma, r)).ravel(),
         "external": np.asarray(external_reliability(r)).ravel(),
     }
     return {name: column[used.ravel()] for name, column in columns.items()}
+
+
+def _significance(value: float, sigma: float) -> float:
+    """t = |value|/σ; where σ is 0, as after an exact fit, infinite, or NaN for the value 0."""
+    if sigma == 0:
+        return float("inf") if value else float("nan")
+    return abs(value) / float(sigma)
 
 
 def _concatenate(tables):

@@ -8,8 +8,11 @@ import pytest
 import jaxbundle
 from jaxbundle import Camera
 from jaxbundle.adjustment.solve import find_minimum, make_solver
+from jaxbundle.adjustment.unknowns import undetermined
 from jaxbundle.bundle import adjust
 from jaxbundle.errors import NotSolvedError
+from jaxbundle.io.result_json import result_dict
+from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.statistics.distributions import tau_quantile
 
 pytestmark = pytest.mark.xdist_group("bundle")
@@ -20,17 +23,21 @@ CONTROL = (0, 4, 20, 24, 62, 100, 124)
 CHECK = (2, 12, 50, 74, 110)
 
 
-@pytest.fixture(scope="module")
-def simulation():
+def simulated(seed):
     """Eight convergent images around a box of 125 points, seven of them control, five check."""
     stations = jaxbundle.ring_of_stations(8, 6.0, 3.0, look_at=(0.0, 0.0, 0.5), roll_every=2)
     axis = np.linspace(-1, 1, 5)
     targets = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
     camera = Camera("cam", "brown", TRUE, free=("c", "x0", "y0", "K1", "K2", "P1"))
     return jaxbundle.simulate_with_truth(
-        stations, targets, camera, noise=SIGMA, seed=4, datum="control", control=CONTROL,
+        stations, targets, camera, noise=SIGMA, seed=seed, datum="control", control=CONTROL,
         control_sigma=0.002, check=CHECK, disturb=0.01,
     )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    return simulated(4)
 
 
 @pytest.fixture(scope="module")
@@ -130,17 +137,76 @@ def test_elimination_fixes_what_is_insignificant(simulation):
     assert found.redundancy == before.redundancy + len(eliminated)
 
 
-def test_variance_components_are_estimated(simulation):
-    """Image σ given twice too large, control σ half: both groups come back to their truth."""
+@pytest.fixture(scope="module")
+def estimated():
+    """Variance components estimated from σ given right, and given wrong: those of the image
+    coordinates 500 times too large, those of the control points half."""
+    network = simulated(7).network
+    wrong = network.replace(
+        observations=dataclasses.replace(
+            network.observations, sigma=500 * network.observations.sigma
+        ),
+        points=dataclasses.replace(network.points, sigma=0.5 * network.points.sigma),
+    )
+    return [adjust(n, estimate_components=True) for n in (network, wrong)]
+
+
+def test_variance_components_are_estimated(estimated):
+    """Whatever σ were given, the estimate is the same, and near the truth."""
+    right, wrong = estimated
+    sigma = wrong.residuals["sigma"]
+    image = wrong.residuals["kind"] == "image"
+    # the component of 800 coordinates is known to 1/√(2·800) = 2.5 %, of 21 to about 20 %
+    assert sigma[image] == pytest.approx(np.full(image.sum(), SIGMA), rel=0.1)
+    control = sigma[wrong.residuals["kind"] == "control"]
+    assert len(control) == 21 and (control > 0.001).all() and (control < 0.004).all()
+    np.testing.assert_allclose(sigma, right.residuals["sigma"], rtol=0.02)
+    assert wrong.sigma0 == pytest.approx(1.0, abs=0.05)
+    assert wrong.warnings == ()
+
+
+def test_what_was_estimated_is_told(estimated, result):
+    right, wrong = estimated
+    assert set(wrong.sigma_factors) == {
+        "image coordinates", *(f"control points in {axis}" for axis in "XYZ")
+    }
+    for name, factor in wrong.sigma_factors.items():
+        given = 500 if name == "image coordinates" else 0.5
+        assert factor == pytest.approx(right.sigma_factors[name] / given, rel=0.02)
+        component = wrong.variance_components[name]
+        assert component.sigma == pytest.approx(factor, rel=2e-3)
+        assert component.given == pytest.approx((given * 0.002, given * 0.002), rel=1e-9)
+        assert component.estimated[0] == pytest.approx(component.sigma * component.given[0])
+    assert result.sigma_factors == {} and result.global_test()["passed"]
+    assert wrong.global_test()["passed"] is None
+    for text in (wrong.report(), str(wrong)):
+        assert "confirmed" not in text and "passed" not in text and "were estimated" in text
+    told = result_dict(wrong, brief=True)["sigma_factors"]
+    assert told == wrong.sigma_factors
+
+
+def test_check_points_have_the_sigma_of_the_estimated_weights(estimated):
+    right, wrong = (found.table("checks") for found in estimated)
+    for axis in "XYZ":
+        np.testing.assert_allclose(wrong[f"s{axis}"], right[f"s{axis}"], rtol=0.02)
+
+
+def test_components_that_do_not_settle_are_told(simulation, monkeypatch):
+    monkeypatch.setattr("jaxbundle.bundle.ROUNDS", 1)
     network = simulation.network
     observations = dataclasses.replace(
         network.observations, sigma=2 * network.observations.sigma
     )
     found = adjust(network.replace(observations=observations), estimate_components=True)
-    sigma = found.residuals["sigma"][found.residuals["kind"] == "image"]
-    # the component of 800 coordinates is known to 1/√(2·800) = 2.5 %
-    assert sigma == pytest.approx(np.full(len(sigma), SIGMA), rel=0.1)
-    assert found.sigma0 == pytest.approx(1.0, abs=0.05)
+    assert any("did not settle in 1 rounds (" in warning for warning in found.warnings)
+    assert found.sigma_factors["image coordinates"] != 1
+
+
+def test_exact_observations_have_no_components(simulation):
+    """Residuals that are rounding keep their weights, and the result says so."""
+    exact = adjust(simulation.truth, estimate_components=True)
+    assert exact.converged and exact.sigma_factors == {}
+    assert any("image coordinates fit exactly" in warning for warning in exact.warnings)
 
 
 def test_gauss_newton_finds_the_same_minimum(simulation, result):
@@ -170,6 +236,17 @@ def test_what_is_not_solved_has_no_values(simulation):
     for ask in (lambda: found.sigma0, lambda: found.images, lambda: found.cameras):
         with pytest.raises(NotSolvedError, match="did not converge"):
             ask()
+
+
+def test_a_wild_coordinate_ends_without_a_result(simulation):
+    found = adjust(with_xy(simulation.network, [7], 1e10))
+    assert not found.converged and "Not solved" in found.report()
+
+
+def test_numbers_that_overflow_have_no_names(result):
+    problem = result.problem
+    data = dataclasses.replace(problem.data, image_weight=1e200 * problem.data.image_weight)
+    assert undetermined(problem, data.start, data) == []
 
 
 def test_an_undetermined_parameter_is_named():
@@ -203,3 +280,27 @@ def test_angles_come_back_on_the_branch_they_were_given(simulation, result):
     for name in ("omega", "phi", "kappa"):
         np.testing.assert_allclose(other.images[f"s{name}"], result.images[f"s{name}"], rtol=1e-6)
     assert other.vtpv == pytest.approx(result.vtpv, rel=1e-9)
+    names = ("X0", "phi", "kappa")
+    columns = [EXTERIOR.index(name) for name in names]
+    for i, sign in ((0, 1), (1, -1)):
+        image = images.id[i]
+        block = other.covariance(*(("image", image, name) for name in names))
+        np.testing.assert_allclose(
+            block, other.image_covariance[i][np.ix_(columns, columns)], rtol=1e-7, atol=1e-20
+        )
+        before = result.image_covariance[i][np.ix_(columns, columns)]
+        assert block[0, 1] == pytest.approx(sign * before[0, 1], rel=1e-6)
+
+
+@pytest.mark.parametrize("name, said", [
+    (("camera", "cam2", "c"), "there is no camera 'cam2'; did you mean 'cam'"),
+    (("camera", "cam", "K9"), "there is no camera parameter 'K9'; known: c, x0, y0, K1"),
+    (("image", "777", "phi"), "there is no image '777'"),
+    (("image", "1", "Phi"), "there is no image parameter 'Phi'; did you mean 'phi'"),
+    (("point", "x", "X"), "there is no point 'x'"),
+    (("point", "8", "x"), "there is no coordinate 'x'; did you mean 'X'"),
+    (("station", "8", "X"), "of a camera, an image or a point"),
+])  # fmt: skip
+def test_an_unknown_of_no_such_name(result, name, said):
+    with pytest.raises(KeyError, match=said):
+        result.covariance(name)

@@ -23,6 +23,7 @@ LAYERS = (
     "result",
     "bundle",
     "batches",
+    "targets",
     "cli",
     "__main__",
 )

@@ -75,9 +75,11 @@ def _scaled_reduced(structure, values, data):
 
 
 def _undetermined_points(problem: Problem, V) -> list[str]:
+    finite = np.isfinite(V).all((1, 2))
+    V = np.where(finite[:, None, None], V, np.eye(3))
     diagonal = np.diagonal(V, axis1=1, axis2=2)
     free = np.asarray(problem.structure.eliminated)[:, 0] > 0
     scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     smallest = np.linalg.eigvalsh(V * scale[:, :, None] * scale[:, None, :])[:, 0]
-    weak = np.flatnonzero(free & (smallest < INDETERMINATE))
+    weak = np.flatnonzero(free & finite & (smallest < INDETERMINATE))
     return [f"X, Y, Z of point {problem.network.points.id[p]}" for p in weak]

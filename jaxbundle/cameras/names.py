@@ -4,8 +4,14 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 
 
-def closest(name: str, known: Iterable[str]) -> str:
-    """`": did you mean 'K1'?"` for the most similar of the known names, or `"."`."""
+def closest_name(name: str, known: Iterable[str]) -> str | None:
+    """The most similar of the known names, whatever their case; None if none is similar."""
     by_folded = {k.casefold(): k for k in known}
     matches = get_close_matches(str(name).casefold(), by_folded, n=1)
-    return f": did you mean {by_folded[matches[0]]!r}?" if matches else "."
+    return by_folded[matches[0]] if matches else None
+
+
+def closest(name: str, known: Iterable[str]) -> str:
+    """`": did you mean 'K1'?"` for the most similar of the known names, or `"."`."""
+    found = closest_name(name, known)
+    return "." if found is None else f": did you mean {found!r}?"

@@ -47,5 +47,5 @@ def check_parameters(model: CameraModel, given: Mapping[str, float]) -> None:
 def _is_finite_number(value) -> bool:
     try:
         return not isinstance(value, bool) and math.isfinite(value)
-    except TypeError:
+    except (TypeError, OverflowError):
         return False

@@ -16,6 +16,7 @@ Source: Agarwal, Snavely, Seitz and Szeliski (2010), Bundle Adjustment in the La
 
 import bz2
 import gzip
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -31,6 +32,7 @@ from jaxbundle.network.columns import Columns
 from jaxbundle.network.tables import EXTERIOR, Network, Source
 
 OPENERS = {".gz": gzip.open, ".bz2": bz2.open}
+UNREADABLE = (OSError, EOFError, zlib.error)
 MODEL = get_model("snavely")
 
 
@@ -41,9 +43,9 @@ def is_bal(path: Path) -> bool:
     try:
         with OPENERS.get(path.suffix.lower(), open)(path, "rb") as file:
             words = file.readline(200).split()
-    except (OSError, EOFError):
+    except UNREADABLE:
         return False
-    return len(words) == 3 and all(word.isdigit() for word in words)
+    return _are_counts(words)
 
 
 def read_bal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
@@ -98,14 +100,19 @@ def read_bal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     )  # fmt: skip
 
 
+def _are_counts(words: Sequence[bytes]) -> bool:
+    """Whether these are three whole numbers."""
+    return len(words) == 3 and all(word.isdigit() and len(word) < 19 for word in words)
+
+
 def _numbers(path: Path):
     """The three counts of the first line, and all numbers after it."""
     try:
         with OPENERS.get(path.suffix.lower(), open)(path, "rb") as file:
             first, text = file.readline().split(), file.read()
-    except (OSError, EOFError) as error:
+    except UNREADABLE as error:
         raise InputError(f"{path}: cannot be read: {error}") from None
-    if len(first) != 3 or not all(word.isdigit() for word in first):
+    if not _are_counts(first):
         raise InputError(
             f"{path}, line 1: three whole numbers are expected: cameras, points, observations"
         )

@@ -1,6 +1,7 @@
 """Which format a path is in, and who reads it."""
 
 import dataclasses
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -63,7 +64,7 @@ def read_network(
     path = Path(path)
     if format is not None and format not in FORMATS:
         raise InputError(f"unknown format {format!r}{did_you_mean(format, FORMATS)}")
-    if not path.exists():
+    if not os.path.exists(path):
         raise InputError(f"{path}: no such file or folder")
     if format is None:
         format = next((name for name, kind in FORMATS.items() if kind.recognises(path)), None)

@@ -21,7 +21,7 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.io.csv_tables import read_text
 from jaxbundle.io.settings import apply_overrides, network_of
-from jaxbundle.network.columns import Columns, count
+from jaxbundle.network.columns import Columns, count, shown
 from jaxbundle.network.tables import Network, Source
 
 PHOTO = ("omega", "phi", "kappa", "X0", "Y0", "Z0")
@@ -163,9 +163,9 @@ class _Parser:
         if not self._more():
             raise self._error(photo.line, f"the file ends after {photo}")
         number, words = self.lines[self.next]
-        if len(words) != 1 or not words[0].isdecimal():
+        if len(words) != 1 or not words[0].isdecimal() or len(words[0]) > 9:
             raise self._error(
-                number, f"{' '.join(words)!r} where the number of image points of {photo} is "
+                number, f"{shown(' '.join(words))} where the number of image points of {photo} is "
                 "expected"
             )  # fmt: skip
         self.next += 1

@@ -30,6 +30,7 @@ Small tables may stand in the file itself, one `[[image]]`, `[[point]]`, `[[obse
 """
 
 import json
+import os
 import tomllib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -77,7 +78,9 @@ def read_project(path: str | Path, overrides: Sequence[str] = ()) -> Network:
 def _read_document(path: Path) -> Document:
     try:
         document = tomllib.loads(read_text(path))
-    except tomllib.TOMLDecodeError as error:
+    except RecursionError:
+        raise InputError(f"{path}: not valid TOML: brackets are nested too deeply") from None
+    except ValueError as error:
         raise InputError(f"{path}: not valid TOML: {error}") from None
     known = ("project", "camera", *INLINE.values())
     for key, value in document.items():
@@ -109,7 +112,7 @@ def _read_table(document: Document, table: str, path: Path) -> Columns | None:
         )
     if not isinstance(file, str):
         raise InputError(f"{path}, [project]: {table} is {file!r}; the name of a file is expected")
-    if not (path.parent / file).is_file():
+    if not os.path.isfile(path.parent / file):
         raise InputError(
             f"{path}, [project]: {table} = {file!r}: no such file {path.parent / file}"
         )

@@ -1,15 +1,15 @@
 """The result of an adjustment as JSON (the fields are listed in docs/result.md).
 
-σ are a posteriori, w uses the a priori σ. A number that does not exist (the σ of a held
-parameter, the MDB of an uncontrolled observation) is null.
+σ are a posteriori, w uses the a priori σ. A number that does not exist (the σ of a camera parameter
+that is held, the MDB of an uncontrolled observation) is null; the σ of a fixed point and of what is
+held of an exterior orientation are 0.
 """
 
 import json
 import math
-from pathlib import Path
 
 from jaxbundle.cameras import get_model
-from jaxbundle.io.csv_tables import write_text
+from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.tables import EXTERIOR
 
 
@@ -42,6 +42,7 @@ def result_dict(adjustment, brief: bool = False) -> dict:
     if not adjustment.converged:
         return head | {"undetermined": list(adjustment.undetermined)}
     head |= {"sigma0": adjustment.sigma0, "vtpv": adjustment.vtpv, "sigma": "a posteriori"}
+    head |= {"sigma_factors": adjustment.sigma_factors}
     head |= {
         "cameras": {name: _camera(table) for name, table in adjustment.cameras.items()},
         "images": _images(adjustment),
@@ -62,6 +63,8 @@ def result_dict(adjustment, brief: bool = False) -> dict:
                     "redundancy": c.redundancy,
                     "vtpv": c.vtpv,
                     "sigma": c.sigma,
+                    "factor": c.factor,
+                    "estimated": list(c.estimated),
                 }
                 for name, c in adjustment.variance_components.items()
             },
@@ -69,13 +72,14 @@ def result_dict(adjustment, brief: bool = False) -> dict:
     return head | {"check_points": _checks(adjustment)}
 
 
-def write_result(adjustment, path: str | Path, brief: bool = False) -> None:
-    """Write the JSON result; the file appears whole or not at all."""
-    write_text(Path(path), result_text(adjustment, brief))
+def unsolved_text(error: NotSolvedError) -> str:
+    """The JSON text of an adjustment that ended before there was an `Adjustment`."""
+    head = {"converged": False, "termination": str(error), "undetermined": [*error.undetermined]}
+    return json.dumps(head, ensure_ascii=False) + "\n"
 
 
 def result_text(adjustment, brief: bool = False) -> str:
-    """The result as JSON text, one line an image, a point and a residual."""
+    """The result as JSON text: one line that ends with a line feed."""
     return json.dumps(without_nan(result_dict(adjustment, brief)), ensure_ascii=False) + "\n"
 
 

@@ -5,14 +5,13 @@ reader that has settings makes one, so that the same overrides work for all of t
 """
 
 import copy
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from jaxbundle.errors import InputError
 from jaxbundle.network.build import CAMERA_FIELDS, make_cameras, make_network
-from jaxbundle.network.columns import Columns, did_you_mean
-from jaxbundle.network.rules import CHOICES, check_choice
+from jaxbundle.network.columns import Columns, did_you_mean, shown
+from jaxbundle.network.rules import CHOICES, check_choice, check_sigma_image
 from jaxbundle.network.tables import Network
 
 TABLES = ("images", "points", "observations", "distances")
@@ -58,12 +57,12 @@ def _project_value(key: str, text: str):
 
 def _override_camera(cameras: list[dict], key: str, text: str) -> None:
     rest = key.removeprefix("camera.")
-    for camera in sorted(cameras, key=lambda c: -len(str(c.get("id", "")))):
-        field = rest.removeprefix(f"{camera.get('id', '')}.")
+    ids = [str(camera.get("id", "")).strip() for camera in cameras]
+    for c in sorted(range(len(ids)), key=lambda c: -len(ids[c])):
+        field, camera = rest.removeprefix(f"{ids[c]}."), cameras[c]
         if field != rest:
             break
     else:
-        ids = [str(camera.get("id")) for camera in cameras]
         raise InputError(
             f"--set {key}: no such camera; known: "
             f"{', '.join(f'camera.{id}.PARAMETER' for id in ids)}"
@@ -75,7 +74,13 @@ def _override_camera(cameras: list[dict], key: str, text: str) -> None:
     elif field == "model":
         camera[field] = text
     elif field.startswith("sigma."):
-        camera.setdefault("sigma", {})[field.removeprefix("sigma.")] = _number(key, text)
+        sigma = camera.setdefault("sigma", {})
+        if not isinstance(sigma, dict):
+            raise InputError(
+                f"--set {key}: sigma of the camera is {shown(sigma)}; expected a table such as "
+                "{ c = 0.1 }"
+            )
+        sigma[field.removeprefix("sigma.")] = _number(key, text)
     elif field in ("id", "sigma"):
         raise InputError(f"--set {key}: cannot be set; known: {', '.join(CAMERA_KEYS)}")
     else:
@@ -114,10 +119,6 @@ def check_settings(project: Mapping[str, Any], where: str) -> None:
             raise InputError(f"{where}{key} is {value!r}; text in quotes is expected")
         if key in CHOICES:
             check_choice(key, value, CHOICES[key], where)
-    sigma = project.get("sigma_image", 1.0)
-    if isinstance(sigma, bool) or not isinstance(sigma, int | float):
-        raise InputError(f"{where}sigma_image is {sigma!r}; a number is expected")
-    if not (math.isfinite(sigma) and sigma > 0):
-        raise InputError(f"{where}sigma_image is {sigma}; it must be finite and positive")
+    check_sigma_image(project.get("sigma_image", 1.0), where)
     if not isinstance(project.get("datum_points", []), list):
         raise InputError(f'{where}datum_points must be a list of ids, such as ["1", "2"]')

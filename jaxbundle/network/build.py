@@ -22,8 +22,15 @@ import numpy as np
 
 from jaxbundle.cameras import MODEL_NAMES, get_model
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import Columns, as_columns, did_you_mean
-from jaxbundle.network.rules import AXES, CHOICES, check_camera, check_choice, check_unique
+from jaxbundle.network.columns import Columns, as_columns, did_you_mean, shown
+from jaxbundle.network.rules import (
+    AXES,
+    CHOICES,
+    check_camera,
+    check_choice,
+    check_sigma_image,
+    check_unique,
+)
 from jaxbundle.network.tables import (
     EXTERIOR,
     Camera,
@@ -79,8 +86,8 @@ def make_network(
              "angle_unit": angle_unit, "image_unit": image_unit}  # fmt: skip
     for key, choices in CHOICES.items():
         check_choice(key, given[key], choices)
-    if sigma_image is not None and not (math.isfinite(sigma_image) and sigma_image > 0):
-        raise InputError(f"sigma_image is {sigma_image}; it must be finite and positive")
+    if sigma_image is not None:
+        check_sigma_image(sigma_image)
 
     cameras = make_cameras(cameras)
     images = _make_images(as_columns(images, "images"), cameras, ANGLE_UNITS[angle_unit])
@@ -140,9 +147,10 @@ def _missing(value) -> bool:
 
 
 def _camera(row: Mapping[str, Any], number: int, where: str) -> Camera:
-    if not isinstance(row, Mapping) or row.get("id", "") == "":
+    id = str(row.get("id", "")).strip() if isinstance(row, Mapping) else ""
+    if not id:
         raise InputError(f"{where}camera {number}: id is missing")
-    id, model = str(row["id"]), row.get("model", "brown")
+    model = row.get("model", "brown")
     where = f"{where}camera {id!r}: "
     parameters = {key: value for key, value in row.items() if key not in CAMERA_FIELDS}
     if model in MODEL_NAMES:
@@ -173,8 +181,11 @@ def _camera(row: Mapping[str, Any], number: int, where: str) -> Camera:
 
 def _number(where: str, key: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
-        raise InputError(f"{where}{key} is {value!r}; a number is expected")
-    return float(value)
+        raise InputError(f"{where}{key} is {shown(value)}; a number is expected")
+    try:
+        return float(value)
+    except OverflowError:
+        raise InputError(f"{where}{key} is {shown(value)}; that is too large") from None
 
 
 def _pair(where: str, key: str, value: Any, kind: type) -> tuple | None:

@@ -42,7 +42,7 @@ def check_network(network: Network) -> Network:
     network = _check_points(network)
     _check_observations(network)
     network = _check_distances(network)
-    _check_datum_points(network)
+    network = _check_datum_points(network)
     everything = network
     network = leave_out_undetermined(network)
     check_images(everything, network)
@@ -206,6 +206,13 @@ def _check_observations(network: Network) -> None:
             f"{sigma[row, k]:g}; it must be finite and positive: correct it, or leave it empty to "
             "use sigma_image"
         )
+    least = np.finfo(float).eps * np.abs(observations.xy).max()
+    for row, k in np.argwhere(sigma < least)[:1]:
+        raise InputError(
+            f"{observations.source(row)}: σ of {'xy'[k]} of {_sighting(network, row)} is "
+            f"{sigma[row, k]:g}, less than the last digit of the image coordinates ({least:.1g}); "
+            "give it, or sigma_image, in the unit of the coordinates"
+        )
     key = observations.image.astype(np.int64) * len(network.points) + observations.point
     order = np.argsort(key, kind="stable")
     for k in np.flatnonzero(np.diff(key[order]) == 0)[:1]:
@@ -245,7 +252,7 @@ def _check_distances(network: Network) -> Network:
     return network
 
 
-def _check_datum_points(network: Network) -> None:
+def _check_datum_points(network: Network) -> Network:
     roles: Mapping[str, str] = dict(zip(network.points.id, network.points.role))
     for id in network.datum_points:
         if id not in roles:
@@ -258,6 +265,12 @@ def _check_datum_points(network: Network) -> None:
                 f"datum_points: point {id!r} is a {roles[id]} point; name tie points (or "
                 "control points with σ)"
             )
+    if network.datum_points and network.datum == "control":
+        return network.warn(
+            "datum_points are not used: the datum is given by control; choose datum = \"inner\" or "
+            "\"minimal\" for them"
+        )
+    return network
 
 
 def _check_start_values(network: Network) -> None:

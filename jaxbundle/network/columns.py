@@ -6,16 +6,19 @@ it came from.
 """
 
 import dataclasses
-import difflib
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxbundle.cameras.names import closest_name
 from jaxbundle.errors import InputError
 from jaxbundle.network.tables import Source
+
+BOOLEAN = (bool, np.bool_)
+"""No numbers, although Python converts them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,12 +87,12 @@ class Columns:
         try:
             number = float(value)
             good = not isinstance(value, str) or (math.isfinite(number) and "_" not in value)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             good = False
-        if not good:
+        if not good or isinstance(value, BOOLEAN):
             or_word = "".join(f" or {word!r}" for word in words)
             raise InputError(
-                f"{self.source(row)}: {name} is {value!r}; a number{or_word} is expected"
+                f"{self.source(row)}: {name} is {shown(value)}; a number{or_word} is expected"
             )
         return number
 
@@ -143,23 +146,33 @@ def _column(values: Any, column: str, name: str) -> Sequence[Any]:
 def did_you_mean(name: str, known: Iterable[str], *, listing: bool = True) -> str:
     """The end of a message about an unknown name: the closest known one, or all of them."""
     known = list(known)
-    folded = {k.lower(): k for k in known}
-    close = difflib.get_close_matches(str(name).lower(), list(folded), 1)
-    if close:
-        return f"; did you mean {folded[close[0]]!r}?"
+    close = closest_name(name, known)
+    if close is not None:
+        return f"; did you mean {close!r}?"
     return f"; known: {', '.join(known)}" if listing and known else ""
 
 
-def some(names: Iterable[str], most: int = 5) -> str:
+def shown(value: Any) -> str:
+    """A value as a message shows it: what is long is cut."""
+    text = repr(value.item() if isinstance(value, np.generic) else value)
+    return text if len(text) <= 60 else f"{text[:58]}…"
+
+
+def quoted(name: Any) -> str:
+    """A name in quotes."""
+    return repr(str(name))
+
+
+def some(names: Iterable[Any], most: int = 5, as_text: Callable[[Any], str] = quoted) -> str:
     """The first few names of a list, and how many more there are."""
     names = list(names)
-    text = ", ".join(repr(str(name)) for name in names[:most])
+    text = ", ".join(map(as_text, names[:most]))
     return f"{text} and {len(names) - most} more" if len(names) > most else text
 
 
-def count(number: int, thing: str) -> str:
-    """A number of things, in words: "1 image", "3 images"."""
-    return f"{number} {thing}{'' if number == 1 else 's'}"
+def count(number: int, thing: str, rest: str = "") -> str:
+    """A number of things, in words: "1 image", "3 images", "3 images held"."""
+    return f"{number} {thing}{'' if number == 1 else 's'}{rest}"
 
 
 def _id(value: Any) -> str:
@@ -167,7 +180,7 @@ def _id(value: Any) -> str:
         return value.strip()
     if value is None or value != value:
         return ""
-    if isinstance(value, float | np.floating) and value == int(value):
+    if isinstance(value, float | np.floating) and float(value).is_integer():
         value = int(value)
     return str(value)
 
@@ -178,8 +191,8 @@ def _plain_numbers(values: Sequence[Any]) -> np.ndarray | None:
         return values.astype(float)
     try:
         numbers = np.fromiter(map(float, values), float, len(values))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return None
     texts = [value for value in values if isinstance(value, str)]
     odd = texts and (not np.isfinite(numbers).all() or any("_" in text for text in texts))
-    return None if odd else numbers
+    return None if odd or any(isinstance(value, BOOLEAN) for value in values) else numbers

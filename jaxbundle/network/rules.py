@@ -3,9 +3,11 @@
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
 from jaxbundle.cameras import MODEL_NAMES, check_parameters, default_parameters, get_model
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import did_you_mean
+from jaxbundle.network.columns import did_you_mean, shown
 from jaxbundle.network.tables import DATUMS, RESIDUAL_DOMAINS, Camera, Source
 from jaxbundle.network.units import ANGLE_UNITS, IMAGE_UNITS
 
@@ -80,5 +82,16 @@ def _check_pair(where, name, pair, meaning):
         raise InputError(f"{where}{name} is {list(pair)}; expected {meaning}, both positive")
 
 
+def check_sigma_image(sigma: float, where: str = "") -> None:
+    """Refuse a default σ of image coordinates that is no finite positive number."""
+    if isinstance(sigma, bool) or not isinstance(sigma, int | float | np.number):
+        raise InputError(f"{where}sigma_image is {shown(sigma)}; a number is expected")
+    if not _positive(sigma):
+        raise InputError(f"{where}sigma_image is {shown(sigma)}; it must be finite and positive")
+
+
 def _positive(value) -> bool:
-    return math.isfinite(value) and value > 0
+    try:
+        return math.isfinite(value) and value > 0
+    except OverflowError:
+        return False

@@ -12,7 +12,7 @@ from jaxtyping import Bool
 
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.columns import count, some
-from jaxbundle.network.tables import Distances, Network, Observations, Points
+from jaxbundle.network.tables import EXTERIOR, Distances, Network, Observations, Points
 
 
 def split_check_points(network: Network) -> tuple[Network, Points, Observations]:
@@ -26,19 +26,7 @@ def split_check_points(network: Network) -> tuple[Network, Points, Observations]
     observations = dataclasses.replace(
         observations, point=(np.cumsum(check) - 1)[observations.point]
     )
-    return keep_points(network, ~check), take_points(network.points, check), observations
-
-
-def take_points(points: Points, mask: Bool[np.ndarray, " points"]) -> Points:
-    """The chosen points, their places kept for messages."""
-    rows = np.flatnonzero(mask)
-    return Points(
-        tuple(points.id[row] for row in rows),
-        tuple(points.role[row] for row in rows),
-        points.position[rows],
-        points.sigma[rows],
-        points.source.take(rows),
-    )
+    return keep_points(network, ~check), network.points.take(check), observations
 
 
 def keep_points(network: Network, keep: Bool[np.ndarray, " points"]) -> Network:
@@ -50,7 +38,7 @@ def keep_points(network: Network, keep: Bool[np.ndarray, " points"]) -> Network:
     network = without_distances(network, ~keep[network.distances.points].all(1))
     gone = {id for id, kept in zip(network.points.id, keep) if not kept}
     return network.replace(
-        points=take_points(network.points, keep),
+        points=network.points.take(keep),
         observations=dataclasses.replace(observations, point=index[observations.point]),
         distances=dataclasses.replace(
             network.distances, points=index[network.distances.points]
@@ -145,7 +133,9 @@ def check_images(before: Network, network: Network) -> None:
             raise NotSolvedError(
                 f"{place}not solved: it shares too few points with other images, so that neither "
                 f"X0, Y0, Z0, omega, phi, kappa of image {images.id[row]} nor X, Y, Z of points "
-                f"{some(lone)} can be determined; add images of the same points, or control points"
+                f"{some(lone)} can be determined; add images of the same points, or control points",
+                [f"{name} of image {images.id[row]}" for name in EXTERIOR]
+                + [f"X, Y, Z of point {id}" for id in lone],
             )
         used = "" if measured[row] == rays[row] else f" of the {measured[row]} measured ones"
         why = "" if not used else " (the others are check points or seen in one image only)"
@@ -202,7 +192,7 @@ def connected_parts(image, point, images: int, points: int):
 def check_redundancy(network: Network) -> None:
     """Refuse fewer observations, priors and datum conditions than unknowns."""
     images, points = network.images, network.points
-    points = take_points(points, ~points.has_role("check"))
+    points = points.take(~points.has_role("check"))
     taking_part = ~network.points.has_role("check")[network.observations.point]
     interior = [len(camera.sigma) for camera in network.cameras]
     weighted = np.isfinite(points.sigma) & points.has_role("control")[:, None]

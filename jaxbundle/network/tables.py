@@ -51,7 +51,7 @@ class Camera:
 
     `parameters` not given start at 0 (or the model's own default); `sigma` gives a parameter a
     prior: a pseudo-observation of its start value. `image_size` is (columns, rows), `pixel_size`
-    (width, height) in the unit of the image coordinates.
+    (width, height) in mm.
     """
 
     id: str

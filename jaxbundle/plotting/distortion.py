@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.cameras import get_model
+from jaxbundle.statistics import farthest_measurements, measured_centre
 
 AZIMUTHS = 12
 
@@ -59,17 +60,14 @@ def distortion_profile(adjustment, camera: str, radii: int = 81) -> DistortionPr
 
 def farthest_measurement(adjustment, camera: str) -> float:
     """The largest distance of a measurement of a camera from its principal point."""
-    s, data = adjustment.problem.structure, adjustment.problem.data
-    c = camera_index(adjustment, camera)
-    used = (np.asarray(s.camera) == c) & (np.asarray(data.image_weight) > 0).any(1)
-    away = np.asarray(data.image_xy)[used] - principal_point(adjustment, camera)
-    return float(np.linalg.norm(away, axis=1).max(initial=0.0))
+    found = farthest_measurements(adjustment.problem, adjustment.values)
+    return float(found[camera_index(adjustment, camera)])
 
 
 def principal_point(adjustment, camera: str) -> Float[np.ndarray, "2"]:
     """The measured image of a camera's axis, where its distortion is centred."""
     p = jnp.array(list(adjustment.camera_parameters(camera).values()))
-    return np.asarray(_centre(_model(adjustment, camera), p))
+    return np.asarray(measured_centre(_model(adjustment, camera), p))
 
 
 def camera_index(adjustment, camera: str) -> int:
@@ -79,12 +77,6 @@ def camera_index(adjustment, camera: str) -> int:
 
 def _model(adjustment, camera):
     return get_model(adjustment.problem.network.cameras[camera_index(adjustment, camera)].model)
-
-
-@partial(jax.jit, static_argnums=0)
-def _centre(model, p):
-    """The measured image of the principal axis."""
-    return jnp.stack(model.from_ideal(tuple(p), 0.0, 0.0))
 
 
 @partial(jax.jit, static_argnums=0)
@@ -105,7 +97,7 @@ def distortion_at(model, parameters, radius):
     p, radius = jnp.asarray(parameters, float), jnp.asarray(radius, float)
     azimuth = 2 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS
     out = np.stack([np.cos(azimuth), np.sin(azimuth)], -1)
-    centre = _centre(model, p)
+    centre = measured_centre(model, p)
     ideal = _ideal(model, p, centre + radius[:, None, None] * out)
     found = _harmonics(model, p, centre, ideal, radius, jnp.asarray(out))
     values, slopes = (np.array(x) for x in found)

@@ -18,6 +18,9 @@ from jaxbundle.plotting.views import network_perspective, network_plan
 MOST_IMAGES = 12
 MOST_CAMERAS = 6
 DOTS_PER_INCH = 150
+FIGURES = ("plan.png", "perspective.png", "histogram.png",
+           "residuals_*.png", "distortion_*.png", "correlations_*.png")  # fmt: skip
+"""Patterns of the names of all files written here."""
 
 
 def save_figures(adjustment, folder: str | Path) -> list[Path]:

@@ -47,7 +47,7 @@ def measured(adjustment, image: str):
         ids[np.asarray(s.point)[rows]],
         np.asarray(data.image_xy)[rows],
         np.asarray(found.residual.image)[rows] / weight,
-        np.asarray(found.w.image)[rows] / adjustment.sigma0,
+        adjustment.pope(np.asarray(found.w.image)[rows]),
     )
 
 

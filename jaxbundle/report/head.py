@@ -9,6 +9,7 @@ import numpy as np
 from jaxbundle.adjustment.datum import open_directions_in_words
 from jaxbundle.adjustment.solver import LIMIT, NOT_FINITE, SINGULAR, STUCK
 from jaxbundle.cameras import get_model
+from jaxbundle.network.columns import count, some
 from jaxbundle.network.tables import ROLES
 from jaxbundle.report.layout import (
     WIDTH,
@@ -16,11 +17,9 @@ from jaxbundle.report.layout import (
     facts,
     fixed,
     heading,
-    number,
     paragraph,
     shortened,
     significant,
-    some,
     table,
 )
 
@@ -104,13 +103,13 @@ def datum(adjustment) -> str:
     defect = adjustment.counts.datum
     if not defect:
         known = [
-            (int(network.points.has_role("control").sum()), "control point"),
-            (int(network.points.has_role("fixed").sum()), "fixed point"),
-            (len(s.exterior), "image with a prior exterior orientation"),
-            (int((np.asarray(s.image_free) == 0).any(1).sum()), "image held"),
-            (len(network.distances), "distance"),
+            (int(network.points.has_role("control").sum()), "control point", ""),
+            (int(network.points.has_role("fixed").sum()), "fixed point", ""),
+            (len(s.exterior), "image", " with a prior exterior orientation"),
+            (int((np.asarray(s.image_free) == 0).any(1).sum()), "image", " held"),
+            (len(network.distances), "distance", ""),
         ]
-        parts = [number(n, noun) for n, noun in known if n]
+        parts = [count(*part) for part in known if part[0]]
         return f"{network.datum}; defect 0: given by {', '.join(parts)}"
     open_ones = "defect 7: the observations leave open position, orientation and scale"
     if defect < 7:
@@ -125,7 +124,7 @@ def datum(adjustment) -> str:
         how = f"these coordinates keep their start values: {', '.join(held)}"
     else:
         how = (
-            f"inner constraints on {number(int(weight.any(1).sum()), 'datum point')}, whose start "
+            f"inner constraints on {count(int(weight.any(1).sum()), 'datum point')}, whose start "
             "values fix it on the whole (sum of their variances smallest)"
         )
     return (
@@ -161,13 +160,13 @@ def counts(adjustment) -> list[str]:
         ("Unknowns", n.unknowns, _listed(groups)),
         ("Redundancy", n.redundancy, "observations + pseudo-observations + conditions − unknowns"),
     ]
-    rows = [(name, str(count), detail) for name, count, detail in rows]
+    rows = [(name, str(n), detail) for name, n, detail in rows]
     return [*heading("Counts"), *table(("", "", ""), rows, "lrl")[1:]]
 
 
 def _listed(groups) -> str:
     """Names with their counts, the empty ones left out."""
-    return ", ".join(f"{name} {count}" for name, count in groups if count)
+    return ", ".join(f"{name} {n}" for name, n in groups if n)
 
 
 def convergence(adjustment) -> list[str]:
@@ -193,12 +192,14 @@ def convergence(adjustment) -> list[str]:
         *heading("Convergence"),
         *table(("iteration", "vᵀPv", "λ (damping)", "step"), rows, "rrrl"),
         "",
-        *paragraph(f"Ended after {number(adjustment.iterations, 'iteration')}, "
+        *paragraph(f"Ended after {count(adjustment.iterations, 'iteration')}, "
                    f"{adjustment.termination}."),
     ]  # fmt: skip
-    if adjustment.removed or adjustment.eliminated:
-        lines += paragraph("The table shows the last of several adjustments: observations or "
-                           "parameters were removed in between (see below).")  # fmt: skip
+    if adjustment.removed or adjustment.eliminated or adjustment.sigma_factors:
+        lines += paragraph(
+            "The table shows the last of several adjustments: observations or parameters were "
+            "removed, or σ estimated, in between (see below)."
+        )
     return lines
 
 
@@ -219,26 +220,29 @@ def image_precision(adjustment) -> str:
     sigma, unit = image_sigmas(adjustment), image_unit(adjustment)
     if not len(sigma) or not np.isfinite(adjustment.sigma0):
         return "–"
-    ends = sigma[[0, -1]] if len(sigma) > 1 else sigma
-    parts = [f"{_span(adjustment.sigma0 * ends)} {unit}"]
+    ends = sigma[[0, -1]]
+    parts = [f"{span(adjustment.sigma0 * ends)} {unit}"]
     if unit == "mm":
-        parts.insert(0, f"{_span(1e3 * adjustment.sigma0 * ends)} µm")
+        parts.insert(0, f"{span(1e3 * adjustment.sigma0 * ends)} µm")
         pitch = {camera.pixel_size for camera in adjustment.problem.network.cameras}
         if len(pitch) == 1 and None not in pitch:
             size = abs(next(iter(pitch))[0])
-            parts.append(f"{_span(adjustment.sigma0 * ends / size, 3)} px")
-    return f"{' = '.join(parts)}  (σ0 × σ a priori {_span(ends, 4)} {unit})"
+            parts.append(f"{span(adjustment.sigma0 * ends / size, 3)} px")
+    kind = "estimated" if adjustment.sigma_factors else "a priori"
+    return f"{' = '.join(parts)}  (σ0 × σ {kind} {span(ends, 4)} {unit})"
 
 
-def _span(values, digits: int = 5) -> str:
-    """One number, or from the smallest to the largest."""
-    return " to ".join(significant(value, digits) for value in values)
+def span(values, digits: int = 5) -> str:
+    """From the smallest to the largest; one number where they are the same to these digits."""
+    return " to ".join(dict.fromkeys(significant(value, digits) for value in values))
 
 
 def chi_squared(adjustment, level: float = 0.05) -> str:
     """The global test in words."""
     if adjustment.redundancy < 1:
         return "no redundancy: σ0 and standard deviations cannot be estimated"
+    if adjustment.sigma_factors:
+        return "not made: the σ of the groups were estimated from these residuals, so that σ0 is 1"
     found = adjustment.global_test(level)
     numbers = (
         f"vᵀPv {significant(found['vtpv'], 5)}, {100 * (1 - level):g} % interval "
@@ -265,15 +269,16 @@ def variance_factor(adjustment) -> list[str]:
         ("Image coordinate", image_precision(adjustment)),
         ("χ² test", chi_squared(adjustment)),
     ]
-    return [
-        *heading("Variance factor"),
-        *facts(rows),
-        "",
-        *paragraph(
-            "All standard deviations below are a posteriori, σ0 × those of the a priori weights, "
-            "unless they are said to be a priori."
-        ),
-    ]
+    text = (
+        "All standard deviations below are a posteriori, σ0 × those of the a priori weights, "
+        "unless they are said to be a priori."
+    )
+    if adjustment.sigma_factors:
+        text += (
+            " The a priori σ of the groups of observations are those estimated, not those given: "
+            "see Variance components."
+        )
+    return [*heading("Variance factor"), *facts(rows), "", *paragraph(text)]
 
 
 def warnings(adjustment) -> list[str]:
@@ -293,7 +298,7 @@ def why_not_solved(adjustment) -> list[str]:
         ("Iterations", f"{adjustment.iterations}, of which {taken} were steps taken"),
     ]
     if names:
-        rows.append(("Not determined", some(names, 40)))
+        rows.append(("Not determined", some(names, 40, clean)))
     advice = [ADVICE.get(reason, ADVICE[STUCK])]
     if reason == LIMIT and taken < tried / 2:
         advice.append("Most steps were rejected: hold parameters that the images hardly determine.")
@@ -310,7 +315,7 @@ def why_not_solved(adjustment) -> list[str]:
 def result_in_words(adjustment) -> str:
     """Converged or not, in one line."""
     if adjustment.converged:
-        return f"converged after {number(adjustment.iterations, 'iteration')}"
+        return f"converged after {count(adjustment.iterations, 'iteration')}"
     return f"NOT converged: {adjustment.termination}"
 
 

@@ -100,18 +100,6 @@ def shorten(text: str, width: int) -> str:
     return text[:head] + "…" + text[len(text) - (width - 1 - head) :]
 
 
-def number(n: int, noun: str) -> str:
-    """`1 image`, `2 images`."""
-    return f"{n} {noun}{'' if n == 1 else 's'}"
-
-
-def some(names: Sequence[str], most: int = 8) -> str:
-    """The first names of a list, and how many more there are."""
-    text = ", ".join(map(clean, names[:most]))
-    more = len(names) - most
-    return f"{text} and {more} more" if more > 0 else text
-
-
 def paragraph(text: str, indent: int = 0, hanging: int = 0) -> list[str]:
     """Text wrapped to the width."""
     return textwrap.wrap(

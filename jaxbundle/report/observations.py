@@ -9,7 +9,8 @@ import math
 
 import numpy as np
 
-from jaxbundle.report.head import image_unit
+from jaxbundle.network.columns import count
+from jaxbundle.report.head import image_unit, span
 from jaxbundle.report.layout import (
     bar,
     clean,
@@ -17,7 +18,6 @@ from jaxbundle.report.layout import (
     facts,
     fixed,
     heading,
-    number,
     paragraph,
     significant,
     table,
@@ -57,7 +57,7 @@ def residuals(adjustment, limit: float, test: str) -> list[str]:
             lines.append(f"… and {more} more: all residuals are in residuals.csv.")
         lines += ["", f"{len(over)} of {len(size)} observations."]
     else:
-        lines.append(f"None of {number(len(size), 'observation')}. The largest:")
+        lines.append(f"None of {count(len(size), 'observation')}. The largest:")
         lines += _rows(adjustment, order[:3])
     return lines + _histogram(found["tau"])
 
@@ -100,10 +100,10 @@ def _histogram(tau) -> list[str]:
     expected = len(tau) * np.diff(normal)
     largest = max(counted.max(), expected.max())
     rows = []
-    for i, count in enumerate(counted):
+    for i, found in enumerate(counted):
         a, b = edges[i], edges[i + 1]
         name = f"< {b:g}" if i == 0 else f"> {a:g}" if np.isinf(b) else f"{a:g} to {b:g}"
-        rows.append((name, str(count), f"{expected[i]:.1f}", bar(count, largest, 50)))
+        rows.append((name, str(found), f"{expected[i]:.1f}", bar(found, largest, 50)))
     return [
         *heading("Normalised residuals τ"),
         *table(("class", "number", "normal", ""), rows, "rrrl"),
@@ -126,10 +126,10 @@ def redundancy(adjustment) -> list[str]:
     rows = [
         ("Sum", f"{r.sum():.3f} (redundancy {adjustment.redundancy})"),
         ("Mean, min, max", f"{r.mean():.3f}, {r.min():.3f}, {r.max():.3f}"),
-        ("r < 0.1", f"{number(weak, 'observation')} weakly controlled"),
+        ("r < 0.1", f"{count(weak, 'observation')} weakly controlled"),
     ]
     if loose:
-        rows.append(("r = 0", f"{number(loose, 'observation')} not controlled at all"))
+        rows.append(("r = 0", f"{count(loose, 'observation')} not controlled at all"))
     return [
         *heading("Redundancy numbers"),
         *facts(rows),
@@ -140,16 +140,24 @@ def redundancy(adjustment) -> list[str]:
 
 
 def components(adjustment) -> list[str]:
-    """Variance components: the observed over the a priori σ of every group."""
+    """Variance components: the observed σ of every group, over those given and as they are."""
     rows = [
         (name, str(c.observations), f"{c.redundancy:.2f}", significant(c.vtpv, 5),
-         significant(c.sigma, 4))
+         significant(c.sigma, 4), span(c.estimated, 3))
         for name, c in adjustment.variance_components.items()
     ]  # fmt: skip
-    return [
-        *heading("Variance components"),
-        *table(("group", "observations", "Σr", "vᵀPv", "σ̂/σ a priori"), rows, "lrrrr"),
-    ]
+    header = ("group", "observations", "Σr", "vᵀPv", "σ̂/σ given", "σ̂")
+    lines = [*heading("Variance components"), *table(header, rows, "lrrrrr")]
+    if adjustment.sigma_factors:
+        names = ", ".join(
+            f"{clean(name)} by {significant(factor, 4)}"
+            for name, factor in adjustment.sigma_factors.items()
+        )
+        lines += ["", *paragraph(
+            f"Estimated: the σ given were multiplied, {names}. What is called a priori elsewhere "
+            "in this report are these estimated σ."
+        )]  # fmt: skip
+    return lines
 
 
 def removals(adjustment) -> list[str]:

@@ -4,6 +4,7 @@ from html import escape
 
 import numpy as np
 
+from jaxbundle.network.columns import count, some
 from jaxbundle.report.head import (
     chi_squared,
     image_precision,
@@ -16,9 +17,7 @@ from jaxbundle.report.layout import (
     clean,
     estimate,
     facts,
-    number,
     significant,
-    some,
 )
 
 MOST_CAMERAS = 3
@@ -32,8 +31,8 @@ def one_line(adjustment) -> str:
         return f"<{name}: NOT converged ({adjustment.termination})>"
     return (
         f"<{name}: converged, σ0 {sigma0_in_words(adjustment)}, redundancy "
-        f"{adjustment.redundancy}, {number(len(network.images), 'image')}, "
-        f"{number(len(network.points), 'point')}>"
+        f"{adjustment.redundancy}, {count(len(network.images), 'image')}, "
+        f"{count(len(network.points), 'point')}>"
     )
 
 
@@ -44,15 +43,15 @@ def summary(adjustment) -> list[tuple[str, str]]:
         ("Result", result_in_words(adjustment)),
         (
             "Network",
-            f"{number(len(network.cameras), 'camera')}, {number(len(network.images), 'image')}, "
-            f"{number(len(network.points), 'point')}; datum {network.datum}, defect "
+            f"{count(len(network.cameras), 'camera')}, {count(len(network.images), 'image')}, "
+            f"{count(len(network.points), 'point')}; datum {network.datum}, defect "
             f"{adjustment.counts.datum}; residuals {network.residuals}",
         ),
         ("Redundancy", redundancy_in_words(adjustment)),
     ]
     if not adjustment.converged:
         if adjustment.undetermined:
-            rows.append(("Not determined", some(adjustment.undetermined)))
+            rows.append(("Not determined", some(adjustment.undetermined, 8, clean)))
         rows.append(("", "There is no result; report() says what to do."))
     else:
         rows += [
@@ -69,7 +68,7 @@ def summary(adjustment) -> list[tuple[str, str]]:
         ("warning", adjustment.warnings),
     ):
         if things:
-            rows.append(("Note", f"{number(len(things), noun)}: see report()"))
+            rows.append(("Note", f"{count(len(things), noun)}: see report()"))
     return rows
 
 
@@ -85,7 +84,7 @@ def _cameras(adjustment):
         text = ", ".join(parts) if parts else "held"
         yield f"Camera {clean(camera)}", f"{entry['model']}: {text}"
     if len(tables) > MOST_CAMERAS:
-        yield "", f"and {number(len(tables) - MOST_CAMERAS, 'other camera')}"
+        yield "", f"and {count(len(tables) - MOST_CAMERAS, 'other camera')}"
 
 
 def _points(adjustment) -> str:

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from jaxbundle.cameras import get_model, validity_message
+from jaxbundle.cameras import get_model
+from jaxbundle.network.columns import count
 from jaxbundle.network.tables import EXTERIOR
-from jaxbundle.plotting.distortion import camera_index, farthest_measurement
 from jaxbundle.report.equations import EQUATIONS
 from jaxbundle.report.head import image_unit
 from jaxbundle.report.layout import (
@@ -15,7 +15,6 @@ from jaxbundle.report.layout import (
     facts,
     fixed,
     heading,
-    number,
     paragraph,
     significant,
     table,
@@ -110,36 +109,20 @@ def _many_cameras(adjustment) -> list[str]:
             header = ("camera", *names[part])
             cells = [(row[0], *row[1:][part]) for row in rows]
             lines += [*table(header, cells, "l" + "r" * (len(header) - 1)), ""]
-    warnings = [w for w in (validity(adjustment, c) for c in tables) if "turns back" in w]
-    for text in warnings[:FEW_CAMERAS]:
-        lines += paragraph(text)
-    if len(warnings) > FEW_CAMERAS:
-        lines.append(f"… and {number(len(warnings) - FEW_CAMERAS, 'other camera')} likewise.")
-    return lines if lines[-1] else lines[:-1]
+    return lines[:-1]
 
 
 def validity(adjustment, camera: str) -> str:
     """Whether the distortion is one-to-one over the image of a camera."""
-    network = adjustment.problem.network
-    given = network.cameras[camera_index(adjustment, camera)]
-    model = get_model(given.model)
-    size, pitch = given.image_size, given.pixel_size
-    where = "the image"
-    if size is not None and model.unit == "px":
-        half = float(np.hypot(*size)) / 2
-    elif size is not None and pitch is not None:
-        half = float(np.hypot(size[0] * pitch[0], size[1] * pitch[1])) / 2
-    else:
-        half, where = farthest_measurement(adjustment, camera), "the measurements"
-    if half <= 0:
+    reach = adjustment.distortion_reach[camera]
+    if reach.radius <= 0:
         return "Distortion: no measurements to compare with."
-    parameters = adjustment.camera_parameters(camera)
-    message = validity_message(camera, model, parameters, half)
-    if message is not None:
-        return message
-    return (
-        f"Distortion: one-to-one over {where}, as far as r = {significant(half, 4)} {model.unit}."
-    )
+    if reach.message is not None:
+        return reach.message
+    where = "the image" if reach.of_image else "the measurements"
+    unit = get_model(adjustment.cameras[camera]["model"]).unit
+    radius = significant(reach.radius, 4)
+    return f"Distortion: one-to-one over {where}, as far as r = {radius} {unit}."
 
 
 # --- images ---------------------------------------------------------------------------------
@@ -173,7 +156,7 @@ def _sigma(value: float, places: int) -> str:
 def _left_out(total: int, most: int, noun: str, file: str) -> list[str]:
     if total <= most:
         return []
-    return [f"… and {number(total - most, f'other {noun}')}: all {total} are in {file}."]
+    return [f"… and {count(total - most, f'other {noun}')}: all {total} are in {file}."]
 
 
 # --- points ---------------------------------------------------------------------------------
@@ -208,7 +191,7 @@ def _precision(adjustment, accuracy_unit) -> list[str]:
     counted = [np.histogram(s / scale, CLASSES)[0] for s in (*columns, together)]
     text = ["∞" if np.isinf(end) else f"{end:g}" for end in CLASSES]
     classes = [
-        (f"{a}–{b}", *(str(count[i]) for count in counted))
+        (f"{a}–{b}", *(str(column[i]) for column in counted))
         for i, (a, b) in enumerate(zip(text, text[1:]))
     ]
     # one table, so that both parts have the same columns

@@ -21,3 +21,7 @@ from jaxbundle.statistics.reliability import minimal_detectable as minimal_detec
 from jaxbundle.statistics.reliability import reliability as reliability
 from jaxbundle.statistics.snooping import Removed as Removed
 from jaxbundle.statistics.snooping import snoop as snoop
+from jaxbundle.statistics.validity import Reach as Reach
+from jaxbundle.statistics.validity import distortion_reach as distortion_reach
+from jaxbundle.statistics.validity import farthest_measurements as farthest_measurements
+from jaxbundle.statistics.validity import measured_centre as measured_centre

@@ -7,6 +7,7 @@ orientations and cameras: with V and W of their own rays and Q of the adjustment
 """
 
 import dataclasses
+from collections.abc import Mapping
 
 import equinox as eqx
 import jax
@@ -22,6 +23,7 @@ from jaxbundle.network.arrays import Tangent, Values
 from jaxbundle.network.structure import Structure, make_structure
 from jaxbundle.network.tables import Distances, Observations, Points
 from jaxbundle.statistics.cofactors import propagate
+from jaxbundle.statistics.components import rescale
 
 STEPS = 20
 
@@ -48,8 +50,10 @@ def intersect_check_points(
     factor: Factor,
     points: Points,
     observations: Observations,
+    factors: Mapping[str, float],
 ) -> CheckPoints:
-    """Intersect the check points of a network with its adjusted orientations."""
+    """Intersect the check points of a network with its adjusted orientations; `factors`: those of
+    the groups of observations, as in the weights of `problem` (variance components)."""
     role = ("tie",) * len(points)
     network = problem.network.replace(
         points=Points(points.id, role, points.position, np.full((len(points), 3), np.nan)),
@@ -57,6 +61,7 @@ def intersect_check_points(
         distances=Distances.none(),
     )
     structure, data, origin, _ = make_structure(network)
+    data = rescale(network.cameras, structure, data, factors)
     shift = jnp.asarray(problem.origin - origin)
     shifted = Values(
         values.camera, values.position + shift, values.rotation, data.start.point

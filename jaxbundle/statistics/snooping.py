@@ -80,7 +80,7 @@ def _worst(problem: Problem, found: Reliability, scale: float) -> Removed | None
     candidates = []
     for kind, tests in (("image", image), ("control", control.ravel()), ("distance", distance)):
         tests = np.where(np.isfinite(tests), tests, -1.0)
-        if tests.size and tests.max() > 0:
+        if tests.size and tests.max() > 0 and scale > 0:
             row = int(tests.argmax())
             candidates.append((float(tests[row]) / scale, kind, row))
     if not candidates:

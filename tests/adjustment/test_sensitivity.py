@@ -3,6 +3,7 @@ in batches; the Gauss–Newton form against dense least squares."""
 
 import dataclasses
 from functools import cache
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -18,13 +19,17 @@ from adjustment_checks import (
 )
 from jax.flatten_util import ravel_pytree
 
+import jaxbundle
 from jaxbundle.adjustment.jacobian import compiled_jacobian, free_tangent
 from jaxbundle.adjustment.residuals import residuals
 from jaxbundle.adjustment.sensitivity import attach_derivatives
 from jaxbundle.adjustment.solve import solve
 from jaxbundle.geometry import quaternion_conjugate, quaternion_multiply
+from jaxbundle.network.check import check_network
 
 pytestmark = pytest.mark.slow
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 STENCIL = ((1, 8 / 12), (-1, -8 / 12), (2, -1 / 12), (-2, 1 / 12))
 """Central differences of fourth order: with steps of 0.3 σ of an observation (1e-4 of the
@@ -235,3 +240,62 @@ def test_gauss_newton_form_is_that_of_error_propagation(name):
     exact = np.asarray(all_derivatives(name, "exact")(data)[1]).reshape(forward.shape)
     apart = np.abs(exact - forward).max() / np.abs(exact).max()
     assert 1e-6 < apart < 1e-1
+
+
+# --- the four photographs -------------------------------------------------------------------
+
+DRAWS = 100
+NOISE = 0.65e-3
+"""σ0 of the four photographs with four camera parameters, mm."""
+
+
+@pytest.fixture(scope="module")
+def photographs():
+    """The problem, and c with its derivatives by all image coordinates, by reverse and by forward
+    mode, for `DRAWS` sets of coordinates at once."""
+    network = check_network(jaxbundle.read_network(EXAMPLES / "convergent4" / "project4.toml"))
+    problem = jaxbundle.make_problem(network)
+    distance = lambda xy: solve(problem, with_xy(problem.data, xy)).camera[0, 0]
+
+    def derivatives(xy):
+        c, forward = jax.linearize(distance, xy)
+        each = jnp.eye(xy.size).reshape(-1, *xy.shape)
+        reverse, = jax.linear_transpose(forward, xy)(jnp.ones_like(c))
+        return c, reverse, jax.vmap(forward)(each).reshape(xy.shape)
+
+    batched = jax.jit(jax.vmap(derivatives))
+    return problem, lambda xy: map(np.asarray, batched(jnp.asarray(xy)))
+
+
+def test_principal_distance_of_the_photographs_by_all_image_coordinates(photographs):
+    problem, derivatives = photographs
+    xy = np.asarray(problem.data.image_xy)
+    assert xy.size == 80
+    h = 1e-3  # mm
+    steps = np.eye(xy.size).reshape(-1, *xy.shape)
+    shifts = np.concatenate([k * h * steps for k, _ in STENCIL] + [0 * steps])
+    batches = (xy + shifts).reshape(-1, DRAWS, *xy.shape)
+    c, reverse, _ = (np.concatenate(x) for x in zip(*map(derivatives, batches)))
+    c = c.reshape(-1, xy.size)
+    difference = sum(weight / h * moved for (_, weight), moved in zip(STENCIL, c))
+    difference = difference.reshape(xy.shape)
+    assert np.abs(reverse[-1] - difference).max() < 1e-6 * np.abs(difference).max()
+
+
+def test_gradients_of_a_hundred_noisy_copies_at_once(photographs):
+    """Forward and reverse mode agree in every one, and gradients carry the noise from one to the
+    next."""
+    problem, derivatives = photographs
+    xy = np.asarray(problem.data.image_xy)
+    noise = np.random.default_rng(3).normal(0, NOISE, (DRAWS, *xy.shape))
+    c, reverse, forward = derivatives(xy + noise)
+    size = np.abs(forward).max((1, 2), keepdims=True)
+    assert (np.abs(reverse - forward) < 1e-10 * size).all()
+    # the trapezoidal rule: what is left is of third order in the noise
+    along = 0.5 * ((reverse[1:] + reverse[:-1]) * np.diff(noise, axis=0)).sum((1, 2))
+    np.testing.assert_allclose(np.diff(c), along, atol=0.01 * np.abs(along).max())
+
+
+def test_check_gradients_of_an_adjustment(photographs):
+    found = jaxbundle.check_gradients(photographs[0], directions=3)
+    assert found.passed, str(found)

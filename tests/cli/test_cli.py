@@ -8,6 +8,10 @@ from pathlib import Path
 
 import pytest
 
+import jaxbundle
+from jaxbundle import cli
+from jaxbundle.__main__ import is_writable
+
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "convergent4"
 
@@ -105,10 +109,13 @@ def test_one_image_alone_is_not_solved(project):
         lines = (project / name).read_text().splitlines()
         kept = [line for line in lines if line.startswith(("id,", "image,", "DSC_037"))]
         (project / name).write_text("\n".join(kept) + "\n")
-    done = run("adjust", project / "project.toml")
+    done = run("adjust", project / "project.toml", "--json", "-", "--out", project / "out")
     assert done.returncode == 3
     assert "DSC_037" in done.stderr and "X0" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
+    told = json.loads(done.stdout)
+    assert told["converged"] is False and "X0 of image DSC_037" in told["undetermined"]
+    assert json.loads((project / "out" / "result.json").read_text()) == told
 
 
 def test_listed_sigmas_of_the_thesis_are_refused_with_the_way_on():
@@ -122,6 +129,46 @@ def test_unknown_option_is_bad_usage():
     done = run("adjust", EXAMPLE / "project.toml", "--jsn", "x")
     assert done.returncode == 2
     assert "--jsn" in done.stderr and "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("arguments, status, said", [
+    ([], 2, "Usage"),
+    (["--version"], 0, jaxbundle.__version__),
+])  # fmt: skip
+def test_without_a_command(arguments, status, said, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["jaxbundle", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert (ended.value.code or 0) == status
+    assert said in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("error, status", [
+    (OSError("the disk\nis full"), 2), (OverflowError("too large"), 2),
+    (RecursionError("too deep"), 2), (MemoryError(), 3),
+])  # fmt: skip
+def test_what_nobody_thought_of_ends_in_one_line(error, status, monkeypatch, capsys):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(cli, "write_project", fail)
+    monkeypatch.setattr(sys, "argv", ["jaxbundle", "convert", str(EXAMPLE), "nowhere"])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == status
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and lines[0].startswith("jaxbundle: ")
+
+
+def test_a_cache_that_cannot_be_written_is_not_used(tmp_path):
+    (tmp_path / "file").write_text("")
+    assert is_writable(str(tmp_path / "new"))
+    assert not is_writable(str(tmp_path / "file" / "cache"))
+
+
+def test_a_level_of_significance_is_between_0_and_1():
+    done = run("adjust", EXAMPLE / "project.toml", "--snooping", "pope", "--significance", "1")
+    assert done.returncode == 2 and "--significance 1: a number between 0 and 1" in done.stderr
 
 
 def test_not_converged_says_so(tmp_path):

@@ -68,6 +68,24 @@ def test_compressed_and_overridden(path, tmp_path):
     assert (network.observations.sigma == 0.5).all()
 
 
+def test_a_damaged_compressed_file(tmp_path):
+    packed = bytearray(gzip.compress(text().encode()))
+    packed[20:40] = b"\xff" * 20
+    path = tmp_path / "problem.txt.gz"
+    path.write_bytes(packed)
+    with pytest.raises(InputError, match="problem.txt.gz"):
+        jaxbundle.read_network(path)
+    with pytest.raises(InputError, match="problem.txt.gz: cannot be read"):
+        jaxbundle.read_network(path, format="bal")
+
+
+def test_a_count_of_thousands_of_digits(tmp_path):
+    path = tmp_path / "problem.txt"
+    path.write_text(f"{'9' * 5000} 6 12\n")
+    with pytest.raises(InputError, match="line 1: three whole numbers are expected"):
+        jaxbundle.read_network(path, format="bal")
+
+
 @pytest.mark.parametrize(
     "damage, complaint",
     [

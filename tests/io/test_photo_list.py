@@ -97,6 +97,7 @@ def test_overrides(write):
     ("0.2", "O.2", "line 2: phi of photograph 'first photo' is 'O.2'; a number is expected"),
     ("\n2\n", "\n3\n", "line 7: 13 values where an image point"),
     ("\n2\n", "\n1\n", "line 6: 5 values where a photograph"),
+    ("\n2\n", f"\n{'9' * 5000}\n", "999… where the number of image points of photograph 'first ph"),
     ("\n2\n", "\ntwo\n", "line 3: 'two' where the number of image points of photograph 'first ph"),
     ("\n2\n", "\n", "line 3: 'a 1.0 2.0 0.01 0.02' where the number of image points"),
     ("3.0 4.0", "3.0 nan", "line 6: y of point 'b' in photograph 'first photo' is 'nan'"),

@@ -1,6 +1,7 @@
 """The project format: what it says, what it refuses, and that writing is the inverse of reading."""
 
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,21 @@ import pytest
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_network, read_project, write_project
 from jaxbundle.io.formats import FORMATS
-from jaxbundle.network.build import make_network
+from jaxbundle.io.settings import CAMERA_KEYS, SETTINGS, TABLES
+from jaxbundle.network.build import (
+    CAMERA_FIELDS,
+    DISTANCE_COLUMNS,
+    IMAGE_COLUMNS,
+    IMAGE_SIGMAS,
+    OBSERVATION_COLUMNS,
+    OBSERVATION_SIGMAS,
+    POINT_COLUMNS,
+    POINT_SIGMAS,
+    make_network,
+)
 from jaxbundle.network.check import check_network
+from jaxbundle.network.tables import DATUMS, RESIDUAL_DOMAINS, ROLES
+from jaxbundle.network.units import ANGLE_UNITS, IMAGE_UNITS
 
 ROOT = Path(__file__).parents[2]
 CASES = ROOT.parent / "shared" / "cases"
@@ -134,6 +148,7 @@ def test_overrides(folder):
 
 @pytest.mark.parametrize("override, said", [
     ("sigma", "expected KEY=VALUE"),
+    (f"images={'a' * 300}.csv", "no such file"),
     ("sigm_image=1", "unknown key; known: name, .*sigma_image.*camera.ID.PARAMETER"),
     ("sigma_image=small", "'small' is not a number"),
     ("sigma_image=-1", "sigma_image is -1.0; it must be finite and positive"),
@@ -154,6 +169,12 @@ def test_a_bad_override_is_refused(folder, override, said):
     ("project.toml", '"deg"', '"degrees"', "angle_unit must be one of rad, deg, gon"),
     ("project.toml", "0.01", '"0.01"', "[project]: sigma_image is '0.01'; a number is expected"),
     ("project.toml", "0.01", "0", "[project]: sigma_image is 0; it must be finite and positive"),
+    ("project.toml", "0.01", "1" + "0" * 400, "…; it must be finite and positive"),
+    ("project.toml", "0.01", "1" + "0" * 5000, "not valid TOML: Exceeds the limit"),
+    ("project.toml", "0.01", "[" * 3000 + "]" * 3000, "not valid TOML: brackets are nested too"),
+    ("project.toml", "c = 50.0", "c = 5" + "0" * 400, "camera 'cam.1': c is 5000"),
+    ("project.toml", "c = 0.1", "c = 1" + "0" * 400, "sigma of c is 1000"),
+    ("project.toml", '"images.csv"', f'"{"a" * 300}.csv"', "[project]: images = 'aaa"),
     ("project.toml", 'name = "small"', "name = 5", "[project]: name is 5; text in quotes"),
     ("project.toml", 'name = "small"', "datum_points = 1", "datum_points must be a list of ids"),
     ("project.toml", 'name = "small"', "name = small", "not valid TOML"),
@@ -245,6 +266,47 @@ def test_tables_in_the_project_file_itself(folder):
         read_project(folder)
 
 
+def test_an_override_of_a_sigma_that_is_no_table_is_refused(folder):
+    edit(folder, "project.toml", "sigma = { c = 0.1 }", "sigma = 5")
+    with pytest.raises(InputError, match="--set camera.cam.1.sigma.c: sigma of the camera is 5; e"):
+        read_project(folder, ["camera.cam.1.sigma.c=1"])
+
+
+@pytest.mark.parametrize("id, X, said", [
+    ('"a"', "1" + "0" * 400, "entry 1: X is 1000"),
+    ('"a"', "true", "entry 1: X is True; a number is expected"),
+    ("inf", "0", "point 'a' is unknown"),
+])  # fmt: skip
+def test_odd_values_in_the_project_file_are_refused(folder, id, X, said):
+    edit(folder, "project.toml", 'points = "points.csv"\n', "")
+    text = (folder / "project.toml").read_text()
+    text += f'\n[[point]]\nid = {id}\nrole = "tie"\nX = {X}\nY = 0\nZ = 0\n'
+    (folder / "project.toml").write_text(text)
+    with pytest.raises(InputError) as error:
+        read_project(folder)
+    assert said in str(error.value) and len(str(error.value)) < 300 + 2 * len(str(folder))
+
+
+def test_only_ends_of_lines_end_a_line(folder):
+    """Separators that Unicode knows may stand in an id; LF, CR LF and CR end a line."""
+    edit(folder, "points.csv", '"e, far"', '"e,\u2028far"')
+    edit(folder, "distances.csv", '"e, far"', '"e,\u2028far"')
+    text = (folder / "observations.csv").read_text().replace("e, far", "e,\u2028far")
+    (folder / "observations.csv").write_text(text.replace("\n", "\r"), newline="")
+    text = (folder / "images.csv").read_text()
+    (folder / "images.csv").write_text(text, newline="\r\n")
+    network = read_project(folder)
+    assert network.points.id[4] == "e,\u2028far"
+    assert network.images.source(1).endswith("images.csv, line 5")
+    assert len(network.observations) == 10
+
+
+def test_blanks_about_the_id_of_a_camera_go(folder):
+    edit(folder, "project.toml", '"cam.1"', '" cam.1 "')
+    camera = read_project(folder, ["camera.cam.1.c=51"]).cameras[0]
+    assert (camera.id, camera.parameters["c"]) == ("cam.1", 51.0)
+
+
 def test_the_default_sigma_is_told(folder):
     edit(folder, "project.toml", "sigma_image = 0.01\n", "")
     network = read_project(folder)
@@ -304,13 +366,44 @@ def test_nothing_is_written_when_something_cannot_be(folder, tmp_path):
 def test_the_kind_of_input_is_recognised(folder):
     assert read_network(folder).name == "small"
     assert read_network(folder / "project.toml", overrides=["name=x"]).name == "x"
-    with pytest.raises(InputError, match="no such file or folder"):
-        read_network(folder / "none.toml")
+    for name in ("none.toml", 300 * "a", "a\0b"):
+        with pytest.raises(InputError, match="no such file or folder"):
+            read_network(folder / name)
     with pytest.raises(InputError, match="not recognised; known formats: project: a .toml file"):
         read_network(folder / "points.csv")
     with pytest.raises(InputError, match="unknown format 'toml'; known: project, photo-list"):
         read_network(folder, "toml")
     assert list(FORMATS)[:2] == ["project", "photo-list"]
+
+
+DOCS = ROOT / "docs" / "project.md"
+
+
+def test_the_project_of_the_documentation(tmp_path):
+    """Its files can be adjusted as they stand there; its row of a table can be added to them."""
+    text = DOCS.read_text(encoding="utf-8")
+    first, row = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
+    (tmp_path / "project.toml").write_text(first, encoding="utf-8")
+    for name, content in re.findall(r"`(\w+\.csv)`:\n\n```\n(.*?)```", text, re.DOTALL):
+        (tmp_path / name).write_text(content, encoding="utf-8")
+    network = check_network(read_project(tmp_path, ["free=c", "sigma_image=0.003"]))
+    assert network.warnings == ()
+    assert [len(network.images), len(network.points), len(network.observations)] == [2, 6, 12]
+    points = "".join(row.replace('"7"', f'"{id}"') for id in [*network.points.id])
+    edit(tmp_path, "project.toml", 'points = "points.csv"\n', "")
+    with (tmp_path / "project.toml").open("a", encoding="utf-8") as file:
+        file.write(points)
+    assert np.isposinf(read_project(tmp_path).points.sigma[:, 2]).all()
+
+
+def test_the_documentation_names_everything():
+    text = DOCS.read_text(encoding="utf-8")
+    columns = (*IMAGE_COLUMNS, *IMAGE_SIGMAS, *POINT_COLUMNS, *POINT_SIGMAS, *OBSERVATION_COLUMNS,
+               *OBSERVATION_SIGMAS, *DISTANCE_COLUMNS)  # fmt: skip
+    for name in (*SETTINGS, *TABLES, *CAMERA_FIELDS, *CAMERA_KEYS, *columns, *ROLES, *FORMATS):
+        assert f"`{name}`" in text, name
+    for name in (*DATUMS, *RESIDUAL_DOMAINS, *IMAGE_UNITS, *ANGLE_UNITS):
+        assert f'`"{name}"`' in text, name
 
 
 EXAMPLES = sorted(p.relative_to(ROOT) for p in (ROOT / "examples").glob("*/project*.toml"))

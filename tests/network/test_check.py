@@ -84,6 +84,7 @@ SIGMA = {"sX": 0.1, "sY": 0.1, "sZ": 0.1}
     ("points", 2, {**CONTROL, **SIGMA, "sZ": None}, ["row 3", "'p2'", "σ of Z", "free"]),
     ("observations", 9, {"sy": -3.1},
      ["observations, row 10", "σ of y", "'p1'", "'i1'", "-3.1", "finite and positive"]),
+    ("observations", 9, {"sx": 1e-200}, ["row 10", "σ of x", "1e-200", "less than the last digit"]),
     ("observations", 9, {"sx": np.inf}, ["observations, row 10", "σ of x", "'p1'", "'i1'"]),
     ("observations", 9, {"x": -np.inf}, ["observations, row 10", "x of point 'p1'", "'i1'"]),
     ("observations", 9, {"point": "p0"},
@@ -135,6 +136,14 @@ def test_bad_settings_are_refused(change, said):
 def test_datum_points_must_be_free_points():
     with pytest.raises(InputError, match="'p3' is a fixed point; name tie points"):
         check_network(broken("points", 3, role="fixed").replace(datum_points=("p3",)))
+
+
+def test_datum_points_of_a_datum_by_control_are_warned_of():
+    given = tables()
+    for k in range(4):
+        given["points"][k] |= {"role": "control", **SIGMA}
+    checked = check_network(make_network(**{**given, "datum": "control", "datum_points": ["p5"]}))
+    assert any("datum_points are not used" in warning for warning in checked.warnings)
 
 
 @pytest.mark.parametrize("table", ["images", "points"])

@@ -1,0 +1,67 @@
+"""Whether the distortion of the adjusted cameras is one-to-one over what they measured."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbundle.adjustment.problem import Problem
+from jaxbundle.cameras import CameraModel, get_model, validity_message
+from jaxbundle.network.arrays import Values
+
+
+@dataclasses.dataclass(frozen=True)
+class Reach:
+    """How far from its principal point a camera is looked at, in the unit of its model.
+
+    `radius`: half the diagonal of the image (`of_image`), or the farthest measurement where the
+    size of the image is not known. `message`: None, or that the distortion turns back inside.
+    """
+
+    radius: float
+    of_image: bool
+    message: str | None
+
+
+def distortion_reach(problem: Problem, values: Values) -> dict[str, Reach]:
+    """The reach of every camera, by id."""
+    found = {}
+    farthest = farthest_measurements(problem, values)
+    for given, p, far in zip(problem.network.cameras, np.asarray(values.camera), farthest):
+        model = get_model(given.model)
+        size, pitch = given.image_size, given.pixel_size
+        if size is not None and model.unit == "px":
+            radius, of_image = float(np.hypot(*size)) / 2, True
+        elif size is not None and pitch is not None:
+            radius, of_image = float(np.hypot(size[0] * pitch[0], size[1] * pitch[1])) / 2, True
+        else:
+            radius, of_image = float(far), False
+        parameters = dict(zip(model.parameters, p.tolist()))
+        message = validity_message(given.id, model, parameters, radius) if radius > 0 else None
+        found[given.id] = Reach(radius, of_image, message)
+    return found
+
+
+def farthest_measurements(problem: Problem, values: Values) -> Float[np.ndarray, " cameras"]:
+    """The largest distance of a measurement of every camera from its principal point."""
+    s, data, cameras = problem.structure, problem.data, problem.network.cameras
+    models = [get_model(given.model) for given in cameras]
+    centre = np.array([
+        measured_centre(model, p[: len(model.parameters)])
+        for model, p in zip(models, np.asarray(values.camera))
+    ])
+    camera = np.asarray(s.camera)
+    used = (np.asarray(data.image_weight) > 0).any(1)
+    away = np.linalg.norm(np.asarray(data.image_xy) - centre[camera], axis=1)
+    farthest = np.zeros(len(cameras))
+    np.maximum.at(farthest, camera[used], away[used])
+    return farthest
+
+
+@partial(jax.jit, static_argnums=0)
+def measured_centre(model: CameraModel, p: Float[Array, " parameters"]) -> Float[Array, "2"]:
+    """The measured image of a camera's axis, where its distortion is centred."""
+    return jnp.stack(model.from_ideal(tuple(p), 0.0, 0.0))

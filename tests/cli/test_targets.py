@@ -1,0 +1,81 @@
+"""What the command line writes is checked before the adjustment, and replaces what was there."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+import jaxbundle
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.targets import FILES, check_targets, write_targets
+
+pytestmark = pytest.mark.xdist_group("convergent4")
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "convergent4" / "project.toml"
+REASON = NotSolvedError("not solved: too few images", ["X0 of image 7"])
+
+
+@pytest.fixture(scope="module")
+def network():
+    return jaxbundle.read_network(EXAMPLE)
+
+
+def names(folder):
+    return {path.name for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("json, out, said", [
+    ("", "file", "--out .*file: cannot be made: .*file is not a folder"),
+    ("r.json", "file/deeper", "--out .*deeper: cannot be made: .*file is not a folder"),
+    ("missing/r.json", None, "--json .*r.json: there is no folder .*missing"),
+    ("folder", None, "--json .*folder: is a folder"),
+])  # fmt: skip
+def test_what_cannot_be_written_is_refused(network, tmp_path, json, out, said):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(InputError, match=said):
+        check_targets(
+            EXAMPLE, network, json and str(tmp_path / json), out and tmp_path / out
+        )
+    assert names(tmp_path) == {"file", "folder"}
+
+
+@pytest.mark.parametrize("json, out", [
+    (str(EXAMPLE), None), (str(EXAMPLE.parent / "points.csv"), None), ("", EXAMPLE.parent),
+])  # fmt: skip
+def test_the_input_is_not_overwritten(network, json, out):
+    with pytest.raises(InputError, match="part of the input and would be overwritten"):
+        check_targets(EXAMPLE, network, json, out)
+
+
+def test_folders_to_be_made_are_fine(network, tmp_path):
+    out = tmp_path / "a" / "b"
+    check_targets(EXAMPLE, network, str(out / "r.json"), out)
+    check_targets(EXAMPLE, network, "-", out)
+    assert names(tmp_path) == set()
+    write_targets(REASON, str(out / "r.json"), out, brief=False, plots=False)
+    assert names(out) == {"report.txt", "result.json", "r.json"}
+
+
+def test_no_file_of_an_earlier_result_stays(convergent4, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / "residuals.txt").write_text("mine")
+    write_targets(convergent4, "", tmp_path, brief=False, plots=False)
+    assert set(FILES) - {"checks.csv"} < names(tmp_path)
+    (tmp_path / "residuals_DSC_037.png").write_bytes(b"")
+    write_targets(REASON, "", tmp_path, brief=False, plots=False)
+    assert names(tmp_path) == {"report.txt", "result.json", "notes.txt", "residuals.txt"}
+    assert (tmp_path / "report.txt").read_text() == "not solved: too few images\n"
+
+
+def test_why_there_is_no_result_is_told_as_json(tmp_path, capsys):
+    write_targets(REASON, "-", tmp_path, brief=True, plots=False)
+    told = {"converged": False, "termination": "not solved: too few images",
+            "undetermined": ["X0 of image 7"]}  # fmt: skip
+    assert json.loads(capsys.readouterr().out) == told
+    assert json.loads((tmp_path / "result.json").read_text()) == told
+
+
+def test_a_device_is_written_to_and_stays_one():
+    write_targets(REASON, "/dev/null", None, brief=True, plots=False)
+    assert Path("/dev/null").is_char_device()
