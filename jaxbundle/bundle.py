@@ -9,7 +9,6 @@ import numpy as np
 
 from jaxbundle.adjustment.datum import move_to_datum
 from jaxbundle.adjustment.problem import Problem, count_rows, make_problem, with_factor
-from jaxbundle.adjustment.residuals import half_square
 from jaxbundle.adjustment.sharding import distribute, find_minimum_of_shards
 from jaxbundle.adjustment.solve import converged, find_minimum, make_solver
 from jaxbundle.adjustment.solver import SINGULAR, TERMINATIONS, Minimum
@@ -19,19 +18,18 @@ from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.check import check_network
 from jaxbundle.network.columns import some
+from jaxbundle.network.padding import filled, pad_values, without_filling
 from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.tables import Network
 from jaxbundle.result import Adjustment
 from jaxbundle.statistics import (
     Component,
+    Inspection,
     intersect_check_points,
-    reliability,
     rescale,
     snoop,
-    undamped_factor,
     variance_components,
 )
-from jaxbundle.statistics import cofactors as all_cofactors
 
 CORE_PARAMETERS = ("c", "x0", "y0", "fx", "fy", "cx", "cy", "f")
 """Interior parameters that are never eliminated for want of significance."""
@@ -99,16 +97,17 @@ def adjust(
         if eliminate:
             problem, minimum, eliminated = _eliminated(problem, minimum, again, critical_t)
 
-    names = () if _solved(problem, minimum) else _names_of_defects(problem, minimum)
+    inspection = _solved(problem, minimum)
+    names = () if inspection else _names_of_defects(problem, minimum)
     check = None
     if len(check_points):
         check = lambda result: intersect_check_points(
-            problem, result.values, result.factor, check_points, check_rays, factors
+            result.inspection, result.values, check_points, check_rays, factors
         )
     return Adjustment(
         network, problem, minimum, removed=tuple(removed), eliminated=tuple(eliminated),
         undetermined=tuple(names), check=check, method=method, reduction=used,
-        sigma_factors=factors,
+        sigma_factors=factors, inspection=inspection,
     )  # fmt: skip
 
 
@@ -119,16 +118,21 @@ def _minimise(problem: Problem, start: Values, **options) -> Minimum:
         minimum = find_minimum_of_shards(solver, distribute(problem), start)
         values = move_to_datum(problem.structure, minimum.values, data.start)
         return eqx.tree_at(lambda m: m.values, minimum, values)
-    return find_minimum(solver, data, None if start is data.start else start)
+    structure, data, sizes = filled(problem.structure, problem.data)
+    solver = dataclasses.replace(solver, structure=structure)
+    minimum = find_minimum(solver, data, pad_values(start, sizes))
+    return eqx.tree_at(
+        lambda m: m.values, minimum, without_filling(minimum.values, problem.data.start)
+    )
 
 
-def _solved(problem: Problem, minimum: Minimum) -> bool:
-    """Converged, no camera collapsed, and no unknown so weak that its σ is rounding noise."""
+def _solved(problem: Problem, minimum: Minimum) -> Inspection | None:
+    """The solution, to be looked at: converged, no camera collapsed, all unknowns determined;
+    else None."""
     if not bool(converged(int(minimum.termination))) or _collapsed(problem, minimum.values):
-        return False
-    factor = undamped_factor(problem.structure, minimum.values, problem.data)
-    pivots = np.abs(np.asarray(factor.reduced.pivots))
-    return bool(np.isfinite(pivots).all() and pivots.min(initial=1.0) ** 2 > 1e-13)
+        return None
+    inspection = Inspection(problem, minimum.values)
+    return inspection if inspection.determined else None
 
 
 def _collapsed(problem: Problem, values: Values) -> list[str]:
@@ -137,11 +141,12 @@ def _collapsed(problem: Problem, values: Values) -> list[str]:
     Where c and a scale of the image are free together, c = 0 makes all corrected residuals zero.
     """
     names = []
+    now, before = np.asarray(values.camera), np.asarray(problem.data.start.camera)
     for c, camera in enumerate(problem.network.cameras):
         model = get_model(camera.model)
         for parameter in model.principal_distance:
             column = model.parameters.index(parameter)
-            ratio = values.camera[c, column] / problem.data.start.camera[c, column]
+            ratio = now[c, column] / before[c, column]
             if not 1 / RUNAWAY < float(ratio) < RUNAWAY:
                 names.append(f"{parameter} of camera {camera.id} (it ran away from its start)")
     return names
@@ -174,20 +179,14 @@ def _snooped(problem, minimum, again, test, significance):
         result = again(problem, values)
         _require_solved(problem, result, "after data snooping")
         last["minimum"] = result
-        found = _reliability(problem, result.values)
-        vtpv = 2 * float(half_square(found.residual))
-        return result.values, found, float(np.sqrt(vtpv / max(problem.counts.redundancy, 1)))
+        found = Inspection(problem, result.values)
+        sigma0 = float(np.sqrt(found.vtpv / max(problem.counts.redundancy, 1)))
+        return result.values, found.reliability, sigma0
 
     problem, _, removed = snoop(
         problem, minimum.values, adjust_from, test=test, significance=significance
     )
     return problem, last["minimum"], removed
-
-
-def _reliability(problem: Problem, values: Values):
-    factor = undamped_factor(problem.structure, values, problem.data)
-    Q = all_cofactors(problem.structure, values, factor)
-    return reliability(problem.structure, values, problem.data, Q)
 
 
 def _with_components(problem, minimum, again, tolerance: float = 1e-3):
@@ -197,7 +196,7 @@ def _with_components(problem, minimum, again, tolerance: float = 1e-3):
     """
     factors: dict[str, float] = {}
     for done in range(ROUNDS + 1):
-        found = _reliability(problem, minimum.values)
+        found = Inspection(problem, minimum.values).reliability
         components = variance_components(problem, problem.data, found, factors)
         estimable = {name: c for name, c in components.items() if c.usable}
         factors = {name: c.factor for name, c in estimable.items()} | factors

@@ -16,7 +16,6 @@ from jaxtyping import Float
 from jaxbundle import plotting, report
 from jaxbundle.adjustment.jacobian import zero_tangent
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.adjustment.residuals import compiled_residuals, half_square
 from jaxbundle.adjustment.solve import converged
 from jaxbundle.adjustment.solver import TERMINATIONS, Minimum
 from jaxbundle.adjustment.unknowns import Name, interior_names
@@ -35,19 +34,16 @@ from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.statistics import (
     CheckPoints,
     Component,
+    Inspection,
     Reach,
     Reliability,
     Removed,
     chi2_quantile,
-    cofactors,
     correlation_matrix,
     distortion_reach,
     external_reliability,
     minimal_detectable,
-    propagate,
-    reliability,
     total_correlation,
-    undamped_factor,
     variance_components,
 )
 
@@ -81,6 +77,7 @@ class Adjustment:
         method: str = "levenberg-marquardt",
         reduction: str | None = None,
         sigma_factors: Mapping[str, float] | None = None,
+        inspection: Inspection | None = None,
     ):
         self.network = network
         self.problem = problem
@@ -91,6 +88,7 @@ class Adjustment:
         self.method = method
         self.reduction = reduction or problem.structure.reduction
         self.sigma_factors = dict(sigma_factors or {})
+        self._inspection = inspection
         self._check = check
 
     # --- how it ended -----------------------------------------------------------------------
@@ -153,9 +151,7 @@ class Adjustment:
     @functools.cached_property
     def vtpv(self) -> float:
         """vᵀPv of all observations, pseudo-observations included."""
-        s, data = self.problem.structure, self.problem.data
-        rows = compiled_residuals(s, self.values, data)
-        return float(2 * half_square(rows))
+        return self.inspection.vtpv
 
     @property
     def sigma0(self) -> float:
@@ -180,11 +176,12 @@ class Adjustment:
     # --- cofactors --------------------------------------------------------------------------
 
     @functools.cached_property
-    def factor(self):
-        """The normal equations at the solution, factorised (see `jaxbundle.adjustment.schur`)."""
-        return undamped_factor(self.problem.structure, self.values, self.problem.data)
+    def inspection(self) -> Inspection:
+        """The solution as statistics look at it."""
+        self._require_solved()
+        return self._inspection or Inspection(self.problem, self.values)
 
-    @functools.cached_property
+    @property
     def cofactors(self):
         """Blocks of the cofactor matrix (see `jaxbundle.statistics.cofactors`)."""
         if self.problem.structure.reduction not in FACTORS:
@@ -193,14 +190,12 @@ class Adjustment:
                 "by iteration and its factor does not fit into memory: there are coordinates, σ0 "
                 "and covariances of single unknowns (`covariance`), but no others"
             )
-        return cofactors(self.problem.structure, self.values, self.factor)
+        return self.inspection.cofactors
 
-    @functools.cached_property
+    @property
     def reliability(self) -> Reliability:
         """Redundancy numbers and w of all observations, in the order of the arrays."""
-        return reliability(
-            self.problem.structure, self.values, self.problem.data, self.cofactors
-        )
+        return self.inspection.reliability
 
     @functools.cached_property
     def variance_components(self) -> dict[str, Component]:
@@ -245,7 +240,7 @@ class Adjustment:
     def image_covariance(self) -> Float[np.ndarray, "images 6 6"]:
         """Covariance of X0, Y0, Z0, ω, φ, κ, angles by their exact Jacobian; radians."""
         s = self.problem.structure
-        Q = np.asarray(self.cofactors.image)[:, :6, :6]
+        Q = np.asarray(self.cofactors.image)[: s.images, :6, :6]
         A = np.zeros((s.images, 6, 6))
         A[:, :3, :3] = np.eye(3)
         A[:, 3:, 3:] = self._angles_like_start[1]
@@ -261,7 +256,8 @@ class Adjustment:
     @functools.cached_property
     def point_covariance(self) -> Float[np.ndarray, "points 3 3"]:
         """Marginal covariance of every point; zero where it is fixed."""
-        return self.sigma0**2 * np.asarray(self.cofactors.point)
+        points = self.problem.structure.points
+        return self.sigma0**2 * np.asarray(self.cofactors.point)[:points]
 
     def camera_parameters(self, camera: str) -> dict[str, float]:
         """All parameters of a camera by name."""
@@ -335,8 +331,7 @@ class Adjustment:
             return jnp.atleast_1d(function(retract(s, values, tangent)))
 
         rows = jax.jacrev(of_tangent)(zero)
-        Q = propagate(s, values, self.factor, rows)
-        return self.sigma0**2 * np.asarray(Q)
+        return self.sigma0**2 * np.asarray(self.inspection.propagate(rows))
 
     # --- tables -----------------------------------------------------------------------------
 

@@ -57,7 +57,12 @@ def gauge_directions(structure: Structure, values: Values) -> Tangent:
     return jax.tree.map(lambda g: g @ structure.gauge, helmert(structure, values))
 
 
-compiled_helmert = eqx.filter_jit(helmert)
+def compiled_helmert(structure: Structure, values: Values) -> Tangent:
+    """`helmert`, compiled once, whether or not the datum is known yet."""
+    return _helmert(structure.without_datum(), values)
+
+
+_helmert = eqx.filter_jit(helmert)
 
 
 def open_similarities(structure: Structure, data: Data) -> Float[np.ndarray, "7 defect"]:

@@ -187,8 +187,8 @@ def distance_blocks(s: Structure, values: Values, data: Data) -> Float[Array, "d
 def compiled_jacobian(structure: Structure, values: Values, data: Data) -> BundleJacobian:
     """`jacobian`, compiled once and shared by everything that looks at a solution, whether or not
     the datum is known yet."""
-    without_datum = dataclasses.replace(structure, gauge=structure.gauge[:, :0])
-    return dataclasses.replace(_compiled(without_datum, values, data), structure=structure)
+    jac = _compiled(structure.without_datum(), values, data)
+    return dataclasses.replace(jac, structure=structure)
 
 
 _compiled = eqx.filter_jit(jacobian)

@@ -10,16 +10,18 @@ import dataclasses
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
-from jaxbundle.network.arrays import Data, Tangent, Values
+from jaxbundle.network.arrays import Data, Values
 from jaxbundle.network.pairs import Pairs
 from jaxbundle.network.rays import RayTable
 from jaxbundle.network.structure import Group, Incidence, Structure
 
 SPARE_POINTS = 2
 
+LARGE = 200_000
+"""Networks of more rays are compiled for their own sizes."""
 STEPS = 8
 """Sizes of buckets between one power of two and the next: at most an eighth is filled in."""
 
@@ -155,7 +157,7 @@ def pad(structure: Structure, data: Data, sizes: Sizes) -> tuple[Structure, Data
         control=_fill(s.control, sizes.control, spare),
         exterior=_fill(s.exterior, sizes.exterior, 0),
         interior=_fill(s.interior, sizes.interior, 0),
-        distance=jnp.asarray(distance),
+        distance=distance,
         incidence=incidence,
         image_pairs=_pairs(s.image_pairs, sizes.image_pairs, (0, 0), old, new),
         image_camera_pairs=_pairs(
@@ -165,34 +167,39 @@ def pad(structure: Structure, data: Data, sizes: Sizes) -> tuple[Structure, Data
         pins=_fill(s.pins, sizes.images, 0),
         datum_weight=_fill(s.datum_weight, sizes.points, 0),
     )
-    return padded, _pad_data(data, sizes, rays)
+    return jax.device_put((padded, _pad_data(data, sizes, rays)))
+
+
+def filled(structure: Structure, data: Data) -> tuple[Structure, Data, Sizes]:
+    """The network in tables of round sizes; large ones, that would feel it, as they are."""
+    if structure.rays > LARGE:
+        return structure, data, sizes_of(structure)
+    sizes = bucket_of(structure)
+    return *pad(structure, data, sizes), sizes
 
 
 def pad_values(values: Values, sizes: Sizes) -> Values:
     """Values of these sizes; the spare points stand apart from each other."""
-    point = _edge(values.point, sizes.points)
-    beyond = jnp.maximum(jnp.arange(sizes.points) - values.point.shape[0] + 1, 0)
-    return Values(
+    number = values.point.shape[0]
+    beyond = np.maximum(np.arange(sizes.points) - number + 1, 0)
+    return jax.device_put(Values(
         camera=_edge(values.camera, sizes.cameras),
         position=_edge(values.position, sizes.images),
         rotation=_edge(values.rotation, sizes.images),
-        point=point + beyond[:, None],
-    )
+        point=_edge(values.point, sizes.points) + beyond[:, None],
+    ))  # fmt: skip
 
 
-def unpad_values(values: Values, like: Values) -> Values:
-    """The values without what was filled in."""
-    return jax.tree.map(lambda x, l: x[: l.shape[0]], values, like)
+def without_filling(arrays, like):
+    """Arrays as long as those of `like`: what was filled in is taken off."""
+    cut = lambda x, l: x if x.shape[0] == l.shape[0] else np.asarray(x)[: l.shape[0]]
+    return jax.device_put(jax.tree.map(cut, arrays, like))
 
 
-def pad_tangents(rows: Tangent, sizes: Sizes) -> Tangent:
-    """Changes of these sizes, zero for what is filled in; their first axis numbers them."""
-    number = (sizes.images, sizes.cameras, sizes.points)
-    filled = (
-        jnp.pad(x, ((0, 0), (0, n - x.shape[1]), (0, 0)))
-        for x, n in zip((rows.image, rows.camera, rows.point), number)
-    )
-    return Tangent(*filled)
+def pad_changes(rows: Float[np.ndarray, "... items w"], items: int) -> np.ndarray:
+    """Changes of so many items, zero for what is filled in."""
+    rows = np.asarray(rows)
+    return np.pad(rows, [(0, 0)] * (rows.ndim - 2) + [(0, items - rows.shape[-2]), (0, 0)])
 
 
 def _pad_data(data: Data, sizes: Sizes, rays: int) -> Data:
@@ -214,7 +221,7 @@ def _pad_data(data: Data, sizes: Sizes, rays: int) -> Data:
 def _fill(x, rows: int, value):
     x = np.asarray(x)
     more = np.full((rows - x.shape[0], *x.shape[1:]), value, x.dtype)
-    return jnp.asarray(np.concatenate([x, more]))
+    return np.concatenate([x, more])
 
 
 def _edge(x, rows: int):
@@ -222,7 +229,7 @@ def _edge(x, rows: int):
     x = np.asarray(x)
     if not x.shape[0]:
         return _fill(x, rows, 0)
-    return jnp.asarray(np.concatenate([x, np.repeat(x[-1:], rows - x.shape[0], 0)]))
+    return np.concatenate([x, np.repeat(x[-1:], rows - x.shape[0], 0)])
 
 
 def _group(group: Group, chunks: int, new_chunks: int, size: int) -> Group:
@@ -238,9 +245,9 @@ def _group(group: Group, chunks: int, new_chunks: int, size: int) -> Group:
 def _pairs(pairs: Pairs | None, sizes, tables, old, new) -> Pairs | None:
     if pairs is None:
         return None
-    missing = lambda index, t: jnp.asarray(
-        np.where(np.asarray(index) >= old[t], new[t], np.asarray(index)).astype(np.int32)
-    )
+    missing = lambda index, t: np.where(
+        np.asarray(index) >= old[t], new[t], np.asarray(index)
+    ).astype(np.int32)
     blocks, *chunks = sizes
     return Pairs(
         first=tuple(

@@ -12,6 +12,8 @@ Rays stand in the order of the images (`jaxbundle.network.rays`). `Incidence` ha
 camera a point is seen with, so that a shared camera costs one row a point, not one a ray.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -148,6 +150,10 @@ class Structure(eqx.Module):
     def defect(self) -> int:
         """Datum defect: directions in which the network may float."""
         return self.gauge.shape[1]
+
+    def without_datum(self) -> "Structure":
+        """The same without the open directions of the datum, for programs that do not ask."""
+        return dataclasses.replace(self, gauge=np.zeros((7, 0)))
 
     def total(self, parts: PyTree[Array]) -> PyTree[Array]:
         """The sum over the devices of what each has found for its own points and rays."""

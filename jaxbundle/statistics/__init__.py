@@ -15,6 +15,7 @@ from jaxbundle.statistics.distributions import chi2_quantile as chi2_quantile
 from jaxbundle.statistics.distributions import normal_quantile as normal_quantile
 from jaxbundle.statistics.distributions import t_quantile as t_quantile
 from jaxbundle.statistics.distributions import tau_quantile as tau_quantile
+from jaxbundle.statistics.inspection import Inspection as Inspection
 from jaxbundle.statistics.reliability import Reliability as Reliability
 from jaxbundle.statistics.reliability import external_reliability as external_reliability
 from jaxbundle.statistics.reliability import minimal_detectable as minimal_detectable

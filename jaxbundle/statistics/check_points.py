@@ -10,20 +10,17 @@ import dataclasses
 from collections.abc import Mapping
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.adjustment.jacobian import compiled_jacobian
-from jaxbundle.adjustment.problem import Problem
 from jaxbundle.adjustment.residuals import compiled_residuals
-from jaxbundle.adjustment.schur import Factor
 from jaxbundle.network.arrays import Tangent, Values
-from jaxbundle.network.structure import Structure, make_structure
+from jaxbundle.network.structure import make_structure
 from jaxbundle.network.tables import Distances, Observations, Points
-from jaxbundle.statistics.cofactors import propagate
 from jaxbundle.statistics.components import rescale
+from jaxbundle.statistics.inspection import Inspection
 
 STEPS = 20
 
@@ -45,15 +42,15 @@ class CheckPoints:
 
 
 def intersect_check_points(
-    problem: Problem,
+    inspection: Inspection,
     values: Values,
-    factor: Factor,
     points: Points,
     observations: Observations,
     factors: Mapping[str, float],
 ) -> CheckPoints:
     """Intersect the check points of a network with its adjusted orientations; `factors`: those of
-    the groups of observations, as in the weights of `problem` (variance components)."""
+    the groups of observations, as in the weights of the problem (variance components)."""
+    problem = inspection.problem
     role = ("tie",) * len(points)
     network = problem.network.replace(
         points=Points(points.id, role, points.position, np.full((len(points), 3), np.nan)),
@@ -69,7 +66,10 @@ def intersect_check_points(
     for _ in range(STEPS):
         step, inverse, spread = _newton(structure, shifted, data)
         shifted = eqx.tree_at(lambda v: v.point, shifted, shifted.point + step)
-    cofactor = np.asarray(inverse + _propagated(problem.structure, values, factor, spread))
+    # The part of the adjusted orientations in their cofactors, one point after the other.
+    still = np.zeros((3, problem.structure.points, 3))
+    of_orientations = [inspection.propagate(Tangent(*rows, still)) for rows in zip(*spread)]
+    cofactor = np.asarray(inverse) + np.asarray(of_orientations)
     position = np.asarray(shifted.point) + origin
     return CheckPoints(
         points.id,
@@ -101,11 +101,3 @@ def _blocks(jac, residual):
     inverse = jnp.linalg.inv(V)
     spread = tuple(jnp.einsum("pij,pj...->pi...", inverse, rows) for rows in (W, Wc))
     return -jnp.einsum("pij,pj->pi", inverse, g), inverse, spread
-
-
-@eqx.filter_jit
-def _propagated(s: Structure, values: Values, factor: Factor, spread):
-    """The part of the adjusted orientations in the cofactors of the check points."""
-    still = jnp.zeros((3, s.points, 3))
-    one = lambda rows: propagate(s, values, factor, Tangent(*rows, still))
-    return jax.lax.map(one, spread)

@@ -4,59 +4,83 @@ The arrays are filled up to round sizes (`jaxbundle.network.padding`), so that n
 the same size share the compiled programs; what was filled in is taken off again here.
 """
 
-import dataclasses
 import functools
 
 import jax
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.residuals import Residuals, compiled_residuals
 from jaxbundle.adjustment.schur import Factor
 from jaxbundle.network.arrays import Tangent, Values
-from jaxbundle.network.padding import bucket_of, pad, pad_tangents, pad_values
+from jaxbundle.network.padding import filled, pad_changes, pad_values, without_filling
 from jaxbundle.statistics.cofactors import Cofactors, cofactors, propagate, undamped_factor
 from jaxbundle.statistics.reliability import Reliability, reliability
 
+DETERMINED = 1e-13
+"""A pivot of the scaled normal equations below this is rounding."""
+
 
 class Inspection:
-    """What statistics need of a problem at its adjusted `values`."""
+    """What statistics need of a problem at its adjusted `values`.
+
+    `factor` and the internal blocks of `cofactors` are those of the filled arrays.
+    """
 
     def __init__(self, problem: Problem, values: Values):
         self.problem = problem
-        self.sizes = bucket_of(problem.structure)
-        self.structure, self.data = pad(problem.structure, problem.data, self.sizes)
+        self.structure, self.data, self.sizes = filled(problem.structure, problem.data)
         self.values = pad_values(values, self.sizes)
 
     @functools.cached_property
-    def factor(self) -> Factor:
-        """The normal equations, undamped, factorised; of the filled arrays."""
-        return undamped_factor(self.structure, self.values, self.data)
+    def residuals(self) -> Residuals:
+        """All residuals divided by their σ, in the order of the problem's arrays."""
+        return self._rows(compiled_residuals(self.structure, self.values, self.data))
 
     @functools.cached_property
-    def _cofactors(self) -> Cofactors:
-        return cofactors(self.structure, self.values, self.factor)
+    def vtpv(self) -> float:
+        """vᵀPv of all observations, pseudo-observations included."""
+        return float(sum((np.asarray(v) ** 2).sum() for v in jax.tree.leaves(self.residuals)))
+
+    @functools.cached_property
+    def factor(self) -> Factor:
+        """The normal equations, undamped, factorised."""
+        return undamped_factor(self.structure, self.values, self.data)
+
+    @property
+    def determined(self) -> bool:
+        """Whether no unknown is so weak that its σ is rounding noise."""
+        pivots = np.abs(np.asarray(self.factor.reduced.pivots))
+        return bool(np.isfinite(pivots).all() and pivots.min(initial=1.0) ** 2 > DETERMINED)
 
     @functools.cached_property
     def cofactors(self) -> Cofactors:
-        """Blocks of the cofactor matrix (`jaxbundle.statistics.cofactors`); the internal ones are
-        those of the filled arrays."""
-        s, Q = self.problem.structure, self._cofactors
-        return dataclasses.replace(
-            Q, image=Q.image[: s.images], camera=Q.camera[: s.cameras], point=Q.point[: s.points]
-        )
+        """Blocks of the cofactor matrix (`jaxbundle.statistics.cofactors`)."""
+        return cofactors(self.structure, self.values, self.factor)
 
     @functools.cached_property
     def reliability(self) -> Reliability:
         """Redundancy numbers and w of all observations, in the order of the problem's arrays."""
-        found = reliability(self.structure, self.values, self.data, self._cofactors)
-        data = self.problem.data
-        rows = (data.image_xy, data.control, data.exterior, data.interior, data.distance)
-        return jax.tree.map(
-            lambda x, n: x[:n], found,
-            Reliability(*3 * [type(found.residual)(*(len(x) for x in rows))]),
-        )  # fmt: skip
+        found = reliability(self.structure, self.values, self.data, self.cofactors)
+        parts = (found.residual, found.redundancy, found.w)
+        return Reliability(*(self._rows(part) for part in parts))
+
+    def _rows(self, rows: Residuals) -> Residuals:
+        given = self.problem.data
+        return without_filling(
+            rows,
+            Residuals(
+                given.image_xy, given.control, given.exterior, given.interior, given.distance
+            ),
+        )
 
     def propagate(self, rows: Tangent) -> Float[Array, "n n"]:
         """F·Q·Fᵀ in the datum for linear functions F of the unknowns (first axis of `rows`)."""
-        rows = pad_tangents(rows, self.sizes)
+        n = self.sizes
+        rows = Tangent(
+            pad_changes(rows.image, n.images),
+            pad_changes(rows.camera, n.cameras),
+            pad_changes(rows.point, n.points),
+        )
         return propagate(self.structure, self.values, self.factor, rows)

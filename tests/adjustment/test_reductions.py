@@ -19,7 +19,7 @@ from jaxbundle.adjustment.solve import find_minimum, make_solver
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.network import Camera
 from jaxbundle.network.build import make_network
-from jaxbundle.network.padding import common_sizes, pad, sizes_of, unpad_values
+from jaxbundle.network.padding import common_sizes, pad, sizes_of, without_filling
 from jaxbundle.network.reduction import FACTORS, choose_reduction, find_band
 from jaxbundle.statistics.cofactors import cofactors, undamped_factor
 from jaxbundle.statistics.reliability import hat_diagonal
@@ -166,6 +166,6 @@ def test_filled_arrays_change_nothing():
         found.history.cost[: int(found.iterations)],
         expected.history.cost[: int(expected.iterations)], rtol=1e-9,
     )  # fmt: skip
-    values = unpad_values(found.values, problem.data.start)
+    values = without_filling(found.values, problem.data.start)
     np.testing.assert_allclose(values.camera, expected.values.camera, rtol=1e-10)
     np.testing.assert_allclose(values.point, expected.values.point, atol=1e-7)
