@@ -17,7 +17,7 @@ from jaxbundle.cameras import MODEL_NAMES, get_model
 from jaxbundle.io.result_json import result_dict
 from jaxbundle.network.columns import count
 from jaxbundle.network.tables import EXTERIOR
-from jaxbundle.report import layout, observations, unknowns
+from jaxbundle.report import head, layout, observations, unknowns
 from jaxbundle.report.equations import EQUATIONS
 from jaxbundle.result import Adjustment
 from jaxbundle.statistics import CheckPoints, Removed
@@ -319,6 +319,25 @@ def test_a_distortion_that_turns_back_is_warned_of(convergent4):
     assert result_dict(changed, brief=True)["warnings"] == [warning]
     assert "1 warning" in str(changed)
     assert convergent4.warnings == ()
+
+
+def test_about_a_known_point_only_rotations_and_scale_are_open(convergent4):
+    """dX = ω×(X − P) + s·(X − P): as a motion about the origin it has a shift, −ω×P − s·P."""
+    problem = convergent4.problem
+    points = problem.network.points
+    P = points.position[0] - problem.origin
+    shifts = np.column_stack([*(-np.cross(axis, P) for axis in np.eye(3)), -P])
+    structure = eqx.tree_at(
+        lambda s: s.gauge, problem.structure, jnp.asarray(np.concatenate([shifts, np.eye(4)]))
+    )
+    network = problem.network.replace(
+        points=dataclasses.replace(points, role=("fixed", *points.role[1:]))
+    )
+    problem = dataclasses.replace(
+        problem, structure=structure, counts=dataclasses.replace(problem.counts, datum=4)
+    )
+    text = head.datum(again(convergent4, network, problem))
+    assert "leave open rotation X, rotation Y, rotation Z, scale;" in text
 
 
 def test_warnings_are_printed(convergent4):

@@ -113,7 +113,9 @@ def datum(adjustment) -> str:
         return f"{network.datum}; defect 0: given by {', '.join(parts)}"
     open_ones = "defect 7: the observations leave open position, orientation and scale"
     if defect < 7:
-        words = open_directions_in_words(np.asarray(s.gauge))
+        known = network.points.has_role("control", "fixed")
+        about = (network.points.position[known] - adjustment.problem.origin).sum(0)
+        words = open_directions_in_words(np.asarray(s.gauge), about / max(known.sum(), 1))
         if defect == 6 and "scale" not in words:
             words = "position and orientation"
         open_ones = f"defect {defect}: the observations leave open {words}"
