@@ -40,6 +40,9 @@ RAYS_TO_SHARE = 10_000
 RUNAWAY = 20.0
 """A principal distance that changed by more than this factor belongs to no camera."""
 
+UNNAMED = ("a combination of unknowns that spreads over many of them",)
+"""What is not determined, where none stands out."""
+
 ROUNDS = 20
 """Variance components are estimated at most so many times."""
 
@@ -98,7 +101,7 @@ def adjust(
             problem, minimum, eliminated = _eliminated(problem, minimum, again, critical_t)
 
     inspection = _solved(problem, minimum)
-    names = () if inspection else _names_of_defects(problem, minimum)
+    names = () if inspection else _names_of_defects(problem, minimum) or UNNAMED
     check = None
     if len(check_points):
         check = lambda result: intersect_check_points(
