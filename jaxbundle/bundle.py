@@ -101,7 +101,9 @@ def adjust(
             problem, minimum, eliminated = _eliminated(problem, minimum, again, critical_t)
 
     inspection = _solved(problem, minimum)
-    names = () if inspection else _names_of_defects(problem, minimum) or UNNAMED
+    names = () if inspection else _names_of_defects(problem, minimum)
+    if not inspection and converged(int(minimum.termination)):
+        names = names or UNNAMED
     check = None
     if len(check_points):
         check = lambda result: intersect_check_points(

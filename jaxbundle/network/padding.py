@@ -2,8 +2,8 @@
 compiled program, and the parts of a network on several devices have one shape.
 
 What is filled in changes nothing: rays of weight 0 that repeat the last ray, points and images
-that are held, pairs of missing rows. There is always one filled chunk of rays and two filled
-points to which filled rows can refer.
+that are held, pairs of missing rows. There is always one filled chunk of rays, two filled points
+and one filled incidence to which filled rows can refer.
 """
 
 import dataclasses
@@ -87,6 +87,7 @@ def common_sizes(all_sizes) -> Sizes:
     groups = [np.add(sizes.groups, found["chunks"] - sizes.chunks) for sizes in all_sizes]
     found["groups"] = tuple(np.max(groups, 0).tolist())
     found["points"] += SPARE_POINTS
+    found["incidences"] += 1
     return Sizes(**found)
 
 
@@ -128,7 +129,7 @@ def pad(structure: Structure, data: Data, sizes: Sizes) -> tuple[Structure, Data
     incidence = s.incidence
     if incidence is not None:
         incidence = Incidence(
-            _edge(incidence.of_ray, rays),
+            _fill(incidence.of_ray, rays, sizes.incidences - 1),
             _fill(incidence.point, sizes.incidences, spare),
             _edge(incidence.camera, sizes.incidences),
         )
