@@ -32,7 +32,7 @@ test: install
 bench: install
 	$(BIN)/python benchmarks/big_block.py
 	$(BIN)/python benchmarks/calibration.py
-	$(BIN)/python benchmarks/bal.py --street 100 10000 --arc 40 10000
+	$(BIN)/python benchmarks/bal.py --street 100 10000 --arc 40 10000 --baseline
 
 clean:
 	rm -rf $(VENV) out
