@@ -1,5 +1,6 @@
 """Batches of cameras against a dense least-squares solution, OpenCV, and themselves."""
 
+import cv2
 import jax
 import numpy as np
 import pytest
@@ -115,7 +116,6 @@ def angles_of(M):
 
 
 def test_equals_opencv(three):
-    cv2 = pytest.importorskip("cv2")
     X = (BOARD * [1, 1, 0]).astype(np.float32)
     xy = three[0].astype(np.float32)
     ours = jaxbundle.calibrate_batch(X, xy, SIZE)

@@ -2,6 +2,7 @@
 
 from functools import partial
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -37,7 +38,6 @@ def matrix(values):
 
 @pytest.mark.parametrize("coefficients", [4, 5, 8, 12])
 def test_opencv_equals_project_points(coefficients):
-    cv2 = pytest.importorskip("cv2")
     case = CASE["opencv"]
     used = case.model.parameters[: 4 + coefficients]
     values = {name: case.values[name] for name in used}
@@ -50,7 +50,6 @@ def test_opencv_equals_project_points(coefficients):
 
 
 def test_kannala_brandt_equals_fisheye_project_points():
-    cv2 = pytest.importorskip("cv2")
     case = CASE["kannala-brandt"]
     points = rays(1.5)
     theirs, _ = cv2.fisheye.projectPoints(
