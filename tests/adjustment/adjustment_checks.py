@@ -258,9 +258,9 @@ DEFECTS = {"free": 7, "minimal": 7, "free with distances": 6, "one fixed point":
 
 
 @cache
-def make(name):
+def make(name, reduction=None):
     """The problem of one of `NETWORKS`."""
-    return make_problem(synthetic(**NETWORKS[name])[0])
+    return make_problem(synthetic(**NETWORKS[name])[0], reduction)
 
 
 @cache

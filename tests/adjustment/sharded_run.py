@@ -32,11 +32,13 @@ from jaxbundle.adjustment.solve import make_solver  # noqa: E402
 COUNTS = {
     "shared cameras of two models": (2,),
     "free with distances": (1, 2, 4),
+    "free with distances by iterative": (2,),
 }
 
 found = {}
 for name, counts in COUNTS.items() if processes == 1 else [("free with distances", None)]:
-    problem = make(name)
+    name, _, reduction = name.partition(" by ")
+    problem = make(name, reduction or None)
     solver = make_solver(problem, atol=1e-9)
     for count in counts or (jax.device_count(),):
         shards = distribute(problem, jax.devices()[:count])
@@ -44,7 +46,7 @@ for name, counts in COUNTS.items() if processes == 1 else [("free with distances
             os._exit(1)
         minimum = find_minimum_of_shards(solver, shards, problem.data.start)
         cost = np.asarray(minimum.history.cost)[: int(minimum.iterations)]
-        found[f"{name}, {count}"] = {
+        found[f"{name}, {count}{reduction}"] = {
             "termination": int(minimum.termination),
             "cost": cost.tolist(),
             "camera": np.asarray(minimum.values.camera).tolist(),

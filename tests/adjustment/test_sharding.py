@@ -56,6 +56,14 @@ def test_on_several_devices(name, devices):
     np.testing.assert_allclose(found["camera"], expected.values.camera, rtol=1e-7, atol=1e-10)
 
 
+def test_conjugate_gradients_on_two_devices():
+    found = on_one_processor()["free with distances, 2iterative"]
+    expected = solved(make("free with distances"))
+    assert found["termination"] == int(expected.termination)
+    assert found["cost"][-1] == pytest.approx(np.nanmin(expected.history.cost), rel=1e-9)
+    np.testing.assert_allclose(found["camera"], expected.values.camera, rtol=1e-6, atol=1e-9)
+
+
 @pytest.mark.parametrize("processes", [2, 4])
 def test_in_several_processes(processes):
     port = free_port()
