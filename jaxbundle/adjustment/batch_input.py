@@ -38,6 +38,32 @@ class Portion:
     middle: np.ndarray
 
 
+def check_shapes(X: np.ndarray, xy: np.ndarray, size: np.ndarray, visible: np.ndarray) -> None:
+    """Refuse the arrays of a batch whose shapes do not fit each other.
+
+    **Raises:** `InputError`."""
+    if xy.ndim != 4 or xy.shape[3] != 2:
+        raise InputError(
+            f"image_points must have the shape [cameras, views, points, 2], but has {xy.shape}"
+        )
+    cameras, _, points, _ = xy.shape
+    if X.shape not in ((points, 3), (cameras, points, 3)):
+        raise InputError(
+            f"object_points must have the shape [{points}, 3] or [{cameras}, {points}, 3], as "
+            f"image_points has {points} points a view, but has {X.shape}"
+        )
+    if visible.shape != xy.shape[:3]:
+        raise InputError(
+            f"visible must have the shape {xy.shape[:3]} of image_points, but has {visible.shape}"
+        )
+    if not cameras:
+        raise InputError("image_points has no camera")
+    if size.shape != (2,) or not (np.isfinite(size) & (size > 0)).all():
+        raise InputError(
+            f"image_size must be width and height in pixels, but is {size.tolist()!r}"
+        )
+
+
 @dataclasses.dataclass(frozen=True)
 class Batch:
     """The checked input: object points about their mean and along their principal axes.
@@ -63,31 +89,11 @@ class Batch:
     @classmethod
     def of(cls, object_points, image_points, image_size, model, visible, free, start):
         model = pixel_model(model)
-        xy = np.asarray(image_points, float)
-        if xy.ndim != 4 or xy.shape[3] != 2:
-            raise InputError(
-                f"image_points must have the shape [cameras, views, points, 2], but has {xy.shape}"
-            )
-        cameras, views, points, _ = xy.shape
-        X = np.asarray(object_points, float)
-        if X.shape not in ((points, 3), (cameras, points, 3)):
-            raise InputError(
-                f"object_points must have the shape [{points}, 3] or [{cameras}, {points}, 3], as "
-                f"image_points has {points} points a view, but has {X.shape}"
-            )
-        visible = np.ones(xy.shape[:3], bool) if visible is None else np.asarray(visible)
-        if visible.shape != xy.shape[:3]:
-            raise InputError(
-                f"visible must have the shape {xy.shape[:3]} of image_points, "
-                f"but has {visible.shape}"
-            )
-        if not cameras:
-            raise InputError("image_points has no camera")
+        xy, X = np.asarray(image_points, float), np.asarray(object_points, float)
         size = np.asarray(image_size, float)
-        if size.shape != (2,) or not (np.isfinite(size) & (size > 0)).all():
-            raise InputError(
-                f"image_size must be width and height in pixels, but is {image_size!r}"
-            )
+        visible = np.ones(xy.shape[:3], bool) if visible is None else np.asarray(visible)
+        check_shapes(X, xy, size, visible)
+        cameras = len(xy)
         free = free_parameters(model, free)
         interior, known = _interior(model, free, start, size, cameras)
         visible = visible.astype(bool)

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 
 from jaxbundle import cameras
 from jaxbundle.adjustment.batch_normal import Calibration, Sightings, gram
+from jaxbundle.adjustment.residuals import cross
 from jaxbundle.adjustment.small_cholesky import backward, cholesky, forward, rows_of
 from jaxbundle.geometry import quaternion_from_matrix
 
@@ -153,7 +154,7 @@ def _pose_of_flat(columns):
     """Columns of R, and t, from K⁻¹·H; the first two made perpendicular without preference."""
     size = 2 / (_norm(columns[0]) + _norm(columns[1]))
     first, second = _perpendicular(_unit(columns[0]), _unit(columns[1]))
-    return (first, second, _cross(first, second)), [size * c for c in columns[2]]
+    return (first, second, cross(first, second)), [size * c for c in columns[2]]
 
 
 def _pose_of_solid(columns):
@@ -190,7 +191,3 @@ def _norm(a):
 def _unit(a):
     length = _norm(a)
     return [p / length for p in a]
-
-
-def _cross(a, b):
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]

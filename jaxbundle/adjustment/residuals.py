@@ -56,8 +56,8 @@ def image_residual(model, domain, free, rotation, centre, interior, point, xy, w
     ray = tuple(
         rotation[3 * i] * X + rotation[3 * i + 1] * Y + rotation[3 * i + 2] * Z for i in range(3)
     )
-    turn = _cross(d_theta, ray)
-    ray = tuple(a + b + 0.5 * c for a, b, c in zip(ray, turn, _cross(d_theta, turn)))
+    turn = cross(d_theta, ray)
+    ray = tuple(a + b + 0.5 * c for a, b, c in zip(ray, turn, cross(d_theta, turn)))
     vx, vy = cameras.residual(model, domain, tuple(interior), ray, xy)
     return weight[0] * vx, weight[1] * vy
 
@@ -71,7 +71,8 @@ def split_change(x, free: int, width: int):
     )
 
 
-def _cross(a, b):
+def cross(a, b):
+    """The vector product of two triples of scalars."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxbundle.adjustment.batch_input import check_shapes
 from jaxbundle.errors import InputError
 
 NEEDED = ("object_points", "image_points", "image_size")
@@ -59,27 +60,19 @@ def read_camera_stack(path: str | Path) -> CameraStack:
             f"{path}: no array {missing[0]!r}; expected {', '.join(NEEDED)} and, if needed, "
             "visible and ids"
         )
-    X, xy, size = (arrays[name] for name in NEEDED)
-    if xy.ndim != 4 or xy.shape[3] != 2:
-        _refuse(path, "image_points", xy, "[cameras, views, points, 2]")
-    cameras, _, points, _ = xy.shape
-    if X.shape not in ((points, 3), (cameras, points, 3)):
-        _refuse(path, "object_points", X, f"[{points}, 3] or [{cameras}, {points}, 3]")
-    if size.shape != (2,):
-        _refuse(path, "image_size", size, "[2], width and height in pixels")
-    visible, ids = arrays.get("visible"), arrays.get("ids", np.arange(cameras))
-    if visible is not None and visible.shape != xy.shape[:3]:
-        _refuse(path, "visible", visible, f"{list(xy.shape[:3])}")
-    if ids.shape != (cameras,):
-        _refuse(path, "ids", ids, f"[{cameras}]")
-    if len({*ids.tolist()}) < cameras:
-        raise InputError(f"{path}: ids must differ, but some occur twice")
-    for name in ("object_points", "image_points", "image_size"):
+    for name in NEEDED:
         if arrays[name].dtype.kind not in "fiu":
             raise InputError(f"{path}: {name} must be numbers, but is {arrays[name].dtype}")
+    X, xy, size = (arrays[name] for name in NEEDED)
+    visible = arrays.get("visible")
+    try:
+        check_shapes(X, xy, size, np.ones(xy.shape[:3]) if visible is None else visible)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    ids = arrays.get("ids", np.arange(len(xy)))
+    if ids.shape != (len(xy),):
+        raise InputError(f"{path}: ids must have the shape ({len(xy)},), but has {ids.shape}")
+    if len({*ids.tolist()}) < len(xy):
+        raise InputError(f"{path}: ids must differ, but some occur twice")
     keys = tuple(f"{path}#{id}" for id in ids.tolist())
     return CameraStack(keys, X, xy, tuple(size.tolist()), visible)
-
-
-def _refuse(path, name, array, expected):
-    raise InputError(f"{path}: {name} has the shape {list(array.shape)}, expected {expected}")
