@@ -101,14 +101,15 @@ def test_the_step_is_that_of_the_dense_system(reduction, free, damped):
 
         steps.append(step(s, data))
     (rows, change), (other_rows, other_change) = steps
-    # Conjugate gradients end at a residual; the condition of a long street stands between it and x.
+    # Conjugate gradients apply S as the difference A − ZᵀZ, and end at a residual; the condition of a
+    # long street stands between it and x, the more the nearer one looks at single unknowns.
     loss = 100 if reduction == "iterative" else 1
     size = np.abs(rows).max()
     np.testing.assert_allclose(other_rows, rows, rtol=1e-7 * loss, atol=1e-8 * loss * size)
     if not free:
         a, b = ravel_pytree(change)[0], ravel_pytree(other_change)[0]
         size = np.abs(a).max()
-        np.testing.assert_allclose(b, a, rtol=1e-8 * loss, atol=1e-9 * loss * size)
+        np.testing.assert_allclose(b, a, rtol=1e-8 * loss, atol=1e-9 * loss**1.5 * size)
 
 
 def test_pins_hold_the_datum():
