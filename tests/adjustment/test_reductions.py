@@ -101,8 +101,8 @@ def test_the_step_is_that_of_the_dense_system(reduction, free, damped):
 
         steps.append(step(s, data))
     (rows, change), (other_rows, other_change) = steps
-    # Conjugate gradients apply S as the difference A − ZᵀZ, and end at a residual; the condition of a
-    # long street stands between it and x, the more the nearer one looks at single unknowns.
+    # Conjugate gradients apply S as the difference A − ZᵀZ, and end at a residual; the condition
+    # of a long street stands between it and x, the more the nearer one looks at single unknowns.
     loss = 100 if reduction == "iterative" else 1
     size = np.abs(rows).max()
     np.testing.assert_allclose(other_rows, rows, rtol=1e-7 * loss, atol=1e-8 * loss * size)
