@@ -91,7 +91,9 @@ def _directional_products(s: Structure, data: Data):
     """What control points, priors and distances change along G [rows, 7], the terms that cancel in
     it, and G on what is held."""
     G = jax.tree.map(np.asarray, compiled_helmert(s, data.start))
-    exterior, distance = (np.asarray(x) for x in _prior_blocks(s, data))
+    exterior, distance = np.zeros((0, 6, 6)), np.zeros((0, 2, 3))
+    if len(s.exterior) or len(s.distance):
+        exterior, distance = (np.asarray(x) for x in _prior_blocks(s, data))
     control = np.asarray(data.control_weight)[..., None] * G.point[np.asarray(s.control)]
     exterior = exterior @ G.image[np.asarray(s.exterior), :6]
     ends = np.einsum("dei,deik->edk", distance, G.point[np.asarray(s.distance)])
