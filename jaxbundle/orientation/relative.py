@@ -10,8 +10,8 @@ the five-parameter manifold with the misclosures of coplanarity as lengths in th
 to first order the least corrections of all four coordinates (Sampson, 1982).
 
 Two simpler explanations are tried. If a rotation alone explains the rays with a variance less than
-`SIMPLER` times that of the relative orientation, there is no (significant) base; if a homography
-does, the object is a plane, of which eight points say nothing.
+`SIMPLER` times that of the relative orientation (and of a homography), there is no significant
+base; if a homography does, the object is a plane, of which eight points say nothing.
 """
 
 import equinox as eqx
@@ -31,8 +31,8 @@ from .linear import ones_unless
 from .pose import Pose, image_of, ray_of
 from .status import Status, first_of
 
-SIMPLER = 4.0
-"""Ratio of variances below which the simpler explanation counts."""
+SIMPLER = 6.0
+"""Ratio of variances below which the simpler explanation counts: F(0.99) of a dozen points."""
 EXACT = 1e-20
 """Variance of image coordinates (c = 1) that is rounding."""
 REFINED = 4
@@ -172,10 +172,12 @@ def _simpler(xy1, xy2, p, vtpv):
     H, _ = homography(xy1, xy2, p)
     by_plane = jax.vmap(apply_homography, (None, 0))(H, xy1)
 
-    def explains(computed, unknowns):
+    def variance_of(computed, unknowns):
         """The differences contain the errors of both images: twice the variance."""
         spare = 2 * n - unknowns
         square = jnp.sum(p[:, None] * (computed - xy2) ** 2) / (2 * jnp.where(spare > 0, spare, 1))
-        return (spare > 0) & (square < SIMPLER * variance + EXACT * average)
+        return jnp.where(spare > 0, square, jnp.inf)
 
-    return explains(by_rotation, 3), explains(by_plane, 8)
+    rotation, plane = variance_of(by_rotation, 3), variance_of(by_plane, 8)
+    limit = lambda other: SIMPLER * other + EXACT * average
+    return rotation < limit(jnp.minimum(variance, plane)), plane < limit(variance)

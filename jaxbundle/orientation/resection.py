@@ -46,9 +46,9 @@ def resection(
     object unit; weights p = 1/σ², equal in x and y; 0: the point is absent.
 
     **Returns:** the cofactors times σ0² are the covariance. `status`: `COLLINEAR_POINTS`,
-    `NO_SOLUTION`, `DANGER_CYLINDER` (the projection centre is where the normal matrix is singular:
-    on a cylinder through the points), `BEHIND_THE_CAMERA`. A centre near the cylinder is told by
-    its cofactors.
+    `NO_SOLUTION`, `DANGER_CYLINDER` (the normal matrix is singular: the centre is on the right
+    cylinder over the circle of three points, or on one cubic curve of such a cylinder with all of
+    more), `BEHIND_THE_CAMERA`. A centre near it is told by its cofactors.
     """
     p = ones_unless(weights, xy)
     chosen = wide_triangle(xy, p)

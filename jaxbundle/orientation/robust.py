@@ -120,12 +120,13 @@ def robust_resection(
     solve = lambda xy, X: three_points(jax.vmap(ray_of)(xy), X)
     found = consensus(key, solve, errors, (xy, X), 3, samples, threshold)
     pose, good = found.model, found.inliers
-    present = jnp.ones_like(good)
-    for _ in range(ROUNDS):
-        result = refine_resection(pose, xy, X, good.astype(xy.dtype))
-        pose = result.pose
-        e = _finite(errors(pose, xy, X))
-        good = e <= (robust_limit(e, present, 3) if threshold is None else threshold)
+
+    def again(_, state):
+        pose, good = state
+        pose = refine_resection(pose, xy, X, good.astype(xy.dtype)).pose
+        return pose, _good(errors(pose, xy, X), 3, threshold)
+
+    pose, good = jax.lax.fori_loop(0, ROUNDS, again, (pose, good))
     return refine_resection(pose, xy, X, good.astype(xy.dtype)), good
 
 
@@ -153,13 +154,18 @@ def robust_relative_orientation(
         return (M.reshape(-1, 3, 3), b.reshape(-1, 3)), jnp.repeat(valid, 4)
 
     found = consensus(key, solve, errors, (xy1, xy2), 5, samples, threshold)
-    good = found.inliers
-    present = jnp.ones_like(good)
-    for _ in range(ROUNDS):
+
+    def again(_, good):
         result = relative_orientation(xy1, xy2, good.astype(xy1.dtype))
-        e = _finite(errors((result.M, result.b), xy1, xy2))
-        good = e <= (robust_limit(e, present, 5) if threshold is None else threshold)
+        return _good(errors((result.M, result.b), xy1, xy2), 5, threshold)
+
+    good = jax.lax.fori_loop(0, ROUNDS, again, found.inliers)
     return relative_orientation(xy1, xy2, good.astype(xy1.dtype)), good
+
+
+def _good(e, size, threshold):
+    e = _finite(e)
+    return e <= (robust_limit(e, e < jnp.inf, size) if threshold is None else threshold)
 
 
 def _finite(e):

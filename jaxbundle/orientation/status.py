@@ -32,8 +32,8 @@ _ADVICE = {
     Status.COLLINEAR_POINTS: "The points lie on one line: add a point beside it.",
     Status.COPLANAR_POINTS: "The points lie in one plane: add a point outside it, or use a method "
     "for planes (homography, resection, five points).",
-    Status.DANGER_CYLINDER: "The projection centre is on a cylinder through the points (danger "
-    "cylinder): add a point off the cylinder.",
+    Status.DANGER_CYLINDER: "Points and projection centre lie on one right cylinder (danger "
+    "cylinder): add a point off it.",
     Status.NO_BASE: "The two images differ by a rotation only: take one from another place.",
     Status.PARALLEL_RAYS: "The rays are parallel: add an image from another direction.",
     Status.PARALLEL_PLANES: "The views of the plane are parallel, or too few, or contradict one "
