@@ -76,17 +76,20 @@ def relative_orientation(
     p = ones_unless(weights, xy1)
     if method not in ("five", "eight"):
         raise ValueError(f'The method must be "five" or "eight", but is {method!r}.')
-    E = eight_points(*stop_gradient((xy1, xy2, p)))[0][None]
+    held = stop_gradient((xy1, xy2, p))
+    E = eight_points(*held)[0][None]
     if method == "five":
+        held = _after(E, held)
         # with noise, a solution that is not quite real is a good start
-        E = jnp.concatenate([E, five_points(xy1, xy2, p)[0]])
+        E = jnp.concatenate([E, five_points(*held)[0]])
     M, b = (a.reshape(-1, *a.shape[2:]) for a in jax.vmap(orientations)(E))
     data = (xy1, xy2, jnp.sqrt(p))
     chosen, score = _refined_best(M, b, stop_gradient(data), p)
     fit = finish(_misclosures, _retract, chosen, data, 5)
     M, b = fit.estimate
     front = _in_front(M, b, xy1, xy2, p)
-    no_base, flat = _simpler(xy1, xy2, p, fit.vtpv)
+    vtpv = stop_gradient(fit.vtpv)
+    no_base, flat = _simpler(*_after(vtpv, held), vtpv)
     status = first_of(
         (no_base, Status.NO_BASE),
         (flat if method == "eight" else jnp.asarray(False), Status.COPLANAR_POINTS),
@@ -136,6 +139,13 @@ def _refined_best(M, b, data, p):
     return jax.tree.map(lambda a: a[k], refined), scores[k]
 
 
+def _after(done, arrays):
+    """The arrays, which wait for `done`: adds zero. Decompositions that run side by side can hang
+    jaxlib 0.10 on two cores; a barrier does not order them."""
+    nothing = jnp.where(jnp.sum(done) > 1e300, 1.0, 0.0)
+    return jax.tree.map(lambda a: a + nothing, arrays)
+
+
 def _misclosures(pair, xy1, xy2, root):
     return root * jax.vmap(sampson_distance, (None, None, 0, 0))(*pair, xy1, xy2)
 
@@ -166,7 +176,7 @@ def _simpler(xy1, xy2, p, vtpv):
     redundancy = n - 5
     variance = vtpv / jnp.where(redundancy > 0, redundancy, 1)
     unit = lambda a: a / jnp.linalg.norm(a)
-    rays = [jax.vmap(lambda xy: unit(ray_of(xy)))(stop_gradient(xy)) for xy in (xy1, xy2)]
+    rays = [jax.vmap(lambda xy: unit(ray_of(xy)))(xy) for xy in (xy1, xy2)]
     turned = Pose(jnp.zeros(3), matrix_from_quaternion(rotation_between(*rays, p)))
     by_rotation = jax.vmap(image_of, (None, 0))(turned, rays[0])
     H, _ = homography(xy1, xy2, p)
