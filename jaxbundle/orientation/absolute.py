@@ -1,0 +1,94 @@
+"""Absolute orientation: the similarity transformation between two lists of points.
+
+    X' = exp(s)·R·X + t,        Σ pᵢ·|X'ᵢ(τ) − X'ᵢ|² = min,        τ = (t, ω, s), R = exp([ω]×)
+
+In closed form about the weighted means (Horn, 1987, J. Opt. Soc. Am. A 4(4), 629–642): R is that of
+the quaternion that belongs to the largest eigenvalue of a symmetric 4 × 4 matrix, so never a
+reflection; exp(s) is the regression coefficient of X' on R·X. τ as in `geometry.similarity`.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float, Int
+
+from jaxbundle.geometry import (
+    matrix_from_quaternion,
+    rotation_vector_from_quaternion,
+    transform_point,
+)
+
+from .linear import extent, normalisation, ones_unless
+from .status import Status, first_of
+
+LINE = 1e-7
+"""Points whose second extent is below this part of the first lie on a line."""
+
+
+class AbsoluteOrientation(eqx.Module):
+    """τ = (tx, ty, tz, ωx, ωy, ωz, s), residuals computed − given, vᵀPv, cofactors Q of τ."""
+
+    tau: Float[Array, "7"]
+    residuals: Float[Array, "n 3"]
+    vtpv: Float[Array, ""]
+    cofactor: Float[Array, "7 7"]
+    status: Int[Array, ""]
+
+
+def absolute_orientation(
+    source: Float[Array, "n 3"],
+    target: Float[Array, "n 3"],
+    weights: Float[Array, " n"] | None = None,
+) -> AbsoluteOrientation:
+    """The similarity that takes `source` to `target`, differentiable, without start values.
+
+    **Arguments:** corresponding points, three or more, not on one line (`COLLINEAR_POINTS`);
+    weights p = 1/σ² of the target, equal in X, Y, Z; 0: the point is absent.
+
+    **Returns:** the cofactors times σ0² are the covariance of τ: t in the target's unit, ω in
+    radians, s without unit.
+    """
+    p = ones_unless(weights, source)
+    (X, _), (Y, _) = normalisation(source, p), normalisation(target, p)
+    x, y = source - X, target - Y
+    q = rotation_between(x, y, p)
+    R = matrix_from_quaternion(q)
+    turned = x @ R.T
+    scale = jnp.sum(p[:, None] * turned * y) / jnp.sum(p[:, None] * x * x)
+    omega = rotation_vector_from_quaternion(q)
+    tau = jnp.concatenate([Y - scale * R @ X, omega, jnp.log(scale)[None]])
+    line = jnp.maximum(_on_a_line(source, p), _on_a_line(target, p))
+    root = jnp.sqrt(p)[:, None]
+    computed = lambda t: jax.vmap(transform_point, (None, 0))(t, source)
+    J = (root[:, :, None] * jax.jacfwd(computed)(tau)).reshape(-1, 7)
+    N = jnp.where(line, jnp.eye(7, dtype=J.dtype), J.T @ J)
+    v = computed(tau) - target
+    return AbsoluteOrientation(
+        tau, v, jnp.sum(p[:, None] * v * v), jnp.where(line, jnp.inf, _inverse(N)),
+        first_of((line, Status.COLLINEAR_POINTS)),
+    )  # fmt: skip
+
+
+def rotation_between(
+    x: Float[Array, "n 3"], y: Float[Array, "n 3"], weights: Float[Array, " n"]
+) -> Float[Array, "4"]:
+    """The unit quaternion of the rotation that takes directions x nearest to y (Horn, 1987)."""
+    S = jnp.einsum("n,ni,nj->ij", weights, x, y)
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = S
+    rows = [
+        [xx + yy + zz, yz - zy, zx - xz, xy - yx],
+        [yz - zy, xx - yy - zz, xy + yx, zx + xz],
+        [zx - xz, xy + yx, yy - xx - zz, yz + zy],
+        [xy - yx, zx + xz, yz + zy, zz - xx - yy],
+    ]
+    return jnp.linalg.eigh(jnp.array(rows))[1][:, -1]
+
+
+def _on_a_line(points, weights):
+    return extent(points, weights)[1] < LINE
+
+
+def _inverse(N):
+    scale = 1 / jnp.sqrt(jnp.diag(N))
+    return jnp.linalg.inv(N * scale * scale[:, None]) * scale * scale[:, None]

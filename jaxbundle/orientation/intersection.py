@@ -1,0 +1,91 @@
+"""Forward intersection: a point from any number of rays, with its covariance.
+
+The point nearest to all rays is linear, with the unit directions dᵢ in the object frame,
+
+    Σ pᵢ·(I − dᵢ·dᵢᵀ)·(X − X0ᵢ) = 0
+
+and starts the adjustment of directions: with two axes eᵢ, nᵢ across the ray, in radians,
+
+    vᵢ = [eᵢ, nᵢ]ᵀ·(X − X0ᵢ)/dᵢᵀ·(X − X0ᵢ),        Σ pᵢ·|vᵢ|² = min
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.lax import stop_gradient
+from jaxtyping import Float, Int
+
+from .least_squares import adjust
+from .linear import ones_unless
+from .status import Status, first_of
+
+PARALLEL = 1e-7
+"""Angle of intersection, in radians, below which rays are parallel."""
+STEPS = 8
+
+
+class Intersection(eqx.Module):
+    """X and its cofactors in the object unit, vᵀPv, angle of intersection in radians.
+
+    `angle`: the greatest between two of the rays, seen as lines, at most 90°.
+    """
+
+    X: Float[Array, "3"]
+    vtpv: Float[Array, ""]
+    cofactor: Float[Array, "3 3"]
+    angle: Float[Array, ""]
+    status: Int[Array, ""]
+
+
+def intersection(
+    X0: Float[Array, "n 3"],
+    rays: Float[Array, "n 3"],
+    weights: Float[Array, " n"] | None = None,
+) -> Intersection:
+    """The point of n ≥ 2 rays from X0, in the object frame (Mᵀ·(x, y, −1)), differentiable.
+
+    **Arguments:** rays of any length; weights p = 1/σ² of the directions, 1/rad²; 0: the ray is
+    absent.
+
+    **Returns:** the cofactors times σ0² are the covariance (infinite: undetermined). `status`:
+    `PARALLEL_RAYS` (also for fewer than two), `BEHIND_THE_CAMERA`.
+    """
+    p = ones_unless(weights, X0)
+    d = rays / jnp.linalg.norm(rays, axis=1, keepdims=True)
+    angle = _widest(stop_gradient(d), p)
+    parallel = angle < PARALLEL
+    across = jnp.eye(3, dtype=d.dtype) - d[:, :, None] * d[:, None, :]
+    N = jnp.einsum("n,nij->ij", p, across)
+    middle = p @ X0 / jnp.sum(p)
+    g = jnp.einsum("n,nij,nj->i", p, across, X0 - middle)
+    start = jnp.linalg.solve(jnp.where(parallel, jnp.eye(3, dtype=d.dtype), N), g) + middle
+    data = (X0, d, jnp.sqrt(p))
+    fit = adjust(_misclosures, jnp.add, start, data, 3, STEPS)
+    along = jnp.einsum("ni,ni->n", d, fit.estimate - X0)
+    status = first_of(
+        (parallel, Status.PARALLEL_RAYS),
+        (~fit.determined, Status.UNDETERMINED),
+        (jnp.any((along <= 0) & (p > 0)), Status.BEHIND_THE_CAMERA),
+    )
+    cofactor = jnp.where(parallel, jnp.inf, fit.cofactor)
+    return Intersection(fit.estimate, fit.vtpv, cofactor, angle, status)
+
+
+def _widest(d, p):
+    """The sine is exact where the cosine is flat, and the other way round."""
+    sine = jnp.linalg.norm(jnp.cross(d[:, None], d[None]), axis=-1)
+    angles = jnp.arctan2(sine, jnp.abs(d @ d.T))
+    return jnp.max(jnp.where((p[:, None] > 0) & (p > 0), angles, 0))
+
+
+def _misclosures(X, X0, d, root):
+    return jax.vmap(_misclosure, (None, 0, 0, 0))(X, X0, d, root).ravel()
+
+
+def _misclosure(X, X0, d, root):
+    axis = jnp.eye(3, dtype=d.dtype)[jnp.argmin(jnp.abs(stop_gradient(d)))]
+    e = jnp.cross(d, axis)
+    e = e / jnp.linalg.norm(e)
+    r, s, t = jnp.stack([e, jnp.cross(d, e), d]) @ (X - X0)
+    return root * jnp.stack([r / t, s / t])

@@ -1,0 +1,110 @@
+"""Least squares with a few unknowns on a manifold: the refinement of every closed form here.
+
+    v(x) → vᵀv = min,        x ← x ⊞ δ,        (N + λ·diag N)·δ = −Jᵀv,        N = JᵀJ
+
+J = ∂v(x ⊞ δ)/∂δ at δ = 0 by forward differentiation; v contains the roots of the weights. λ
+falls with success and rises with failure (Levenberg, 1944; Marquardt, 1963). The iterations are
+not differentiated: the last step is without damping from an estimate held fixed, so that its
+derivative by the data is that of the solution (implicit function theorem, with N for the Hessian).
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.lax import stop_gradient
+from jax.scipy.linalg import cho_factor, cho_solve
+from jaxtyping import Float, PyTree
+
+DETERMINED = 1e-10
+"""Least eigenvalue of the normal matrix scaled to a unit diagonal, below it nothing is solved."""
+
+
+class Fit(eqx.Module):
+    """An adjusted estimate, its vᵀPv, and Q = N⁻¹ in the order of δ (infinite: undetermined).
+
+    `weakest`: least eigenvalue of N scaled to a unit diagonal, 1 for uncorrelated unknowns.
+    """
+
+    estimate: PyTree
+    vtpv: Float[Array, ""]
+    cofactor: Float[Array, "u u"]
+    weakest: Float[Array, ""]
+
+    @property
+    def determined(self):
+        return self.weakest > DETERMINED
+
+
+def adjust(residuals: Callable, retract: Callable, start, data: tuple, unknowns: int, steps=12):
+    """`minimise`, then `finish`: from start values to a differentiable `Fit`."""
+    estimate, _ = minimise(residuals, retract, start, data, unknowns, steps)
+    return finish(residuals, retract, estimate, data, unknowns)
+
+
+def minimise(residuals: Callable, retract: Callable, start, data: tuple, unknowns: int, steps=12):
+    """The estimate after `steps` damped steps, and its vᵀv, without derivative.
+
+    **Arguments:** `residuals(x, *data)` [n], `retract(x, δ)`; `start`: x to begin with.
+    """
+    start, data = stop_gradient((start, data))
+
+    def square(x):
+        s = jnp.sum(residuals(x, *data) ** 2)
+        return jnp.where(jnp.isnan(s), jnp.inf, s)
+
+    def improve(_, state):
+        x, least, damping = state
+        N, g = normal_equations(residuals, retract, x, data, unknowns)
+        trial = retract(x, -_solve(N + damping * jnp.diag(jnp.diag(N)), g))
+        now = square(trial)
+        better = now < least
+        x = jax.tree.map(lambda a, b: jnp.where(better, a, b), trial, x)
+        damping = jnp.where(better, damping / 20, jnp.minimum(damping * 8, 1e6))
+        return x, jnp.where(better, now, least), damping
+
+    estimate, vtv, _ = jax.lax.fori_loop(0, steps, improve, (start, square(start), 1e-4))
+    return estimate, vtv
+
+
+def finish(residuals: Callable, retract: Callable, estimate, data: tuple, unknowns: int) -> Fit:
+    """The last step, which carries the derivatives, and the cofactors."""
+    x = stop_gradient(estimate)
+    N, g = normal_equations(residuals, retract, x, data, unknowns)
+    diagonal = stop_gradient(jnp.diag(N))
+    scale = 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
+    scaled = stop_gradient(N) * scale * scale[:, None]
+    weakest = jnp.linalg.eigvalsh(jnp.where(jnp.isfinite(scaled), scaled, 0))[0]
+    determined = weakest > DETERMINED
+    N = jnp.where(determined, N, jnp.eye(unknowns, dtype=N.dtype))
+    step = jnp.where(determined, -_solve(N, g), 0)
+    square = lambda x: jnp.sum(residuals(x, *data) ** 2)
+    # at the minimum, rounding may let vᵀv rise; far from it, an undamped step may be wrong
+    rounding = 1e-22 * jnp.sum(diagonal)
+    good = stop_gradient(square(retract(x, step)) <= 1.001 * square(x) + rounding)
+    x = retract(x, jnp.where(good, step, 0))
+    eye = jnp.eye(unknowns, dtype=N.dtype)
+    cofactor = jnp.where(determined, _solve(N, eye), jnp.inf)
+    return Fit(x, square(x), cofactor, weakest)
+
+
+def normal_equations(residuals, retract, x, data, unknowns):
+    """N = JᵀJ and Jᵀv at x."""
+
+    def twice(delta):
+        v = residuals(retract(x, delta), *data)
+        return v, v
+
+    zero = jnp.zeros(unknowns, jax.tree.leaves(x)[0].dtype)
+    J, v = jax.jacfwd(twice, has_aux=True)(zero)
+    return J.T @ J, J.T @ v
+
+
+def _solve(N, g):
+    """N⁻¹·g with N scaled to a unit diagonal; not finite if N is not positive definite."""
+    diagonal = jnp.diag(N)
+    scale = 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
+    column = scale if g.ndim == 1 else scale[:, None]
+    return column * cho_solve(cho_factor(N * scale * scale[:, None]), column * g)

@@ -1,0 +1,60 @@
+"""Linear algebra of start values: null vectors, normalised coordinates, the extent of points.
+
+A homogeneous system A·h ≈ 0, |h| = 1, is solved by the right singular vector of the least singular
+value. Its exact first derivative, also where that value is zero, is that of
+
+    h − (AᵀA − σₙ²·I)⁺·AᵀA·h
+
+with all but the last AᵀA held: the correction itself is zero (Golub and Pereyra, 1973).
+"""
+
+import jax.numpy as jnp
+from jax import Array
+from jax.lax import stop_gradient
+from jaxtyping import Float
+
+
+def null_vector(
+    A: Float[Array, "rows n"],
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """h of least |A·h|, |h| = 1, and the singular values, largest first; zero if rows are few."""
+    _, s, Vt = _right_singular(stop_gradient(A))
+    gap = s[:-1] ** 2 - s[-1] ** 2
+    usable = gap > 1e-28 * s[0] ** 2
+    h, others = Vt[-1], Vt[:-1]
+    slope = others @ (A.T @ (A @ h))
+    return h - (jnp.where(usable, slope / jnp.where(usable, gap, 1), 0) @ others), s
+
+
+def null_space(A: Float[Array, "rows n"], k: int) -> Float[Array, "k n"]:
+    """The k right singular vectors of the least singular values, without derivative."""
+    return _right_singular(stop_gradient(A))[2][-k:]
+
+
+def normalisation(
+    points: Float[Array, "n d"], weights: Float[Array, " n"]
+) -> tuple[Float[Array, " d"], Float[Array, ""]]:
+    """Weighted mean, and the root mean square of a coordinate about it (Hartley, 1997)."""
+    total = jnp.sum(weights)
+    mean = weights @ points / total
+    square = weights @ jnp.sum((points - mean) ** 2, 1) / (total * points.shape[1])
+    return mean, jnp.sqrt(jnp.where(square > 0, square, 1.0))
+
+
+def extent(points: Float[Array, "n d"], weights: Float[Array, " n"]) -> Float[Array, " d"]:
+    """Extents along the principal axes relative to the largest: (1, 0, 0) of points on a line."""
+    mean, _ = normalisation(points, weights)
+    rows = stop_gradient(jnp.sqrt(weights)[:, None] * (points - mean))
+    s = _right_singular(rows)[1]
+    return s / jnp.where(s[0] > 0, s[0], 1)
+
+
+def ones_unless(weights: Float[Array, " n"] | None, points: Array) -> Float[Array, " n"]:
+    """The weights, one a point if there are none."""
+    return jnp.ones(points.shape[0], points.dtype) if weights is None else weights
+
+
+def _right_singular(A):
+    """SVD with all right singular vectors: empty rows are added to a flat matrix."""
+    missing = max(A.shape[1] - A.shape[0], 0)
+    return jnp.linalg.svd(jnp.pad(A, ((0, missing), (0, 0))), full_matrices=False)

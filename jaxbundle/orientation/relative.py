@@ -1,0 +1,193 @@
+"""Relative orientation of two images by coplanarity, without start values.
+
+The first camera is the frame: M₁ = I, X0₁ = 0; the second has the rotation M from the first and its
+centre at the base b, |b| = 1. Essential matrices in closed form (`essential`) give candidates of
+which that is taken whose points are in front of both cameras with the least vᵀPv. It is refined on
+the five-parameter manifold with the misclosures of coplanarity as lengths in the image,
+
+    v = a₂ᵀ·E·a₁/√(|(E·a₁)ₓᵧ|² + |(Eᵀ·a₂)ₓᵧ|²),        E = M·[b]×,        Σ p·v² = min
+
+to first order the least corrections of all four coordinates (Sampson, 1982).
+
+Two simpler explanations are tried. If a rotation alone explains the rays with a variance less than
+`SIMPLER` times that of the relative orientation (and of a homography), there is no significant
+base; if a homography does, the object is a plane, of which eight points say nothing.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.lax import stop_gradient
+from jaxtyping import Float, Int
+
+from jaxbundle.geometry import matrix_from_quaternion, matrix_from_rotation_vector
+
+from .absolute import rotation_between
+from .essential import eight_points, five_points, orientations
+from .homography import apply_homography, homography
+from .least_squares import finish, minimise
+from .linear import ones_unless
+from .pose import Pose, image_of, ray_of
+from .status import Status, first_of
+
+SIMPLER = 6.0
+"""Ratio of variances below which the simpler explanation counts: F(0.99) of a dozen points."""
+EXACT = 1e-20
+"""Variance of image coordinates (c = 1) that is rounding."""
+REFINED = 4
+"""Candidates that are refined."""
+STEPS = 12
+
+
+class RelativeOrientation(eqx.Module):
+    """M from the first camera to the second, base b in the frame of the first, vᵀPv.
+
+    `cofactor`: of three turns δθ in radians in the frame of the second camera, and of the two
+    components of b, radians, across it. `in_front`: weight of the points in front of both cameras,
+    in parts of the whole.
+    """
+
+    M: Float[Array, "3 3"]
+    b: Float[Array, "3"]
+    vtpv: Float[Array, ""]
+    cofactor: Float[Array, "5 5"]
+    in_front: Float[Array, ""]
+    status: Int[Array, ""]
+
+
+def relative_orientation(
+    xy1: Float[Array, "n 2"],
+    xy2: Float[Array, "n 2"],
+    weights: Float[Array, " n"] | None = None,
+    method: str = "five",
+) -> RelativeOrientation:
+    """The relative orientation of two images of n points, differentiable in all arguments.
+
+    **Arguments:** ideal image coordinates divided by the principal distance, y up; weights
+    p = 1/σ², equal for the four coordinates; 0: the point is absent. `method`: `"five"` (n ≥ 6, any
+    object; the solution of eight points is one more candidate) or `"eight"` (n ≥ 8, not a plane).
+
+    **Returns:** `status`: `NO_BASE`, `COPLANAR_POINTS` (method `"eight"`), `NO_SOLUTION`,
+    `UNDETERMINED`, `BEHIND_THE_CAMERA` (most points are).
+
+    **Raises:** `ValueError` for another method.
+    """
+    p = ones_unless(weights, xy1)
+    if method not in ("five", "eight"):
+        raise ValueError(f'The method must be "five" or "eight", but is {method!r}.')
+    held = stop_gradient((xy1, xy2, p))
+    E = eight_points(*held)[0][None]
+    if method == "five":
+        held = _after(E, held)
+        # with noise, a solution that is not quite real is a good start
+        E = jnp.concatenate([E, five_points(*held)[0]])
+    M, b = (a.reshape(-1, *a.shape[2:]) for a in jax.vmap(orientations)(E))
+    data = (xy1, xy2, jnp.sqrt(p))
+    chosen, score = _refined_best(M, b, stop_gradient(data), p)
+    fit = finish(_misclosures, _retract, chosen, data, 5)
+    M, b = fit.estimate
+    front = _in_front(M, b, xy1, xy2, p)
+    vtpv = stop_gradient(fit.vtpv)
+    no_base, flat = _simpler(*_after(vtpv, held), vtpv)
+    status = first_of(
+        (no_base, Status.NO_BASE),
+        (flat if method == "eight" else jnp.asarray(False), Status.COPLANAR_POINTS),
+        (~jnp.isfinite(score), Status.NO_SOLUTION),
+        (~fit.determined, Status.UNDETERMINED),
+        (front < 0.5, Status.BEHIND_THE_CAMERA),
+    )
+    return RelativeOrientation(M, b, fit.vtpv, fit.cofactor, front, status)
+
+
+def sampson_distance(
+    M: Float[Array, "3 3"], b: Float[Array, "3"], xy1: Float[Array, "2"], xy2: Float[Array, "2"]
+) -> Float[Array, ""]:
+    """Misclosure of coplanarity of one point as a length in the image, c = 1, with a sign."""
+    a1, a2 = ray_of(xy1), ray_of(xy2)
+    line2, line1 = M @ jnp.cross(b, a1), jnp.cross(M.T @ a2, b)
+    length = jnp.sum(line2[:2] ** 2) + jnp.sum(line1[:2] ** 2)
+    return a2 @ line2 / jnp.sqrt(jnp.where(length > 0, length, 1))
+
+
+def distances_along_rays(
+    M: Float[Array, "3 3"], b: Float[Array, "3"], xy1: Float[Array, "2"], xy2: Float[Array, "2"]
+) -> Float[Array, "2"]:
+    """(s₁, s₂) of the nearest points s₁·a₁ and b + s₂·Mᵀ·a₂ of two rays; positive: in front."""
+    a1, a2 = ray_of(xy1), M.T @ ray_of(xy2)
+    aa, cc, dot = a1 @ a1, a2 @ a2, a1 @ a2
+    determinant = aa * cc - dot * dot
+    s = jnp.stack([cc * (b @ a1) - dot * (b @ a2), dot * (b @ a1) - aa * (b @ a2)])
+    return s / jnp.where(determinant > 0, determinant, 1)
+
+
+def _refined_best(M, b, data, p):
+    """Of the candidates the best few refined, of these the best, and its score."""
+    xy1, xy2, _ = data
+
+    def score(pair, square):
+        behind = 1 - _in_front(*pair, xy1, xy2, p)
+        value = (square / jnp.sum(p) + EXACT) * (1 + 100 * behind)
+        return jnp.where(jnp.isfinite(value), value, jnp.inf)
+
+    first = lambda M, b: score((M, b), jnp.sum(_misclosures((M, b), *data) ** 2))
+    _, best = jax.lax.top_k(-jax.vmap(first)(M, b), REFINED)
+    refine = lambda M, b: minimise(_misclosures, _retract, (M, b), data, 5, STEPS)
+    refined, squares = jax.vmap(refine)(M[best], b[best])
+    scores = jax.vmap(score)(refined, squares)
+    k = jnp.argmin(scores)
+    return jax.tree.map(lambda a: a[k], refined), scores[k]
+
+
+def _after(done, arrays):
+    """The arrays, which wait for `done`: adds zero. Decompositions that run side by side can hang
+    jaxlib 0.10 on two cores; a barrier does not order them."""
+    nothing = jnp.where(jnp.sum(done) > 1e300, 1.0, 0.0)
+    return jax.tree.map(lambda a: a + nothing, arrays)
+
+
+def _misclosures(pair, xy1, xy2, root):
+    return root * jax.vmap(sampson_distance, (None, None, 0, 0))(*pair, xy1, xy2)
+
+
+def _retract(pair, delta):
+    M, b = pair
+    M = matrix_from_rotation_vector(delta[:3]) @ M
+    b = b + delta[3:] @ _across(b)
+    return M, b / jnp.linalg.norm(b)
+
+
+def _across(b):
+    """Two unit vectors perpendicular to b, of length 1, and to one another."""
+    axis = jnp.eye(3, dtype=b.dtype)[jnp.argmin(jnp.abs(stop_gradient(b)))]
+    first = jnp.cross(b, axis)
+    first = first / jnp.linalg.norm(first)
+    return jnp.stack([first, jnp.cross(b, first)])
+
+
+def _in_front(M, b, xy1, xy2, p):
+    s = jax.vmap(distances_along_rays, (None, None, 0, 0))(M, b, xy1, xy2)
+    return jnp.sum(jnp.where(jnp.all(s > 0, 1), p, 0)) / jnp.sum(p)
+
+
+def _simpler(xy1, xy2, p, vtpv):
+    """Whether a rotation, and whether a homography, explain the second image as well."""
+    n, average = jnp.sum(p > 0), jnp.sum(p) / jnp.sum(p > 0)
+    redundancy = n - 5
+    variance = vtpv / jnp.where(redundancy > 0, redundancy, 1)
+    unit = lambda a: a / jnp.linalg.norm(a)
+    rays = [jax.vmap(lambda xy: unit(ray_of(xy)))(xy) for xy in (xy1, xy2)]
+    turned = Pose(jnp.zeros(3), matrix_from_quaternion(rotation_between(*rays, p)))
+    by_rotation = jax.vmap(image_of, (None, 0))(turned, rays[0])
+    H, _ = homography(xy1, xy2, p)
+    by_plane = jax.vmap(apply_homography, (None, 0))(H, xy1)
+
+    def variance_of(computed, unknowns):
+        """The differences contain the errors of both images: twice the variance."""
+        spare = 2 * n - unknowns
+        square = jnp.sum(p[:, None] * (computed - xy2) ** 2) / (2 * jnp.where(spare > 0, spare, 1))
+        return jnp.where(spare > 0, square, jnp.inf)
+
+    rotation, plane = variance_of(by_rotation, 3), variance_of(by_plane, 8)
+    limit = lambda other: SIMPLER * other + EXACT * average
+    return rotation < limit(jnp.minimum(variance, plane)), plane < limit(variance)

@@ -1,0 +1,111 @@
+"""Resection: the exterior orientation of one image of known points, without start values.
+
+Three points that span a wide triangle in the image give up to four poses in closed form
+(`three_points`). Each is refined with all points on the collinearity equations,
+
+    v = −[r, s]/q − [x, y],        [r, s, q] = M·(X − X0),        Σ p·|v|² = min
+
+and the one with the least vᵀPv and the points in front of the camera is the solution.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.lax import stop_gradient
+from jaxtyping import Float, Int
+
+from .least_squares import finish, minimise
+from .linear import extent, normalisation, ones_unless
+from .pose import Pose, image_of, ray_of, retract_pose, to_camera
+from .status import Status, first_of
+from .three_points import three_points
+
+LINE = 1e-7
+"""Points whose second extent is below this part of the first lie on a line."""
+STEPS = 10
+
+
+class Resection(eqx.Module):
+    """Pose, vᵀPv, and cofactors of (δX0 in the object unit, δθ in radians in the camera frame)."""
+
+    pose: Pose
+    vtpv: Float[Array, ""]
+    cofactor: Float[Array, "6 6"]
+    status: Int[Array, ""]
+
+
+def resection(
+    xy: Float[Array, "n 2"],
+    X: Float[Array, "n 3"],
+    weights: Float[Array, " n"] | None = None,
+) -> Resection:
+    """The pose of an image of n ≥ 4 known points, differentiable in all arguments.
+
+    **Arguments:** ideal image coordinates divided by the principal distance, y up; points in the
+    object unit; weights p = 1/σ², equal in x and y; 0: the point is absent.
+
+    **Returns:** the cofactors times σ0² are the covariance. `status`: `COLLINEAR_POINTS`,
+    `NO_SOLUTION`, `DANGER_CYLINDER` (the normal matrix is singular: the centre is on the right
+    cylinder over the circle of three points, or on one cubic curve of such a cylinder with all of
+    more), `BEHIND_THE_CAMERA`. A centre near it is told by its cofactors.
+    """
+    p = ones_unless(weights, xy)
+    chosen = wide_triangle(xy, p)
+    # with noise, the pose nearest to a solution may be all there is, and a good start
+    starts, _ = three_points(jax.vmap(ray_of)(stop_gradient(xy[chosen])), stop_gradient(X[chosen]))
+    data = (xy, X, jnp.sqrt(p))
+    refine = lambda start: minimise(_misclosures, retract_pose, start, data, 6, STEPS)
+    poses, squares = jax.vmap(refine)(starts)
+    behind = jax.vmap(lambda pose: jnp.sum(jnp.where(p > 0, _behind(pose, X), 0)))(poses)
+    worst = jnp.where(jnp.isfinite(squares), behind, jnp.inf)
+    best = jnp.argmin(jnp.where(worst == jnp.min(worst), squares, jnp.inf))
+    pose = jax.tree.map(lambda a: a[best], poses)
+    fit = finish(_misclosures, retract_pose, pose, data, 6)
+    status = first_of(
+        (extent(X, p)[1] < LINE, Status.COLLINEAR_POINTS),
+        (~jnp.isfinite(worst[best]), Status.NO_SOLUTION),
+        (~fit.determined, Status.DANGER_CYLINDER),
+        (worst[best] > 0, Status.BEHIND_THE_CAMERA),
+    )
+    return Resection(fit.estimate, fit.vtpv, fit.cofactor, status)
+
+
+def refine_resection(
+    pose: Pose,
+    xy: Float[Array, "n 2"],
+    X: Float[Array, "n 3"],
+    weights: Float[Array, " n"] | None = None,
+) -> Resection:
+    """A pose improved by least squares; arguments and result as in `resection`, n ≥ 3."""
+    p = ones_unless(weights, xy)
+    data = (xy, X, jnp.sqrt(p))
+    pose, _ = minimise(_misclosures, retract_pose, pose, data, 6, STEPS)
+    fit = finish(_misclosures, retract_pose, pose, data, 6)
+    status = first_of(
+        (extent(X, p)[1] < LINE, Status.COLLINEAR_POINTS),
+        (~fit.determined, Status.DANGER_CYLINDER),
+        (jnp.any(_behind(fit.estimate, X) & (p > 0)), Status.BEHIND_THE_CAMERA),
+    )
+    return Resection(fit.estimate, fit.vtpv, fit.cofactor, status)
+
+
+def wide_triangle(xy: Float[Array, "n 2"], weights: Float[Array, " n"]) -> Int[Array, "3"]:
+    """Three of the points of weight > 0, far apart: outermost, farthest from it, largest area."""
+    xy = stop_gradient(xy)
+    most = lambda value: jnp.argmax(jnp.where(weights > 0, value, -1.0))
+    distance = lambda point: jnp.sum((xy - point) ** 2, 1)
+    i = most(distance(normalisation(xy, weights)[0]))
+    j = most(distance(xy[i]))
+    along, across = xy[j] - xy[i], xy - xy[i]
+    k = most(jnp.abs(along[0] * across[:, 1] - along[1] * across[:, 0]))
+    return jnp.stack([i, j, k])
+
+
+def _misclosures(pose, xy, X, root):
+    computed = jax.vmap(image_of, (None, 0))(pose, X)
+    return (root[:, None] * (computed - xy)).ravel()
+
+
+def _behind(pose, X):
+    return jax.vmap(to_camera, (None, 0))(pose, X)[:, 2] >= 0

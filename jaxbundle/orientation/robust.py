@@ -1,0 +1,178 @@
+"""Gross errors: solutions from random minimal samples, RANSAC and least median of squares.
+
+Every sample of the fewest observations gives one or several models; each is held against all
+observations by their absolute errors e. The best one has
+
+    RANSAC   least Σ min(e², t²)         Fischler and Bolles (1981); Torr and Zisserman (2000)
+    LMedS    least median of e²          Rousseeuw (1984); needs no threshold, up to 50 % errors
+
+With a part ε of gross errors, k samples of n observations contain a good one with the probability
+P = 1 − (1 − (1 − ε)ⁿ)ᵏ. All samples are drawn from one key and solved at once by vmap: the same key
+gives the same answer.
+"""
+
+from collections.abc import Callable
+from math import ceil, log
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, PyTree
+
+from .essential import five_points, orientations
+from .linear import ones_unless
+from .pose import image_of, ray_of, to_camera
+from .relative import (
+    RelativeOrientation,
+    distances_along_rays,
+    relative_orientation,
+    sampson_distance,
+)
+from .resection import Resection, refine_resection
+from .three_points import three_points
+
+FAR = 1e6
+"""Error of an observation that contradicts a model altogether (a point behind the camera)."""
+CUT = 2.5
+"""Observations beyond so many robust standard deviations are gross errors (LMedS)."""
+ROUNDING = 1e-11
+"""Least standard deviation that counts."""
+ROUNDS = 3
+"""A solution of all good observations, then these chosen again."""
+
+
+class Consensus(eqx.Module):
+    """The best model, the observations that agree with it, and their greatest accepted error."""
+
+    model: PyTree
+    inliers: Bool[Array, " n"]
+    threshold: Float[Array, ""]
+
+
+def samples_needed(size: int, gross: float = 0.4, confidence: float = 0.999) -> int:
+    """Number of samples of `size` of which one is free of errors, as probable as `confidence`."""
+    return ceil(log(1 - confidence) / log(1 - (1 - gross) ** size))
+
+
+def consensus(
+    key: Array,
+    solve: Callable,
+    errors: Callable,
+    data: tuple,
+    size: int,
+    samples: int,
+    threshold: float | None = None,
+    weights: Float[Array, " n"] | None = None,
+) -> Consensus:
+    """The best of the models of `samples` random samples of `size` observations.
+
+    **Arguments:** `data`: arrays with the observations along their first axis; `solve(*sample)`:
+    models with a leading axis of slots, and which of them are valid; `errors(model, *data)` [n],
+    not negative. `threshold`: RANSAC with this greatest error of a good observation; without it
+    LMedS. `weights`: 0: the observation is absent.
+    """
+    present = ones_unless(weights, data[0]) > 0
+    n = present.shape[0]
+    draws = jax.random.uniform(key, (samples, n))
+    _, chosen = jax.lax.top_k(jnp.where(present, draws, -1), size)
+    models, valid = jax.vmap(lambda k: solve(*(a[k] for a in data)))(chosen)
+    models = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), models)
+
+    def score(model, valid):
+        e = _finite(errors(model, *data))
+        if threshold is None:
+            value = _median(e, present)
+        else:
+            value = jnp.sum(jnp.where(present, jnp.minimum(e, threshold) ** 2, 0))
+        return jnp.where(valid, value, jnp.inf)
+
+    best = jnp.argmin(jax.vmap(score)(models, valid.reshape(-1)))
+    model = jax.tree.map(lambda a: a[best], models)
+    e = _finite(errors(model, *data))
+    limit = robust_limit(e, present, size) if threshold is None else jnp.asarray(threshold)
+    return Consensus(model, present & (e <= limit), limit)
+
+
+def robust_limit(e: Float[Array, " n"], present: Bool[Array, " n"], size: int) -> Array:
+    """CUT·σ with σ = 1.4826·(1 + 5/(n − size))·median e (Rousseeuw and Leroy, 1987, p. 202)."""
+    spare = jnp.maximum(jnp.sum(present) - size, 1)
+    return CUT * jnp.maximum(1.4826 * (1 + 5 / spare) * _median(e, present), ROUNDING)
+
+
+def robust_resection(
+    key: Array,
+    xy: Float[Array, "n 2"],
+    X: Float[Array, "n 3"],
+    samples: int = 60,
+    threshold: float | None = None,
+) -> tuple[Resection, Bool[Array, " n"]]:
+    """Resection of points with up to 40 % gross errors, and which points are good.
+
+    Arguments as in `resection` and `consensus`; the threshold is a length in the image, c = 1.
+    """
+
+    def errors(pose, xy, X):
+        e = jnp.linalg.norm(jax.vmap(image_of, (None, 0))(pose, X) - xy, axis=1)
+        q = jax.vmap(to_camera, (None, 0))(pose, X)[:, 2]
+        return jnp.where(q < 0, e, FAR)
+
+    solve = lambda xy, X: three_points(jax.vmap(ray_of)(xy), X)
+    found = consensus(key, solve, errors, (xy, X), 3, samples, threshold)
+    pose, good = found.model, found.inliers
+
+    def again(_, state):
+        pose, good = state
+        pose = refine_resection(pose, xy, X, good.astype(xy.dtype)).pose
+        return pose, _good(errors(pose, xy, X), 3, threshold)
+
+    pose, good = jax.lax.fori_loop(0, ROUNDS, again, (pose, good))
+    return refine_resection(pose, xy, X, good.astype(xy.dtype)), good
+
+
+def robust_relative_orientation(
+    key: Array,
+    xy1: Float[Array, "n 2"],
+    xy2: Float[Array, "n 2"],
+    samples: int = 150,
+    threshold: float | None = None,
+) -> tuple[RelativeOrientation, Bool[Array, " n"]]:
+    """Relative orientation of points with up to 40 % gross errors, and which points are good.
+
+    Arguments as in `relative_orientation` and `consensus`. A gross error along the epipolar line
+    is none: it contradicts nothing.
+    """
+
+    def errors(pair, xy1, xy2):
+        e = jnp.abs(jax.vmap(sampson_distance, (None, None, 0, 0))(*pair, xy1, xy2))
+        s = jax.vmap(distances_along_rays, (None, None, 0, 0))(*pair, xy1, xy2)
+        return jnp.where(jnp.all(s > 0, 1), e, FAR)
+
+    def solve(xy1, xy2):
+        E, valid = five_points(xy1, xy2)
+        M, b = jax.vmap(orientations)(E)
+        return (M.reshape(-1, 3, 3), b.reshape(-1, 3)), jnp.repeat(valid, 4)
+
+    found = consensus(key, solve, errors, (xy1, xy2), 5, samples, threshold)
+
+    def again(_, good):
+        result = relative_orientation(xy1, xy2, good.astype(xy1.dtype))
+        return _good(errors((result.M, result.b), xy1, xy2), 5, threshold)
+
+    good = jax.lax.fori_loop(0, ROUNDS, again, found.inliers)
+    return relative_orientation(xy1, xy2, good.astype(xy1.dtype)), good
+
+
+def _good(e, size, threshold):
+    e = _finite(e)
+    return e <= (robust_limit(e, e < jnp.inf, size) if threshold is None else threshold)
+
+
+def _finite(e):
+    return jnp.where(jnp.isfinite(e), e, FAR)
+
+
+def _median(e, present):
+    """Of those present, the upper one of two."""
+    ordered = jnp.sort(jnp.where(present, e, jnp.inf))
+    return ordered[jnp.minimum(jnp.sum(present) // 2, e.shape[0] - 1)]

@@ -1,0 +1,136 @@
+"""Resection in closed form from three points: all real solutions.
+
+The unknown distances s = (s₁, s₂, s₃) from the projection centre obey the law of cosines, with the
+cosines between the rays dᵢ and the squared sides aᵢⱼ of the triangle,
+
+    sᵀ·Qᵢⱼ·s = sᵢ² + sⱼ² − 2·sᵢ·sⱼ·(dᵢ·dⱼ) = aᵢⱼ
+
+Combinations of the three equations with Σ μᵢⱼ·aᵢⱼ = 0 are homogeneous: a pencil A + t·B of conics
+through the four solutions. It is degenerate for the real roots of the cubic det(A + t·B) = 0, where
+it is a pair of lines, which the eigenvectors give; each line meets another conic of the pencil in
+two points (Finsterwalder, 1903; Haralick et al., 1994, Int. J. Computer Vision 13(3), 331–356;
+Persson and Nordberg, 2018, ECCV). Newton steps on the three equations remove what rounding left.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float
+
+from .pose import Pose
+
+FITS = 1e-9
+"""Greatest misclosure of the law of cosines, in parts of the sum of the squared sides."""
+PAIRS = ((0, 1), (0, 2), (1, 2))
+NEWTON_STEPS = 4
+
+
+def three_points(
+    rays: Float[Array, "3 3"], X: Float[Array, "3 3"]
+) -> tuple[Pose, Bool[Array, "4"]]:
+    """The poses (four slots) from which three points X appear along three rays.
+
+    **Arguments:** `rays`: directions in the camera frame, of any length, towards the points (z < 0
+    in front of a camera); X in the object unit, not on one line.
+
+    **Returns:** poses with a leading axis of 4, and which of them are solutions. Real double
+    solutions (danger cylinder) may fill two slots. Derivatives are those of the closed form.
+    """
+    rays = rays / jnp.linalg.norm(rays, axis=1, keepdims=True)
+    sides = jnp.stack([jnp.sum((X[i] - X[j]) ** 2) for i, j in PAIRS])
+    size = jnp.sum(sides)
+    s, valid = _distances(rays @ rays.T, sides / size)
+    place = lambda s: _pose(jnp.sqrt(size) * s[:, None] * rays, X)
+    return jax.vmap(place)(s), valid
+
+
+def _distances(cosines, sides):
+    """s [4, 3] for squared sides of sum 1, and which of them solve the equations."""
+    Q = jnp.stack([_law_of_cosines(i, j, cosines[i, j]) for i, j in PAIRS])
+    first = jnp.cross(sides, jnp.array([0.3, -0.5, 0.8]))  # a direction no triangle has
+    second = jnp.cross(sides, first)
+    A, B = (jnp.tensordot(m / jnp.linalg.norm(m), Q, 1) for m in (first, second))
+    t, w, v = _pair_of_lines(A, B)
+    plus, minus = jnp.sqrt(jnp.maximum(w[2], 0)), jnp.sqrt(jnp.maximum(-w[0], 0))
+    other = B - t * A
+    on_lines = [_meets(other, v[:, 1], minus * v[:, 2] + k * plus * v[:, 0]) for k in (1, -1)]
+    s = jnp.concatenate(on_lines)
+    s = s * jnp.where(jnp.sum(s, 1) < 0, -1, 1)[:, None]
+    length = jnp.einsum("ni,kij,nj->n", s, Q, s)
+    s = s / jnp.sqrt(jnp.where(length > 0, length, 1))[:, None]
+    s = jax.vmap(lambda s: _newton(s, Q, sides))(s)
+    wrong = jnp.max(jnp.abs(jnp.einsum("ni,kij,nj->nk", s, Q, s) - sides), axis=1)
+    return s, (wrong < FITS) & jnp.all(s > 0, axis=1)
+
+
+def _law_of_cosines(i, j, cosine):
+    Q = jnp.zeros((3, 3), cosine.dtype).at[i, i].set(1).at[j, j].set(1)
+    return Q.at[i, j].set(-cosine).at[j, i].set(-cosine)
+
+
+def _pair_of_lines(A, B):
+    """t, eigenvalues and eigenvectors of A + t·B, of three t the best conditioned pair of lines."""
+    a, b = _cofactors(A), _cofactors(B)
+    roots = _real_roots(
+        jnp.sum(b[0] * B[0]), jnp.sum(b * A), jnp.sum(a * B), jnp.sum(a[0] * A[0])
+    )
+    w, v = jnp.linalg.eigh(A + roots[:, None, None] * B)
+    crossing = jnp.minimum(-w[:, 0], w[:, 2]) / jnp.max(jnp.abs(w), axis=1)
+    best = jnp.argmax(crossing)
+    return roots[best], w[best], v[best]
+
+
+def _cofactors(A):
+    return jnp.stack([jnp.cross(A[1], A[2]), jnp.cross(A[2], A[0]), jnp.cross(A[0], A[1])])
+
+
+def _real_roots(c3, c2, c1, c0):
+    """The real roots [3] of a cubic; a single one is repeated."""
+    a, b, c = c2 / c3, c1 / c3, c0 / c3
+    p, q = b - a * a / 3, (2 * a * a / 27 - b / 3) * a + c
+    discriminant = q * q / 4 + p**3 / 27
+    three = discriminant < 0
+    r = jnp.sqrt(jnp.where(three, -p / 3, 1))
+    angle = jnp.arccos(jnp.clip(-q / (2 * r**3), -1, 1)) / 3
+    of_three = 2 * r * jnp.cos(angle - 2 * jnp.pi / 3 * jnp.arange(3))
+    root = jnp.sqrt(jnp.where(three, 0, discriminant))
+    u = jnp.cbrt(-q / 2 - jnp.where(q < 0, -root, root))
+    of_one = u - p / jnp.where(u == 0, 1, 3 * u)
+    t = jnp.where(three, of_three, of_one) - a / 3
+    for _ in range(2):
+        slope = (3 * t + 2 * a) * t + b
+        t = t - jnp.where(slope == 0, 0, (((t + a) * t + b) * t + c) / slope)
+    return t
+
+
+def _meets(C, u, v):
+    """The two points α·u + β·v of a line on the conic C; the nearest real ones if it misses."""
+    a, b, d = u @ C @ u, u @ C @ v, v @ C @ v
+    root = jnp.sqrt(jnp.maximum(b * b - a * d, 0))
+    h = -(b + jnp.where(b < 0, -root, root))
+    return jnp.stack([h * u + a * v, d * u + h * v])
+
+
+def _newton(s, Q, sides):
+    """Steps on the three equations, in the least squares sense where they are singular."""
+    for _ in range(NEWTON_STEPS):
+        Qs = Q @ s
+        J, f = 2 * Qs, Qs @ s - sides
+        N = J.T @ J
+        step = jnp.linalg.solve(N + 1e-14 * jnp.trace(N) * jnp.eye(3), J.T @ f)
+        s = s - jnp.where(jnp.isfinite(step), step, 0)
+    return s
+
+
+def _pose(Y, X):
+    """The pose that takes the triangle X to the same triangle Y in the camera frame."""
+    M = _triad(Y).T @ _triad(X)
+    return Pose(jnp.mean(X, 0) - M.T @ jnp.mean(Y, 0), M)
+
+
+def _triad(P):
+    """Axes of a triangle, as rows."""
+    unit = lambda a: a / jnp.linalg.norm(a)
+    x = unit(P[1] - P[0])
+    z = unit(jnp.cross(x, P[2] - P[0]))
+    return jnp.stack([x, jnp.cross(z, x), z])
