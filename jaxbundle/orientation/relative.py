@@ -179,7 +179,7 @@ def _simpler(xy1, xy2, p, vtpv):
     rays = [jax.vmap(lambda xy: unit(ray_of(xy)))(xy) for xy in (xy1, xy2)]
     turned = Pose(jnp.zeros(3), matrix_from_quaternion(rotation_between(*rays, p)))
     by_rotation = jax.vmap(image_of, (None, 0))(turned, rays[0])
-    H, _ = homography(xy1, xy2, p)
+    H, _ = homography(*_after(by_rotation, (xy1, xy2, p)))
     by_plane = jax.vmap(apply_homography, (None, 0))(H, xy1)
 
     def variance_of(computed, unknowns):
