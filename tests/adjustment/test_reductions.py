@@ -109,7 +109,8 @@ def test_the_step_is_that_of_the_dense_system(reduction, free, damped):
     if not free:
         a, b = ravel_pytree(change)[0], ravel_pytree(other_change)[0]
         size = np.abs(a).max()
-        np.testing.assert_allclose(b, a, rtol=1e-8 * loss, atol=1e-9 * loss**1.5 * size)
+        # 1e-4 of the step: what the street bends by without moving an image point by 1e-6.
+        np.testing.assert_allclose(b, a, rtol=1e-8, atol=1e-4 * size if loss > 1 else 1e-9 * size)
 
 
 def test_pins_hold_the_datum():
