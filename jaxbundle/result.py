@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle import plotting, report
+from jaxbundle import plotting, report, result_tables
 from jaxbundle.adjustment.jacobian import zero_tangent
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.adjustment.solve import converged
@@ -23,7 +23,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.geometry import (
     matrix_from_quaternion,
-    omega_phi_kappa_from_matrix,
+    omega_phi_kappa_near,
     retract_quaternion,
 )
 from jaxbundle.network.arrays import Tangent, Values, retract
@@ -39,11 +39,7 @@ from jaxbundle.statistics import (
     Reliability,
     Removed,
     chi2_quantile,
-    correlation_matrix,
     distortion_reach,
-    external_reliability,
-    minimal_detectable,
-    total_correlation,
     variance_components,
 )
 
@@ -55,7 +51,7 @@ class Adjustment:
     that return arrays are radians):
 
     - `converged`, `termination`, `iterations`, `sigma0`, `vtpv`, `redundancy`, `counts`
-    - `cameras`, `images`, `points`, `residuals`, `distances`: tables (dicts of numpy columns)
+    - `cameras`, `images`, `points`, `residuals`: tables (dicts of numpy columns)
     - `method`, `reduction`: of the solution; the latter of the reduced system of images and cameras
     - `warnings`, `removed` (data snooping), `eliminated` (insignificant parameters),
       `undetermined` (names, where the network is singular)
@@ -216,25 +212,13 @@ class Adjustment:
     def image_values(self) -> Float[np.ndarray, "images 6"]:
         """X0, Y0, Z0 (object unit), ω, φ, κ (radians, on the turn and branch of the start)."""
         values = self.values
-        angles, *_ = self._angles_like_start
         position = np.asarray(values.position) + self.problem.origin
-        return np.concatenate([position, np.asarray(angles)], 1)
+        return np.concatenate([position, np.asarray(self._angles[0])], 1)
 
     @functools.cached_property
-    def _angles_like_start(self):
-        """ω, φ, κ of all images and their Jacobians by δθ, next to the angles that were given;
-        and what the derivatives have been multiplied by.
-
-        (ω, φ, κ) and (ω + π, π − φ, κ + π) are one rotation, and so are whole turns.
-        """
-        angles, jacobian = (np.asarray(x) for x in _all_angles(self.values.rotation))
-        start = self.problem.network.images.angles
-        other = angles * [1, -1, 1] + np.pi
-        turn = lambda a: a + 2 * np.pi * np.round((start - a) / (2 * np.pi))
-        angles, other = turn(angles), turn(other)
-        flip = ((other - start) ** 2).sum(1) < ((angles - start) ** 2).sum(1)
-        sign = np.where(flip[:, None], [1.0, -1.0, 1.0], 1.0)
-        return np.where(flip[:, None], other, angles), jacobian * sign[:, :, None], sign
+    def _angles(self):
+        """ω, φ, κ of all images, next to the angles that were given, and their Jacobians by δθ."""
+        return _all_angles(self.values.rotation, self.problem.network.images.angles)
 
     @functools.cached_property
     def image_covariance(self) -> Float[np.ndarray, "images 6 6"]:
@@ -243,7 +227,7 @@ class Adjustment:
         Q = np.asarray(self.cofactors.image)[: s.images, :6, :6]
         A = np.zeros((s.images, 6, 6))
         A[:, :3, :3] = np.eye(3)
-        A[:, 3:, 3:] = self._angles_like_start[1]
+        A[:, 3:, 3:] = self._angles[1]
         free = np.asarray(s.image_free)
         Q = Q * free[:, :, None] * free[:, None, :]
         return self.sigma0**2 * A @ Q @ A.transpose(0, 2, 1)
@@ -267,10 +251,11 @@ class Adjustment:
 
     def camera_covariance(self, camera: str) -> tuple[list[str], Float[np.ndarray, "n n"]]:
         """Names and covariance of the free parameters of a camera."""
-        names, Q = self._camera_cofactor(camera)
+        names, Q = self.camera_cofactor(camera)
         return names, self.sigma0**2 * Q
 
-    def _camera_cofactor(self, camera: str):
+    def camera_cofactor(self, camera: str) -> tuple[list[str], Float[np.ndarray, "n n"]]:
+        """Names and cofactors of the free parameters of a camera."""
         c, s = self._camera(camera), self.problem.structure
         free = np.flatnonzero(np.asarray(s.camera_free)[c])
         Q = self.cofactors.image[c, 6:, 6:] if s.own_camera else self.cofactors.camera[c]
@@ -306,7 +291,7 @@ class Adjustment:
         return self.covariance_of(pick)
 
     def _value_of(self, name: Name, values: Values):
-        """The unknown of this name; of an angle, what changes as it does on its branch."""
+        """The unknown of this name."""
         network = self.problem.network
         if name.kind == "camera":
             c = self._camera(name.id)
@@ -314,7 +299,9 @@ class Adjustment:
             return values.camera[c, _place(name.parameter, parameters, "camera parameter")]
         if name.kind == "image":
             i = _place(name.id, network.images.id, "image")
-            angles = _angles(values.rotation[i], jnp.zeros(3)) * self._angles_like_start[2][i]
+            angles = _angles_near(
+                values.rotation[i], jnp.zeros(3), network.images.angles[i]
+            )
             pose = jnp.concatenate([values.position[i], angles])
             return pose[_place(name.parameter, EXTERIOR, "image parameter")]
         if name.kind == "point":
@@ -344,122 +331,31 @@ class Adjustment:
     def cameras(self) -> dict[str, dict]:
         """Per camera: model, and per parameter value, sigma, free, t, total_correlation; and the
         correlation matrix of the free ones."""
-        tables = {}
-        for given in self.problem.network.cameras:
-            values = self.camera_parameters(given.id)
-            free, Q = self._camera_cofactor(given.id)
-            sigma = dict(zip(free, self.sigma0 * np.sqrt(np.diagonal(Q))))
-            total = dict(zip(free, total_correlation(Q))) if free else {}
-            tables[given.id] = {
-                "model": given.model,
-                "parameters": {
-                    name: {
-                        "value": value,
-                        "sigma": float(sigma[name]) if name in sigma else None,
-                        "free": name in sigma,
-                        "t": _significance(value, sigma[name]) if name in sigma else None,
-                        "total_correlation": float(total[name]) if name in sigma else None,
-                    }
-                    for name, value in values.items()
-                },
-                "free": free,
-                "correlations": correlation_matrix(Q),
-            }
-        return tables
+        return result_tables.cameras(self)
 
     @functools.cached_property
     def images(self) -> dict[str, np.ndarray]:
         """Columns id, X0 … kappa, sX0 … skappa (angles in the network's unit), rays, rms (of v,
         image unit)."""
-        s = self.problem.structure
-        scale = np.array([1, 1, 1, *[self.angle_scale] * 3])
-        values = self.image_values * scale
-        sigma = np.sqrt(np.clip(np.diagonal(self.image_covariance, axis1=1, axis2=2), 0, None))
-        sigma = sigma * scale
-        image = np.asarray(s.image)
-        weight = np.asarray(self.problem.data.image_weight)
-        used = weight > 0
-        v = np.asarray(self.reliability.residual.image) / np.where(used, weight, 1.0)
-        squares = np.bincount(image, (v**2 * used).sum(1), minlength=s.images)
-        number = np.bincount(image, used.sum(1), minlength=s.images)
-        table = {"id": np.array(self.problem.network.images.id, dtype=object)}
-        table |= {name: values[:, i] for i, name in enumerate(EXTERIOR)}
-        table |= {f"s{name}": sigma[:, i] for i, name in enumerate(EXTERIOR)}
-        table["rays"] = np.bincount(image, used.any(1), minlength=s.images).astype(int)
-        table["rms"] = np.sqrt(squares / np.maximum(number, 1))
-        return table
+        return result_tables.images(self)
 
     @functools.cached_property
     def points(self) -> dict[str, np.ndarray]:
         """Columns id, role, X, Y, Z, sX, sY, sZ, rays."""
-        network, s = self.problem.network, self.problem.structure
-        sigma = np.sqrt(np.clip(np.diagonal(self.point_covariance, axis1=1, axis2=2), 0, None))
-        used = (np.asarray(self.problem.data.image_weight) > 0).any(1)
-        table = {
-            "id": np.array(network.points.id, dtype=object),
-            "role": np.array(network.points.role, dtype=object),
-        }
-        table |= {axis: self.point_values[:, i] for i, axis in enumerate("XYZ")}
-        table |= {f"s{axis}": sigma[:, i] for i, axis in enumerate("XYZ")}
-        table["rays"] = np.bincount(np.asarray(s.point), used, minlength=s.points).astype(int)
-        return table
+        return result_tables.points(self)
 
     @functools.cached_property
     def residuals(self) -> dict[str, np.ndarray]:
         """One row an observation: kind, image, point, axis, v, sigma (a priori), r, w (Baarda),
         tau (Pope), mdb, external; image observations first, in the order they were given."""
-        s, data, found = self.problem.structure, self.problem.data, self.reliability
-        network = self.problem.network
-        images = np.array(network.images.id, dtype=object)
-        points = np.array(network.points.id, dtype=object)
-        cameras = np.array([c.id for c in network.cameras], dtype=object)
-        blank = lambda rows: np.full(rows, "", dtype=object)
-        back = self.problem.rays
-        image = np.asarray(s.image)[back]
-        point = np.asarray(s.point)[back]
-        parts = [
-            ("image", images[image], points[point], ("x", "y"), back,
-             found.residual.image, data.image_weight, found.redundancy.image, found.w.image),
-        ]  # fmt: skip
-        control = points[np.asarray(s.control)]
-        parts.append(("control", blank(len(control)), control, tuple("XYZ"), np.s_[:],
-                      found.residual.control, data.control_weight, found.redundancy.control,
-                      found.w.control))  # fmt: skip
-        exterior = images[np.asarray(s.exterior)]
-        parts.append(("prior", exterior, blank(len(exterior)), EXTERIOR, np.s_[:],
-                      found.residual.exterior, data.exterior_weight, found.redundancy.exterior,
-                      found.w.exterior))  # fmt: skip
-        for row, c in enumerate(np.asarray(s.interior)):
-            axes = get_model(network.cameras[c].model).parameters
-            one = np.s_[row : row + 1, : len(axes)]
-            parts.append(("prior", cameras[[c]], blank(1), axes, np.s_[:],
-                          found.residual.interior[one], data.interior_weight[one],
-                          found.redundancy.interior[one], found.w.interior[one]))  # fmt: skip
-        a, b = (points[np.asarray(s.distance)[:, i]] for i in range(2))
-        parts.append(("distance", a, b, ("d",), np.s_[:], found.residual.distance[:, None],
-                      data.distance_weight[:, None], found.redundancy.distance[:, None],
-                      found.w.distance[:, None]))  # fmt: skip
-        return _concatenate([_residual_rows(self, *part) for part in parts])
+        return result_tables.residuals(self)
 
     def table(self, name: str) -> dict[str, np.ndarray]:
         """A table by name: images, points, residuals, cameras (one row a parameter) or checks."""
         if name == "cameras":
-            rows = [
-                {"camera": camera, "model": given["model"], "parameter": parameter, **entry}
-                for camera, given in self.cameras.items()
-                for parameter, entry in given["parameters"].items()
-            ]
-            return {key: np.array([row[key] for row in rows], dtype=object) for key in rows[0]}
+            return result_tables.parameters(self)
         if name == "checks":
-            found = self.check_points
-            if found is None:
-                return {}
-            sigma = self.sigma0 * np.sqrt(np.diagonal(found.cofactor, axis1=1, axis2=2))
-            table = {"id": np.array(found.id, dtype=object)}
-            table |= {axis: found.position[:, i] for i, axis in enumerate("XYZ")}
-            table |= {f"d{axis}": found.difference[:, i] for i, axis in enumerate("XYZ")}
-            table |= {f"s{axis}": sigma[:, i] for i, axis in enumerate("XYZ")}
-            return table | {"rays": found.rays}
+            return result_tables.checks(self)
         if name not in ("images", "points", "residuals"):
             raise KeyError(f"tables are cameras, images, points, residuals, checks; not {name!r}")
         return getattr(self, name)
@@ -519,51 +415,17 @@ def _place(name: str, names: Sequence[str], thing: str) -> int:
     return names.index(name)
 
 
-def _angles(rotation, d_theta):
-    return omega_phi_kappa_from_matrix(
-        matrix_from_quaternion(retract_quaternion(rotation, d_theta))
+def _angles_near(rotation, d_theta, given):
+    return omega_phi_kappa_near(
+        matrix_from_quaternion(retract_quaternion(rotation, d_theta)), given
     )
 
 
 @jax.jit
-def _all_angles(rotation):
-    """ω, φ, κ of all images, and their Jacobians by δθ."""
+def _all_angles(rotation, given):
+    """ω, φ, κ of all images near the given ones, and their Jacobians by δθ."""
     zero = jnp.zeros((rotation.shape[0], 3))
-    return jax.vmap(_angles)(rotation, zero), jax.vmap(jax.jacfwd(_angles, 1))(rotation, zero)
-
-
-def _residual_rows(adjustment, kind, image, point, axes, order, v, weight, r, w):
-    """The rows of one kind of observation [things × axes] as columns; weightless rows left out."""
-    v, weight, r, w = (np.asarray(x)[order] for x in (v, weight, r, w))
-    if kind == "prior" and axes == EXTERIOR:
-        unit = np.array([1, 1, 1, *[adjustment.angle_scale] * 3])
-    else:
-        unit = np.ones(weight.shape[1])
-    used = weight > 0
-    sigma = np.where(used, unit / np.where(used, weight, 1), np.nan)
-    repeat = lambda ids: np.repeat(ids, len(axes))
-    columns = {
-        "kind": np.full(weight.size, kind, dtype=object),
-        "image": repeat(image),
-        "point": repeat(point),
-        "axis": np.tile(np.array(axes, dtype=object), len(image)),
-        "v": (v * sigma).ravel(),
-        "sigma": sigma.ravel(),
-        "r": r.ravel(),
-        "w": w.ravel(),
-        "tau": adjustment.pope(w).ravel(),
-        "mdb": np.asarray(minimal_detectable(sigma, r)).ravel(),
-        "external": np.asarray(external_reliability(r)).ravel(),
-    }
-    return {name: column[used.ravel()] for name, column in columns.items()}
-
-
-def _significance(value: float, sigma: float) -> float:
-    """t = |value|/σ; where σ is 0, as after an exact fit, infinite, or NaN for the value 0."""
-    if sigma == 0:
-        return float("inf") if value else float("nan")
-    return abs(value) / float(sigma)
-
-
-def _concatenate(tables):
-    return {name: np.concatenate([t[name] for t in tables]) for name in tables[0]}
+    return (
+        jax.vmap(_angles_near)(rotation, zero, given),
+        jax.vmap(jax.jacfwd(_angles_near, 1))(rotation, zero, given),
+    )

@@ -1,4 +1,4 @@
-"""The indoor calibration of seed 002, re-simulated: the precision BINGO 5.5 printed in 2009."""
+"""The indoor calibration of a video camera, re-simulated: the precision BINGO 5.5 printed."""
 
 from pathlib import Path
 

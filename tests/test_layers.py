@@ -20,6 +20,7 @@ LAYERS = (
     "gradients",
     "plotting",
     "report",
+    "result_tables",
     "result",
     "bundle",
     "batches",

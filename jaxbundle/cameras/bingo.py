@@ -8,14 +8,15 @@ x, y are measured from the image ORIGIN, not from the principal point: dr is the
 measurement, so it is taken off. F, the format factor, places the zero of dr at R = 100/F. It is a
 convention, never an unknown. dr/R is written without the division, finite at R = 0.
 
-Units: the image unit of the files (in the listings of seed 002, 1 unit = 10 px); p25 and p26 in
+Units: the image unit of the files (in the listings named below, 1 unit = 10 px); p25 and p26 in
 the same unit, listed by the program in 1/1000 of it.
 
-Source: the radial tables of the BINGO 5.5 listings (2008) in seed 002, all eight of which the
-formula reproduces; the normalising constants S25 and S26 were fitted to them. The sign follows from
-the listed correlations of the parameters, c with 25 −69 %, 26 with 25 −13 %: a simulation of that
-network gives −71 and −13 with this sign, +73 and −48 with the other. Parameter 17, which occurs in
-the listings, is not published there and not offered here.
+Source: the eight radial tables of the BINGO 5.5 listings printed by Repanšek (2009, Kalibracija
+videokamere za uporabo v mobilnem kartirnem sistemu), all of which the formula reproduces; the
+normalising constants S25 and S26 were fitted to them. The sign follows from the listed correlations
+of the parameters, c with 25 −69 %, 26 with 25 −13 %: a simulation of that network gives −71 and −13
+with this sign, +73 and −48 with the other. Parameter 17, which occurs in the listings, is not
+published there and not offered here.
 """
 
 import jax.numpy as jnp

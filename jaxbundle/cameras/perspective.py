@@ -3,7 +3,7 @@
     xi = −c·r/q,  yi = −c·s/q                       mm, y up
     xi = fx·X/Z,  yi = fy·Y/Z                       px, v down, [X, Y, Z] = [r, −s, −q]
 
-Source: seed 000, eq. 2.8 ff.; Kraus (2007), Photogrammetry, section 2.1.
+Source: Kraus (2007), Photogrammetry, section 2.1.
 """
 
 import jax.numpy as jnp

@@ -12,7 +12,7 @@ while its coefficients are those of the CORRECTION, as here.
 Units: mm; K_i in mm^−2i, P1 and P2 in 1/mm, P3 in mm⁻², P4 in mm⁻⁴.
 
 Source: Light (1992), The new camera calibration system at the U.S. Geological Survey, PE&RS 58(2);
-the figures of the report of 16 June 2005 in seed 003 follow.
+the figures of a Report of Calibration of 16 June 2005 follow.
 """
 
 from . import brown, perspective

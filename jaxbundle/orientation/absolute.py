@@ -19,6 +19,7 @@ from jaxbundle.geometry import (
     transform_point,
 )
 
+from .least_squares import inverse
 from .linear import extent, normalisation, ones_unless
 from .status import Status, first_of
 
@@ -65,7 +66,7 @@ def absolute_orientation(
     N = jnp.where(line, jnp.eye(7, dtype=J.dtype), J.T @ J)
     v = computed(tau) - target
     return AbsoluteOrientation(
-        tau, v, jnp.sum(p[:, None] * v * v), jnp.where(line, jnp.inf, _inverse(N)),
+        tau, v, jnp.sum(p[:, None] * v * v), jnp.where(line, jnp.inf, inverse(N)),
         first_of((line, Status.COLLINEAR_POINTS)),
     )  # fmt: skip
 
@@ -87,8 +88,3 @@ def rotation_between(
 
 def _on_a_line(points, weights):
     return extent(points, weights)[1] < LINE
-
-
-def _inverse(N):
-    scale = 1 / jnp.sqrt(jnp.diag(N))
-    return jnp.linalg.inv(N * scale * scale[:, None]) * scale * scale[:, None]

@@ -85,8 +85,7 @@ def finish(residuals: Callable, retract: Callable, estimate, data: tuple, unknow
     rounding = 1e-22 * jnp.sum(diagonal)
     good = stop_gradient(square(retract(x, step)) <= 1.001 * square(x) + rounding)
     x = retract(x, jnp.where(good, step, 0))
-    eye = jnp.eye(unknowns, dtype=N.dtype)
-    cofactor = jnp.where(determined, _solve(N, eye), jnp.inf)
+    cofactor = jnp.where(determined, inverse(N), jnp.inf)
     return Fit(x, square(x), cofactor, weakest)
 
 
@@ -100,6 +99,11 @@ def normal_equations(residuals, retract, x, data, unknowns):
     zero = jnp.zeros(unknowns, jax.tree.leaves(x)[0].dtype)
     J, v = jax.jacfwd(twice, has_aux=True)(zero)
     return J.T @ J, J.T @ v
+
+
+def inverse(N: Float[Array, "u u"]) -> Float[Array, "u u"]:
+    """N⁻¹ of a positive definite N; not finite of another."""
+    return _solve(N, jnp.eye(N.shape[0], dtype=N.dtype))
 
 
 def _solve(N, g):

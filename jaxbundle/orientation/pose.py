@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
+from jaxbundle.cameras.perspective import ideal
 from jaxbundle.geometry import matrix_from_rotation_vector
 
 
@@ -28,8 +29,7 @@ def to_camera(pose: Pose, X: Float[Array, "3"]) -> Float[Array, "3"]:
 
 def image_of(pose: Pose, X: Float[Array, "3"]) -> Float[Array, "2"]:
     """(x, y) of a point by the collinearity equations (Kraus, 2007, section 4.1), c = 1."""
-    r, s, q = to_camera(pose, X)
-    return jnp.stack([-r / q, -s / q])
+    return jnp.stack(ideal((1.0,), *to_camera(pose, X)))
 
 
 def ray_of(xy: Float[Array, "2"]) -> Float[Array, "3"]:

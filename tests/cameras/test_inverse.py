@@ -71,7 +71,7 @@ def test_second_derivatives_against_finite_differences():
     assert_allclose(jnp.moveaxis(numerical, 1, -1), hessian, atol=1e-8)
 
 
-THESIS = Case(  # seed 000, all ten parameters; its measured points lie within 12 mm
+THESIS = Case(  # examples/convergent4, all ten parameters; its measured points lie within 12 mm
     "brown",
     dict(c=18.528014315, x0=0.2834298, y0=0.02675643, K1=2.2723256e-4, K2=2.4496753e-6,
          K3=-3.4431701e-8, P1=3.5647508e-5, P2=-3.6367571e-5, b1=-1.5800064e-3, b2=2.7737157e-4,

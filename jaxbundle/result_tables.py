@@ -1,0 +1,177 @@
+"""The tables of a result: an `Adjustment` in, columns by name out.
+
+σ are a posteriori, angles in the network's unit; the tables of one kind of thing are one function.
+"""
+
+import numpy as np
+
+from jaxbundle.cameras import get_model
+from jaxbundle.network.tables import EXTERIOR
+from jaxbundle.statistics import (
+    correlation_matrix,
+    external_reliability,
+    minimal_detectable,
+    total_correlation,
+)
+
+
+def cameras(adjustment) -> dict[str, dict]:
+    """Per camera: model, and per parameter value, sigma, free, t, total_correlation; and the
+    correlation matrix of the free ones."""
+    tables = {}
+    for given in adjustment.problem.network.cameras:
+        values = adjustment.camera_parameters(given.id)
+        free, Q = adjustment.camera_cofactor(given.id)
+        sigma = dict(zip(free, adjustment.sigma0 * np.sqrt(np.diagonal(Q))))
+        total = dict(zip(free, total_correlation(Q))) if free else {}
+        tables[given.id] = {
+            "model": given.model,
+            "parameters": {
+                name: {
+                    "value": value,
+                    "sigma": float(sigma[name]) if name in sigma else None,
+                    "free": name in sigma,
+                    "t": _significance(value, sigma[name]) if name in sigma else None,
+                    "total_correlation": float(total[name]) if name in sigma else None,
+                }
+                for name, value in values.items()
+            },
+            "free": free,
+            "correlations": correlation_matrix(Q),
+        }
+    return tables
+
+
+def parameters(adjustment) -> dict[str, np.ndarray]:
+    """The parameters of all cameras, one row each."""
+    rows = [
+        {"camera": camera, "model": given["model"], "parameter": parameter, **entry}
+        for camera, given in adjustment.cameras.items()
+        for parameter, entry in given["parameters"].items()
+    ]
+    return {key: np.array([row[key] for row in rows], dtype=object) for key in rows[0]}
+
+
+def images(adjustment) -> dict[str, np.ndarray]:
+    """Columns id, X0 … kappa, sX0 … skappa (angles in the network's unit), rays, rms (of v,
+    image unit)."""
+    s = adjustment.problem.structure
+    scale = np.array([1, 1, 1, *[adjustment.angle_scale] * 3])
+    values = adjustment.image_values * scale
+    sigma = np.sqrt(np.clip(np.diagonal(adjustment.image_covariance, axis1=1, axis2=2), 0, None))
+    sigma = sigma * scale
+    image = np.asarray(s.image)
+    weight = np.asarray(adjustment.problem.data.image_weight)
+    used = weight > 0
+    v = np.asarray(adjustment.reliability.residual.image) / np.where(used, weight, 1.0)
+    squares = np.bincount(image, (v**2 * used).sum(1), minlength=s.images)
+    number = np.bincount(image, used.sum(1), minlength=s.images)
+    table = {"id": np.array(adjustment.problem.network.images.id, dtype=object)}
+    table |= {name: values[:, i] for i, name in enumerate(EXTERIOR)}
+    table |= {f"s{name}": sigma[:, i] for i, name in enumerate(EXTERIOR)}
+    table["rays"] = np.bincount(image, used.any(1), minlength=s.images).astype(int)
+    table["rms"] = np.sqrt(squares / np.maximum(number, 1))
+    return table
+
+
+def points(adjustment) -> dict[str, np.ndarray]:
+    """Columns id, role, X, Y, Z, sX, sY, sZ, rays."""
+    network, s = adjustment.problem.network, adjustment.problem.structure
+    sigma = np.sqrt(np.clip(np.diagonal(adjustment.point_covariance, axis1=1, axis2=2), 0, None))
+    used = (np.asarray(adjustment.problem.data.image_weight) > 0).any(1)
+    table = {
+        "id": np.array(network.points.id, dtype=object),
+        "role": np.array(network.points.role, dtype=object),
+    }
+    table |= {axis: adjustment.point_values[:, i] for i, axis in enumerate("XYZ")}
+    table |= {f"s{axis}": sigma[:, i] for i, axis in enumerate("XYZ")}
+    table["rays"] = np.bincount(np.asarray(s.point), used, minlength=s.points).astype(int)
+    return table
+
+
+def residuals(adjustment) -> dict[str, np.ndarray]:
+    """One row an observation: kind, image, point, axis, v, sigma (a priori), r, w (Baarda),
+    tau (Pope), mdb, external; image observations first, in the order they were given."""
+    s, data, found = adjustment.problem.structure, adjustment.problem.data, adjustment.reliability
+    network = adjustment.problem.network
+    images = np.array(network.images.id, dtype=object)
+    points = np.array(network.points.id, dtype=object)
+    cameras = np.array([c.id for c in network.cameras], dtype=object)
+    blank = lambda rows: np.full(rows, "", dtype=object)
+    back = adjustment.problem.rays
+    image = np.asarray(s.image)[back]
+    point = np.asarray(s.point)[back]
+    parts = [
+        ("image", images[image], points[point], ("x", "y"), back,
+         found.residual.image, data.image_weight, found.redundancy.image, found.w.image),
+    ]  # fmt: skip
+    control = points[np.asarray(s.control)]
+    parts.append(("control", blank(len(control)), control, tuple("XYZ"), np.s_[:],
+                  found.residual.control, data.control_weight, found.redundancy.control,
+                  found.w.control))  # fmt: skip
+    exterior = images[np.asarray(s.exterior)]
+    parts.append(("prior", exterior, blank(len(exterior)), EXTERIOR, np.s_[:],
+                  found.residual.exterior, data.exterior_weight, found.redundancy.exterior,
+                  found.w.exterior))  # fmt: skip
+    for row, c in enumerate(np.asarray(s.interior)):
+        axes = get_model(network.cameras[c].model).parameters
+        one = np.s_[row : row + 1, : len(axes)]
+        parts.append(("prior", cameras[[c]], blank(1), axes, np.s_[:],
+                      found.residual.interior[one], data.interior_weight[one],
+                      found.redundancy.interior[one], found.w.interior[one]))  # fmt: skip
+    a, b = (points[np.asarray(s.distance)[:, i]] for i in range(2))
+    parts.append(("distance", a, b, ("d",), np.s_[:], found.residual.distance[:, None],
+                  data.distance_weight[:, None], found.redundancy.distance[:, None],
+                  found.w.distance[:, None]))  # fmt: skip
+    return _concatenate([_residual_rows(adjustment, *part) for part in parts])
+
+
+def checks(adjustment) -> dict[str, np.ndarray]:
+    """Of the check points, if there are any: columns id, X, Y, Z, dX, dY, dZ (against the given
+    coordinates), sX, sY, sZ, rays."""
+    found = adjustment.check_points
+    if found is None:
+        return {}
+    sigma = adjustment.sigma0 * np.sqrt(np.diagonal(found.cofactor, axis1=1, axis2=2))
+    table = {"id": np.array(found.id, dtype=object)}
+    table |= {axis: found.position[:, i] for i, axis in enumerate("XYZ")}
+    table |= {f"d{axis}": found.difference[:, i] for i, axis in enumerate("XYZ")}
+    table |= {f"s{axis}": sigma[:, i] for i, axis in enumerate("XYZ")}
+    return table | {"rays": found.rays}
+
+
+def _residual_rows(adjustment, kind, image, point, axes, order, v, weight, r, w):
+    """The rows of one kind of observation [things × axes] as columns; weightless rows left out."""
+    v, weight, r, w = (np.asarray(x)[order] for x in (v, weight, r, w))
+    if kind == "prior" and axes == EXTERIOR:
+        unit = np.array([1, 1, 1, *[adjustment.angle_scale] * 3])
+    else:
+        unit = np.ones(weight.shape[1])
+    used = weight > 0
+    sigma = np.where(used, unit / np.where(used, weight, 1), np.nan)
+    repeat = lambda ids: np.repeat(ids, len(axes))
+    columns = {
+        "kind": np.full(weight.size, kind, dtype=object),
+        "image": repeat(image),
+        "point": repeat(point),
+        "axis": np.tile(np.array(axes, dtype=object), len(image)),
+        "v": (v * sigma).ravel(),
+        "sigma": sigma.ravel(),
+        "r": r.ravel(),
+        "w": w.ravel(),
+        "tau": adjustment.pope(w).ravel(),
+        "mdb": np.asarray(minimal_detectable(sigma, r)).ravel(),
+        "external": np.asarray(external_reliability(r)).ravel(),
+    }
+    return {name: column[used.ravel()] for name, column in columns.items()}
+
+
+def _significance(value: float, sigma: float) -> float:
+    """t = |value|/σ; where σ is 0, as after an exact fit, infinite, or NaN for the value 0."""
+    if sigma == 0:
+        return float("inf") if value else float("nan")
+    return abs(value) / float(sigma)
+
+
+def _concatenate(tables):
+    return {name: np.concatenate([t[name] for t in tables]) for name in tables[0]}
