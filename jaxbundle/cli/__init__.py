@@ -1,0 +1,9 @@
+"""The command line, a file for each command.
+
+Exit status: 0 solved; 2 bad input (one line, nothing written); 3 not solved (says why).
+"""
+
+from jaxbundle.cli import adjust as adjust
+from jaxbundle.cli import batch as batch
+from jaxbundle.cli import convert as convert
+from jaxbundle.cli.app import main as main

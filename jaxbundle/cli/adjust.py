@@ -1,0 +1,96 @@
+"""`jaxbundle adjust`: adjust a network and report it."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import jaxbundle
+from jaxbundle import report
+from jaxbundle.cli.app import Format, Input, Quiet, Settings, app
+from jaxbundle.cli.progress import iterating
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.io import read_network
+from jaxbundle.network.columns import some
+from jaxbundle.network.reduction import REDUCTIONS
+from jaxbundle.result import Adjustment
+from jaxbundle.targets import check_targets, write_targets
+
+
+@app.command()
+def adjust(
+    input: Input,
+    json: Annotated[str, typer.Option(help="write the result as JSON; - for stdout alone")] = "",
+    out: Annotated[Path | None, typer.Option(help="folder for report, JSON, tables, plots")] = None,
+    set: Settings = None,
+    format: Format = None,
+    max_iterations: Annotated[int, typer.Option(min=1)] = 100,
+    method: Annotated[
+        str, typer.Option(help="levenberg-marquardt or gauss-newton")
+    ] = "levenberg-marquardt",
+    reduction: Annotated[
+        str | None,
+        typer.Option(help="of the reduced system: dense, banded or iterative; chosen if not given"),
+    ] = None,
+    snooping: Annotated[
+        str | None, typer.Option(help="remove blunders one at a time: pope or baarda")
+    ] = None,
+    significance: Annotated[
+        float, typer.Option(help="level of one test of data snooping, two-sided")
+    ] = 0.001,
+    eliminate: Annotated[
+        bool, typer.Option("--eliminate", help="fix insignificant additional parameters (t < 2)")
+    ] = False,
+    components: Annotated[
+        bool, typer.Option("--components", help="estimate variance components of the groups")
+    ] = False,
+    brief: Annotated[bool, typer.Option("--brief", help="no points and residuals in JSON")] = False,
+    quiet: Quiet = False,
+    plots: Annotated[bool, typer.Option(help="plots in the folder of --out")] = True,
+) -> None:
+    """Adjust a network and report it."""
+    jaxbundle.enable_x64()
+    jaxbundle.use_cores()
+    network = read_network(input, format, tuple(set or ()))
+    if method not in ("levenberg-marquardt", "gauss-newton"):
+        raise InputError(f"--method {method!r}: levenberg-marquardt or gauss-newton")
+    if reduction not in (None, *REDUCTIONS):
+        raise InputError(f"--reduction {reduction!r}: {', '.join(REDUCTIONS)}")
+    if snooping not in (None, "pope", "baarda"):
+        raise InputError(f"--snooping {snooping!r}: pope or baarda")
+    if not 0 < significance < 1:
+        raise InputError(f"--significance {significance:g}: a number between 0 and 1")
+    check_targets(input, network, json, out)
+    try:
+        with iterating(quiet or json == "-") as tell:
+            result = jaxbundle.adjust(
+                network,
+                method=method,
+                reduction=reduction,
+                max_iterations=max_iterations,
+                snooping=snooping,
+                significance=significance,
+                eliminate=eliminate,
+                estimate_components=components,
+                progress=tell,
+            )
+    except NotSolvedError as error:
+        write_targets(error, json, out, brief, plots)
+        raise
+    write_targets(result, json, out, brief, plots)
+    if json != "-" and not quiet and result.converged:
+        print(report.text(result))
+    if not result.converged:
+        raise NotSolvedError(_why_not(result))
+
+
+def _why_not(result: Adjustment) -> str:
+    parts = [f"not solved: {result.termination}"]
+    if result.undetermined:
+        parts.append(f"not determined: {some(result.undetermined, 12, str)}")
+        parts.append("fix them, give them a prior σ, or measure what determines them")
+    elif "limit" in result.termination:
+        parts.append("raise --max-iterations or give better start values")
+    else:
+        parts.append("give better start values and look for gross errors")
+    return "; ".join(parts)

@@ -1,0 +1,67 @@
+"""The application the commands are registered with, and how it ends."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import jaxbundle
+from jaxbundle.errors import InputError, NotSolvedError
+
+BAD_INPUT, NOT_SOLVED = 2, 3
+
+app = typer.Typer(
+    name="jaxbundle",
+    help="Least squares for photogrammetry: self-calibrating bundle adjustment.",
+    invoke_without_command=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+Input = Annotated[Path, typer.Argument(help="project .toml, text list of photographs, …")]
+Settings = Annotated[list[str] | None, typer.Option(help="KEY=VALUE replaces a setting")]
+Format = Annotated[str | None, typer.Option(help="kind of input, if not recognised")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="print nothing but errors")]
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        print(f"jaxbundle {jaxbundle.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _main(
+    context: typer.Context,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="print the version")
+    ] = False,
+) -> None:
+    """Every command has its own help: jaxbundle adjust --help."""
+    if context.invoked_subcommand is None:
+        print(context.get_help())
+        raise typer.Exit(BAD_INPUT)
+
+
+def main() -> None:
+    """Run the command line; errors of the input, the solution, the machine end in one line."""
+    try:
+        sys.exit(app(standalone_mode=False))
+    except (InputError, NotSolvedError) as error:
+        print(f"jaxbundle: {error}", file=sys.stderr)
+        sys.exit(BAD_INPUT if isinstance(error, InputError) else NOT_SOLVED)
+    except MemoryError:
+        print("jaxbundle: not enough memory for this network", file=sys.stderr)
+        sys.exit(NOT_SOLVED)
+    except (OSError, OverflowError, RecursionError) as error:
+        print(f"jaxbundle: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(BAD_INPUT)
+    except typer.Abort:
+        sys.exit(130)
+    except Exception as error:
+        # Usage errors of the command line itself (unknown option, missing argument).
+        if hasattr(error, "format_message"):
+            print(f"jaxbundle: {error.format_message()}", file=sys.stderr)
+            sys.exit(BAD_INPUT)
+        raise

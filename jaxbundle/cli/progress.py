@@ -1,0 +1,44 @@
+"""What long work shows on a terminal; nothing in a pipe."""
+
+from rich.console import Console
+from rich.progress import (
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+)
+
+
+def counting(quiet: bool) -> Progress:
+    """A bar with the number done of the number there is."""
+    console = Console(stderr=True)
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
+    return Progress(
+        *columns, console=console, transient=True, disable=quiet or not console.is_terminal
+    )
+
+
+class iterating:
+    """A line with the iteration and vᵀPv; as a context gives what adjustment tells, or None."""
+
+    def __init__(self, silent: bool):
+        self.console = Console(stderr=True)
+        self.silent = silent or not self.console.is_terminal
+
+    def __enter__(self):
+        if self.silent:
+            return None
+        self.bar = Progress(
+            SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn(),
+            console=self.console, transient=True,
+        )  # fmt: skip
+        self.bar.start()
+        task = self.bar.add_task("compiling")
+        return lambda step, cost, damping: self.bar.update(
+            task, description=f"iteration {int(step)}: vᵀPv {2 * float(cost):.6g}"
+        )
+
+    def __exit__(self, *_):
+        if not self.silent:
+            self.bar.stop()
