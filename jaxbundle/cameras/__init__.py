@@ -15,6 +15,8 @@ Batch them with `jax.vmap`. A model is a `CameraModel`, found by name:
 
 from .catalogue import MODEL_NAMES as MODEL_NAMES
 from .catalogue import get_model as get_model
+from .convert import Conversion as Conversion
+from .convert import convert_camera as convert_camera
 from .inverse import implicit_inverse as implicit_inverse
 from .model import CameraModel as CameraModel
 from .model import image_ray as image_ray
