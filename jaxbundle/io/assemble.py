@@ -1,18 +1,17 @@
 """Networks from what readers of other programs' files find, and the pieces writers need.
 
 The readers give rotation matrices and numbers; here they become tables, with the settings of the
-command line put in. Angles are ω, φ, κ, computed for many images at once.
+command line put in.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.cameras import default_parameters, get_model
-from jaxbundle.geometry import matrix_from_omega_phi_kappa, omega_phi_kappa_from_matrix
+from jaxbundle.io.poses import angles_of
 from jaxbundle.io.settings import SETTINGS, Document, apply_overrides, check_settings
 from jaxbundle.network.build import make_cameras, make_network
 from jaxbundle.network.columns import Columns
@@ -26,9 +25,6 @@ from jaxbundle.network.tables import (
     Points,
     Source,
 )
-
-AT_ONCE = 256
-"""Rotations computed together; all batches have this shape and share one compiled program."""
 
 
 def foreign_document(name: str, cameras: Sequence[Mapping], **project) -> Document:
@@ -97,30 +93,6 @@ def image_columns(
     values = np.concatenate([np.reshape(X0, (-1, 3)), angles_of(M)], 1)
     columns = {"id": ids, "camera": cameras, **dict(zip(EXTERIOR, values.T))}
     return Columns(columns, source)
-
-
-def angles_of(M: Float[np.ndarray, "images 3 3"]) -> Float[np.ndarray, "images 3"]:
-    """ω, φ, κ in radians of rotation matrices."""
-    return _batched(_angles, np.reshape(M, (-1, 3, 3)), (3,))
-
-
-def matrices_of(angles: Float[np.ndarray, "images 3"]) -> Float[np.ndarray, "images 3 3"]:
-    """M of ω, φ, κ in radians."""
-    return _batched(_matrices, np.reshape(angles, (-1, 3)), (3, 3))
-
-
-_angles = jax.jit(jax.vmap(omega_phi_kappa_from_matrix))
-_matrices = jax.jit(jax.vmap(matrix_from_omega_phi_kappa))
-
-
-def _batched(function, rows, shape):
-    results = np.zeros((len(rows), *shape))
-    with jax.enable_x64(True):
-        for begin in range(0, len(rows), AT_ONCE):
-            part = rows[begin : begin + AT_ONCE]
-            batch = np.concatenate([part, np.zeros((AT_ONCE - len(part), *rows.shape[1:]))])
-            results[begin : begin + AT_ONCE] = function(batch)[: len(part)]
-    return results
 
 
 def all_parameters(camera: Camera) -> dict[str, float]:

@@ -20,12 +20,12 @@ import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
-from jaxbundle.geometry import matrix_from_rotation_vector, omega_phi_kappa_from_matrix
+from jaxbundle.geometry.pose_conventions import exterior_from_bundler
+from jaxbundle.io.poses import angles_of, matrices_of_rotation_vectors
 from jaxbundle.io.settings import SETTINGS, apply_overrides, check_settings
 from jaxbundle.network.build import make_cameras, make_network
 from jaxbundle.network.columns import Columns
@@ -149,14 +149,8 @@ def _not_a_number(path: Path, text: bytes) -> InputError:
 
 def _images(pose) -> dict:
     """Exterior orientation of the images from rotation vectors and shifts."""
-
-    def exterior(pose):
-        M = matrix_from_rotation_vector(pose[:3])
-        return -M.T @ pose[3:], omega_phi_kappa_from_matrix(M)
-
-    with jax.enable_x64(True):
-        centre, angles = jax.jit(jax.vmap(exterior))(pose)
-    columns = np.concatenate([centre, angles], 1).T
+    M, centre = exterior_from_bundler(matrices_of_rotation_vectors(pose[:, :3]), pose[:, 3:])
+    columns = np.concatenate([centre, angles_of(M)], 1).T
     ids = np.arange(len(pose))
     return {"id": ids, "camera": ids, **dict(zip(EXTERIOR, columns))}
 
