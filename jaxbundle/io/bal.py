@@ -24,8 +24,16 @@ import numpy as np
 
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
-from jaxbundle.geometry.pose_conventions import exterior_from_bundler
-from jaxbundle.io.poses import angles_of, matrices_of_rotation_vectors
+from jaxbundle.geometry.pose_conventions import bundler_pose, exterior_from_bundler
+from jaxbundle.io.assemble import all_parameters
+from jaxbundle.io.csv_tables import write_bytes
+from jaxbundle.io.losses import need_values, what_is_lost
+from jaxbundle.io.poses import (
+    angles_of,
+    matrices_of,
+    matrices_of_rotation_vectors,
+    rotation_vectors_of,
+)
 from jaxbundle.io.settings import SETTINGS, apply_overrides, check_settings
 from jaxbundle.network.build import make_cameras, make_network
 from jaxbundle.network.columns import Columns
@@ -98,6 +106,35 @@ def read_bal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         ),
         **project,
     )  # fmt: skip
+
+
+def write_bal(network: Network, path: str | Path) -> tuple[str, ...]:
+    """Write a network as a problem, compressed if the name ends in .gz or .bz2.
+
+    Its cameras must be of model `snavely`. Images that share a camera each get a copy of it.
+
+    **Returns:** what the format has no place for, in words.
+    """
+    path = Path(path)
+    images, points, rays = network.images, network.points, network.observations
+    need_values(network, "snavely", "BAL")
+    R, t = bundler_pose(matrices_of(images.angles), images.position)
+    given = np.array([[*all_parameters(c).values()] for c in network.cameras])[images.camera]
+    cameras = np.concatenate([rotation_vectors_of(R), t, given], 1)
+    lines = [f"{len(images)} {len(points)} {len(rays)}"]
+    lines += [
+        f"{image} {point} {x!r} {y!r}"
+        for image, point, (x, y) in zip(rays.image.tolist(), rays.point.tolist(), rays.xy.tolist())
+    ]
+    lines += map(repr, [*cameras.ravel().tolist(), *points.position.ravel().tolist()])
+    text = ("\n".join(lines) + "\n").encode()
+    match path.suffix.lower():
+        case ".gz":
+            text = gzip.compress(text, mtime=0)
+        case ".bz2":
+            text = bz2.compress(text)
+    write_bytes(path, text)
+    return what_is_lost(network, shared_cameras=True, names=True)
 
 
 def _are_counts(words: Sequence[bytes]) -> bool:

@@ -17,6 +17,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import cv_pose, exterior_from_cv
 from jaxbundle.io.assemble import assemble, foreign_document, image_columns
 from jaxbundle.io.colmap_models import HALF, to_colmap
+from jaxbundle.io.losses import need_values, what_is_lost
 from jaxbundle.io.poses import matrices_of, matrices_of_quaternions, quaternions_of
 from jaxbundle.network.columns import Columns, count, some
 from jaxbundle.network.tables import Camera, Network, Source
@@ -143,12 +144,7 @@ def from_network(network: Network) -> tuple[ColmapModel, tuple[str, ...]]:
     cameras = dict(zip(_numbers([c.id for c in network.cameras]), network.cameras))
     for camera in cameras.values():
         to_colmap(camera)
-    for table, values, thing in ((images, images.position, "image"), (images, images.angles,
-                                 "image"), (points, points.position, "point")):  # fmt: skip
-        for row, *_ in np.argwhere(~np.isfinite(values))[:1]:
-            raise InputError(
-                f"{table.source(row)}: {thing} {table.id[row]!r} has no orientation or coordinates"
-            )
+    need_values(network)
     R, t = cv_pose(matrices_of(images.angles), images.position)
     q = quaternions_of(R)
     camera_numbers = list(cameras)
@@ -163,14 +159,10 @@ def from_network(network: Network) -> tuple[ColmapModel, tuple[str, ...]]:
         ))  # fmt: skip
         if any(character.isspace() for character in images.id[i]):
             raise InputError(f"image {images.id[i]!r}: COLMAP's names have no blanks; rename it")
-    lost = []
-    if not points.has_role("tie").all():
-        lost.append("roles and σ of control, fixed and check points")
-    if len(network.distances):
-        lost.append("distances")
+    lost = what_is_lost(network)
     if list(point_numbers.astype(str)) != list(points.id):
-        lost.append("names of points, which are numbered from 1")
-    return ColmapModel(cameras, made, point_numbers, points.position, points.source), tuple(lost)
+        lost = (*lost, "names of points, which are numbered from 1")
+    return ColmapModel(cameras, made, point_numbers, points.position, points.source), lost
 
 
 def _numbers(ids: Sequence[str]) -> list[int]:

@@ -15,8 +15,8 @@ from jaxbundle.network.columns import Columns
 from jaxbundle.network.tables import Source
 
 
-def read_text(path: Path) -> str:
-    """The text of a file.
+def read_text(path: Path, fallback: str = "") -> str:
+    """The text of a file; `fallback` is the encoding of what is not UTF-8.
 
     **Raises:** `InputError` if there is none, it cannot be read, or it is not UTF-8.
     """
@@ -27,6 +27,8 @@ def read_text(path: Path) -> str:
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:
+        if fallback:
+            return error.object.decode(fallback)
         line = error.object[: error.start].count(b"\n") + 1
         raise InputError(
             f"{path}, line {line}: not UTF-8 text; save the file as UTF-8"

@@ -75,16 +75,17 @@ class Rows:
     """The lines of a file one after the other.
 
     **Arguments:** `comment` begins lines that do not count; `blank` whether empty lines count;
-    `separator` of the words, blanks if None.
+    `separator` of the words, blanks if None; `fallback` the encoding of what is not UTF-8.
     """
 
     def __init__(
-        self, path: Path, comment: str = "", blank: bool = False, separator: str | None = None
-    ):
+        self, path: Path, comment: str = "", blank: bool = False, separator: str | None = None,
+        fallback: str = "",
+    ):  # fmt: skip
         self.path = path
         self.lines = [
             (number, line)
-            for number, line in enumerate(read_text(path).splitlines(), 1)
+            for number, line in enumerate(read_text(path, fallback).splitlines(), 1)
             if (blank or line.strip()) and not (comment and line.lstrip().startswith(comment))
         ]
         self.separator = separator
