@@ -18,6 +18,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.network.tables import Camera, Network, Observations
 
+SIZES = ("image_size", "pixel_size")
 COUNTERPARTS = (
     ("c", "f", "fx", "fy"), ("x0", "cx"), ("y0", "cy"), ("K1", "k1"), ("K2", "k2"), ("K3", "k3"),
     ("P1", "P2", "p1", "p2"),
@@ -26,12 +27,13 @@ COUNTERPARTS = (
 
 
 def convert_cameras(
-    network: Network, model: str, r0: float = 0.0, only: Sequence[str] | None = None
-) -> tuple[Network, dict[str, Conversion]]:
+    network: Network, model: str, r0: float = 0.0, only: Sequence[str] | None = None,
+    measured: bool = False,
+) -> tuple[Network, dict[str, Conversion]]:  # fmt: skip
     """The network with all cameras, or `only` some, in the model of this name.
 
-    **Arguments:** `r0` of the target, mm, where it has one. The area a fit looks at is the image,
-    or what the measurements cover, if the camera has no image size.
+    **Arguments:** `r0` of the target, mm, where it has one; `measured`: a fit looks at the area the
+    measurements cover, as it does where the camera has no image size, and not at the whole image.
 
     **Returns:** the network, and by camera what its conversion cost.
 
@@ -48,7 +50,7 @@ def convert_cameras(
             cameras.append(camera)
             continue
         mine = of_ray == c
-        made, conversion, shift, step = _converted(camera, model, r0, xy[mine])
+        made, conversion, shift, step = _converted(camera, model, r0, xy[mine], measured)
         xy[mine], sigma[mine] = shift + step * xy[mine], np.abs(step) * sigma[mine]
         cameras.append(made)
         done[camera.id] = conversion
@@ -73,7 +75,7 @@ def convert_one(camera: Camera, model: str, r0: float = 0.0) -> tuple[Camera, Co
     return made, conversion
 
 
-def _converted(camera: Camera, model: str, r0: float, xy):
+def _converted(camera: Camera, model: str, r0: float, xy, measured: bool = False):
     """The camera, the conversion, and shift and step of its image points."""
     source, target = get_model(camera.model), get_model(model)
     sizes = camera.image_size, camera.pixel_size
@@ -81,7 +83,7 @@ def _converted(camera: Camera, model: str, r0: float, xy):
     if model == "snavely" and camera.model != "bingo":
         parameters, centre, sizes = _centred(camera)
     area = None
-    if len(xy) and camera.image_size is None:
+    if len(xy) and (measured or camera.image_size is None):
         area = xy.min(0) - centre, xy.max(0) - centre
     try:
         conversion = convert_camera(
@@ -89,7 +91,9 @@ def _converted(camera: Camera, model: str, r0: float, xy):
         )
         shift, step = between_frames(source, target, *sizes)
     except ValueError as error:
-        raise InputError(f"camera {camera.id!r}: {error}") from None
+        size = next((name for name in SIZES if str(error).startswith(name)), None)
+        remedy = f"; give --set camera.{camera.id}.{size}=WIDTH,HEIGHT" if size else ""
+        raise InputError(f"camera {camera.id!r}: {error}{remedy}") from None
     made = dataclasses.replace(
         camera, model=model, parameters=conversion.parameters, sigma={},
         free=_counterparts(camera.free, target.parameters),
