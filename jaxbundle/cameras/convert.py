@@ -81,7 +81,7 @@ def convert_camera(
     values = {**default_parameters(source), **parameters}
     sizes = (image_size, pixel_size)
     shift, step = between_frames(source, target, *sizes)
-    xy = image_grid(*(area or _image_area(source, *sizes)))
+    xy = image_grid(*(area or image_area(source, *sizes)))
     rays = rays_of(source, values, xy)
     # beyond the radius where a correction turns back, its rays belong to other points
     there = np.abs(images_of(source, values, rays) - xy).max(1) < SAME_POINT * np.ptp(xy)
@@ -111,7 +111,7 @@ def convert_camera(
     )  # fmt: skip
 
 
-def _image_area(source: CameraModel, image_size, pixel_size) -> Area:
+def image_area(source: CameraModel, image_size, pixel_size) -> Area:
     """The corners of the whole image, in the model's coordinates."""
     if image_size is None:
         raise ValueError("image_size is needed to know the area of the image")

@@ -6,6 +6,7 @@ them. `save_figures` writes all of them as PNG files without touching pyplot.
 
 from jaxbundle.plotting.cameras import correlation_matrix as correlation_matrix
 from jaxbundle.plotting.cameras import distortion_curve as distortion_curve
+from jaxbundle.plotting.comparison import difference_map as difference_map
 from jaxbundle.plotting.distortion import DistortionProfile as DistortionProfile
 from jaxbundle.plotting.distortion import distortion_profile as distortion_profile
 from jaxbundle.plotting.files import save_figures as save_figures
