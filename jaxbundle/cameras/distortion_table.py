@@ -17,6 +17,8 @@ from .model import CameraModel
 from .parameters import default_parameters
 
 AZIMUTHS = 12
+ROUNDING = 1e-13
+"""Distortion below this fraction of an image coordinate is noise of the arithmetic."""
 
 
 def distortion_table(
@@ -52,7 +54,9 @@ def distortion_table(
     radial = (d * out).sum(2).mean(1)
     tangential = d[..., 1] * out[:, 0] - d[..., 0] * out[:, 1]
     decentring = 2 * np.abs((tangential * np.exp(-1j * azimuth)).mean(1))
-    return {"r": radius, "radial": radial, "decentring": decentring}
+    noise = ROUNDING * (np.abs(begin).max() + radius)
+    without = lambda d: np.where(np.abs(d) < noise, 0.0, d)
+    return {"r": radius, "radial": without(radial), "decentring": without(decentring)}
 
 
 def _principal_point(values: Mapping[str, float]):

@@ -10,12 +10,10 @@ import jaxbundle
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.compare import compare_cameras, difference_rings
 from jaxbundle.cli.app import app
+from jaxbundle.cli.cameras_given import camera_given, pair
 from jaxbundle.errors import InputError
-from jaxbundle.io import read_network
 from jaxbundle.io.assemble import all_parameters
-from jaxbundle.io.camera_files import chosen_camera, is_camera_file, read_cameras
 from jaxbundle.io.csv_tables import write_bytes, write_csv
-from jaxbundle.network.tables import Camera
 
 RINGS = 10
 
@@ -36,9 +34,9 @@ def compare(
 ) -> None:
     """Compare two calibrations: parameters, and how far images are apart over the image."""
     jaxbundle.enable_x64()
-    first, second = _camera(a), _camera(b)
-    size = _pair("--image-size", image_size) or first.image_size or second.image_size
-    pitch = _pair("--pixel-size", pixel_size) or first.pixel_size or second.pixel_size
+    first, second = camera_given(a), camera_given(b)
+    size = pair("--image-size", image_size) or first.image_size or second.image_size
+    pitch = pair("--pixel-size", pixel_size) or first.pixel_size or second.pixel_size
     try:
         found = compare_cameras(
             (get_model(first.model), first.parameters), (get_model(second.model),
@@ -66,25 +64,6 @@ def compare(
         write_csv(csv, list(rings), zip(*(column.tolist() for column in rings.values())))
     if plot is not None:
         write_bytes(plot, _png(found))
-
-
-def _camera(text: str) -> Camera:
-    file, mark, id = text.rpartition("#")
-    if not mark or Path(text).exists():
-        file, id = text, None
-    path = Path(file)
-    cameras = read_cameras(path) if is_camera_file(path) else read_network(path).cameras
-    return chosen_camera(cameras, id, f"{file} (FILE#ID)")
-
-
-def _pair(option: str, text: str) -> tuple[float, float] | None:
-    if not text:
-        return None
-    try:
-        first, second = (float(word) for word in text.split(","))
-    except ValueError:
-        raise InputError(f"{option} {text}: two numbers W,H are expected") from None
-    return first, second
 
 
 def _png(found) -> bytes:

@@ -9,6 +9,7 @@ import typer
 import jaxbundle
 from jaxbundle.cameras.field_of_view import angle_class, equivalent_35mm, field_of_view
 from jaxbundle.cli.app import app
+from jaxbundle.cli.cameras_given import pair
 from jaxbundle.errors import InputError
 from jaxbundle.io import write_project
 from jaxbundle.network.planned_block import planned_network
@@ -35,7 +36,7 @@ def plan(
 ) -> None:
     """Design a block of vertical photographs: strips, photographs, and expected precision."""
     jaxbundle.enable_x64()
-    image_format, extent = _pair("--image", image), _pair("--area", area)
+    image_format, extent = _needed("--image", image), _needed("--area", area)
     design = design_block(
         c, image_format, extent, sigma_image, height=height, scale_number=scale,
         pixel_on_ground=ground_pixel, pixel=pixel, forward_overlap=forward, side_overlap=side,
@@ -70,9 +71,8 @@ def plan(
         print(f"{name:22}{value}")
 
 
-def _pair(option: str, text: str) -> tuple[float, float]:
-    try:
-        first, second = (float(word) for word in text.replace("x", ",").split(","))
-    except ValueError:
-        raise InputError(f"{option} {text}: two numbers A,B are expected") from None
-    return first, second
+def _needed(option: str, text: str) -> tuple[float, float]:
+    found = pair(option, text)
+    if found is None:
+        raise InputError(f"{option}: two numbers A,B are expected")
+    return found
