@@ -114,3 +114,15 @@ def test_cut_off(tmp_path, share):
     for part in (cut, cut[: max(end, 0)]):
         with pytest.raises(InputError, match="export.txt"):
             read(tmp_path, part)
+
+
+def test_points_it_does_not_list_are_found_from_its_orientations(tmp_path):
+    from jaxbundle.orientation.network import orient
+
+    lines = export().splitlines()
+    net = read(tmp_path, "\n".join(line for line in lines if not line.startswith((" 3 ", " 8 "))))
+    lost = [net.points.id.index(id) for id in ("3", "8")]
+    assert np.isnan(net.points.position[lost]).all() and "'3', '8'" in net.warnings[-1]
+    found = orient(net).network
+    at = [found.points.id.index(id) for id in ("3", "8")]
+    assert_allclose(found.points.position[at], POINTS[[2, 7]], atol=1e-6)
