@@ -60,10 +60,12 @@ def test_the_video_cameras_are_those_printed():
     assert found == pytest.approx(printed, abs=6e-4)
 
 
-def test_camera_on_the_command_line(monkeypatch, capsys):
+def test_camera_on_the_command_line(monkeypatch, capsys, tmp_path):
+    plot, table = tmp_path / "curves.png", tmp_path / "table.csv"
     monkeypatch.setattr(
-        sys, "argv", ["jaxbundle", "camera", f"{CAMERAS}#1-indoor", "--step", "1", "--about-origin"]
-    )
+        sys, "argv", ["jaxbundle", "camera", f"{CAMERAS}#1-indoor", f"{CAMERAS}#1-outdoor",
+                      "--step", "1", "--about-origin", "--plot", str(plot), "--csv", str(table)]
+    )  # fmt: skip
     with pytest.raises(SystemExit) as ended:
         cli.main()
     said = capsys.readouterr().out
@@ -72,3 +74,5 @@ def test_camera_on_the_command_line(monkeypatch, capsys):
     assert "74.175°" in said
     row = next(line.split() for line in said.splitlines() if line.split()[:1] == ["1"])
     assert float(row[1]) == pytest.approx(0.065, abs=5e-4)
+    assert plot.read_bytes()[:4] == b"\x89PNG"
+    assert table.read_text().splitlines()[0] == "r,radial,decentring"

@@ -1,10 +1,12 @@
-"""Cameras as the command line is given them: FILE or FILE#ID."""
+"""What the commands about cameras share: FILE or FILE#ID, pairs of numbers, figures."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_network
 from jaxbundle.io.camera_files import chosen_camera, is_camera_file, read_cameras
+from jaxbundle.io.csv_tables import write_bytes
 from jaxbundle.network.tables import Camera
 
 
@@ -33,3 +35,16 @@ def pair(option: str, text: str) -> tuple[float, float] | None:
     except ValueError:
         raise InputError(f"{option} {text}: two numbers A,B are expected") from None
     return first, second
+
+
+def write_png(path: Path, size: tuple[float, float], draw: Callable) -> None:
+    """Write a figure; `draw` is given its axes.
+
+    **Raises:** `InputError` without matplotlib.
+    """
+    from jaxbundle.plotting.files import png
+
+    try:
+        write_bytes(path, png(size, None, draw))
+    except ImportError as error:
+        raise InputError(str(error)) from None

@@ -10,10 +10,10 @@ import jaxbundle
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.compare import compare_cameras, difference_rings
 from jaxbundle.cli.app import app
-from jaxbundle.cli.cameras_given import camera_given, pair
+from jaxbundle.cli.cameras_given import camera_given, pair, write_png
 from jaxbundle.errors import InputError
 from jaxbundle.io.assemble import all_parameters
-from jaxbundle.io.csv_tables import write_bytes, write_csv
+from jaxbundle.io.csv_tables import write_csv
 
 RINGS = 10
 
@@ -63,14 +63,6 @@ def compare(
     if csv is not None:
         write_csv(csv, list(rings), zip(*(column.tolist() for column in rings.values())))
     if plot is not None:
-        write_bytes(plot, _png(found))
+        from jaxbundle.plotting.calibrations import difference_map
 
-
-def _png(found) -> bytes:
-    from jaxbundle.plotting.comparison import difference_map
-    from jaxbundle.plotting.files import png
-
-    try:
-        return png((7.5, 6), None, lambda ax: difference_map(found, ax))
-    except ImportError as error:
-        raise InputError(str(error)) from None
+        write_png(plot, (7.5, 6), lambda ax: difference_map(found, ax))

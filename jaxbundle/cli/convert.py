@@ -7,6 +7,8 @@ from typing import Annotated
 import typer
 
 from jaxbundle.cli.app import Format, Input, Quiet, Settings, app
+from jaxbundle.cli.cameras_given import pair
+from jaxbundle.errors import InputError
 from jaxbundle.io.exchange import convert as convert_file
 
 
@@ -22,13 +24,21 @@ def convert(
     measured: Annotated[
         bool, typer.Option("--measured", help="fit models over what is measured, not the image")
     ] = False,
+    image_size: Annotated[str, typer.Option(help="W,H in pixels, of cameras without")] = "",
+    pixel_size: Annotated[str, typer.Option(help="W,H in mm, of cameras without")] = "",
     set: Settings = None,
     format: Format = None,
     quiet: Quiet = False,
 ) -> None:
     """Write any input in another format: project, COLMAP, BAL, Bundler, OpenCV, PLY, DXF, CSV."""
     overrides = tuple(set or ())
-    done = convert_file(input, output, to, model, camera, format, overrides, measured)
+    size = pair("--image-size", image_size)
+    if size is not None and not all(number.is_integer() for number in size):
+        raise InputError(f"--image-size {image_size}: whole numbers of pixels are expected")
+    done = convert_file(
+        input, output, to, model, camera, format, overrides, measured,
+        size and tuple(map(int, size)), pair("--pixel-size", pixel_size),
+    )  # fmt: skip
     if not quiet:
         print(str(done).split("\n", 1)[0])
         for line in str(done).splitlines()[1:]:

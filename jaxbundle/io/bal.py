@@ -90,6 +90,7 @@ def read_bal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     for camera in document["camera"] if free is not None else ():
         camera["free"] = free
     check_settings(project, f"{path}: ")
+    angle_unit = project.pop("angle_unit", "rad")
     return make_network(
         make_cameras(document["camera"], f"{path}, "),
         _table(path, "camera", _images(given[:, :6])),
@@ -105,7 +106,7 @@ def read_bal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             Source(str(path), np.arange(rows) + 2, "line"),
         ),
         **project,
-    )  # fmt: skip
+    ).replace(angle_unit=angle_unit)  # fmt: skip
 
 
 def write_bal(network: Network, path: str | Path) -> tuple[str, ...]:

@@ -23,6 +23,7 @@ from jaxbundle.io.opencv_file import SUFFIXES, write_opencv
 from jaxbundle.io.project import FILE_NAME
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.network.conversion import convert_cameras, convert_one
+from jaxbundle.network.rules import check_camera
 from jaxbundle.network.tables import Camera, Network
 
 CAMERA_KINDS = {"opencv": "NAME.yaml, .yml, .json", "cameras": "NAME.toml"}
@@ -55,6 +56,8 @@ def convert(
     format: str | None = None,
     overrides: Sequence[str] = (),
     measured: bool = False,
+    image_size: Sequence[float] | None = None,
+    pixel_size: Sequence[float] | None = None,
 ) -> Converted:
     """Write an input in another format.
 
@@ -67,6 +70,7 @@ def convert(
     - `camera`: which camera, where the output holds one.
     - `format`, `overrides`: of the input, as in `read_network`.
     - `measured`: what is fitted is fitted over the area of the measurements, not the whole image.
+    - `image_size` (pixels), `pixel_size` (mm): of all cameras that have none.
 
     **Raises:** `InputError`; nothing is written then.
     """
@@ -74,8 +78,10 @@ def convert(
     kind = _kind(output, to)
     _check_output(output, kind)
     if format is None and is_camera_file(input):
-        return _convert_cameras(input, read_cameras(input), output, kind, model, camera)
+        cameras = _sized(read_cameras(input), image_size, pixel_size)
+        return _convert_cameras(input, cameras, output, kind, model, camera)
     network = read_network(input, format, overrides)
+    network = network.replace(cameras=_sized(network.cameras, image_size, pixel_size))
     _keep_input(input, network, output, kind)
     if kind in CAMERA_KINDS:
         if model is not None and measured:
@@ -107,6 +113,21 @@ def _kind(output: Path, to: str | None) -> str:
         known = "; ".join(f"{name}: {looks}" for name, looks in kinds.items())
         raise InputError(f"{output}: what to write is not recognised; give --to or a name: {known}")
     return found
+
+
+def _sized(cameras: Sequence[Camera], image_size, pixel_size) -> tuple[Camera, ...]:
+    """The cameras, with sizes where they had none."""
+    given = {"image_size": image_size, "pixel_size": pixel_size}
+    made = tuple(
+        dataclasses.replace(camera, **{
+            name: tuple(size) for name, size in given.items()
+            if size is not None and getattr(camera, name) is None
+        })
+        for camera in cameras
+    )  # fmt: skip
+    for camera in made:
+        check_camera(camera)
+    return made
 
 
 def _check_output(output: Path, kind: str) -> None:

@@ -92,7 +92,7 @@ def _converted(camera: Camera, model: str, r0: float, xy, measured: bool = False
         shift, step = between_frames(source, target, *sizes)
     except ValueError as error:
         size = next((name for name in SIZES if str(error).startswith(name)), None)
-        remedy = f"; give --set camera.{camera.id}.{size}=WIDTH,HEIGHT" if size else ""
+        remedy = f"; give --{size.replace('_', '-')} WIDTH,HEIGHT" if size else ""
         raise InputError(f"camera {camera.id!r}: {error}{remedy}") from None
     made = dataclasses.replace(
         camera, model=model, parameters=conversion.parameters, sigma={},

@@ -132,3 +132,12 @@ def test_no_camera_is_oriented(tmp_path):
     path.write_text("# Bundle file v0.3\n0 0\n")
     with pytest.raises(InputError, match="no camera is oriented"):
         read_bundler(path)
+
+
+@pytest.mark.parametrize("read", [read_bal, read_bundler])
+def test_angles_are_shown_in_the_unit_asked_for_and_stay(tmp_path, read):
+    path = tmp_path / "p.out"
+    (write_bal if read is read_bal else write_bundler)(case(), path)
+    plain, gon = read(path), read(path, ["angle_unit=gon"])
+    assert gon.angle_unit == "gon"
+    assert_allclose(gon.images.angles, plain.images.angles)

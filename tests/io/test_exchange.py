@@ -62,6 +62,26 @@ def test_a_principal_point_is_no_hindrance(tmp_path, name):
     )
 
 
+def test_bundlers_cameras_need_an_image_size_to_become_colmaps(tmp_path):
+    from jaxbundle.io import write_bal
+
+    net = network("snavely", ("0", "1", "2"), 0)
+    write_bal(net, tmp_path / "p.txt")
+    with pytest.raises(InputError, match="image_size is needed.*give --image-size"):
+        convert(tmp_path / "p.txt", tmp_path / "colmap")
+    done = convert(tmp_path / "p.txt", tmp_path / "colmap", image_size=(1001, 801))
+    assert all(cost.exact for cost in done.conversions.values())
+    back = read_network(tmp_path / "colmap")
+    xy = net.observations.xy * [1, -1] + [500, 400]
+    np.testing.assert_allclose(back.observations.xy, xy, atol=1e-9)
+    convert(tmp_path / "colmap", tmp_path / "q.txt")
+    again = read_network(tmp_path / "q.txt")
+    np.testing.assert_allclose(again.observations.xy, net.observations.xy, atol=1e-9)
+    assert again.cameras[2].parameters == pytest.approx(net.cameras[0].parameters)
+    with pytest.raises(InputError, match="image_size"):
+        convert(tmp_path / "p.txt", tmp_path / "colmap", image_size=(-1, 5))
+
+
 def test_a_conversion_that_is_not_exact_must_be_asked_for(brown, tmp_path):
     out = tmp_path / "colmap"
     with pytest.raises(InputError, match="no model 'brown'.*largest.*px; give --model opencv"):
@@ -74,7 +94,9 @@ def test_a_conversion_that_is_not_exact_must_be_asked_for(brown, tmp_path):
     measured = convert(brown, out, model="opencv", measured=True).conversions["1"]
     assert measured.largest < cost.largest
     back = tmp_path / "back"
-    again = convert(out, back, model="brown", overrides=["camera.1.pixel_size=0.005,0.005"])
+    with pytest.raises(InputError, match="pixel_size is needed.*give --pixel-size WIDTH,HEIGHT"):
+        convert(out, back, model="brown")
+    again = convert(out, back, model="brown", pixel_size=(0.005, 0.005))
     before, after = network("brown", ("a", "b", "c")), read_network(back)
     limit = 0.005 * measured.largest + again.conversions["1"].largest
     for name, value in before.cameras[0].parameters.items():

@@ -1,9 +1,49 @@
-"""The difference of two calibrations as a map over the image."""
+"""Calibrations without an adjustment: their distortion curves, and the difference of two as a map.
+"""
+
+from collections.abc import Mapping
 
 import numpy as np
 
 from jaxbundle.cameras.compare import Comparison
-from jaxbundle.plotting.style import INK, axes, label, micrometres, quiet, round_number, title
+from jaxbundle.plotting.style import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    RUST,
+    axes,
+    label,
+    legend,
+    micrometres,
+    plain,
+    quiet,
+    round_number,
+    title,
+)
+
+COLOURS = (BLUE, RUST, GREEN, INK)
+
+
+def radial_curves(tables: Mapping[str, Mapping[str, np.ndarray]], unit: str, ax=None):
+    """Radial distortion of cameras over the radius; matplotlib axes.
+
+    **Arguments:** `tables` by name, as `jaxbundle.cameras.distortion_table` gives them, all in
+    `unit`.
+    """
+    ax = axes(ax, (6.5, 4.2))
+    factor, small = micrometres(unit)
+    for k, (name, table) in enumerate(tables.items()):
+        style = ("-", "--", ":")[k // len(COLOURS) % 3]
+        r, dr = (np.concatenate([[0.0], table[key]]) for key in ("r", "radial"))
+        ax.plot(r, factor * dr, style, color=COLOURS[k % len(COLOURS)], label=plain(name), lw=1.4)
+    ax.axhline(0, color=GREY, lw=0.8)
+    quiet(ax)
+    label(ax, "x", "radius in the measured image", unit)
+    label(ax, "y", "measured − ideal", small)
+    legend(ax)
+    title(ax, "Radial distortion")
+    return ax
 
 
 def difference_map(comparison: Comparison, ax=None, name: str = "Difference of two calibrations"):
