@@ -50,7 +50,8 @@ def camera(
         unit = get_model(given.model).unit
         extent = np.multiply(size, pitch if unit == "mm" else 1.0)
         reach = float(np.hypot(*extent) / 2)
-        tables.append(_table(given, reach, step or reach / STEPS, about_origin))
+        width = reach / STEPS if step is None else step
+        tables.append(_table(given, reach, width, about_origin))
         _print(given, extent, size, pitch, tables[-1])
         name = given.id if given.id not in curves else f"{given.id} ({file})"
         curves[name] = _table(given, reach, reach / CURVE, about_origin)

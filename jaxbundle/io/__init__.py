@@ -5,6 +5,7 @@ from jaxbundle.io.bundler import write_bundler as write_bundler
 from jaxbundle.io.camera_files import read_cameras as read_cameras
 from jaxbundle.io.camera_files import write_cameras as write_cameras
 from jaxbundle.io.colmap import write_colmap as write_colmap
+from jaxbundle.io.colmap import write_colmap_cameras as write_colmap_cameras
 from jaxbundle.io.coordinates import write_coordinates as write_coordinates
 from jaxbundle.io.dxf import write_dxf as write_dxf
 from jaxbundle.io.exchange import Converted as Converted

@@ -4,7 +4,7 @@
 |---|---|---|
 | `.yaml`, `.yml`, `.json` of OpenCV | its camera | one, of model `opencv` or `kannala-brandt` |
 | `.toml` with `[[camera]]` entries, a project file among them | its cameras | all cameras |
-| `cameras.txt`, `cameras.bin` of COLMAP | its cameras | as part of a sparse model |
+| `cameras.txt`, `cameras.bin` of COLMAP | its cameras | all, as `cameras.txt` |
 | any input of `jaxbundle adjust` | its cameras | |
 """
 

@@ -5,8 +5,13 @@ from pathlib import Path
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.colmap_binary import binary_files, read_binary_cameras, read_binary_model
-from jaxbundle.io.colmap_model import from_network, to_network
-from jaxbundle.io.colmap_text import read_text_cameras, read_text_model, text_files
+from jaxbundle.io.colmap_model import from_network, numbers_of, to_network
+from jaxbundle.io.colmap_text import (
+    camera_lines,
+    read_text_cameras,
+    read_text_model,
+    text_files,
+)
 from jaxbundle.io.csv_tables import write_bytes
 from jaxbundle.network.tables import Camera, Network
 
@@ -47,6 +52,12 @@ def read_colmap_cameras(path: str | Path) -> tuple[Camera, ...]:
     path = Path(path)
     read = read_binary_cameras if path.suffix.lower() == ".bin" else read_text_cameras
     return tuple(read(path).values())
+
+
+def write_colmap_cameras(cameras: Sequence[Camera], path: str | Path) -> None:
+    """Write a cameras.txt alone; cameras as in `write_colmap`."""
+    lines = camera_lines(dict(zip(numbers_of([camera.id for camera in cameras]), cameras)))
+    write_bytes(Path(path), ("\n".join(lines) + "\n").encode())
 
 
 def write_colmap(network: Network, folder: str | Path, text: bool = False) -> tuple[str, ...]:

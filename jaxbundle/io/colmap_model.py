@@ -141,31 +141,29 @@ def from_network(network: Network) -> tuple[ColmapModel, tuple[str, ...]]:
     **Raises:** `InputError` for a camera COLMAP has no model for, and for what has no coordinates.
     """
     images, points, rays = network.images, network.points, network.observations
-    cameras = dict(zip(_numbers([c.id for c in network.cameras]), network.cameras))
+    cameras = dict(zip(numbers_of([c.id for c in network.cameras]), network.cameras))
     for camera in cameras.values():
         to_colmap(camera)
     need_values(network)
     R, t = cv_pose(matrices_of(images.angles), images.position)
     q = quaternions_of(R)
     camera_numbers = list(cameras)
-    point_numbers = np.array(_numbers(points.id), np.int64)
+    point_numbers = np.array(numbers_of(points.id), np.int64)
     made = []
     order = np.argsort(rays.image, kind="stable")
     parts = np.split(order, np.searchsorted(rays.image[order], np.arange(1, len(images))))
-    for i, (number, mine) in enumerate(zip(_numbers(images.id), parts)):
+    for i, (number, mine) in enumerate(zip(numbers_of(images.id), parts)):
         made.append(ColmapImage(
             number, camera_numbers[images.camera[i]], images.id[i], q[i], t[i],
             rays.xy[mine] + HALF, point_numbers[rays.point[mine]], f"image {images.id[i]!r}",
         ))  # fmt: skip
-        if any(character.isspace() for character in images.id[i]):
-            raise InputError(f"image {images.id[i]!r}: COLMAP's names have no blanks; rename it")
     lost = what_is_lost(network)
     if list(point_numbers.astype(str)) != list(points.id):
         lost = (*lost, "names of points, which are numbered from 1")
     return ColmapModel(cameras, made, point_numbers, points.position, points.source), lost
 
 
-def _numbers(ids: Sequence[str]) -> list[int]:
+def numbers_of(ids: Sequence[str]) -> list[int]:
     """The ids themselves where all are whole numbers from 1, else 1, 2, 3, …"""
     good = all(id.isascii() and id.isdigit() and len(id) < 10 and id[0] != "0" for id in ids)
     return [int(id) for id in ids] if good else list(range(1, len(ids) + 1))

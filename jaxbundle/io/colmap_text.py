@@ -8,10 +8,12 @@
 Source: COLMAP documentation, "Output Format".
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
+from jaxbundle.errors import InputError
 from jaxbundle.io.colmap_model import ColmapImage, ColmapModel, check_unique, tracks
 from jaxbundle.io.colmap_models import from_colmap, parameter_names, to_colmap
 from jaxbundle.io.rows import Row, Rows
@@ -90,14 +92,14 @@ def _points(path: Path, images: set[int]):
 
 def text_files(model: ColmapModel) -> dict[str, bytes]:
     """The three text files by name."""
-    cameras = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
-    for number, camera in model.cameras.items():
-        name, values = to_colmap(camera)
-        width, height = camera.image_size
-        cameras.append(f"{number} {name} {width} {height} {_join(values)}")
     images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
               "# POINTS2D[] as (X, Y, POINT3D_ID)"]  # fmt: skip
     for image in model.images:
+        if any(character.isspace() for character in image.name):
+            raise InputError(
+                f"image {image.name!r}: names in COLMAP's text files have no blanks; rename it, or "
+                "write the binary form"
+            )
         pose = _join([*image.q, *image.t])
         images.append(f"{image.id} {pose} {image.camera} {image.name}")
         images.append(" ".join(
@@ -109,8 +111,19 @@ def text_files(model: ColmapModel) -> dict[str, bytes]:
         track = " ".join(f"{image} {k}" for image, k in of_point[id])
         colour = " ".join(map(str, GREY))
         points.append(f"{id} {_join(position)} {colour} 0 {track}".rstrip())
-    texts = {"cameras.txt": cameras, "images.txt": images, "points3D.txt": points}
+    texts = {"cameras.txt": camera_lines(model.cameras), "images.txt": images,
+             "points3D.txt": points}  # fmt: skip
     return {name: ("\n".join(lines) + "\n").encode() for name, lines in texts.items()}
+
+
+def camera_lines(cameras: Mapping[int, Camera]) -> list[str]:
+    """The lines of a cameras.txt."""
+    lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
+    for number, camera in cameras.items():
+        name, values = to_colmap(camera)
+        width, height = camera.image_size
+        lines.append(f"{number} {name} {width} {height} {_join(values)}")
+    return lines
 
 
 def _join(values) -> str:

@@ -17,6 +17,7 @@ from jaxbundle.io.camera_files import (
     read_cameras,
     write_cameras,
 )
+from jaxbundle.io.colmap import write_colmap_cameras
 from jaxbundle.io.coordinates import images_path
 from jaxbundle.io.formats import PIXEL_MODELS, TARGETS, read_network
 from jaxbundle.io.opencv_file import SUFFIXES, write_opencv
@@ -26,8 +27,12 @@ from jaxbundle.network.conversion import convert_cameras, convert_one
 from jaxbundle.network.rules import check_camera
 from jaxbundle.network.tables import Camera, Network
 
-CAMERA_KINDS = {"opencv": "NAME.yaml, .yml, .json", "cameras": "NAME.toml"}
+CAMERA_KINDS = {
+    "opencv": "NAME.yaml, .yml, .json", "cameras": "NAME.toml", "colmap-cameras": "cameras.txt"
+}  # fmt: skip
 """Outputs that hold cameras alone."""
+MOST_SHOWN = 8
+"""Conversions told one by one, the worst first."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +47,10 @@ class Converted:
 
     def __str__(self) -> str:
         lines = [f"{self.path}: {self.kind}"]
-        lines += [f"camera {id!r} → {cost}" for id, cost in self.conversions.items()]
+        costs = sorted(self.conversions.items(), key=lambda item: -item[1].largest)
+        lines += [f"camera {id!r} → {cost}" for id, cost in costs[:MOST_SHOWN]]
+        if len(costs) > MOST_SHOWN:
+            lines.append(f"and {len(costs) - MOST_SHOWN} more cameras, with smaller differences")
         lines += [f"not kept: {'; '.join(self.lost)}"] if self.lost else []
         return "\n".join([*lines, *(f"warning: {warning}" for warning in self.warnings)])
 
@@ -106,6 +114,8 @@ def _kind(output: Path, to: str | None) -> str:
         return to
     if output.suffix.lower() in SUFFIXES:
         return "opencv"
+    if output.name.lower() == "cameras.txt":
+        return "colmap-cameras"
     found = next((name for name, target in TARGETS.items() if target.recognises(output)), None)
     if found is None and output.suffix.lower() == ".toml":
         return "cameras"
@@ -197,8 +207,8 @@ def _convert_cameras(
         cameras = [chosen_camera(cameras, id, str(input))]
     costs, made = {}, []
     for camera in cameras:
-        target = model or ("opencv" if kind == "opencv" and camera.model not in PIXEL_MODELS
-                           else camera.model)  # fmt: skip
+        foreign = kind != "cameras" and camera.model not in PIXEL_MODELS
+        target = model or ("opencv" if foreign else camera.model)
         if target != camera.model:
             converted, costs[camera.id] = convert_one(camera, target)
             if model is None:
@@ -207,6 +217,8 @@ def _convert_cameras(
         made.append(camera)
     if kind == "opencv":
         write_opencv(made[0], output)
+    elif kind == "colmap-cameras":
+        write_colmap_cameras(made, output)
     else:
         write_cameras(made, output)
     return Converted(kind, output, costs, (), ())

@@ -128,6 +128,15 @@ def test_what_colmap_cannot_express():
         to_colmap(Camera("c", "opencv", {"fx": 5.0, "fy": 5.0, "s1": 1e-3}, **size))
 
 
+def test_names_with_blanks(tmp_path):
+    before = network("opencv", ("a 1", "b", "c"))
+    write_colmap(before, tmp_path / "binary")
+    assert_same(before, read_colmap(tmp_path / "binary"))
+    with pytest.raises(InputError, match="image 'a 1': names in COLMAP's text files have no"):
+        write_colmap(before, tmp_path / "text", text=True)
+    assert not (tmp_path / "text").exists()
+
+
 def test_what_is_lost_is_told(tmp_path):
     before = network("opencv", ("a", "b", "c"))
     points = before.points

@@ -1,5 +1,6 @@
 """`convert`: what is recognised, what a conversion costs and loses, and what is refused."""
 
+import dataclasses
 import os
 import sys
 
@@ -77,6 +78,9 @@ def test_bundlers_cameras_need_an_image_size_to_become_colmaps(tmp_path):
     convert(tmp_path / "colmap", tmp_path / "q.txt")
     again = read_network(tmp_path / "q.txt")
     np.testing.assert_allclose(again.observations.xy, net.observations.xy, atol=1e-9)
+    many = dataclasses.replace(done, conversions={str(k): cost for k in range(12)
+                                                  for cost in [done.conversions["0"]]})
+    assert len(str(many).splitlines()) == 11 and "and 4 more cameras" in str(many)
     assert again.cameras[2].parameters == pytest.approx(net.cameras[0].parameters)
     with pytest.raises(InputError, match="image_size"):
         convert(tmp_path / "p.txt", tmp_path / "colmap", image_size=(-1, 5))
@@ -122,6 +126,12 @@ def test_camera_files(brown, tmp_path):
     with pytest.raises(InputError, match="2 cameras .*name one of them"):
         convert(tmp_path / "two.toml", tmp_path / "x.yaml")
     convert(tmp_path / "two.toml", tmp_path / "x.yaml", camera="1")
+    made = convert(tmp_path / "two.toml", tmp_path / "cameras.txt", camera="1")
+    assert made.kind == "colmap-cameras"
+    (camera,) = read_cameras(tmp_path / "cameras.txt")
+    given = CAMERAS["opencv"]
+    assert camera.parameters == pytest.approx(given.parameters, rel=1e-15)
+    assert camera.image_size == given.image_size
     with pytest.raises(InputError, match="holds cameras alone"):
         convert(tmp_path / "two.toml", tmp_path / "x.ply")
     with pytest.raises(InputError, match="no camera '7'"):
