@@ -73,7 +73,7 @@ def fit_parameters(
     **Arguments:** `xy` in the model's unit and axes; `starts` complete sets of start values, the
     best of them is taken; `free` what is fitted (`FITTED` of the model if empty).
 
-    **Raises:** `ValueError` if no start has an image of every ray.
+    **Raises:** `ValueError` if no start has an image of every ray, or the numbers are beyond it.
     """
     from scipy.optimize import least_squares
 
@@ -89,14 +89,15 @@ def fit_parameters(
             p[chosen] = q
             return p
 
-        found = least_squares(
-            lambda q: np.asarray(_images(model, complete(q), rays) - xy).ravel(),
-            start[chosen],
-            lambda q: np.asarray(_jacobian(model, complete(q), rays))[..., chosen].reshape(
-                -1, len(chosen)
-            ),
-            x_scale="jac", ftol=1e-15, xtol=1e-15, gtol=1e-15, max_nfev=MOST_EVALUATIONS,
-        )  # fmt: skip
+        residuals = lambda q: np.asarray(_images(model, complete(q), rays) - xy).ravel()
+        slopes = lambda q: np.asarray(_jacobian(model, complete(q), rays))[..., chosen]
+        try:
+            found = least_squares(
+                residuals, start[chosen], lambda q: slopes(q).reshape(-1, len(chosen)),
+                x_scale="jac", ftol=1e-15, xtol=1e-15, gtol=1e-15, max_nfev=MOST_EVALUATIONS,
+            )  # fmt: skip
+        except np.linalg.LinAlgError as error:
+            raise ValueError(f"the fit failed: {error}") from None
     return dict(zip(model.parameters, complete(found.x).tolist()))
 
 

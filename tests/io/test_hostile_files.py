@@ -63,9 +63,10 @@ def made(kind: str, folder: Path) -> Path:
             (folder / "image.dat").write_text(IMAGE)
             (folder / "geoin.dat").write_text(GEO)
         case "metashape":
-            from test_metashape import xml
+            from test_metashape import PIXEL, xml
 
-            (folder / "cameras.xml").write_text(xml(transform=True))
+            text = xml(transform=True).replace("<b1>", "<b2>2.5</b2><b1>")
+            (folder / "cameras.xml").write_text(text.replace("<calibration", PIXEL, 1))
         case "column-map":
             from test_column_map import write
 

@@ -1,5 +1,7 @@
 """Metashape's camera XML: the published formula, the chunk's transform, and broken files."""
 
+import re
+
 import numpy as np
 import pytest
 from exchange_cases import ANGLES, POINTS, POSITION, matrix
@@ -9,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.cameras.convert_fit import images_of
 from jaxbundle.errors import InputError
+from jaxbundle.io.assemble import all_parameters
 from jaxbundle.io.metashape import is_metashape, read_metashape
 
 P = dict(f=1000.0, cx=3.5, cy=-2.25, k1=-0.1, k2=0.02, k3=0.001, p1=1e-3, p2=-5e-4, b1=1.5)
@@ -87,12 +90,40 @@ def test_markers(tmp_path):
     assert [net.images.id[i] for i in net.observations.image] == ["a#0", "a#2", "b"]
 
 
+PIXEL = ('<property name="pixel_width" value="0.005"/><property name="pixel_height" value="0.005"/>'
+         "<calibration")  # fmt: skip
+
+
+def test_a_skew_is_fitted(tmp_path):
+    text = xml().replace("<b1>", "<b2>2.5</b2><b1>").replace("<calibration", PIXEL, 1)
+    net = read(tmp_path, text)
+    (camera,) = net.cameras
+    assert camera.model == "brown-projected" and camera.pixel_size == (0.005, 0.005)
+    told = float(re.search(r"brown-projected, largest difference (\S+) px", net.warnings[-2])[1])
+    assert told <= 0.05
+    rays = (POINTS - POSITION[0]) @ matrix(ANGLES[0]).T
+    X, Y, Z = (rays * [1, -1, -1]).T
+    u, v = published(X, Y, Z)
+    u = u + 2.5 * (v - 360 - P["cy"]) / P["f"]
+    x, y = images_of(get_model(camera.model), all_parameters(camera), rays).T
+    mine = np.stack([x / 0.005 + 640, 360 - y / 0.005], 1)
+    assert np.linalg.norm(mine - np.stack([u, v], 1), axis=1).max() <= 1.05 * told
+
+
 BROKEN = {
     "not XML": (lambda t: t[: len(t) // 2], "not valid XML"),
     "entities": (lambda t: t.replace("<document", "<!DOCTYPE x><document", 1), "document type"),
     "no chunk": (lambda t: "<document></document>", "one <chunk>"),
-    "skew": (lambda t: t.replace("<b1>", "<b2>0.1</b2><b1>"), r"b2 \(skew\) is 0.1"),
-    "k4": (lambda t: t.replace("<b1>", "<k4>0.1</k4><b1>"), "k4 .* has no place"),
+    "skew": (lambda t: t.replace("<b1>", "<b2>0.1</b2><b1>"), "without the pixel size"),
+    "k4": (
+        lambda t: t.replace("<b1>", "<k4>-3</k4><b1>").replace("<calibration", PIXEL, 1),
+        r"k4 -3 have no place.*brown-projected, differs by \d",
+    ),
+    "pixel": (
+        lambda t: t.replace("<b1>", "<b2>1</b2><b1>").replace(
+            "<calibration", PIXEL.replace("0.005", "-1"), 1
+        ), "must be positive",
+    ),
     "p3": (lambda t: t.replace("<b1>", "<p3>0.1</p3><b1>"), "p3 is 0.1"),
     "old": (lambda t: t.replace("<b1>", "<skew>0.1</skew><b1>"), "<skew> is of an old version"),
     "fisheye": (lambda t: t.replace('"cam" type="frame"', '"cam" type="fisheye"'), "type 'fisheye"),
