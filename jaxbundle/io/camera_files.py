@@ -8,14 +8,13 @@
 | any input of `jaxbundle adjust` | its cameras | |
 """
 
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.colmap import read_colmap_cameras
 from jaxbundle.io.column_map import is_column_map
-from jaxbundle.io.csv_tables import read_text, write_text
+from jaxbundle.io.csv_tables import read_toml, write_text
 from jaxbundle.io.opencv_file import is_opencv, read_opencv
 from jaxbundle.io.project import cameras_text
 from jaxbundle.network.build import make_cameras
@@ -30,7 +29,7 @@ def is_camera_file(path: Path) -> bool:
     if path.name.lower() in COLMAP_FILES and path.is_file():
         return True
     return is_opencv(path) or (_is_toml(path) and not is_column_map(path) and
-                               "project" not in _document(path))  # fmt: skip
+                               "project" not in read_toml(path))  # fmt: skip
 
 
 def read_cameras(path: str | Path) -> tuple[Camera, ...]:
@@ -44,7 +43,7 @@ def read_cameras(path: str | Path) -> tuple[Camera, ...]:
     if path.name.lower() in COLMAP_FILES:
         return read_colmap_cameras(path)
     if _is_toml(path):
-        cameras = _document(path).get("camera", [])
+        cameras = read_toml(path).get("camera", [])
         if not isinstance(cameras, list) or not all(isinstance(c, dict) for c in cameras):
             raise InputError(f"{path}: write [[camera]] in double brackets, one for each camera")
         return make_cameras(cameras, f"{path}, ")
@@ -73,12 +72,3 @@ def chosen_camera(cameras: Sequence[Camera], id: str | None, where: str) -> Came
 
 def _is_toml(path: Path) -> bool:
     return path.suffix.lower() == ".toml" and path.is_file()
-
-
-def _document(path: Path) -> dict:
-    try:
-        return tomllib.loads(read_text(path))
-    except RecursionError:
-        raise InputError(f"{path}: not valid TOML: brackets are nested too deeply") from None
-    except ValueError as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from None

@@ -41,7 +41,6 @@ A table `distances` may be there. Where points have no column `role`, they are t
 """  # noqa: E501
 
 import re
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -49,7 +48,7 @@ import numpy as np
 
 from jaxbundle import geometry
 from jaxbundle.errors import InputError
-from jaxbundle.io.csv_tables import read_text
+from jaxbundle.io.csv_tables import read_toml
 from jaxbundle.io.poses import angles_of, batched
 from jaxbundle.io.rows import Rows
 from jaxbundle.io.settings import SETTINGS, TABLES, apply_overrides, network_of
@@ -85,12 +84,7 @@ def read_column_map(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     **Raises:** `InputError` naming file, line and column.
     """
     path = Path(path)
-    try:
-        document = tomllib.loads(read_text(path))
-    except RecursionError:
-        raise InputError(f"{path}: not valid TOML: brackets are nested too deeply") from None
-    except ValueError as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from None
+    document = read_toml(path)
     for key in document:
         if key not in ("project", "camera", "table"):
             known = ("project", "camera", "table")

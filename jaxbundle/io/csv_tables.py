@@ -4,6 +4,7 @@ import csv
 import io
 import os
 import re
+import tomllib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,20 @@ def read_text(path: Path, fallback: str = "") -> str:
         raise InputError(
             f"{path}, line {line}: not UTF-8 text; save the file as UTF-8"
         ) from None
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The document of a TOML file.
+
+    **Raises:** `InputError` if it cannot be read or is not TOML.
+    """
+    text = read_text(path)
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise InputError(f"{path}: not valid TOML: brackets are nested too deeply") from None
+    except ValueError as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from None
 
 
 def read_csv(path: Path) -> Columns:

@@ -31,7 +31,6 @@ Small tables may stand in the file itself, one `[[image]]`, `[[point]]`, `[[obse
 
 import json
 import os
-import tomllib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -39,7 +38,7 @@ from types import MappingProxyType
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.csv_tables import read_csv, read_text, write_csv, write_text
+from jaxbundle.io.csv_tables import read_csv, read_toml, write_csv, write_text
 from jaxbundle.io.settings import SETTINGS, TABLES, Document, apply_overrides, network_of
 from jaxbundle.network.build import (
     DISTANCE_COLUMNS,
@@ -88,12 +87,7 @@ def project_file(path: Path) -> Path:
 
 
 def _read_document(path: Path) -> Document:
-    try:
-        document = tomllib.loads(read_text(path))
-    except RecursionError:
-        raise InputError(f"{path}: not valid TOML: brackets are nested too deeply") from None
-    except ValueError as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from None
+    document = read_toml(path)
     known = ("project", "camera", *INLINE.values())
     for key, value in document.items():
         if key not in known:
