@@ -13,7 +13,8 @@ def adjusted_network(adjustment) -> Network:
     Cameras, orientations and points have their adjusted values; observations that data snooping has
     removed are gone. Control points with σ are tie points here and priors are dropped: what they
     said has been used, and around the adjusted values they would say it twice. So the datum is
-    inner; adjusted again, the network stays as it is. Check points are not in it.
+    inner; adjusted again, the network stays as it is. σ of image coordinates are those given, also
+    where variance components were estimated. Check points are not in it.
     """
     problem = adjustment.problem
     network = problem.network
