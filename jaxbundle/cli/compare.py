@@ -35,6 +35,11 @@ def compare(
     """Compare two calibrations: parameters, and how far images are apart over the image."""
     jaxbundle.enable_x64()
     first, second = camera_given(a), camera_given(b)
+    if None not in (first.image_size, second.image_size) and first.image_size != second.image_size:
+        raise InputError(
+            f"{a}, {b}: images of {list(first.image_size)} and {list(second.image_size)} pixels "
+            "are not of one camera"
+        )
     size = pair("--image-size", image_size) or first.image_size or second.image_size
     pitch = pair("--pixel-size", pixel_size) or first.pixel_size or second.pixel_size
     try:

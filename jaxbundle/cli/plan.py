@@ -17,6 +17,8 @@ from jaxbundle.network.planning import design_block, relief_displacement
 from jaxbundle.network.tables import Camera
 from jaxbundle.statistics.expected import expected_precision
 
+MOST_PHOTOGRAPHS = 2000
+
 
 @app.command()
 def plan(
@@ -30,7 +32,10 @@ def plan(
     pixel: Annotated[float | None, typer.Option(help="pixel size, mm")] = None,
     forward: Annotated[float, typer.Option(help="forward overlap")] = 0.6,
     side: Annotated[float, typer.Option(help="side overlap")] = 0.3,
-    control_sigma: Annotated[float, typer.Option(help="σ of nine control points, m")] = 0.05,
+    control_sigma: Annotated[float, typer.Option(help="σ of control points, m")] = 0.05,
+    control_every: Annotated[
+        int | None, typer.Option(help="bases and strips between them; nine in all if not given")
+    ] = None,
     network: Annotated[bool, typer.Option(help="σ by the covariance of a simulated block")] = True,
     out: Annotated[Path | None, typer.Option(help="folder for the block as a project")] = None,
 ) -> None:
@@ -58,9 +63,18 @@ def plan(
         ("photographs", f"{design.photographs_per_strip} a strip, {design.photographs} in all"),
         ("σX, σH by formula", f"{design.sigma_plan:.4g} m, {design.sigma_height:.4g} m"),
     ]  # fmt: skip
+    if network and design.photographs > MOST_PHOTOGRAPHS:
+        raise InputError(
+            f"{design.photographs} photographs: the covariance of so many takes long; give "
+            "--no-network, or plan a part of the area"
+        )
     if network or out is not None:
         camera = Camera("cam", "brown", {"c": c})
-        block = planned_network(design, camera, image_format, extent, sigma_image, control_sigma)
+        block = planned_network(
+            design, camera, image_format, extent, sigma_image, control_sigma, control_every
+        )
+        control = sum(role in ("control", "fixed") for role in block.points.role)
+        lines.append(("simulated block", f"{len(block.points)} points, {control} of them control"))
         if network:
             found = expected_precision(block)
             for axis, (mean, low, high) in found.summary().items():

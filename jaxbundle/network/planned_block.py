@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from jaxbundle.errors import InputError
 from jaxbundle.network.planning import BlockDesign
 from jaxbundle.network.simulate import simulate
 from jaxbundle.network.stations import aerial_block
@@ -24,12 +25,14 @@ def planned_network(
     area: tuple[float, float],
     sigma_image: float,
     control_sigma: float,
+    control_every: int | None = None,
     seed: int = 0,
 ) -> Network:
     """A simulated network of the block, datum by control.
 
-    Tie points stand half a base apart along the strips and half a strip spacing across; nine of
-    them, at the corners of the area, the middles of its edges and its centre, are control points.
+    Tie points stand half a base apart along the strips and half a strip spacing across. Control
+    points are the nine at the corners of the area, the middles of its edges and its centre, or,
+    with `control_every`, one every so many bases along and strips across.
 
     **Arguments:** `camera` of a model in mm; `image_format` and `sigma_image` in mm; `area` as in
     `design_block`; `control_sigma` object unit.
@@ -43,10 +46,8 @@ def planned_network(
     grid = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     heights = np.random.default_rng(seed).uniform(-1, 1, len(grid)) * RELIEF * design.height
     targets = np.concatenate([grid, heights[:, None]], axis=1)
-    control = [
-        row * columns + column
-        for row in (0, rows // 2, rows - 1) for column in (0, columns // 2, columns - 1)
-    ]  # fmt: skip
+    along, across = (_control(n, control_every) for n in counts)
+    control = [row * columns + column for row in across for column in along]
     stations = aerial_block(
         design.strips, design.photographs_per_strip, height=design.height,
         footprint=design.footprint, forward_overlap=design.forward_overlap,
@@ -57,6 +58,15 @@ def planned_network(
         image_format=image_format, control=control, control_sigma=control_sigma, min_rays=2,
         name="planned block",
     )  # fmt: skip
+
+
+def _control(points: int, every: int | None) -> list[int]:
+    """Which of a row of points, two a base, are control points; the last is one."""
+    if every is None:
+        return [0, points // 2, points - 1]
+    if every < 1:
+        raise InputError(f"control every {every} bases: a number from 1 is expected")
+    return sorted({*range(0, points, 2 * every), points - 1})
 
 
 def _odd(steps: float) -> int:

@@ -9,9 +9,10 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.adjustment.problem import make_problem
+from jaxbundle.adjustment.problem import make_problem, with_factor
 from jaxbundle.errors import InputError
 from jaxbundle.network.check import check_network
+from jaxbundle.network.reduction import FACTORS
 from jaxbundle.network.tables import Network
 from jaxbundle.statistics.inspection import Inspection
 
@@ -40,7 +41,9 @@ def expected_precision(network: Network) -> ExpectedPrecision:
 
     **Raises:** `InputError` for a network that cannot be adjusted.
     """
-    problem = make_problem(check_network(network))
+    problem = with_factor(make_problem(check_network(network)))
+    if problem.structure.reduction not in FACTORS:
+        raise InputError("the planned network is too large for its covariance; plan a part of it")
     found = Inspection(problem, problem.data.start)
     if not found.determined:
         raise InputError("the planned network leaves something undetermined; plan more overlap")

@@ -110,6 +110,19 @@ def test_the_formula_is_the_right_order(block):
     assert mean["Z"] > mean["X"]
 
 
+def test_more_control_is_better_control(block):
+    design, few = block
+    camera = Camera("cam", "brown", {"c": 153.0})
+    arguments = (design, camera, (230, 230), (1900, 3500), 0.005, 0.05)
+    many = planned_network(*arguments, control_every=1)
+    count = lambda net: sum(role == "control" for role in net.points.role)
+    assert count(many) > count(few) == 9
+    worse, better = (expected_precision(net).summary()["Z"][0] for net in (few, many))
+    assert better < worse
+    with pytest.raises(InputError, match="control every 0 bases"):
+        planned_network(*arguments, control_every=0)
+
+
 def run(monkeypatch, capsys, *arguments):
     monkeypatch.setattr(sys, "argv", ["jaxbundle", *map(str, arguments)])
     with pytest.raises(SystemExit) as ended:
@@ -123,6 +136,8 @@ def test_the_command(monkeypatch, capsys, tmp_path):
                      "--out", tmp_path / "block")  # fmt: skip
     assert not code and "scale                 1 : 10000" in said.out
     assert "4 a strip, 8 in all" in said.out and (tmp_path / "block" / "project.toml").exists()
+    code, said = run(monkeypatch, capsys, "plan", *options, "--height", 10)
+    assert code == 2 and "photographs: the covariance of so many takes long" in said.err
     code, said = run(monkeypatch, capsys, "plan", *options)
     assert code == 2 and "give one of height" in said.err
 
@@ -141,5 +156,8 @@ def test_compare_on_the_command_line(monkeypatch, capsys, tmp_path):
     row = next(line for line in said.out.splitlines() if line.startswith("fx"))
     assert row.split() == ["fx", "500", "505", "5"]
     assert (tmp_path / "r.csv").read_text().startswith("r,radial,tangential,rms,largest,points\n")
+    (tmp_path / "c.toml").write_text(camera.format("1", 500.0).replace("640", "320"))
+    code, said = run(monkeypatch, capsys, "compare", tmp_path / "a.toml", tmp_path / "c.toml")
+    assert code == 2 and "[640, 480] and [320, 480] pixels are not of one camera" in said.err
     code, said = run(monkeypatch, capsys, "compare", tmp_path / "a.toml", tmp_path / "b.toml")
     assert code == 2 and "2 cameras (1, 2); name one of them" in said.err
