@@ -1,6 +1,7 @@
 """PLY, DXF and CSV of points and cameras, read back by other means."""
 
 import csv
+import sys
 
 import ezdxf
 import numpy as np
@@ -88,4 +89,11 @@ def test_a_camera_without_orientation_is_refused(tmp_path):
     for write, name in ((write_ply, "x.ply"), (write_dxf, "x.dxf")):
         with pytest.raises(InputError, match="image 'a' has no orientation"):
             write(net.replace(images=images), tmp_path / name)
+    assert not list(tmp_path.iterdir())
+
+
+def test_dxf_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ezdxf", None)
+    with pytest.raises(InputError, match=r"DXF needs ezdxf: pip install 'jaxbundle\[files\]'"):
+        write_dxf(case(), tmp_path / "net.dxf")
     assert not list(tmp_path.iterdir())
