@@ -4,6 +4,8 @@ Every function draws on the axes given as `ax`, or on those of a new pyplot figu
 them. `save_figures` writes all of them as PNG files without touching pyplot.
 """
 
+from jaxbundle.plotting.calibrations import difference_map as difference_map
+from jaxbundle.plotting.calibrations import radial_curves as radial_curves
 from jaxbundle.plotting.cameras import correlation_matrix as correlation_matrix
 from jaxbundle.plotting.cameras import distortion_curve as distortion_curve
 from jaxbundle.plotting.distortion import DistortionProfile as DistortionProfile

@@ -62,12 +62,12 @@ def save_figures(adjustment, folder: str | Path) -> list[Path]:
     written = []
     for name, (size, projection, draw, arguments) in drawings.items():
         path = folder / f"{name}.png"
-        _write(path, _png(size, projection, lambda ax: draw(adjustment, *arguments, ax=ax)))  # noqa: B023
+        _write(path, png(size, projection, lambda ax: draw(adjustment, *arguments, ax=ax)))  # noqa: B023
         written.append(path)
     return written
 
 
-def _png(size, projection, draw) -> bytes:
+def png(size, projection, draw) -> bytes:
     """One drawing as a PNG image."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -151,7 +151,7 @@ def test_what_nobody_thought_of_ends_in_one_line(error, status, monkeypatch, cap
     def fail(*_):
         raise error
 
-    monkeypatch.setattr(cli, "write_project", fail)
+    monkeypatch.setattr(cli.convert, "convert_file", fail)
     monkeypatch.setattr(sys, "argv", ["jaxbundle", "convert", str(EXAMPLE), "nowhere"])
     with pytest.raises(SystemExit) as ended:
         cli.main()
