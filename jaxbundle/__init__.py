@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from jaxbundle.network.stations import ring_of_stations as ring_of_stations
     from jaxbundle.network.stations import stations_looking_at as stations_looking_at
     from jaxbundle.orientation.network import Oriented as Oriented
-    from jaxbundle.orientation.network import orient as orient
+    from jaxbundle.oriented import orient as orient
     from jaxbundle.result import Adjustment as Adjustment
 
 _HOME = {
@@ -62,7 +62,8 @@ _HOME = {
         "aerial_block", "cloud_of_targets", "grid_of_targets", "ring_of_stations",
         "stations_looking_at",
     ),
-    "jaxbundle.orientation.network": ("Oriented", "orient"),
+    "jaxbundle.orientation.network": ("Oriented",),
+    "jaxbundle.oriented": ("orient",),
     "jaxbundle.result": ("Adjustment",),
 }
 _MODULE = {name: module for module, names in _HOME.items() for name in names}

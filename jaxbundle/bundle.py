@@ -10,7 +10,8 @@ from jaxbundle.errors import InputError
 from jaxbundle.network.check import check_network
 from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.tables import Network
-from jaxbundle.orientation.network import lacks_start_values, orient, screen
+from jaxbundle.orientation.network import lacks_start_values
+from jaxbundle.oriented import orient, screen
 from jaxbundle.repeated import eliminated_parameters, robustly, snooped, with_components
 from jaxbundle.result import Adjustment
 from jaxbundle.solution import minimise, names_of_defects, solved

@@ -23,6 +23,7 @@ LAYERS = (
     "result_tables",
     "result",
     "solution",
+    "oriented",
     "repeated",
     "bundle",
     "batches",
