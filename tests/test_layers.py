@@ -24,6 +24,7 @@ LAYERS = (
     "result",
     "bundle",
     "batches",
+    "calibration",
     "targets",
     "cli",
     "__main__",

@@ -184,8 +184,13 @@ def _document_text(network: Network) -> str:
         del settings["datum_points"]
     lines += ["[project]", *_assignments(settings)]
     for camera in network.cameras:
-        lines += ["", "[[camera]]", *_assignments(_camera_entry(camera))]
+        lines += ["", *camera_lines(camera)]
     return "\n".join(lines) + "\n"
+
+
+def camera_lines(camera: Camera) -> list[str]:
+    """A camera as it stands in a project file."""
+    return ["[[camera]]", *_assignments(_camera_entry(camera))]
 
 
 def _camera_entry(camera: Camera) -> dict:

@@ -27,3 +27,5 @@ from .transfer import ground_point as ground_point
 from .transfer import image_point as image_point
 from .transfer import image_to_image as image_to_image
 from .transfer import line_of_sight as line_of_sight
+from .views import BoardViews as BoardViews
+from .views import measure_boards as measure_boards

@@ -1,0 +1,134 @@
+"""What a calibration writes into a folder.
+
+| file | |
+|---|---|
+| report.txt, result.json | the whole protocol; its numbers |
+| CAMERA.toml | the camera, to stand in a project; σ as comments |
+| network/ | the project that was adjusted: `jaxbundle adjust network` goes on from it |
+| coverage, uncertainty, uncertainty_far, uncertainty_distance .png | how good it is |
+| plan, perspective, histogram, residuals_…, distortion_…, correlations_… .png | as of `adjust` |
+"""
+
+import json
+import re
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.calibration.report import rig_dict
+from jaxbundle.errors import InputError
+from jaxbundle.io.csv_tables import write_text
+from jaxbundle.io.project import camera_lines, write_project
+from jaxbundle.network.tables import Camera
+from jaxbundle.plotting import (
+    coverage_map,
+    save_figures,
+    uncertainty_curve,
+    uncertainty_image,
+    write_figures,
+)
+
+REPORT, RESULT, NETWORK = "report.txt", "result.json", "network"
+DISTANCES = 15
+CAMERA_WRITERS: dict[str, Callable[[Camera, Path], None]] = {}
+"""Further forms a camera is written in: ending of the file, and who writes it."""
+
+
+def camera_text(camera: Camera, sigma: Mapping[str, float]) -> str:
+    """A calibrated camera in our TOML, its σ as comments."""
+    comments = [f"# σ of {name}: {value:.4g}" for name, value in sigma.items()]
+    return "\n".join([*camera_lines(camera), *comments]) + "\n"
+
+
+def file_name(name: str) -> str:
+    """A name that can stand in a file system."""
+    return re.sub(r"[^\w.-]+", "_", name, flags=re.ASCII).strip("._")[:60] or "camera"
+
+
+def write_calibration(calibration, folder: str | Path, plots: bool = True) -> None:
+    """Write everything about a calibration into a folder (see the module's docstring).
+
+    **Raises:** `InputError` where that cannot be done; `ImportError` for plots without matplotlib.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made: {error.strerror}") from None
+    write_text(folder / REPORT, calibration.report())
+    write_text(folder / RESULT, json_text(calibration.to_dict()))
+    if not calibration.converged:
+        return
+    name = file_name(calibration.name)
+    write_text(folder / f"{name}.toml", camera_text(calibration.camera, calibration.sigma))
+    for ending, write in CAMERA_WRITERS.items():
+        write(calibration.camera, folder / f"{name}{ending}")
+    write_project(calibration.adjustment.problem.network, folder / NETWORK)
+    if plots:
+        save_plots(calibration, folder)
+
+
+def write_calibrations(found, folder: str | Path, plots: bool = True) -> None:
+    """Write one calibration into a folder, several into folders of their own, and the rig beside.
+
+    A rig adds report.txt and result.json of the whole, and its cameras as rig_CAMERA.toml.
+    """
+    folder = Path(folder)
+    if len(found.cameras) == 1:
+        return write_calibration(next(iter(found.cameras.values())), folder, plots)
+    for name, one in found.cameras.items():
+        write_calibration(one, folder / file_name(name), plots)
+    write_text(folder / REPORT, found.report())
+    write_text(folder / RESULT, json_text(calibrations_dict(found)))
+    if found.rig is not None:
+        for name in found.rig.names:
+            text = camera_text(found.rig.camera(name), found.rig.sigma[name])
+            write_text(folder / f"rig_{file_name(name)}.toml", text)
+
+
+def calibrations_dict(found, brief: bool = False) -> dict:
+    """The JSON of one calibration, or of several under their names, with the rig."""
+    if len(found.cameras) == 1:
+        return next(iter(found.cameras.values())).to_dict(brief)
+    parts = {name: one.to_dict(brief) for name, one in found.cameras.items()}
+    document = {"converged": found.converged, "calibrations": parts}
+    if found.rig is not None:
+        document["rig"] = rig_dict(found.rig)
+    return document
+
+
+def save_plots(calibration, folder: Path) -> None:
+    """The figures of quality, and those of the adjustment."""
+    size, name = calibration.views.image_size, calibration.name
+    unit = calibration.adjustment.network.object_unit
+    near = float(np.median(calibration.distances))
+    span = calibration.distances.min(), calibration.distances.max()
+    distances = np.geomspace(span[0] / 4, 100 * span[1], DISTANCES)
+    curve = calibration.uncertainty_over_distance(distances)
+    image = partial(uncertainty_image, image_size=size, unit=unit, name=name)
+    write_figures(folder, {
+        "coverage": ((7, 5.6), None, partial(
+            coverage_map, calibration.coverage, calibration.measured, size, name)),
+        "uncertainty": ((7, 5.6), None, partial(image, calibration.uncertainty(near))),
+        "uncertainty_far": ((7, 5.6), None, partial(image, calibration.uncertainty())),
+        "uncertainty_distance": ((6.5, 4.2), None, partial(
+            uncertainty_curve, distances, *curve, span, unit, name)),
+    })  # fmt: skip
+    save_figures(calibration.adjustment, folder)
+
+
+def json_text(document: dict) -> str:
+    """One JSON object; what is not a finite number is null."""
+    return json.dumps(_plain(document), ensure_ascii=False, indent=1) + "\n"
+
+
+def _plain(value):
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    return value.item() if isinstance(value, np.generic) else value
