@@ -196,16 +196,14 @@ def adjust_rig(
     at, system = start, _system(rig, start, X)
     rows = 2 * sum(int(camera.seen.sum()) for camera in rig)
     redundancy = rows - POSE * len(start.shift) - len(system.right)
-    damping, converged, step = FIRST_DAMPING, False, 0
-    if not np.isfinite(system.vtpv) or redundancy < 0:
-        max_iterations = 0
-    for step in range(1, max_iterations + 1):
+    damping, converged, steps = FIRST_DAMPING, False, 0
+    possible = np.isfinite(system.vtpv) and redundancy >= 0
+    while possible and steps < max_iterations and damping <= LARGEST_DAMPING:
+        steps += 1
         try:
             d_pose, d_shared, slope = _step(system, damping)
         except np.linalg.LinAlgError:
-            damping *= 10
-            if damping > LARGEST_DAMPING:
-                break
+            damping = max(10 * damping, FIRST_DAMPING)
             continue
         small = TOLERANCE**2 * system.vtpv / max(redundancy, 1) + ROUNDING * system.vtpv
         if slope <= small and damping == 0:
@@ -219,8 +217,6 @@ def adjust_rig(
             damping = 0.0 if near else damping / 10
         else:
             damping = max(10 * damping, FIRST_DAMPING)
-            if damping > LARGEST_DAMPING:
-                break
     system = _system(rig, at, X)
     sigma0 = float(np.sqrt(system.vtpv / redundancy)) if redundancy > 0 else float("nan")
     try:
@@ -229,7 +225,7 @@ def adjust_rig(
         Q = np.full(system.shared.shape, np.inf)
         Q_pose, converged = np.full(system.poses.shape, np.inf), False
     return RigSolution(
-        at, converged, step, system.vtpv, redundancy, sigma0, Q, Q_pose, system.residuals
+        at, converged, steps, system.vtpv, redundancy, sigma0, Q, Q_pose, system.residuals
     )
 
 

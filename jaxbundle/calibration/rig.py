@@ -38,9 +38,11 @@ from jaxbundle.network.columns import some
 
 FEWEST = 3
 """Epochs that two cameras must share."""
-CONTRADICTS, LEAST_CONTRADICTION = 5.0, 1.0
+CONTRADICTS, LEAST_CONTRADICTION = 3.0, 1.0
 """An epoch is left out whose RMS is above so many times the median of all, and so many pixels."""
-ROUNDS = 5
+WORST = 0.5
+"""In one round those go whose RMS is above this part of the largest: the worst spoil the others."""
+ROUNDS = 10
 
 
 @dataclasses.dataclass(frozen=True)
@@ -338,5 +340,6 @@ def _contradictions(calibrations, rig, solution):
     rms = np.sqrt(square / np.maximum(number, 1))
     several = sum(camera.seen.any(1).astype(int) for camera in rig) > 1
     limit = max(CONTRADICTS * float(np.median(rms)), LEAST_CONTRADICTION)
-    bad = np.flatnonzero(several & (rms > limit))
+    rms = np.where(several, rms, 0.0)
+    bad = np.flatnonzero(rms > max(limit, WORST * rms.max()))
     return [(int(e), float(rms[e])) for e in bad]

@@ -71,12 +71,14 @@ def test_uncertainty_without_rotation_is_that_of_a_sample(sample):
     calibration, batch = sample
     rays = rays_of(render.LENS.parameters, UV)
     truth = image_of(np.array([render.LENS.parameters]), rays[None])[0]
+
+    def turned(theta, p):
+        return image_of(p[None], Rotation.from_rotvec(theta).apply(rays)[None])[0]
+
     images = []
     for p in batch.interior[:150]:
-        turned = lambda theta, p=p: image_of(p[None], Rotation.from_rotvec(theta).apply(rays)[None])
-        best = least_squares(lambda theta: (turned(theta)[0] - truth).ravel(), np.zeros(3),
-                             x_scale=1e-3)  # fmt: skip
-        images.append(turned(best.x)[0])
+        away = lambda theta, p=p: (turned(theta, p) - truth).ravel()
+        images.append(turned(least_squares(away, np.zeros(3), x_scale=1e-3).x, p))
     stated = calibration.uncertainty(frame="rotation", grid=GRID).sigma.ravel()
     # what is left in the middle is a thirtieth of what is left in the corners, and of fewer draws
     corner = [0, 2, 6, 8]
