@@ -21,6 +21,8 @@ LARGE = 1.0
 CONTRADICTION = 3.0
 WEAK = 1.0
 """A distortion coefficient with |value|/σ below this says nothing."""
+DISTANCES, VAGUE = ("c", "f", "fx", "fy"), 50.0
+"""A principal distance whose σ is above a fiftieth of it is as good as unknown."""
 STRONG = ("c", "x0", "y0", "fx", "fy", "cx", "cy", "f")
 
 
@@ -39,7 +41,12 @@ def advice(
     **Arguments:** X0 and M of the views of a board in the plane Z = const, whose centre is
     `middle`; `covered`; `rms` of the residuals in pixels; `t` = |value|/σ by parameter.
     """
-    found = [*_geometry(position, rotation, middle, unit), *_image(covered)]
+    found = [
+        f"{name} is known to {100 / max(t[name], 1e-9):.0f} % only: the photographs do not "
+        "determine the principal distance; they need tilts and distances that differ"
+        for name in DISTANCES if t.get(name, np.inf) < VAGUE
+    ]  # fmt: skip
+    found += [*_geometry(position, rotation, middle, unit), *_image(covered)]
     if rms > LARGE:
         found.append(
             f"the residuals are large (RMS {rms:.2f} px): look for blur, movement, a board that "

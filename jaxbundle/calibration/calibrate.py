@@ -51,11 +51,10 @@ def calibrate(
     board_sigma: float | None = None,
     board_free: bool = False,
     snooping: str | None = "pope",
-    significance: float = 0.001,
     camera: str = "cam",
     object_unit: str = "m",
-    max_iterations: int = 100,
     progress: Callable[[int, int], None] | None = None,
+    **options,
 ) -> Calibration:
     """Calibrate a camera from photographs of a board.
 
@@ -69,7 +68,8 @@ def calibrate(
     - `sigma_image`: a priori σ of an image coordinate, pixels.
     - `board_sigma`: σ of a coordinate of the board (object unit); `board_free`: its points are
       estimated. Neither: the board is exact.
-    - `snooping`, `significance`: removal of gross errors, see `jaxbundle.adjust`; None: none.
+    - `snooping`: removal of gross errors, None: none; it and further `options` (`significance`,
+      `max_iterations`, …) are those of `jaxbundle.adjust`.
     - `camera`: its name. `progress(done, total)`: photographs searched.
 
     **Returns:** a `Calibration`; look at `converged` before anything else.
@@ -97,8 +97,7 @@ def calibrate(
         start, made, sigma_image, board_sigma=board_sigma, board_free=board_free,
         object_unit=object_unit,
     )  # fmt: skip
-    options = {"snooping": snooping, "significance": significance, "max_iterations": max_iterations}
-    result = adjust(network, **options)
+    result = adjust(network, snooping=snooping, **options)
     if board.diameter is not None and board.kind != "chessboard" and result.converged:
         for _ in range(ECCENTRICITY_ROUNDS):
             centred = _without_eccentricity(start, result, made)
@@ -106,7 +105,7 @@ def calibrate(
                 dataclasses.replace(start, views=centred), made, sigma_image,
                 board_sigma=board_sigma, board_free=board_free, object_unit=object_unit,
             )  # fmt: skip
-            result = adjust(network, **options)
+            result = adjust(network, snooping=snooping, **options)
         start = dataclasses.replace(start, views=centred)
     return Calibration(start.views, result)
 

@@ -20,7 +20,7 @@ import numpy as np
 from jaxbundle.calibration.report import rig_dict
 from jaxbundle.errors import InputError
 from jaxbundle.io.csv_tables import write_text
-from jaxbundle.io.project import camera_lines, write_project
+from jaxbundle.io.project import cameras_text, write_project
 from jaxbundle.network.tables import Camera
 from jaxbundle.plotting import (
     coverage_map,
@@ -39,7 +39,7 @@ CAMERA_WRITERS: dict[str, Callable[[Camera, Path], None]] = {}
 def camera_text(camera: Camera, sigma: Mapping[str, float]) -> str:
     """A calibrated camera in our TOML, its σ as comments."""
     comments = [f"# σ of {name}: {value:.4g}" for name, value in sigma.items()]
-    return "\n".join([*camera_lines(camera), *comments]) + "\n"
+    return "\n".join([cameras_text([camera]).rstrip(), *comments]) + "\n"
 
 
 def file_name(name: str) -> str:

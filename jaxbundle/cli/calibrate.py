@@ -14,6 +14,7 @@ from jaxbundle.cli.app import Quiet, app
 from jaxbundle.cli.progress import counting
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.csv_tables import write_text
+from jaxbundle.io.result_json import unsolved_text
 from jaxbundle.measure.views import photographs
 from jaxbundle.targets import check_writable
 
@@ -86,25 +87,35 @@ def calibrate(
     check_writable(json, out, (REPORT, RESULT), files)
     with counting(quiet or json == "-") as bar:
         task = bar.add_task("searching the board", total=len(files))
-        found = calibrate_cameras(
-            cameras, known, rig=rig, model=model, free=_words(free) or None,
-            given=_values(given), pixel_size=pixel_size, sigma_image=sigma_image,
-            board_sigma=board_sigma, board_free=board_free,
-            snooping=None if snooping == "none" else snooping, significance=significance,
-            object_unit=unit, progress=lambda: bar.advance(task),
-        )  # fmt: skip
-    text = json_text(calibrations_dict(found, brief)) if json else ""
-    if out is not None:
+
+        def tell():
+            bar.advance(task)
+            if bar.tasks[task].finished:
+                bar.update(task, description="adjusting")
+
         try:
-            write_calibrations(found, out, plots)
-        except ImportError as error:
-            print(f"no plots: {error}", file=sys.stderr)
-    if json == "-":
-        print(text, end="")
-    elif json:
-        write_text(Path(json), text)
-    if json != "-" and not quiet:
-        print(found.report())
+            found = calibrate_cameras(
+                cameras, known, rig=rig, model=model, free=_words(free) or None,
+                given=_values(given), pixel_size=pixel_size, sigma_image=sigma_image,
+                board_sigma=board_sigma, board_free=board_free,
+                snooping=None if snooping == "none" else snooping, significance=significance,
+                object_unit=unit, progress=tell,
+            )  # fmt: skip
+        except NotSolvedError as error:
+            _write_json(json, unsolved_text(error))
+            raise
+        bar.update(task, description="how good it is")
+        text = json_text(calibrations_dict(found, brief)) if json else ""
+        report = "" if quiet or json == "-" else found.report()
+        bar.update(task, description="writing")
+        if out is not None:
+            try:
+                write_calibrations(found, out, plots)
+            except ImportError as error:
+                print(f"no plots: {error}", file=sys.stderr)
+    _write_json(json, text)
+    if report:
+        print(report)
     failed = [name for name, one in found.cameras.items() if not one.converged]
     if failed:
         names = found.cameras[failed[0]].adjustment.undetermined
@@ -113,6 +124,13 @@ def calibrate(
             f"not solved: camera {failed[0]}: {found.cameras[failed[0]].adjustment.termination}"
             f"{what}; free fewer parameters (--free), or take photographs from more directions"
         )
+
+
+def _write_json(json: str, text: str) -> None:
+    if json == "-":
+        print(text, end="")
+    elif json:
+        write_text(Path(json), text)
 
 
 def _size(text: str) -> tuple[int, int]:

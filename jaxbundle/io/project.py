@@ -183,14 +183,13 @@ def _document_text(network: Network) -> str:
     if not network.datum_points:
         del settings["datum_points"]
     lines += ["[project]", *_assignments(settings)]
-    for camera in network.cameras:
-        lines += ["", *camera_lines(camera)]
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines) + "\n\n" + cameras_text(network.cameras)
 
 
-def camera_lines(camera: Camera) -> list[str]:
-    """A camera as it stands in a project file."""
-    return ["[[camera]]", *_assignments(_camera_entry(camera))]
+def cameras_text(cameras: Sequence[Camera]) -> str:
+    """Cameras as the `[[camera]]` entries of a TOML file."""
+    entries = (["[[camera]]", *_assignments(_camera_entry(camera)), ""] for camera in cameras)
+    return "\n".join(line for entry in entries for line in entry)
 
 
 def _camera_entry(camera: Camera) -> dict:

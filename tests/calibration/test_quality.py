@@ -162,6 +162,7 @@ def test_what_is_missing_is_said():
         for i in range(8)
     ]
     assert ["turned by 90°" in text for text in poses_in_words(unturned)] == [True]
+    assert poses_in_words(good, t={"fx": 2.0})[0].startswith("fx is known to 50 % only")
     near = [render.pose(*angles, middle, 0.5) for angles in (
         (30, 0, 0), (-30, 0, 0), (0, 30, 90), (0, -30, 90), (20, 20, 0), (0, 0, 0))]  # fmt: skip
     said = poses_in_words(near)
