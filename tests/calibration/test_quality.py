@@ -168,7 +168,7 @@ def test_what_is_missing_is_said():
     said = poses_in_words(near)
     assert "only 6 photographs" in said[0] and "nearly one distance (0.5 to 0.5 m)" in said[1]
     left = coverage(np.array([[10.0, 10], [10, 350], [470, 10]]), (480, 360))
-    said = poses_in_words(good, covered=left, rms=2.0, t={"fx": 1.0, "k3": 0.4})
+    said = poses_in_words(good, covered=left, rms=2.0, t={"fx": 900.0, "k3": 0.4})
     assert "no point in the lower right corner" in said[0] and "cover 3 %" in said[1]
     assert "RMS 2.00 px" in said[2] and said[3].startswith("not significant: k3 (t 0.4)")
 
