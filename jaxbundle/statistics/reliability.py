@@ -41,6 +41,19 @@ def reliability(
     return _tested(compiled_jacobian(structure, values, data), residual, data, cofactors)
 
 
+def held_against(
+    structure: Structure, values: Values, data: Data, cofactors: Cofactors
+) -> tuple[Residuals, Residuals]:
+    """v/σ and h = diag(J·Q·Jᵀ) of all observations, with cofactors of another adjustment."""
+    residual = compiled_residuals(structure, values, data)
+    return residual, _hat(compiled_jacobian(structure, values, data), cofactors)
+
+
+@eqx.filter_jit
+def _hat(jac, cofactors) -> Residuals:
+    return hat_diagonal(jac, cofactors)
+
+
 @eqx.filter_jit
 def _tested(jac, residual, data, cofactors) -> Reliability:
     hat = hat_diagonal(jac, cofactors)
