@@ -2,7 +2,8 @@
 
 1. The board is found in every photograph (`measure`), or its image points are given.
 2. Start values of camera and poses; views that cannot be right are left out (`start`).
-3. Adjustment as a network with residuals in the measured image, with data snooping. The board is
+3. Adjustment as a network with residuals in the measured image, with data snooping or robust. The
+   board is
 
        known      its points are fixed: exact coordinates of a drawing
        weighted   its points are control points with a σ: a print is not exact and not flat
@@ -50,6 +51,7 @@ def calibrate(
     sigma_image: float = SIGMA,
     board_sigma: float | None = None,
     board_free: bool = False,
+    robust: str | None = None,
     snooping: str | None = "pope",
     camera: str = "cam",
     object_unit: str = "m",
@@ -68,8 +70,9 @@ def calibrate(
     - `sigma_image`: a priori σ of an image coordinate, pixels.
     - `board_sigma`: σ of a coordinate of the board (object unit); `board_free`: its points are
       estimated. Neither: the board is exact.
-    - `snooping`: removal of gross errors, None: none; it and further `options` (`significance`,
-      `max_iterations`, …) are those of `jaxbundle.adjust`.
+    - `robust`: "huber", "cauchy" or "tukey": points that fit badly count less, instead of being
+      removed; `snooping`: how they are removed, None: not at all. Both, and further `options`
+      (`significance`, `max_iterations`, …), are those of `jaxbundle.adjust`.
     - `camera`: its name. `progress(done, total)`: photographs searched.
 
     **Returns:** a `Calibration`; look at `converged` before anything else.
@@ -97,7 +100,8 @@ def calibrate(
         start, made, sigma_image, board_sigma=board_sigma, board_free=board_free,
         object_unit=object_unit,
     )  # fmt: skip
-    result = adjust(network, snooping=snooping, **options)
+    options |= {"robust": robust, "snooping": None if robust else snooping}
+    result = adjust(network, **options)
     if board.diameter is not None and board.kind != "chessboard" and result.converged:
         for _ in range(ECCENTRICITY_ROUNDS):
             centred = _without_eccentricity(start, result, made)
@@ -105,7 +109,7 @@ def calibrate(
                 dataclasses.replace(start, views=centred), made, sigma_image,
                 board_sigma=board_sigma, board_free=board_free, object_unit=object_unit,
             )  # fmt: skip
-            result = adjust(network, snooping=snooping, **options)
+            result = adjust(network, **options)
         start = dataclasses.replace(start, views=centred)
     return Calibration(start.views, result)
 

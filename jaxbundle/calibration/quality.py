@@ -1,6 +1,7 @@
 """How good is a calibration: maps of uncertainty, coverage of the image, two halves compared."""
 
 import dataclasses
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -179,12 +180,13 @@ def cross_validation(result) -> CrossValidation | None:
     network = _at(network, result)
     turns = np.arange(len(network.images)) % 2
     try:
-        halves = [adjust(part(network, turns == half)) for half in (0, 1)]
+        again = partial(adjust, robust=result.robust)
+        halves = [again(part(network, turns == half)) for half in (0, 1)]
         if not all(half.converged for half in halves):
             return None
         name = network.cameras[0].id
         own = [half.camera_parameters(name) for half in halves]
-        held = [adjust(_held(part(network, turns == 1 - half), own[half])) for half in (0, 1)]
+        held = [again(_held(part(network, turns == 1 - half), own[half])) for half in (0, 1)]
     except (InputError, NotSolvedError):
         return None
     if not all(other.converged for other in held):

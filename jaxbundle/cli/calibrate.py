@@ -62,7 +62,10 @@ def calibrate(
     snooping: Annotated[
         str, typer.Option(help="removal of gross errors: pope, baarda or none")
     ] = "pope",
-    significance: Annotated[float, typer.Option(help="level of one test, two-sided")] = 0.001,
+    significance: Annotated[float, typer.Option(help="level of the test")] = 0.001,
+    robust: Annotated[
+        str | None, typer.Option(help="instead of removal: huber, cauchy or tukey")
+    ] = None,
     unit: Annotated[str, typer.Option(help="name of the unit of the board")] = "m",
     json: Annotated[str, typer.Option(help="write the result as JSON; - for stdout alone")] = "",
     out: Annotated[
@@ -99,7 +102,7 @@ def calibrate(
                 given=_values(given), pixel_size=pixel_size, sigma_image=sigma_image,
                 board_sigma=board_sigma, board_free=board_free,
                 snooping=None if snooping == "none" else snooping, significance=significance,
-                object_unit=unit, progress=tell,
+                robust=robust, object_unit=unit, progress=tell,
             )  # fmt: skip
         except NotSolvedError as error:
             _write_json(json, unsolved_text(error))

@@ -194,6 +194,18 @@ def test_gross_errors_are_removed():
     assert max(map(abs, normalised(found, TRUTH).values())) < 3.5
 
 
+def test_gross_errors_count_little():
+    views = simulated()
+    rng = np.random.default_rng(9)
+    bad = rng.uniform(size=views.xy.shape[:2]) < 0.05
+    xy = views.xy + np.where(bad[..., None], rng.normal(size=views.xy.shape), 0.0)
+    found = calibrate(dataclasses.replace(views, xy=xy), robust="tukey")
+    assert not found.adjustment.removed
+    assert max(map(abs, normalised(found, TRUTH).values())) < 4
+    spoilt = calibrate(dataclasses.replace(views, xy=xy), snooping=None)
+    assert abs(spoilt.parameters["fx"] - TRUTH["fx"]) > abs(found.parameters["fx"] - TRUTH["fx"])
+
+
 def test_a_view_in_the_wrong_order_is_left_out():
     views = simulated()
     xy = views.xy.copy()
