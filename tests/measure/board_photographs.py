@@ -37,3 +37,21 @@ def rendered(lens, views, pattern=PATTERN, **options):
         render.photograph(lens, M, X0, pattern, seed=i, **options)
         for i, (M, X0) in enumerate(views)
     ]
+
+
+def write_example(folder, number=12):
+    """The photographs of examples/board, JPEG; in the last one the board is cut by the edge."""
+    import cv2
+
+    views = [*poses(number), render.pose(15, -20, 5, (0.02, 0.03), 0.42)]
+    for i, picture in enumerate(rendered(render.LENS, views), 1):
+        cv2.imwrite(f"{folder}/photo_{i:02d}.jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 92])
+
+
+if __name__ == "__main__":
+    import sys
+
+    import jaxbundle
+
+    jaxbundle.enable_x64()
+    write_example(sys.argv[1])
