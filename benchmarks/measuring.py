@@ -5,7 +5,7 @@
 Photographs as in the tests (`tests/measure/render.py`): 480 × 360 pixels, grey values of noise σ 2
 with a contrast of 204, blurred by 0.7 or 1.2 pixels, the object tilted by 0° or 25°. Targets: 20
 discs each, their true centres those of the images of the circles (eccentricity taken into account).
-Corners: `find_board` on a chessboard of 9 × 6. RMS of a coordinate in pixels, all against truth; for
+Corners: `find_board` on a chessboard of 9 × 6. RMS of a coordinate in pixels, against truth; for
 targets also the RMS of errors over the σ they state, which should be 1.
 """
 

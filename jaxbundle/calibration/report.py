@@ -150,7 +150,8 @@ def rig_text(rig) -> str:
         ("Epochs", f"{len(rig.epochs)} used, {len(rig.left_out)} left out"),
         ("σ0", f"{rig.sigma0:.4f}, redundancy {rig.redundancy}"),
         ("RMS", ", ".join(f"{clean(name)} {rms:.4f} px" for name, rms in rig.rms.items())),
-        ("Board", "taken as known"),
+        ("Board", "exact" if rig.known.known else "its points estimated, inner constraints"
+         if rig.known.free else f"known with σ {rig.known.sigma:g} {unit}"),
     ])  # fmt: skip
     lines += facts((clean(epoch), clean(why)) for epoch, why in rig.left_out)
     for name, m in rig.mountings.items():

@@ -6,7 +6,8 @@ Photographs taken at the same moment are an epoch; they are found by name: equal
 else equal last numbers in them (left_017.jpg, right_017.jpg). Start values of the mounting come
 from the epochs two cameras share: M_k·Mᵣᵀ and Mᵣ·(X0_k − X0_r) should be the same in all of them,
 and the one nearest to all others is taken. Epochs that contradict the mounting (the board moved in
-between) are left out. The board is taken as known; gross errors were removed camera by camera.
+between) are left out. The board is known, weighted or free, as in the calibration of one camera;
+gross errors were removed camera by camera.
 """
 
 import dataclasses
@@ -19,11 +20,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.adjustment.rig import (
+from jaxbundle.adjustment.rig import RigSolution, adjust_rig
+from jaxbundle.adjustment.rig_normal import (
     RigCamera,
-    RigSolution,
+    RigObject,
     RigValues,
-    adjust_rig,
     interior_columns,
     mounting_columns,
 )
@@ -71,13 +72,14 @@ class RigCalibration:
     """Cameras of one mounting, calibrated together.
 
     **Attributes:** `cameras`: the calibrations of each by itself; `mountings`, `parameters`,
-    `sigma` of the common adjustment, by camera; `epochs`; `left_out`: epoch and reason; `rms`
-    (pixels) by camera; `sigma0`, `redundancy`, `converged`.
+    `sigma` of the common adjustment, by camera; `board`: its points [points, 3]; `epochs`;
+    `left_out`: epoch and reason; `rms` (pixels) by camera; `sigma0`, `redundancy`, `converged`.
     """
 
-    def __init__(self, cameras, rig, epochs, left_out, solution: RigSolution):
+    def __init__(self, cameras, rig, known: RigObject, epochs, left_out, solution: RigSolution):
         self.cameras: dict[str, Calibration] = cameras
         self._rig: list[RigCamera] = rig
+        self.known = known
         self.epochs: tuple[str, ...] = epochs
         self.left_out: tuple[tuple[str, str], ...] = left_out
         self.solution = solution
@@ -107,6 +109,12 @@ class RigCalibration:
             v = v / np.array(unit_size(get_model(given.model), given.pixel_size))
             found[name] = float(np.sqrt(np.nanmean((v**2).sum(2))))
         return found
+
+    @property
+    def board(self) -> Float[np.ndarray, "points 3"]:
+        """Adjusted coordinates of the board, object unit."""
+        nominal = next(iter(self.cameras.values())).views.board.points
+        return self.solution.values.points + nominal.mean(0)
 
     @functools.cached_property
     def parameters(self) -> dict[str, dict[str, float]]:
@@ -174,10 +182,16 @@ def _mounting(base, turn, C) -> Mounting:
 
 
 def calibrate_rig(
-    calibrations: Mapping[str, Calibration], max_iterations: int = 50
+    calibrations: Mapping[str, Calibration],
+    *,
+    board_sigma: float | None = None,
+    board_free: bool = False,
+    max_iterations: int = 50,
 ) -> RigCalibration:
     """The common calibration of cameras that were calibrated by themselves, from photographs of one
     board taken in step; the first is the reference.
+
+    **Arguments:** `board_sigma` (object unit), `board_free`: as in `calibrate`.
 
     **Raises:** `InputError` where the photographs of two cameras cannot be paired;
     `NotSolvedError` where an adjustment does not settle.
@@ -192,13 +206,14 @@ def calibrate_rig(
     epochs = list(dict.fromkeys(key for name in calibrations for key in keys[name]))
     poses = _poses(calibrations, keys)
     base, turn = _start_of_mountings(list(calibrations), poses)
-    middle = next(iter(calibrations.values())).views.board.points.mean(0)
+    points = next(iter(calibrations.values())).views.board.points
+    middle = points.mean(0)
+    known = RigObject(points - middle, board_sigma, board_free)
     left_out: list[tuple[str, str]] = []
     for _ in range(ROUNDS):
         rig = [_camera(one, keys[name], epochs) for name, one in calibrations.items()]
-        start = _start(calibrations, poses, base, turn, epochs, middle)
-        points = next(iter(calibrations.values())).views.board.points - middle
-        solution = adjust_rig(rig, points, start, max_iterations)
+        start = _start(calibrations, poses, base, turn, epochs, points)
+        solution = adjust_rig(rig, known, start, max_iterations)
         bad = _contradictions(calibrations, rig, solution) if solution.converged else []
         if not bad:
             break
@@ -212,7 +227,7 @@ def calibrate_rig(
             "photographs that are not of the same moment"
         )
     return RigCalibration(
-        dict(calibrations), rig, tuple(epochs), tuple(left_out), solution
+        dict(calibrations), rig, known, tuple(epochs), tuple(left_out), solution
     )
 
 
@@ -286,8 +301,8 @@ def _start_of_mountings(names, poses):
     return base, turn
 
 
-def _start(calibrations, poses, base, turn, epochs, middle) -> RigValues:
-    shift, rotation = [], []
+def _start(calibrations, poses, base, turn, epochs, points) -> RigValues:
+    shift, rotation, middle = [], [], points.mean(0)
     for key in epochs:
         name = next(name for name in calibrations if key in poses[name])
         M, X0 = poses[name][key]
@@ -301,7 +316,7 @@ def _start(calibrations, poses, base, turn, epochs, middle) -> RigValues:
     names = list(calibrations)
     return RigValues(
         interior, np.array([base[n] for n in names]), np.array([turn[n] for n in names]),
-        np.array(shift), np.array(rotation),
+        np.array(shift), np.array(rotation), points - middle,
     )  # fmt: skip
 
 

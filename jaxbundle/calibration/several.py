@@ -49,8 +49,6 @@ def calibrate_cameras(
 
     **Raises:** `InputError`, `NotSolvedError`, naming the camera where there are several.
     """
-    if rig and (options.get("board_free") or options.get("board_sigma")):
-        raise InputError("a rig takes the board as known: leave --board-free, --board-sigma out")
     if rig and len(photographs) < 2:
         raise InputError("a rig has two cameras or more: give --camera NAME=PATTERN for each")
     found = {}
@@ -64,5 +62,6 @@ def calibrate_cameras(
             raise type(error)(f"camera {name}: {error}") from None
     together = None
     if rig and all(one.converged for one in found.values()):
-        together = calibrate_rig(found)
+        known = {name: options[name] for name in ("board_sigma", "board_free") if name in options}
+        together = calibrate_rig(found, **known)
     return Calibrations(found, together)

@@ -9,7 +9,8 @@ import pytest
 import render
 from test_calibrate import TRUTH, VIEWS, simulated
 
-from jaxbundle.adjustment.rig import RigCamera, RigValues, adjust_rig, interior_columns
+from jaxbundle.adjustment.rig import adjust_rig
+from jaxbundle.adjustment.rig_normal import RigCamera, RigObject, RigValues, interior_columns
 from jaxbundle.calibration import BoardViews, calibrate, calibrate_cameras, calibrate_rig
 from jaxbundle.calibration.rig import epoch_keys
 from jaxbundle.cameras import get_model
@@ -30,7 +31,7 @@ def right_of(views):
     return [(TURN @ M, X0 + M.T @ BASE) for M, X0 in views]
 
 
-def pair(seed=0, noise=NOISE, moved=()):
+def pair(seed=0, noise=NOISE, moved=(), board=taken.BOARD.points):
     """Views of both cameras; at the epochs `moved` the board moved before the right one."""
     rng = np.random.default_rng(seed)
     middle = tuple(taken.BOARD.points.mean(0)[:2] + [0.01, 0])
@@ -41,7 +42,7 @@ def pair(seed=0, noise=NOISE, moved=()):
         other[e] = M, X0 + [0.01, 0.005, 0.0]
     found = {}
     for name, lens, views in (("left", render.LENS, poses), ("right", RIGHT, other)):
-        xy = taken.corners(lens, views)
+        xy = np.array([lens.image_of(M, X0, board) for M, X0 in views])
         xy = xy + noise * rng.normal(size=xy.shape)
         names = tuple(f"{name}_{e:03d}.png" for e in range(VIEWS))
         found[name] = BoardViews(taken.BOARD, names, lens.size, xy)
@@ -57,8 +58,9 @@ def as_rig(views):
         (np.array(render.LENS.parameters), np.array(RIGHT.parameters)),
         np.array([np.zeros(3), BASE]), np.array([np.eye(3), TURN]),
         np.array([M @ (middle - X0) for M, X0 in poses]), np.array([M for M, _ in poses]),
+        taken.BOARD.points - middle,
     )  # fmt: skip
-    return rig, taken.BOARD.points - middle, truth
+    return rig, RigObject(taken.BOARD.points - middle), truth
 
 
 @pytest.fixture(scope="module")
@@ -109,8 +111,8 @@ def test_sigma_is_honest():
     """Errors of 60 rigs over the σ each of them states."""
     errors = []
     for seed in range(60):
-        rig, points, truth = as_rig(pair(seed))
-        found = adjust_rig(rig, points, truth)
+        rig, board, truth = as_rig(pair(seed))
+        found = adjust_rig(rig, board, truth)
         assert found.converged
         sigma = found.sigma0 * np.sqrt(np.diagonal(found.cofactors))
         own = [interior_columns(rig, k) for k in (0, 1)]
@@ -126,12 +128,12 @@ def test_sigma_is_honest():
 
 
 def test_exact_rays_from_poor_start_values():
-    rig, points, truth = as_rig(pair(noise=0.0))
+    rig, board, truth = as_rig(pair(noise=0.0))
     poor = dataclasses.replace(
         truth, base=truth.base + [[0, 0, 0], [0.01, -0.01, 0.02]], shift=truth.shift * 1.1,
         interior=(truth.interior[0] * 1.02, truth.interior[1] * 0.97),
     )  # fmt: skip
-    found = adjust_rig(rig, points, poor)
+    found = adjust_rig(rig, board, poor)
     assert found.vtpv < 1e-14
     np.testing.assert_allclose(found.values.base[1], BASE, atol=1e-9)
     np.testing.assert_allclose(found.values.turn[1], TURN, atol=1e-9)
@@ -144,6 +146,36 @@ def test_an_epoch_that_is_not_of_one_moment_is_left_out():
     assert "photographs not of the same moment" in found.left_out[0][1]
     mounting = found.mountings["right"]
     assert (np.abs(mounting.base - BASE) < 3.5 * mounting.sigma[:3]).all()
+
+
+def test_a_bent_board_is_estimated_with_the_rig():
+    """Scale comes from the board on the whole; σ0 and the shape come out right."""
+    nominal = taken.BOARD.points
+    away = (nominal - nominal.mean(0))[:, 0] / 0.12
+    true = nominal + np.outer(5e-4 * (away**2 - np.mean(away**2)), [0, 0, 1])
+    views = pair(board=true)
+    rig, board, truth = as_rig(views)
+    truth = dataclasses.replace(truth, points=nominal - nominal.mean(0))
+    known = adjust_rig(rig, board, truth)
+    free = adjust_rig(rig, RigObject(board.given, free=True), truth)
+    sharp = [dataclasses.replace(camera, weight=1 / NOISE) for camera in rig]
+    weighted = adjust_rig(sharp, RigObject(board.given, sigma=5e-4), truth)
+    assert weighted.sigma0 == pytest.approx(1, abs=0.1)
+    assert known.converged and free.converged and weighted.converged
+    assert known.sigma0 > 1.3 * NOISE
+    assert free.sigma0 == pytest.approx(NOISE, rel=0.05)
+    assert free.redundancy == known.redundancy - nominal.size + 7
+    assert weighted.redundancy == known.redundancy
+    first = interior_columns(rig, 1).stop
+    sigma = free.sigma0 * np.sqrt(np.diagonal(free.cofactors)[first:]).reshape(-1, 3)
+    error = free.values.points - (true - true.mean(0))
+    assert np.sqrt(np.mean((error / sigma) ** 2)) == pytest.approx(1, abs=0.2)
+    np.testing.assert_allclose(free.values.points.mean(0), 0, atol=1e-9)
+    shape = (free.values.points - board.given) * board.given
+    assert abs(shape.sum()) < 1e-9
+    base = free.values.base[1] - BASE
+    assert (np.abs(base) < 3.5 * free.sigma0 * np.sqrt(np.diagonal(free.cofactors)[:3])).all()
+    np.testing.assert_allclose(weighted.values.points[:, 2], free.values.points[:, 2], atol=2e-5)
 
 
 def test_photographs_are_paired_by_name():
@@ -161,8 +193,6 @@ def test_what_is_no_rig_is_refused():
     views = simulated()
     with pytest.raises(InputError, match="a rig has two cameras or more"):
         calibrate_cameras({"left": views}, rig=True)
-    with pytest.raises(InputError, match="a rig takes the board as known"):
-        calibrate_cameras(pair(), rig=True, board_free=True)
     with pytest.raises(InputError, match="camera right: only 1 photograph"):
         calibrate_cameras({"left": views, "right": views.take([0])})
     one = calibrate(views, snooping=None)
