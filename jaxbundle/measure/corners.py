@@ -2,7 +2,9 @@
 
 Corners of squares are refined by OpenCV's `cornerSubPix`: the point to which all grey-value
 gradients around it are perpendicular (Förstner and Gülch, 1987). Its window is chosen from the
-distance to the next corner. Circles are refined by `targets`.
+distance to the next corner. Circles are refined by `targets`. Boards are sought in a smaller copy
+of a large photograph (24 million pixels take 25 s, one of 1600 columns 1 s), points are measured in
+the photograph itself.
 """
 
 import numpy as np
@@ -17,6 +19,10 @@ Grey = UInt8[np.ndarray, "rows columns"]
 
 WINDOW = 0.35
 """Half a window, in distances to the next corner: no other corner's edges end in it."""
+SIDES = (1600, 3200)
+"""Longer sides of the copies in which boards are sought, in pixels, one after the other."""
+QUICK = 800
+"""The same, where boards of other sizes are tried."""
 SMALLEST, LARGEST = 2, 15
 """Limits of half a window, in pixels."""
 
@@ -46,6 +52,7 @@ def other_sizes(grey: Grey, board: Board) -> Board | None:
     m, n = board.columns, board.rows
     tried = [(n, m), (m - 1, n - 1), (n - 1, m - 1), (m + 1, n + 1)]
     tried += [(m - 1, n), (m, n - 1), (m + 1, n), (m, n + 1)]
+    grey, _ = _reduced(need_opencv(), grey, QUICK)
     for columns, rows in tried:
         try:
             other = Board(columns, rows, board.square, board.kind)
@@ -58,18 +65,44 @@ def other_sizes(grey: Grey, board: Board) -> Board | None:
 
 def _chessboard(cv2, grey, board):
     size = (board.columns, board.rows)
-    flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
-    found, xy = cv2.findChessboardCornersSB(grey, size, flags=flags)
-    if not found:
-        flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-        found, xy = cv2.findChessboardCorners(grey, size, flags=flags)
-    if not found:
+
+    def seek(grey):
+        flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
+        found, xy = cv2.findChessboardCornersSB(grey, size, flags=flags)
+        if not found:
+            flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+            found, xy = cv2.findChessboardCorners(grey, size, flags=flags)
+        return xy if found else None
+
+    xy = _in_copies(cv2, grey, seek)
+    if xy is None:
         raise InputError(
             f"no chessboard of {size[0]} × {size[1]} inner corners found: it must be seen whole, "
             "with a light margin"
         )
     xy = _refined(cv2, grey, xy.reshape(*board.grid, 2))
     return _first_black(grey, _turned_right(xy), board).reshape(-1, 2)
+
+
+def _in_copies(cv2, grey, seek):
+    """What `seek` finds in smaller copies of the image, as pixels of the image; None: nothing."""
+    sides = [side for side in SIDES if side < max(grey.shape)]
+    for side in (*sides, max(grey.shape))[: len(SIDES)]:
+        copy, factor = _reduced(cv2, grey, side)
+        xy = seek(copy)
+        if xy is not None:
+            return factor * xy.reshape(-1, 2).astype(float) + (factor - 1) / 2
+    return None
+
+
+def _reduced(cv2, grey, side):
+    """The image made smaller by a whole factor, so that no side is longer; and the factor."""
+    factor = -(-max(grey.shape) // side)
+    if factor < 2:
+        return grey, 1
+    rows, columns = (n // factor * factor for n in grey.shape)
+    size = (columns // factor, rows // factor)
+    return cv2.resize(grey[:rows, :columns], size, interpolation=cv2.INTER_AREA), factor
 
 
 def _refined(cv2, grey, xy):
@@ -151,19 +184,22 @@ def _circles(cv2, grey, board):
     size = (board.columns, board.rows)
     uneven = board.kind == "asymmetric-circles"
     flags = cv2.CALIB_CB_ASYMMETRIC_GRID if uneven else cv2.CALIB_CB_SYMMETRIC_GRID
-    for shade in (0, 255):
-        for more in (0, cv2.CALIB_CB_CLUSTERING):
+
+    def seek(grey):
+        for shade in (0, 255):
             finder = _blob_finder(cv2, grey, shade)
-            found, xy = cv2.findCirclesGrid(grey, size, flags=flags | more, blobDetector=finder)
-            if found:
-                break
-        if found:
-            break
-    else:
+            for more in (0, cv2.CALIB_CB_CLUSTERING):
+                found, xy = cv2.findCirclesGrid(grey, size, flags=flags | more, blobDetector=finder)
+                if found:
+                    return xy
+        return None
+
+    xy = _in_copies(cv2, grey, seek)
+    if xy is None:
         raise InputError(
             f"no grid of {size[0]} × {size[1]} circles found: it must be seen whole and sharp"
         )
-    xy = xy.reshape(*board.grid, 2).astype(float)
+    xy = xy.reshape(*board.grid, 2)
     if uneven:
         xy = _uneven_rows(xy)
     else:

@@ -53,6 +53,17 @@ def test_every_point_is_found_and_numbered(board, seed):
     assert np.abs(error).max() < 0.3
 
 
+@pytest.mark.parametrize("board", [CHESS, CIRCLES], ids=lambda b: b.kind)
+def test_large_photographs_are_searched_in_small(board):
+    """A photograph five times as large: found in a copy, measured in itself."""
+    picture, true = taken(board, 20, 15, 10, 0.5)
+    large = cv2.resize(picture, None, fx=5, fy=5, interpolation=cv2.INTER_CUBIC)
+    found = find_board(large[:, :-3], board)
+    true = 5 * true + 2
+    assert np.abs(found - true).max() < 1.0
+    assert np.sqrt(np.mean((found - true) ** 2)) < 0.3
+
+
 def test_a_hidden_part_of_a_charuco_board_is_missing():
     picture, true = taken(CHARUCO, 10, 10, 0, 0.5)
     picture[:, 260:] = 128
