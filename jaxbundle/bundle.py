@@ -76,7 +76,7 @@ def adjust(
     problem = with_factor(problem)
 
     removed, eliminated, factors, weights = [], [], {}, None
-    if robust and (solved(problem, minimum) or not names_of_defects(problem, minimum)):
+    if robust:
         problem, minimum, weights = robustly(problem, minimum, again, robust)
     if solved(problem, minimum):
         if snooping:

@@ -11,7 +11,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.arrays import Values
 from jaxbundle.result import Adjustment
-from jaxbundle.solution import require_solved
+from jaxbundle.solution import require_solved, solved
 from jaxbundle.statistics import (
     Component,
     Inspection,
@@ -39,10 +39,12 @@ def snooped(problem: Problem, minimum, again, test: str, significance: float):
 
 def robustly(problem: Problem, minimum, again, estimator: str):
     """The problem with the weights of a robust estimator, its minimum, the factors of the image
-    points."""
+    points. The first weights come from the minimum, or from the start values if it is no solution.
+    """
     repeat = _Repeat(again, "by robust estimation")
     repeat.minimum = minimum
-    problem, _, factors, rests = reweight(problem, minimum.values, repeat, estimator)
+    first = minimum.values if solved(problem, minimum) else problem.data.start
+    problem, _, factors, rests = reweight(problem, first, repeat, estimator)
     if not rests:
         raise NotSolvedError(
             f"not solved by robust estimation: the weights of {estimator} do not come to rest; use "

@@ -7,4 +7,5 @@ from jaxbundle.cli import adjust as adjust
 from jaxbundle.cli import batch as batch
 from jaxbundle.cli import calibrate as calibrate
 from jaxbundle.cli import convert as convert
+from jaxbundle.cli import orient as orient
 from jaxbundle.cli.app import main as main

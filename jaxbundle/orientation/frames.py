@@ -15,25 +15,28 @@ FEW = 6
 ROUNDS = 3
 
 
-def onto_the_given(network: Network, model: Model) -> tuple[Model, str]:
-    """The model in the frame of control points and of images whose position is given; without
-    three of them, to the scale of the distances, in a frame of its own. And which, in words."""
+def onto_the_given(network: Network, model: Model) -> Model | None:
+    """The model in the frame of control points and of images whose position is given, else of the
+    approximate coordinates of points; None where there are not three."""
     points, images = network.points, network.images
     control = controlled(points) & model.known
     stations = model.placed & np.isfinite(images.position).all(1)
-    source = np.concatenate([model.X[control], model.X0[stations]])
-    target = np.concatenate([points.position[control], images.position[stations]])
-    found = similarity(source, target)
-    if found is not None:
-        return model.moved(*found), "in the frame of control"
-    approximate = np.isfinite(points.position).all(1) & model.known & ~points.has_role("check")
-    found = similarity(model.X[approximate], points.position[approximate])
-    if found is not None:
-        return model.moved(*found), "in the frame of the points given"
+    found = similarity(
+        np.concatenate([model.X[control], model.X0[stations]]),
+        np.concatenate([points.position[control], images.position[stations]]),
+    )
+    if found is None:
+        tie = np.isfinite(points.position).all(1) & model.known & ~points.has_role("check")
+        found = similarity(model.X[tie], points.position[tie])
+    return None if found is None else model.moved(*found)
+
+
+def to_scale(network: Network, model: Model) -> tuple[Model, str]:
+    """The model with the scale of the distances, if there are any, and what it refers to."""
     scale = scale_of_distances(network, model)
-    if scale is not None:
-        return model.moved(scale * np.eye(3), np.zeros(3)), "to scale, in a frame of its own"
-    return model, "in a frame and a scale of its own"
+    if scale is None:
+        return model, "in a frame and a scale of its own"
+    return model.moved(scale * np.eye(3), np.zeros(3)), "to scale, in a frame of its own"
 
 
 def scale_of_distances(network: Network, model: Model) -> float | None:
@@ -46,29 +49,29 @@ def scale_of_distances(network: Network, model: Model) -> float | None:
     return float(np.median(distances.value[there] / np.linalg.norm(a - b, axis=1)))
 
 
-def join(sights: Sights, model: Model, part: Model) -> bool:
-    """Take a second model over into the first; whether something connects them.
+def joined(sights: Sights, model: Model, part: Model) -> Model | None:
+    """A model with what a second one knows besides; None where nothing connects them.
 
     The similarity is that of the points both know, or, where they have an image in common, the one
     of its pose and of the distances to the points it sees."""
     both = model.known & part.known
     if not both.any():
-        return False
+        return None
     shared = np.flatnonzero(model.placed & part.placed)
     if len(shared):
         seen = np.bincount(sights.image, both[sights.point], minlength=sights.images)
-        image = shared[seen[shared].argmax()]
-        found = _by_an_image(model, part, image, both)
+        found = _by_an_image(model, part, shared[seen[shared].argmax()], both)
     else:
         found = similarity(part.X[both], model.X[both])
     if found is None:
-        return False
+        return None
     part = part.moved(*found)
-    new = part.placed & ~model.placed
-    model.place(new, part.X0[new], part.M[new])
-    new = part.known & ~model.known
-    model.X[new], model.known[new] = part.X[new], True
-    return True
+    image, point = part.placed & ~model.placed, part.known & ~model.known
+    choose = lambda rows, new, old: np.where(rows.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+    return Model(
+        choose(image, part.X0, model.X0), choose(image, part.M, model.M), model.placed | image,
+        choose(point, part.X, model.X), model.known | point, model.held,
+    )  # fmt: skip
 
 
 def _by_an_image(model, part, image, both):

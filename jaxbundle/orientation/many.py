@@ -147,7 +147,7 @@ def _similarity(source, target, weights):
 @jax.jit
 @jax.vmap
 def _matrix(angles):
-    return (matrix_from_omega_phi_kappa(*angles),)
+    return (matrix_from_omega_phi_kappa(angles),)
 
 
 @jax.jit

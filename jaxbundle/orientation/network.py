@@ -5,8 +5,9 @@
 2. Where nothing can begin so, given coordinates of tie points count as known.
 3. Where nothing can begin so either, or images are left, a model begins with two of them: of the
    pairs with many points in common one whose rays meet at good angles, oriented relatively (five
-   points). It grows, and is then taken by a similarity onto control points, given positions, or
-   the first model (`frames`). Without any of these it keeps its own frame.
+   points). It grows; what it does not reach follows by a pair of a placed and a new image, joined
+   to it. In the end a similarity takes it onto control points or given positions (`frames`);
+   without these it keeps its own frame.
 
 A plane has two relative orientations, and of two pictures from one place every one is wrong: a pair
 from which little grows is replaced by the next.
@@ -25,7 +26,7 @@ from jaxbundle.network.columns import count, some
 from jaxbundle.network.sightings import keep_images, keep_points
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation import many
-from jaxbundle.orientation.frames import join, onto_the_given
+from jaxbundle.orientation.frames import joined, onto_the_given, to_scale
 from jaxbundle.orientation.growth import (
     AGREE,
     FOR_OTHERS,
@@ -44,6 +45,8 @@ PAIRS = 16
 """Pairs whose relative orientation is looked at."""
 SEEDS = 6
 """Pairs a model is grown from, at most."""
+OUT_OF_THE_QUESTION = 3.0
+"""Image points that miss by more than so many tolerances are left out."""
 MOST = 0.8
 """A model in which this part of the image points finds its place need not compete."""
 WIDE = 0.5
@@ -99,7 +102,6 @@ def orient(network: Network) -> Oriented:
     if not model.placed.any():
         why = _why_nothing(network, seen)
         raise NotSolvedError(f"no start values found: {why}", _names(network))
-    finish(seen, model)
     return _result(network, seen, model, frame)
 
 
@@ -110,20 +112,19 @@ def _model(network: Network, seen: Sights) -> tuple[Model, str]:
         approximate = _with_approximate_points(network, model)
         grow(seen, approximate)
         model = approximate if approximate.placed.any() else model
-    if not model.placed.any():
-        part = _from_a_pair(seen, ~model.placed)
-        if part is None:
-            return model, frame
-        finish(seen, part)
-        model, frame = onto_the_given(network, part)
-        model = _with_control(network, model)
-        grow(seen, model)
+    fixed = model.placed.any()
     while not model.placed.all():
-        part = _from_a_pair(seen, ~model.placed, model.placed)
-        if part is None or not join(seen, model, part):
+        part = _from_a_pair(seen, model)
+        if part is None:
             break
+        model = part if not model.placed.any() else joined(seen, model, part)
         grow(seen, model)
-    return model, frame
+        if not fixed and (moved := onto_the_given(network, model)):
+            fixed, frame = True, "in the frame given"
+            model = _with_control(network, moved)
+            grow(seen, model)
+    finish(seen, model)
+    return (model, frame) if fixed else to_scale(network, model)
 
 
 def _given(network: Network, seen: Sights) -> Model:
@@ -148,22 +149,22 @@ def _with_approximate_points(network: Network, model: Model) -> Model:
     return dataclasses.replace(model, X=X, known=model.known | given, placed=model.placed.copy())
 
 
-def _from_a_pair(seen: Sights, new: Bool[np.ndarray, " images"], old=None) -> Model | None:
-    """The best of the models that grow from a few good pairs of images: both `new`, or one of them
-    `old`, where there are such."""
-    linked = old is not None
-    old = _neighbours(seen, new) & old if linked else np.zeros(seen.images, bool)
-    among, best, most = new | old, None, 0
-    for image, other, M, b in _good_pairs(seen, among, old, linked):
-        model = Model.empty(seen)
-        model.place(image, np.zeros(3), np.eye(3))
-        model.place(other, b, M)
-        grow(seen, model, among)
+def _from_a_pair(seen: Sights, model: Model) -> Model | None:
+    """The best of the models that grow from a few good pairs of the images not placed; if some are
+    placed, from pairs with one of them, to a model that can be joined to theirs."""
+    new, linked = ~model.placed, model.placed.any()
+    old = _neighbours(seen, new) & model.placed
+    best, most = None, 0
+    for image, other, M, b in _good_pairs(seen, new | old, old, linked):
+        part = Model.empty(seen)
+        part.place(image, np.zeros(3), np.eye(3))
+        part.place(other, b, M)
+        grow(seen, part, new | old)
         rows = new[seen.image]
-        good = int((misclosures(seen, model) < seen.tolerance[seen.image])[rows].sum())
-        if good > most:
-            best, most = model, good
-        if good >= MOST * rows.sum():
+        good = int((misclosures(seen, part) < seen.tolerance[seen.image])[rows].sum())
+        if good > most and not (linked and joined(seen, model, part) is None):
+            best, most = part, good
+        if most >= MOST * rows.sum():
             break
     return best
 
@@ -224,12 +225,15 @@ def _result(network: Network, seen: Sights, model: Model, frame: str) -> Oriente
     X = np.where(
         (model.known & ~np.isfinite(points.position).all(1))[:, None], model.X, points.position
     )
+    wrong = _contradicting(network, seen, model)
     keep = model.placed
     known = np.isfinite(X).all(1)
     reasons = _reasons(network, seen, model, known)
+    rays = network.observations
     network = network.replace(
         images=dataclasses.replace(images, position=position, angles=angles),
         points=dataclasses.replace(points, position=X),
+        observations=rays.take(np.setdiff1d(np.arange(len(rays)), wrong)),
     )
     network = keep_points(keep_images(network, keep), known)
     said = [
@@ -237,7 +241,19 @@ def _result(network: Network, seen: Sights, model: Model, frame: str) -> Oriente
         + some((f"{id} ({why})" for id, why in found.items()), 5, str)
         for thing, found in zip(("image", "point"), reasons) if found
     ]  # fmt: skip
+    if len(wrong):
+        names = (f"{points.id[rays.point[k]]} in {images.id[rays.image[k]]}" for k in wrong)
+        said.append(
+            f"left out {count(len(wrong), 'image point')} that contradict the start values "
+            f"altogether: {some(names, 5, str)}"
+        )
     return Oriented(network.warn(f"start values found, {frame}", *said), frame, *reasons)
+
+
+def _contradicting(network: Network, seen: Sights, model: Model):
+    """Rows of the observations of known points in placed images that are out of the question."""
+    misclosure = misclosures(seen, model) / seen.tolerance[seen.image]
+    return seen.row[np.flatnonzero(misclosure > OUT_OF_THE_QUESTION)]
 
 
 def _reasons(network: Network, seen: Sights, model: Model, known):

@@ -32,6 +32,7 @@ class Sights:
     image: Int[np.ndarray, " n"]
     point: Int[np.ndarray, " n"]
     xy: Float[np.ndarray, "n 2"]
+    row: Int[np.ndarray, " n"]
     tolerance: Float[np.ndarray, " images"]
     points: int
 
@@ -68,7 +69,9 @@ def sights(network: Network) -> Sights:
     rows = np.flatnonzero(np.isfinite(xy).all(1))
     rows = rows[np.argsort(rays.image[rows], kind="stable")]
     tolerance = TOLERANCE * np.where(np.isfinite(extent), extent, 1.0)
-    return Sights(rays.image[rows], rays.point[rows], xy[rows], tolerance, len(network.points))
+    return Sights(
+        rays.image[rows], rays.point[rows], xy[rows], rows, tolerance, len(network.points)
+    )
 
 
 def _pictures(model, p, xy):

@@ -33,8 +33,8 @@ from jaxbundle.statistics.inspection import Inspection
 ESTIMATORS = ("huber", "cauchy", "tukey")
 LEAST_WEIGHT = 1e-6
 """Weights of image points do not fall lower, so that the network stays determined."""
-RESTING = 1e-3
-"""Weights that change by less are at rest."""
+RESTING = 1e-4
+"""Weights whose changes have a smaller root mean square are at rest."""
 ROUNDS = 100
 
 
@@ -76,7 +76,7 @@ def reweight(
             t = _lengths(problem, values)
             fixed = scale if name != "huber" else _scale(problem, weighted, t)
             now = np.maximum(_WEIGHT[name](t / fixed), LEAST_WEIGHT)
-            rests = np.abs(now - w).max(initial=0.0) < RESTING
+            rests = np.sqrt(np.mean((now - w) ** 2)) < RESTING
             w, scale = now, fixed
             if rests:
                 break
