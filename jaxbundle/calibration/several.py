@@ -6,7 +6,8 @@ from pathlib import Path
 
 from jaxbundle.calibration.calibrate import calibrate
 from jaxbundle.calibration.result import Calibration
-from jaxbundle.calibration.rig import RigCalibration, calibrate_rig
+from jaxbundle.calibration.rig import calibrate_rig
+from jaxbundle.calibration.rig_result import RigCalibration
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.measure.boards import Board
 from jaxbundle.measure.views import BoardViews

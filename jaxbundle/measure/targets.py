@@ -1,8 +1,6 @@
 """The centre of a target, a light or dark spot, in a photograph.
 
-1. A window about the place given grows until the spot nearest to it ends inside. Threshold within a
-   window: the grey value that separates two classes best (Otsu, 1979); what the rim of the window
-   shows is background.
+1. The spot, its window and threshold: `spots`.
 2. Centre by weighted grey values: with g the grey value, b that of the background, f that of the
    target, over the spot and the pixels next to it, where its blurred edge ends,
 
@@ -13,7 +11,6 @@
    background's, has its middle value; then `fit_ellipse`. (Blur σ makes a disc of radius r smaller
    by about σ²/2r; its centre stays.)
 
-σg is estimated from the window by a mask that cancels what is linear in the image (Immerkær, 1996).
 Both centres are those of the ellipse, not of the circle: `circle_centre_shift`.
 """
 
@@ -26,16 +23,8 @@ from scipy import ndimage
 
 from jaxbundle.errors import InputError
 from jaxbundle.measure.ellipses import fit_ellipse
+from jaxbundle.measure.spots import MARGIN, find_spot
 
-FIRST, LARGEST = 8, 256
-"""Half a window, in pixels: where it begins, and the largest."""
-CONTRAST = 5.0
-"""A target differs from its background by more than so many σg."""
-LEAST_CONTRAST = 4.0
-"""And by so many grey values."""
-LEAST_PIXELS = 5
-MARGIN = 3
-"""Pixels beyond the spot that its blurred edge may reach."""
 PROFILES = (16, 32, 64)
 """Numbers of profiles: the largest that is not above the circumference in pixels, lest pixels be
 measured twice."""
@@ -67,24 +56,6 @@ class Target:
     noise: float
 
 
-@dataclasses.dataclass(frozen=True)
-class _Spot:
-    """A spot in its window: the window's corner (column, row) in the photograph, grey values, the
-    pixels of the spot, and the levels."""
-
-    corner: np.ndarray
-    grey: np.ndarray
-    inside: np.ndarray
-    background: float
-    level: float
-    threshold: float
-    noise: float
-
-    @property
-    def contrast(self) -> float:
-        return self.level - self.background
-
-
 def centre_by_grey_values(grey, near) -> Target:
     """The centre of the target nearest to `near` (column, row) as the centre of its grey values.
 
@@ -92,7 +63,7 @@ def centre_by_grey_values(grey, near) -> Target:
 
     **Raises:** `InputError` where no target stands out, or it is cut by the edge of the image.
     """
-    spot = _find_spot(np.asarray(grey, float), np.asarray(near, float))
+    spot = find_spot(np.asarray(grey, float), np.asarray(near, float))
     xy, spread, total = _moments(spot)
     away = _places(spot) - xy[:, None, None]
     region = _region(spot)
@@ -103,7 +74,7 @@ def centre_by_grey_values(grey, near) -> Target:
 def centre_by_ellipse(grey, near) -> Target:
     """The centre of the target nearest to `near` (column, row) as that of an ellipse through its
     edge; arguments and errors as in `centre_by_grey_values`."""
-    spot = _find_spot(np.asarray(grey, float), np.asarray(near, float))
+    spot = find_spot(np.asarray(grey, float), np.asarray(near, float))
     xy, spread, _ = _moments(spot)
     axes, angle = _axes_of(spread)
     edge = _edge_points(spot, xy, axes, angle)
@@ -129,109 +100,6 @@ def _place(spot, xy):
     return f"at ({x:.1f}, {y:.1f})"
 
 
-# Window and threshold -----------------------------------------------------------------------
-
-
-def _find_spot(grey, near) -> _Spot:
-    where = f"at ({near[0]:.1f}, {near[1]:.1f})"
-    rows, columns = grey.shape
-    if not (0 <= near[0] < columns and 0 <= near[1] < rows):
-        raise InputError(f"{where}: outside the image of {columns} × {rows} pixels")
-    why = "no target stands out from its surroundings"
-    half = FIRST
-    while half <= LARGEST:
-        low = np.maximum(np.rint(near).astype(int) - half, 0)
-        high = np.minimum(np.rint(near).astype(int) + half + 1, [columns, rows])
-        window = grey[low[1] : high[1], low[0] : high[0]]
-        inside, threshold = _nearest_spot(window, near - low)
-        if inside is not None:
-            ends = _ends_inside(inside)
-            if ends:
-                return _levels(grey, low, window, inside, threshold)
-            why = "the target reaches the edge of the image, or joins its surroundings"
-        if (low == 0).all() and (high == [columns, rows]).all():
-            break
-        half *= 2
-    raise InputError(f"{where}: {why}")
-
-
-def _nearest_spot(window, near):
-    """Pixels of the spot nearest to a place, and the threshold; None where there is none."""
-    threshold = otsu(window)
-    bright = window > threshold
-    contrast = window[bright].mean() - window[~bright].mean() if bright.any() else 0.0
-    if contrast < max(CONTRAST * noise_of(window), LEAST_CONTRAST):
-        return None, threshold
-    rim = np.concatenate([bright[0], bright[-1], bright[1:-1, 0], bright[1:-1, -1]])
-    labels, number = ndimage.label(bright if rim.mean() < 0.5 else ~bright)
-    sizes = ndimage.sum_labels(np.ones_like(window), labels, np.arange(1, number + 1))
-    large = np.flatnonzero(sizes >= LEAST_PIXELS) + 1
-    rows, columns = np.nonzero(np.isin(labels, large))
-    if not len(rows):
-        return None, threshold
-    nearest = np.argmin((columns - near[0]) ** 2 + (rows - near[1]) ** 2)
-    inside = labels == labels[rows[nearest], columns[nearest]]
-    return ndimage.binary_fill_holes(inside), threshold
-
-
-def _ends_inside(inside) -> bool:
-    """Whether the spot, with the room its edge needs, ends within the window."""
-    rows, columns = (np.flatnonzero(inside.any(axis)) for axis in (1, 0))
-    free = min(rows[0], columns[0], inside.shape[0] - 1 - rows[-1],
-               inside.shape[1] - 1 - columns[-1])  # fmt: skip
-    return free >= MARGIN
-
-
-def _levels(grey, low, window, inside, threshold) -> _Spot:
-    """The spot in the smallest window that holds it, with the levels of target and background."""
-    rows, columns = np.nonzero(inside)
-    room = 2 * MARGIN
-    first = np.maximum([columns.min() - room, rows.min() - room], 0)
-    last = np.array([columns.max() + room + 1, rows.max() + room + 1])
-    cut = (slice(first[1], last[1]), slice(first[0], last[0]))
-    window, inside = window[cut], inside[cut]
-    bright = window[inside].mean() > window[~inside].mean()
-    core = inside & ~ndimage.binary_dilation(~inside, iterations=2)
-    level = np.median(window[core]) if core.sum() >= LEAST_PIXELS else np.quantile(
-        window[inside], 0.9 if bright else 0.1
-    )
-    around = ndimage.binary_dilation(inside, iterations=MARGIN + 2)
-    around &= ~ndimage.binary_dilation(inside, iterations=MARGIN)
-    own = window > threshold if bright else window < threshold
-    around &= ~own
-    background = np.median(window[around]) if around.any() else np.median(window[~inside])
-    return _Spot(
-        low + first, window, inside, float(background), float(level),
-        float(background + level) / 2, noise_of(window),
-    )  # fmt: skip
-
-
-def otsu(grey) -> float:
-    """The threshold that makes the two classes of grey values differ most (Otsu, 1979)."""
-    low, high = float(grey.min()), float(grey.max())
-    counts, edges = np.histogram(grey, 256, (low, max(high, low + 1e-9)))
-    middle = (edges[:-1] + edges[1:]) / 2
-    below, total = np.cumsum(counts), np.cumsum(counts * middle)
-    above = below[-1] - below
-    with np.errstate(divide="ignore", invalid="ignore"):
-        between = below * above * (total / below - (total[-1] - total) / above) ** 2
-    best = np.flatnonzero(between >= np.nanmax(between, initial=0.0) * (1 - 1e-12))
-    return float(edges[1:][best].mean()) if len(best) else low
-
-
-def noise_of(grey) -> float:
-    """σ of the noise of the grey values (Immerkær, 1996, with the median for its mean, since edges
-    are outliers); not below that of rounding to whole grey values, 1/√12."""
-    if min(grey.shape) < 3:
-        return 12**-0.5
-    mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]])
-    response = ndimage.convolve(grey, mask)[1:-1, 1:-1]
-    return max(float(np.median(np.abs(response)) / (6 * 0.6745)), 12**-0.5)
-
-
-# Grey values --------------------------------------------------------------------------------
-
-
 def _region(spot):
     return ndimage.binary_dilation(spot.inside, np.ones((3, 3)), iterations=MARGIN)
 
@@ -255,9 +123,6 @@ def _axes_of(spread):
     values, vectors = np.linalg.eigh(spread + np.eye(2) / 12)
     x, y = vectors[:, 1]
     return 2 * np.sqrt(values[::-1]), np.arctan2(y, x)
-
-
-# Edge ---------------------------------------------------------------------------------------
 
 
 def _edge_points(spot, xy, axes, angle):

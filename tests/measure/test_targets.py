@@ -16,7 +16,7 @@ from jaxbundle.measure import (
     circle_centre_shift,
     fit_ellipse,
 )
-from jaxbundle.measure.targets import noise_of, otsu
+from jaxbundle.measure.spots import noise_of, otsu
 from jaxbundle.orientation import Pose
 
 SPACING = 0.06
