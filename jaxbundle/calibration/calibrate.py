@@ -29,7 +29,7 @@ from jaxbundle.cameras import CameraModel, get_model
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.measure.boards import Board
-from jaxbundle.measure.ellipses import circle_centre_shift
+from jaxbundle.measure.ellipses import rim_centre_shift
 from jaxbundle.measure.views import BoardViews, measure_boards
 from jaxbundle.network.build import make_network
 from jaxbundle.network.tables import Camera, Network
@@ -171,7 +171,7 @@ def _without_eccentricity(start: Start, result, camera: Camera) -> BoardViews:
 
 
 def _shifts(model, p, poses, centres, up, radius):
-    one = lambda pose, X: circle_centre_shift(model, p, pose, X, up, radius)
+    one = lambda pose, X: rim_centre_shift(model, p, pose, X, up, radius)
     return jax.jit(jax.vmap(jax.vmap(one, (None, 0)), (0, None)))(poses, centres)
 
 

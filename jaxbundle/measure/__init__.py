@@ -13,6 +13,7 @@ from .corners import find_board as find_board
 from .ellipses import Ellipse as Ellipse
 from .ellipses import circle_centre_shift as circle_centre_shift
 from .ellipses import fit_ellipse as fit_ellipse
+from .ellipses import rim_centre_shift as rim_centre_shift
 from .fiducials import Transformation as Transformation
 from .fiducials import fit_fiducials as fit_fiducials
 from .matching import Match as Match

@@ -17,7 +17,9 @@ is the pole of the line at infinity, the image of the direction
 
     H·diag(−ρ², −ρ², 1)·Hᵀ·z = q·X − ρ²·(z − n_q·n)
 
-since a·aᵀ + b·bᵀ = 1 − n·nᵀ (compare Ahn, Warnecke and Kotowski, 1999; Dold, 1996).
+since a·aᵀ + b·bᵀ = 1 − n·nᵀ (compare Ahn, Warnecke and Kotowski, 1999; Dold, 1996). Where the
+distortion bends over the circle's image, that image is no ellipse: `rim_centre_shift` fits one to
+it, as it is measured.
 """
 
 import equinox as eqx
@@ -28,6 +30,8 @@ from jaxtyping import Array, Float
 from jaxbundle.cameras import CameraModel, project
 from jaxbundle.orientation.pose import Pose, to_camera
 
+RIM = 32
+"""Points of a rim."""
 ROUNDING = 1e-13
 """Added to the scatter matrix, relative: points exactly on an ellipse leave it singular."""
 
@@ -115,6 +119,27 @@ def circle_centre_shift(
     middle = X[2] * X - radius**2 * (jnp.array([0, 0, 1.0]) - n[2] * n)
     image = lambda ray: jnp.stack(project(model, tuple(p), *ray))
     return image(middle) - image(X)
+
+
+def rim_centre_shift(
+    model: CameraModel,
+    p,
+    pose: Pose,
+    centre: Float[Array, "3"],
+    normal: Float[Array, "3"],
+    radius: float,
+) -> Float[Array, "2"]:
+    """Centre of the ellipse through the image of a circle's rim minus image of its centre: as
+    `circle_centre_shift`, and with the distortion as it is along the rim."""
+    aside = jnp.where(jnp.abs(normal[0]) < 0.8, jnp.array([1.0, 0, 0]), jnp.array([0, 1.0, 0]))
+    a = jnp.cross(normal, aside)
+    a = a / jnp.linalg.norm(a)
+    t = 2 * jnp.pi * (jnp.arange(RIM) + 0.5) / RIM
+    rim = centre + radius * (
+        jnp.cos(t)[:, None] * a + jnp.sin(t)[:, None] * jnp.cross(normal, a)
+    )
+    image = lambda X: jnp.stack(project(model, tuple(p), *to_camera(pose, X)))
+    return fit_ellipse(jax.vmap(image)(rim)).centre - image(centre)
 
 
 def _centre(conic):
