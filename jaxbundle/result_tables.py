@@ -161,8 +161,8 @@ def _residual_rows(adjustment, kind, image, point, axes, order, v, weight, r, w)
         "r": r.ravel(),
         "w": w.ravel(),
         "tau": adjustment.pope(w).ravel(),
-        "mdb": np.asarray(minimal_detectable(sigma, r)).ravel(),
-        "external": np.asarray(external_reliability(r)).ravel(),
+        "mdb": minimal_detectable(sigma, r).ravel(),
+        "external": external_reliability(r).ravel(),
     }
     if adjustment.weights is not None:
         factor = adjustment.weights if kind == "image" else np.ones(len(image))

@@ -4,14 +4,18 @@
 |---|---|
 | report.txt, result.json | the whole protocol; its numbers |
 | CAMERA.toml | the camera, to stand in a project; σ as comments |
-| network/ | the project that was adjusted: `jaxbundle adjust network` goes on from it |
-| coverage, uncertainty, uncertainty_far, uncertainty_distance .png | how good it is |
+| CAMERA.yaml, colmap/ | the camera for OpenCV; camera, poses and board for COLMAP |
+| network/ | the adjusted network: `jaxbundle adjust FOLDER/network` goes on from it |
+| coverage, uncertainty, uncertainty_far, uncertainty_distance, halves .png | how good it is |
 | plan, perspective, histogram, residuals_…, distortion_…, correlations_… .png | as of `adjust` |
+
+A model that OpenCV and COLMAP do not have is converted to `opencv` for them; what that costs stands
+as a comment in the TOML.
 """
 
 import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
@@ -19,26 +23,31 @@ import numpy as np
 
 from jaxbundle.calibration.report import rig_dict
 from jaxbundle.errors import InputError
+from jaxbundle.io import adjusted_network, write_colmap, write_opencv, write_project
 from jaxbundle.io.csv_tables import write_text
-from jaxbundle.io.project import cameras_text, write_project
-from jaxbundle.network.tables import Camera
+from jaxbundle.io.project import ADJUSTED, cameras_text
+from jaxbundle.network.conversion import convert_cameras
+from jaxbundle.network.tables import Camera, Network
 from jaxbundle.plotting import (
     coverage_map,
+    difference_map,
     save_figures,
     uncertainty_curve,
     uncertainty_image,
     write_figures,
 )
 
-REPORT, RESULT, NETWORK = "report.txt", "result.json", "network"
+REPORT, RESULT = "report.txt", "result.json"
 DISTANCES = 15
-CAMERA_WRITERS: dict[str, Callable[[Camera, Path], None]] = {}
-"""Further forms a camera is written in: ending of the file, and who writes it."""
+COLMAP = "colmap"
+FOREIGN = ("opencv", "kannala-brandt")
+"""Models that OpenCV and COLMAP have."""
 
 
-def camera_text(camera: Camera, sigma: Mapping[str, float]) -> str:
-    """A calibrated camera in our TOML, its σ as comments."""
+def camera_text(camera: Camera, sigma: Mapping[str, float], *remarks: str) -> str:
+    """A calibrated camera in our TOML, its σ and remarks as comments."""
     comments = [f"# σ of {name}: {value:.4g}" for name, value in sigma.items()]
+    comments += [f"# {remark}" for remark in remarks]
     return "\n".join([cameras_text([camera]).rstrip(), *comments]) + "\n"
 
 
@@ -62,12 +71,27 @@ def write_calibration(calibration, folder: str | Path, plots: bool = True) -> No
     if not calibration.converged:
         return
     name = file_name(calibration.name)
-    write_text(folder / f"{name}.toml", camera_text(calibration.camera, calibration.sigma))
-    for ending, write in CAMERA_WRITERS.items():
-        write(calibration.camera, folder / f"{name}{ending}")
-    write_project(calibration.adjustment.problem.network, folder / NETWORK)
+    network = adjusted_network(calibration.adjustment)
+    write_project(network, folder / ADJUSTED)
+    remark = _write_foreign(network, folder, name)
+    text = camera_text(calibration.camera, calibration.sigma, *remark)
+    write_text(folder / f"{name}.toml", text)
     if plots:
         save_plots(calibration, folder)
+
+
+def _write_foreign(network: Network, folder: Path, name: str) -> list[str]:
+    """The camera for OpenCV and COLMAP; what a conversion of its model cost, in words."""
+    remark = []
+    if network.cameras[0].model not in FOREIGN:
+        try:
+            network, cost = convert_cameras(network, "opencv")
+        except InputError as error:
+            return [f"not written for OpenCV and COLMAP: {error}"]
+        remark = [f"{name}.yaml and {COLMAP}: {conversion}" for conversion in cost.values()]
+    write_opencv(network.cameras[0], folder / f"{name}.yaml")
+    write_colmap(network, folder / COLMAP, text=True)
+    return remark
 
 
 def write_calibrations(found, folder: str | Path, plots: bool = True) -> None:
@@ -108,14 +132,19 @@ def save_plots(calibration, folder: Path) -> None:
     distances = np.geomspace(span[0] / 4, 100 * span[1], DISTANCES)
     curve = calibration.uncertainty_over_distance(distances)
     image = partial(uncertainty_image, image_size=size, unit=unit, name=name)
-    write_figures(folder, {
+    drawings = {
         "coverage": ((7, 5.6), None, partial(
             coverage_map, calibration.coverage, calibration.measured, size, name)),
         "uncertainty": ((7, 5.6), None, partial(image, calibration.uncertainty(near))),
         "uncertainty_far": ((7, 5.6), None, partial(image, calibration.uncertainty())),
         "uncertainty_distance": ((6.5, 4.2), None, partial(
             uncertainty_curve, distances, *curve, span, unit, name)),
-    })  # fmt: skip
+    }  # fmt: skip
+    halves = calibration.cross_validation
+    if halves is not None and halves.comparison is not None:
+        drawings["halves"] = ((7.5, 6), None, partial(
+            difference_map, halves.comparison, name=f"Camera {name}: the two halves"))  # fmt: skip
+    write_figures(folder, drawings)
     save_figures(calibration.adjustment, folder)
 
 

@@ -8,26 +8,24 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.cameras import CameraModel, project
+from jaxbundle.cameras.frames import pixel_frame
 from jaxbundle.errors import InputError
-from jaxbundle.network.units import image_from_pixel, pixel_from_image
 
 
 def in_model_units(
     uv: Float[np.ndarray, "*any 2"], model: CameraModel, image_size, pixel_size=None
 ) -> Float[np.ndarray, "*any 2"]:
     """Pixels (v down) as the model counts: as they are; from the image centre, y up; in mm."""
-    if model.axes == "down":
-        return np.asarray(uv, float)
-    return image_from_pixel(uv, image_size, unit_size(model, pixel_size))
+    origin, step = pixel_frame(model, image_size, pixel_size)
+    return (np.asarray(uv, float) - origin) / step
 
 
 def in_pixels(
     xy: Float[np.ndarray, "*any 2"], model: CameraModel, image_size, pixel_size=None
 ) -> Float[np.ndarray, "*any 2"]:
     """The inverse of `in_model_units`."""
-    if model.axes == "down":
-        return np.asarray(xy, float)
-    return pixel_from_image(xy, image_size, unit_size(model, pixel_size))
+    origin, step = pixel_frame(model, image_size, pixel_size)
+    return origin + step * np.asarray(xy, float)
 
 
 def unit_size(model: CameraModel, pixel_size) -> tuple[float, float]:

@@ -9,8 +9,9 @@ from jaxtyping import Float, Int
 from jaxbundle.bundle import adjust
 from jaxbundle.calibration.frames import in_model_units, in_pixels, unit_size
 from jaxbundle.cameras import get_model
+from jaxbundle.cameras.compare import Comparison, compare_cameras
 from jaxbundle.errors import InputError, NotSolvedError
-from jaxbundle.network.tables import Network
+from jaxbundle.network.tables import Camera, Network
 from jaxbundle.statistics.projection import (
     FRAMES,
     images_through_scene,
@@ -150,7 +151,9 @@ class CrossValidation:
     - `rms_other`: the same with the camera held as the other half has it;
     - `difference`: of the parameters, first half − second half, in units of its σ;
     - `test`: dᵀ·C⁻¹·d/k of all k free parameters, near 1 if the halves differ by chance;
-    - `halves`: the parameters of both.
+    - `halves`: the parameters of both; `comparison`: how far their images are apart over the
+      image, the implied rotation removed (`jaxbundle.cameras.compare`), in the model's unit; None
+      where nothing can be compared.
     """
 
     rms_own: float
@@ -158,6 +161,7 @@ class CrossValidation:
     difference: dict[str, float]
     test: float
     halves: tuple[dict[str, float], dict[str, float]]
+    comparison: Comparison | None
 
 
 def kept_rays(adjustment):
@@ -198,8 +202,20 @@ def cross_validation(result) -> CrossValidation | None:
     test = float((d / scale) @ np.linalg.solve(C / np.outer(scale, scale), d / scale)) / len(d)
     rms = lambda parts: float(np.sqrt(np.mean([_rms(p) ** 2 for p in parts])))
     return CrossValidation(
-        rms(halves), rms(held), dict(zip(names, (d / scale).tolist())), test, tuple(own)
-    )
+        rms(halves), rms(held), dict(zip(names, (d / scale).tolist())), test, tuple(own),
+        _compared(network.cameras[0], own),
+    )  # fmt: skip
+
+
+def _compared(camera: Camera, halves) -> Comparison | None:
+    model = get_model(camera.model)
+    try:
+        return compare_cameras(
+            *((model, parameters) for parameters in halves),
+            image_size=camera.image_size, pixel_size=camera.pixel_size,
+        )  # fmt: skip
+    except ValueError:
+        return None
 
 
 def _at(network: Network, result) -> Network:

@@ -83,6 +83,8 @@ def _quality(calibration):
         f"{abs(checked.difference[largest]):.1f} σ in {largest}, the most; test of all parameters "
         f"together {checked.test:.2f} (1 expected)."
     )]  # fmt: skip
+    if checked.comparison is not None:
+        lines += paragraph(f"Their images, over the whole image: {checked.comparison}.")
     return lines
 
 
@@ -136,6 +138,10 @@ def _quality_dict(calibration) -> dict:
         "cross_validation": None if checked is None else {
             "rms_own": checked.rms_own, "rms_other": checked.rms_other, "test": checked.test,
             "difference": checked.difference, "halves": list(checked.halves),
+            "images": None if checked.comparison is None else {
+                "rms": checked.comparison.rms, "largest": checked.comparison.largest,
+                "unit": checked.comparison.unit,
+            },
         },
         "advice": calibration.advice,
     }  # fmt: skip

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbundle.cameras import get_model
+from jaxbundle.cameras.frames import pixel_frame
 from jaxbundle.errors import InputError
 from jaxbundle.network.tables import Camera
 
@@ -54,7 +55,8 @@ def _to_px(xy, centre, pitch):
 
 def _grid(image_size, pixel_size):
     """The image centre (pixels) and the pixel size (mm, negative where v runs down)."""
-    return (np.array(image_size) - 1) / 2, np.array(pixel_size) * [1, -1]
+    centre, per_mm = pixel_frame(get_model("brown"), image_size, pixel_size)
+    return centre, 1 / per_mm
 
 
 def from_image_unit(

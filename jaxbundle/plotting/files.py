@@ -80,12 +80,12 @@ def write_figures(folder: str | Path, drawings: Mapping[str, tuple]) -> list[Pat
     written = []
     for name, (size, projection, draw) in drawings.items():
         path = folder / f"{name}.png"
-        _write(path, _png(size, projection, draw))
+        _write(path, png(size, projection, draw))
         written.append(path)
     return written
 
 
-def _png(size, projection, draw) -> bytes:
+def png(size, projection, draw) -> bytes:
     """One drawing as a PNG image."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -18,7 +18,7 @@ from jaxbundle.calibration.files import write_calibration
 from jaxbundle.calibration.quality import coverage, grid_of, uncertainty_map
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
-from jaxbundle.io import read_network
+from jaxbundle.io import read_cameras, read_network, read_opencv
 
 pytestmark = pytest.mark.xdist_group("calibration")
 
@@ -115,6 +115,7 @@ def test_maps_that_cannot_be(sample):
 def test_two_halves_agree_unless_the_camera_changed(calibration):
     found = calibration.cross_validation
     assert 0.1 < found.test < 3
+    assert 0 < found.comparison.rms < 0.5 and found.comparison.unit == "px"
     assert found.rms_own < calibration.rms < found.rms_other < 1.3 * calibration.rms
     views = simulated()
     zoomed = dataclasses.replace(
@@ -124,6 +125,7 @@ def test_two_halves_agree_unless_the_camera_changed(calibration):
     mixed = np.where((np.arange(len(views)) % 2 == 1)[:, None, None], other, views.xy)
     changed = calibrate(dataclasses.replace(views, xy=mixed), snooping=None)
     assert changed.cross_validation.test > 100
+    assert changed.cross_validation.comparison.largest > 10 * found.comparison.largest
     assert any("halves of the photographs contradict" in text for text in changed.advice)
 
 
@@ -191,7 +193,13 @@ def test_report_and_json_and_files(calibration, folder, tmp_path):
         "corners": pytest.approx(calibration.uncertainty().corners),
     }  # fmt: skip
     again = read_network(tmp_path / "out" / "network")
-    assert len(again.observations) == len(calibration.measured)
+    removed = len(calibration.adjustment.removed)
+    assert len(again.observations) == len(calibration.measured) - removed
+    for camera in (read_opencv(tmp_path / "out" / "cam.yaml"),
+                   *read_cameras(tmp_path / "out" / "colmap" / "cameras.txt")):  # fmt: skip
+        assert camera.image_size == (480, 360)
+        for name, value in calibration.camera.parameters.items():
+            assert camera.parameters.get(name, 0.0) == pytest.approx(value, abs=1e-9)
     text = (tmp_path / "out" / "cam.toml").read_text()
     assert f"fx = {calibration.parameters['fx']!r}" in text and "free = []" in text
     assert "# σ of fx: 0." in text
