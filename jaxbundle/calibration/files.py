@@ -24,6 +24,7 @@ import numpy as np
 from jaxbundle.calibration.report import rig_dict
 from jaxbundle.errors import InputError
 from jaxbundle.io import adjusted_network, write_colmap, write_opencv, write_project
+from jaxbundle.io.colmap import PARTS
 from jaxbundle.io.csv_tables import write_text
 from jaxbundle.io.project import ADJUSTED, cameras_text
 from jaxbundle.network.conversion import convert_cameras
@@ -36,10 +37,12 @@ from jaxbundle.plotting import (
     uncertainty_image,
     write_figures,
 )
+from jaxbundle.plotting.files import FIGURES
 
 REPORT, RESULT = "report.txt", "result.json"
 DISTANCES = 15
 COLMAP = "colmap"
+OWN_FIGURES = ("coverage.png", "uncertainty*.png", "halves.png")
 FOREIGN = ("opencv", "kannala-brandt")
 """Models that OpenCV and COLMAP have."""
 
@@ -61,16 +64,12 @@ def write_calibration(calibration, folder: str | Path, plots: bool = True) -> No
 
     **Raises:** `InputError` where that cannot be done; `ImportError` for plots without matplotlib.
     """
-    folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made: {error.strerror}") from None
+    folder, name = Path(folder), file_name(calibration.name)
+    _make_empty(folder, name)
     write_text(folder / REPORT, calibration.report())
     write_text(folder / RESULT, json_text(calibration.to_dict()))
     if not calibration.converged:
         return
-    name = file_name(calibration.name)
     network = adjusted_network(calibration.adjustment)
     write_project(network, folder / ADJUSTED)
     remark = _write_foreign(network, folder, name)
@@ -78,6 +77,18 @@ def write_calibration(calibration, folder: str | Path, plots: bool = True) -> No
     write_text(folder / f"{name}.toml", text)
     if plots:
         save_plots(calibration, folder)
+
+
+def _make_empty(folder: Path, name: str) -> None:
+    """Make the folder, and remove what an earlier calibration has written into it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for pattern in (REPORT, RESULT, f"{name}.toml", f"{name}.yaml", *OWN_FIGURES, *FIGURES,
+                        *(f"{COLMAP}/{part}.txt" for part in PARTS)):  # fmt: skip
+            for path in folder.glob(pattern):
+                path.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
 
 
 def _write_foreign(network: Network, folder: Path, name: str) -> list[str]:
