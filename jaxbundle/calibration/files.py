@@ -29,18 +29,10 @@ from jaxbundle.io.csv_tables import write_text
 from jaxbundle.io.project import ADJUSTED, cameras_text
 from jaxbundle.network.conversion import convert_cameras
 from jaxbundle.network.tables import Camera, Network
-from jaxbundle.plotting import (
-    coverage_map,
-    difference_map,
-    save_figures,
-    uncertainty_curve,
-    uncertainty_image,
-    write_figures,
-)
+from jaxbundle.plotting import save_figures, write_figures
 from jaxbundle.plotting.files import FIGURES
 
 REPORT, RESULT = "report.txt", "result.json"
-DISTANCES = 15
 COLMAP = "colmap"
 OWN_FIGURES = ("coverage.png", "uncertainty*.png", "halves.png")
 FOREIGN = ("opencv", "kannala-brandt")
@@ -136,25 +128,16 @@ def calibrations_dict(found, brief: bool = False) -> dict:
 
 def save_plots(calibration, folder: Path) -> None:
     """The figures of quality, and those of the adjustment."""
-    size, name = calibration.views.image_size, calibration.name
-    unit = calibration.adjustment.network.object_unit
     near = float(np.median(calibration.distances))
-    span = calibration.distances.min(), calibration.distances.max()
-    distances = np.geomspace(span[0] / 4, 100 * span[1], DISTANCES)
-    curve = calibration.uncertainty_over_distance(distances)
-    image = partial(uncertainty_image, image_size=size, unit=unit, name=name)
     drawings = {
-        "coverage": ((7, 5.6), None, partial(
-            coverage_map, calibration.coverage, calibration.measured, size, name)),
-        "uncertainty": ((7, 5.6), None, partial(image, calibration.uncertainty(near))),
-        "uncertainty_far": ((7, 5.6), None, partial(image, calibration.uncertainty())),
-        "uncertainty_distance": ((6.5, 4.2), None, partial(
-            uncertainty_curve, distances, *curve, span, unit, name)),
-    }  # fmt: skip
+        "coverage": ((7, 5.6), None, calibration.plot_coverage),
+        "uncertainty": ((7, 5.6), None, partial(calibration.plot_uncertainty, near)),
+        "uncertainty_far": ((7, 5.6), None, calibration.plot_uncertainty),
+        "uncertainty_distance": ((6.5, 4.2), None, calibration.plot_uncertainty_over_distance),
+    }
     halves = calibration.cross_validation
     if halves is not None and halves.comparison is not None:
-        drawings["halves"] = ((7.5, 6), None, partial(
-            difference_map, halves.comparison, name=f"Camera {name}: the two halves"))  # fmt: skip
+        drawings["halves"] = ((7.5, 6), None, calibration.plot_halves)
     write_figures(folder, drawings)
     save_figures(calibration.adjustment, folder)
 

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle import plotting
 from jaxbundle.calibration import quality
 from jaxbundle.calibration.advice import advice
 from jaxbundle.calibration.quality import Coverage, CrossValidation, UncertaintyMap
@@ -14,6 +15,9 @@ from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.tables import Camera
 from jaxbundle.result import Adjustment
+
+DISTANCES = 15
+"""Distances of a curve of uncertainty."""
 
 
 class Calibration:
@@ -106,7 +110,7 @@ class Calibration:
         t = {name: abs(self.parameters[name]) / s for name, s in self.sigma.items() if s > 0}
         return advice(
             self.position, self.rotation, self.views.board.points.mean(0),
-            self.adjustment.network.object_unit, self.coverage, self.rms, t,
+            self._unit, self.coverage, self.rms, t,
             self.__dict__.get("cross_validation"),
         )  # fmt: skip
 
@@ -135,6 +139,38 @@ class Calibration:
         """σ of a projected point in the middle and in the corners, pixels, [n] each."""
         maps = [self.uncertainty(d) for d in distances]
         return np.array([m.middle for m in maps]), np.array([m.corners for m in maps])
+
+    @property
+    def _unit(self) -> str:
+        return self.adjustment.network.object_unit
+
+    def plot_coverage(self, ax=None):
+        """Where in the image points were measured; matplotlib axes."""
+        return plotting.coverage_map(
+            self.coverage, self.measured, self.views.image_size, self.name, ax
+        )
+
+    def plot_uncertainty(self, distance: float = np.inf, frame: str = "scene", ax=None):
+        """σ of a projected point over the image; matplotlib axes."""
+        found = self.uncertainty(distance, frame)
+        return plotting.uncertainty_image(found, self.views.image_size, self._unit, self.name, ax)
+
+    def plot_uncertainty_over_distance(self, ax=None):
+        """σ of a projected point in the middle and in the corners, from a quarter of the nearest
+        distance of the board to a hundred times the farthest; matplotlib axes."""
+        span = float(self.distances.min()), float(self.distances.max())
+        distances = np.geomspace(span[0] / 4, 100 * span[1], DISTANCES)
+        curves = self.uncertainty_over_distance(distances)
+        return plotting.uncertainty_curve(distances, *curves, span, self._unit, self.name, ax)
+
+    def plot_halves(self, ax=None):
+        """How far the images of the two halves' cameras are apart (`cross_validation`); matplotlib
+        axes."""
+        halves = self.cross_validation
+        if halves is None or halves.comparison is None:
+            raise ValueError("there are no two halves to compare: too few photographs")
+        title = f"Camera {self.name}: the two halves"
+        return plotting.difference_map(halves.comparison, ax, title)
 
     def report(self) -> str:
         """The whole protocol as text."""

@@ -19,6 +19,7 @@ from jaxbundle.calibration.quality import coverage, grid_of, uncertainty_map
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_cameras, read_network, read_opencv
+from jaxbundle.plotting import write_figures
 
 pytestmark = pytest.mark.xdist_group("calibration")
 
@@ -210,24 +211,19 @@ def test_report_and_json_and_files(calibration, folder, tmp_path):
 
 
 def test_figures(calibration, tmp_path):
-    from jaxbundle.plotting import coverage_map, uncertainty_curve, uncertainty_image, write_figures
-
-    size = calibration.views.image_size
-    m = calibration.uncertainty()
-    drawings = {
-        "coverage": lambda ax: coverage_map(
-            calibration.coverage, calibration.measured, size, "c", ax),
-        "map": lambda ax: uncertainty_image(m, size, "m", "c", ax),
-        "curve": lambda ax: uncertainty_curve(
-            [1, 2, 3], [0.1, 0.2, 0.3], [1, 2, 2.5], (1, 2), "m", "c", ax),
-    }  # fmt: skip
     axes = {}
+    drawings = {
+        "coverage": calibration.plot_coverage, "map": calibration.plot_uncertainty,
+        "curve": calibration.plot_uncertainty_over_distance, "halves": calibration.plot_halves,
+    }  # fmt: skip
     written = write_figures(tmp_path, {
-        name: ((6, 5), None, lambda ax, name=name, draw=draw: axes.update({name: draw(ax)}))
+        name: ((6, 5), None, lambda ax, name=name, draw=draw: axes.update({name: draw(ax=ax)}))
         for name, draw in drawings.items()
     })
-    assert [path.name for path in written] == ["coverage.png", "map.png", "curve.png"]
+    assert [path.stem for path in written] == list(drawings)
     assert axes["map"].get_ylim() == (359.5, -0.5)
     assert axes["curve"].get_xscale() == "log"
     shown = axes["coverage"].images[0].get_array()
     np.testing.assert_array_equal(shown.filled(0), calibration.coverage.counts)
+    near = axes["curve"].lines[0].get_ydata().min()
+    assert near < calibration.uncertainty().middle
