@@ -58,4 +58,4 @@ def images_of_board(
     points: Float[np.ndarray, "points 3"],
 ) -> Float[np.ndarray, "views points 2"]:
     """Image points of a board in the model's unit, for X0 and M of every view."""
-    return np.asarray(_images(model, p, position, rotation, points))
+    return np.array(_images(model, p, position, rotation, points))
