@@ -1,13 +1,13 @@
 """`jaxbundle calibrate` as a person meets it."""
 
 import json
+import shutil
 import sys
+from pathlib import Path
 
-import board_photographs as taken
 import cv2
 import numpy as np
 import pytest
-import render
 
 import jaxbundle.calibration.files
 import jaxbundle.calibration.quality
@@ -15,14 +15,15 @@ from jaxbundle import cli
 
 pytestmark = pytest.mark.xdist_group("calibration")
 
+EXAMPLE = Path(__file__).parents[2] / "examples" / "board"
 VIEWS = 12
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("command")
-    for i, picture in enumerate(taken.rendered(render.LENS, taken.poses(VIEWS))):
-        cv2.imwrite(str(folder / f"photo_{i:02d}.png"), picture)
+    for photograph in EXAMPLE.glob("*.jpg"):
+        shutil.copy(photograph, folder)
     (folder / "text.jpg").write_text("no photograph")
     return folder
 
@@ -48,7 +49,8 @@ def test_photographs_to_camera(command, folder, tmp_path, monkeypatch):
         folder, "--board", "9x6", "--square", 0.03, "--out", out, "--json", file
     )
     assert (code, error) == (0, "")
-    assert "text.jpg  not an image" in told and "Cross-validation" in told
+    assert "photo_13.jpg  no chessboard" in told and "text.jpg      not an image" in told
+    assert "Cross-validation" in told
     result = json.loads(file.read_text())
     assert result["converged"] and len(result["calibration"]["photographs"]["used"]) == VIEWS
     fx = result["cameras"]["cam"]["parameters"]["fx"]
@@ -62,7 +64,7 @@ def test_photographs_to_camera(command, folder, tmp_path, monkeypatch):
 def test_two_cameras_and_brief_json_alone(command, folder, monkeypatch):
     monkeypatch.setattr(jaxbundle.calibration.quality, "cross_validation", lambda result: None)
     code, told, error = command(
-        "--camera", f"a={folder}/photo_*.png", "--camera", f"b={folder}/photo_*.png",
+        "--camera", f"a={folder}/photo_*.jpg", "--camera", f"b={folder}/photo_*.jpg",
         "--board", "9x6", "--square", 0.03, "--json", "-", "--brief",
     )  # fmt: skip
     assert (code, error) == (0, "")
@@ -98,5 +100,5 @@ def test_photographs_that_show_no_board(command, folder, tmp_path):
     code, _, error = command(tmp_path, "--board", "9x6", "--square", 0.03, "--out", out)
     assert code == 2 and "no photograph of 1 shows the board: grey.png: no chessboard" in error
     assert not out.exists()
-    code, _, error = command(folder / "photo_00.png", "--board", "10x7", "--square", 0.03)
+    code, _, error = command(folder / "photo_01.jpg", "--board", "10x7", "--square", 0.03)
     assert code == 2 and "give --board 9x6" in error

@@ -14,7 +14,7 @@ CHESS = Board(9, 6, 0.03)
 CIRCLES = Board(8, 6, 0.03, "circles", diameter=0.012)
 UNEVEN = Board(4, 7, 0.02, "asymmetric-circles", diameter=0.012)
 CHARUCO = Board(9, 6, 0.03, "charuco")
-POSES = [(0, 0, 0, 0.5), (25, -20, 90, 0.5), (-20, 15, -80, 0.5), (10, 20, 175, 0.5)]
+POSES = [(25, -20, 90, 0.5), (-20, 15, -80, 0.5), (10, 20, 175, 0.5)]
 
 
 def printed(board):
@@ -38,7 +38,7 @@ def taken(board, omega, phi, kappa, distance, seed=0):
 
 
 @pytest.mark.parametrize("board", [CHESS, CIRCLES, UNEVEN, CHARUCO], ids=lambda b: b.kind)
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 def test_every_point_is_found_and_numbered(board, seed):
     picture, true = taken(board, *POSES[seed], seed)
     found = find_board(picture, board)
