@@ -2,8 +2,9 @@
 
 import dataclasses
 import glob
+import hashlib
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -104,16 +105,18 @@ def measure_boards(
     if not files:
         raise InputError("no photographs are given")
     names = _names(files)
+    paths = dict(zip(names, files))
+    repeated = _repeated(paths)
     found, failed = [], {}
+    look = lambda name: repeated.get(name) or _look(paths[name], board)
     with ThreadPoolExecutor(available_cores()) as pool:
-        look = lambda path: _look(path, board)
-        for done, (name, result) in enumerate(zip(names, pool.map(look, files)), 1):
+        for done, (name, result) in enumerate(zip(names, pool.map(look, names)), 1):
             if isinstance(result, str):
                 failed[name] = result
             else:
                 found.append((name, *result))
             if progress is not None:
-                progress(done, len(files))
+                progress(done, len(names))
     if not found:
         raise InputError(_nothing_found(files, board, failed))
     sizes = Counter(size for _, size, _ in found)
@@ -130,6 +133,21 @@ def measure_boards(
         board, tuple(name for name, _ in used), size, np.array([xy for _, xy in used]),
         tuple(sorted(failed.items(), key=lambda item: order[item[0]])),
     )  # fmt: skip
+
+
+def _repeated(paths: Mapping[str, Path]) -> dict[str, str]:
+    """The files that have the content of an earlier one, and which that is."""
+    first: dict[bytes, str] = {}
+    found = {}
+    for name, path in paths.items():
+        try:
+            content = path.read_bytes()
+        except OSError:
+            continue
+        same = first.setdefault(hashlib.blake2b(content).digest(), name)
+        if same != name and content:
+            found[name] = f"is the same file as {same}"
+    return found
 
 
 def _look(path, board):

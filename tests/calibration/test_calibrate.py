@@ -251,6 +251,16 @@ def test_what_cannot_be_calibrated_says_why(folder, tmp_path):
         dataclasses.replace(views, xy=views.xy[:, :53])
 
 
+def test_a_photograph_counts_once(folder, tmp_path):
+    picture = sorted(folder.glob("photo_*.png"))[0]
+    told = []
+    for name in ("a.png", "b.png"):
+        (tmp_path / name).write_bytes(picture.read_bytes())
+    views = measure_boards([tmp_path], taken.BOARD, lambda *done: told.append(done))
+    assert views.names == ("a.png",) and views.failed == (("b.png", "is the same file as a.png"),)
+    assert told == [(1, 2), (2, 2)]
+
+
 def test_names_and_patterns(tmp_path):
     for name in ("a/1.png", "b/1.png", "b/2.png"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
