@@ -105,6 +105,16 @@ def orient(network: Network) -> Oriented:
     return _result(network, seen, model, frame)
 
 
+def screen(network: Network) -> Network:
+    """The network without the image points that contradict its start values altogether, and with
+    tie points intersected anew; it warns of what it left out."""
+    tie = network.points.has_role("tie")[:, None]
+    points = dataclasses.replace(
+        network.points, position=np.where(tie, np.nan, network.points.position)
+    )
+    return orient(network.replace(points=points)).network
+
+
 def _model(network: Network, seen: Sights) -> tuple[Model, str]:
     model, frame = _given(network, seen), "in the frame given"
     grow(seen, model)

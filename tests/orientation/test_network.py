@@ -122,6 +122,18 @@ def test_one_measurement_in_twenty_wrong():
     assert abs(result.sigma0 - 1) < 0.15
 
 
+def test_blunders_that_leave_least_squares_no_solution():
+    """With good start values, too, what contradicts them altogether goes before data snooping."""
+    simulation = block(control=range(8), start=TRUE)
+    spoilt = with_blunders(simulation.network, 0.05, 20.0)
+    assert not adjust(spoilt).converged
+    result = adjust(spoilt, snooping="pope")
+    off = result.image_values[:, :3] - simulation.truth.images.position
+    sigma = np.stack([result.images[f"s{axis}"] for axis in ("X0", "Y0", "Z0")], 1)
+    assert np.abs(off / sigma).max() < 5
+    assert any("contradict the start values" in warning for warning in result.warnings)
+
+
 def test_a_strip_that_hangs_together_by_pairs():
     """With few points in three images resection stops; a pair takes it on."""
     simulation = block(1, 30, 350, control=())
