@@ -15,9 +15,11 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.adjustment.problem import require_x64
@@ -162,17 +164,18 @@ def _without_eccentricity(start: Start, result, camera: Camera) -> BoardViews:
     p = np.asarray(result.values.camera)[0][: len(model.parameters)]
     M = np.asarray(jax.vmap(matrix_from_quaternion)(result.values.rotation))
     poses = Pose(result.image_values[:, :3], M)
-    centres, up = views.board.points, np.array([0.0, 0.0, 1.0])
-    shift = _shifts(model, p, poses, centres, up, views.board.diameter / 2)
+    shift = _shifts(model, p, poses, views.board.points, views.board.diameter / 2)
     xy = in_model_units(views.xy, model, views.image_size, camera.pixel_size) - np.asarray(shift)
     return dataclasses.replace(
         views, xy=in_pixels(xy, model, views.image_size, camera.pixel_size)
     )
 
 
-def _shifts(model, p, poses, centres, up, radius):
+@partial(jax.jit, static_argnums=0)
+def _shifts(model, p, poses, centres, radius):
+    up = jnp.array([0.0, 0.0, 1.0])
     one = lambda pose, X: rim_centre_shift(model, p, pose, X, up, radius)
-    return jax.jit(jax.vmap(jax.vmap(one, (None, 0)), (0, None)))(poses, centres)
+    return jax.vmap(jax.vmap(one, (None, 0)), (0, None))(poses, centres)
 
 
 def _model(name: str, free) -> tuple[CameraModel, tuple[str, ...]]:

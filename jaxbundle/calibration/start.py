@@ -21,13 +21,13 @@ from jaxbundle.calibration.frames import images_of_board, in_model_units
 from jaxbundle.cameras import CameraModel, get_model
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.measure.views import BoardViews
+from jaxbundle.network.columns import count
 
 GROSS = 12.0
 """Residuals above so many times their typical size (1.4826·median) are gross."""
 LEAST_GROSS = 3.0
 """And above so many pixels."""
 PART = 1 / 3
-ROUNDS = 10
 SIMPLE = ("fx", "fy", "cx", "cy", "k1", "k2")
 FREE_IN_MM = {
     "brown": ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2"),
@@ -61,12 +61,12 @@ def start_values(
 
     **Raises:** `InputError` for too few views; `NotSolvedError` where they determine no camera.
     """
-    if len(views) < 2:
-        raise InputError(
-            f"only {len(views)} photograph shows the board{_why(views)}; a camera needs several, "
-            "8 or more, from different directions"
-        )
-    for _ in range(ROUNDS):
+    while True:
+        if len(views) < 2:
+            raise InputError(
+                f"only {count(len(views), 'photograph')} can be used{_why(views)}; a camera needs "
+                "several, 8 or more, from different directions"
+            )
         solved = _solve(views, model, free)
         used = solved.views[0]
         if not used.all():
@@ -79,7 +79,7 @@ def start_values(
         gross = _gross_views(views, solved)
         if not gross.any():
             break
-        if len(views) - gross.sum() < 2:
+        if gross.sum() > len(views) - 2:
             raise NotSolvedError(
                 "not solved: the photographs contradict one another: the points of "
                 f"{int(gross.sum())} of {len(views)} do not fit a camera; look for different "
@@ -111,8 +111,8 @@ def _solve(views: BoardViews, model: CameraModel, free) -> BatchCalibration:
     xy = in_model_units(views.xy, get_model(attempts[0][0]), size)
     for name, wanted, start in attempts:
         held = [n for n in model.principal_distance if n not in wanted]
-        if not wanted or (start is None and held and model.unit == "px"):
-            wanted = (*model.principal_distance, *wanted)
+        if start is None and model.unit == "px":
+            wanted = (*held, *wanted)
         solved = calibrate_batch(
             views.board.points, xy[None], size, name, views.visible[None],
             free=wanted, start=start, threads=1,

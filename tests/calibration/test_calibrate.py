@@ -14,7 +14,7 @@ from jaxbundle.calibration import Board, BoardViews, calibrate
 from jaxbundle.calibration.calibrate import board_network
 from jaxbundle.calibration.start import default_free, start_values
 from jaxbundle.cameras import get_model
-from jaxbundle.errors import InputError
+from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.measure.views import measure_boards, photographs
 from jaxbundle.network.tables import Camera
 
@@ -219,6 +219,11 @@ def test_a_view_in_the_wrong_order_is_left_out():
     assert "do not fit those of the other photographs" in failed["view 6"]
     assert "lie on a line" in failed["view 7"]
     assert start.parameters["fx"] == pytest.approx(620, abs=10)
+    lines = np.where((np.arange(54) < 5)[:, None], views.xy, np.nan)
+    with pytest.raises(NotSolvedError, match="determine no camera .too few points"):
+        start_values(dataclasses.replace(views, xy=lines), OPENCV, default_free(OPENCV))
+    held = start_values(views, OPENCV, ("fx", "k1"), given={"fy": 621.0})
+    assert held.parameters["fy"] == 621.0 and held.parameters["k2"] == 0
 
 
 def test_what_cannot_be_calibrated_says_why(folder, tmp_path):
@@ -226,7 +231,7 @@ def test_what_cannot_be_calibrated_says_why(folder, tmp_path):
     good, bad = sorted(folder.glob("photo_*.png")), [folder / "text.jpg", folder / "grey.png"]
     for given, said in (
         (bad, "no photograph of 2 shows the board: text.jpg: not an image"),
-        ([good[0], bad[0]], r"only 1 photograph shows the board \(text.jpg: not an image"),
+        ([good[0], bad[0]], r"only 1 photograph can be used \(text.jpg: not an image"),
         ([tmp_path], "no photographs in this folder"),
         ([tmp_path / "*.jpg"], "no file matches"),
         ([], "no photographs"),
