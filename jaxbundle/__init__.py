@@ -21,6 +21,11 @@ if TYPE_CHECKING:
     from jaxbundle.adjustment.batch import BatchCalibration as BatchCalibration
     from jaxbundle.adjustment.batch import calibrate_batch as calibrate_batch
     from jaxbundle.bundle import adjust as adjust
+    from jaxbundle.calibration import Board as Board
+    from jaxbundle.calibration import BoardViews as BoardViews
+    from jaxbundle.calibration import Calibration as Calibration
+    from jaxbundle.calibration import calibrate as calibrate
+    from jaxbundle.calibration import calibrate_cameras as calibrate_cameras
     from jaxbundle.configuration import enable_x64 as enable_x64
     from jaxbundle.configuration import use_cores as use_cores
     from jaxbundle.errors import InputError as InputError
@@ -49,6 +54,9 @@ _HOME = {
     "jaxbundle.adjustment": ("Problem", "make_problem", "solve"),
     "jaxbundle.adjustment.batch": ("BatchCalibration", "calibrate_batch"),
     "jaxbundle.bundle": ("adjust",),
+    "jaxbundle.calibration": (
+        "Board", "BoardViews", "Calibration", "calibrate", "calibrate_cameras",
+    ),
     "jaxbundle.configuration": ("enable_x64", "use_cores"),
     "jaxbundle.errors": ("InputError", "NotSolvedError"),
     "jaxbundle.gradients": ("check_gradients",),

@@ -30,11 +30,20 @@ NETWORK_FILES = (FILE_NAME, *(f"{name}.csv" for name in NETWORK_TABLES))
 
 def check_targets(input: Path, network: Network, json: str, out: Path | None) -> None:
     """Refuse a JSON file or a folder that cannot be written, or that would replace the input."""
+    tables = (network.images, network.points, network.observations, network.distances)
+    names = (*FILES, *(Path(ADJUSTED) / name for name in NETWORK_FILES))
+    check_writable(json, out, names, (input, *(t.source.name for t in tables)))
+
+
+def check_writable(
+    json: str, out: Path | None, names: Iterable[str | Path], inputs: Iterable[str | Path]
+) -> None:
+    """Refuse a JSON file, or a folder for files of these names, that cannot be written, or that
+    would replace one of the inputs."""
     written = []
     if out is not None:
         _check_folder(f"--out {out}", out)
-        written += [out / name for name in FILES]
-        written += [out / ADJUSTED / name for name in NETWORK_FILES]
+        written += [out / name for name in names]
     if json not in ("", "-"):
         path = Path(json)
         if path.is_dir():
@@ -44,8 +53,7 @@ def check_targets(input: Path, network: Network, json: str, out: Path | None) ->
                 raise InputError(f"--json {json}: there is no folder {path.parent}")
             _check_folder(f"--json {json}", path.parent)
         written.append(path)
-    tables = (network.images, network.points, network.observations, network.distances)
-    read = {os.path.realpath(path) for path in (input, *(t.source.name for t in tables))}
+    read = {os.path.realpath(path) for path in inputs}
     for path in written:
         if os.path.realpath(path) in read:
             raise InputError(f"{path} is part of the input and would be overwritten; give another")

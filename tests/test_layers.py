@@ -27,6 +27,7 @@ LAYERS = (
     "repeated",
     "bundle",
     "batches",
+    "calibration",
     "targets",
     "cli",
     "__main__",

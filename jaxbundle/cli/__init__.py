@@ -5,6 +5,7 @@ Exit status: 0 solved; 2 bad input (one line, nothing written); 3 not solved (sa
 
 from jaxbundle.cli import adjust as adjust
 from jaxbundle.cli import batch as batch
+from jaxbundle.cli import calibrate as calibrate
 from jaxbundle.cli import camera as camera
 from jaxbundle.cli import compare as compare
 from jaxbundle.cli import convert as convert
