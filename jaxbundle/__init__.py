@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from jaxbundle.errors import InputError as InputError
     from jaxbundle.errors import NotSolvedError as NotSolvedError
     from jaxbundle.gradients import check_gradients as check_gradients
+    from jaxbundle.io import convert as convert
     from jaxbundle.io import read_network as read_network
     from jaxbundle.io import write_project as write_project
     from jaxbundle.network import Camera as Camera
@@ -60,7 +61,7 @@ _HOME = {
     "jaxbundle.configuration": ("enable_x64", "use_cores"),
     "jaxbundle.errors": ("InputError", "NotSolvedError"),
     "jaxbundle.gradients": ("check_gradients",),
-    "jaxbundle.io": ("read_network", "write_project"),
+    "jaxbundle.io": ("convert", "read_network", "write_project"),
     "jaxbundle.network": ("Camera", "Network"),
     "jaxbundle.network.arrays": ("Data", "Values"),
     "jaxbundle.network.build": ("make_network",),
