@@ -1,0 +1,1 @@
+"""Line scanners: from trajectory and optics to the ground and back."""
