@@ -111,10 +111,16 @@ def two_line_orbit(
         from sgp4.api import SGP4_ERRORS, Satrec
     except ImportError:
         raise InputError("two-line elements need sgp4: pip install 'jaxbundle[geo]'") from None
-    try:
-        satellite = Satrec.twoline2rv(first.strip(), second.strip())
-    except ValueError as error:
-        raise InputError(f"two-line elements: {' '.join(str(error).split())}") from None
+    first, second = first.strip(), second.strip()
+    for number, line in enumerate((first, second), 1):
+        if not (len(line) == 69 and line[:2] == f"{number} " and _checksum(line) == line[68]):
+            raise InputError(
+                f"two-line elements, line {number}: {line!r} is damaged (69 characters, the last the "
+                "checksum, are expected); copy it again"
+            )
+    if first[2:7] != second[2:7]:
+        raise InputError("two-line elements: the lines belong to two satellites; copy them again")
+    satellite = Satrec.twoline2rv(first, second)
     times = np.asarray(times, float)
     day, part = julian_date(epoch)
     error, km, km_s = satellite.sgp4_array(np.full(len(times), day), part + times / DAY)
@@ -162,6 +168,10 @@ def julian_date(epoch: str) -> tuple[float, float]:
     days = (moment - datetime.datetime(2000, 1, 1)).days
     midnight = datetime.datetime(2000, 1, 1) + datetime.timedelta(days)
     return 2451544.5 + days, (moment - midnight).total_seconds() / DAY
+
+
+def _checksum(line):
+    return str(sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10)
 
 
 def _about(axis, angles):

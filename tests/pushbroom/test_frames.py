@@ -94,8 +94,11 @@ def test_two_line_elements():
     np.testing.assert_allclose(R.T @ P[0], teme, atol=0.2)
     # short-period terms of SGP4's velocity are of first order only
     np.testing.assert_allclose(V[0], (P[1] - P[0]) / 1e-2, atol=2)
-    with pytest.raises(InputError, match="two-line elements"):
-        two_line_orbit(TLE[0], "2 00006" + TLE[1][7:], epoch, np.zeros(1))
+    with pytest.raises(InputError, match="line 2: .* checksum"):
+        two_line_orbit(TLE[0], TLE[1].replace("34.2682", "35.2682"), epoch, np.zeros(1))
+    other = TLE[1].replace("00005", "00014")
+    with pytest.raises(InputError, match="two satellites"):
+        two_line_orbit(TLE[0], other, epoch, np.zeros(1))
 
 
 def test_circular_orbit():
