@@ -115,8 +115,8 @@ def two_line_orbit(
     for number, line in enumerate((first, second), 1):
         if not (len(line) == 69 and line[:2] == f"{number} " and _checksum(line) == line[68]):
             raise InputError(
-                f"two-line elements, line {number}: {line!r} is damaged (69 characters, the last the "
-                "checksum, are expected); copy it again"
+                f"two-line elements, line {number}: {line!r} is damaged (69 characters, the last "
+                "the checksum, are expected); copy it again"
             )
     if first[2:7] != second[2:7]:
         raise InputError("two-line elements: the lines belong to two satellites; copy them again")
