@@ -2,12 +2,12 @@
 
 | switch | what | size from 500 to 800 km |
 |---|---|---|
-| `light_time` | the Earth turns while the light travels, by Ω·ρ/c about its axis | 0.8 to 1.3 m at the equator |
-| `aberration` | the moving camera sees light c·l coming along c·l + v | 20 m (v/c·ρ) |
-| `refraction` | layers of air bend the ray, n₁·sin i₁ = n₂·sin i₂ | 0.05 m at 1.5°, 2 m at 50° |
+| `light_time` | the Earth turns while light travels, by Ω·ρ/c | 0.8 to 1.3 m at the equator |
+| `aberration` | the moving camera sees light c·l coming along c·l + v | 13 to 20 m (v/c·ρ) |
+| `refraction` | layers of air bend the ray, n₁·sin i₁ = n₂·sin i₂ | 0.05 m at 5°, 2 m at 50° |
 
-They belong to a product and cannot be guessed: the quaternions of one provider contain the aberration,
-those of another do not. All three mean Earth-fixed positions.
+They belong to a product and cannot be guessed: the quaternions of one provider contain the
+aberration, those of another do not. All three mean Earth-fixed positions.
 
 The velocity of the aberration is the inertial one, V + Ω × P (classical addition; relativity
 changes 20 m by a micrometre). The layers of air are those of Orekit Rugged (MultiLayerModel): the

@@ -2,9 +2,9 @@
 
     [X, Y, Z] = P + s·R·[ξ, η, −1]
 
-One pose a line, the directions of the pixels once for all lines: a whole line costs little more than
-its intersections with the surface. `locate` is the textbook's formula of one pixel, `locate_lines`
-the same for lines × pixels, `locate_points` for scattered places.
+One pose a line, the directions of the pixels once for all lines: a whole line costs little more
+than its intersections with the surface. `locate` is the textbook's formula of one pixel,
+`locate_lines` the same for lines × pixels, `locate_points` for scattered places.
 """
 
 import jax
@@ -23,7 +23,7 @@ from .surfaces import Surface
 def locate(
     image: PushbroomImage, surface: Surface, line: Float[Array, ""], pixel: Float[Array, ""]
 ) -> Vector:
-    """The point (X, Y, Z), in metres, that a place in the image shows; NaN for a ray that misses."""
+    """The point (X, Y, Z), in metres, that a place in the image shows; NaN if the ray misses."""
     pose = pose_at(image, image.times.time(line))
     return ground_point(pose, image.optics.slopes(pixel), surface, image.corrections)
 

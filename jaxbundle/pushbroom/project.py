@@ -6,8 +6,8 @@ The point X is seen at the time t by the pixel u where
 
 `project` searches the whole image: the sign of the second equation, with the pixel that the first
 one gives, changes wherever the line of detectors passes over the point; from each change Newton's
-method in (t, u) goes on with the polynomials of `pieces`. Two passages within one step of the search
-(a piece, or 1/128 of the image) that turn back in between are not separated.
+method in (t, u) goes on with the polynomials of `pieces`. Two passages within one step of the
+search (a piece, or 1/128 of the image) that turn back in between are not separated.
 
 `project_near` is the textbook's way for one point that is near a known place in the image, with the
 trajectory itself. By the implicit function theorem its derivatives are exact in everything.
@@ -17,7 +17,6 @@ With corrections, X gives way to the point where it seems to be (`seen_point`).
 
 from enum import IntEnum
 from functools import partial
-from typing import NamedTuple
 
 import equinox as eqx
 import jax

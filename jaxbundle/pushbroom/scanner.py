@@ -1,11 +1,11 @@
 """A line of detectors: when a line is taken, and where a pixel looks.
 
 Line l and pixel u are counted from 0, whole numbers at the centres: pixel 0 of line 0 is the first
-pixel taken, its area from −½ to ½. A pixel looks along [ξ, η, −1] in the camera frame: ξ to the right,
-η forward, both tangents of angles. Three kinds of optics:
+pixel taken, its area from −½ to ½. A pixel looks along [ξ, η, −1] in the camera frame: ξ to the
+right, η forward, both tangents of angles. Three kinds of optics:
 
-- `FocalLine`: detectors at (x, y) = (pitch·(u − middle), row) in the focal plane of a frame camera, so
-  that principal distance, principal point and every distortion of `jaxbundle.cameras` apply;
+- `FocalLine`: detectors at (x, y) = (pitch·(u − middle), row) in the focal plane of a frame camera,
+  so that principal distance, principal point and every distortion of `jaxbundle.cameras` apply;
 - `AngleTable`: angles ψ across and along for every pixel, ξ = tan ψ, linear in between;
 - `AnglePolynomial`: the tangents as polynomials of û = (u − middle)/half.
 """
@@ -23,7 +23,7 @@ Pair = tuple[Array, Array]
 
 
 class LineTimes(eqx.Module):
-    """Line l is taken at first + period·l, or at the times of a table, linear in between; seconds."""
+    """Line l is taken at first + period·l, or at times of a table, linear in between; seconds."""
 
     first: Float[Array, ""]
     period: Float[Array, ""]

@@ -1,7 +1,7 @@
 """What a ray meets: a plane, an ellipsoid (or sphere), a constant height above it.
 
-A terrain model is a surface too (`terrain`). A surface tells the distance s, in lengths of d, of the
-first point o + s·d in front, NaN where there is none, and the height of a point near it.
+A terrain model is a surface too (`terrain`). A surface tells the distance s, in lengths of d, of
+the first point o + s·d in front, NaN where there is none, and the height of a point near it.
 """
 
 import abc

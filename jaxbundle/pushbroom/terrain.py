@@ -1,18 +1,18 @@
 """A terrain model: the first hit of a ray with a bilinear surface over a grid, nothing missed.
 
 Between the highest and the lowest height of the model a ray is, in the coordinates of the grid
-(column x, row y, height h), a curve near a straight line. Through three exact points it is a parabola
-in τ, within a millimetre over ten kilometres. It is followed from cell to cell (Amanatides and Woo, 1987); in a cell
+(column x, row y, height h), a curve near a straight line. Through three exact points it is a
+parabola in τ, within a millimetre over ten kilometres. It is followed from cell to cell (Amanatides
+and Woo, 1987). In a cell
 
     f(τ) = h(τ) − [(1−v)·((1−u)·z₀₀ + u·z₀₁) + v·((1−u)·z₁₀ + u·z₁₁)]
 
-is a parabola too, and its first root, where there
-is one, is the first hit: neither the back of a ridge nor a peak between two samples is ever taken or
-passed. One Newton step on the exact coordinates then puts the point on the ray and on the surface,
-and carries the derivatives.
+is a parabola too, and its first root, where there is one, is the first hit: neither the back of a
+ridge nor a peak between two samples is ever taken or passed. One Newton step on the exact
+coordinates puts the point on ray and surface, and carries the derivatives.
 
-The grid is either regular in longitude and latitude (`earth` an ellipsoid of revolution, ellipsoidal
-heights) or in X and Y of a local frame (`earth` None).
+The grid is regular in longitude and latitude (`earth` an ellipsoid of revolution, heights above
+it), or in X and Y of a local frame (`earth` None).
 """
 
 from typing import ClassVar
@@ -156,7 +156,8 @@ def _first_hit(path, heights):
         a, b, c = p
         value, rate = a + tau * (b + tau * c), b + 2 * tau * c
         target = jnp.where(rate > 0, jnp.floor(value) + 1, jnp.ceil(value) - 1)
-        return jnp.where(rate == 0, jnp.inf, tau + (target - value) / jnp.where(rate == 0, 1, rate))
+        step = (target - value) / jnp.where(rate == 0, 1, rate)
+        return jnp.where(rate == 0, jnp.inf, tau + step)
 
     def step(state):
         tau, hit, _ = state
@@ -181,7 +182,7 @@ def _first_hit(path, heights):
 
 
 def _first_root(f0, fm, f1):
-    """The first w in [0, 1] where the parabola through (0, f0), (½, fm), (1, f1) is zero; else ∞."""
+    """The first w in [0, 1] where the parabola through (0, f0), (½, fm), (1, f1) is 0; else ∞."""
     a = 2 * (f0 + f1) - 4 * fm
     b = f1 - f0 - a
     discriminant = b * b - 4 * a * f0
