@@ -43,14 +43,18 @@ class Pieces(eqx.Module):
 
 
 def make_pieces(image: PushbroomImage, earth: Ellipsoid | None) -> Pieces:
-    """The pieces from the first line of an image to the last; `earth` as in `project`.
+    """The pieces from the edge of the first line to that of the last, as far as the tables reach.
+
+    `earth` as in `project`.
 
     **Raises:** `InputError` if no pieces follow the trajectory.
     """
-    first, last = (float(image.times.time(float(line))) for line in (0, image.lines - 1))
-    tables = image.trajectory.position, image.trajectory.attitude.table
-    nodes = np.unique(np.concatenate([breaks(table) for table in tables]))
-    line = (last - first) / max(image.lines - 1, 1)
+    first, last = (float(image.times.time(line)) for line in (-0.5, image.lines - 0.5))
+    line = (last - first) / image.lines
+    tables = [breaks(image.trajectory.position), breaks(image.trajectory.attitude.table)]
+    first = max(first, *(table[0] for table in tables))
+    last = min(last, *(table[-1] for table in tables))
+    nodes = np.unique(np.concatenate(tables))
     nodes = nodes[(nodes > first + SAME * line) & (nodes < last - SAME * line)]
     ends = np.r_[first, nodes[np.diff(nodes, prepend=-np.inf) > SAME * line], last]
     origin, reach, per_radian = _sight(image, earth)

@@ -38,6 +38,8 @@ ROUNDS, STEPS = 5, 2
 """How often the piece of a point may be chosen anew, and Newton's steps with its polynomials."""
 SETTLED = 1e-4
 """A last step below this, in lines and pixels, leaves an error below its square."""
+EDGE = 1e-5
+"""A root so many lines beyond the end of its piece stays with it."""
 CHUNK = 16384
 """Points that go through all steps together, so that they stay in the cache."""
 NEAR_STEPS = 6
@@ -254,7 +256,7 @@ def _passages(image, search, X, most):
     value = forward(*first[1:])
     zero = jnp.zeros_like(value)
     state = (value, first[0], zero.astype(int), (zero,) * most)
-    unroll = 1 if image.corrections.any else 8
+    unroll = 1 if image.corrections.any else 4
     (final, _, count, starts), _ = jax.lax.scan(step_to, state, rest, unroll=unroll)
     return starts, count, final > 0, value < 0
 
@@ -305,7 +307,10 @@ def _newton(image, search, X, own, k, state):
     moved = tau - first if image.corrections.any else dtau
     line = (image.times.time(1.0) - image.times.time(0.0)) / half
     short = (jnp.abs(moved) < SETTLED * line) & (jnp.abs(dv) < SETTLED) & (q < 0)
-    stays = ((tau >= -1) | (k == 0)) & ((tau <= 1) | (k == len(pieces.coefficients) - 1))
+    last = len(pieces.coefficients) - 1
+    # a root at the very end of a piece would go to and fro
+    ends = 1 + EDGE * line
+    stays = ((tau >= -ends) | (k == 0)) & ((tau <= ends) | (k == last))
     chosen = own == k
     new = middle + tau * half, v, short & stays
     return tuple(jnp.where(chosen, a, b) for a, b in zip(new, state))
