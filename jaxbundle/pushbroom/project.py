@@ -104,20 +104,26 @@ def make_search(image: PushbroomImage, earth: Ellipsoid | None = WGS84) -> Searc
 
 @partial(jax.jit, static_argnames="most")
 def project(
-    image: PushbroomImage, search: Search, X: Float[Array, "3 n"], most: int = 1
+    image: PushbroomImage,
+    search: Search,
+    X: Float[Array, "3 n"],
+    most: int = 1,
+    margin: float = 0.0,
 ) -> Projected:
     """The places of points in the whole image, the first `most` of each.
 
-    **Arguments:** `search` of the same image, by `make_search`; X in metres, coordinates first.
+    **Arguments:** `search` of the same image, by `make_search`; X in metres, coordinates first;
+    what is beside the image by up to `margin` lines and pixels is taken as in it.
     """
-    passages = lambda X: _passages(image, search, X, most)
+    passages = lambda X: _passages(image, search, X, most, margin)
     starts, count, ahead, behind = _in_chunks(passages, tuple(X))
     hidden = _hidden(search, X)
-    first, last = image.times.time(-0.5), image.times.time(image.lines - 0.5)
+    edge = 0.5 + margin
+    first, last = image.times.time(-edge), image.times.time(image.lines - 1 + edge)
     lines, pixels, seen, lost = [], [], [], jnp.zeros(X.shape[1], bool)
     for k in range(most):
         t, u, settled = _places(image, search, X, starts[k], count > k)
-        inside = (t >= first) & (t < last) & (u >= -0.5) & (u < image.pixels - 0.5)
+        inside = (t >= first) & (t < last) & (u >= -edge) & (u < image.pixels - 1 + edge)
         good = (count > k) & settled & inside & ~hidden
         lost |= (count > k) & ~settled
         seen.append(good)
@@ -221,12 +227,12 @@ def _places(image, search, X, start, there):
     return jax.lax.cond(jnp.any(there), place, nothing, start)
 
 
-def _passages(image, search, X, most):
+def _passages(image, search, X, most, margin):
     """When the line of detectors passes over the points, about, and how often; before or after?
 
     The search begins and ends a line outside the image, so that its edges are within.
     """
-    step = image.times.time(1.0) - image.times.time(0.0)
+    step = (1 + margin) * (image.times.time(1.0) - image.times.time(0.0))
     samples = search.samples.at[0].add(-step).at[-1].add(step)
     numbers, motions = jax.vmap(partial(_sample, search.pieces))(samples)
 

@@ -14,9 +14,11 @@ from jaxtyping import Array, Float
 from jaxbundle.geometry.ellipsoid import (
     WGS84,
     Ellipsoid,
+    at_height,
     geodetic,
     ray_to_ellipsoid,
     ray_to_height,
+    residual,
 )
 from jaxbundle.geometry.vectors import Scalar, Vector
 
@@ -55,7 +57,7 @@ class Ground(Surface):
     earth: Ellipsoid = WGS84
 
     def distance(self, o: Vector, d: Vector) -> Scalar:
-        return ray_to_ellipsoid(self.earth, o, d)
+        return _from_outside(self.earth, o, ray_to_ellipsoid(self.earth, o, d))
 
 
 class Height(Surface):
@@ -65,4 +67,10 @@ class Height(Surface):
     earth: Ellipsoid = WGS84
 
     def distance(self, o: Vector, d: Vector) -> Scalar:
-        return ray_to_height(self.earth, self.level, o, d)
+        s = ray_to_height(self.earth, self.level, o, d)
+        return _from_outside(at_height(self.earth, self.level), o, s)
+
+
+def _from_outside(ellipsoid, o, s):
+    """A ray from within would end on the other side of the Earth."""
+    return jnp.where(residual(ellipsoid, o) > 0, s, jnp.nan)
