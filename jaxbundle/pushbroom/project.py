@@ -149,13 +149,15 @@ def project_from(
 ) -> tuple[Array, Array]:
     """Line and pixel of points near the given places; arrays of any one shape, not searched for.
 
-    What is near in the image should be near in the arrays, as it is in a raster.
+    NaN where Newton's method does not settle. What is near in the image should be near in the
+    arrays, as it is in a raster: points of one piece are gone through together.
     """
     flat = [jnp.ravel(a) for a in jnp.broadcast_arrays(*X, image.times.time(line), pixel * 1.0)]
     place = lambda *args: _refine(image, search, args[:3], *args[3:])
-    t, u, _ = _in_chunks(lambda args: place(*args), tuple(flat))
+    t, u, settled = _in_chunks(lambda args: place(*args), tuple(flat))
     shape = jnp.broadcast_shapes(*(jnp.shape(a) for a in (*X, line, pixel)))
-    return image.times.line(t).reshape(shape), u.reshape(shape)
+    found = lambda a: jnp.where(settled, a, jnp.nan).reshape(shape)
+    return found(image.times.line(t)), found(u)
 
 
 def project_near(

@@ -5,7 +5,7 @@
 | `constant` | value |
 | `linear` | value + rate·(t − t₀) |
 | `sine` | value + amplitude·sin(2π·(t − t₀)/period + phase) |
-| `walk` | value + a random walk of `sigma` in one second, smooth between steps of `step` seconds |
+| `walk` | value + a random walk, `sigma` in a second, smooth between its steps of `step` s |
 | `table` | cubic spline through (times, values) |
 """
 
@@ -20,6 +20,9 @@ from jaxbundle.errors import InputError
 from jaxbundle.network.columns import did_you_mean
 
 Times = Float[np.ndarray, " n"]
+
+LEAD = 60.0
+"""A random walk begins so many seconds before the start, where it is 0."""
 
 KEYS = {
     "constant": ("value",),
@@ -58,13 +61,15 @@ def signal(
             turn = 2 * np.pi * passed / get("period", 1.0) + get("phase")
             return get("value") + get("amplitude") * np.sin(turn)
         case "walk":
-            return get("value") + _walk(t, get("sigma"), get("step", 1.0), rng)
+            return get("value") + _walk(passed, get("sigma"), get("step", 1.0), rng)
         case "table":
             return CubicSpline(description["times"], description["values"], extrapolate=False)(t)
     return np.full(len(t), get("value"))
 
 
-def _walk(t, sigma, step, rng):
-    nodes = np.arange(t[0] - 2 * step, t[-1] + 3 * step, step)
+def _walk(passed, sigma, step, rng):
+    # from a fixed time on, so that one seed gives one walk at whatever times it is asked for
+    nodes = np.arange(-LEAD, passed[-1] + 3 * step, step)
     steps = sigma * np.sqrt(step) * rng.normal(size=len(nodes))
-    return CubicSpline(nodes, np.cumsum(steps))(t)
+    spline = CubicSpline(nodes, np.cumsum(steps))
+    return spline(passed) - spline(0.0)
