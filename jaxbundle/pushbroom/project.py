@@ -4,8 +4,8 @@ The point X is seen at the time t by the pixel u where
 
     r + ξ(u)·q = 0,    s + η(u)·q = 0,        [r, s, q] = Rᵀ(t)·(X − P(t)),    q < 0.
 
-`project` searches the whole image: the sign of the second equation, with the pixel that the first
-one gives, changes wherever the line of detectors passes over the point; from each change Newton's
+`project_points` searches the whole image: the sign of the second equation, with the pixel that the
+first one gives, changes wherever the line of detectors passes over the point; from each change Newton's
 method in (t, u) goes on with the polynomials of `pieces`. Two passages within one step of the
 search (a piece, or 1/128 of the image) that turn back in between are not separated.
 
@@ -93,7 +93,7 @@ class Search(eqx.Module):
 
 
 def make_search(image: PushbroomImage, earth: Ellipsoid | None = WGS84) -> Search:
-    """Prepare an image for `project`; `earth` is None in a local frame."""
+    """Prepare an image for `project_points`; `earth` is None in a local frame."""
     pieces = make_pieces(image, earth)
     chosen = np.unique(np.linspace(0, len(pieces.ends) - 1, SEARCH + 1).round().astype(int))
     u = np.linspace(0, max(image.pixels - 1, 1), 257)
@@ -103,7 +103,7 @@ def make_search(image: PushbroomImage, earth: Ellipsoid | None = WGS84) -> Searc
 
 
 @partial(jax.jit, static_argnames="most")
-def project(
+def project_points(
     image: PushbroomImage,
     search: Search,
     X: Float[Array, "3 n"],
