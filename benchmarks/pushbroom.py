@@ -4,9 +4,9 @@
 
 An image of 10 000 lines of 8000 pixels of 4.7 m from 500 km: positions every second (Lagrange,
 order 7), quaternions at 10 Hz (slerp), a lens with distortion. Blocks of lines are given to two
-threads in turn, as `correct` does; the best of several rounds counts. `--map` also corrects a whole image of
-10 000 × 8000 random pixels to a GeoTIFF. Every figure stands beside its demand; what is computed is
-checked first, and a wrong answer ends with exit status 1, whatever the time.
+threads in turn, as `correct` does; the best of several rounds counts. `--map` also corrects a
+whole image of 10 000 × 8000 random pixels to a GeoTIFF. Every figure stands beside its demand;
+what is computed is checked first, and a wrong answer ends with exit status 1, whatever the time.
 
     ellipsoid      X, Y, Z on the ellipsoid           geodetic     the same to λ, φ, h
     terrain        first hit with a rough model       jacobian     ∂(X, Y, Z)/∂(3 angles, 3 shifts)

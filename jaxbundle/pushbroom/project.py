@@ -5,9 +5,9 @@ The point X is seen at the time t by the pixel u where
     r + ξ(u)·q = 0,    s + η(u)·q = 0,        [r, s, q] = Rᵀ(t)·(X − P(t)),    q < 0.
 
 `project_points` searches the whole image: the sign of the second equation, with the pixel that the
-first one gives, changes wherever the line of detectors passes over the point; from each change Newton's
-method in (t, u) goes on with the polynomials of `pieces`. Two passages within one step of the
-search (a piece, or 1/128 of the image) that turn back in between are not separated.
+first one gives, changes wherever the line of detectors passes over the point; from each change
+Newton's method in (t, u) goes on with the polynomials of `pieces`. Two passages within one step of
+the search (a piece, or 1/128 of the image) that turn back in between are not separated.
 
 `project_near` is the textbook's way for one point that is near a known place in the image, with the
 trajectory itself. By the implicit function theorem its derivatives are exact in everything.
