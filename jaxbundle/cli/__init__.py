@@ -11,4 +11,5 @@ from jaxbundle.cli import compare as compare
 from jaxbundle.cli import convert as convert
 from jaxbundle.cli import orient as orient
 from jaxbundle.cli import plan as plan
+from jaxbundle.cli import pushbroom as pushbroom
 from jaxbundle.cli.app import main as main

@@ -1,10 +1,12 @@
 """Geometry: pure, differentiable functions of one rotation, one pose, one point.
 
 Batch them with `jax.vmap`. Angles are in radians, lengths in the unit of their arguments.
-`affine` and `similarity` are used as namespaces: `affine.apply`, `similarity.transform_point`.
+`affine`, `ellipsoid` and `similarity` are used as namespaces: `affine.apply`,
+`ellipsoid.geodetic`, `similarity.transform_point`.
 """
 
 from . import affine as affine
+from . import ellipsoid as ellipsoid
 from . import similarity as similarity
 from .quaternions import matrix_from_quaternion as matrix_from_quaternion
 from .quaternions import matrix_from_rotation_vector as matrix_from_rotation_vector

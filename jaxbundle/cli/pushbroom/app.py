@@ -1,0 +1,93 @@
+"""The sub-application of line scanners, and what its commands share."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from jaxbundle.cli.app import app
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import Ellipsoid
+from jaxbundle.io.csv_tables import write_csv, write_text
+from jaxbundle.io.rasters import read_terrain
+from jaxbundle.io.result_json import without_nan
+from jaxbundle.pushbroom.resample import RESAMPLINGS
+from jaxbundle.pushbroom.surfaces import Ground, Height, Plane, Surface
+
+pushbroom = typer.Typer(
+    help="Line scanners: image to ground and back, simulation, correction, accuracy.",
+    no_args_is_help=True,
+)
+app.add_typer(pushbroom, name="pushbroom")
+
+ScannerFile = Annotated[Path, typer.Argument(help="scanner file, .toml (docs/pushbroom.md)")]
+Level = Annotated[
+    float | None, typer.Option("--height", help="metres above the ellipsoid; Z in a local frame")
+]
+Dem = Annotated[Path | None, typer.Option(help="raster of the terrain, heights as --height")]
+Csv = Annotated[Path | None, typer.Option(help="file for the table; - or none: standard output")]
+Json = Annotated[str, typer.Option(help="the table as JSON instead; - for standard output")]
+
+
+def surface_of(earth: Ellipsoid | None, height: float | None, dem: Path | None) -> Surface:
+    """The surface that the options name: the ellipsoid (or Z = 0) if none."""
+    if dem is not None:
+        if height is not None:
+            raise InputError("--height and --dem: give one of them")
+        check_spheroid(earth)
+        return read_terrain(dem, earth)
+    if earth is None:
+        return Plane(height or 0.0)
+    if height is None:
+        return Ground(earth)
+    check_spheroid(earth)
+    return Height(height, earth)
+
+
+def check_resampling(kind: str) -> None:
+    """Refuse a resampling that is none."""
+    if kind not in RESAMPLINGS:
+        raise InputError(f"--resampling {kind!r}: {', '.join(RESAMPLINGS)}")
+
+
+def check_spheroid(earth: Ellipsoid | None) -> None:
+    """Refuse heights above an ellipsoid of three different axes."""
+    if earth is not None and earth.a != earth.b:
+        raise InputError(
+            "heights, longitude and latitude need an ellipsoid of revolution; make the first two "
+            "axes of [scanner] earth equal"
+        )
+
+
+def write_rows(
+    columns: Mapping[str, Sequence], csv: Path | None, json_: str, head: Mapping | None = None
+) -> None:
+    """A table as CSV or JSON, in a file or on standard output."""
+    columns = {name: _plain(values) for name, values in columns.items()}
+    rows = list(zip(*columns.values()))
+    if json_:
+        rows = [dict(zip(columns, row)) for row in rows]
+        text = json.dumps(without_nan({**(head or {}), "rows": rows}), ensure_ascii=False) + "\n"
+        if json_ == "-":
+            print(text, end="")
+        else:
+            write_text(Path(json_), text)
+    rows = [["" if v != v else v for v in row] for row in zip(*columns.values())]
+    if csv is not None and str(csv) != "-":
+        write_csv(csv, list(columns), rows)
+    elif not json_:
+        print(",".join(columns))
+        for row in rows:
+            print(",".join(map(str, row)))
+
+
+def _plain(values):
+    return values.tolist() if isinstance(values, np.ndarray) else list(values)
+
+
+def warn(message: str) -> None:
+    """A line on standard error."""
+    typer.echo(f"jaxbundle: {message}", err=True)

@@ -1,0 +1,97 @@
+"""`jaxbundle pushbroom locate`: from the image to the ground."""
+
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import numpy as np
+import typer
+
+import jaxbundle
+from jaxbundle.cli.pushbroom.app import (
+    Csv,
+    Dem,
+    Json,
+    Level,
+    ScannerFile,
+    pushbroom,
+    surface_of,
+    warn,
+    write_rows,
+)
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import geodetic
+from jaxbundle.io.csv_tables import read_csv
+from jaxbundle.io.scanner import read_scanner
+from jaxbundle.network.tables import Source
+from jaxbundle.pushbroom.image import PushbroomImage
+from jaxbundle.pushbroom.locate import locate_points
+
+
+@pushbroom.command()
+def locate(
+    scanner: ScannerFile,
+    points: Annotated[Path | None, typer.Option(help="table line,pixel[,id]")] = None,
+    grid: Annotated[
+        str, typer.Option(help="LINESxPIXELS places over the whole image, if no points")
+    ] = "11x11",
+    height: Level = None,
+    dem: Dem = None,
+    csv: Csv = None,
+    json: Json = "",
+) -> None:
+    """Where on the ground places of the image are; (0, 0) is the centre of the first pixel."""
+    jaxbundle.enable_x64()
+    file = read_scanner(scanner)
+    surface = surface_of(file.earth, height, dem)
+    ids, line, pixel, source = places(file.image, points, grid)
+    X = np.array(jax.jit(locate_points)(file.image, surface, line, pixel))
+    missed = np.isnan(X).any(0)
+    reason = "no terrain there" if dem else "misses the surface"
+    if missed.any():
+        row = int(missed.argmax())
+        remedy = (
+            "give a model that covers the image" if dem else "look at attitude, mounting and height"
+        )
+        said = (
+            f"{source(row)}: the ray of line {line[row]:g}, pixel {pixel[row]:g}: {reason}; "
+            f"{remedy} ({missed.sum()} of {len(line)} points)"
+        )
+        if missed.all():
+            raise InputError(said)
+        warn(said)
+    columns = {"id": ids} if ids else {}
+    columns |= {"line": line, "pixel": pixel, "X": X[0], "Y": X[1], "Z": X[2]}
+    if file.earth is not None and file.earth.a == file.earth.b:
+        longitude, latitude, h = (np.asarray(v) for v in geodetic(file.earth, tuple(X)))
+        columns |= {"longitude": np.degrees(longitude), "latitude": np.degrees(latitude)}
+        columns |= {"height": h}
+    columns["status"] = ["found" if not m else reason for m in missed]
+    write_rows(columns, csv, json, {"scanner": file.name})
+
+
+def places(image: PushbroomImage, points: Path | None, grid: str):
+    """Ids, lines, pixels and their source: of a table, or a grid over the image."""
+    if points is None:
+        try:
+            rows, columns = (int(n) for n in grid.lower().split("x"))
+            if min(rows, columns) < 1:
+                raise ValueError
+        except ValueError:
+            raise InputError(f"--grid {grid!r}: two numbers are expected, such as 11x11") from None
+        lines = np.repeat(np.linspace(0, image.lines - 1, rows), columns)
+        pixels = np.tile(np.linspace(0, image.pixels - 1, columns), rows)
+        return (), lines, pixels, Source("grid", None, "place")
+    table = read_csv(points)
+    table.check_names(("line", "pixel"), ("id",))
+    line, pixel = (table.numbers(name, required=True) for name in ("line", "pixel"))
+    for name, values, size in (("line", line, image.lines), ("pixel", pixel, image.pixels)):
+        outside = ~((values >= -0.5) & (values <= size - 0.5))
+        if outside.any():
+            row = int(outside.argmax())
+            raise InputError(
+                f"{table.source(row)}: {name} {values[row]:g} is off the image, which has {size}; "
+                f"-0.5 to {size - 0.5:g} is expected"
+            )
+    ids = table.ids("id") if "id" in table.values else ()
+    return ids, line, pixel, table.source

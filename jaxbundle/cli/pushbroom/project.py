@@ -1,0 +1,81 @@
+"""`jaxbundle pushbroom project`: from the ground to the image."""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+import jaxbundle
+from jaxbundle.cli.pushbroom.app import (
+    Csv,
+    Json,
+    ScannerFile,
+    check_spheroid,
+    pushbroom,
+    warn,
+    write_rows,
+)
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed
+from jaxbundle.io.csv_tables import read_csv
+from jaxbundle.io.scanner import read_scanner
+from jaxbundle.network.columns import Columns
+from jaxbundle.pushbroom.project import Status, make_search, project_points
+
+MOST = 4
+"""So many lines that see one point are told."""
+
+
+@pushbroom.command()
+def project(
+    scanner: ScannerFile,
+    points: Annotated[
+        Path, typer.Option(help="table X,Y,Z[,id] (m) or longitude,latitude,height[,id] (degrees)")
+    ],
+    csv: Csv = None,
+    json: Json = "",
+) -> None:
+    """Where in the image points of the ground are: a row for every line that sees one."""
+    jaxbundle.enable_x64()
+    file = read_scanner(scanner)
+    table = read_csv(points)
+    X = _points(table, file.earth)
+    found = project_points(file.image, make_search(file.image, file.earth), X, most=MOST)
+    line, pixel = np.asarray(found.line), np.asarray(found.pixel)
+    status, count = np.asarray(found.status), np.asarray(found.count)
+    if (status != Status.SEEN).all():
+        raise InputError(
+            f"{table.source(0)}: no point is in the image; this one is "
+            f"{Status(int(status[0])).meaning}: look at coordinates, frame and units"
+        )
+    unseen = np.flatnonzero(status != Status.SEEN)
+    if len(unseen):
+        first = unseen[0]
+        warn(
+            f"{table.source(first)}: not in the image but {Status(int(status[first])).meaning} "
+            f"({len(unseen)} of {len(status)} points)"
+        )
+    solution, point = np.nonzero(~np.isnan(line) | ((np.arange(MOST) == 0)[:, None] & (count == 0)))
+    order = np.lexsort((solution, point))
+    solution, point = solution[order], point[order]
+    ids = table.ids("id") if "id" in table.values else [str(k + 1) for k in range(len(status))]
+    write_rows({
+        "id": [ids[p] for p in point], "line": line[solution, point],
+        "pixel": pixel[solution, point], "count": count[point],
+        "status": [Status(int(status[p])).meaning for p in point],
+    }, csv, json, {"scanner": file.name})  # fmt: skip
+
+
+def _points(table: Columns, earth: Ellipsoid | None) -> np.ndarray:
+    if "longitude" in table.values:
+        if earth is None:
+            raise InputError(f"{table.source.name}: a local frame has no longitudes; give X, Y, Z")
+        check_spheroid(earth)
+        names = ("longitude", "latitude", "height")
+        table.check_names(names, ("id",))
+        longitude, latitude, h = (table.numbers(n, required=True) for n in names)
+        return np.array(earth_fixed(earth, (np.radians(longitude), np.radians(latitude), h)))
+    names = ("X", "Y", "Z")
+    table.check_names(names, ("id",))
+    return np.stack([table.numbers(n, required=True) for n in names])

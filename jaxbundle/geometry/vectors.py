@@ -1,0 +1,58 @@
+"""Vectors as unpacked triples (x, y, z).
+
+Formulas of one point that are mapped over millions of pixels take and return triples, or anything
+that unpacks into three components, such as an array of shape [3, …]. XLA fuses them into one loop;
+a batch of products of 3×3 matrices costs several times more.
+"""
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+
+Scalar = float | Float[Array, ""]
+Vector = tuple[Scalar, Scalar, Scalar]
+
+
+def dot(u: Vector, v: Vector) -> Scalar:
+    """u·v."""
+    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+
+
+def cross(u: Vector, v: Vector) -> Vector:
+    """u × v."""
+    return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+
+
+def along(o: Vector, d: Vector, s: Scalar) -> Vector:
+    """o + s·d, the point of a ray."""
+    return o[0] + s * d[0], o[1] + s * d[1], o[2] + s * d[2]
+
+
+def difference(u: Vector, v: Vector) -> Vector:
+    """u − v."""
+    return u[0] - v[0], u[1] - v[1], u[2] - v[2]
+
+
+def scaled(s: Scalar, v: Vector) -> Vector:
+    """s·v."""
+    return s * v[0], s * v[1], s * v[2]
+
+
+def length(v: Vector) -> Scalar:
+    """|v|."""
+    return jnp.sqrt(dot(v, v))
+
+
+def unit(v: Vector) -> Vector:
+    """v/|v|."""
+    return scaled(1 / length(v), v)
+
+
+def turned(M: Float[Array, "3 3"], v: Vector) -> Vector:
+    """M·v."""
+    return dot(M[0], v), dot(M[1], v), dot(M[2], v)
+
+
+def turned_back(M: Float[Array, "3 3"], v: Vector) -> Vector:
+    """Mᵀ·v."""
+    return tuple(M[0][k] * v[0] + M[1][k] * v[1] + M[2][k] * v[2] for k in range(3))

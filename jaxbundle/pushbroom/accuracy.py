@@ -1,0 +1,161 @@
+"""What errors of the ancillary data do on the ground: in closed form, and by drawing them.
+
+Closed form: with J the derivative of the horizontal ground coordinates by every single error (bias,
+drift, each row), by automatic differentiation through the whole chain, the covariance is
+
+    Σ = J·diag(σ²)·Jᵀ,     RMS = √(tr Σ),
+
+and CE90, the radius with 90 % of the errors inside, follows from its eigenvalues λ₁, λ₂: with s, c
+normally distributed, P(λ₁·s² + λ₂·c² ≤ CE90²) = 0.9. For a level camera h above a plane, with
+V = tan(FOV/2), an error of attitude gives over the line
+
+    RMS = h·√[(1 + 2V²/3 + V⁴/5)·σ_roll² + σ_pitch² + V²/3·σ_yaw²].
+
+By drawing: the same errors drawn, the ground coordinates computed anew, quantiles counted.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.optimize import brentq
+
+from jaxbundle.geometry.ellipsoid import geodetic
+from jaxbundle.geometry.vectors import difference
+
+from .image import PushbroomImage
+from .locate import locate_point
+from .noise import Noise, disturbed, draw, no_errors, sigmas
+from .surfaces import Surface
+
+
+class GroundAccuracy(eqx.Module):
+    """Errors east and north (X and Y in a local frame) at places in an image, metres.
+
+    `covariance` [n, 2, 2]; `rms` [n] of the length; `ce90` [n].
+    """
+
+    covariance: Float[np.ndarray, "n 2 2"]
+    rms: Float[np.ndarray, " n"]
+    ce90: Float[np.ndarray, " n"]
+
+    @property
+    def overall(self) -> float:
+        """The RMS over all places."""
+        return float(np.sqrt(np.mean(self.rms**2)))
+
+
+def propagated(
+    image: PushbroomImage,
+    surface: Surface,
+    lines: Float[np.ndarray, " n"],
+    pixels: Float[np.ndarray, " n"],
+    noise: Noise,
+) -> GroundAccuracy:
+    """The accuracy by propagation of covariances, exact to first order."""
+    covariance = np.asarray(_covariances(image, surface, lines, pixels, sigmas(image, noise)))
+    rms = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
+    return GroundAccuracy(covariance, rms, np.array([circular_error(c) for c in covariance]))
+
+
+def drawn(
+    image: PushbroomImage,
+    surface: Surface,
+    lines: Float[np.ndarray, " n"],
+    pixels: Float[np.ndarray, " n"],
+    noise: Noise,
+    draws: int = 1000,
+    seed: int = 0,
+) -> GroundAccuracy:
+    """The accuracy by Monte Carlo."""
+    keys = jax.random.split(jax.random.key(seed), draws)
+    errors = np.asarray(_draws(image, surface, lines, pixels, noise, keys))
+    covariance = np.einsum("dni,dnj->nij", errors, errors) / draws
+    length = np.linalg.norm(errors, axis=2)
+    return GroundAccuracy(
+        covariance, np.sqrt(np.mean(length**2, 0)), np.quantile(length, 0.9, axis=0)
+    )
+
+
+def ground_errors(
+    image: PushbroomImage,
+    truth: PushbroomImage,
+    surface: Surface,
+    lines: Float[np.ndarray, " n"],
+    pixels: Float[np.ndarray, " n"],
+) -> Float[np.ndarray, "n 2"]:
+    """East and north at which places of an image are located wrongly, metres."""
+    return np.asarray(_differences(image, truth, surface, lines, pixels))
+
+
+def closed_form(
+    height: float, field_of_view: float, roll: float, pitch: float, yaw: float
+) -> float:
+    """The RMS over a line of a level camera above a plane, of σ of its angles in radians."""
+    V = np.tan(field_of_view / 2)
+    across = (1 + 2 * V**2 / 3 + V**4 / 5) * roll**2
+    return float(height * np.sqrt(across + pitch**2 + V**2 / 3 * yaw**2))
+
+
+def circular_error(covariance: Float[np.ndarray, "2 2"], part: float = 0.9) -> float:
+    """The radius of a circle that holds this part of normally distributed errors."""
+    large = float(np.linalg.eigvalsh(covariance)[1])
+    small = max(float(np.linalg.eigvalsh(covariance)[0]), 0.0)
+    if not large > 0:
+        return 0.0 if large == 0 else np.nan
+    # the mean over angles of what is outside the circle in this direction
+    angle = (np.arange(2000) + 0.5) * np.pi / 2000
+    ratio = small / large
+    # in axes of unit variance the circle has the radius r/√(λ₁cos² + λ₂sin²)
+    stretch = np.cos(angle) ** 2 + ratio * np.sin(angle) ** 2
+    outside = lambda r: np.mean(np.exp(-(r**2) / (2 * stretch))) - (1 - part)
+    return float(np.sqrt(large) * brentq(outside, 0.0, 10.0))
+
+
+@eqx.filter_jit
+def _covariances(image, surface, lines, pixels, sigma):
+    zero = no_errors(image)
+
+    def of_place(line, pixel):
+        axes, X0 = _east_north(surface, locate_point(image, surface, line, pixel))
+        move = lambda errors: _horizontal(
+            axes, X0, locate_point(disturbed(image, errors), surface, line, pixel)
+        )
+        J = jax.jacrev(move)(zero)
+        parts = [(j * s).reshape(2, -1) for j, s in zip(J, sigma)]
+        return sum(part @ part.T for part in parts)
+
+    return jax.vmap(of_place)(lines, pixels)
+
+
+@eqx.filter_jit
+def _draws(image, surface, lines, pixels, noise, keys):
+    def one(key):
+        wrong = disturbed(image, draw(image, noise, key))
+        return _differences(wrong, image, surface, lines, pixels)
+
+    return jax.lax.map(one, keys)
+
+
+@eqx.filter_jit
+def _differences(image, truth, surface, lines, pixels):
+    def of_place(line, pixel):
+        axes, X0 = _east_north(surface, locate_point(truth, surface, line, pixel))
+        return _horizontal(axes, X0, locate_point(image, surface, line, pixel))
+
+    return jax.vmap(of_place)(lines, pixels)
+
+
+def _east_north(surface, X):
+    """The unit vectors east and north at X, and X."""
+    if surface.earth is None:
+        return jnp.eye(3)[:2], X
+    longitude, latitude, _ = geodetic(surface.earth, X)
+    s, c, z = jnp.sin(longitude), jnp.cos(longitude), jnp.sin(latitude)
+    east = jnp.stack([-s, c, 0 * s])
+    return jnp.stack([east, jnp.stack([-z * c, -z * s, jnp.cos(latitude)])]), X
+
+
+def _horizontal(axes, X0, X) -> Float[Array, "2"]:
+    return axes @ jnp.stack(difference(X, X0))

@@ -1,0 +1,106 @@
+"""A pushbroom image: every line a photograph of one row, with its own exterior orientation.
+
+    X = P(t) + s·R(t)·[ξ, η, −1],      t = t(l),   (ξ, η) = optics(u)
+    R(t) = R_attitude(t)·exp([a + ȧ·(t − t₀)]×)·R_mounting,      P(t) = P_table(t) + p + ṗ·(t − t₀)
+
+`Offsets` a, ȧ, p, ṗ (about the time t₀ of the middle line) are zero unless something is to be
+estimated or propagated; a turns about right, forward and up: pitch, roll and yaw.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbundle.geometry import matrix_from_rotation_vector
+
+from .ancillary import check_covered
+from .corrections import Corrections
+from .scanner import LineTimes, Optics
+from .trajectory import (
+    Trajectory,
+    matrix_from_pitch_roll_yaw,
+    position_at,
+    rotation_at,
+    velocity_at,
+)
+
+
+class Offsets(eqx.Module):
+    """Small changes of the trajectory: radians, metres, and the same a second."""
+
+    attitude: Float[Array, "3"]
+    attitude_rate: Float[Array, "3"]
+    position: Float[Array, "3"]
+    position_rate: Float[Array, "3"]
+
+
+def no_offsets() -> Offsets:
+    """The trajectory as its tables give it."""
+    return Offsets(*(jnp.zeros(3) for _ in range(4)))
+
+
+class PushbroomImage(eqx.Module):
+    """Trajectory, line times, optics, mounting and corrections of an image.
+
+    `mounting`: pitch, roll, yaw in radians of the camera in the frame whose attitude is given;
+    `lines`, `pixels`: its size. All arrays are parameters: replace them by `equinox.tree_at`,
+    differentiate by them.
+    """
+
+    trajectory: Trajectory
+    times: LineTimes
+    optics: Optics
+    mounting: Float[Array, "3"]
+    offsets: Offsets
+    corrections: Corrections = eqx.field(static=True)
+    lines: int = eqx.field(static=True)
+    pixels: int = eqx.field(static=True)
+
+    @property
+    def middle_time(self) -> Float[Array, ""]:
+        """The time of the middle line, in seconds."""
+        return self.times.time((self.lines - 1) / 2)
+
+
+class Pose(NamedTuple):
+    """Exterior orientation of a line: P in metres, R camera → object, rate V of P in m/s."""
+
+    P: Float[Array, "3"]
+    R: Float[Array, "3 3"]
+    V: Float[Array, "3"]
+
+
+def make_image(
+    trajectory: Trajectory,
+    times: LineTimes,
+    optics: Optics,
+    lines: int,
+    pixels: int,
+    mounting: Float[Array, "3"] | None = None,
+    corrections: Corrections = Corrections(),  # noqa: B008
+) -> PushbroomImage:
+    """An image whose tables reach over all its lines.
+
+    **Raises:** `InputError` that names the line at a time outside a table or in a gap.
+    """
+    mounting = jnp.zeros(3) if mounting is None else jnp.asarray(mounting, float)
+    image = PushbroomImage(
+        trajectory, times, optics, mounting, no_offsets(), corrections, int(lines), int(pixels)
+    )
+    when = np.asarray(times.time(jnp.arange(lines, dtype=float)))
+    check_covered(trajectory.position, when, "positions")
+    check_covered(trajectory.attitude.table, when, "attitude")
+    return image
+
+
+def pose_at(image: PushbroomImage, t: Float[Array, ""]) -> Pose:
+    """The pose at the time t, in seconds; NaN where the tables do not reach."""
+    dt, offsets = t - image.middle_time, image.offsets
+    turn = matrix_from_rotation_vector(offsets.attitude + dt * offsets.attitude_rate)
+    R = rotation_at(image.trajectory, t) @ turn @ matrix_from_pitch_roll_yaw(image.mounting)
+    P = position_at(image.trajectory, t) + offsets.position + dt * offsets.position_rate
+    V = velocity_at(image.trajectory, t) + offsets.position_rate
+    return Pose(P, R, V)

@@ -1,0 +1,80 @@
+"""Image → ground: the first point of a pixel's ray on a surface.
+
+    [X, Y, Z] = P + s·R·[ξ, η, −1]
+
+One pose a line, the directions of the pixels once for all lines: a whole line costs little more
+than its intersections with the surface. `locate_point` is the textbook's formula of one
+pixel, `locate_lines` the same for lines × pixels, `locate_points` for scattered places.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbundle.geometry.vectors import Vector, along, difference, length, turned
+
+from .corrections import Corrections, earlier_earth, inertial_velocity, refracted
+from .corrections import true_direction as without_aberration
+from .image import Pose, PushbroomImage, pose_at
+from .scanner import slopes_of
+from .surfaces import Surface
+
+
+def locate_point(
+    image: PushbroomImage, surface: Surface, line: Float[Array, ""], pixel: Float[Array, ""]
+) -> Vector:
+    """The point (X, Y, Z), in metres, that a place in the image shows; NaN if the ray misses."""
+    pose = pose_at(image, image.times.time(line))
+    return ground_point(pose, image.optics.slopes(pixel), surface, image.corrections)
+
+
+def ground_point(
+    pose: Pose, slopes: tuple[Array, Array], surface: Surface, corrections: Corrections
+) -> Vector:
+    """The first point on the surface in the direction [ξ, η, −1] of a pose."""
+    P, R, V = pose
+    o, d = tuple(P), turned(R, (*slopes, -1.0))
+    if corrections.aberration:
+        d = without_aberration(d, inertial_velocity(o, tuple(V)))
+    X = along(o, d, surface.distance(o, d))
+    if corrections.light_time:
+        start, direction = o, d
+        for _ in range(2):
+            distance = length(difference(X, o))
+            o, d = earlier_earth(start, distance), earlier_earth(direction, distance)
+            X = along(o, d, surface.distance(o, d))
+    if corrections.refraction:
+        o, d = refracted(surface.earth, surface.height(X), o, d)
+        X = along(o, d, surface.distance(o, d))
+    return X
+
+
+def locate_lines(
+    image: PushbroomImage,
+    surface: Surface,
+    lines: Float[Array, " lines"],
+    pixels: Float[Array, " pixels"],
+) -> Float[Array, "3 lines pixels"]:
+    """The points of all pixels of all lines, coordinates first."""
+    slopes = slopes_of(image.optics, pixels)
+
+    def of_line(line):
+        pose = pose_at(image, image.times.time(line))
+        return jax.vmap(lambda a, b: ground_point(pose, (a, b), surface, image.corrections))(
+            *slopes
+        )
+
+    if surface.iterative:
+        # the state of a loop over 8000 pixels stays in the cache, that of many lines does not
+        return jnp.stack(jax.lax.map(of_line, lines), axis=0)
+    return jnp.stack(jax.vmap(of_line)(lines))
+
+
+def locate_points(
+    image: PushbroomImage,
+    surface: Surface,
+    lines: Float[Array, " n"],
+    pixels: Float[Array, " n"],
+) -> Float[Array, "3 n"]:
+    """The points of scattered places in the image, a pose for each."""
+    return jnp.stack(jax.vmap(lambda l, u: locate_point(image, surface, l, u))(lines, pixels))

@@ -1,0 +1,103 @@
+"""Errors of ancillary data: bias, drift, and white noise of every row, in attitude and position.
+
+An attitude in error is R·exp([ε]×), ε in radians about right, forward and up (pitch, roll, yaw); a
+position in error is P + ε in metres. In time,
+
+    ε(t) = bias + drift·(t − t₀) + what is interpolated of the noise of the rows,
+
+t₀ the time of the middle line. `Errors` are values (drawn, or zero to be differentiated by),
+`Noise` their standard deviations, each axis alike or one by one.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbundle.geometry import (
+    matrix_from_omega_phi_kappa,
+    omega_phi_kappa_near,
+    quaternion_from_rotation_vector,
+    quaternion_multiply,
+)
+from jaxbundle.geometry.quaternions import matrix_from_rotation_vector
+
+from .image import PushbroomImage
+
+Sigma = float | Float[np.ndarray, "3"]
+
+
+class Noise(NamedTuple):
+    """Standard deviations: radians and metres, drifts a second, rows independent of each other."""
+
+    attitude_bias: Sigma = 0.0
+    attitude_drift: Sigma = 0.0
+    attitude_white: Sigma = 0.0
+    position_bias: Sigma = 0.0
+    position_drift: Sigma = 0.0
+    position_white: Sigma = 0.0
+
+
+class Errors(NamedTuple):
+    """Errors of an image's ancillary data, in the order of `Noise`."""
+
+    attitude_bias: Float[Array, "3"]
+    attitude_drift: Float[Array, "3"]
+    attitude_white: Float[Array, "rows 3"]
+    position_bias: Float[Array, "3"]
+    position_drift: Float[Array, "3"]
+    position_white: Float[Array, "rows2 3"]
+
+
+def no_errors(image: PushbroomImage) -> Errors:
+    """Errors of zero."""
+    rows = [len(t.times) for t in (image.trajectory.attitude.table, image.trajectory.position)]
+    shapes = [(3,), (3,), (rows[0], 3), (3,), (3,), (rows[1], 3)]
+    return Errors(*(jnp.zeros(shape) for shape in shapes))
+
+
+def sigmas(image: PushbroomImage, noise: Noise) -> Errors:
+    """The standard deviation of every single error."""
+    return Errors(*(
+        jnp.broadcast_to(jnp.asarray(sigma, float), zero.shape)
+        for sigma, zero in zip(noise, no_errors(image))
+    ))  # fmt: skip
+
+
+def draw(image: PushbroomImage, noise: Noise, key: Array) -> Errors:
+    """Normally distributed errors."""
+    keys = jax.random.split(key, len(Errors._fields))
+    return Errors(*(
+        sigma * jax.random.normal(k, sigma.shape) for sigma, k in zip(sigmas(image, noise), keys)
+    ))  # fmt: skip
+
+
+def disturbed(image: PushbroomImage, errors: Errors) -> PushbroomImage:
+    """The image with these errors in its trajectory; differentiable in them."""
+    attitude, position = image.trajectory.attitude.table, image.trajectory.position
+    turn = _turned_angles if attitude.values.shape[1] == 3 else _turned_quaternion
+    offsets = image.offsets
+    return eqx.tree_at(
+        lambda i: (
+            i.trajectory.attitude.table.values, i.trajectory.position.values, i.offsets.attitude,
+            i.offsets.attitude_rate, i.offsets.position, i.offsets.position_rate,
+        ), image, (
+            jax.vmap(turn)(attitude.values, errors.attitude_white),
+            position.values + errors.position_white,
+            offsets.attitude + errors.attitude_bias, offsets.attitude_rate + errors.attitude_drift,
+            offsets.position + errors.position_bias, offsets.position_rate + errors.position_drift,
+        ),
+    )  # fmt: skip
+
+
+def _turned_quaternion(q, error):
+    return quaternion_multiply(q, quaternion_from_rotation_vector(error))
+
+
+def _turned_angles(angles, error):
+    """Of R·exp([ε]×), the angles next to the given ones."""
+    M = matrix_from_rotation_vector(error).T @ matrix_from_omega_phi_kappa(angles)
+    return omega_phi_kappa_near(M, angles)

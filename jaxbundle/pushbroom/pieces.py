@@ -1,0 +1,124 @@
+"""The trajectory of an image as polynomials in time, for the way from the ground to the image.
+
+A point X is at [r, s, q] = Rᵀ·(X − P) = M·(X − O) + m in the camera frame, O a fixed origin. The
+twelve numbers M, m are interpolated by polynomials of degree 5 through Chebyshev points of short
+pieces of time. A piece ends where the interpolation of a table does, and is halved until the
+polynomials keep the image coordinates of the ground within `TOLERANCE` pixels. That costs a few
+multiplications for each point where interpolation and rotation cost hundreds.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import Ellipsoid, ray_to_ellipsoid
+from jaxbundle.geometry.vectors import turned
+
+from .image import PushbroomImage, pose_at
+from .interpolation import breaks
+
+DEGREE = 5
+TOLERANCE = 1e-7
+SHORTEST = 1e-3
+"""No piece becomes shorter than this part of a line."""
+SAME = 1e-6
+"""Rows of two tables nearer in time than this part of a line are taken as one."""
+
+NODES = np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))
+CHECKS = np.cos(np.pi * np.arange(DEGREE + 2) / (DEGREE + 1))
+"""Between the nodes and at the ends, where the polynomial errs most."""
+TO_COEFFICIENTS = np.linalg.inv(np.vander(NODES, increasing=True))
+TO_CHECKS = np.vander(CHECKS, DEGREE + 1, increasing=True) @ TO_COEFFICIENTS
+
+
+class Pieces(eqx.Module):
+    """Ends of the n pieces in seconds; coefficients of M (rows first) and m in τ from −1 to 1."""
+
+    ends: Float[Array, " n+1"]
+    coefficients: Float[Array, "n 6 12"]
+    origin: Float[Array, "3"]
+
+
+def make_pieces(image: PushbroomImage, earth: Ellipsoid | None) -> Pieces:
+    """The pieces from the edge of the first line to that of the last, as far as the tables reach.
+
+    `earth` as in `make_search`.
+
+    **Raises:** `InputError` if no pieces follow the trajectory.
+    """
+    first, last = (float(image.times.time(line)) for line in (-0.5, image.lines - 0.5))
+    line = (last - first) / image.lines
+    tables = [breaks(image.trajectory.position), breaks(image.trajectory.attitude.table)]
+    first = max(first, *(table[0] for table in tables))
+    last = min(last, *(table[-1] for table in tables))
+    nodes = np.unique(np.concatenate(tables))
+    nodes = nodes[(nodes > first + SAME * line) & (nodes < last - SAME * line)]
+    ends = np.r_[first, nodes[np.diff(nodes, prepend=-np.inf) > SAME * line], last]
+    origin, reach, per_radian = _sight(image, earth)
+    left, right, found = ends[:-1], ends[1:], []
+    while len(left):
+        values, checks = _numbers(image, origin, left, right, (first, last))
+        wrong = np.abs(TO_CHECKS @ values - checks)
+        # turns act on the whole sight, shifts over its length
+        error = per_radian * (wrong[..., :9].max((1, 2)) + wrong[..., 9:].max((1, 2)) / reach)
+        good = error <= TOLERANCE
+        found += zip(left[good], right[good], TO_COEFFICIENTS @ values[good])
+        left, right = left[~good], right[~good]
+        if len(left) and (right - left).min() < SHORTEST * line:
+            raise InputError(
+                f"attitude: the trajectory at {left[0]:.9g} s does not follow from its rows within "
+                f"{SHORTEST:g} lines; look for wrong rows there"
+            )
+        middle = (left + right) / 2
+        left, right = np.r_[left, middle], np.r_[middle, right]
+    found.sort(key=lambda piece: piece[0])
+    coefficients = jnp.asarray(np.stack([piece[2] for piece in found]))
+    return Pieces(
+        jnp.asarray(np.r_[[p[0] for p in found], last]), coefficients, jnp.asarray(origin)
+    )
+
+
+def _numbers(image, origin, left, right, span):
+    """The twelve numbers at nodes and checks of many pieces: [n, 6, 12] and [n, 7, 12]."""
+    places = np.r_[NODES, CHECKS]
+    t = (left + right)[:, None] / 2 + (right - left)[:, None] / 2 * places
+    t = np.clip(t, *span)
+    size = 1 << int(np.ceil(np.log2(t.size)))  # few shapes to compile
+    padded = np.full(size, t.flat[0])
+    padded[: t.size] = t.ravel()
+    numbers = np.asarray(_pose_numbers(image, origin, padded))[: t.size]
+    numbers = numbers.reshape(*t.shape, 12)
+    return numbers[:, : DEGREE + 1], numbers[:, DEGREE + 1 :]
+
+
+@jax.jit
+def _pose_numbers(image, origin, times):
+    def at(t):
+        P, R, _ = pose_at(image, t)
+        return jnp.concatenate([R.T.ravel(), R.T @ (origin - P)])
+
+    return jax.vmap(at)(times)
+
+
+@jax.jit
+def _middle(image):
+    pose = pose_at(image, image.middle_time)
+    u = (image.pixels - 1) / 2
+    slopes, per_pixel = jax.jvp(image.optics.slopes, (u,), (1.0,))
+    return pose, turned(pose.R, (*slopes, -1.0)), jnp.hypot(*per_pixel)
+
+
+def _sight(image, earth):
+    """A point on the ground in the middle, its distance, and pixels a radian (the finer of two)."""
+    (P, _, V), d, per_pixel = jax.tree.map(np.asarray, _middle(image))
+    if earth is None:
+        s = -P[2] / d[2] if d[2] else 0.0
+    else:
+        s = float(ray_to_ellipsoid(earth, P, d))
+    reach = s if np.isfinite(s) and s > 0 else 1e3
+    period = float(image.times.time(1.0) - image.times.time(0.0))
+    advance = max(np.linalg.norm(V) * period / reach, 1e-12)
+    return P + reach * np.array(d), reach, max(1 / float(per_pixel), 1 / advance)

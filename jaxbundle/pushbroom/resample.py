@@ -1,0 +1,55 @@
+"""Values of a raster between its pixels: nearest, bilinear, cubic.
+
+Cubic is Keys' convolution with a = −½ (Keys, 1981, IEEE Trans. ASSP 29), exact for parabolas. Whole
+numbers are the centres of pixels; up to half a pixel beyond the outer centres their values go on,
+farther out there is none: NaN. So is it where a pixel that takes part has none.
+"""
+
+from typing import Literal, get_args
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Resampling = Literal["nearest", "bilinear", "cubic"]
+RESAMPLINGS: tuple[str, ...] = get_args(Resampling)
+
+
+def resample(
+    bands: Float[Array, "bands rows columns"],
+    row: Float[Array, "*shape"],
+    column: Float[Array, "*shape"],
+    kind: Resampling = "bilinear",
+) -> Float[Array, "bands *shape"]:
+    """The values of all bands at places in the raster."""
+    rows, columns = bands.shape[1:]
+    inside = (row >= -0.5) & (row <= rows - 0.5) & (column >= -0.5) & (column <= columns - 0.5)
+    match kind:
+        case "nearest":
+            i, j = jnp.round(row).astype(int), jnp.round(column).astype(int)
+            value = bands[:, jnp.clip(i, 0, rows - 1), jnp.clip(j, 0, columns - 1)]
+        case "bilinear":
+            value = _convolve(bands, row, column, lambda x: (1 - x, x), 0)
+        case "cubic":
+            value = _convolve(bands, row, column, _keys, 1)
+        case _:
+            raise ValueError(f"Unknown resampling {kind!r}; known: {RESAMPLINGS}")
+    return jnp.where(inside, value, jnp.nan)
+
+
+def _convolve(bands, row, column, weights, before):
+    """Products of one-dimensional weights of the pixels from `before` the place on."""
+    rows, columns = bands.shape[1:]
+    i, j = jnp.floor(row), jnp.floor(column)
+    down, right = weights(row - i), weights(column - j)
+    i, j = jnp.nan_to_num(i).astype(int) - before, jnp.nan_to_num(j).astype(int) - before
+    across = lambda line: sum(
+        w * bands[:, line, jnp.clip(j + k, 0, columns - 1)] for k, w in enumerate(right)
+    )
+    return sum(w * across(jnp.clip(i + k, 0, rows - 1)) for k, w in enumerate(down))
+
+
+def _keys(x):
+    """Weights of the pixels at −1, 0, 1, 2 for a place x in [0, 1]."""
+    near = lambda d: 1 + d * d * (1.5 * d - 2.5)
+    far = lambda d: 2 + d * (-4 + d * (2.5 - 0.5 * d))
+    return far(1 + x), near(x), near(1 - x), far(2 - x)

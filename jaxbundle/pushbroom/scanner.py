@@ -1,0 +1,115 @@
+"""A line of detectors: when a line is taken, and where a pixel looks.
+
+Line l and pixel u are counted from 0, whole numbers at the centres: pixel 0 of line 0 is the first
+pixel taken, its area from −½ to ½. A pixel looks along [ξ, η, −1] in the camera frame: ξ to the
+right, η forward, both tangents of angles. Three kinds of optics:
+
+- `FocalLine`: detectors at (x, y) = (pitch·(u − middle), row) in the focal plane of a frame camera,
+  so that principal distance, principal point and every distortion of `jaxbundle.cameras` apply;
+- `AngleTable`: angles ψ across and along for every pixel, ξ = tan ψ, linear in between;
+- `AnglePolynomial`: the tangents as polynomials of û = (u − middle)/half.
+"""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbundle.cameras import get_model, image_ray
+
+Pair = tuple[Array, Array]
+
+
+class LineTimes(eqx.Module):
+    """Line l is taken at first + period·l, or at times of a table, linear in between; seconds."""
+
+    first: Float[Array, ""]
+    period: Float[Array, ""]
+    table: Float[Array, " lines"] | None = None
+
+    def time(self, line: Float[Array, ""]) -> Float[Array, ""]:
+        """The time of a line."""
+        if self.table is None:
+            return self.first + self.period * line
+        return _at(self.table, line)
+
+    def line(self, t: Float[Array, ""]) -> Float[Array, ""]:
+        """The line of a time."""
+        if self.table is None:
+            return (t - self.first) / self.period
+        rows = jnp.searchsorted(self.table, t, side="right") - 1
+        row = jnp.clip(rows, 0, len(self.table) - 2)
+        start, end = self.table[row], self.table[row + 1]
+        return row + (t - start) / (end - start)
+
+
+class Optics(eqx.Module):
+    """Where the pixels of the line look."""
+
+    @abc.abstractmethod
+    def slopes(self, u: Float[Array, ""]) -> Pair:
+        """(ξ, η) of the pixel u."""
+
+
+class FocalLine(Optics):
+    """Detectors on a straight line in the focal plane of the camera `model`.
+
+    `parameters` of the model, in its unit; `pitch` in this unit a pixel; `middle` the pixel at
+    x = 0; `row` the y of the line.
+    """
+
+    parameters: Float[Array, " p"]
+    pitch: Float[Array, ""]
+    middle: Float[Array, ""]
+    row: Float[Array, ""]
+    model: str = eqx.field(static=True, default="brown")
+
+    def slopes(self, u: Float[Array, ""]) -> Pair:
+        model = get_model(self.model)
+        x = self.pitch * (u - self.middle)
+        r, s, q = image_ray(model, tuple(self.parameters), x, self.row + 0 * x)
+        return -r / q, -s / q
+
+
+class AngleTable(Optics):
+    """Angles in radians for every pixel."""
+
+    across: Float[Array, " pixels"]
+    along: Float[Array, " pixels"]
+
+    def slopes(self, u: Float[Array, ""]) -> Pair:
+        return jnp.tan(_at(self.across, u)), jnp.tan(_at(self.along, u))
+
+
+class AnglePolynomial(Optics):
+    """Tangents ξ and η as polynomials of û, coefficients from the constant upwards."""
+
+    across: Float[Array, " k"]
+    along: Float[Array, " m"]
+    middle: Float[Array, ""]
+    half: Float[Array, ""]
+
+    def slopes(self, u: Float[Array, ""]) -> Pair:
+        x = (u - self.middle) / self.half
+        return _polynomial(self.across, x), _polynomial(self.along, x)
+
+
+def slopes_of(optics: Optics, pixels: Float[Array, " n"]) -> tuple[Array, Array]:
+    """(ξ, η) of many pixels."""
+    return jax.vmap(optics.slopes)(pixels)
+
+
+def _at(values, place):
+    """Linear in between; the first and last step go on beyond the ends."""
+    i = jnp.clip(jnp.floor(place).astype(int), 0, len(values) - 2)
+    part = place - i
+    return (1 - part) * values[i] + part * values[i + 1]
+
+
+def _polynomial(coefficients, x):
+    value = jnp.zeros_like(x)
+    for c in coefficients[::-1]:
+        value = value * x + c
+    return value

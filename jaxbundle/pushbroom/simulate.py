@@ -1,0 +1,163 @@
+"""Simulation: a true trajectory, what instruments make of it, and the image that is taken.
+
+The true angles are sums of signals (`signals`) on a circular orbit about the turning Earth, or on a
+straight line above a plane. Instruments sample position and attitude at their rates, and err
+(`noise`). The image processing knows those samples only: its trajectory is interpolated from them.
+What remains without any error is the interpolation.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbundle.errors import InputError
+
+from .ancillary import attitude_table, position_table
+from .frames import circular_orbit
+from .image import PushbroomImage, make_image
+from .locate import locate_lines
+from .noise import Noise, disturbed, draw
+from .resample import Resampling, resample
+from .scanner import LineTimes, Optics
+from .signals import signal
+from .surfaces import Surface
+from .trajectory import Trajectory
+
+MARGIN = 6
+"""Rows of ancillary data before the first line and after the last."""
+TRUE_RATE = 20.0
+"""Rows a second of the true attitude, splined; at least five times the rate of the instrument."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Flight:
+    """What is simulated; angles in radians, lengths in metres, times in seconds.
+
+    - `lines`, `pixels`, `period`, `optics`, `mounting`: the scanner.
+    - `track`: `{"height", "inclination", "node", "argument"}` of a circular orbit, or
+      `{"start", "velocity"}` of a straight line in a local frame.
+    - `angles`: signals of pitch, roll, yaw, in the orbital frame or the local one.
+    - `position_rate`, `attitude_rate`: of the instruments, in Hz; `noise`: their errors.
+    - `position_interpolation`, `attitude_interpolation`: of the samples.
+    - `seed`: of all that is drawn.
+    """
+
+    lines: int
+    pixels: int
+    period: float
+    optics: Optics
+    track: Mapping[str, Any]
+    angles: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    mounting: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    position_rate: float = 2.0
+    attitude_rate: float = 4.0
+    position_interpolation: str = "lagrange"
+    attitude_interpolation: str = "spline"
+    noise: Noise = Noise()  # noqa: RUF009
+    seed: int = 0
+
+
+def true_image(flight: Flight) -> PushbroomImage:
+    """The image with the true trajectory."""
+    rate = max(TRUE_RATE, 5 * flight.attitude_rate)
+    return _image(flight, _position(flight, 2.0, "lagrange"), _attitude(flight, rate, "spline"))
+
+
+def measured_image(flight: Flight) -> PushbroomImage:
+    """The image with the trajectory as its instruments tell it: sampled, with noise."""
+    image = _image(
+        flight,
+        _position(flight, flight.position_rate, flight.position_interpolation),
+        _attitude(flight, flight.attitude_rate, flight.attitude_interpolation),
+    )
+    if not any(np.any(sigma) for sigma in flight.noise):
+        return image
+    return with_errors_in_rows(image, draw(image, flight.noise, jax.random.key(flight.seed)))
+
+
+def with_errors_in_rows(image: PushbroomImage, errors) -> PushbroomImage:
+    """As `disturbed`, with bias and drift in the rows of the tables, as instruments write them."""
+    t0 = image.middle_time
+
+    def rows(table, bias, drift, white):
+        return white + bias + (table.times[:, None] - t0) * drift
+
+    zero = jax.tree.map(jnp.zeros_like, errors)
+    attitude, position = image.trajectory.attitude.table, image.trajectory.position
+    return disturbed(image, zero._replace(
+        attitude_white=rows(
+            attitude, errors.attitude_bias, errors.attitude_drift, errors.attitude_white
+        ),
+        position_white=rows(
+            position, errors.position_bias, errors.position_drift, errors.position_white
+        ),
+    ))  # fmt: skip
+
+
+def taken_image(
+    image: PushbroomImage,
+    surface: Surface,
+    scene: Float[Array, "bands rows columns"],
+    to_scene,
+    lines: Float[np.ndarray, " lines"],
+    resampling: Resampling = "bilinear",
+) -> Float[np.ndarray, "bands lines pixels"]:
+    """Lines of the image of a scene; NaN where the scene does not reach.
+
+    **Arguments:** `to_scene(X)` gives row and column in the scene of points X [3, lines, pixels].
+    """
+    X = np.asarray(_ground(image, surface, lines, np.arange(image.pixels, dtype=float)))
+    row, column = to_scene(X)
+    return np.asarray(_resample(scene, row, column, resampling))
+
+
+_ground = jax.jit(locate_lines)
+_resample = jax.jit(resample, static_argnums=3)
+
+
+def _image(flight, position, attitude):
+    times = LineTimes(jnp.zeros(()), jnp.asarray(float(flight.period)))
+    return make_image(
+        Trajectory(position, attitude), times, flight.optics, flight.lines, flight.pixels,
+        flight.mounting,
+    )  # fmt: skip
+
+
+def _samples(flight, rate):
+    """Times of rows a whole number of steps from the first line."""
+    last = flight.period * (flight.lines - 1)
+    return np.arange(-MARGIN, np.ceil(last * rate) + MARGIN + 1) / rate
+
+
+def _position(flight, rate, method):
+    t, track = _samples(flight, rate), dict(flight.track)
+    if "start" in track:
+        start, velocity = (np.asarray(track[k], float) for k in ("start", "velocity"))
+        return position_table(t, start + t[:, None] * velocity, np.tile(velocity, (len(t), 1)),
+                              method="linear")  # fmt: skip
+    if "height" not in track:
+        raise InputError("track: give height, inclination, … of an orbit, or start and velocity")
+    P, V = circular_orbit(t, **track)
+    return position_table(t, P, V, method=method)
+
+
+def _attitude(flight, rate, method):
+    t = _samples(flight, rate)
+    angles = [
+        _drawn(flight.angles.get(name, 0.0), t, k, flight.seed)
+        for k, name in enumerate(("pitch", "roll", "yaw"))
+    ]
+    reference = "earth" if "start" in flight.track else "orbit"
+    return attitude_table(t, np.stack(angles, 1), method=method, reference=reference)
+
+
+def _drawn(description, t, axis, seed):
+    """The sum of one or several signals."""
+    parts = description if isinstance(description, list | tuple) else [description]
+    rng = [np.random.default_rng([seed, axis, k]) for k in range(len(parts))]
+    return sum(signal(part, t, 0.0, r) for part, r in zip(parts, rng))

@@ -1,0 +1,86 @@
+"""Accuracy on the ground: closed form, propagation and Monte Carlo against each other."""
+
+import equinox as eqx
+import numpy as np
+import pytest
+from pushbroom_scenes import PIXELS, above_a_plane, satellite
+from scipy.stats import chi2
+
+from jaxbundle.pushbroom.accuracy import circular_error, closed_form, drawn, propagated
+from jaxbundle.pushbroom.noise import Noise, disturbed, no_errors
+from jaxbundle.pushbroom.surfaces import Ground, Plane
+from jaxbundle.pushbroom.trajectory import attitude_at
+
+EDGES = np.linspace(-0.5, PIXELS - 0.5, 201)
+LINE = np.full(200, 100.0), (EDGES[1:] + EDGES[:-1]) / 2
+SOME = np.array([20.0, 300.0, 577.0]), np.array([3.0, 170.0, 398.0])
+
+
+@pytest.mark.parametrize("roll, pitch, yaw", [
+    (1e-4, 0, 0), (0, 1e-4, 0), (0, 0, 1e-4), (1e-4, 2e-4, 3e-4)
+])  # fmt: skip
+def test_closed_form_of_a_level_camera(roll, pitch, yaw):
+    image = eqx.tree_at(lambda i: i.optics.row, above_a_plane(c=20.0), 0.0)
+    noise = Noise(attitude_bias=np.array([pitch, roll, yaw]))
+    found = propagated(image, Plane(), *LINE, noise)
+    view = 2 * np.arctan(0.05 * PIXELS / 2 / 20)
+    expected = closed_form(1000, view, roll, pitch, yaw)
+    np.testing.assert_allclose(found.overall, expected, rtol=3e-5)
+
+
+NOISES = {
+    "bias": Noise(attitude_bias=1e-4, position_bias=3.0),
+    "drift": Noise(attitude_drift=1e-4, position_drift=2.0),
+    "white": Noise(attitude_white=1e-4, position_white=5.0),
+}
+
+
+@pytest.mark.parametrize("name", NOISES)
+def test_propagation_against_drawing(name):
+    """RMS within 3 %, CE90, and covariances within four standard deviations, on the ellipsoid."""
+    image, draws = satellite("lagrange", "slerp"), 6000
+    exact = propagated(image, Ground(), *SOME, NOISES[name])
+    found = drawn(image, Ground(), *SOME, NOISES[name], draws)
+    np.testing.assert_allclose(found.rms, exact.rms, rtol=0.03)
+    np.testing.assert_allclose(found.ce90, exact.ce90, rtol=0.04)
+    scale = np.sqrt(np.einsum("nii,njj->nij", exact.covariance, exact.covariance))
+    assert (np.abs(found.covariance - exact.covariance) / scale).max() < 4 * np.sqrt(2 / draws)
+
+
+def test_white_noise_is_averaged_between_the_rows():
+    """Halfway between two rows, linear interpolation leaves σ/√2."""
+    image = satellite("lagrange", "linear")
+    at_row, between = 60.0, 67.5  # rows every 0.1 s are 15 lines apart
+    found = propagated(
+        image, Ground(), np.array([at_row, between]), np.array([200.0, 200.0]),
+        Noise(attitude_white=1e-4),
+    )  # fmt: skip
+    np.testing.assert_allclose(found.rms[1] / found.rms[0], np.sqrt(0.5), rtol=1e-3)
+
+
+def test_errors_turn_angles_and_quaternions_alike():
+    """An error of a row is R·exp([ε]×), however the attitude is given."""
+    error = np.array([1e-3, -2e-3, 3e-3])
+    for turns in ("angles", "slerp"):
+        image = satellite(turns=turns)
+        table = image.trajectory.attitude.table
+        errors = no_errors(image)
+        errors = errors._replace(attitude_white=errors.attitude_white.at[14].set(error))
+        t = table.times[14]
+        images = image, disturbed(image, errors)
+        before, after = (np.array(attitude_at(i.trajectory.attitude, t)) for i in images)
+        turn = before.T @ after
+        np.testing.assert_allclose([turn[2, 1], turn[0, 2], turn[1, 0]], error, rtol=1e-2)
+        np.testing.assert_allclose(
+            np.arccos((np.trace(turn) - 1) / 2), np.linalg.norm(error), rtol=1e-6
+        )
+
+
+def test_circular_error():
+    np.testing.assert_allclose(circular_error(np.eye(2)), np.sqrt(chi2.ppf(0.9, 2)), rtol=1e-6)
+    np.testing.assert_allclose(
+        circular_error(np.diag([4.0, 0.0])), 2 * np.sqrt(chi2.ppf(0.9, 1)), rtol=1e-3
+    )
+    samples = np.random.default_rng(0).normal(size=(400_000, 2)) * [3, 1]
+    counted = np.quantile(np.linalg.norm(samples, axis=1), 0.9)
+    np.testing.assert_allclose(circular_error(np.diag([9.0, 1.0])), counted, rtol=0.005)

@@ -1,0 +1,218 @@
+"""Image to ground against independent computations, corrections, and derivatives."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pushbroom_scenes import (
+    LINES,
+    PERIOD,
+    PIXELS,
+    above_a_plane,
+    attitude,
+    focal_line,
+    locate,
+    orbit,
+    quaternions,
+    satellite,
+)  # fmt: skip
+from scipy.interpolate import CubicHermiteSpline
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation, Slerp
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry import ellipsoid as el
+from jaxbundle.pushbroom.corrections import (
+    INDICES,
+    Corrections,
+    earlier_earth,
+    refracted,
+    seen_direction,
+    seen_point,
+    true_direction,
+)
+from jaxbundle.pushbroom.frames import EARTH_RATE
+from jaxbundle.pushbroom.image import make_image, pose_at
+from jaxbundle.pushbroom.locate import ground_point, locate_points
+from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable, LineTimes
+from jaxbundle.pushbroom.surfaces import Ground, Height, Plane
+
+SOME_LINES = np.linspace(0, LINES - 1, 8)
+SOME_PIXELS = np.linspace(0, PIXELS - 1, 5)
+
+
+def test_plane_by_the_published_equations():
+    """Eq. 2-7 to 2-9 of Hakim et al.: X = T − Tz·(R·[u, v, f])/(R·[u, v, f])z."""
+    pitch, roll, yaw = 0.05, -0.08, 0.3
+    X = locate(above_a_plane((pitch, roll, yaw)), Plane(20.0), SOME_LINES, SOME_PIXELS)
+    R = Rotation.from_euler("XYZ", [pitch, roll, yaw]).as_matrix()
+    u, v, f = 0.05 * (SOME_PIXELS - (PIXELS - 1) / 2), 0.3, -120.0
+    ray = R @ np.stack([u, v + 0 * u, f + 0 * u])
+    T = np.stack([0 * SOME_LINES, 50 * 0.01 * SOME_LINES, 1000 + 0 * SOME_LINES])
+    expected = T[:, :, None] - (T[2] - 20)[:, None] * (ray / ray[2])[:, None]
+    np.testing.assert_allclose(X, expected, atol=1e-9)
+
+
+def test_against_scipy_and_pyproj():
+    """Hermite orbit, slerp, Brown's correction in numpy, pyproj's height as the surface: 1e-6 m."""
+    pyproj = pytest.importorskip("pyproj")
+    peer = pyproj.Transformer.from_crs(4978, 4979, always_xy=True)
+    image = satellite("hermite", "slerp")
+    X = np.array(locate(image, Height(321.0), SOME_LINES, SOME_PIXELS))
+    t = np.arange(-6.0, 11.0)
+    P, V = orbit(t)
+    position = CubicHermiteSpline(t, P, V)
+    rows = np.arange(-1, 5.5, 0.1)
+    turns = Slerp(rows, attitude(rows))
+    mounting = Rotation.from_euler("XYZ", [0.01, -0.02, 0.3])
+    for i, line in enumerate(SOME_LINES):
+        o, R = position(line * PERIOD), turns(line * PERIOD) * mounting
+        for j, pixel in enumerate(SOME_PIXELS):
+            x, y = 0.05 * (pixel - (PIXELS - 1) / 2) - 0.02, 0.3
+            r2 = x * x + y * y
+            dx = x * 2e-6 * r2 + 1e-6 * (r2 + 2 * x * x)
+            dy = y * 2e-6 * r2 + 2e-6 * x * y
+            d = R.apply([x + dx, y + dy, -700.0])
+            d /= np.linalg.norm(d)
+            above = lambda s, o=o, d=d: peer.transform(*(o + s * d))[2] - 321
+            s = brentq(above, 4e5, 6e5, xtol=1e-9)
+            np.testing.assert_allclose(X[:, i, j], o + s * d, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "earth", [el.WGS84, el.sphere(6371e3), el.Ellipsoid(6378e3, 6371e3, 6357e3)]
+)
+def test_points_are_on_the_ellipsoid_and_on_the_ray(earth):
+    image = satellite()
+    X = locate(image, Ground(earth), SOME_LINES, SOME_PIXELS)
+    assert np.abs(el.residual(earth, X)).max() < 1e-12
+    pose = pose_at(image, image.times.time(SOME_LINES[3]))
+    xi, eta = image.optics.slopes(SOME_PIXELS[2])
+    ray = pose.R @ jnp.array([xi, eta, -1.0])
+    assert np.linalg.norm(np.cross(X[:, 3, 2] - pose.P, ray / np.linalg.norm(ray))) < 1e-8
+
+
+def test_scattered_points_are_those_of_the_lines():
+    image = satellite()
+    X = locate(image, Ground(), SOME_LINES, SOME_PIXELS)
+    lines, pixels = (a.ravel() for a in np.meshgrid(SOME_LINES, SOME_PIXELS, indexing="ij"))
+    np.testing.assert_allclose(
+        jax.jit(locate_points)(image, Ground(), lines, pixels), X.reshape(3, -1), atol=1e-8
+    )
+
+
+def test_rays_off_the_earth_have_no_point():
+    up = eqx.tree_at(lambda i: i.mounting, satellite(), jnp.array([0.0, 1.5, 0.0]))
+    assert np.isnan(locate(up, Ground(), SOME_LINES, SOME_PIXELS)).all()
+    assert np.isnan(locate(above_a_plane((2.0, 0.0, 0.0)), Plane(), SOME_LINES, SOME_PIXELS)).all()
+
+
+def test_optics_of_all_kinds_see_the_same():
+    line = focal_line()
+    u = np.arange(PIXELS, dtype=float)
+    xi, eta = jax.vmap(line.slopes)(u)
+    table = AngleTable(jnp.arctan(xi), jnp.arctan(eta))
+    middle, half = (PIXELS - 1) / 2, PIXELS / 2
+    fit = lambda y: jnp.asarray(np.polynomial.polynomial.polyfit((u - middle) / half, y, 6))
+    polynomial = AnglePolynomial(fit(xi), fit(eta), jnp.float64(middle), jnp.float64(half))
+    for other in (table, polynomial):
+        np.testing.assert_allclose(jax.vmap(other.slopes)(u), (xi, eta), atol=1e-12)
+    between = np.array(jax.vmap(table.slopes)(u[:-1] + 0.5))
+    np.testing.assert_allclose(between, jax.vmap(line.slopes)(u[:-1] + 0.5), atol=1e-9)
+
+
+def test_times_of_lines():
+    times = LineTimes(jnp.float64(2.0), jnp.float64(0.5))
+    table = LineTimes(jnp.float64(0), jnp.float64(0), 2 + 0.5 * jnp.arange(20.0))
+    for line in (-0.5, 0.0, 3.25, 19.5):
+        assert times.time(line) == table.time(jnp.float64(line)) == 2 + 0.5 * line
+        assert times.line(times.time(line)) == table.line(table.time(jnp.float64(line))) == line
+
+
+def test_an_image_longer_than_its_tables_is_refused():
+    image = satellite()
+    with pytest.raises(InputError, match="attitude: line 810 .* outside the table"):
+        make_image(image.trajectory, image.times, image.optics, 1000, PIXELS)
+
+
+P = tuple(orbit([0.0])[0][0])
+V = tuple(orbit([0.0])[1][0])
+
+
+def test_aberration_is_the_sum_of_velocities():
+    seen = (0.1, -0.2, -1.0)
+    l = np.array(true_direction(seen, V))
+    np.testing.assert_allclose(np.linalg.norm(l), 1)
+    sight = 299792458 * l + np.array(V)
+    np.testing.assert_allclose(np.cross(sight / np.linalg.norm(sight), seen), 0, atol=1e-14)
+    back = np.array(seen_direction(tuple(l), V))
+    np.testing.assert_allclose(np.cross(back / np.linalg.norm(back), seen), 0, atol=1e-14)
+
+
+def test_light_time_turns_the_earth():
+    """In an inertial frame light is straight, and the ground moves on while it travels."""
+    v = np.array([6378e3, 1e5, 2e5])
+    seconds = 5e5 / 299792458
+    turn = Rotation.from_rotvec([0, 0, EARTH_RATE * seconds])
+    np.testing.assert_allclose(earlier_earth(tuple(v), 5e5), turn.apply(v), atol=1e-9)
+
+
+def test_refraction_keeps_the_invariant_of_bouguer():
+    """On a sphere n·r·sin z is the same above the air and at the ground."""
+    earth = el.sphere(6371e3)
+    o = (6371e3 + 6e5, 0.0, 0.0)
+    for tangent in (0.03, 0.5, 1.2):
+        d = np.array([-1, tangent, 0]) / np.hypot(1, tangent)
+        start, bent = (np.array(v) for v in refracted(earth, 0.0, o, tuple(d)))
+        before = np.linalg.norm(np.cross(o, d))
+        after = np.linalg.norm(np.cross(start, bent)) * INDICES[-2]
+        np.testing.assert_allclose(after, before, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name, least, most", [
+    ("light_time", 0.3, 1.3), ("aberration", 10, 20), ("refraction", 0.01, 3),
+])  # fmt: skip
+def test_size_and_inverse_of_corrections(name, least, most):
+    """`seen_point` undoes what the correction did to the ray."""
+    pose = pose_at(satellite(), jnp.float64(1.0))
+    of = lambda corrections: np.array(
+        ground_point(pose, (jnp.float64(0.3), jnp.float64(0.1)), Ground(), corrections)
+    )
+    corrections = Corrections(**{name: True})
+    plain, moved = of(Corrections()), of(corrections)
+    assert least < np.linalg.norm(moved - plain) < most
+    seen = seen_point(corrections, el.WGS84, tuple(pose.P), tuple(pose.V), tuple(moved))
+    sights = [np.array(X) - pose.P for X in (seen, plain)]
+    a, b = (sight / np.linalg.norm(sight) for sight in sights)
+    assert np.linalg.norm(np.cross(a, b)) * 6e5 < 1e-7
+
+
+def test_derivatives_by_every_parameter():
+    """Positions, attitudes, mounting, lens, times, offsets: each leaf in a random direction."""
+    image = satellite("hermite", "slerp")
+    lines, pixels = np.array([10.3, 222.0, 541.7]), SOME_PIXELS  # between the rows of the tables
+    arrays, static = eqx.partition(image, eqx.is_inexact_array)
+    at = jax.jit(lambda a: locate_points(eqx.combine(a, static), Height(50.0), lines, pixels[:3]))
+    change = jax.jit(lambda a, da: jax.jvp(at, (a,), (da,))[1])
+    leaves, tree = jax.tree.flatten(arrays)
+    rng = np.random.default_rng(3)
+    # a step that moves the ground by a centimetre, whatever the unit of the parameter
+    for k, leaf in enumerate(leaves):
+        direction = [jnp.zeros_like(a) for a in leaves]
+        direction[k] = jnp.asarray(rng.normal(size=leaf.shape))
+        exact = np.array(change(arrays, jax.tree.unflatten(tree, direction)))
+        step = min(0.01 / max(np.abs(exact).max(), 1e-9), 1e3)
+        moved = [
+            at(jax.tree.unflatten(tree, [a + sign * step * d for a, d in zip(leaves, direction)]))
+            for sign in (1, -1)
+        ]
+        difference = (moved[0] - moved[1]) / (2 * step)
+        np.testing.assert_allclose(exact, difference, atol=1e-5 * np.abs(exact).max() + 1e-7)
+
+
+def test_quaternions_of_the_scene_are_what_they_seem():
+    t = np.array([0.0, 1.0])
+    np.testing.assert_allclose(
+        Rotation.from_quat(np.roll(quaternions(t), -1, axis=1)).as_matrix(), attitude(t).as_matrix()
+    )

@@ -1,0 +1,197 @@
+"""Scanner files: what they mean, frames, and what is refused; the commands that read them."""
+
+import csv
+import io
+import json
+import sys
+
+import numpy as np
+import pytest
+from pushbroom_scenes import LINES, PIXELS, locate, orbit, quaternions, satellite
+from scanner_files import TEXT, write_scanner
+
+from jaxbundle import cli
+from jaxbundle.errors import InputError
+from jaxbundle.geometry import ellipsoid as el
+from jaxbundle.io.rasters import read_terrain
+from jaxbundle.io.scanner import read_scanner
+from jaxbundle.pushbroom.frames import EarthOrientation, to_earth, turn_quaternions
+from jaxbundle.pushbroom.surfaces import Ground
+
+PLACES = np.linspace(0, LINES - 1, 8), np.linspace(0, PIXELS - 1, 5)
+EPOCH = "2016-06-22T04:00:12.25"
+
+
+def assert_same_image(image, atol=1e-6):
+    expected = locate(satellite(), Ground(), *PLACES)
+    np.testing.assert_allclose(locate(image, Ground(), *PLACES), expected, atol=atol)
+
+
+def test_a_file_is_the_image_it_describes(tmp_path):
+    scanner = read_scanner(write_scanner(tmp_path))
+    assert scanner.name == "test" and scanner.earth == el.WGS84
+    assert_same_image(scanner.image)
+
+
+@pytest.mark.parametrize("frame", ["GCRF", "TEME"])
+def test_inertial_tables(tmp_path, frame):
+    """The tables turned back to an inertial frame describe the same image."""
+    pytest.importorskip("erfa")
+    eop = EarthOrientation(-0.2, 0.1, 0.4)
+    t = np.arange(-6.0, 11.0)
+    R = to_earth(frame, EPOCH, t, eop)
+    P, V = orbit(t)
+    back = np.swapaxes(R, 1, 2)
+    P = np.einsum("nij,nj->ni", back, P)
+    rows = np.arange(-1, 5.5, 0.1)
+    turn = np.swapaxes(to_earth(frame, EPOCH, rows, eop), 1, 2)
+    q = turn_quaternions(turn, quaternions(rows))
+    text = TEXT.replace('csv"\n', f'csv"\nframe = "{frame}"\n')
+    text += "[earth_orientation]\nut1_utc = -0.2\nx_pole = 0.1\ny_pole = 0.4\n"
+    assert_same_image(read_scanner(write_scanner(tmp_path, text, (P, 0 * V), q)).image)
+
+
+def test_an_orbit_instead_of_a_table(tmp_path):
+    circle = (
+        'span = [-6, 11]\ncircle = { height = 505000.0, inclination = 97.4, '
+        f"node = {float(np.degrees(1.9))!r}, argument = {float(np.degrees(0.1))!r} }}\n"
+    )
+    text = TEXT.replace('table = "positions.csv"\n', circle)
+    assert_same_image(read_scanner(write_scanner(tmp_path, text)).image)
+
+
+BROKEN = {
+    "misspelt section": ("[optics]", "[optic]", ["[optic]", "did you mean 'optics'"]),
+    "misspelt key": ("period", "perod", ["[times]", "'perod'", "did you mean 'period'"]),
+    "misspelt parameter": ("K1 =", "k11 =", ["[optics]", "k11", "K1"]),
+    "no table": ("positions.csv", "nowhere.csv", ["[position]", "no such file"]),
+    "unknown frame": ('attitude.csv"', 'attitude.csv"\nframe = "orbt"', ["'orbt'", "'orbit'"]),
+    "no principal distance": ("c = 700.0", "", ["[optics]", "c is missing"]),
+    "negative period": ("period = ", "period = -", ["[times]", "positive"]),
+    "not a number": ("lines = 600", 'lines = "many"', ["[scanner]", "lines is 'many'"]),
+    "too short": ("lines = 600", "lines = 900", ["attitude", "line 810", "outside the table"]),
+    "local frame": ('ions.csv"', 'ions.csv"\nframe = "local"', ["[position]", 'earth = "local"']),
+    "interpolation": ('ude.csv"', 'ude.csv"\ninterpolation = "slurp"', ["did you mean 'slerp'"]),
+    "angles": ("yaw", "jaw", ["[mounting]", "'jaw'", "'yaw'"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_what_is_wrong_in_a_file(tmp_path, case):
+    old, new, words = BROKEN[case]
+    assert old in TEXT
+    path = write_scanner(tmp_path, TEXT.replace(old, new, 1))
+    with pytest.raises(InputError) as refused:
+        read_scanner(path)
+    for word in words:
+        assert word in str(refused.value), refused.value
+
+
+@pytest.mark.parametrize("column, value, words", [
+    (0, "-0.9", ["attitude.csv, line 4", "twice"]), (0, "-5", ["line 4", "sort"]),
+    (1, "0.5", ["line 4", "length"]), (1, "x", ["line 4", "q0"]),
+])  # fmt: skip
+def test_what_is_wrong_in_a_table(tmp_path, column, value, words):
+    path = write_scanner(tmp_path)
+    lines = (tmp_path / "attitude.csv").read_text().splitlines()
+    cells = lines[3].split(",")
+    cells[column] = value
+    lines[3] = ",".join(cells)
+    (tmp_path / "attitude.csv").write_text("\n".join(lines))
+    with pytest.raises(InputError) as refused:
+        read_scanner(path)
+    for word in words:
+        assert word in str(refused.value)
+
+
+def run(monkeypatch, capsys, *arguments):
+    """Exit status, standard output and error of a command, in this process."""
+    monkeypatch.setattr(sys, "argv", ["jaxbundle", "pushbroom", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    return ended.value.code or 0, *capsys.readouterr()
+
+
+def test_there_and_back_by_the_commands(tmp_path, monkeypatch, capsys):
+    scanner = write_scanner(tmp_path)
+    (tmp_path / "places.csv").write_text("id,line,pixel\na,10.25,7\nb,599,399.4\n")
+    places = ("--points", tmp_path / "places.csv")
+    ground = tmp_path / "ground.csv"
+    assert run(monkeypatch, capsys, "locate", scanner, *places, "--height", 200, "--csv", ground)[
+        0
+    ] == 0
+    rows = list(csv.DictReader(io.StringIO(ground.read_text())))
+    assert [row["id"] for row in rows] == ["a", "b"]
+    assert all(abs(float(row["height"]) - 200) < 1e-6 for row in rows)
+    for names in (("X", "Y", "Z"), ("longitude", "latitude", "height")):
+        text = "\n".join(",".join(row[n] for n in ("id", *names)) for row in rows)
+        (tmp_path / "points.csv").write_text(",".join(("id", *names)) + "\n" + text + "\n")
+        status, out, _ = run(
+            monkeypatch, capsys, "project", scanner, "--points", tmp_path / "points.csv",
+            "--json", "-",
+        )  # fmt: skip
+        found = json.loads(out)["rows"]
+        assert status == 0 and [row["count"] for row in found] == [1, 1]
+        np.testing.assert_allclose([row["line"] for row in found], [10.25, 599], atol=1e-6)
+        np.testing.assert_allclose([row["pixel"] for row in found], [7, 399.4], atol=1e-6)
+
+
+def test_what_the_commands_refuse(tmp_path, monkeypatch, capsys):
+    scanner = write_scanner(tmp_path)
+    off, gone = tmp_path / "off.csv", tmp_path / "gone.csv"
+    off.write_text("line,pixel\n1,2\n3,400\n")
+    gone.write_text("X,Y,Z\n6378137,0,0\n")
+    cases = [
+        (["locate", scanner, "--points", off], ["off.csv, line 3", "pixel 400", "399.5"]),
+        (["locate", scanner, "--grid", "few"], ["--grid 'few'", "11x11"]),
+        (["locate", scanner, "--height", "7e6"], ["misses the surface", "121 of 121"]),
+        (["project", scanner, "--points", gone], ["gone.csv, line 2", "not", "in the image"]),
+        (["project", scanner, "--points", tmp_path / "none.csv"], ["none.csv", "no such file"]),
+    ]
+    for arguments, words in cases:
+        status, out, err = run(monkeypatch, capsys, *arguments)
+        assert status == 2 and out == "" and len(err.splitlines()) == 1, err
+        for word in words:
+            assert word in err or word == "not", err
+
+
+def write_raster(path, heights, crs, transform):
+    rasterio = pytest.importorskip("rasterio")
+    with rasterio.open(
+        path, "w", driver="GTiff", height=heights.shape[0], width=heights.shape[1], count=1,
+        dtype="float64", crs=crs, transform=rasterio.transform.Affine(*transform), nodata=-9999,
+    ) as target:  # fmt: skip
+        target.write(heights, 1)
+    return path
+
+
+def test_terrain_rasters(tmp_path, monkeypatch, capsys):
+    """Heights of a plane over longitude and latitude; the same in UTM; a model elsewhere."""
+    scanner = write_scanner(tmp_path)
+    X = locate(satellite(), Ground(), *PLACES)
+    longitude, latitude, _ = (np.degrees(v) for v in el.geodetic(el.WGS84, tuple(X)))
+    west, north = float(longitude.min()) - 0.05, float(latitude.max()) + 0.05
+    size = int((latitude.max() - latitude.min() + 0.1) / 0.01), int(np.ptp(longitude) / 0.01 + 10)
+    column, row = np.meshgrid(np.arange(size[1]) + 0.5, np.arange(size[0]) + 0.5)
+    slope = 100 + 3 * column - 2 * row
+    path = write_raster(tmp_path / "dem.tif", slope, "EPSG:4326", (0.01, 0, west, 0, -0.01, north))
+    status, out, _ = run(monkeypatch, capsys, "locate", scanner, "--dem", path, "--grid", "3x3")
+    assert status == 0
+    for found in csv.DictReader(io.StringIO(out)):
+        x = (float(found["longitude"]) - west) / 0.01
+        y = (north - float(found["latitude"])) / 0.01
+        assert abs(float(found["height"]) - (100 + 3 * x - 2 * y)) < 1e-4
+    elsewhere = write_raster(tmp_path / "far.tif", slope, "EPSG:4326", (0.01, 0, 170, 0, -0.01, 0))
+    status, out, err = run(monkeypatch, capsys, "locate", scanner, "--dem", elsewhere)
+    assert status == 2 and "no terrain" in err and "covers the image" in err
+    bare = write_raster(tmp_path / "bare.tif", slope, None, (0.01, 0, 0, 0, -0.01, 0))
+    with pytest.raises(InputError, match="no coordinate system"):
+        read_terrain(bare, el.WGS84)
+    with pytest.raises(InputError, match="nowhere.tif"):
+        read_terrain(tmp_path / "nowhere.tif", el.WGS84)
+    utm = write_raster(tmp_path / "utm.tif", np.full((60, 50), 250.0), "EPSG:32633",
+                       (100, 0, 5e5, 0, -100, 5.5e6))  # fmt: skip
+    terrain = read_terrain(utm, el.WGS84)
+    heights = np.asarray(terrain.heights)
+    assert np.allclose(heights[np.isfinite(heights)], 250) and terrain.step[1] < 0
+    assert abs(np.degrees(terrain.origin[1]) - 49.65) < 0.01

@@ -1,0 +1,192 @@
+"""Interpolation of positions and attitudes against scipy, and what is refused."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.interpolate import CubicHermiteSpline, CubicSpline, KroghInterpolator, interp1d
+from scipy.spatial.transform import Rotation, Slerp
+
+from jaxbundle.errors import InputError
+from jaxbundle.network.tables import Source
+from jaxbundle.pushbroom.ancillary import attitude_table, check_covered, continuous, position_table
+from jaxbundle.pushbroom.interpolation import interpolate, rate
+from jaxbundle.pushbroom.trajectory import (
+    Trajectory,
+    attitude_at,
+    matrix_from_pitch_roll_yaw,
+    orbital_frame,
+    rotation_at,
+)
+
+rng = np.random.default_rng(1)
+TIMES = np.cumsum(rng.uniform(0.5, 1.5, 12))
+VALUES = np.stack([np.sin(TIMES), np.cos(0.7 * TIMES), TIMES**2], 1)
+RATES = np.stack([np.cos(TIMES), -0.7 * np.sin(0.7 * TIMES), 2 * TIMES], 1)
+BETWEEN = np.r_[TIMES[0], rng.uniform(TIMES[0], TIMES[-1], 40), TIMES[5], TIMES[-1]]
+at = jax.jit(jax.vmap(interpolate, (None, 0)))
+turned = jax.jit(jax.vmap(attitude_at, (None, 0)))
+
+
+def lagrange(order):
+    """Newton's form of the polynomial through the rows about t."""
+
+    def value(t):
+        i = np.clip(np.searchsorted(TIMES, t, side="right") - 1, 0, len(TIMES) - 2)
+        first = np.clip(i - (order - 1) // 2, 0, len(TIMES) - order - 1)
+        rows = slice(first, first + order + 1)
+        return KroghInterpolator(TIMES[rows], VALUES[rows])(t)
+
+    return lambda times: np.array([value(t) for t in times])
+
+
+ORACLES = {
+    "linear": interp1d(TIMES, VALUES, axis=0),
+    "hermite": CubicHermiteSpline(TIMES, VALUES, RATES),
+    "spline": CubicSpline(TIMES, VALUES),
+    "lagrange 3": lagrange(3),
+    "lagrange 7": lagrange(7),
+}
+
+
+def table_of(name, values=VALUES, **options):
+    method, *order = name.split()
+    order = {"order": int(order[0])} if order else {}
+    return position_table(TIMES, values, RATES, method=method, **order, **options)
+
+
+@pytest.mark.parametrize("name", ORACLES)
+def test_positions_between_the_rows(name):
+    found = at(table_of(name), BETWEEN)
+    np.testing.assert_allclose(found, ORACLES[name](BETWEEN), rtol=1e-12, atol=1e-11)
+
+
+@pytest.mark.parametrize("name", ORACLES)
+def test_rates_and_derivatives_by_the_rows(name):
+    """The rate against differences in time; the derivative by a row is the weight of the row."""
+    table = table_of(name)
+    t = TIMES[4] + 0.3
+    h = 1e-5
+    difference = (ORACLES[name]([t + h]) - ORACLES[name]([t - h]))[0] / (2 * h)
+    np.testing.assert_allclose(rate(table, jnp.float64(t)), difference, atol=1e-6)
+    _, weight = jax.jvp(
+        lambda values: interpolate(table_like(table, values), t), (table.values,),
+        (jnp.zeros_like(table.values).at[4].set(1.0),),
+    )  # fmt: skip
+    moved = VALUES.copy()
+    moved[4] += 1
+    change = interpolate(table_like(table, moved), t) - interpolate(table, t)
+    np.testing.assert_allclose(weight, change, atol=1e-11)
+
+
+def table_like(table, values):
+    return type(table)(
+        table.times, jnp.asarray(values), table.rates, table.gap, table.method, table.order
+    )
+
+
+@pytest.mark.parametrize("name", ORACLES)
+def test_nothing_is_extrapolated(name):
+    ends = np.array([TIMES[0] - 1e-9, TIMES[-1] + 1e-9])
+    assert np.isnan(at(table_of(name), np.r_[ends, BETWEEN][: len(BETWEEN)])[:2]).all()
+
+
+def test_gaps_are_not_bridged():
+    keep = np.r_[0:5, 11]
+    table = position_table(TIMES[keep], VALUES[keep], method="linear", gap=3)
+    inside, before = TIMES[8], TIMES[3] + 0.1
+    found = at(table, np.r_[inside, before, BETWEEN][: len(BETWEEN)])
+    assert np.isnan(found[0]).all() and np.isfinite(found[1]).all()
+    with pytest.raises(InputError, match="gap of .* between rows 5 and 6"):
+        check_covered(table, [before, inside], "positions.csv")
+    wide = position_table(TIMES[keep], VALUES[keep], method="linear", gap=100)
+    check_covered(wide, [before, inside], "positions.csv")
+
+
+ROTATIONS = Rotation.from_euler(
+    "XYZ", np.stack([0.2 * np.sin(TIMES), 3 + 0.1 * TIMES, 0.3 * np.cos(TIMES)], 1)
+)
+QUATERNIONS = np.roll(ROTATIONS.as_quat(), 1, axis=1)
+
+
+def test_slerp():
+    signs = rng.choice([-1, 1], len(TIMES))[:, None]
+    table = attitude_table(TIMES, signs * QUATERNIONS)
+    peer = Slerp(TIMES, ROTATIONS)(BETWEEN).as_matrix()
+    np.testing.assert_allclose(turned(table, BETWEEN), peer, atol=1e-14)
+
+
+@pytest.mark.parametrize("method, oracle", [
+    ("linear", lambda q: interp1d(TIMES, q, axis=0)), ("spline", lambda q: CubicSpline(TIMES, q)),
+])  # fmt: skip
+def test_normalised_polynomials(method, oracle):
+    signs = rng.choice([-1, 1], len(TIMES))[:, None]
+    table = attitude_table(TIMES, signs * QUATERNIONS, method=method)
+    peer = Rotation.from_quat(np.roll(oracle(continuous(QUATERNIONS))(BETWEEN), -1, axis=1))
+    np.testing.assert_allclose(turned(table, BETWEEN), peer.as_matrix(), atol=1e-14)
+
+
+def test_angles_of_the_published_order():
+    """R of eq. 2-3 of Hakim et al.: Rx(θ₂)·Ry(θ₁)·Rz(θ₃)."""
+    angles = np.stack([0.2 * np.sin(TIMES), 0.1 * np.cos(TIMES), np.pi * TIMES / 6], 1)
+    wrapped = (angles + np.pi) % (2 * np.pi) - np.pi
+    table = attitude_table(TIMES, wrapped, method="spline")
+    peer = Rotation.from_euler("XYZ", CubicSpline(TIMES, angles)(BETWEEN)).as_matrix()
+    np.testing.assert_allclose(turned(table, BETWEEN), peer, atol=1e-13)
+    pitch, roll, yaw = 0.1, 0.2, 0.3
+    c1, s1, c2, s2 = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
+    c3, s3 = np.cos(yaw), np.sin(yaw)
+    np.testing.assert_allclose(matrix_from_pitch_roll_yaw(jnp.array([pitch, roll, yaw])), [
+        [c1 * c3, -c1 * s3, s1],
+        [c2 * s3 + c3 * s1 * s2, c2 * c3 - s1 * s2 * s3, -c1 * s2],
+        [s2 * s3 - c2 * c3 * s1, c3 * s2 + c2 * s1 * s3, c1 * c2],
+    ], atol=1e-15)  # fmt: skip
+
+
+def test_orbital_frame():
+    """Right, forward, up of a platform above the equator that flies north."""
+    axes = orbital_frame(jnp.array([7e6, 0, 0]), jnp.array([100.0, 0, 7e3]))
+    np.testing.assert_allclose(axes.T, [[0, 1, 0], [0, 0, 1], [1, 0, 0]], atol=1e-15)
+    position = position_table(TIMES, 7e6 * np.stack(
+        [np.cos(1e-3 * TIMES), 0 * TIMES, np.sin(1e-3 * TIMES)], 1
+    ))  # fmt: skip
+    level = attitude_table(TIMES, np.zeros((12, 3)), method="linear", reference="orbit")
+    t = jnp.float64(TIMES[6])
+    a = 1e-3 * t
+    expected = [[0, 1, 0], [-jnp.sin(a), 0, jnp.cos(a)], [jnp.cos(a), 0, jnp.sin(a)]]
+    np.testing.assert_allclose(rotation_at(Trajectory(position, level), t).T, expected, atol=1e-10)
+
+
+SOURCE = Source("att.csv", np.arange(12) + 2, "line")
+
+
+def broken(array, row, value):
+    array = array.copy()
+    array[row] = value
+    return array
+
+
+@pytest.mark.parametrize("make, words", [
+    (lambda: position_table(broken(TIMES, 4, TIMES[3]), VALUES, source=SOURCE), ["line 6", "tw"]),
+    (lambda: position_table(broken(TIMES, 4, 0.1), VALUES, source=SOURCE), ["line 6", "sort"]),
+    (lambda: position_table(broken(TIMES, 4, np.nan), VALUES, source=SOURCE), ["line 6", "time"]),
+    (lambda: position_table(TIMES, broken(VALUES, 2, np.inf), source=SOURCE), ["line 4"]),
+    (lambda: position_table(TIMES, VALUES, method="hermite", source=SOURCE), ["velocities"]),
+    (lambda: position_table(TIMES, VALUES, method="splin", source=SOURCE), ["mean 'spline'"]),
+    (lambda: position_table(TIMES, VALUES, order=12, source=SOURCE), ["12 rows", "needs 13"]),
+    (lambda: position_table(TIMES[:5], VALUES, source=SOURCE), ["att.csv", "(5,)"]),
+    (lambda: attitude_table(TIMES, broken(QUATERNIONS, 7, [1, 1, 0, 0]), source=SOURCE),
+     ["line 9", "1.41421", "w, x, y, z"]),
+    (lambda: attitude_table(TIMES, broken(QUATERNIONS, 7, np.nan), source=SOURCE), ["line 9"]),
+    (lambda: attitude_table(TIMES, VALUES, source=SOURCE), ["slerp", "linear"]),
+])  # fmt: skip
+def test_bad_tables_are_refused_with_their_row(make, words):
+    with pytest.raises(InputError) as refused:
+        make()
+    for word in words:
+        assert word in str(refused.value)
+
+
+def test_times_outside_are_refused():
+    with pytest.raises(InputError, match="line 1 is at .* outside the table"):
+        check_covered(table_of("linear"), [TIMES[2], TIMES[-1] + 1], "positions.csv")
