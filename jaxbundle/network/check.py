@@ -34,6 +34,19 @@ def check_network(network: Network) -> Network:
 
     **Raises:** `InputError`, one line with file, row, thing and remedy.
     """
+    everything = network = check_tables(network)
+    network = leave_out_undetermined(network)
+    check_images(everything, network)
+    _check_start_values(network)
+    check_parts(network)
+    check_redundancy(network)
+    network = _warn_of_points_behind(network)
+    return network.replace(warnings=tuple(dict.fromkeys(network.warnings)))
+
+
+def check_tables(network: Network) -> Network:
+    """The network with every value looked at, whatever can be determined from them; start values
+    may be missing. As in `check_network`."""
     for key, choices in CHOICES.items():
         check_choice(key, getattr(network, key), choices)
     _check_sizes(network)
@@ -42,15 +55,7 @@ def check_network(network: Network) -> Network:
     network = _check_points(network)
     _check_observations(network)
     network = _check_distances(network)
-    network = _check_datum_points(network)
-    everything = network
-    network = leave_out_undetermined(network)
-    check_images(everything, network)
-    _check_start_values(network)
-    check_parts(network)
-    check_redundancy(network)
-    network = _warn_of_points_behind(network)
-    return network.replace(warnings=tuple(dict.fromkeys(network.warnings)))
+    return _check_datum_points(network)
 
 
 def _check_sizes(network: Network) -> None:
@@ -136,6 +141,10 @@ def _check_images(network: Network) -> None:
         images, (sigma < 0) | np.isinf(sigma), "image",
         lambda row, k: f"σ of {EXTERIOR[k]} is {sigma[row, k]:g}; it must be positive and finite, "
         'empty (no prior), or "fixed" (0) to hold the value',
+    )  # fmt: skip
+    _refuse(
+        images, ~np.isnan(sigma) & np.isnan(values), "image",
+        lambda row, k: f"{EXTERIOR[k]} has a σ but no value; give the value, or leave the σ empty",
     )  # fmt: skip
     held = (sigma[:, 3:] == 0).sum(1, keepdims=True)
     _refuse(
@@ -287,7 +296,8 @@ def _refuse_missing(table, values, names, thing):
     also = f" (and {more} more)" if more > 0 else ""
     _refuse(
         table, missing, thing,
-        lambda row, k: f"{names[k]} has no start value{also}; give start values",
+        lambda row, k: f"{names[k]} has no start value{also}; give start values, or find them with "
+        "jaxbundle.orient",
     )  # fmt: skip
 
 
