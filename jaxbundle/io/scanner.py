@@ -88,11 +88,15 @@ class Scanner:
 
 
 def read_scanner(path: str | Path) -> Scanner:
-    """The pushbroom image of a scanner file.
+    """The pushbroom image of a scanner file; of support data (`io.csm`) if it ends in `.json`.
 
     **Raises:** `InputError` naming file, section and key, or table and line.
     """
     path = Path(path)
+    if path.suffix.lower() == ".json":
+        from jaxbundle.io.csm import read_csm  # which makes a `Scanner` too
+
+        return read_csm(path)
     file = read_sections(path, SECTIONS, NEEDED)
     scanner = file.section("scanner")
     lines, pixels = (scanner.whole(key) for key in ("lines", "pixels"))

@@ -6,7 +6,7 @@ and c = (a, b) the 20 coefficients of the numerator and the 19 free ones of the 
     v = a·T/(1 + b·T') − y,        Σv² + τ²·|D·c|² → min.
 
 The start is linear, a·T − y·b·T' = y (Tao and Hu, 2001, PE&RS 67(12)); Gauss-Newton steps follow,
-shortened where the denominator would vanish at a point.
+halved until the sum falls and no denominator vanishes at a point.
 
 The unknowns are nearly dependent on each other, so τ holds them small (Tikhonov): all but the four
 linear terms of the numerator, for which D is a thousand times less. τ is the largest that predicts
@@ -51,11 +51,11 @@ ENOUGH = 1e-5
 """Pixels."""
 START = 1e-2
 """The ridge of the linear start, in units of the largest singular value."""
-STEPS, CHOOSING = 20, (0, 1, 2)
+STEPS, CHOOSING = 30, (0, 1, 2)
 """Steps of Gauss-Newton, and those in which the ridge is chosen."""
 HALVINGS = 30
-SETTLED = 1e-8
-"""Pixels that a last step of Gauss-Newton may still move a point of the table."""
+SETTLED, EXACT = 1e-3, 1e-8
+"""A last whole step moves no point by more than this part of the RMS and so many pixels."""
 TABLE = Source("table")
 
 
@@ -251,17 +251,9 @@ def _fit_one(T, y, scale, ridge, sigma):
         if ridge is None and k in CHOOSING:
             tau = _ridge(U, s, target, scale)
         step = _ridged(U, s, Vt, D, target, tau) - c
-        for _ in range(HALVINGS):
-            if (1 + T[:, 1:] @ (c + step)[TERMS:] > 0).all():
-                break
-            step = step / 2
-        else:
-            raise InputError(
-                "the denominator vanishes within the table: no rational polynomials follow it; "
-                "look for wrong rows, or give a larger ridge"
-            )
-        c = c + step
-        if settled := k > max(CHOOSING) and np.abs(J @ step).max() * scale < SETTLED:
+        c = c + _shortened(c, step, T, y, tau * D)
+        settled = np.abs(J @ step).max() < SETTLED * np.sqrt(np.mean(v**2)) + EXACT / scale
+        if settled and k > max(CHOOSING):
             break
     v, J = _linearised(c, T, y)
     U, s, Vt = np.linalg.svd(J / D, full_matrices=False)
@@ -270,6 +262,27 @@ def _fit_one(T, y, scale, ridge, sigma):
         sigma = scale * float(np.sqrt(np.sum(v**2) / redundancy))
     half = Vt.T * (s / (s**2 + tau**2)) / D[:, None]
     return c, (sigma / scale) ** 2 * half @ half.T, sigma, redundancy, tau, settled
+
+
+def _shortened(c, step, T, y, ridge):
+    """The step, halved until the sum of squares falls and no denominator vanishes."""
+
+    def square(c):
+        denominator = 1 + T[:, 1:] @ c[TERMS:]
+        v = T @ c[:TERMS] / np.where(denominator > 0, denominator, 1.0) - y
+        return np.sum(v**2) + np.sum((ridge * c) ** 2) if (denominator > 0).all() else np.inf
+
+    now = square(c)
+    for _ in range(HALVINGS):
+        if square(c + step) < np.inf and square(c + step) <= now * (1 + 1e-12) + 1e-28:
+            return step
+        step = step / 2
+    if now == np.inf:
+        raise InputError(
+            "the denominator vanishes within the table: no rational polynomials follow it; "
+            "look for wrong rows, or give a larger ridge"
+        )
+    return 0 * step
 
 
 def _ridged(U, s, Vt, D, y, tau):
