@@ -88,7 +88,7 @@ class Scanner:
 
 
 def read_scanner(path: str | Path) -> Scanner:
-    """The pushbroom image of a scanner file; of support data (`io.csm`) if it ends in `.json`.
+    """The pushbroom image of a scanner file; `.json` is read by `io.csm`, `.dim` by `io.dimap`.
 
     **Raises:** `InputError` naming file, section and key, or table and line.
     """
@@ -97,6 +97,10 @@ def read_scanner(path: str | Path) -> Scanner:
         from jaxbundle.io.csm import read_csm  # which makes a `Scanner` too
 
         return read_csm(path)
+    if path.suffix.lower() == ".dim":
+        from jaxbundle.io.dimap import read_dimap
+
+        return read_dimap(path)
     file = read_sections(path, SECTIONS, NEEDED)
     scanner = file.section("scanner")
     lines, pixels = (scanner.whole(key) for key in ("lines", "pixels"))
