@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pushbroom_scenes import LINES, PERIOD, PIXELS, locate, orbit, satellite, search_and_project
+from pushbroom_scenes import LINES, PERIOD, PIXELS, locate, orbit, satellite
 from scipy.spatial.transform import Rotation
 
 from jaxbundle.cameras import get_model
@@ -16,7 +16,7 @@ from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.io.csm import read_csm
 from jaxbundle.pushbroom.frames import EARTH_RATE
 from jaxbundle.pushbroom.image import pose_at
-from jaxbundle.pushbroom.project import make_search
+from jaxbundle.pushbroom.project import make_search, project_points
 from jaxbundle.pushbroom.scanner import FocalLine
 from jaxbundle.pushbroom.surfaces import Ground
 
@@ -147,7 +147,7 @@ def test_an_image_written_as_support_data_is_read_as_itself(tmp_path, older):
     assert scanner.image.optics.model == "usgs"
     assert float(scanner.image.optics.parameters[names.index("K1")]) == K1
     X = jnp.asarray(found.reshape(3, -1))
-    seen = search_and_project(scanner.image, make_search(scanner.image), X)
+    seen = project_points(scanner.image, make_search(scanner.image), X)
     line, pixel = (a.ravel() for a in np.meshgrid(*PLACES, indexing="ij"))
     np.testing.assert_allclose(seen.line[0], line, atol=1e-5)
     np.testing.assert_allclose(seen.pixel[0], pixel, atol=1e-5)
