@@ -14,7 +14,7 @@ What the fields mean is what usgscsm makes of them:
 
 Tables are resampled evenly, positions by Hermite's cubics, rotations by slerp, and interpolated by
 Lagrange's polynomial of degree 7. Which way along its line the camera looks is told by the planet:
-it is in front. Light time and aberration are in the pointing already; no correction is set.
+it is in front. No correction is set, as usgscsm applies none.
 """
 
 import json
