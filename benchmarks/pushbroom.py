@@ -11,6 +11,7 @@ what is computed is checked first, and a wrong answer ends with exit status 1, w
     ellipsoid      X, Y, Z on the ellipsoid           geodetic     the same to λ, φ, h
     terrain        first hit with a rough model       jacobian     ∂(X, Y, Z)/∂(3 angles, 3 shifts)
     raster         ground → image, near a known place search       ground → image, nothing known
+    rpc_project    ground → image by RPC              rpc_locate   the way back, heights given
 """
 
 import argparse
@@ -42,6 +43,9 @@ from jaxbundle.pushbroom.frames import circular_orbit  # noqa: E402
 from jaxbundle.pushbroom.image import make_image  # noqa: E402
 from jaxbundle.pushbroom.locate import locate_lines  # noqa: E402
 from jaxbundle.pushbroom.project import make_search, project_from, project_points  # noqa: E402
+from jaxbundle.pushbroom.rpc import locate_points as rpc_locate  # noqa: E402
+from jaxbundle.pushbroom.rpc import project_points as rpc_project  # noqa: E402
+from jaxbundle.pushbroom.rpc_fit import fit_image  # noqa: E402
 from jaxbundle.pushbroom.scanner import FocalLine, LineTimes  # noqa: E402
 from jaxbundle.pushbroom.surfaces import Ground  # noqa: E402
 from jaxbundle.pushbroom.terrain import bilinear, make_terrain  # noqa: E402
@@ -50,6 +54,7 @@ from jaxbundle.pushbroom.trajectory import Trajectory, orbital_frame  # noqa: E4
 LINES, PIXELS, PERIOD, ORBIT = 10_000, 8000, 1 / 1500, (5e5, np.radians(97.4), 0.3, 0.6)
 DEMANDS = {
     "ellipsoid": 50, "geodetic": 10, "terrain": 2, "jacobian": 3, "raster": 10, "search": None,
+    "rpc_project": None, "rpc_locate": None,
 }  # fmt: skip
 U = jnp.arange(float(PIXELS))
 
@@ -130,6 +135,13 @@ def measure(rounds):
     places = project_points(scan, search, X)
     check("search", np.abs(np.stack([places.line[0], places.pixel[0]]) - spread).max(), 1e-6)
 
+    rpc = fit_image(scan, WGS84, (0.0, 1000.0))[0].rpc
+    l, u = (v.ravel() for v in np.meshgrid(np.arange(8.0) + 4000, U, indexing="ij"))
+    h = np.linspace(0.0, 1000.0, len(l))
+    east, north, _ = rpc_locate(rpc, l, u, h)
+    again = rpc_project(rpc, east, north, h)
+    check("rpc_locate", np.abs(np.stack(again[:2]) - [l, u]).max(), 1e-6)
+
     return {
         "ellipsoid": rate(lambda l: locate(scan, ground, l, U), lines(64), 64 * PIXELS, rounds),
         "geodetic": rate(lambda l: to_degrees(scan, l), lines(64), 64 * PIXELS, rounds),
@@ -137,6 +149,8 @@ def measure(rounds):
         "jacobian": rate(lambda l: jacobian(scan, l), lines(8), 8 * PIXELS, rounds),
         "raster": rate(back, blocks, 8 * PIXELS, rounds),
         "search": rate(lambda X: project_points(scan, search, X), [X] * 2, X.shape[1], rounds),
+        "rpc_project": rate(lambda h: rpc_project(rpc, east, north, h), [h] * 8, len(h), rounds),
+        "rpc_locate": rate(lambda h: rpc_locate(rpc, l, u, h), [h] * 8, len(h), rounds),
     }, wrong  # fmt: skip
 
 

@@ -88,11 +88,19 @@ class Scanner:
 
 
 def read_scanner(path: str | Path) -> Scanner:
-    """The pushbroom image of a scanner file.
+    """The pushbroom image of a scanner file; `.json` is read by `io.csm`, `.dim` by `io.dimap`.
 
     **Raises:** `InputError` naming file, section and key, or table and line.
     """
     path = Path(path)
+    if path.suffix.lower() == ".json":
+        from jaxbundle.io.csm import read_csm  # which makes a `Scanner` too
+
+        return read_csm(path)
+    if path.suffix.lower() == ".dim":
+        from jaxbundle.io.dimap import read_dimap
+
+        return read_dimap(path)
     file = read_sections(path, SECTIONS, NEEDED)
     scanner = file.section("scanner")
     lines, pixels = (scanner.whole(key) for key in ("lines", "pixels"))

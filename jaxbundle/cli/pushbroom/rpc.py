@@ -1,0 +1,199 @@
+"""`jaxbundle pushbroom rpc`: rational polynomial coefficients, fitted, applied, compensated."""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+import jaxbundle
+from jaxbundle.cli.pushbroom.app import (
+    Csv,
+    Dem,
+    Json,
+    Level,
+    check_spheroid,
+    pushbroom,
+    surface_of,
+    warn,
+    write_rows,
+)
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.geometry.ellipsoid import WGS84
+from jaxbundle.io.csv_tables import read_csv
+from jaxbundle.io.rpc import read_rpc, write_rpc
+from jaxbundle.io.scanner import read_scanner
+from jaxbundle.network.columns import Columns
+from jaxbundle.pushbroom.rpc import RpcStatus, locate_points_on, project_points
+from jaxbundle.pushbroom.rpc_bias import compensated, fit_bias
+from jaxbundle.pushbroom.rpc_fit import RpcCheck, RpcTable, fit_image, fit_rpc
+
+rpc = typer.Typer(help="Rational polynomial coefficients (RPC00B).", no_args_is_help=True)
+pushbroom.add_typer(rpc, name="rpc")
+
+COLUMNS = ("longitude", "latitude", "height", "line", "sample")
+GROUND_SIGMA = ("seast", "snorth", "sheight")
+TERMS = ("shift", "by_line", "by_sample")
+
+RpcFile = Annotated[Path, typer.Argument(help="coefficients: _RPC.TXT, .RPB, or a tagged GeoTIFF")]
+Out = Annotated[Path, typer.Option(help="file for the coefficients: .txt, .rpb, an existing .tif")]
+
+
+@rpc.command()
+def fit(
+    source: Annotated[
+        Path, typer.Argument(help="scanner file, or table longitude,latitude,height,line,sample")
+    ],
+    out: Out,
+    heights: Annotated[
+        str, typer.Option(help="LOW:HIGH of the ground, metres above the ellipsoid")
+    ] = "0:3000",
+    ridge: Annotated[float | None, typer.Option(min=0, help="ridge, chosen if not given")] = None,
+    json: Json = "",
+) -> None:
+    """Fit coefficients to a scanner, or to a table; tell what they leave, in pixels."""
+    jaxbundle.enable_x64()
+    head = {}
+    if source.suffix.lower() == ".csv":
+        table, columns = _table(source)
+        found = fit_rpc(table, ridge=ridge, source=columns.source)
+    else:
+        file = read_scanner(source)
+        if file.earth is None:
+            raise InputError(f"{source}: a local frame has no longitudes; RPCs need an Earth")
+        check_spheroid(file.earth)
+        if file.earth != WGS84:
+            warn(f"{source}: the ellipsoid is not WGS84, which other programs will assume")
+        found, check = fit_image(file.image, file.earth, _heights(heights), ridge=ridge)
+        head = _told("check", check)
+    if not found.converged:
+        raise NotSolvedError(
+            f"{source}: the fit does not converge; give a larger --ridge than "
+            f"{found.ridge.max():.3g}, or points over more heights"
+        )
+    write_rpc(out, found.rpc)
+    head = {"points": len(found.check.residuals), **_told("fit", found.check), **head}
+    head |= {"ridge_line": found.ridge[0], "ridge_sample": found.ridge[1]}
+    _tell(head, json)
+
+
+@rpc.command()
+def apply(
+    coefficients: RpcFile,
+    points: Annotated[
+        Path,
+        typer.Option(help="longitude,latitude,height[,id] (degrees, metres), or line,sample[,id]"),
+    ],
+    height: Level = None,
+    dem: Dem = None,
+    csv: Csv = None,
+    json: Json = "",
+) -> None:
+    """Points of the ground to the image; places in the image to a surface."""
+    jaxbundle.enable_x64()
+    given, table = read_rpc(coefficients), read_csv(points)
+    ids = table.ids("id") if "id" in table.values else [str(k + 1) for k in range(len(table))]
+    if "line" in table.values:
+        table.check_names(("line", "sample"), ("id",))
+        place = [table.numbers(name, required=True) for name in ("line", "sample")]
+        surface = surface_of(WGS84, height, dem)
+        east, north, h, status = map(np.asarray, locate_points_on(given, surface, *place))
+        columns = dict(zip(COLUMNS, (np.degrees(east), np.degrees(north), h, *place)))
+    else:
+        table.check_names(COLUMNS[:3], ("id",))
+        east, north, h = (table.numbers(name, required=True) for name in COLUMNS[:3])
+        line, sample, status = map(
+            np.asarray, project_points(given, np.radians(east), np.radians(north), h)
+        )
+        columns = dict(zip(COLUMNS, (east, north, h, line, sample)))
+    if (bad := status != RpcStatus.INSIDE).any():
+        row = int(bad.argmax())
+        said = (
+            f"{table.source(row)}: {RpcStatus(int(status[row])).meaning} "
+            f"({bad.sum()} of {len(status)} points)"
+        )
+        if (status == RpcStatus.NOT_CONVERGED).all():
+            raise InputError(f"{said}; look at coordinates and units")
+        warn(said)
+    meaning = [RpcStatus(int(s)).meaning for s in status]
+    write_rows({"id": ids, **columns, "status": meaning}, csv, json)
+
+
+@rpc.command()
+def compensate(
+    coefficients: RpcFile,
+    control: Annotated[
+        Path,
+        typer.Option(
+            help="table longitude,latitude,height,line,sample[,id,seast,snorth,sheight]"
+        ),
+    ],
+    out: Out,
+    model: Annotated[str, typer.Option(help="shift or affine, in the image")] = "shift",
+    sigma: Annotated[float, typer.Option(help="σ of measured lines and samples, pixels")] = 1.0,
+    csv: Csv = None,
+    json: Json = "",
+) -> None:
+    """Remove the bias that control points tell of; residuals, redundancy numbers and w of each."""
+    jaxbundle.enable_x64()
+    given = read_rpc(coefficients)
+    table, columns = _table(control, ("id", *GROUND_SIGMA))
+    ground = None
+    if any(name in columns.values for name in GROUND_SIGMA):
+        ground = np.stack([columns.numbers(name, required=True) for name in GROUND_SIGMA], 1)
+    found = fit_bias(
+        given, table, model=model, sigma=sigma, ground_sigma=ground, source=columns.source
+    )
+    changed, left = compensated(given, found.bias)
+    write_rpc(out, changed)
+    k = len(found.cofactor) // 2
+    names = [f"{axis}_{term}" for axis in ("line", "sample") for term in TERMS[:k]]
+    values = [float(v) for axis in (found.bias.line, found.bias.sample) for v in axis[:k]]
+    head = {"sigma0": found.sigma0, "redundancy": found.redundancy, **dict(zip(names, values))}
+    sigmas = np.sqrt(np.diag(found.covariance)).tolist()
+    head |= {f"s_{name}": s for name, s in zip(names, sigmas)}
+    if left is not None:
+        head |= _told("refit", left)
+    ids = columns.ids("id") if "id" in columns.values else [str(i + 1) for i in range(len(columns))]
+    rows = {"id": ids}
+    for i, axis in enumerate(("line", "sample")):
+        rows |= {f"v_{axis}": found.residuals[:, i], f"r_{axis}": found.redundancy_numbers[:, i]}
+        rows |= {f"w_{axis}": found.w[:, i]}
+    write_rows(rows, csv, json, head)
+    if json != "-":
+        typer.echo("; ".join(f"{k} {v:.6g}" for k, v in head.items()), err=True)
+
+
+def _table(path: Path, optional: tuple[str, ...] = ()) -> tuple[RpcTable, Columns]:
+    columns = read_csv(path)
+    columns.check_names(COLUMNS, ("id", *optional))
+    values = [columns.numbers(name, required=True) for name in COLUMNS]
+    return RpcTable(np.radians(values[0]), np.radians(values[1]), *values[2:]), columns
+
+
+def _heights(text: str) -> tuple[float, float]:
+    try:
+        low, high = (float(part) for part in text.split(":"))
+        if not low < high or not np.isfinite([low, high]).all():
+            raise ValueError
+    except ValueError:
+        raise InputError(
+            f"--heights {text!r}: two numbers, the lower first, are expected, such as 0:3000"
+        ) from None
+    return low, high
+
+
+def _told(name: str, check: RpcCheck) -> dict[str, float]:
+    axes = ("line", "sample")
+    told = {f"{name}_rms_{axis}": float(v) for axis, v in zip(axes, check.rms)}
+    return told | {f"{name}_largest_{axis}": float(v) for axis, v in zip(axes, check.largest)}
+
+
+def _tell(head: dict, json: str) -> None:
+    """Figures as a table of name and value, or as JSON."""
+    head = {name: float(v) if isinstance(v, np.floating) else v for name, v in head.items()}
+    if json:
+        write_rows({}, None, json, head)
+    else:
+        for name, value in head.items():
+            print(f"{name:22} {value:.6g}")

@@ -1,0 +1,256 @@
+"""Rational polynomial coefficients (RPC): an image as polynomials of longitude, latitude, height.
+
+With L, P, H the longitude, latitude and height less their offsets, divided by their scales,
+
+    line   = line_offset   + line_scale·a(L, P, H)/b(L, P, H),
+    sample = sample_offset + sample_scale·c(L, P, H)/d(L, P, H),
+
+each polynomial of 20 coefficients in the order of RPC00B (STDI-0002, appendix E):
+
+    1, L, P, H, LP, LH, PH, L², P², H², PLH, L³, LP², LH², L²P, P³, PH², L²H, P²H, H³.
+
+RPC00A, which orders them otherwise, is not meant. Offsets and scales keep the units of the files,
+degrees and metres; longitudes and latitudes given to functions are in radians, as everywhere here.
+Heights are above the ellipsoid. In RPC00B line 0, sample 0 is the centre of the first pixel, as
+everywhere here; `sample` is the pixel of a line scanner.
+
+The way back solves two equations by Newton's method in (L, P). Its last step is taken from a place
+held fixed, so that its derivatives are those of the solution (implicit function theorem), by
+line, sample, height and every coefficient.
+"""
+
+from enum import IntEnum
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.lax import stop_gradient
+from jaxtyping import Array, Float
+
+from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, earth_fixed
+from jaxbundle.geometry.vectors import Vector, along, difference, unit
+
+from .surfaces import Surface
+
+Scalar = float | Float[Array, ""]
+
+TERMS = 20
+STEPS = 6
+"""Newton's steps of the way back; it doubles its digits with each."""
+SETTLED = 1e-9
+"""A last step below this, in units of the scales, ends Newton's method."""
+MARGIN = 0.1
+"""So much beyond the scales (of 1) still counts as inside."""
+AHEAD = 20e3
+"""A line of sight begins so far above the highest height of the domain, metres."""
+ROUNDS = 3
+
+
+class RpcStatus(IntEnum):
+    """Whether the polynomials may be trusted at a place."""
+
+    INSIDE = 0
+    OUTSIDE = 1
+    NOT_CONVERGED = 2
+
+    @property
+    def meaning(self) -> str:
+        """In words, for a person."""
+        return _MEANING[self]
+
+
+_MEANING = {
+    RpcStatus.INSIDE: "inside the domain",
+    RpcStatus.OUTSIDE: "outside the domain of the coefficients: extrapolated",
+    RpcStatus.NOT_CONVERGED: "no place found: the polynomials lead nowhere from here",
+}
+
+
+class Rpc(eqx.Module):
+    """Coefficients of RPC00B, offsets and scales: lines, samples, degrees, metres."""
+
+    line_numerator: Float[Array, "20"]
+    line_denominator: Float[Array, "20"]
+    sample_numerator: Float[Array, "20"]
+    sample_denominator: Float[Array, "20"]
+    line_offset: Scalar
+    line_scale: Scalar
+    sample_offset: Scalar
+    sample_scale: Scalar
+    longitude_offset: Scalar
+    longitude_scale: Scalar
+    latitude_offset: Scalar
+    latitude_scale: Scalar
+    height_offset: Scalar
+    height_scale: Scalar
+
+
+def project(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> tuple[Array, Array]:
+    """Line and sample of one point, given in radians and metres; see `domain` for their status."""
+    return _image(rpc, *normalised(rpc, longitude, latitude, height))
+
+
+def locate(
+    rpc: Rpc, line: Scalar, sample: Scalar, height: Scalar
+) -> tuple[Array, Array, Array]:
+    """Longitude and latitude, radians, of a place in the image at a height; and its `RpcStatus`.
+
+    NaN where Newton's method does not settle.
+    """
+    H = (height - rpc.height_offset) / rpc.height_scale
+    target = jnp.stack([
+        (line - rpc.line_offset) / rpc.line_scale,
+        (sample - rpc.sample_offset) / rpc.sample_scale,
+    ])  # fmt: skip
+    fixed = stop_gradient((rpc, H, target))
+
+    def misclosure(place, rpc, H, target):
+        v = jnp.stack(_ratios(rpc, *place, H)) - target
+        return v, v
+
+    def newton(_, state):
+        place, _, _ = state
+        J, v = jax.jacfwd(misclosure, has_aux=True)(place, *fixed)
+        step = _solved(J, v)
+        return place - step, jnp.max(jnp.abs(step)), J
+
+    start = (jnp.zeros(2), jnp.asarray(jnp.inf), jnp.zeros((2, 2)))
+    place, last, J = stop_gradient(jax.lax.fori_loop(0, STEPS, newton, start))
+    L, P = place - _solved(J, misclosure(place, rpc, H, target)[0])
+    settled = last < SETTLED
+    longitude = jnp.radians(rpc.longitude_offset + rpc.longitude_scale * L)
+    latitude = jnp.radians(rpc.latitude_offset + rpc.latitude_scale * P)
+    found = lambda a: jnp.where(settled, a, jnp.nan)
+    status = jnp.where(
+        settled, _inside(jnp.stack([L, P, H, *target])), int(RpcStatus.NOT_CONVERGED)
+    )
+    return found(longitude), found(latitude), status
+
+
+def domain(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> Array:
+    """The `RpcStatus` of a point: whether it and its image are where the coefficients were made."""
+    place = normalised(rpc, longitude, latitude, height)
+    ratios = jnp.stack(_ratios(rpc, *place))
+    inside = _inside(jnp.stack([*place, *ratios]))
+    return jnp.where(jnp.isfinite(ratios).all(), inside, int(RpcStatus.NOT_CONVERGED))
+
+
+def locate_on(
+    rpc: Rpc, surface: Surface, line: Scalar, sample: Scalar
+) -> tuple[Array, Array, Array, Array]:
+    """(longitude, latitude, height, status) of the first point of the line of sight on a surface.
+
+    The points at the lowest and the highest height of the domain span a straight line; where it
+    meets the surface it is shifted onto the polynomials' own line of sight, and again.
+
+    **Arguments:** `surface` above an ellipsoid of revolution.
+    """
+    top, d = sight(rpc, line, sample, surface.earth)
+
+    def shift(state, _):
+        o, _ = state
+        X = along(o, d, surface.distance(o, d))
+        h = surface.height(X)
+        longitude, latitude, status = locate(rpc, line, sample, h)
+        own = earth_fixed(surface.earth, (longitude, latitude, h))
+        return (along(o, difference(own, X), 1.0), (longitude, latitude, h, status)), None
+
+    nothing = (jnp.zeros(()), jnp.zeros(()), jnp.zeros(()), jnp.zeros((), int))
+    start = (along(top, d, -AHEAD), nothing)
+    (_, (longitude, latitude, h, status)), _ = jax.lax.scan(shift, start, length=ROUNDS)
+    missed = jnp.isnan(h)
+    return longitude, latitude, h, jnp.where(missed, int(RpcStatus.NOT_CONVERGED), status)
+
+
+def sight(
+    rpc: Rpc, line: Scalar, sample: Scalar, earth: Ellipsoid = WGS84
+) -> tuple[Vector, Vector]:
+    """The chord of a line of sight: its point at the highest height, and its direction downwards.
+
+    Earth-fixed, metres; the direction is a unit vector.
+    """
+    def point(height):
+        longitude, latitude, _ = locate(rpc, line, sample, height)
+        return jnp.stack(earth_fixed(earth, (longitude, latitude, height)))
+
+    ends = rpc.height_offset + rpc.height_scale * jnp.array([1.0, -1.0])
+    top, bottom = jax.vmap(point)(ends)
+    return tuple(top), unit(difference(bottom, top))
+
+
+@jax.jit
+def project_points(
+    rpc: Rpc,
+    longitude: Float[Array, " n"],
+    latitude: Float[Array, " n"],
+    height: Float[Array, " n"],
+) -> tuple[Array, Array, Array]:
+    """Lines, samples and statuses of many points, radians and metres."""
+    place = lambda *point: (*project(rpc, *point), domain(rpc, *point))
+    return jax.vmap(place)(longitude, latitude, height)
+
+
+@jax.jit
+def locate_points(
+    rpc: Rpc, line: Float[Array, " n"], sample: Float[Array, " n"], height: Float[Array, " n"]
+) -> tuple[Array, Array, Array]:
+    """Longitudes, latitudes (radians) and statuses of many places at given heights."""
+    return jax.vmap(lambda l, s, h: locate(rpc, l, s, h))(line, sample, height)
+
+
+@jax.jit
+def locate_points_on(
+    rpc: Rpc, surface: Surface, line: Float[Array, " n"], sample: Float[Array, " n"]
+) -> tuple[Array, Array, Array, Array]:
+    """Longitudes, latitudes, heights and statuses of many places on a surface."""
+    return jax.vmap(lambda l, s: locate_on(rpc, surface, l, s))(line, sample)
+
+
+def monomials(L: Scalar, P: Scalar, H: Scalar) -> tuple[Scalar, ...]:
+    """The 20 terms in the order of RPC00B."""
+    return (
+        1.0 + 0 * L, L, P, H, L * P, L * H, P * H, L * L, P * P, H * H, P * L * H,
+        L * L * L, L * P * P, L * H * H, L * L * P, P * P * P, P * H * H, L * L * H, P * P * H,
+        H * H * H,
+    )  # fmt: skip
+
+
+def normalised(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> Vector:
+    """(L, P, H); longitudes may differ by turns."""
+    east = jnp.degrees(longitude) - rpc.longitude_offset
+    east = east - 360 * jnp.round(east / 360)
+    return (
+        east / rpc.longitude_scale,
+        (jnp.degrees(latitude) - rpc.latitude_offset) / rpc.latitude_scale,
+        (height - rpc.height_offset) / rpc.height_scale,
+    )
+
+
+def _image(rpc, L, P, H):
+    line, sample = _ratios(rpc, L, P, H)
+    return (
+        rpc.line_offset + rpc.line_scale * line,
+        rpc.sample_offset + rpc.sample_scale * sample,
+    )
+
+
+def _ratios(rpc, L, P, H):
+    terms = monomials(L, P, H)
+    value = lambda coefficients: sum(c * m for c, m in zip(coefficients, terms))
+    return (
+        value(rpc.line_numerator) / value(rpc.line_denominator),
+        value(rpc.sample_numerator) / value(rpc.sample_denominator),
+    )
+
+
+def _inside(values):
+    inside = jnp.max(jnp.abs(values)) <= 1 + MARGIN
+    return jnp.where(inside, int(RpcStatus.INSIDE), int(RpcStatus.OUTSIDE))
+
+
+def _solved(J, v):
+    """J⁻¹·v of 2 × 2."""
+    determinant = J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]
+    return jnp.stack([
+        J[1, 1] * v[0] - J[0, 1] * v[1], J[0, 0] * v[1] - J[1, 0] * v[0]
+    ]) / determinant  # fmt: skip

@@ -1,0 +1,195 @@
+"""Bias compensation of RPCs with control points, in the image (Grodecki, Dial, 2003, PE&RS 69(1)).
+
+    line   + v = l + a₀ + a₁·l̂ + a₂·ŝ,        sample + v = s + b₀ + b₁·l̂ + b₂·ŝ
+
+(l, s) the image of a control point by the coefficients, (l̂, ŝ) the same less offset, by scale.
+`"shift"` estimates a₀, b₀ alone. With the σ of the measurement and of the control point,
+G = ∂(l, s)/∂(east, north, up), the weights of a point are
+
+    P = (diag(σ²) + G·Σ·Gᵀ)⁻¹.
+
+Of correlated observations (Baarda, 1968), with Q the cofactors of the unknowns:
+
+    Qv = P⁻¹ − A·Q·Aᵀ,      r = diag(Qv·P),      w = (P·v)ᵢ/√(P·Qv·P)ᵢᵢ.
+"""
+
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, earth_fixed, geodetic
+from jaxbundle.geometry.vectors import along
+from jaxbundle.network.tables import Source
+
+from .rpc import MARGIN, Rpc, Scalar, project, project_points
+from .rpc_fit import RpcCheck, RpcTable, check_rpc, fit_rpc
+
+MODELS = {"shift": 1, "affine": 3}
+"""Unknowns of each axis."""
+CONTROL = Source("control points")
+DETERMINED = 1e-6
+"""Least singular value of the equations, of the largest: below, points are on one line."""
+GRID = 12
+"""Points along each side of the grid to which an affine bias is fitted."""
+
+
+class Bias(eqx.Module):
+    """a₀, a₁, a₂ and b₀, b₁, b₂, in pixels."""
+
+    line: Float[Array, "3"]
+    sample: Float[Array, "3"]
+
+
+class BiasFit(eqx.Module):
+    """An estimated bias: cofactors (a₀…, then b₀…), σ0, and for lines and samples of each control
+    point residuals (pixels), redundancy numbers, w (σ a priori). σ0 is NaN without redundancy.
+    """
+
+    bias: Bias
+    cofactor: Float[np.ndarray, "u u"]
+    sigma0: float
+    redundancy: int
+    residuals: Float[np.ndarray, "n 2"]
+    redundancy_numbers: Float[np.ndarray, "n 2"]
+    w: Float[np.ndarray, "n 2"]
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "u u"]:
+        """σ0²·Q, a posteriori; a priori (σ0 = 1) without redundancy."""
+        return self.cofactor * (self.sigma0**2 if self.redundancy else 1.0)
+
+
+def project_compensated(
+    rpc: Rpc, bias: Bias, longitude: Scalar, latitude: Scalar, height: Scalar
+) -> tuple[Array, Array]:
+    """Line and sample of one point, radians and metres, with the bias."""
+    line, sample = project(rpc, longitude, latitude, height)
+    terms = _terms(rpc, line, sample)
+    return line + jnp.dot(bias.line, terms), sample + jnp.dot(bias.sample, terms)
+
+
+def fit_bias(
+    rpc: Rpc,
+    control: RpcTable,
+    *,
+    model: Literal["shift", "affine"] = "shift",
+    sigma: float | Float[np.ndarray, "n 2"] = 1.0,
+    ground_sigma: Float[np.ndarray, "n 3"] | None = None,
+    earth: Ellipsoid = WGS84,
+    source: Source = CONTROL,
+) -> BiasFit:
+    """The bias that control points tell of.
+
+    **Arguments:** `control` as given and as measured; `sigma` of what is measured, in pixels;
+    `ground_sigma` of the points east, north, up, metres (none if None); `source` names rows.
+
+    **Raises:** `InputError` for an unknown model, too few points, points on one line, what is not a
+    number.
+    """
+    if model not in MODELS:
+        raise InputError(f"unknown bias {model!r}; 'shift' or 'affine' is expected")
+    control = RpcTable(*(np.asarray(column, float) for column in control))
+    n, k = len(control.line), MODELS[model]
+    for name, column in zip(control._fields, control):
+        if (bad := ~np.isfinite(column)).any():
+            raise InputError(f"{source(int(bad.argmax()))}: the {name} is not a finite number")
+    if n < k:
+        raise InputError(f"{source.name}: {n} control points; {model!r} needs {k}; give more")
+    sigma = np.broadcast_to(np.asarray(sigma, float), (n, 2))
+    if (bad := ~(sigma > 0).all(1)).any():
+        raise InputError(f"{source(int(bad.argmax()))}: σ must be positive, in pixels")
+    computed, G = (np.asarray(a) for a in _images(rpc, earth, *control[:3]))
+    if (bad := ~np.isfinite(computed).all(1)).any():
+        raise InputError(
+            f"{source(int(bad.argmax()))}: the coefficients have no image of this point; look at "
+            "longitude, latitude, height and their order"
+        )
+    terms = np.asarray(_terms(rpc, computed[:, 0], computed[:, 1])).T[:, :k]
+    singular = np.linalg.svd(terms, compute_uv=False)
+    if singular[-1] < DETERMINED * singular[0]:
+        raise InputError(f"{source.name}: all points on one line; give others, or use 'shift'")
+    # rows in the order line, sample of the first point, of the second, …
+    A = np.zeros((n, 2, 2 * k))
+    A[:, 0, :k] = A[:, 1, k:] = terms
+    A = A.reshape(2 * n, 2 * k)
+    inverse_weights = np.zeros((n, 2, n, 2))
+    ground = np.zeros((n, 3)) if ground_sigma is None else np.asarray(ground_sigma, float)
+    each = np.einsum("nij,nj,nkj->nik", G, ground**2, G) + sigma[:, :, None] ** 2 * np.eye(2)
+    inverse_weights[np.arange(n), :, np.arange(n), :] = each
+    inverse_weights = inverse_weights.reshape(2 * n, 2 * n)
+    P = np.linalg.inv(inverse_weights)
+    observed = np.stack([control.line, control.sample], 1)
+    Q = np.linalg.inv(A.T @ P @ A)
+    x = Q @ A.T @ P @ (observed - computed).ravel()
+    v = (A @ x).reshape(n, 2) - (observed - computed)
+    Qv = inverse_weights - A @ Q @ A.T
+    r = np.clip(np.diag(Qv @ P), 0.0, 1.0)
+    test = np.diag(P @ Qv @ P)
+    free = r > 1e-8
+    w = np.where(free, P @ v.ravel() / np.sqrt(np.where(free, test, 1.0)), np.nan)
+    redundancy = 2 * n - 2 * k
+    vtpv = float(v.ravel() @ P @ v.ravel())
+    sigma0 = float(np.sqrt(vtpv / redundancy)) if redundancy else np.nan
+    full = lambda a: jnp.asarray(np.r_[a, np.zeros(3 - k)])
+    return BiasFit(
+        Bias(full(x[:k]), full(x[k:])), Q, sigma0, redundancy, v, r.reshape(n, 2), w.reshape(n, 2)
+    )
+
+
+def compensated(rpc: Rpc, bias: Bias) -> tuple[Rpc, RpcCheck | None]:
+    """Coefficients with the bias in them, and what a fit leaves (None for a shift: exact).
+
+    A shift moves the offsets. An affine bias mixes two fractions of different denominators: the
+    coefficients are fitted anew to the domain of the old ones.
+    """
+    if not np.any(np.r_[bias.line[1:], bias.sample[1:]]):
+        moved = (rpc.line_offset + bias.line[0], rpc.sample_offset + bias.sample[0])
+        return eqx.tree_at(lambda r: (r.line_offset, r.sample_offset), rpc, moved), None
+    side = np.linspace(-1, 1, GRID)
+    L, P, H = (a.ravel() for a in np.meshgrid(side, side, side))
+    place = (
+        np.radians(float(rpc.longitude_offset) + float(rpc.longitude_scale) * L),
+        np.radians(float(rpc.latitude_offset) + float(rpc.latitude_scale) * P),
+        float(rpc.height_offset) + float(rpc.height_scale) * H,
+    )
+    line, sample, _ = (np.asarray(a) for a in project_points(rpc, *place))
+    terms = np.asarray(_terms(rpc, line, sample))
+    reach = 1 + MARGIN
+    inside = (np.abs(terms[1]) <= reach) & (np.abs(terms[2]) <= reach)
+    columns = (*place, line + bias.line @ terms, sample + bias.sample @ terms)
+    table = RpcTable(*(np.asarray(column)[inside] for column in columns))
+    fitted = fit_rpc(table).rpc
+    return fitted, check_rpc(fitted, table)
+
+
+def _terms(rpc, line, sample):
+    """1, l̂, ŝ."""
+    return jnp.stack([
+        1.0 + 0 * line, (line - rpc.line_offset) / rpc.line_scale,
+        (sample - rpc.sample_offset) / rpc.sample_scale,
+    ])  # fmt: skip
+
+
+@jax.jit
+def _images(rpc, earth, longitude, latitude, height):
+    """(l, s) [n, 2] and their derivatives by east, north, up [n, 2, 3]."""
+
+    def image(shift, place):
+        east, north, _ = place
+        s, c, z, k = jnp.sin(east), jnp.cos(east), jnp.sin(north), jnp.cos(north)
+        X = earth_fixed(earth, place)
+        for axis, size in zip(((-s, c, 0.0), (-z * c, -z * s, k), (k * c, k * s, z)), shift):
+            X = along(X, axis, size)
+        value = jnp.stack(project(rpc, *geodetic(earth, X)))
+        return value, value
+
+    def of_point(*place):
+        G, value = jax.jacfwd(image, has_aux=True)(jnp.zeros(3), place)
+        return value, G
+
+    return jax.vmap(of_point)(longitude, latitude, height)

@@ -1,0 +1,318 @@
+"""Rational polynomial coefficients from a table: of a rigorous model, or given.
+
+For the lines, and likewise for the samples, with T the 20 terms of a point, y its normalised line
+and c = (a, b) the 20 coefficients of the numerator and the 19 free ones of the denominator,
+
+    v = a·T/(1 + b·T') − y,        Σv² + τ²·|D·c|² → min.
+
+The start is linear, a·T − y·b·T' = y (Tao and Hu, 2001, PE&RS 67(12)); Gauss-Newton steps follow,
+halved until the sum falls and no denominator vanishes at a point.
+
+The unknowns are nearly dependent on each other, so τ holds them small (Tikhonov): all but the four
+linear terms of the numerator, for which D is a thousand times less. τ is the largest that predicts
+each point from all others as well as any τ does, or within `ENOUGH` pixels (PRESS, Allen, 1974):
+
+    PRESS(τ) = mean (vᵢ/(1 − hᵢ))²,        h = diag J·(N + τ²D²)⁻¹·Jᵀ,    N = Jᵀ·J.
+
+The covariance is that of what noise of the table does to the coefficients,
+
+    Σ = σ²·(N + τ²D²)⁻¹·N·(N + τ²D²)⁻¹,
+
+σ a posteriori from n − Σhᵢ redundancies if it is not given. What the ridge withholds is no noise:
+it shows in the residuals, as does what no rational polynomial of degree 3 can follow.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
+from jaxbundle.network.tables import Source
+
+from .image import PushbroomImage
+from .locate import locate_points
+from .rpc import TERMS, Rpc, monomials, project_points
+from .surfaces import Height
+
+UNKNOWNS = 2 * TERMS - 1
+FEWEST = UNKNOWNS + 1
+"""Fewer points than that do not check anything."""
+LINEAR = 1e-3
+"""D of the constant and linear terms of the numerator."""
+LADDER = 10.0 ** np.arange(-1.0, -15.25, -0.5)
+"""Ridges that are tried, in units of the largest singular value."""
+AS_GOOD = 1.05
+ENOUGH = 1e-5
+"""Pixels."""
+START = 1e-2
+"""The ridge of the linear start, in units of the largest singular value."""
+STEPS, CHOOSING = 30, (0, 1, 2)
+"""Steps of Gauss-Newton, and those in which the ridge is chosen."""
+HALVINGS = 30
+SETTLED, EXACT = 1e-3, 1e-8
+"""A last whole step moves no point by more than this part of the RMS and so many pixels."""
+TABLE = Source("table")
+
+
+class RpcTable(NamedTuple):
+    """Points of the ground and where the image shows them: radians, metres, lines, samples."""
+
+    longitude: Float[np.ndarray, " n"]
+    latitude: Float[np.ndarray, " n"]
+    height: Float[np.ndarray, " n"]
+    line: Float[np.ndarray, " n"]
+    sample: Float[np.ndarray, " n"]
+
+
+class RpcCheck(NamedTuple):
+    """Computed less given lines and samples [n, 2], their RMS and largest amount, in pixels."""
+
+    residuals: Float[np.ndarray, "n 2"]
+    rms: Float[np.ndarray, "2"]
+    largest: Float[np.ndarray, "2"]
+
+    @property
+    def worst(self) -> int:
+        """The row of the largest residual."""
+        return int(np.abs(self.residuals).max(1).argmax())
+
+
+class RpcFit(eqx.Module):
+    """Fitted coefficients, and for lines and samples: covariance (numerator, then denominator from
+    its second coefficient), σ of a line or sample in pixels, redundancy, ridge τ.
+    """
+
+    rpc: Rpc
+    covariance: Float[np.ndarray, "2 39 39"]
+    sigma: Float[np.ndarray, "2"]
+    redundancy: Float[np.ndarray, "2"]
+    ridge: Float[np.ndarray, "2"]
+    check: RpcCheck
+    converged: bool
+
+
+def fit_rpc(
+    table: RpcTable,
+    *,
+    ridge: float | None = None,
+    sigma: float | None = None,
+    source: Source = TABLE,
+) -> RpcFit:
+    """The coefficients that follow a table best.
+
+    **Arguments:** `ridge` τ in units of the normalised equations, chosen if None; `sigma` of the
+    table's lines and samples in pixels, a posteriori if None; `source` names rows in messages.
+
+    **Raises:** `InputError` for fewer than 40 points, what is not a number, points of one height.
+    """
+    table = RpcTable(*(np.asarray(column, float) for column in table))
+    _check(table, source)
+    offsets = _offsets(table)
+    places = _normalised(table, offsets)
+    T = np.stack(np.broadcast_arrays(*monomials(*places[:3])), 1)
+    found = [
+        _fit_one(T, y, offsets[f"{name}_scale"], ridge, sigma)
+        for name, y in zip(("line", "sample"), places[3:])
+    ]
+    (line, *of_line), (sample, *of_sample) = found
+    full = lambda c: (jnp.asarray(c[:TERMS]), jnp.asarray(np.r_[1.0, c[TERMS:]]))
+    rpc = Rpc(*full(line), *full(sample), **{k: jnp.asarray(v) for k, v in offsets.items()})
+    covariance, sigmas, redundancy, ridges, settled = map(np.array, zip(of_line, of_sample))
+    return RpcFit(
+        rpc, covariance, sigmas, redundancy, ridges, check_rpc(rpc, table), bool(settled.all())
+    )
+
+
+def fit_image(
+    image: PushbroomImage,
+    earth: Ellipsoid,
+    heights: tuple[float, float],
+    *,
+    size: tuple[int, int, int] = (15, 15, 7),
+    ridge: float | None = None,
+) -> tuple[RpcFit, RpcCheck]:
+    """The coefficients of an image between two heights, and a check at other places and heights.
+
+    **Arguments:** `size` of the grid: lines, pixels, heights; the check has twice as many lines and
+    pixels, and heights half way between those of the grid.
+    """
+    low, high = heights
+    lines, pixels, layers = size
+    levels = np.linspace(low, high, layers)
+    fit = fit_rpc(image_table(image, earth, levels, (lines, pixels)), ridge=ridge)
+    between = (levels[1:] + levels[:-1]) / 2
+    denser = image_table(image, earth, between, (2 * lines, 2 * pixels))
+    return fit, check_rpc(fit.rpc, denser)
+
+
+def image_table(
+    image: PushbroomImage,
+    earth: Ellipsoid,
+    heights: Float[np.ndarray, " layers"],
+    size: tuple[int, int],
+) -> RpcTable:
+    """A grid of `size` lines × pixels over the whole image, on the ground at each height.
+
+    **Raises:** `InputError` if a ray misses.
+    """
+    lines = np.repeat(np.linspace(0, image.lines - 1, size[0]), size[1])
+    pixels = np.tile(np.linspace(0, image.pixels - 1, size[1]), size[0])
+    layers = []
+    for height in heights:
+        place = np.asarray(_ground(image, earth, jnp.asarray(float(height)), lines, pixels))
+        if (bad := np.isnan(place).any(0)).any():
+            row = int(bad.argmax())
+            raise InputError(
+                f"the ray of line {lines[row]:g}, pixel {pixels[row]:g} misses the height "
+                f"{height:g} m; look at attitude, mounting and heights"
+            )
+        layers.append(np.stack([*place, lines, pixels]))
+    return RpcTable(*np.concatenate(layers, axis=1))
+
+
+def check_rpc(rpc: Rpc, table: RpcTable) -> RpcCheck:
+    """How well coefficients follow a table."""
+    line, sample, _ = project_points(rpc, table.longitude, table.latitude, table.height)
+    v = np.stack([np.asarray(line) - table.line, np.asarray(sample) - table.sample], 1)
+    return RpcCheck(v, np.sqrt(np.mean(v**2, 0)), np.abs(v).max(0))
+
+
+@jax.jit
+def _ground(image, earth, height, lines, pixels):
+    X = locate_points(image, Height(height, earth), lines, pixels)
+    return jnp.stack(geodetic(earth, tuple(X)))
+
+
+def _check(table, source):
+    n = len(table.line)
+    for name, column in zip(table._fields, table):
+        if column.shape != (n,):
+            raise InputError(f"{source.name}: {name} has the shape {column.shape}; ({n},) expected")
+        if (bad := ~np.isfinite(column)).any():
+            raise InputError(f"{source(int(bad.argmax()))}: the {name} is not a finite number")
+    if n < FEWEST:
+        raise InputError(
+            f"{source.name}: {n} points for {UNKNOWNS} coefficients of each axis; give at least "
+            f"{FEWEST}, over the whole image and several heights"
+        )
+    for name in ("height", "line", "sample"):
+        if np.ptp(getattr(table, name)) == 0:
+            raise InputError(
+                f"{source.name}: every {name} is {getattr(table, name)[0]:g}; give points at "
+                f"several {name}s"
+            )
+
+
+def _offsets(table: RpcTable) -> dict[str, float]:
+    """Middle and half range of each column; longitudes and latitudes in degrees."""
+    mean = np.angle(np.mean(np.exp(1j * table.longitude)))
+    east = np.degrees(mean + np.angle(np.exp(1j * (table.longitude - mean))))
+    columns = {
+        "line": table.line, "sample": table.sample, "longitude": east,
+        "latitude": np.degrees(table.latitude), "height": table.height,
+    }  # fmt: skip
+    offsets = {}
+    for name, column in columns.items():
+        low, high = float(column.min()), float(column.max())
+        offsets |= {f"{name}_offset": (low + high) / 2, f"{name}_scale": (high - low) / 2}
+    offsets["longitude_offset"] = (offsets["longitude_offset"] + 180) % 360 - 180
+    return offsets
+
+
+def _normalised(table, offsets):
+    east = np.degrees(table.longitude) - offsets["longitude_offset"]
+    columns = {
+        "longitude": east - 360 * np.round(east / 360),
+        "latitude": np.degrees(table.latitude) - offsets["latitude_offset"],
+    }
+    columns |= {
+        name: getattr(table, name) - offsets[f"{name}_offset"]
+        for name in ("height", "line", "sample")
+    }
+    return [column / offsets[f"{name}_scale"] for name, column in columns.items()]
+
+
+def _fit_one(T, y, scale, ridge, sigma):
+    """c [39], its covariance, σ in pixels, redundancy, τ, settled; y in units of `scale` pixels."""
+    D = np.r_[np.full(4, LINEAR), np.ones(UNKNOWNS - 4)]
+    U, s, Vt = np.linalg.svd(np.hstack([T, -y[:, None] * T[:, 1:]]) / D, full_matrices=False)
+    tau = max(s[0] * START, ridge or 0.0)
+    c, settled = _ridged(U, s, Vt, D, y, tau), False
+    tau = tau if ridge is None else ridge
+    for k in range(STEPS):
+        v, J = _linearised(c, T, y)
+        U, s, Vt = np.linalg.svd(J / D, full_matrices=False)
+        target = J @ c - v
+        if ridge is None and k in CHOOSING:
+            tau = _ridge(U, s, target, scale)
+        step = _ridged(U, s, Vt, D, target, tau) - c
+        c = c + _shortened(c, step, T, y, tau * D)
+        settled = np.abs(J @ step).max() < SETTLED * np.sqrt(np.mean(v**2)) + EXACT / scale
+        if settled and k > max(CHOOSING):
+            break
+    v, J = _linearised(c, T, y)
+    U, s, Vt = np.linalg.svd(J / D, full_matrices=False)
+    redundancy = len(y) - float(np.sum(s**2 / (s**2 + tau**2)))
+    if sigma is None:
+        sigma = scale * float(np.sqrt(np.sum(v**2) / redundancy))
+    half = Vt.T * (s / (s**2 + tau**2)) / D[:, None]
+    return c, (sigma / scale) ** 2 * half @ half.T, sigma, redundancy, tau, settled
+
+
+def _shortened(c, step, T, y, ridge):
+    """The step, halved until the sum of squares falls and no denominator vanishes."""
+
+    def square(c):
+        denominator = 1 + T[:, 1:] @ c[TERMS:]
+        v = T @ c[:TERMS] / np.where(denominator > 0, denominator, 1.0) - y
+        return np.sum(v**2) + np.sum((ridge * c) ** 2) if (denominator > 0).all() else np.inf
+
+    now = square(c)
+    for _ in range(HALVINGS):
+        if square(c + step) < np.inf and square(c + step) <= now * (1 + 1e-12) + 1e-28:
+            return step
+        step = step / 2
+    if now == np.inf:
+        raise InputError(
+            "the denominator vanishes within the table: no rational polynomials follow it; "
+            "look for wrong rows, or give a larger ridge"
+        )
+    return 0 * step
+
+
+def _ridged(U, s, Vt, D, y, tau):
+    """The least squares solution of U·diag(s)·Vᵀ·D·c = y with the ridge τ."""
+    return Vt.T @ (s / (s**2 + tau**2) * (U.T @ y)) / D
+
+
+def _ridge(U, s, y, scale):
+    """The largest ridge of the ladder that predicts as well as any."""
+    part = U.T @ y
+    press = []
+    for tau in s[0] * LADDER:
+        kept = s**2 / (s**2 + tau**2)
+        h = (U**2) @ kept
+        press.append(np.sqrt(np.mean(((y - U @ (kept * part)) / (1 - h)) ** 2)))
+    press = np.array(press)
+    return float(s[0] * LADDER[(press <= AS_GOOD * press.min() + ENOUGH / scale).argmax()])
+
+
+def _linearised(c, T, y):
+    return tuple(np.asarray(a) for a in _value_and_jacobian(c, T, y))
+
+
+@jax.jit
+def _value_and_jacobian(c, T, y):
+    """v and ∂v/∂c of all points."""
+
+    def misclosure(c, T, y):
+        v = (c[:TERMS] @ T) / (1 + c[TERMS:] @ T[1:]) - y
+        return v, v
+
+    J, v = jax.vmap(jax.jacrev(misclosure, has_aux=True), (None, 0, 0))(c, T, y)
+    return v, J

@@ -1,0 +1,249 @@
+"""ISDs of line scanners: published ground points of usgscsm, there and back, what is refused."""
+
+import copy
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pushbroom_scenes import LINES, PERIOD, PIXELS, locate, orbit, satellite
+from scipy.spatial.transform import Rotation
+
+from jaxbundle.cameras import get_model
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import WGS84
+from jaxbundle.io.csm import read_csm
+from jaxbundle.pushbroom.frames import EARTH_RATE
+from jaxbundle.pushbroom.image import pose_at
+from jaxbundle.pushbroom.project import make_search, project_points
+from jaxbundle.pushbroom.scanner import FocalLine
+from jaxbundle.pushbroom.surfaces import Ground
+
+K0, K1 = 1e-4, 2e-6
+"""Radial correction of the measurement, as `optical_distortion` has it with the other sign."""
+
+
+def write(folder, isd):
+    path = folder / "isd.json"
+    path.write_text(json.dumps(isd))
+    return path
+
+
+def small(times, positions, pointing, body, radius):
+    """Sixteen lines and samples behind 50 mm, ten pixels a millimetre."""
+    table = {"ephemeris_times": list(times), "reference_frame": 1}
+    return {
+        "name_model": "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL", "center_ephemeris_time": 1000.0,
+        "line_scan_rate": [[0.5, -0.85, 0.1]], "image_lines": 16, "image_samples": 16,
+        "focal2pixel_lines": [0.0, -10.0, 0.0], "focal2pixel_samples": [0.0, 0.0, 10.0],
+        "focal_length_model": {"focal_length": 50}, "starting_detector_line": 1,
+        "starting_detector_sample": 0, "detector_center": {"line": 0.5, "sample": 8.0},
+        "radii": {"semimajor": radius, "semiminor": radius, "unit": "km"},
+        "instrument_position": table | {"positions": np.array(positions).tolist()},
+        "instrument_pointing": table | {"quaternions": np.array(pointing).tolist()},
+        "body_rotation": table | {"quaternions": np.array(body).tolist()},
+    }  # fmt: skip
+
+
+def test_published_ground_points(tmp_path):
+    """Figures of the tests of usgscsm: a fly-by of a ball of 10 m, and an orbit at 50 km."""
+    t = 999.2 + 0.2 * np.arange(9)
+    track = np.stack([0.02 * (t - 1000), 0 * t, -1.0 + 0 * t], 1)
+    half = np.sqrt(0.5)
+    pointing, body = (np.tile(q, (9, 1)) for q in ([0.0, 0, 0, 1], [0, -half, 0, half]))
+    isd = small(t, track, pointing, body, 0.01)
+    ball = read_csm(write(tmp_path, isd))
+    found = locate(ball.image, Ground(ball.earth), np.array([7.5]), np.array([7.5]))[:, 0, 0]
+    np.testing.assert_allclose(found, [9.999995, 0, 0.009999995], atol=1e-9)
+    t = 999.2 + 0.1 * np.arange(16)
+    angle = 0.1 * np.arange(16) / 1050
+    orbit = 1050 * np.stack([np.cos(angle), 0 * angle, -np.sin(angle)], 1)
+    turn = np.pi / 4 + angle / 2
+    pointing = np.stack([np.cos(turn), 0 * turn, -np.sin(turn), 0 * turn], 1)
+    isd = small(t, orbit, pointing, np.tile([1.0, 0, 0, 0], (16, 1)), 1000.0)
+    # the velocities there do not belong to the positions, and are used all the same
+    V = np.stack([-0.1 * np.arange(16), 0 * angle, -1.05 * np.cos(angle)], 1)
+    isd["instrument_position"]["velocities"] = V.tolist()
+    moon = read_csm(write(tmp_path, isd))
+    found = locate(moon.image, Ground(moon.earth), np.array([8.0]), np.array([7.5]))[:, 0, 0]
+    # the quaternions there have eight digits: a centimetre at most
+    np.testing.assert_allclose(found, [999999.67004351, 0, -812.35021438], atol=0.01)
+
+
+def expected_image():
+    names = get_model("usgs").parameters
+    given = {"c": 700.0, "K0": K0, "K1": K1}
+    optics = FocalLine(
+        jnp.array([given.get(name, 0.0) for name in names]), jnp.float64(0.05),
+        jnp.float64((PIXELS - 1) / 2), jnp.float64(0.3), "usgs",
+    )  # fmt: skip
+    return satellite(turns="lagrange", optics=optics)
+
+
+def support_data(older=False):
+    """The image of `expected_image`, its detectors along y of a camera that looks along +z."""
+    image = expected_image()
+    centre = 3.1e8
+    # x and y changed, z forward: v_camera here = C·v_camera there
+    C = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]])
+    rows = np.array(image.trajectory.attitude.table.times)
+    R = np.asarray(jax.vmap(lambda t: pose_at(image, t).R)(rows)) @ C
+    t = np.array(image.trajectory.position.times)
+    isd = {
+        "name_sensor": "test", "center_ephemeris_time": centre,
+        # the centre of the first line, half a period after its start
+        "line_scan_rate": [[0.5, -PERIOD / 2, PERIOD]], "image_lines": LINES,
+        "image_samples": PIXELS, "focal2pixel_lines": [0.0, 20.0, 0.0],
+        "focal2pixel_samples": [0.0, 0.0, 20.0], "focal_length_model": {"focal_length": 700.0},
+        "detector_center": {"line": -6.0, "sample": PIXELS / 2},
+        "optical_distortion": {"radial": {"coefficients": [-K0, -K1, 0.0]}},
+        "radii": {"semimajor": WGS84.a / 1e3, "semiminor": WGS84.c / 1e3, "unit": "km"},
+    }  # fmt: skip
+    P = np.array(image.trajectory.position.values)
+    if older:
+        ours = np.stack(Rotation.from_matrix(R).as_quat())
+        return isd | {
+            "sensor_position": {"positions": P.tolist(), "unit": "m"}, "t0_ephemeris": t[0],
+            "dt_ephemeris": 1.0, "sensor_orientation": {"quaternions": ours.tolist()},
+            "t0_quaternion": rows[0], "dt_quaternion": 0.1,
+        }  # fmt: skip
+    fixed = Rotation.from_euler("xyz", [0.3, -0.2, 0.5])
+    turning = lambda at: Rotation.from_rotvec(np.outer(at, [0, 0, -EARTH_RATE])) * fixed
+    lens = Rotation.from_euler("z", 0.4)
+    pointing = lens.inv() * (Rotation.from_matrix(R).inv() * turning(rows))
+    scalar_first = lambda rotation: np.roll(rotation.as_quat(), 1, axis=1).tolist()
+    inertial = turning(t).inv().apply(P)
+    ends = np.array([t[0], t[-1]])
+    step = 1e-2
+    before, after = (turning(t + s).inv().apply(orbit(t + s)[0]) for s in (-step, step))
+    return isd | {
+        "instrument_position": {
+            "ephemeris_times": (centre + t).tolist(), "positions": (inertial / 1e3).tolist(),
+            "velocities": ((after - before) / (2 * step) / 1e3).tolist(),
+        },
+        "body_rotation": {
+            "ephemeris_times": (centre + ends).tolist(), "quaternions": scalar_first(turning(ends)),
+        },
+        "instrument_pointing": {
+            "ephemeris_times": (centre + rows).tolist(), "quaternions": scalar_first(pointing),
+            "constant_rotation": lens.as_matrix().ravel().tolist(),
+        },
+    }  # fmt: skip
+
+
+PLACES = np.linspace(0, LINES - 1, 8), np.linspace(0, PIXELS - 1, 5)
+
+
+@pytest.mark.parametrize("older", [False, True])
+def test_an_image_written_as_support_data_is_read_as_itself(tmp_path, older):
+    scanner = read_csm(write(tmp_path, support_data(older)))
+    assert scanner.name == "test" and scanner.earth.a == WGS84.a
+    expected = locate(expected_image(), Ground(), *PLACES)
+    found = locate(scanner.image, Ground(), *PLACES)
+    # times of 3e8 s are rounded to 6e-8 s: half a millimetre of flight
+    np.testing.assert_allclose(found, expected, atol=1e-5 if older else 2e-3)
+    names = get_model("usgs").parameters
+    assert scanner.image.optics.model == "usgs"
+    assert float(scanner.image.optics.parameters[names.index("K1")]) == K1
+    X = jnp.asarray(found.reshape(3, -1))
+    seen = project_points(scanner.image, make_search(scanner.image), X)
+    line, pixel = (a.ravel() for a in np.meshgrid(*PLACES, indexing="ij"))
+    np.testing.assert_allclose(seen.line[0], line, atol=1e-5)
+    np.testing.assert_allclose(seen.pixel[0], pixel, atol=1e-5)
+
+
+def slopes(folder, distortion):
+    isd = support_data(older=True) | {"optical_distortion": distortion}
+    u = np.arange(0, PIXELS, 50)
+    optics = read_csm(write(folder, isd)).image.optics
+    return np.stack([np.asarray(a) for a in jax.vmap(optics.slopes)(u * 1.0)]), 0.05 * (u - 199.5)
+
+
+def test_other_distortions(tmp_path):
+    """In their own formulas: ξ is y/f there, η is x/f."""
+    (xi, eta), y = slopes(tmp_path, {"lrolrocnac": {"coefficients": [1.8e-5]}})
+    np.testing.assert_allclose(700 * xi, y / (1 + 1.8e-5 * y * y), atol=1e-9)
+    np.testing.assert_allclose(700 * eta, 0.3, atol=1e-9)
+    (xi, eta), y = slopes(tmp_path, {"kplo_shadowcam": {"coefficients": [1.8e-5]}})
+    np.testing.assert_allclose(700 * xi, y * (1 + 1.8e-5 * y * y), atol=1e-9)
+    a = [0.01, 1.0, 1e-3, 1e-5, 2e-5, 1e-5, 0, 0, 1e-6, 0]
+    b = [0, 2e-3, 1.0, 0, 0, 3e-5, 0, 0, 0, 1e-6]
+    (xi, eta), y = slopes(tmp_path, {"transverse": {"x": a, "y": b}})
+    u, v = 700 * eta, 700 * xi
+    back = lambda c: (
+        c[0] + c[1] * u + c[2] * v + c[3] * u**2 + c[4] * u * v + c[5] * v**2 + c[6] * u**3
+        + c[7] * u**2 * v + c[8] * u * v**2 + c[9] * v**3
+    )  # fmt: skip
+    np.testing.assert_allclose(back(a), 0.3, atol=1e-9)
+    np.testing.assert_allclose(back(b), y, atol=1e-9)
+    given = {"x": [1e-3, 0, 1e-6, 0], "y": [2e-3, 1e-4, 0, 0], "boresight_x": 0.01}
+    (xi, eta), y = slopes(tmp_path, {"kaguyalism": given | {"boresight_y": -0.02}})
+    r = np.hypot(0.3, y)
+    np.testing.assert_allclose(700 * eta, 0.3 + 0.01 + 1e-3 + 1e-6 * r**2, atol=1e-9)
+    np.testing.assert_allclose(700 * xi, y - 0.02 + 2e-3 + 1e-4 * r, atol=1e-9)
+
+
+def test_lines_of_two_periods(tmp_path):
+    rates = [[0.5, -PERIOD / 2, PERIOD], [100.5, 99.5 * PERIOD, PERIOD / 2]]
+    image = read_csm(write(tmp_path, support_data(True) | {"line_scan_rate": rates})).image
+    times = [float(image.times.time(line)) for line in (0.0, 99.0, 100.0, 110.0)]
+    expected = PERIOD * np.array([0, 99, 99.5 + 0.25, 99.5 + 0.25 + 5])
+    np.testing.assert_allclose(times, expected, atol=1e-12)
+
+
+def changed(path, value):
+    def change(isd):
+        *parents, last = path.split(".")
+        for key in parents:
+            isd = isd[key]
+        isd[last] = value
+
+    return change
+
+
+BROKEN = {
+    "frame camera": (changed("name_model", "USGS_ASTRO_FRAME_SENSOR_MODEL"), ["name_model"]),
+    "no focal length": (
+        lambda isd: isd.pop("focal_length_model"), ["focal_length is missing"],
+    ),
+    "text": (changed("image_lines", "many"), ["image_lines", "'many'", "number"]),
+    "shape": (changed("focal2pixel_lines", [0.0, 1.0]), ["focal2pixel_lines", "array 3"]),
+    "dependent": (changed("focal2pixel_lines", [0.0, 0.0, 1.0]), ["dependent"]),
+    "period": (changed("line_scan_rate", [[0.5, 0.0, 0.0]]), ["line_scan_rate", "positive"]),
+    "unit": (changed("radii.unit", "miles"), ["radii.unit", "'miles'"]),
+    "distortion": (changed("optical_distortion", {"fisheye": {}}), ["'fisheye'", "radial"]),
+    "quaternion": (
+        changed("body_rotation.quaternions", [[1, 0, 0, 0], [1, 1, 0, 0]]),
+        ["body_rotation", "unit"],
+    ),
+    "rows": (
+        changed("body_rotation.quaternions", [[1, 0, 0, 0]]), ["body_rotation", "array 2 × 4"],
+    ),
+    "times": (
+        changed("body_rotation.ephemeris_times", [3.1e8, 3.1e8]), ["body_rotation", "twice"],
+    ),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def isd():
+    return support_data()
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_what_is_refused(tmp_path, isd, case):
+    change, words = BROKEN[case]
+    isd = copy.deepcopy(isd)
+    change(isd)
+    with pytest.raises(InputError) as refused:
+        read_csm(write(tmp_path, isd))
+    for word in ("isd.json", *words):
+        assert word in str(refused.value), refused.value
+
+
+def test_what_is_no_json(tmp_path):
+    for text, word in (("{", "not valid JSON"), ("[]", "object")):
+        (tmp_path / "isd.json").write_text(text)
+        with pytest.raises(InputError, match=word):
+            read_csm(tmp_path / "isd.json")

@@ -1,0 +1,103 @@
+"""Bias compensation: injected biases found, covariance by Monte Carlo, tests, what is refused."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rpc_scenes import made_up, places
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import WGS84, earth_fixed
+from jaxbundle.pushbroom.rpc import project_points
+from jaxbundle.pushbroom.rpc_bias import Bias, compensated, fit_bias, project_compensated
+from jaxbundle.pushbroom.rpc_fit import RpcTable
+
+RPC = made_up()
+PLACES = places(RPC, 12)
+BIAS = Bias(jnp.array([3.0, 0.5, -0.8]), jnp.array([-7.0, 0.2, 0.4]))
+SHIFT = Bias(jnp.array([3.0, 0, 0]), jnp.array([-7.0, 0, 0]))
+image = jax.jit(jax.vmap(project_compensated, (None, None, 0, 0, 0)))
+
+
+def control(bias, noise=0.0, rng=None):
+    measured = np.stack(image(RPC, bias, *PLACES))
+    noisy = measured if rng is None else measured + noise * rng.normal(size=measured.shape)
+    return RpcTable(*PLACES, *noisy)
+
+
+@pytest.mark.parametrize("model, bias", [("shift", SHIFT), ("affine", BIAS)])
+def test_an_injected_bias_is_found_and_put_into_the_coefficients(model, bias):
+    fit = fit_bias(RPC, control(bias), model=model)
+    np.testing.assert_allclose(fit.bias.line, bias.line, atol=1e-9)
+    np.testing.assert_allclose(fit.bias.sample, bias.sample, atol=1e-9)
+    rpc, check = compensated(RPC, fit.bias)
+    found = project_points(rpc, *PLACES)[:2]
+    np.testing.assert_allclose(found, image(RPC, bias, *PLACES), atol=2e-3)
+    assert (check is None) == (model == "shift")
+    assert check is None or check.largest.max() < 2e-3
+
+
+def test_covariance_redundancy_and_tests_by_drawing():
+    """With σ of image and ground: unknowns scatter as told, w is standard normal, σ0 is 1."""
+    rng, noise, ground = np.random.default_rng(1), 0.4, np.array([2.0, 1.0, 5.0])
+    draws = 400
+    base = control(BIAS)
+    east, north, h = PLACES
+    X = np.array(earth_fixed(WGS84, PLACES))
+    # the point as given is off the true one by east, north, up, here by spherical formulas
+    N = np.linalg.norm(X, axis=0)
+    unknowns, tests, sigma0 = [], [], []
+    for _ in range(draws):
+        e = ground * rng.normal(size=(len(h), 3))
+        given = (east + e[:, 0] / (N * np.cos(north)), north + e[:, 1] / N, h + e[:, 2])
+        measured = (column + noise * rng.normal(size=len(h)) for column in base[3:])
+        fit = fit_bias(
+            RPC, RpcTable(*given, *measured), model="affine", sigma=noise,
+            ground_sigma=np.tile(ground, (len(h), 1)),
+        )  # fmt: skip
+        unknowns.append(np.r_[fit.bias.line, fit.bias.sample])
+        tests.append(fit.w)
+        sigma0.append(fit.sigma0)
+    scatter = np.cov(np.array(unknowns).T)
+    whitened = np.linalg.solve(fit.cofactor, scatter)
+    assert np.trace(whitened) / 6 == pytest.approx(1.0, abs=0.06)
+    assert np.mean(np.square(tests)) == pytest.approx(1.0, abs=0.05)
+    assert np.mean(np.square(sigma0)) == pytest.approx(1.0, abs=0.05)
+    assert fit.redundancy_numbers.sum() == pytest.approx(fit.redundancy, rel=1e-9) == 18
+
+
+def test_a_blunder_has_the_largest_w_and_moves_its_residual_by_r():
+    clean = control(SHIFT, 0.3, np.random.default_rng(2))
+    line = clean.line.copy()
+    line[4] += 6.0
+    before, after = (fit_bias(RPC, c, sigma=0.3) for c in (clean, clean._replace(line=line)))
+    assert np.abs(after.w).argmax() == 2 * 4
+    moved = after.residuals[4, 0] - before.residuals[4, 0]
+    assert moved == pytest.approx(-6.0 * before.redundancy_numbers[4, 0], rel=1e-9)
+    np.testing.assert_allclose(before.redundancy_numbers, 1 - 1 / 12)
+    np.testing.assert_allclose(before.covariance, np.eye(2) * (before.sigma0 * 0.3) ** 2 / 12)
+
+
+def test_without_redundancy():
+    one = RpcTable(*(column[:1] for column in control(SHIFT)))
+    fit = fit_bias(RPC, one, sigma=0.5)
+    assert fit.redundancy == 0 and np.isnan(fit.sigma0) and np.isnan(fit.w).all()
+    np.testing.assert_allclose(fit.covariance, 0.25 * np.eye(2))
+
+
+def one_point_twice(table):
+    return RpcTable(*(np.repeat(column[:1], 4) for column in table))
+
+
+@pytest.mark.parametrize("table, options, words", [
+    (control(BIAS), {"model": "afine"}, ["'afine'"]),
+    (RpcTable(*(c[:2] for c in control(BIAS))), {"model": "affine"}, ["2 control points", "3"]),
+    (one_point_twice(control(BIAS)), {"model": "affine"}, ["one line", "shift"]),
+    (control(BIAS), {"sigma": 0.0}, ["row 1", "positive"]),
+    (control(BIAS)._replace(height=np.r_[np.zeros(11), np.inf]), {}, ["row 12", "height"]),
+], ids=["model", "few", "one line", "sigma", "inf"])  # fmt: skip
+def test_what_is_refused(table, options, words):
+    with pytest.raises(InputError) as refused:
+        fit_bias(RPC, table, **options)
+    for word in words:
+        assert word in str(refused.value)
