@@ -43,10 +43,7 @@ def read_sections(
 
     **Raises:** `InputError` for what is unknown or missing.
     """
-    try:
-        document = tomllib.loads(read_text(path))
-    except ValueError as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from None
+    document = read_toml(path)
     for key, value in document.items():
         if key not in sections:
             raise InputError(f"{path}: unknown section [{key}]{did_you_mean(key, sections)}")
