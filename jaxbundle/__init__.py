@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from jaxbundle.network.stations import grid_of_targets as grid_of_targets
     from jaxbundle.network.stations import ring_of_stations as ring_of_stations
     from jaxbundle.network.stations import stations_looking_at as stations_looking_at
+    from jaxbundle.orientation.network import Oriented as Oriented
+    from jaxbundle.orientation.network import orient as orient
     from jaxbundle.result import Adjustment as Adjustment
 
 _HOME = {
@@ -60,6 +62,7 @@ _HOME = {
         "aerial_block", "cloud_of_targets", "grid_of_targets", "ring_of_stations",
         "stations_looking_at",
     ),
+    "jaxbundle.orientation.network": ("Oriented", "orient"),
     "jaxbundle.result": ("Adjustment",),
 }
 _MODULE = {name: module for module, names in _HOME.items() for name in names}

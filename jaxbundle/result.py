@@ -58,6 +58,8 @@ class Adjustment:
     - `sigma_factors`: where variance components were estimated, by group of observations, what its
       a priori σ have been multiplied by; empty otherwise. Everything called a priori then means
       the estimated σ, except in `variance_components`.
+    - `robust`, `weights`: the estimator, and the factors of the weights it gave the image points
+      in the order of the observations; None otherwise. A priori σ are then those after weighting.
     """
 
     def __init__(
@@ -74,6 +76,8 @@ class Adjustment:
         reduction: str | None = None,
         sigma_factors: Mapping[str, float] | None = None,
         inspection: Inspection | None = None,
+        robust: str | None = None,
+        weights: Float[np.ndarray, " observations"] | None = None,
     ):
         self.network = network
         self.problem = problem
@@ -84,6 +88,8 @@ class Adjustment:
         self.method = method
         self.reduction = reduction or problem.structure.reduction
         self.sigma_factors = dict(sigma_factors or {})
+        self.robust = robust
+        self.weights = weights
         self._inspection = inspection
         self._check = check
 

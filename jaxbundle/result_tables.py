@@ -91,7 +91,8 @@ def points(adjustment) -> dict[str, np.ndarray]:
 
 def residuals(adjustment) -> dict[str, np.ndarray]:
     """One row an observation: kind, image, point, axis, v, sigma (a priori), r, w (Baarda),
-    tau (Pope), mdb, external; image observations first, in the order they were given."""
+    tau (Pope), mdb, external, and weight (the factor) after robust estimation; image observations
+    first, in the order they were given."""
     s, data, found = adjustment.problem.structure, adjustment.problem.data, adjustment.reliability
     network = adjustment.problem.network
     images = np.array(network.images.id, dtype=object)
@@ -160,9 +161,12 @@ def _residual_rows(adjustment, kind, image, point, axes, order, v, weight, r, w)
         "r": r.ravel(),
         "w": w.ravel(),
         "tau": adjustment.pope(w).ravel(),
-        "mdb": np.asarray(minimal_detectable(sigma, r)).ravel(),
-        "external": np.asarray(external_reliability(r)).ravel(),
+        "mdb": minimal_detectable(sigma, r).ravel(),
+        "external": external_reliability(r).ravel(),
     }
+    if adjustment.weights is not None:
+        factor = adjustment.weights if kind == "image" else np.ones(len(image))
+        columns["weight"] = repeat(factor)
     return {name: column[used.ravel()] for name, column in columns.items()}
 
 

@@ -22,6 +22,8 @@ LAYERS = (
     "report",
     "result_tables",
     "result",
+    "solution",
+    "repeated",
     "bundle",
     "batches",
     "targets",

@@ -1,6 +1,7 @@
 """Projects with the answer of an independent adjustment, where the folder of cases stands beside
 the checkout (the data of most belong to others and are not in the repository)."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -90,3 +91,31 @@ def test_images_and_points(case):
             np.testing.assert_allclose(found_sigma[free], sigma[free], rtol=1e-3)
             if comparable:
                 assert np.all(np.abs(found - value)[free] < 0.002 * sigma[free])
+
+
+@pytest.mark.xdist_group("camcal/project")
+def test_camcal_with_blunders():
+    """5 % of 5 to 50 σ (a posteriori): those above 8 σ with redundancy numbers above 0.3 are found,
+    1 % of the good ones may go; Huber's estimate stays within its σ of the clean one."""
+    network = jaxbundle.read_network(CASES / "camcal/project.toml")
+    clean, rays = adjust(network), network.observations
+    rng = np.random.default_rng(0)
+    bad, size = rng.random(len(rays)) < 0.05, rng.uniform(5, 50, len(rays))
+    angle = rng.uniform(0, 2 * np.pi, len(rays))
+    length = bad * size * clean.sigma0 * rays.sigma[:, 0]
+    xy = rays.xy + length[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
+    spoilt = network.replace(observations=dataclasses.replace(rays, xy=xy))
+
+    removed = {r.name for r in adjust(spoilt, snooping="pope").removed}
+    gone = np.array([
+        f"point {network.points.id[p]} in image {network.images.id[i]}" in removed
+        for i, p in zip(rays.image, rays.point)
+    ])
+    clear = bad & (size > 8) & (clean.residuals["r"][: 2 * len(rays)].reshape(-1, 2).min(1) > 0.3)
+    assert gone[clear].mean() >= 0.95
+    assert gone[~bad].mean() <= 0.01
+
+    huber = adjust(spoilt, robust="huber").cameras["cam"]["parameters"]
+    for name, entry in clean.cameras["cam"]["parameters"].items():
+        if entry["free"]:
+            assert abs(huber[name]["value"] - entry["value"]) < huber[name]["sigma"]

@@ -32,11 +32,14 @@ def adjust(
         str | None,
         typer.Option(help="of the reduced system: dense, banded or iterative; chosen if not given"),
     ] = None,
+    robust: Annotated[
+        str | None, typer.Option(help="robust estimation: huber, cauchy or tukey")
+    ] = None,
     snooping: Annotated[
-        str | None, typer.Option(help="remove blunders one at a time: pope or baarda")
+        str | None, typer.Option(help="remove blunders by the test of pope or baarda")
     ] = None,
     significance: Annotated[
-        float, typer.Option(help="level of one test of data snooping, two-sided")
+        float, typer.Option(help="level of data snooping: of the largest (pope), of one (baarda)")
     ] = 0.001,
     eliminate: Annotated[
         bool, typer.Option("--eliminate", help="fix insignificant additional parameters (t < 2)")
@@ -68,6 +71,7 @@ def adjust(
                 method=method,
                 reduction=reduction,
                 max_iterations=max_iterations,
+                robust=robust,
                 snooping=snooping,
                 significance=significance,
                 eliminate=eliminate,

@@ -24,12 +24,16 @@ Sources: Hamilton (1844) for the product; Shepperd (1978), J. Guidance and Contr
 for the quaternion of a matrix; Solà (2017), arXiv:1711.02508, for Exp, Log, ⊞ and ⊟.
 """
 
-from functools import reduce
+from functools import partial, reduce
 from math import factorial
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
+
+traced_once = partial(jax.jit, inline=True)
+"""Traced once for all callers, and compiled as a part of each."""
 
 
 def quaternion_multiply(a: Float[Array, "4"], b: Float[Array, "4"]) -> Float[Array, "4"]:
@@ -51,6 +55,7 @@ def quaternion_conjugate(q: Float[Array, "4"]) -> Float[Array, "4"]:
     return jnp.concatenate([q[:1], -q[1:]])
 
 
+@traced_once
 def matrix_from_quaternion(q: Float[Array, "4"]) -> Float[Array, "3 3"]:
     """The rotation matrix M(q) of q = (w, x, y, z).
 
@@ -147,6 +152,7 @@ _SINE_SERIES = [(-1) ** k / factorial(2 * k + 1) for k in range(9)]
 _ARCTANGENT_SERIES = [(-1) ** k / (2 * k + 1) for k in range(11)]
 
 
+@traced_once
 def _sine_over_angle(square: Array) -> Array:
     """sin θ/θ as a function of θ², smooth at zero."""
     small = square < 0.1

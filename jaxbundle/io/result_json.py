@@ -42,7 +42,7 @@ def result_dict(adjustment, brief: bool = False) -> dict:
     if not adjustment.converged:
         return head | {"undetermined": list(adjustment.undetermined)}
     head |= {"sigma0": adjustment.sigma0, "vtpv": adjustment.vtpv, "sigma": "a posteriori"}
-    head |= {"sigma_factors": adjustment.sigma_factors}
+    head |= {"sigma_factors": adjustment.sigma_factors, "robust": adjustment.robust}
     head |= {
         "cameras": {name: _camera(table) for name, table in adjustment.cameras.items()},
         "images": _images(adjustment),
@@ -130,9 +130,8 @@ def _points(table) -> dict:
 
 
 def _residuals(table) -> list:
-    names = ("kind", "image", "point", "axis", "v", "sigma", "r", "w", "tau", "mdb", "external")
-    columns = [table[name].tolist() for name in names]
-    return [dict(zip(names, row)) for row in zip(*columns)]
+    columns = [column.tolist() for column in table.values()]
+    return [dict(zip(table, row)) for row in zip(*columns)]
 
 
 def _checks(adjustment) -> dict:

@@ -34,6 +34,19 @@ def check_network(network: Network) -> Network:
 
     **Raises:** `InputError`, one line with file, row, thing and remedy.
     """
+    everything = network = check_tables(network)
+    network = leave_out_undetermined(network)
+    check_images(everything, network)
+    _check_start_values(network)
+    check_parts(network)
+    check_redundancy(network)
+    network = _warn_of_points_behind(network)
+    return network.replace(warnings=tuple(dict.fromkeys(network.warnings)))
+
+
+def check_tables(network: Network) -> Network:
+    """The network with every value looked at, whatever can be determined from them; start values
+    may be missing. As in `check_network`."""
     for key, choices in CHOICES.items():
         check_choice(key, getattr(network, key), choices)
     _check_sizes(network)
@@ -42,15 +55,7 @@ def check_network(network: Network) -> Network:
     network = _check_points(network)
     _check_observations(network)
     network = _check_distances(network)
-    network = _check_datum_points(network)
-    everything = network
-    network = leave_out_undetermined(network)
-    check_images(everything, network)
-    _check_start_values(network)
-    check_parts(network)
-    check_redundancy(network)
-    network = _warn_of_points_behind(network)
-    return network.replace(warnings=tuple(dict.fromkeys(network.warnings)))
+    return _check_datum_points(network)
 
 
 def _check_sizes(network: Network) -> None:

@@ -47,6 +47,18 @@ def keep_points(network: Network, keep: Bool[np.ndarray, " points"]) -> Network:
     )
 
 
+def keep_images(network: Network, keep: Bool[np.ndarray, " images"]) -> Network:
+    """The network with some of its images; the rays of the others go with them."""
+    if keep.all():
+        return network
+    observations = network.observations.take(keep[network.observations.image])
+    index = np.cumsum(keep) - 1
+    return network.replace(
+        images=network.images.take(keep),
+        observations=dataclasses.replace(observations, image=index[observations.image]),
+    )
+
+
 def without_distances(network: Network, drop: Bool[np.ndarray, " distances"]) -> Network:
     """The network without some of its distances."""
     if not drop.any():

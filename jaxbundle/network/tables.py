@@ -77,6 +77,14 @@ class Images:
     def __len__(self) -> int:
         return len(self.id)
 
+    def take(self, rows) -> "Images":
+        """The chosen images (a mask or indices), their places kept for messages."""
+        rows = np.flatnonzero(rows) if np.asarray(rows).dtype == bool else np.asarray(rows)
+        return Images(
+            tuple(self.id[row] for row in rows), self.camera[rows], self.position[rows],
+            self.angles[rows], self.sigma[rows], self.source.take(rows),
+        )  # fmt: skip
+
 
 @dataclasses.dataclass(frozen=True)
 class Points:

@@ -104,6 +104,7 @@ def robust_resection(
     key: Array,
     xy: Float[Array, "n 2"],
     X: Float[Array, "n 3"],
+    weights: Float[Array, " n"] | None = None,
     samples: int = 60,
     threshold: float | None = None,
 ) -> tuple[Resection, Bool[Array, " n"]]:
@@ -111,6 +112,7 @@ def robust_resection(
 
     Arguments as in `resection` and `consensus`; the threshold is a length in the image, c = 1.
     """
+    p = ones_unless(weights, xy)
 
     def errors(pose, xy, X):
         e = jnp.linalg.norm(jax.vmap(image_of, (None, 0))(pose, X) - xy, axis=1)
@@ -118,22 +120,23 @@ def robust_resection(
         return jnp.where(q < 0, e, FAR)
 
     solve = lambda xy, X: three_points(jax.vmap(ray_of)(xy), X)
-    found = consensus(key, solve, errors, (xy, X), 3, samples, threshold)
+    found = consensus(key, solve, errors, (xy, X), 3, samples, threshold, p)
     pose, good = found.model, found.inliers
 
     def again(_, state):
         pose, good = state
-        pose = refine_resection(pose, xy, X, good.astype(xy.dtype)).pose
-        return pose, _good(errors(pose, xy, X), 3, threshold)
+        pose = refine_resection(pose, xy, X, p * good).pose
+        return pose, _good(errors(pose, xy, X), p > 0, 3, threshold)
 
     pose, good = jax.lax.fori_loop(0, ROUNDS, again, (pose, good))
-    return refine_resection(pose, xy, X, good.astype(xy.dtype)), good
+    return refine_resection(pose, xy, X, p * good), good
 
 
 def robust_relative_orientation(
     key: Array,
     xy1: Float[Array, "n 2"],
     xy2: Float[Array, "n 2"],
+    weights: Float[Array, " n"] | None = None,
     samples: int = 150,
     threshold: float | None = None,
 ) -> tuple[RelativeOrientation, Bool[Array, " n"]]:
@@ -142,6 +145,7 @@ def robust_relative_orientation(
     Arguments as in `relative_orientation` and `consensus`. A gross error along the epipolar line
     is none: it contradicts nothing.
     """
+    p = ones_unless(weights, xy1)
 
     def errors(pair, xy1, xy2):
         e = jnp.abs(jax.vmap(sampson_distance, (None, None, 0, 0))(*pair, xy1, xy2))
@@ -153,19 +157,19 @@ def robust_relative_orientation(
         M, b = jax.vmap(orientations)(E)
         return (M.reshape(-1, 3, 3), b.reshape(-1, 3)), jnp.repeat(valid, 4)
 
-    found = consensus(key, solve, errors, (xy1, xy2), 5, samples, threshold)
+    found = consensus(key, solve, errors, (xy1, xy2), 5, samples, threshold, p)
 
     def again(_, good):
-        result = relative_orientation(xy1, xy2, good.astype(xy1.dtype))
-        return _good(errors((result.M, result.b), xy1, xy2), 5, threshold)
+        result = relative_orientation(xy1, xy2, p * good)
+        return _good(errors((result.M, result.b), xy1, xy2), p > 0, 5, threshold)
 
     good = jax.lax.fori_loop(0, ROUNDS, again, found.inliers)
-    return relative_orientation(xy1, xy2, good.astype(xy1.dtype)), good
+    return relative_orientation(xy1, xy2, p * good), good
 
 
-def _good(e, size, threshold):
+def _good(e, present, size, threshold):
     e = _finite(e)
-    return e <= (robust_limit(e, e < jnp.inf, size) if threshold is None else threshold)
+    return present & (e <= (robust_limit(e, present, size) if threshold is None else threshold))
 
 
 def _finite(e):

@@ -54,6 +54,7 @@ def text(
     lines += observations.residuals(adjustment, residual_limit, test)
     lines += observations.redundancy(adjustment)
     lines += observations.components(adjustment)
+    lines += observations.downweighted(adjustment, max_rows)
     lines += observations.removals(adjustment)
     return _joined(lines)
 

@@ -160,6 +160,10 @@ def components(adjustment) -> list[str]:
     return lines
 
 
+HALF = 0.5
+"""Image points with less of their weight are named."""
+
+
 def removals(adjustment) -> list[str]:
     """What data snooping took away, in that order, and the parameters fixed for lack of t."""
     lines = []
@@ -176,6 +180,25 @@ def removals(adjustment) -> list[str]:
         lines += heading("Eliminated parameters")
         lines += paragraph(f"Held at 0 because they were not significant, in this order: {names}.")
     return lines
+
+
+def downweighted(adjustment, most: int) -> list[str]:
+    """The image points that robust estimation gave the least weight."""
+    if adjustment.robust is None:
+        return []
+    found, total = adjustment.residuals, len(adjustment.weights)
+    order = np.argsort(adjustment.weights, kind="stable")
+    least = order[adjustment.weights[order] < HALF]
+    rows = [
+        (found["image"][2 * i], found["point"][2 * i], significant(adjustment.weights[i], 2))
+        for i in least[:most]
+    ]
+    lines = heading(f"Robust estimation ({adjustment.robust})")
+    lines += paragraph(
+        f"{len(least)} of {total} image points have less than half their weight"
+        f"{', the least of them:' if rows else '.'}"
+    )
+    return lines + (["", *table(("image", "point", "weight"), rows, "llr")] if rows else [])
 
 
 # --- comparisons ----------------------------------------------------------------------------

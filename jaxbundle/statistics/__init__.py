@@ -20,6 +20,8 @@ from jaxbundle.statistics.reliability import Reliability as Reliability
 from jaxbundle.statistics.reliability import external_reliability as external_reliability
 from jaxbundle.statistics.reliability import minimal_detectable as minimal_detectable
 from jaxbundle.statistics.reliability import reliability as reliability
+from jaxbundle.statistics.robust import ESTIMATORS as ESTIMATORS
+from jaxbundle.statistics.robust import reweight as reweight
 from jaxbundle.statistics.snooping import Removed as Removed
 from jaxbundle.statistics.snooping import snoop as snoop
 from jaxbundle.statistics.validity import Reach as Reach

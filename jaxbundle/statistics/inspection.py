@@ -13,10 +13,10 @@ from jaxtyping import Array, Float
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.adjustment.residuals import Residuals, compiled_residuals
 from jaxbundle.adjustment.schur import Factor
-from jaxbundle.network.arrays import Tangent, Values
+from jaxbundle.network.arrays import Data, Tangent, Values
 from jaxbundle.network.padding import filled, pad_changes, pad_values, without_filling
 from jaxbundle.statistics.cofactors import Cofactors, cofactors, propagate, undamped_factor
-from jaxbundle.statistics.reliability import Reliability, reliability
+from jaxbundle.statistics.reliability import Reliability, held_against, reliability
 
 DETERMINED = 1e-13
 """A pivot of the scaled normal equations below this is rounding."""
@@ -65,6 +65,13 @@ class Inspection:
         found = reliability(self.structure, self.values, self.data, self.cofactors)
         parts = (found.residual, found.redundancy, found.w)
         return Reliability(*(self._rows(part) for part in parts))
+
+    def predicted_tests(self, data: Data) -> Residuals:
+        """v/√(1 + h) of all observations with the weights of `data`, as if none of them had taken
+        part: normalised residuals of those that did not."""
+        _, data, _ = filled(self.problem.structure, data)
+        v, h = held_against(self.structure, self.values, data, self.cofactors)
+        return self._rows(jax.tree.map(lambda v, h: v / np.sqrt(1 + np.asarray(h)), v, h))
 
     def _rows(self, rows: Residuals) -> Residuals:
         given = self.problem.data

@@ -11,9 +11,9 @@ With the residuals divided by their a priori σ (v/σ) and h = diag(J·Q·Jᵀ) 
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Float
 
 from jaxbundle.adjustment.jacobian import BundleJacobian, compiled_jacobian
 from jaxbundle.adjustment.residuals import Residuals, compiled_residuals
@@ -39,6 +39,19 @@ def reliability(
     """Redundancy numbers and test statistics of all observations."""
     residual = compiled_residuals(structure, values, data)
     return _tested(compiled_jacobian(structure, values, data), residual, data, cofactors)
+
+
+def held_against(
+    structure: Structure, values: Values, data: Data, cofactors: Cofactors
+) -> tuple[Residuals, Residuals]:
+    """v/σ and h = diag(J·Q·Jᵀ) of all observations, with cofactors of another adjustment."""
+    residual = compiled_residuals(structure, values, data)
+    return residual, _hat(compiled_jacobian(structure, values, data), cofactors)
+
+
+@eqx.filter_jit
+def _hat(jac, cofactors) -> Residuals:
+    return hat_diagonal(jac, cofactors)
 
 
 @eqx.filter_jit
@@ -104,18 +117,16 @@ def hat_diagonal(jac: BundleJacobian, cofactors: Cofactors) -> Residuals:
     return Residuals(image, control, exterior, parameters, distance)
 
 
-@jax.jit
-def minimal_detectable(sigma, redundancy, delta0: float = 4.13) -> Float[Array, "..."]:
+def minimal_detectable(sigma, redundancy, delta0: float = 4.13) -> Float[np.ndarray, "..."]:
     """Smallest blunder found by the w-test, in the unit of σ (δ0 = 4.13: α 0.1 %, power 80 %)."""
-    return jnp.where(
-        redundancy > UNCONTROLLED,
-        sigma * delta0 / jnp.sqrt(jnp.maximum(redundancy, UNCONTROLLED)),
-        jnp.inf,
+    r = np.asarray(redundancy)
+    return np.where(
+        r > UNCONTROLLED, np.asarray(sigma) * delta0 / np.sqrt(np.maximum(r, UNCONTROLLED)), np.inf
     )
 
 
-@jax.jit
-def external_reliability(redundancy, delta0: float = 4.13) -> Float[Array, "..."]:
+def external_reliability(redundancy, delta0: float = 4.13) -> Float[np.ndarray, "..."]:
     """Largest effect of an undetected blunder on any unknown, in units of that unknown's σ."""
-    r = jnp.maximum(redundancy, UNCONTROLLED)
-    return jnp.where(redundancy > UNCONTROLLED, delta0 * jnp.sqrt((1 - r) / r), jnp.inf)
+    r = np.asarray(redundancy)
+    bounded = np.maximum(r, UNCONTROLLED)
+    return np.where(r > UNCONTROLLED, delta0 * np.sqrt((1 - bounded) / bounded), np.inf)

@@ -1,12 +1,18 @@
-"""Data snooping: remove the worst observation, adjust again, until none is worse than the limit.
+"""Data snooping: remove what the test calls a blunder, adjust again, until nothing is worse.
 
-One at a time, because one blunder spoils the residuals of its neighbours (Baarda 1968). An image
-point goes with both of its coordinates; a tie point that is left with one ray goes too. Removed
-observations keep their rows with weight zero, so nothing is compiled again.
+    |w|  > z(1 − α/2)                        Baarda (1968): each observation by itself
+    |τ|  > τ(1 − α'/2, redundancy)           Pope (1976): the largest of n, α' = 1 − (1 − α)^(1/n)
+
+One blunder spoils the residuals of its neighbours. So of every image and of every point only the
+worst ray goes at a time, and only rays at least half as bad as the worst of all; a control
+coordinate or a distance goes alone. An image point goes with both of its coordinates; a tie point
+that is left with one ray goes too. In the end whatever was removed is held against the adjustment
+it took no part in, by its predicted residual v and the variance σ²·(1 + h) of that: what passes
+comes back. Removed observations keep their rows with weight zero, so nothing is compiled again.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,7 +21,10 @@ import numpy as np
 from jaxbundle.adjustment.problem import Problem, count_rows
 from jaxbundle.network.arrays import Values
 from jaxbundle.statistics.distributions import normal_quantile, tau_quantile
-from jaxbundle.statistics.reliability import Reliability
+from jaxbundle.statistics.inspection import Inspection
+
+TOGETHER = 0.5
+"""Rays are removed together with the worst one if their test is at least this part of its."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,62 +40,110 @@ class Removed:
 def snoop(
     problem: Problem,
     values: Values,
-    adjust_from: Callable[[Problem, Values], tuple[Values, Reliability, float]],
+    adjust_from: Callable[[Problem, Values], Values],
     *,
     test: str = "pope",
     significance: float = 0.001,
     limit: int | None = None,
-    progress: Callable[[Removed], None] | None = None,
 ) -> tuple[Problem, Values, list[Removed]]:
-    """Remove blunders one at a time.
+    """Remove blunders, the worst first.
 
     **Arguments:**
 
-    - `adjust_from(problem, start)`: adjusted values, their reliability, σ̂0.
-    - `test`: `"pope"` (σ a posteriori) or `"baarda"` (σ a priori).
-    - `significance`: α of the single two-sided test; `limit`: at most so many removals.
+    - `adjust_from(problem, start)`: adjusted values.
+    - `test`: `"pope"` (σ a posteriori, the largest of all) or `"baarda"` (σ a priori, each).
+    - `significance`: α, two-sided: with `"pope"` the probability to lose anything of a network
+      without blunders, with `"baarda"` that of one observation.
+    - `limit`: at most so many removals.
 
     **Returns:** the problem without the removed observations, its solution, and what was removed
     in the order of removal.
     """
     if test not in ("pope", "baarda"):
         raise ValueError(f"test must be \"pope\" or \"baarda\", not {test!r}")
-    removed: list[Removed] = []
+    whole, removed, returned = problem, [], set()
     while True:
-        values, found, sigma0 = adjust_from(problem, values)
-        redundancy = problem.counts.redundancy
-        if redundancy < 2 or (limit is not None and len(removed) >= limit):
+        values = adjust_from(problem, values)
+        if problem.counts.redundancy < 2:
             return problem, values, removed
-        scale = sigma0 if test == "pope" else 1.0
-        critical = (
-            tau_quantile(1 - significance / 2, redundancy)
-            if test == "pope"
-            else normal_quantile(1 - significance / 2)
-        )
-        worst = _worst(problem, found, scale)
-        if worst is None or worst.test < critical:
+        found = Inspection(problem, values)
+        critical = _critical(problem, found, test, significance)
+        room = len(removed) if limit is None else limit - len(removed)
+        worst = _worst(problem, found, critical)[: None if limit is None else max(room, 0)]
+        if worst:
+            removed += worst
+            problem = without(problem, *worst)
+            continue
+        back = [r for r in _passing(whole, found, removed, critical) if r.row not in returned]
+        if not back:
             return problem, values, removed
-        removed.append(worst)
-        if progress is not None:
-            progress(worst)
-        problem = without(problem, worst)
+        returned |= {r.row for r in back}
+        removed = [r for r in removed if r not in back]
+        problem = without(whole, *removed)
 
 
-def _worst(problem: Problem, found: Reliability, scale: float) -> Removed | None:
-    """The image point, control coordinate or distance with the largest test value."""
-    image = np.abs(np.asarray(found.w.image)).max(1, initial=0.0, where=np.isfinite(found.w.image))
-    control = np.abs(np.asarray(found.w.control))
-    distance = np.abs(np.asarray(found.w.distance))
-    candidates = []
-    for kind, tests in (("image", image), ("control", control.ravel()), ("distance", distance)):
-        tests = np.where(np.isfinite(tests), tests, -1.0)
-        if tests.size and tests.max() > 0 and scale > 0:
-            row = int(tests.argmax())
-            candidates.append((float(tests[row]) / scale, kind, row))
-    if not candidates:
-        return None
-    value, kind, row = max(candidates)
-    return Removed(kind, row, _name(problem, kind, row), value)
+def _critical(problem: Problem, found: Inspection, test: str, significance: float) -> float:
+    """The greatest |w|, with the a priori σ, that is no blunder."""
+    if test == "baarda":
+        return normal_quantile(1 - significance / 2)
+    counts = problem.counts
+    tested = counts.observations + counts.control + counts.distances
+    of_one = -np.expm1(np.log1p(-significance) / max(tested, 1))
+    sigma0 = float(np.sqrt(found.vtpv / counts.redundancy))
+    return sigma0 * tau_quantile(1 - of_one / 2, counts.redundancy)
+
+
+def _worst(problem: Problem, found: Inspection, critical: float) -> list[Removed]:
+    """What has to go now, the worst first."""
+    w, sigma0 = found.reliability.w, np.sqrt(found.vtpv / problem.counts.redundancy)
+    image = _finite(w.image).max(1, initial=0.0)
+    most = {
+        "image": image,
+        "control": _finite(w.control).ravel(),
+        "distance": _finite(w.distance),
+    }
+    kind = max(most, key=lambda kind: most[kind].max(initial=0.0))
+    largest = most[kind].max(initial=0.0)
+    if not largest > critical:
+        return []
+    rows = [int(most[kind].argmax())]
+    if kind == "image":
+        s = problem.structure
+        candidates = np.flatnonzero(image > max(critical, TOGETHER * largest))
+        candidates = candidates[np.argsort(-image[candidates], kind="stable")]
+        by_image = np.unique(np.asarray(s.image)[candidates], return_index=True)[1]
+        by_point = np.unique(np.asarray(s.point)[candidates], return_index=True)[1]
+        rows = candidates[np.intersect1d(by_image, by_point)].tolist()
+    scale = sigma0 if sigma0 > 0 else 1.0
+    return [
+        Removed(kind, row, _name(problem, kind, row), float(most[kind][row] / scale))
+        for row in rows
+    ]
+
+
+def _passing(
+    whole: Problem, found: Inspection, removed: Sequence[Removed], critical: float
+) -> list[Removed]:
+    """Removed observations that agree with the adjustment without them."""
+    if not removed:
+        return []
+    tests = found.predicted_tests(whole.data)
+    free = np.asarray(found.problem.structure.point_free).any(1)
+    set_aside = np.asarray(whole.structure.point_free).any(1) & ~free
+    value = {
+        "image": np.where(
+            set_aside[np.asarray(whole.structure.point)], np.inf, _finite(tests.image).max(1)
+        ),
+        "control": _finite(tests.control).ravel(),
+        "distance": _finite(tests.distance),
+    }
+    return [r for r in removed if value[r.kind][r.row] < critical]
+
+
+def _finite(tests) -> np.ndarray:
+    """|tests|, 0 where there is none."""
+    tests = np.abs(np.asarray(tests))
+    return np.where(np.isfinite(tests), tests, 0.0)
 
 
 def _name(problem: Problem, kind: str, row: int) -> str:
@@ -101,34 +158,38 @@ def _name(problem: Problem, kind: str, row: int) -> str:
     return f"distance {a}–{b}"
 
 
-def without(problem: Problem, removed: Removed) -> Problem:
-    """The problem with one observation's weight set to zero, and a lone tie point set aside."""
+def without(problem: Problem, *removed: Removed) -> Problem:
+    """The problem with the weights of some observations set to zero, and lone tie points set
+    aside."""
     s, data = problem.structure, problem.data
-    if removed.kind == "control":
-        i, axis = divmod(removed.row, 3)
-        weight = data.control_weight.at[i, axis].set(0.0)
-        data = eqx.tree_at(lambda d: d.control_weight, data, weight)
-    elif removed.kind == "distance":
-        weight = data.distance_weight.at[removed.row].set(0.0)
-        data = eqx.tree_at(lambda d: d.distance_weight, data, weight)
-    else:
-        weight = np.array(data.image_weight)
-        weight[removed.row] = 0.0
-        point = int(s.point[removed.row])
-        rays = np.flatnonzero(np.asarray(s.point) == point)
-        alone = (weight[rays] > 0).any(1).sum() < 2
-        if alone and problem.network.points.role[point] == "tie" and point not in s.kept:
-            weight[rays] = 0.0
-            s = eqx.tree_at(
-                lambda s: (s.point_free, s.eliminated, s.datum_weight),
-                dataclasses.replace(s, all_free=False),
-                (
-                    s.point_free.at[point].set(0.0),
-                    s.eliminated.at[point].set(0.0),
-                    s.datum_weight.at[point].set(0.0),
-                ),
-            )
-        data = eqx.tree_at(lambda d: d.image_weight, data, jnp.asarray(weight))
+    rows = {kind: [r.row for r in removed if r.kind == kind]
+            for kind in ("image", "control", "distance")}  # fmt: skip
+    image, control = np.array(data.image_weight), np.array(data.control_weight)
+    distance = np.array(data.distance_weight)
+    image[rows["image"]] = 0.0
+    control.reshape(-1)[rows["control"]] = 0.0
+    distance[rows["distance"]] = 0.0
+
+    point = np.asarray(s.point)
+    rays = np.bincount(point, (image > 0).any(1), minlength=s.points)
+    touched = np.unique(point[rows["image"]])
+    tie = problem.network.points.has_role("tie")
+    lone = np.setdiff1d(touched[(rays[touched] < 2) & tie[touched]], np.asarray(s.kept))
+    if len(lone):
+        image[np.isin(point, lone)] = 0.0
+        s = eqx.tree_at(
+            lambda s: (s.point_free, s.eliminated, s.datum_weight),
+            dataclasses.replace(s, all_free=False),
+            (
+                s.point_free.at[lone].set(0.0),
+                s.eliminated.at[lone].set(0.0),
+                s.datum_weight.at[lone].set(0.0),
+            ),
+        )
+    data = eqx.tree_at(
+        lambda d: (d.image_weight, d.control_weight, d.distance_weight), data,
+        tuple(map(jnp.asarray, (image, control, distance))),
+    )  # fmt: skip
     return dataclasses.replace(
         problem, structure=s, data=data, counts=count_rows(s, data)
     )

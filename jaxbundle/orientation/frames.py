@@ -1,0 +1,93 @@
+"""Models brought into one frame: onto control and given positions, onto each other, or to scale."""
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.network.tables import Network
+from jaxbundle.orientation import many
+from jaxbundle.orientation.growth import Model, controlled
+from jaxbundle.orientation.sights import Sights
+
+APART = 3.0
+"""Points that miss the similarity by more than so many times the median take no part in it."""
+FEW = 6
+"""So few points are all believed: none can be told from the others."""
+ROUNDS = 3
+
+
+def onto_the_given(network: Network, model: Model) -> Model | None:
+    """The model in the frame of control points and of images whose position is given, else of the
+    approximate coordinates of points; None where there are not three."""
+    points, images = network.points, network.images
+    control = controlled(points) & model.known
+    stations = model.placed & np.isfinite(images.position).all(1)
+    found = similarity(
+        np.concatenate([model.X[control], model.X0[stations]]),
+        np.concatenate([points.position[control], images.position[stations]]),
+    )
+    if found is None:
+        tie = np.isfinite(points.position).all(1) & model.known & ~points.has_role("check")
+        found = similarity(model.X[tie], points.position[tie])
+    return None if found is None else model.moved(*found)
+
+
+def to_scale(network: Network, model: Model) -> tuple[Model, str]:
+    """The model with the scale of the distances, if there are any, and what it refers to."""
+    scale = scale_of_distances(network, model)
+    if scale is None:
+        return model, "in a frame and a scale of its own"
+    return model.moved(scale * np.eye(3), np.zeros(3)), "to scale, in a frame of its own"
+
+
+def scale_of_distances(network: Network, model: Model) -> float | None:
+    """The median of measured distances by those in the model."""
+    distances = network.distances
+    there = model.known[distances.points].all(1) if len(distances) else np.zeros(0, bool)
+    if not there.any():
+        return None
+    a, b = model.X[distances.points[there]].transpose(1, 0, 2)
+    return float(np.median(distances.value[there] / np.linalg.norm(a - b, axis=1)))
+
+
+def joined(sights: Sights, model: Model, part: Model) -> Model | None:
+    """A model with what a second one knows besides; None where nothing connects them.
+
+    The similarity is that of the points both know, or, where they have an image in common, the one
+    of its pose and of the distances to the points it sees."""
+    both = model.known & part.known
+    if not both.any():
+        return None
+    shared = np.flatnonzero(model.placed & part.placed)
+    if len(shared):
+        seen = np.bincount(sights.image, both[sights.point], minlength=sights.images)
+        found = _by_an_image(model, part, shared[seen[shared].argmax()], both)
+    else:
+        found = similarity(part.X[both], model.X[both])
+    if found is None:
+        return None
+    part = part.moved(*found)
+    image, point = part.placed & ~model.placed, part.known & ~model.known
+    choose = lambda rows, new, old: np.where(rows.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+    return Model(
+        choose(image, part.X0, model.X0), choose(image, part.M, model.M), model.placed | image,
+        choose(point, part.X, model.X), model.known | point, model.held,
+    )  # fmt: skip
+
+
+def _by_an_image(model, part, image, both):
+    to, off = (np.linalg.norm(m.X[both] - m.X0[image], axis=1) for m in (model, part))
+    A = np.median(to / off) * model.M[image].T @ part.M[image]
+    return A, model.X0[image] - A @ part.X0[image]
+
+
+def similarity(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]):
+    """A and t of X' = A·X + t with the points that agree; None: fewer than three, or on a line."""
+    good = np.ones(len(source), bool)
+    for _ in range(ROUNDS):
+        found = many.similarity(source, target, good.astype(float)) if good.sum() >= 3 else None
+        if found is None or len(source) < FEW:
+            return found
+        A, t = found
+        off = np.linalg.norm(source @ A.T + t - target, axis=1)
+        good = off <= APART * np.median(off) + 1e-9 * np.ptp(target, axis=0).max()
+    return found

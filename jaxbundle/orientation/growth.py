@@ -1,0 +1,198 @@
+"""A model of images and points that grows: images from known points, points from placed images.
+
+    known points ──resection──▶ images ──intersection──▶ more points ──▶ …
+
+An image is placed from `LEAST` known points or more of which most agree; those with the most known
+points go first, so that every later one finds more. A point is known from two rays or more that
+meet at more than `NARROW` and agree. All with the tolerance of start values: the adjustment that
+follows does the rest.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxbundle.network.tables import Points
+from jaxbundle.orientation import many
+from jaxbundle.orientation.sights import Sights
+from jaxbundle.orientation.status import Status
+
+LEAST = 4
+"""Known points an image needs: three, and one to choose among their solutions."""
+ENOUGH = 12
+"""An image with so many known points need not wait for better ones."""
+AGREE = 0.4
+"""Least part of the points of an image, or a pair, that must agree."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Demands:
+    """On an intersected point: its least angle of intersection (radians), and how far its rays may
+    miss it, in tolerances."""
+
+    angle: float
+    miss: float
+
+
+FOR_OTHERS = Demands(0.02, 1.0)
+"""A point from which images are placed."""
+FOR_ITSELF = Demands(1e-3, 4.0)
+"""A point that needs a start value."""
+
+
+@dataclasses.dataclass
+class Model:
+    """Images and points of one frame; a point that is `held` (control) is never intersected."""
+
+    X0: Float[np.ndarray, "images 3"]
+    M: Float[np.ndarray, "images 3 3"]
+    placed: Bool[np.ndarray, " images"]
+    X: Float[np.ndarray, "points 3"]
+    known: Bool[np.ndarray, " points"]
+    held: Bool[np.ndarray, " points"]
+
+    @classmethod
+    def empty(cls, sights: Sights) -> "Model":
+        images, points = sights.images, sights.points
+        return cls(
+            np.full((images, 3), np.nan), np.full((images, 3, 3), np.nan), np.zeros(images, bool),
+            np.full((points, 3), np.nan), np.zeros(points, bool), np.zeros(points, bool),
+        )  # fmt: skip
+
+    def place(self, image, X0, M) -> None:
+        """An image, or several, with their poses."""
+        self.X0[image], self.M[image], self.placed[image] = X0, M, True
+
+    def moved(self, A: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"]) -> "Model":
+        """The same model in the frame X' = A·X + t, A a rotation times a scale."""
+        R = A / np.cbrt(np.linalg.det(A))
+        return dataclasses.replace(
+            self, X0=self.X0 @ A.T + t, M=self.M @ R.T, X=self.X @ A.T + t
+        )
+
+
+def controlled(points: Points) -> Bool[np.ndarray, " points"]:
+    """Points whose three coordinates are known: fixed, or control with all axes."""
+    return points.has_role("fixed") | (
+        points.has_role("control") & ~np.isposinf(points.sigma).any(1)
+    )
+
+
+def grow(
+    sights: Sights, model: Model, among: Bool[np.ndarray, " images"] | None = None
+) -> None:
+    """Place what can be placed of the images (`among` these), and intersect the points they see."""
+    among = np.ones(sights.images, bool) if among is None else among
+    tried = np.zeros(sights.images, int)
+    intersect(sights, model, FOR_OTHERS)
+    while True:
+        known = np.bincount(sights.image, model.known[sights.point], minlength=sights.images)
+        waiting = among & ~model.placed & (known >= LEAST) & (known > tried)
+        if not waiting.any():
+            break
+        enough = min(ENOUGH, known[waiting].max())
+        chosen = np.flatnonzero(waiting & (known >= enough))
+        tried[chosen] = known[chosen]
+        if place_images(sights, model, chosen):
+            intersect(sights, model, FOR_OTHERS)
+
+
+def finish(sights: Sights, model: Model) -> None:
+    """Everything once more, images from all their points and points from all their rays."""
+    for _ in range(2):
+        intersect(sights, model, FOR_ITSELF, again=True)
+        _refine(sights, model)
+    intersect(sights, model, FOR_ITSELF, again=True)
+
+
+def place_images(sights: Sights, model: Model, images) -> int:
+    """Resect images from the known points they see; returns how many could be placed."""
+    rows = [_known_rows(sights, model, image) for image in images]
+    X0, M, part = many.resect(
+        [sights.xy[r] for r in rows], [model.X[sights.point[r]] for r in rows],
+        sights.tolerance[images],
+    )  # fmt: skip
+    number = np.minimum([len(r) for r in rows], many.SLOTS)
+    good = (part >= AGREE) & (part * number >= LEAST)
+    for i, image in enumerate(images):
+        if good[i]:
+            model.place(image, X0[i], M[i])
+    return int(good.sum())
+
+
+def _known_rows(sights, model, image):
+    rows = np.arange(sights.image.size)[sights.of(image)]
+    return rows[model.known[sights.point[rows]]]
+
+
+def _refine(sights: Sights, model: Model) -> None:
+    """All placed images improved by the points that agree."""
+    images = np.flatnonzero(model.placed)
+    error = misclosures(sights, model)
+    rows = [_known_rows(sights, model, image) for image in images]
+    weights = [(error[r] < sights.tolerance[i]).astype(float) for r, i in zip(rows, images)]
+    use = [k for k, w in enumerate(weights) if w[many.spread(len(w))].sum() >= LEAST]
+    if not use:
+        return
+    images, rows = images[use], [rows[k] for k in use]
+    model.X0[images], model.M[images] = many.refine(
+        (model.X0[images], model.M[images]), [sights.xy[r] for r in rows],
+        [model.X[sights.point[r]] for r in rows], [weights[k] for k in use],
+    )  # fmt: skip
+
+
+def misclosures(sights: Sights, model: Model) -> Float[np.ndarray, " n"]:
+    """|computed − measured| of every sight, c = 1; infinite behind a camera, NaN if not placed."""
+    ray = model.X[sights.point] - model.X0[sights.image]
+    r, s, q = np.einsum("nij,nj->in", model.M[sights.image], ray)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error = np.hypot(-r / q - sights.xy[:, 0], -s / q - sights.xy[:, 1])
+    return np.where(q >= 0, np.inf, error)
+
+
+def intersect(sights: Sights, model: Model, demands: Demands, again: bool = False) -> None:
+    """Intersect the points that are not known yet, or all that are not held `again`.
+
+    Of a point whose rays disagree the worst ray is left aside, as long as two remain.
+    """
+    rows = np.flatnonzero(model.placed[sights.image])
+    rows = rows[np.argsort(sights.point[rows], kind="stable")]
+    point = sights.point[rows]
+    first = np.searchsorted(point, np.arange(sights.points))
+    number = np.bincount(point, minlength=sights.points)
+    wanted = np.flatnonzero((number >= 2) & ~model.held & (again | ~model.known))
+    if not len(wanted):
+        return
+    place = np.minimum(np.arange(many.RAYS), number[wanted, None] - 1)
+    scale = np.maximum((number[wanted, None] - 1) / (many.RAYS - 1), 1.0)
+    row = rows[first[wanted, None] + (place * scale).astype(int)]
+    weights = (np.arange(many.RAYS) < number[wanted, None]).astype(float)
+    X0 = model.X0[sights.image[row]]
+    xy1 = np.pad(sights.xy[row], ((0, 0), (0, 0), (0, 1)), constant_values=-1.0)
+    rays = np.einsum("nkij,nki->nkj", model.M[sights.image[row]], xy1)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    tolerance = demands.miss * sights.tolerance[sights.image[row]]
+
+    X, good = np.full((len(wanted), 3), np.nan), np.zeros(len(wanted), bool)
+    todo = np.arange(len(wanted))
+    while len(todo):
+        found, angle, status = many.intersect(X0[todo], rays[todo], weights[todo])
+        off = _across(found[:, None] - X0[todo], rays[todo]) / tolerance[todo] * weights[todo]
+        sound = status == int(Status.SOUND)
+        agree = sound & (off.max(1) < 1)
+        X[todo], good[todo] = found, agree & (angle > demands.angle)
+        # blunders: two rays that contradict each other say nothing about which is wrong
+        more = ~agree & (weights[todo].sum(1) > 2) & np.isfinite(off).all(1)
+        weights[todo[more], off[more].argmax(1)] = 0.0
+        todo = todo[more]
+    model.known[wanted] = good
+    model.X[wanted] = np.where(good[:, None], X, np.nan)
+
+
+def _across(d, rays):
+    """Tangent of the angle between a direction and a unit ray; large if it points backwards."""
+    along = np.einsum("nkj,nkj->nk", d, rays)
+    across = np.linalg.norm(np.cross(d, rays), axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(along > 0, across / along, 1e3)

@@ -1,0 +1,179 @@
+"""Many orientations at once: lists of any length in, one compiled program for all of them.
+
+Every item is filled up with absent observations (weight 0) to `SLOTS`, and items to full lanes; of
+more observations the spread is kept, not the number. On the host, numpy in and out.
+"""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.geometry import (
+    matrix_from_omega_phi_kappa,
+    omega_phi_kappa_from_matrix,
+    transform_point,
+)
+
+from .absolute import absolute_orientation
+from .intersection import intersection
+from .pose import Pose
+from .resection import refine_resection
+from .robust import robust_relative_orientation, robust_resection
+from .status import Status
+
+SLOTS = 64
+"""Points of an image, of a pair, of two models."""
+RAYS = 8
+"""Rays of a point."""
+LANES, POINT_LANES = 8, 1024
+
+
+def resect(
+    xy: Sequence[Float[np.ndarray, "_ 2"]],
+    X: Sequence[Float[np.ndarray, "_ 3"]],
+    tolerance: Float[np.ndarray, " images"],
+):
+    """X0, M of images, and the part of their points that agree within `tolerance` (c = 1); 0: no
+    pose."""
+    rows = [spread(len(a)) for a in xy]
+    return _in_lanes(
+        _resect, LANES, _filled(xy, rows, SLOTS), _filled(X, rows, SLOTS),
+        _weights(rows, SLOTS), tolerance,
+    )  # fmt: skip
+
+
+def refine(poses, xy, X, weights):
+    """X0, M of images improved from start values by points of weight > 0."""
+    rows = [spread(len(a)) for a in xy]
+    return _in_lanes(
+        _refine, LANES, *poses, _filled(xy, rows, SLOTS), _filled(X, rows, SLOTS),
+        _filled(weights, rows, SLOTS),
+    )  # fmt: skip
+
+
+def orient_pairs(xy1, xy2, tolerance):
+    """M, b of pairs of images, the part of the points that agree within `tolerance`, and the
+    median angle of intersection (radians)."""
+    rows = [spread(len(a)) for a in xy1]
+    return _in_lanes(
+        _orient_pair, LANES, _filled(xy1, rows, SLOTS), _filled(xy2, rows, SLOTS),
+        _weights(rows, SLOTS), tolerance,
+    )  # fmt: skip
+
+
+def intersect(X0, rays, weights):
+    """X, angle of intersection and status of points with up to `RAYS` rays, [n, RAYS, …]."""
+    return _in_lanes(_intersect, POINT_LANES, X0, rays, weights)
+
+
+def similarity(source, target, weights):
+    """A = exp(s)·R and t of X' = A·X + t between two lists of points; None of points on a line."""
+    rows = [spread(len(source))]
+    A, t, status = _in_lanes(
+        _similarity, 1, _filled([source], rows, SLOTS), _filled([target], rows, SLOTS),
+        _filled([weights], rows, SLOTS) * _weights(rows, SLOTS),
+    )  # fmt: skip
+    return (A[0], t[0]) if status[0] == int(Status.SOUND) else None
+
+
+def matrices(angles):
+    """M of ω, φ, κ."""
+    return _in_lanes(_matrix, POINT_LANES, angles)[0]
+
+
+def angles(M):
+    """ω, φ, κ of M."""
+    return _in_lanes(_angles, POINT_LANES, M)[0]
+
+
+def spread(number: int, most: int = SLOTS) -> np.ndarray:
+    """Up to `most` of a number of rows, evenly."""
+    if number <= most:
+        return np.arange(number)
+    return np.linspace(0, number - 1, most).astype(int)
+
+
+@jax.jit
+@jax.vmap
+def _resect(xy, X, weights, tolerance):
+    key = jax.random.key(0)
+    found, good = robust_resection(key, xy, X, weights, threshold=tolerance)
+    sound = (found.status == int(Status.SOUND)) & jnp.all(jnp.isfinite(found.pose.X0))
+    part = jnp.sum(good) / jnp.sum(weights > 0)
+    return found.pose.X0, found.pose.M, jnp.where(sound, part, 0.0)
+
+
+@jax.jit
+@jax.vmap
+def _refine(X0, M, xy, X, weights):
+    found = refine_resection(Pose(X0, M), xy, X, weights).pose
+    good = jnp.all(jnp.isfinite(found.X0)) & jnp.all(jnp.isfinite(found.M))
+    return jnp.where(good, found.X0, X0), jnp.where(good, found.M, M)
+
+
+@jax.jit
+@jax.vmap
+def _orient_pair(xy1, xy2, weights, tolerance):
+    key = jax.random.key(0)
+    found, good = robust_relative_orientation(key, xy1, xy2, weights, threshold=tolerance)
+    ray = lambda xy: jnp.append(xy, -1.0) / jnp.sqrt(1 + xy @ xy)
+    one, two = jax.vmap(ray)(xy1), jax.vmap(ray)(xy2) @ found.M
+    angle = jnp.arctan2(jnp.linalg.norm(jnp.cross(one, two), axis=1), jnp.sum(one * two, 1))
+    number = jnp.sum(good)
+    ordered = jnp.sort(jnp.where(good, angle, jnp.inf))
+    part = jnp.where(found.status == int(Status.SOUND), number / jnp.sum(weights > 0), 0.0)
+    return found.M, found.b, part, jnp.where(number > 0, ordered[number // 2], 0.0)
+
+
+@jax.jit
+@jax.vmap
+def _intersect(X0, rays, weights):
+    found = intersection(X0, rays, weights)
+    return found.X, found.angle, found.status
+
+
+@jax.jit
+@jax.vmap
+def _similarity(source, target, weights):
+    found = absolute_orientation(source, target, weights)
+    t = transform_point(found.tau, jnp.zeros(3))
+    A = jax.vmap(transform_point, (None, 0), 1)(found.tau, jnp.eye(3)) - t[:, None]
+    return A, t, found.status
+
+
+@jax.jit
+@jax.vmap
+def _matrix(angles):
+    return (matrix_from_omega_phi_kappa(angles),)
+
+
+@jax.jit
+@jax.vmap
+def _angles(M):
+    return (omega_phi_kappa_from_matrix(M),)
+
+
+def _filled(columns, rows, slots):
+    """[items, slots, …]: the chosen rows of each column, the last one repeated."""
+    return np.stack([np.asarray(a)[_fill(r, slots)] for a, r in zip(columns, rows)])
+
+
+def _fill(rows, slots):
+    return np.concatenate([rows, np.full(slots - len(rows), rows[-1], int)])
+
+
+def _weights(rows, slots):
+    return np.stack([(np.arange(slots) < len(r)).astype(float) for r in rows])
+
+
+def _in_lanes(program, lanes, *arrays):
+    """The program applied to items, `lanes` at a time; missing ones repeat the last."""
+    number = len(arrays[0])
+    parts = []
+    for first in range(0, number, lanes):
+        chosen = np.minimum(np.arange(first, first + lanes), number - 1)
+        parts.append(jax.device_get(program(*(np.asarray(a)[chosen] for a in arrays))))
+    return tuple(np.concatenate(column)[:number] for column in zip(*parts))

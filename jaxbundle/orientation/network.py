@@ -1,0 +1,297 @@
+"""The start values of a whole network: what can be placed first, and what follows from it.
+
+1. Images with a given exterior orientation stand, control points are known: images that see enough
+   of them are resected, points intersected, more images resected, … (`growth`).
+2. Where nothing can begin so, given coordinates of tie points count as known.
+3. Where nothing can begin so either, or images are left, a model begins with two of them: of the
+   pairs with many points in common one whose rays meet at good angles, oriented relatively (five
+   points). It grows; what it does not reach follows by a pair of a placed and a new image, joined
+   to it. In the end a similarity takes it onto control points or given positions (`frames`);
+   without these it keeps its own frame.
+
+A plane has two relative orientations, and of two pictures from one place every one is wrong: a pair
+from which little grows is replaced by the next.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Bool
+from scipy.sparse import coo_array, triu
+
+from jaxbundle.errors import NotSolvedError
+from jaxbundle.network.check import check_tables
+from jaxbundle.network.columns import count, some
+from jaxbundle.network.sightings import keep_images, keep_points
+from jaxbundle.network.tables import Network
+from jaxbundle.orientation import many
+from jaxbundle.orientation.frames import joined, onto_the_given, to_scale
+from jaxbundle.orientation.growth import (
+    AGREE,
+    FOR_OTHERS,
+    LEAST,
+    Model,
+    controlled,
+    finish,
+    grow,
+    misclosures,
+)
+from jaxbundle.orientation.sights import Sights, sights
+
+IN_COMMON = 6
+"""Points two images must share to begin with."""
+PAIRS = 16
+"""Pairs whose relative orientation is looked at."""
+SEEDS = 6
+"""Pairs a model is grown from, at most."""
+OUT_OF_THE_QUESTION = 3.0
+"""Image points that miss by more than so many tolerances are left out."""
+MOST = 0.8
+"""A model in which this part of the image points finds its place need not compete."""
+WIDE = 0.5
+"""Angle of intersection, radians, beyond which wider is no better."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Oriented:
+    """A network with start values; `images`, `points`: why those that are not in it were not
+    placed; `frame`: what the coordinates refer to."""
+
+    network: Network
+    frame: str
+    images: Mapping[str, str]
+    points: Mapping[str, str]
+
+    def __str__(self) -> str:
+        placed, known = len(self.network.images), len(self.network.points)
+        lines = [
+            f"placed {count(placed, 'image')} of {placed + len(self.images)} and "
+            f"{count(known, 'point')} of {known + len(self.points)}, {self.frame}"
+        ]
+        for thing, reasons in (("image", self.images), ("point", self.points)):
+            lines += [f"{thing} {id} not placed: {why}" for id, why in reasons.items()]
+        return "\n".join(lines)
+
+
+def lacks_start_values(network: Network) -> bool:
+    """Whether an image or a tie point has no start value."""
+    images, points = network.images, network.points
+    tie = points.has_role("tie") | (points.has_role("control") & ~controlled(points))
+    return bool(
+        np.isnan(images.position).any()
+        or np.isnan(images.angles).any()
+        or np.isnan(points.position[tie]).any()
+    )
+
+
+def orient(network: Network) -> Oriented:
+    """Find the start values a network lacks; those it has stay.
+
+    The principal distance of a camera should be right to some per cent; its distortion may be
+    unknown, and nearly half of the measurements of an image wrong.
+
+    **Returns:** the network with start values; images and points that could not be placed are left
+    out of it and named with the reason.
+
+    **Raises:** `InputError` for bad tables; `NotSolvedError` where no image could be placed.
+    """
+    network = check_tables(network)
+    seen = sights(network)
+    model, frame = _model(network, seen)
+    if not model.placed.any():
+        why = _why_nothing(network, seen)
+        raise NotSolvedError(f"no start values found: {why}", _names(network))
+    return _result(network, seen, model, frame)
+
+
+def _model(network: Network, seen: Sights) -> tuple[Model, str]:
+    model, frame = _given(network, seen), "in the frame given"
+    grow(seen, model)
+    if not model.placed.any():
+        approximate = _with_approximate_points(network, model)
+        grow(seen, approximate)
+        model = approximate if approximate.placed.any() else model
+    fixed = model.placed.any()
+    while not model.placed.all():
+        part = _from_a_pair(seen, model)
+        if part is None:
+            break
+        model = part if not model.placed.any() else joined(seen, model, part)
+        grow(seen, model)
+        if not fixed and (moved := onto_the_given(network, model)):
+            fixed, frame = True, "in the frame given"
+            model = _with_control(network, moved)
+            grow(seen, model)
+    finish(seen, model)
+    return (model, frame) if fixed else to_scale(network, model)
+
+
+def _given(network: Network, seen: Sights) -> Model:
+    """Images with all six start values, points with all three coordinates known."""
+    model, images = Model.empty(seen), network.images
+    there = np.isfinite(images.position).all(1) & np.isfinite(images.angles).all(1)
+    if there.any():
+        model.place(there, images.position[there], many.matrices(images.angles[there]))
+    return _with_control(network, model)
+
+
+def _with_control(network: Network, model: Model) -> Model:
+    held = controlled(network.points)
+    X = np.where(held[:, None], network.points.position, model.X)
+    return dataclasses.replace(model, X=X, known=model.known | held, held=held)
+
+
+def _with_approximate_points(network: Network, model: Model) -> Model:
+    points = network.points
+    given = np.isfinite(points.position).all(1) & ~points.has_role("check")
+    X = np.where(given[:, None], points.position, model.X)
+    return dataclasses.replace(model, X=X, known=model.known | given, placed=model.placed.copy())
+
+
+def _from_a_pair(seen: Sights, model: Model) -> Model | None:
+    """The best of the models that grow from a few good pairs of the images not placed; if some are
+    placed, from pairs with one of them, to a model that can be joined to theirs."""
+    new, linked = ~model.placed, model.placed.any()
+    old = _neighbours(seen, new) & model.placed
+    best, most = None, 0
+    for image, other, M, b in _good_pairs(seen, new | old, old, linked):
+        part = Model.empty(seen)
+        part.place(image, np.zeros(3), np.eye(3))
+        part.place(other, b, M)
+        grow(seen, part, new | old)
+        rows = new[seen.image]
+        good = int((misclosures(seen, part) < seen.tolerance[seen.image])[rows].sum())
+        if good > most and not (linked and joined(seen, model, part) is None):
+            best, most = part, good
+        if most >= MOST * rows.sum():
+            break
+    return best
+
+
+def _neighbours(seen: Sights, images: Bool[np.ndarray, " images"]) -> Bool[np.ndarray, " images"]:
+    """The images that share enough points with some of these."""
+    of_these = np.zeros(seen.points, bool)
+    of_these[seen.point[images[seen.image]]] = True
+    return np.bincount(seen.image, of_these[seen.point], minlength=seen.images) >= IN_COMMON
+
+
+def _good_pairs(seen: Sights, among: Bool[np.ndarray, " images"], old, linked: bool):
+    """Pairs and their relative orientations, the most promising first; `linked`: of an old image
+    and another."""
+    pairs, common = _pairs_in_common(seen, among, old, linked)
+    if not len(pairs):
+        return
+    xy = [_common_points(seen, *pair) for pair in pairs]
+    tolerance = seen.tolerance[pairs].mean(1)
+    M, b, part, angle = many.orient_pairs([a for a, _ in xy], [b for _, b in xy], tolerance)
+    worth = np.sqrt(common) * part * np.minimum(angle, WIDE)
+    usable = (part >= AGREE) & (angle > FOR_OTHERS.angle)
+    for k in [k for k in np.argsort(-worth) if usable[k]][:SEEDS]:
+        yield *pairs[k], M[k], b[k]
+
+
+def _pairs_in_common(seen: Sights, among, old, linked):
+    """Up to `PAIRS` pairs of images, and the number of their points: those with the most, and
+    others with enough, which lie wider apart."""
+    rows = among[seen.image]
+    shape = (seen.images, seen.points)
+    sees = coo_array((np.ones(rows.sum(), int), (seen.image[rows], seen.point[rows])), shape)
+    sees = sees.tocsr()
+    common = triu(sees @ sees.T, k=1)
+    use = (common.data >= IN_COMMON) & ((old[common.row] != old[common.col]) | (not linked))
+    pairs, number = np.stack([common.row, common.col], 1)[use], common.data[use]
+    order = np.argsort(-number, kind="stable")
+    enough = order[number[order] >= 0.3 * number.max(initial=0)]
+    chosen = np.unique(np.concatenate(
+        [order[: PAIRS // 2], enough[many.spread(len(enough), PAIRS - PAIRS // 2)]]
+    ))
+    return pairs[chosen], number[chosen]
+
+
+def _common_points(seen: Sights, image: int, other: int):
+    one, two = seen.of(image), seen.of(other)
+    _, k, l = np.intersect1d(seen.point[one], seen.point[two], return_indices=True)
+    return seen.xy[one][k], seen.xy[two][l]
+
+
+def _result(network: Network, seen: Sights, model: Model, frame: str) -> Oriented:
+    images, points = network.images, network.points
+    position, angles = images.position.copy(), images.angles.copy()
+    lacking = model.placed & ~np.isfinite(np.concatenate([position, angles], 1)).all(1)
+    position[lacking] = model.X0[lacking]
+    if lacking.any():
+        angles[lacking] = many.angles(model.M[lacking])
+    X = np.where(
+        (model.known & ~np.isfinite(points.position).all(1))[:, None], model.X, points.position
+    )
+    wrong = _contradicting(network, seen, model)
+    keep = model.placed
+    known = np.isfinite(X).all(1)
+    reasons = _reasons(network, seen, model, known)
+    rays = network.observations
+    network = network.replace(
+        images=dataclasses.replace(images, position=position, angles=angles),
+        points=dataclasses.replace(points, position=X),
+        observations=rays.take(np.setdiff1d(np.arange(len(rays)), wrong)),
+    )
+    network = keep_points(keep_images(network, keep), known)
+    said = [
+        f"left out {count(len(found), thing)} for which no start values were found: "
+        + some((f"{id} ({why})" for id, why in found.items()), 5, str)
+        for thing, found in zip(("image", "point"), reasons) if found
+    ]  # fmt: skip
+    if len(wrong):
+        names = (f"{points.id[rays.point[k]]} in {images.id[rays.image[k]]}" for k in wrong)
+        said.append(
+            f"left out {count(len(wrong), 'image point')} that contradict the start values "
+            f"altogether: {some(names, 5, str)}"
+        )
+    return Oriented(network.warn(f"start values found, {frame}", *said), frame, *reasons)
+
+
+def _contradicting(network: Network, seen: Sights, model: Model):
+    """Rows of the observations of known points in placed images that are out of the question."""
+    misclosure = misclosures(seen, model) / seen.tolerance[seen.image]
+    return seen.row[np.flatnonzero(misclosure > OUT_OF_THE_QUESTION)]
+
+
+def _reasons(network: Network, seen: Sights, model: Model, known):
+    rays = np.bincount(seen.image, minlength=seen.images)
+    of_known = np.bincount(seen.image, model.known[seen.point], minlength=seen.images).astype(int)
+    images = {}
+    for image in np.flatnonzero(~model.placed):
+        if of_known[image] < LEAST:
+            why = f"it sees {of_known[image]} known points of {rays[image]}; {LEAST} are needed"
+        else:
+            why = (
+                f"fewer than {AGREE:.0%} of the {of_known[image]} known points it sees agree on a "
+                "pose: look for wrong point numbers, or a wrong principal distance"
+            )
+        images[network.images.id[image]] = why
+    placed = model.placed[seen.image]
+    by_point = np.bincount(seen.point[placed], minlength=seen.points)
+    points = {}
+    for point in np.flatnonzero(~known):
+        if by_point[point] < 2:
+            why = f"seen in {count(by_point[point], 'placed image')}; 2 are needed"
+        else:
+            why = f"its {by_point[point]} rays do not meet, or are parallel"
+        points[network.points.id[point]] = why
+    return images, points
+
+
+def _why_nothing(network: Network, seen: Sights) -> str:
+    rays = np.bincount(seen.image, minlength=seen.images)
+    control = np.bincount(seen.image, controlled(network.points)[seen.point], minlength=seen.images)
+    best = int(control.argmax())
+    return (
+        f"no image sees {LEAST} control points that agree ({int(control[best])} in "
+        f"{network.images.id[best]!r} at most), and no two images share {IN_COMMON} points whose "
+        f"rays meet at an angle (up to {rays.max()} points in an image); measure more points in "
+        "common, or give start values"
+    )
+
+
+def _names(network: Network) -> list[str]:
+    return [f"image {id}" for id in network.images.id]

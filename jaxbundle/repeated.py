@@ -1,0 +1,144 @@
+"""Adjustments repeated: robust estimation, data snooping, variance components, elimination."""
+
+import dataclasses
+
+import equinox as eqx
+import numpy as np
+
+from jaxbundle.adjustment.problem import Problem, count_rows
+from jaxbundle.adjustment.unknowns import Name
+from jaxbundle.cameras import get_model
+from jaxbundle.errors import NotSolvedError
+from jaxbundle.network.arrays import Values
+from jaxbundle.result import Adjustment
+from jaxbundle.solution import require_solved, solved
+from jaxbundle.statistics import (
+    Component,
+    Inspection,
+    rescale,
+    reweight,
+    snoop,
+    variance_components,
+)
+
+CORE_PARAMETERS = ("c", "x0", "y0", "fx", "fy", "cx", "cy", "f")
+"""Interior parameters that are never eliminated for want of significance."""
+
+ROUNDS = 20
+"""Variance components are estimated at most so many times."""
+
+
+def snooped(problem: Problem, minimum, again, test: str, significance: float):
+    """The problem and its minimum without blunders, and what was removed."""
+    repeat = _Repeat(again, "after data snooping")
+    problem, _, removed = snoop(
+        problem, minimum.values, repeat, test=test, significance=significance
+    )
+    return problem, repeat.minimum, removed
+
+
+def robustly(problem: Problem, minimum, again, estimator: str):
+    """The problem with the weights of a robust estimator, its minimum, the factors of the image
+    points. The first weights come from the minimum, or from the start values if it is no solution.
+    """
+    repeat = _Repeat(again, "by robust estimation")
+    repeat.minimum = minimum
+    first = minimum.values if solved(problem, minimum) else problem.data.start
+    problem, _, factors, rests = reweight(problem, first, repeat, estimator)
+    if not rests:
+        raise NotSolvedError(
+            f"not solved by robust estimation: the weights of {estimator} do not come to rest; use "
+            "huber, or data snooping"
+        )
+    return problem, repeat.minimum, factors
+
+
+class _Repeat:
+    """Adjusts a changed problem, and keeps the minimum."""
+
+    def __init__(self, again, when: str):
+        self.again, self.when = again, when
+
+    def __call__(self, problem: Problem, values: Values) -> Values:
+        self.minimum = self.again(problem, values)
+        require_solved(problem, self.minimum, self.when)
+        return self.minimum.values
+
+
+def with_components(problem, minimum, again, tolerance: float = 1e-3):
+    """Repeat Förstner's estimate until every component is 1 within `tolerance`.
+
+    Also returned: by group, what its σ have been multiplied by.
+    """
+    factors: dict[str, float] = {}
+    for done in range(ROUNDS + 1):
+        found = Inspection(problem, minimum.values).reliability
+        components = variance_components(problem, problem.data, found, factors)
+        estimable = {name: c for name, c in components.items() if c.usable}
+        factors = {name: c.factor for name, c in estimable.items()} | factors
+        open_ones = [name for name, c in estimable.items() if abs(c.ratio - 1) >= tolerance]
+        if done == ROUNDS or not open_ones:
+            break
+        ratios = {name: c.ratio for name, c in estimable.items()}
+        data = rescale(problem.network.cameras, problem.structure, problem.data, ratios)
+        problem = dataclasses.replace(problem, data=data)
+        minimum = again(problem, minimum.values)
+        require_solved(problem, minimum, "with the estimated variance components")
+        factors |= {name: c.sigma for name, c in estimable.items()}
+    network = problem.network.warn(*_doubts(components, open_ones))
+    return dataclasses.replace(problem, network=network), minimum, factors
+
+
+def _doubts(components: dict[str, Component], open_ones: list[str]):
+    """What is to be said of an estimate of variance components."""
+    if open_ones:
+        yield (
+            f"the variance components did not settle in {ROUNDS} rounds ({', '.join(open_ones)}): "
+            "their σ are not final"
+        )
+    for name, component in components.items():
+        if not component.usable:
+            why = "fit exactly" if component.redundancy >= 1 else "have too little redundancy"
+            yield f"variance components: {name} {why}; their σ are left as they are"
+
+
+def eliminated_parameters(problem, minimum, again, critical_t):
+    """Fix insignificant additional parameters at 0, the weakest first."""
+    names = []
+    while True:
+        result = Adjustment(problem.network, problem, minimum)
+        weak = [
+            name for _, name in result.insignificant(critical_t)
+            if name.parameter not in CORE_PARAMETERS
+        ]  # fmt: skip
+        if not weak:
+            return problem, minimum, names
+        names.append(weak[0])
+        problem, values = _without_parameter(problem, minimum.values, weak[0])
+        minimum = again(problem, values)
+        require_solved(problem, minimum, f"without {weak[0]}")
+
+
+def _without_parameter(problem: Problem, values: Values, name: Name):
+    s, data = problem.structure, problem.data
+    c = [camera.id for camera in problem.network.cameras].index(name.id)
+    model = get_model(problem.network.cameras[c].model)
+    column = model.parameters.index(name.parameter)
+    position = np.flatnonzero(
+        (np.asarray(s.camera_columns)[c] == column) & (np.asarray(s.camera_free)[c] > 0)
+    )[0]
+    s = eqx.tree_at(
+        lambda s: s.camera_free,
+        dataclasses.replace(s, all_free=False),
+        s.camera_free.at[c, position].set(0.0),
+    )
+    data = eqx.tree_at(
+        lambda d: d.start.camera, data, data.start.camera.at[c, column].set(0.0)
+    )
+    row = np.flatnonzero(np.asarray(s.interior) == c)
+    if len(row):
+        weight = data.interior_weight.at[row[0], column].set(0.0)
+        data = eqx.tree_at(lambda d: d.interior_weight, data, weight)
+    values = eqx.tree_at(lambda v: v.camera, values, values.camera.at[c, column].set(0.0))
+    counts = count_rows(s, data)
+    return dataclasses.replace(problem, structure=s, data=data, counts=counts), values

@@ -1,0 +1,87 @@
+"""One minimum: iterate to it, and see whether it is a solution."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from jaxbundle.adjustment.datum import move_to_datum
+from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.sharding import distribute, find_minimum_of_shards
+from jaxbundle.adjustment.solve import converged, find_minimum, make_solver
+from jaxbundle.adjustment.solver import SINGULAR, TERMINATIONS, Minimum
+from jaxbundle.adjustment.unknowns import undetermined
+from jaxbundle.cameras import get_model
+from jaxbundle.errors import NotSolvedError
+from jaxbundle.network.arrays import Values
+from jaxbundle.network.columns import some
+from jaxbundle.network.padding import filled, pad_values, without_filling
+from jaxbundle.statistics import Inspection
+
+RAYS_TO_SHARE = 10_000
+"""Networks with so many rays are distributed over the devices, where there are several."""
+
+RUNAWAY = 20.0
+"""A principal distance that changed by more than this factor belongs to no camera."""
+
+
+def minimise(problem: Problem, start: Values, **options) -> Minimum:
+    """Iterate from `start`; the datum and what is held stay those of the problem's own start."""
+    solver, data = make_solver(problem, **options), problem.data
+    if len(jax.devices()) > 1 and problem.structure.rays >= RAYS_TO_SHARE:
+        minimum = find_minimum_of_shards(solver, distribute(problem), start)
+        values = move_to_datum(problem.structure, minimum.values, data.start)
+        return eqx.tree_at(lambda m: m.values, minimum, values)
+    structure, data, sizes = filled(problem.structure, problem.data)
+    solver = dataclasses.replace(solver, structure=structure)
+    minimum = find_minimum(solver, data, pad_values(start, sizes))
+    return eqx.tree_at(
+        lambda m: m.values, minimum, without_filling(minimum.values, problem.data.start)
+    )
+
+
+def solved(problem: Problem, minimum: Minimum) -> Inspection | None:
+    """The solution, to be looked at: converged, no camera collapsed, all unknowns determined;
+    else None."""
+    if not bool(converged(int(minimum.termination))) or _collapsed(problem, minimum.values):
+        return None
+    inspection = Inspection(problem, minimum.values)
+    return inspection if inspection.determined else None
+
+
+def names_of_defects(problem: Problem, minimum: Minimum) -> list[str]:
+    values = minimum.values
+    if bool(converged(int(minimum.termination))) and _collapsed(problem, values):
+        return _collapsed(problem, values)
+    if not all(np.isfinite(np.asarray(x)).all() for x in (values.camera, values.position)):
+        values = problem.data.start
+    return undetermined(problem, values, problem.data)
+
+
+def require_solved(problem: Problem, minimum: Minimum, when: str) -> None:
+    """Refuse to go on from an adjustment repeated that was not solved."""
+    if not solved(problem, minimum):
+        names = names_of_defects(problem, minimum)
+        reason = int(minimum.termination)
+        why = TERMINATIONS[SINGULAR if bool(converged(reason)) else reason]
+        if names:
+            why = f"the network is no longer determined: {some(names, 8, str)}"
+        raise NotSolvedError(f"not solved {when}: {why}", names)
+
+
+def _collapsed(problem: Problem, values: Values) -> list[str]:
+    """Principal distances that ran away from their start values by a factor of `RUNAWAY`.
+
+    Where c and a scale of the image are free together, c = 0 makes all corrected residuals zero.
+    """
+    names = []
+    now, before = np.asarray(values.camera), np.asarray(problem.data.start.camera)
+    for c, camera in enumerate(problem.network.cameras):
+        model = get_model(camera.model)
+        for parameter in model.principal_distance:
+            column = model.parameters.index(parameter)
+            ratio = now[c, column] / before[c, column]
+            if not 1 / RUNAWAY < float(ratio) < RUNAWAY:
+                names.append(f"{parameter} of camera {camera.id} (it ran away from its start)")
+    return names

@@ -1,0 +1,205 @@
+"""A whole network without start values: the same adjustment as with them, and what cannot be
+placed is named."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jaxbundle
+from jaxbundle import Camera, InputError, NotSolvedError
+from jaxbundle.bundle import adjust
+from jaxbundle.network.stations import Stations
+from jaxbundle.orientation.network import lacks_start_values, orient
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+CASES = Path(__file__).parents[3] / "shared" / "cases"
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("orient")]
+
+FORMAT = (92.0, 60.0)
+TRUE = Camera("aerial", "brown", {"c": 100.0, "x0": 0.1, "K1": 2e-6})
+NOMINAL = Camera("aerial", "brown", {"c": 98.0}, free=("c", "x0", "y0", "K1"))
+
+
+def bare(network, images=True, points=True):
+    """Without the start values of the images, of the tie points."""
+    if images:
+        nothing = np.full((len(network.images), 3), np.nan)
+        network = network.replace(
+            images=dataclasses.replace(network.images, position=nothing, angles=nothing)
+        )
+    if points:
+        tie = network.points.has_role("tie")[:, None]
+        position = np.where(tie, np.nan, network.points.position)
+        network = network.replace(points=dataclasses.replace(network.points, position=position))
+    return network
+
+
+def with_blunders(network, part, size, seed=5):
+    rng = np.random.default_rng(seed)
+    rays = network.observations
+    bad = rng.random(len(rays)) < part
+    xy = rays.xy + bad[:, None] * rng.uniform(-size, size, rays.xy.shape)
+    return network.replace(observations=dataclasses.replace(rays, xy=xy))
+
+
+def block(strips=4, images=6, points=350, control=(0, 1, 2, 3), start=NOMINAL):
+    """An aerial block over hills, control in its corners, and its truth."""
+    stations = jaxbundle.aerial_block(
+        strips, images, height=1000, footprint=(920, 600), forward_overlap=0.6, side_overlap=0.3
+    )
+    reach = np.abs(stations.position[:, :2]).max(0) + 0.45 * np.array([920, 600])
+    targets = jaxbundle.cloud_of_targets(points, (*(2 * reach), 100.0), seed=1)
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    targets[:8, :2] = np.concatenate([0.55 * corners, 0.3 * corners]) * reach
+    return jaxbundle.simulate_with_truth(
+        stations, targets, TRUE, start=start, noise=0.005, seed=2, image_format=FORMAT,
+        control=control, control_sigma=0.02, datum="control" if len(control) else "inner",
+    )  # fmt: skip
+
+
+def close_up(targets, **options):
+    """Ten convergent images of targets."""
+    stations = jaxbundle.ring_of_stations(10, 6.0, 5.0, roll_every=2)
+    return jaxbundle.simulate(
+        stations, targets, TRUE, start=NOMINAL, noise=0.002, image_format=FORMAT, **options
+    )
+
+
+def assert_same_answer(network, without):
+    """σ0, redundancy, parameters of cameras and their σ."""
+    expected, found = adjust(network), adjust(without)
+    assert found.redundancy == expected.redundancy
+    assert found.sigma0 == pytest.approx(expected.sigma0, rel=1e-8)
+    for camera, table in expected.cameras.items():
+        for name, entry in table["parameters"].items():
+            if entry["free"]:
+                other = found.cameras[camera]["parameters"][name]
+                assert abs(other["value"] - entry["value"]) < 1e-4 * entry["sigma"]
+                assert other["sigma"] == pytest.approx(entry["sigma"], rel=1e-5)
+
+
+@pytest.mark.parametrize("name", ["convergent4", "resection63", "bingo_indoor"])
+def test_examples_need_no_start_values(name):
+    network = jaxbundle.read_network(EXAMPLES / name / "project.toml")
+    without = bare(network)
+    assert lacks_start_values(without) and not lacks_start_values(network)
+    assert_same_answer(network, without)
+
+
+@pytest.mark.skipif(not CASES.is_dir(), reason="the folder ../shared/cases is not here")
+@pytest.mark.parametrize(
+    "name", ["camcal", "sxb_weighted_control", "riva_3dfield", "aicon_free_scalebar"]
+)
+def test_cases_need_no_start_values(name):
+    network = jaxbundle.read_network(CASES / name / "project.toml")
+    assert_same_answer(network, bare(network))
+
+
+def test_control_in_the_corners_of_a_block():
+    """No image sees control enough: pairs first, then onto the control."""
+    simulation = block()
+    found = orient(bare(simulation.network))
+    assert not found.images and not found.points and "given" in found.frame
+    off = found.network.images.position - simulation.truth.images.position
+    assert np.abs(off).max() < 0.05 * 1000  # the principal distance is 2 % wrong
+    assert_same_answer(simulation.network, bare(simulation.network))
+
+
+def test_one_measurement_in_twenty_wrong():
+    """Most of what is wrong is left out with the start values, the rest by data snooping."""
+    simulation = block(control=range(8), start=TRUE)
+    network = bare(with_blunders(simulation.network, 0.05, 20.0))
+    found = orient(network)
+    assert not found.images
+    off = found.network.images.position - simulation.truth.images.position
+    assert np.abs(off).max() < 0.2 * 1000
+    result = adjust(network, snooping="pope")
+    off = result.image_values[:, :3] - simulation.truth.images.position
+    sigma = np.stack([result.images[f"s{axis}"] for axis in ("X0", "Y0", "Z0")], 1)
+    assert np.abs(off / sigma).max() < 5
+    assert abs(result.sigma0 - 1) < 0.15
+
+
+def test_a_strip_that_hangs_together_by_pairs():
+    """With few points in three images resection stops; a pair takes it on."""
+    simulation = block(1, 30, 350, control=())
+    found = orient(bare(simulation.network))
+    assert not found.images
+    truth, position = simulation.truth.images.position, found.network.images.position
+    along = np.linalg.norm(np.diff(position, axis=0), axis=1)
+    assert np.ptp(along) < 0.3 * along.mean()
+    assert len(truth) == len(position)
+
+
+@pytest.mark.parametrize("relief", [0.0, 0.5])
+def test_planes_and_solids_without_control(relief):
+    network = close_up(jaxbundle.grid_of_targets(9, 9, 0.6, relief=relief))
+    assert_same_answer(network, bare(network))
+
+
+def test_a_distance_gives_the_scale():
+    targets = jaxbundle.grid_of_targets(9, 9, 0.6, relief=0.5)
+    network = close_up(targets, distances=[(0, 80)], distance_sigma=1e-4)
+    found = orient(bare(network))
+    assert "to scale" in found.frame
+    a, b = (found.network.points.position[found.network.points.id.index(k)] for k in ("1", "81"))
+    assert np.linalg.norm(a - b) == pytest.approx(network.distances.value[0], rel=1e-9)
+
+
+def test_what_is_given_stays():
+    """Start values of half the images: they keep them, the others follow in their frame."""
+    network = close_up(jaxbundle.grid_of_targets(9, 9, 0.6, relief=0.5))
+    without, every_other = bare(network), np.arange(10) % 2 == 0
+    images = without.images
+    given = dataclasses.replace(
+        images,
+        position=np.where(every_other[:, None], network.images.position, np.nan),
+        angles=np.where(every_other[:, None], network.images.angles, np.nan),
+    )
+    found = orient(without.replace(images=given)).network
+    np.testing.assert_array_equal(
+        found.images.position[every_other], network.images.position[every_other]
+    )
+    assert np.abs(found.images.position - network.images.position).max() < 0.5
+
+
+def test_approximate_points_are_enough():
+    network = close_up(jaxbundle.grid_of_targets(9, 9, 0.6, relief=0.5))
+    found = orient(bare(network, points=False)).network
+    np.testing.assert_array_equal(found.points.position, network.points.position)
+    assert np.abs(found.images.position - network.images.position).max() < 0.5
+
+
+def test_what_cannot_be_placed_is_named_with_the_reason():
+    """An image with two points of the others, a point seen by that image and one more."""
+    network = bare(close_up(jaxbundle.grid_of_targets(9, 9, 0.6, relief=0.5)))
+    rays = network.observations
+    keep = (rays.image != 4) | np.isin(rays.point, [10, 11])
+    found = orient(network.replace(observations=rays.take(keep)))
+    assert list(found.images) == [network.images.id[4]]
+    assert "2 known points of 2" in found.images[network.images.id[4]]
+    assert network.images.id[4] in str(found)
+    assert len(found.network.images) == 9
+    warning = next(w for w in found.network.warnings if w.startswith("left out 1 image"))
+    assert network.images.id[4] in warning
+    result = adjust(network.replace(observations=rays.take(keep)))
+    assert result.converged and warning in result.warnings
+
+
+def test_images_from_one_place_have_no_answer():
+    turns = Stations(np.zeros((4, 3)), 0.1 * np.random.default_rng(0).normal(size=(4, 3)))
+    targets = jaxbundle.cloud_of_targets(60, (4, 4, 2), centre=(0, 0, -10))
+    network = jaxbundle.simulate(turns, targets, TRUE, noise=0.002)
+    with pytest.raises(NotSolvedError, match="no start values found.*rays meet at an angle"):
+        orient(bare(network))
+
+
+def test_bad_data_is_found_before():
+    network = bare(close_up(jaxbundle.grid_of_targets(9, 9, 0.6)))
+    xy = network.observations.xy.copy()
+    xy[3, 1] = np.nan
+    rays = dataclasses.replace(network.observations, xy=xy)
+    with pytest.raises(InputError, match="row 4: y of point"):
+        orient(network.replace(observations=rays))

@@ -1,0 +1,180 @@
+"""Blunders in a network: data snooping by removal and return, robust estimation by weights."""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import integrate
+
+import jaxbundle
+from jaxbundle import Camera, InputError
+from jaxbundle.adjustment.solve import find_minimum, make_solver
+from jaxbundle.bundle import adjust
+from jaxbundle.cameras import get_model, residual
+from jaxbundle.geometry import matrix_from_quaternion
+from jaxbundle.report import text
+from jaxbundle.statistics import Inspection, robust
+from jaxbundle.statistics.snooping import Removed, _passing, without
+
+pytestmark = pytest.mark.xdist_group("bundle")
+
+SIGMA = 0.002
+TRUE = {"c": 24.0, "x0": 0.05, "y0": -0.03, "K1": 1.2e-4}
+
+
+@pytest.fixture(scope="module")
+def network():
+    """Ten convergent images around a box of 125 points, free, self-calibrating."""
+    stations = jaxbundle.ring_of_stations(10, 6.0, 3.0, look_at=(0.0, 0.0, 0.5), roll_every=2)
+    axis = np.linspace(-1, 1, 5)
+    targets = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    camera = Camera("cam", "brown", TRUE, free=("c", "x0", "y0", "K1", "P1", "P2"))
+    return jaxbundle.simulate(stations, targets, camera, noise=SIGMA, seed=11, disturb=0.01)
+
+
+@pytest.fixture(scope="module")
+def clean(network):
+    return adjust(network)
+
+
+def with_blunders(network, seed, part=0.05):
+    """Errors of 5 to 50 σ in any direction; which rows have one, and their sizes in σ."""
+    rng = np.random.default_rng(seed)
+    rays = network.observations
+    bad = rng.random(len(rays)) < part
+    size, angle = rng.uniform(5, 50, len(rays)), rng.uniform(0, 2 * np.pi, len(rays))
+    shift = (bad * size * SIGMA)[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
+    return network.replace(
+        observations=dataclasses.replace(rays, xy=rays.xy + shift)
+    ), bad, size
+
+
+def rows_of(removed, network):
+    rays = network.observations
+    names = [
+        f"point {network.points.id[p]} in image {network.images.id[i]}"
+        for i, p in zip(rays.image, rays.point)
+    ]
+    return np.isin(names, [r.name for r in removed])
+
+
+def differences(found, clean):
+    """Parameters of the camera against those of the clean data, in σ of `found`."""
+    return [
+        abs(entry["value"] - clean.cameras["cam"]["parameters"][name]["value"]) / entry["sigma"]
+        for name, entry in found.cameras["cam"]["parameters"].items() if entry["free"]
+    ]  # fmt: skip
+
+
+def test_snooping_of_many_blunders(network, clean):
+    spoilt, bad, size = with_blunders(network, 1)
+    found = adjust(spoilt, snooping="pope")
+    gone = rows_of(found.removed, spoilt)
+    number = clean.residuals["r"].reshape(-1, 2).min(1)
+    clear = bad & (size > 8) & (number > 0.3)
+    assert clear.sum() > 30
+    assert gone[clear].mean() >= 0.95
+    assert gone[~bad].mean() <= 0.01
+    assert abs(found.sigma0 - 1) < 0.1
+    assert max(differences(found, clean)) < 1.5
+
+
+def test_baarda_finds_them_too(network):
+    spoilt, bad, size = with_blunders(network, 2, 0.01)
+    found = adjust(spoilt, snooping="baarda", significance=1e-5)
+    gone = rows_of(found.removed, spoilt)
+    assert gone[bad & (size > 8)].all() and gone[~bad].sum() <= 1
+
+
+def test_what_agrees_comes_back(network):
+    """Removed observations pass that agree with an adjustment they took no part in."""
+    spoilt, bad, _ = with_blunders(network, 1)
+    problem = jaxbundle.make_problem(jaxbundle.check_network(spoilt))
+    wrong = [Removed("image", int(problem.rays[k]), "wrong", 9.0) for k in np.flatnonzero(bad)]
+    right = [
+        Removed("image", int(problem.rays[k]), "right", 9.0) for k in np.flatnonzero(~bad)[::97]
+    ]
+    less = without(problem, *wrong, *right)
+    back = _passing(problem, Inspection(less, jaxbundle.solve(less)), wrong + right, 4.5)
+    assert all(r in back for r in right)
+    assert sum(r in back for r in wrong) <= 0.05 * len(wrong)
+
+
+def test_predicted_test_of_an_observation(network):
+    """v/√(1 + h) against the residual and its covariance, both from the formula of the camera."""
+    problem = jaxbundle.make_problem(jaxbundle.check_network(network))
+    row = int(problem.rays[123])
+    less = without(problem, Removed("image", row, "", 0.0))
+    values = jaxbundle.solve(less)
+    predicted = np.asarray(Inspection(less, values).predicted_tests(problem.data).image)[row]
+
+    s, data = problem.structure, problem.data
+    i, p = int(s.image[row]), int(s.point[row])
+    model = get_model("brown")
+
+    def misclosure(v):
+        ray = matrix_from_quaternion(v.rotation[i]) @ (v.point[p] - v.position[i])
+        return jnp.stack(residual(model, "corrected", tuple(v.camera[0]), ray, data.image_xy[row]))
+
+    minimum = find_minimum(make_solver(less), less.data)
+    result = jaxbundle.Adjustment(less.network, less, minimum)
+    h = np.diagonal(result.covariance_of(misclosure)) / result.sigma0**2 / SIGMA**2
+    expected = np.asarray(misclosure(result.values)) / SIGMA / np.sqrt(1 + h)
+    np.testing.assert_allclose(predicted, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("estimator", robust.ESTIMATORS)
+def test_robust_estimates_are_near_the_clean_one(network, clean, estimator):
+    spoilt, bad, size = with_blunders(network, 3)
+    found = adjust(spoilt, robust=estimator)
+    assert max(differences(found, clean)) < 1
+    assert found.weights[bad & (size > 20)].max() < 0.25
+    assert np.median(found.weights[~bad]) > 0.8
+    assert "Robust estimation" in text(found)
+    assert found.residuals["weight"][:2] == pytest.approx(found.weights[0], abs=0)
+
+
+def test_without_blunders_huber_is_least_squares(network, clean):
+    """One good image point in ninety is touched: the estimates agree to a small part of σ."""
+    assert max(differences(adjust(network, robust="huber"), clean)) < 0.3
+
+
+def test_huber_minimises_his_function(network):
+    """At the solution Σ ρ(t), ρ = t²/2 or k·t − k²/2, is stationary along camera parameters."""
+    spoilt, _, _ = with_blunders(network, 3)
+    found = adjust(spoilt, robust="huber")
+    problem = jaxbundle.make_problem(jaxbundle.check_network(spoilt))
+    t0 = robust._lengths(problem, found.values)
+    scale = robust._scale(problem, found.problem, t0)
+
+    def total(step):
+        moved = found.values.camera.at[0, 0].add(step)
+        t = robust._lengths(problem, eqx.tree_at(lambda v: v.camera, found.values, moved)) / scale
+        return np.where(t < 3, t**2 / 2, 3 * t - 4.5).sum()
+
+    step = 0.3 * found.cameras["cam"]["parameters"]["c"]["sigma"]
+    slope = (total(step) - total(-step)) / 2
+    curvature = total(step) - 2 * total(0.0) + total(-step)
+    assert abs(slope) < 0.02 * curvature
+
+
+@pytest.mark.parametrize(
+    ("weight", "k", "efficiency"), [(robust.cauchy, 2.5486, 0.95), (robust.tukey, 5.1230, 0.95)]
+)
+def test_efficiency_in_the_plane(weight, k, efficiency):
+    """E[ψ' + ψ/t]²/(2·E[ψ²]) for t² ~ χ²₂, by numerical integration (Maronna, 1976)."""
+    density = lambda t: t * np.exp(-t * t / 2)
+    psi = lambda t: t * float(weight(np.array(t), k))
+    slope = lambda t: (psi(t + 1e-5) - psi(t - 1e-5)) / 2e-5
+    mean = lambda f: integrate.quad(lambda t: f(t) * density(t), 1e-4, 12, points=[k], limit=200)[0]
+    found = mean(lambda t: slope(t) + psi(t) / t) ** 2 / (2 * mean(lambda t: psi(t) ** 2))
+    assert found == pytest.approx(efficiency, abs=1e-3)
+
+
+def test_what_cannot_be_asked_for(network):
+    with pytest.raises(InputError, match="huber, cauchy, tukey"):
+        adjust(network, robust="l1")
+    with pytest.raises(InputError, match="not both"):
+        adjust(network, robust="huber", snooping="pope")
