@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.maps import MapGrid, MapSystem, grid_around
-from jaxbundle.io.rasters import rasterio
+from jaxbundle.io.rasters import as_type, rasterio, unreadable
 from jaxbundle.pushbroom.correct import BLOCK, STEP, block_places
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.locate import locate_lines
@@ -94,7 +94,7 @@ def write_corrected(
                             progress(done, len(corners))
         os.replace(temporary, target)
     except package.errors.RasterioError as error:
-        raise InputError(f"{source}: {' '.join(str(error).split())}") from None
+        raise unreadable(source, error) from None
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -116,7 +116,7 @@ def _block(bands, map_, lock, image, search, surface, system, grid, resampling, 
     part = np.pad(part.astype(float), [(0, 0), *pad], mode="edge")
     values = np.asarray(_resample(part, line - origin[0], pixel - origin[1], resampling))
     rows, columns = min(BLOCK, grid.rows - row), min(BLOCK, grid.columns - column)
-    values = _as_type(values[:, :rows, :columns], map_.dtypes[0])
+    values = as_type(values[:, :rows, :columns], map_.dtypes[0])
     with lock:
         map_.write(values, window=((row, row + rows), (column, column + columns)))
 
@@ -128,10 +128,3 @@ def _window(line, pixel, image):
         for v, size in ((line, image.lines), (pixel, image.pixels))
     ]
     return tuple(ends), (ends[0][0], ends[1][0])
-
-
-def _as_type(values, dtype):
-    if np.issubdtype(dtype, np.floating):
-        return values.astype(dtype)
-    limits = np.iinfo(dtype)
-    return np.clip(np.rint(np.nan_to_num(values)), limits.min, limits.max).astype(dtype)

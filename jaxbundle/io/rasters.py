@@ -1,4 +1,4 @@
-"""Rasters through rasterio: terrain models."""
+"""Rasters through rasterio: terrain models, and what all readers and writers share."""
 
 from pathlib import Path
 
@@ -18,6 +18,19 @@ def rasterio():
     except ImportError:
         raise InputError("rasters need rasterio: pip install 'jaxbundle[geo]'") from None
     return rasterio
+
+
+def unreadable(path: str | Path, error: Exception) -> InputError:
+    """What rasterio says about a file, in one line."""
+    return InputError(f"{path}: {' '.join(str(error).split())}")
+
+
+def as_type(values: np.ndarray, dtype: np.dtype | str) -> np.ndarray:
+    """Values as they are stored: whole numbers are rounded and kept in range, NaN becomes 0."""
+    if np.issubdtype(dtype, np.floating):
+        return values.astype(dtype)
+    limits = np.iinfo(dtype)
+    return np.clip(np.rint(np.nan_to_num(values)), limits.min, limits.max).astype(dtype)
 
 
 def read_terrain(path: str | Path, earth: Ellipsoid | None) -> Terrain:
@@ -46,7 +59,7 @@ def read_terrain(path: str | Path, earth: Ellipsoid | None) -> Terrain:
             ) as warped:  # fmt: skip
                 return _terrain(warped, earth, path)
     except package.errors.RasterioError as error:
-        raise InputError(f"{path}: {' '.join(str(error).split())}") from None
+        raise unreadable(path, error) from None
 
 
 def _terrain(source, earth, path):

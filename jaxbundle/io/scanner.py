@@ -42,8 +42,6 @@ ut1_utc = -0.12                     # seconds; x_pole, y_pole in arcseconds
 """
 
 import dataclasses
-import os
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -54,9 +52,8 @@ import numpy as np
 from jaxbundle.cameras import check_parameters, default_parameters, get_model
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid
-from jaxbundle.io.csv_tables import read_csv, read_text
-from jaxbundle.network.columns import Columns, did_you_mean, shown
-from jaxbundle.network.units import ANGLE_UNITS
+from jaxbundle.io.sections import Section, TomlFile, read_sections
+from jaxbundle.network.columns import did_you_mean, shown
 from jaxbundle.pushbroom import frames
 from jaxbundle.pushbroom.ancillary import attitude_table, check_times, position_table
 from jaxbundle.pushbroom.corrections import Corrections
@@ -96,141 +93,58 @@ def read_scanner(path: str | Path) -> Scanner:
     **Raises:** `InputError` naming file, section and key, or table and line.
     """
     path = Path(path)
-    file = _File(path, _read(path))
+    file = read_sections(path, SECTIONS, NEEDED)
     scanner = file.section("scanner")
     lines, pixels = (scanner.whole(key) for key in ("lines", "pixels"))
-    earth = _earth(scanner)
+    earth = earth_of(scanner)
     position = _position(file, earth)
     attitude = _attitude(file, earth)
-    angle = file.radians
-    mounting = [angle * file.section("mounting").number(name, 0.0) for name in ANGLES]
+    mounting = mounting_of(file)
     switches = file.section("corrections")
     corrections = Corrections(*(switches.switch(name) for name in Corrections._fields))
     if corrections.any and earth is None:
         raise InputError(f"{switches.where}corrections need an Earth; set [scanner] earth")
     image = make_image(
-        Trajectory(position, attitude), _times(file, lines), _optics(file, pixels), lines, pixels,
+        Trajectory(position, attitude), _times(file, lines), optics_of(file, pixels), lines, pixels,
         mounting, corrections,
     )  # fmt: skip
     return Scanner(scanner.text("name", path.stem), image, earth)
 
 
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        document = tomllib.loads(read_text(path))
-    except ValueError as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from None
-    for key, value in document.items():
-        if key not in SECTIONS:
-            raise InputError(f"{path}: unknown section [{key}]{did_you_mean(key, SECTIONS)}")
-        if not isinstance(value, dict):
-            raise InputError(f"{path}: {key} must be a section, [{key}]")
-        for name in value:
-            if SECTIONS[key] and name not in SECTIONS[key]:
-                raise InputError(
-                    f"{path}, [{key}]: unknown key {name!r}{did_you_mean(name, SECTIONS[key])}"
-                )
-    for key in NEEDED:
-        if key not in document:
-            raise InputError(f"{path}: the section [{key}] is missing")
-    return document
+def _orientation(file: TomlFile) -> frames.EarthOrientation:
+    section = file.section("earth_orientation")
+    fields = frames.EarthOrientation._fields
+    return frames.EarthOrientation(*(section.number(name, 0.0) for name in fields))
 
 
-@dataclasses.dataclass(frozen=True)
-class _File:
-    path: Path
-    document: dict[str, Any]
-
-    def section(self, name: str) -> "_Section":
-        return _Section(self, f"{self.path}, [{name}]: ", self.document.get(name, {}))
-
-    @property
-    def radians(self) -> float:
-        """Radians in one unit of the file's angles."""
-        unit = self.section("scanner").text("angle_unit", "deg")
-        if unit not in ANGLE_UNITS:
-            raise InputError(f"{self.path}: angle_unit {unit!r}{did_you_mean(unit, ANGLE_UNITS)}")
-        return ANGLE_UNITS[unit]
-
-    @property
-    def orientation(self) -> frames.EarthOrientation:
-        section = self.section("earth_orientation")
-        return frames.EarthOrientation(*(
-            section.number(name, 0.0) for name in frames.EarthOrientation._fields
-        ))  # fmt: skip
-
-    @property
-    def epoch(self) -> str:
-        epoch = self.section("scanner").values.get("epoch")
-        if epoch is None:
-            raise InputError(
-                f"{self.path}, [scanner]: epoch is missing; an inertial frame needs the UTC from "
-                'which times count, such as epoch = "2024-03-01T10:20:30"'
-            )
-        return str(epoch)
+def _epoch(file: TomlFile) -> str:
+    epoch = file.section("scanner").values.get("epoch")
+    if epoch is None:
+        raise InputError(
+            f"{file.path}, [scanner]: epoch is missing; an inertial frame needs the UTC from "
+            'which times count, such as epoch = "2024-03-01T10:20:30"'
+        )
+    return str(epoch)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Section:
-    file: _File
-    where: str
-    values: dict[str, Any]
-
-    def __contains__(self, key: str) -> bool:
-        return key in self.values
-
-    def _given(self, key, default, expected, kinds):
-        value = self.values.get(key, default)
-        if value is None:
-            raise InputError(f"{self.where}{key} is missing; {expected} is expected")
-        if not isinstance(value, kinds) or isinstance(value, bool) and bool not in kinds:
-            raise InputError(f"{self.where}{key} is {shown(value)}; {expected} is expected")
-        return value
-
-    def number(self, key: str, default: float | None = None) -> float:
-        value = float(self._given(key, default, "a number", (int, float)))
-        if not np.isfinite(value):
-            raise InputError(f"{self.where}{key} is {value}; a finite number is expected")
-        return value
-
-    def whole(self, key: str) -> int:
-        value = self._given(key, None, "a whole number, 2 or more,", (int,))
-        if value < 2:
-            raise InputError(f"{self.where}{key} is {value}; 2 or more are expected")
-        return value
-
-    def text(self, key: str, default: str | None = None) -> str:
-        return self._given(key, default, "text in quotes", (str,))
-
-    def switch(self, key: str) -> bool:
-        return self._given(key, False, "true or false", (bool,))
-
-    def numbers(self, key: str, count: int | None = None) -> np.ndarray:
-        expected = f"a list of {count or 'some'} numbers"
-        values = self._given(key, None, expected, (list,))
-        good = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
-        if not good or not values or count not in (None, len(values)):
-            raise InputError(f"{self.where}{key} is {shown(values)}; {expected} is expected")
-        return np.array(values, float)
-
-    def table(self) -> Columns:
-        name = self.text("table")
-        path = self.file.path.parent / name
-        if not os.path.isfile(path):
-            raise InputError(f"{self.where}table = {name!r}: no such file {path}")
-        return read_csv(path)
-
-    def options(self, method: str) -> dict[str, Any]:
-        """Interpolation, order, gap."""
-        options = {"method": self.text("interpolation", method)}
-        if "order" in self:
-            options["order"] = int(self.number("order"))
-        if "gap" in self:
-            options["gap"] = self.number("gap")
-        return options
+def _options(section: Section, method: str) -> dict[str, Any]:
+    """Interpolation, order, gap."""
+    options = {"method": section.text("interpolation", method)}
+    if "order" in section:
+        options["order"] = int(section.number("order"))
+    if "gap" in section:
+        options["gap"] = section.number("gap")
+    return options
 
 
-def _earth(scanner: _Section) -> Ellipsoid | None:
+def mounting_of(file: TomlFile) -> list[float]:
+    """Pitch, roll, yaw of the mounting in radians."""
+    section = file.section("mounting")
+    return [file.radians * section.number(name, 0.0) for name in ANGLES]
+
+
+def earth_of(scanner: Section) -> Ellipsoid | None:
+    """The ellipsoid of [scanner] earth; None for a local frame."""
     value = scanner.values.get("earth", "WGS84")
     if isinstance(value, list):
         axes = scanner.numbers("earth", 3)
@@ -244,7 +158,7 @@ def _earth(scanner: _Section) -> Ellipsoid | None:
     return WGS84 if value == "WGS84" else None
 
 
-def _times(file: _File, lines: int) -> LineTimes:
+def _times(file: TomlFile, lines: int) -> LineTimes:
     section = file.section("times")
     if "table" not in section:
         period = section.number("period")
@@ -262,7 +176,7 @@ def _times(file: _File, lines: int) -> LineTimes:
     return LineTimes(jnp.zeros(()), jnp.zeros(()), jnp.asarray(t))
 
 
-def _frame(section: _Section, earth: Ellipsoid | None, known: Sequence[str]) -> str:
+def _frame(section: Section, earth: Ellipsoid | None, known: Sequence[str]) -> str:
     frame = section.text("frame", "local" if earth is None else "ITRF")
     if frame not in known:
         raise InputError(f"{section.where}unknown frame {frame!r}{did_you_mean(frame, known)}")
@@ -274,7 +188,7 @@ def _frame(section: _Section, earth: Ellipsoid | None, known: Sequence[str]) -> 
     return frame
 
 
-def _position(file: _File, earth: Ellipsoid | None) -> Table:
+def _position(file: TomlFile, earth: Ellipsoid | None) -> Table:
     section = file.section("position")
     kinds = [kind for kind in ("table", "tle", "circle") if kind in section]
     if len(kinds) != 1:
@@ -290,12 +204,12 @@ def _position(file: _File, earth: Ellipsoid | None) -> Table:
     P, V = values(names), values(rates) if "VX" in columns.values else None
     if frame in ("GCRF", "J2000", "TEME"):
         check_times(t, columns.source)
-        R = frames.to_earth(frame, file.epoch, t, file.orientation)
-        P, V = frames.turn_positions(R, P, V, file.orientation)
-    return position_table(t, P, V, **section.options("lagrange"), source=columns.source)
+        R = frames.to_earth(frame, _epoch(file), t, _orientation(file))
+        P, V = frames.turn_positions(R, P, V, _orientation(file))
+    return position_table(t, P, V, **_options(section, "lagrange"), source=columns.source)
 
 
-def _orbit(file: _File, section: _Section, kind: str) -> Table:
+def _orbit(file: TomlFile, section: Section, kind: str) -> Table:
     """Two-line elements or a circle, at the steps of a table from which is interpolated."""
     start, end = section.numbers("span", 2)
     t = np.arange(start, end, section.number("step", 1.0))
@@ -303,16 +217,16 @@ def _orbit(file: _File, section: _Section, kind: str) -> Table:
         lines = section.values["tle"]
         if not (isinstance(lines, list) and len(lines) == 2):
             raise InputError(f"{section.where}tle: a list of the two lines is expected")
-        P, V = frames.two_line_orbit(*lines, file.epoch, t, file.orientation)
+        P, V = frames.two_line_orbit(*lines, _epoch(file), t, _orientation(file))
     else:
-        circle = _Section(file, f"{section.where}circle: ", section.values["circle"])
+        circle = Section(file, f"{section.where}circle: ", section.values["circle"])
         angles = (circle.number(k, 0.0) for k in ("inclination", "node", "argument"))
         angles = [file.radians * angle for angle in angles]
         P, V = frames.circular_orbit(t, circle.number("height"), *angles)
-    return position_table(t, P, V, **section.options("lagrange"))
+    return position_table(t, P, V, **_options(section, "lagrange"))
 
 
-def _attitude(file: _File, earth: Ellipsoid | None) -> Attitude:
+def _attitude(file: TomlFile, earth: Ellipsoid | None) -> Attitude:
     section = file.section("attitude")
     frame = _frame(section, earth, (*FRAMES, "orbit"))
     columns = section.table()
@@ -327,20 +241,21 @@ def _attitude(file: _File, earth: Ellipsoid | None) -> Attitude:
             raise InputError(f"{section.where}frame {frame} needs quaternions; give q0, q1, q2, q3")
         check_times(t, columns.source)
         # what is not unit is refused below, with its row
-        R = frames.to_earth(frame, file.epoch, t, file.orientation)
+        R = frames.to_earth(frame, _epoch(file), t, _orientation(file))
         lengths = np.linalg.norm(values, axis=1, keepdims=True)
         values = lengths * frames.turn_quaternions(R, values)
     return attitude_table(
-        t, values, **section.options("slerp" if quaternions else "linear"),
+        t, values, **_options(section, "slerp" if quaternions else "linear"),
         reference="orbit" if frame == "orbit" else "earth", source=columns.source,
     )  # fmt: skip
 
 
-def _optics(file: _File, pixels: int) -> Optics:
+def optics_of(file: TomlFile, pixels: int) -> Optics:
+    """The optics of the section [optics]."""
     section = file.section("optics")
     middle = section.number("middle", (pixels - 1) / 2)
     if "table" in section:
-        _check_keys(section, ("table",))
+        section.check_keys(("table",))
         columns = section.table()
         columns.check_names(("across", "along"), ("pixel",))
         angles = [file.radians * columns.numbers(n, required=True) for n in ("across", "along")]
@@ -350,7 +265,7 @@ def _optics(file: _File, pixels: int) -> Optics:
             )
         return AngleTable(*(jnp.asarray(a) for a in angles))
     if "across" in section:
-        _check_keys(section, ("across", "along", "middle", "half"))
+        section.check_keys(("across", "along", "middle", "half"))
         half = section.number("half", pixels / 2)
         return AnglePolynomial(
             jnp.asarray(section.numbers("across")), jnp.asarray(section.numbers("along")),
@@ -358,7 +273,7 @@ def _optics(file: _File, pixels: int) -> Optics:
         )  # fmt: skip
     try:
         model = get_model(section.text("model", "brown"))
-        _check_keys(section, ("model", "pitch", "middle", "row", *model.parameters))
+        section.check_keys(("model", "pitch", "middle", "row", *model.parameters))
         given = {name: section.number(name) for name in model.parameters if name in section}
         check_parameters(model, given)
     except InputError:
@@ -373,9 +288,3 @@ def _optics(file: _File, pixels: int) -> Optics:
         jnp.asarray([values[name] for name in model.parameters]), jnp.asarray(pitch),
         jnp.asarray(middle), jnp.asarray(section.number("row", 0.0)), model.name,
     )  # fmt: skip
-
-
-def _check_keys(section: _Section, known: Sequence[str]) -> None:
-    for key in section.values:
-        if key not in known:
-            raise InputError(f"{section.where}unknown key {key!r}{did_you_mean(key, known)}")

@@ -1,4 +1,7 @@
 """`jaxbundle pushbroom …`: line scanners, a file for each command."""
 
+from jaxbundle.cli.pushbroom import accuracy as accuracy
+from jaxbundle.cli.pushbroom import correct as correct
 from jaxbundle.cli.pushbroom import locate as locate
 from jaxbundle.cli.pushbroom import project as project
+from jaxbundle.cli.pushbroom import simulate as simulate

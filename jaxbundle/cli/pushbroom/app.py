@@ -14,6 +14,7 @@ from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.csv_tables import write_csv, write_text
 from jaxbundle.io.rasters import read_terrain
 from jaxbundle.io.result_json import without_nan
+from jaxbundle.pushbroom.resample import RESAMPLINGS
 from jaxbundle.pushbroom.surfaces import Ground, Height, Plane, Surface
 
 pushbroom = typer.Typer(
@@ -44,6 +45,12 @@ def surface_of(earth: Ellipsoid | None, height: float | None, dem: Path | None) 
         return Ground(earth)
     check_spheroid(earth)
     return Height(height, earth)
+
+
+def check_resampling(kind: str) -> None:
+    """Refuse a resampling that is none."""
+    if kind not in RESAMPLINGS:
+        raise InputError(f"--resampling {kind!r}: {', '.join(RESAMPLINGS)}")
 
 
 def check_spheroid(earth: Ellipsoid | None) -> None:

@@ -44,7 +44,7 @@ def locate(
     jaxbundle.enable_x64()
     file = read_scanner(scanner)
     surface = surface_of(file.earth, height, dem)
-    ids, line, pixel, source = _places(file.image, points, grid)
+    ids, line, pixel, source = places(file.image, points, grid)
     X = np.array(jax.jit(locate_points)(file.image, surface, line, pixel))
     missed = np.isnan(X).any(0)
     reason = "no terrain there" if dem else "misses the surface"
@@ -70,7 +70,8 @@ def locate(
     write_rows(columns, csv, json, {"scanner": file.name})
 
 
-def _places(image: PushbroomImage, points: Path | None, grid: str):
+def places(image: PushbroomImage, points: Path | None, grid: str):
+    """Ids, lines, pixels and their source: of a table, or a grid over the image."""
     if points is None:
         try:
             rows, columns = (int(n) for n in grid.lower().split("x"))

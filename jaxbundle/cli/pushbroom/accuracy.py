@@ -1,0 +1,79 @@
+"""`jaxbundle pushbroom accuracy`: what errors of the ancillary data do on the ground."""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+import jaxbundle
+from jaxbundle.cli.pushbroom.app import (
+    Csv,
+    Dem,
+    Json,
+    Level,
+    ScannerFile,
+    pushbroom,
+    surface_of,
+    write_rows,
+)
+from jaxbundle.cli.pushbroom.locate import places
+from jaxbundle.errors import InputError
+from jaxbundle.io.scanner import read_scanner
+from jaxbundle.pushbroom.accuracy import drawn, ground_errors, propagated
+from jaxbundle.pushbroom.noise import Noise
+from jaxbundle.pushbroom.terrain import Terrain
+
+Sigma = Annotated[float, typer.Option(min=0, help="standard deviation: degrees, metres, a second")]
+
+
+@pushbroom.command()
+def accuracy(
+    scanner: ScannerFile,
+    truth: Annotated[Path | None, typer.Option(help="scanner file of the truth")] = None,
+    attitude_bias: Sigma = 0.0,
+    attitude_drift: Sigma = 0.0,
+    attitude_white: Sigma = 0.0,
+    position_bias: Sigma = 0.0,
+    position_drift: Sigma = 0.0,
+    position_white: Sigma = 0.0,
+    draws: Annotated[int, typer.Option(min=0, help="Monte Carlo beside the closed form")] = 0,
+    seed: int = 0,
+    grid: Annotated[str, typer.Option(help="LINESxPIXELS places over the image")] = "11x11",
+    height: Level = None,
+    dem: Dem = None,
+    csv: Csv = None,
+    json: Json = "",
+) -> None:
+    """RMS and CE90 on the ground of errors with given σ; or the errors against a known truth."""
+    jaxbundle.enable_x64()
+    file = read_scanner(scanner)
+    surface = surface_of(file.earth, height, dem)
+    _, line, pixel, _ = places(file.image, None, grid)
+    columns = {"line": line, "pixel": pixel}
+    if truth is not None:
+        errors = ground_errors(file.image, read_scanner(truth).image, surface, line, pixel)
+        length = np.hypot(*errors.T)
+        columns |= {"east": errors[:, 0], "north": errors[:, 1], "error": length}
+        head = {"rms": float(np.sqrt(np.nanmean(length**2))),
+                "ce90": float(np.nanquantile(length, 0.9))}  # fmt: skip
+    else:
+        degree = np.pi / 180
+        noise = Noise(
+            degree * attitude_bias, degree * attitude_drift, degree * attitude_white,
+            position_bias, position_drift, position_white,
+        )  # fmt: skip
+        if not any(noise):
+            raise InputError("no σ is given: --attitude-white 0.01, for example, or --truth FILE")
+        if isinstance(surface, Terrain):
+            raise InputError("--dem: with σ give --height instead; a terrain has no reverse mode")
+        found = propagated(file.image, surface, line, pixel, noise)
+        columns |= {"rms": found.rms, "ce90": found.ce90}
+        head = {"rms": found.overall}
+        if draws:
+            counted = drawn(file.image, surface, line, pixel, noise, draws, seed)
+            columns |= {"drawn_rms": counted.rms, "drawn_ce90": counted.ce90}
+            head |= {"drawn_rms": counted.overall, "draws": draws}
+    write_rows(columns, csv, json, {"scanner": file.name, **head})
+    if json != "-":
+        typer.echo("; ".join(f"{k} {v:.6g}" for k, v in head.items()), err=True)

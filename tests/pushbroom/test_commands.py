@@ -1,0 +1,132 @@
+"""simulate, correct, accuracy: from a flight file to a map and its errors."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+from test_simulate_correct import pattern
+
+from jaxbundle import cli
+
+rasterio = pytest.importorskip("rasterio")
+
+FLIGHT = """
+[scanner]
+name = "aircraft"
+lines = 300
+pixels = 200
+earth = "local"
+
+[times]
+period = 0.02
+
+[optics]
+c = 60.0
+pitch = 0.1
+
+[track]
+start = [300.0, 200.0, 800.0]
+velocity = [5.0, 60.0, 0.0]
+
+[angles]
+roll = [{ kind = "sine", amplitude = 1.0, period = 3.0 }, 0.5]
+yaw = { kind = "linear", value = -5.0, rate = 0.2 }
+
+[instruments]
+attitude_rate = 20.0
+
+[noise]
+attitude_bias = 0.05
+
+[simulation]
+seed = 3
+"""
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Exit status, standard output and error of a command, in this process."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["jaxbundle", "pushbroom", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        return ended.value.code or 0, *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def flight(tmp_path):
+    path = tmp_path / "flight.toml"
+    path.write_text(FLIGHT)
+    return path
+
+
+def write_scene(path):
+    x, y = np.meshgrid(np.arange(-100, 900) + 0.5, 800 - np.arange(800) - 0.5)
+    with rasterio.open(
+        path, "w", driver="GTiff", height=800, width=1000, count=2, dtype="float32",
+        transform=rasterio.transform.Affine(1, 0, -100, 0, -1, 800),
+    ) as target:  # fmt: skip
+        target.write(pattern(x, y).astype("float32"))
+    return path
+
+
+@pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
+def test_from_a_flight_to_a_map(tmp_path, flight, run):
+    scene, out = write_scene(tmp_path / "scene.tif"), tmp_path / "out"
+    status, said, _ = run("simulate", flight, "--out", out, "--scene", scene)
+    assert status == 0 and said.strip() == str(out / "scanner.toml")
+    names = {p.name for p in out.iterdir()}
+    assert names == {"scanner.toml", "positions.csv", "attitude.csv", "truth", "image.tif"}
+    truth = out / "truth" / "scanner.toml"
+    status, said, err = run("correct", truth, out / "image.tif", "--out", tmp_path / "map.tif",
+                            "--spacing", 2)  # fmt: skip
+    assert status == 0, err
+    with rasterio.open(tmp_path / "map.tif") as result:
+        found, t = result.read(), result.transform
+    x, y = np.meshgrid(t.c + t.a * (np.arange(found.shape[2]) + 0.5),
+                       t.f + t.e * (np.arange(found.shape[1]) + 0.5))  # fmt: skip
+    shown = np.isfinite(found[0])
+    assert shown.mean() > 0.4
+    assert np.quantile(np.abs(found - pattern(x, y))[:, shown], 0.98) < 0.2
+    status, said, _ = run("accuracy", out / "scanner.toml", "--truth", truth, "--json", "-")
+    told = json.loads(said)
+    # one draw of a bias of 0.05° about three axes, 800 m above the ground
+    assert status == 0 and 0.05 < told["rms"] < 4
+    assert len(told["rows"]) == 121 and {"east", "north", "error"} <= set(told["rows"][0])
+    status, said, _ = run("accuracy", truth, "--attitude-bias", 0.05, "--draws", 900, "--json", "-",
+                          "--grid", "3x3")  # fmt: skip
+    told = json.loads(said)
+    assert status == 0 and abs(told["drawn_rms"] / told["rms"] - 1) < 0.08
+    assert abs(told["rms"] / (800 * np.radians(0.05) * np.sqrt(2)) - 1) < 0.05
+
+
+def test_what_is_refused(tmp_path, flight, run):
+    for old, new, words in [
+        ("roll", "rol", ["[angles]", "'rol'", "'roll'"]), ('"sine"', '"sin"', ["'sin'", "'sine'"]),
+        ("amplitude", "amplitud", ["roll", "amplitude"]), ("start", "begin", ["[track]", "begin"]),
+        ("0.02", "-1", ["[times]", "positive"]), ("0.05", "-1", ["[noise]", "negative"]),
+    ]:  # fmt: skip
+        flight.write_text(FLIGHT.replace(old, new, 1))
+        status, said, err = run("simulate", flight, "--out", tmp_path / "out")
+        assert status == 2 and said == "" and len(err.splitlines()) == 1
+        assert all(word in err for word in words), err
+        assert not (tmp_path / "out").exists()
+    flight.write_text(FLIGHT)
+    assert run("simulate", flight, "--out", tmp_path / "out", "--quiet")[0] == 0
+    scanner = tmp_path / "out" / "scanner.toml"
+    for arguments, words in [
+        (["accuracy", scanner], ["no σ", "--attitude-white"]),
+        (["correct", scanner, tmp_path / "no.tif", "--out", tmp_path / "m.tif"], ["no.tif"]),
+        (["correct", scanner, tmp_path / "no.tif", "--out", tmp_path / "m.tif", "--crs",
+          "EPSG:4326"], ["local frame"]),
+        (["correct", scanner, tmp_path / "no.tif", "--out", tmp_path / "m.tif", "--resampling",
+          "best"], ["best", "bilinear"]),
+    ]:  # fmt: skip
+        status, said, err = run(*arguments)
+        assert status == 2 and len(err.splitlines()) == 1
+        assert all(word in err for word in words), err
+    assert not (tmp_path / "m.tif").exists()
