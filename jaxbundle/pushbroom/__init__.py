@@ -1,1 +1,52 @@
-"""Line scanners: from trajectory and optics to the ground and back."""
+"""Line scanners: from trajectory and optics to the ground and back.
+
+    image = read_scanner("scanner.toml").image            # jaxbundle.io.scanner; or make_image(…)
+    X = locate_lines(image, Ground(), lines, pixels)      # [3, lines, pixels], metres
+    found = project_points(image, make_search(image), X.reshape(3, -1))
+
+Every array of a `PushbroomImage` is a parameter: `equinox.tree_at` replaces it, `jax.jacfwd`
+differentiates by it. Times are in seconds, angles in radians, the Earth is WGS 84 unless another
+ellipsoid is given. `docs/pushbroom.md` has the conventions.
+"""
+
+from .accuracy import closed_form as closed_form
+from .accuracy import drawn as drawn
+from .accuracy import ground_errors as ground_errors
+from .accuracy import propagated as propagated
+from .ancillary import attitude_table as attitude_table
+from .ancillary import position_table as position_table
+from .corrections import Corrections as Corrections
+from .frames import EarthOrientation as EarthOrientation
+from .frames import circular_orbit as circular_orbit
+from .frames import to_earth as to_earth
+from .frames import turn_positions as turn_positions
+from .frames import turn_quaternions as turn_quaternions
+from .frames import two_line_orbit as two_line_orbit
+from .image import Offsets as Offsets
+from .image import PushbroomImage as PushbroomImage
+from .image import make_image as make_image
+from .image import pose_at as pose_at
+from .locate import locate as locate_point
+from .locate import locate_lines as locate_lines
+from .locate import locate_points as locate_points
+from .noise import Noise as Noise
+from .noise import disturbed as disturbed
+from .project import Projected as Projected
+from .project import Status as Status
+from .project import make_search as make_search
+from .project import project as project_points
+from .project import project_from as project_from
+from .project import project_near as project_near
+from .scanner import AnglePolynomial as AnglePolynomial
+from .scanner import AngleTable as AngleTable
+from .scanner import FocalLine as FocalLine
+from .scanner import LineTimes as LineTimes
+from .simulate import Flight as Flight
+from .simulate import measured_image as measured_image
+from .simulate import true_image as true_image
+from .surfaces import Ground as Ground
+from .surfaces import Height as Height
+from .surfaces import Plane as Plane
+from .terrain import Terrain as Terrain
+from .terrain import make_terrain as make_terrain
+from .trajectory import Trajectory as Trajectory

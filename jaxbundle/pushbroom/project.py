@@ -36,11 +36,11 @@ SEARCH = 128
 """The search has about as many steps at most."""
 ROUNDS, STEPS = 5, 2
 """How often the piece of a point may be chosen anew, and Newton's steps with its polynomials."""
-SETTLED = 1e-4
+SETTLED = 1e-3
 """A last step below this, in lines and pixels, leaves an error below its square."""
 EDGE = 1e-5
 """A root so many lines beyond the end of its piece stays with it."""
-CHUNK = 16384
+CHUNK = 2048
 """Points that go through all steps together, so that they stay in the cache."""
 NEAR_STEPS = 6
 
@@ -303,13 +303,16 @@ def _newton(image, search, X, own, k, state):
     motion = _motion(c, tau, half, pieces.origin) if image.corrections.any else None
     D = _sights(image, search, X, motion)
     rsq = [[_combined(c[p], D, i) for p in range(DEGREE + 1)] for i in range(3)]
-    for _ in range(STEPS):
-        (r, dr), (s, ds), (q, dq) = (_value_and_rate(p, tau) for p in rsq)
-        (xi, eta), (dxi, deta) = jax.jvp(image.optics.slopes, (v,), (jnp.ones_like(v),))
+    (r, dr), (s, ds), (q, dq) = (_value_and_rate(p, tau) for p in rsq)
+    (xi, eta), (dxi, deta) = jax.jvp(image.optics.slopes, (v,), (jnp.ones_like(v),))
+    ft, gt, fu, gu = dr + xi * dq, ds + eta * dq, dxi * q, deta * q
+    inverse = 1 / (ft * gu - fu * gt)
+    for step in range(STEPS):
+        if step:  # with the derivatives of the first one
+            r, s, q = (_value(p, tau) for p in rsq)
+            xi, eta = image.optics.slopes(v)
         f, g = r + xi * q, s + eta * q
-        ft, gt, fu, gu = dr + xi * dq, ds + eta * dq, dxi * q, deta * q
-        determinant = ft * gu - fu * gt
-        dtau, dv = (gu * f - fu * g) / determinant, (ft * g - gt * f) / determinant
+        dtau, dv = inverse * (gu * f - fu * g), inverse * (ft * g - gt * f)
         tau, v = tau - dtau, v - dv
     # a sight with corrections belongs to the time at which the round began
     moved = tau - first if image.corrections.any else dtau
@@ -357,6 +360,14 @@ def _combined(numbers, D, i):
         numbers[3 * i] * D[0] + numbers[3 * i + 1] * D[1] + numbers[3 * i + 2] * D[2]
         + numbers[9 + i]
     )  # fmt: skip
+
+
+def _value(coefficients, tau):
+    """A polynomial (Horner)."""
+    value = coefficients[-1]
+    for c in coefficients[-2::-1]:
+        value = value * tau + c
+    return value
 
 
 def _value_and_rate(coefficients, tau):
