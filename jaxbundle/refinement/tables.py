@@ -8,8 +8,8 @@ from jaxtyping import Float
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.network.tables import Network, Observations, Source
-from jaxbundle.pushbroom.ancillary import check_covered
 from jaxbundle.pushbroom.image import PushbroomImage
+from jaxbundle.pushbroom.interpolation import Table, covers, interval
 from jaxbundle.refinement.freedom import Freedom
 
 ROLES = ("control", "tie", "check")
@@ -122,9 +122,16 @@ def check_observations(
             raise InputError(f"{where} is measured twice, also at "
                              f"{observations.source(seen[i, p])}; leave one")
         seen[i, p] = row
-        t = [float(one.image.times.time(observations.xy[row, 0]))]
-        try:
-            check_covered(one.image.trajectory.position, t, "positions", "the measured line, row")
-            check_covered(one.image.trajectory.attitude.table, t, "attitude", "the measured line, row")
-        except InputError as error:
-            raise InputError(f"{where}: {error}") from None
+        t = float(one.image.times.time(observations.xy[row, 0]))
+        _check_time(one.image.trajectory.position, t, "positions", where)
+        _check_time(one.image.trajectory.attitude.table, t, "attitude", where)
+
+
+def _check_time(table: Table, t: float, what: str, where: str) -> None:
+    if not bool(covers(table, interval(table, t), t)):
+        first, last = float(table.times[0]), float(table.times[-1])
+        wrong = "in a gap of" if first <= t <= last else "outside"
+        raise InputError(
+            f"{where}: its line is at {t:.9g} s, {wrong} the table of {what}, {first:.9g} to "
+            f"{last:.9g} s; give ancillary data for the whole image, or leave the point out"
+        )
