@@ -15,8 +15,8 @@ from jaxbundle.refinement.equations import System, Unknowns
 from jaxbundle.refinement.inspection import layout_of
 from jaxbundle.refinement.solver import normal
 
-WEAK = 1e-4
-"""Eigenvalues below this: a σ more than 100 times greater than of the unknown alone."""
+WEAK = 1e-2
+"""Eigenvalues below this: a σ more than ten times greater than of the unknown alone."""
 NULL = 1e-10
 """Eigenvalues below this are rounding."""
 PART = 0.15
@@ -61,10 +61,12 @@ def weaknesses(system: System, unknowns: Unknowns, columns: Columns) -> list[Wea
 
 def _sentence(named, value):
     how = "do not determine" if value < NULL else "hardly determine"
-    if len(named) == 1:
-        return f"the points {how} the {named[0]}"
-    first, *others = named
-    return f"the points {how} the {first} against {', '.join(others)}"
+    text = f"the points {how} the {named[0]}"
+    if named[1:]:
+        text += f" against {', '.join(named[1:])}"
+    if value < NULL:
+        return text
+    return f"{text} (σ {1 / np.sqrt(value):.2g} times as large as of one alone)"
 
 
 def _shares(vector, columns):
