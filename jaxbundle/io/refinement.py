@@ -58,7 +58,7 @@ from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable, FocalLine, Optics
 from jaxbundle.refinement.freedom import Freedom
 from jaxbundle.refinement.refine import TESTS, east_north_up
-from jaxbundle.refinement.tables import GroundPoints, ScannerImage
+from jaxbundle.refinement.tables import GroundPoints, ScannerImage, check_points_table
 
 SECTIONS = {
     "refine": (
@@ -124,6 +124,8 @@ def read_refinement(path: str | Path) -> RefineFile:
     if "frames" in section:
         frames = read_network(path.parent / section.text("frames"))
     points = _points(read_csv(path.parent / section.text("points")), earth, radians)
+    # told first: the ids of observations are looked up in it
+    check_points_table(points)
     ids = {id: k for k, id in enumerate(points.id)}
     if frames is not None:
         ids |= {id: k for k, id in enumerate(

@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.refinement.equations import System, Unknowns
-from jaxbundle.refinement.solver import Reduced, normal, solve
+from jaxbundle.refinement.solver import Reduced, normal, polished, solve
 from jaxbundle.statistics.distributions import normal_quantile, tau_quantile
 
 UNCONTROLLED = 1e-8
@@ -115,7 +115,8 @@ def adjust(system: System, start: Unknowns, weak) -> Inspection:
     """
     redundancy = count_redundancy(system)
     found = solve(system, start, jnp.asarray(float(redundancy)))
-    reduced, v = normal(system, found.unknowns)
+    system, unknowns = polished(system, found.unknowns)
+    reduced, v = normal(system, unknowns)
     if not np.isfinite(np.asarray(reduced.lower)).all() or redundancy < 0:
         reasons = weak(system, found.unknowns)
         raise NotSolvedError(
@@ -127,7 +128,7 @@ def adjust(system: System, start: Unknowns, weak) -> Inspection:
             f"the adjustment did not settle in {int(found.steps)} steps; look at start values and "
             "blunders"
         )
-    return _inspect(system, found.unknowns, int(found.steps), reduced, v, redundancy)
+    return _inspect(system, unknowns, int(found.steps), reduced, v, redundancy)
 
 
 def _inspect(system, unknowns, steps, reduced, v, redundancy) -> Inspection:

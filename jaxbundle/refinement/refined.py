@@ -76,7 +76,7 @@ def _attitude(image, form, change) -> Attitude:
     end = min(np.searchsorted(rows, last) + MARGIN, len(rows) - 1)
     times = rows[start : end + 1]
     centres = form.spline.centres
-    times = np.union1d(times, centres[(centres > times[0]) & (centres < times[-1])])
+    times = np.union1d(times, centres[(centres > first) & (centres < last)])
     gaps = rows[1:][np.diff(rows) > old.table.gap]
     R = lambda t: _padded(lambda t: _rotations(image, form, change, t), t)
     rotations, pending = R(times), np.ones(len(times) - 1, bool)
