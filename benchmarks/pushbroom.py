@@ -2,11 +2,11 @@
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/pushbroom.py [--json FILE] [--map]
 
-An image of 10 000 lines of 8000 pixels of 4.7 m from 500 km: positions every second (Lagrange, order 7),
-quaternions at 10 Hz (slerp), a lens with distortion. Blocks of lines are given to two threads in
-turn, as `correct` does; the best of several rounds counts. `--map` also corrects a whole image of
-10 000 × 8000 random pixels to a GeoTIFF. Every figure stands beside its demand; what is computed is
-checked first, and a wrong answer ends with exit status 1, whatever the time.
+An image of 10 000 lines of 8000 pixels of 4.7 m from 500 km: positions every second (Lagrange,
+order 7), quaternions at 10 Hz (slerp), a lens with distortion. Blocks of lines are given to two
+threads in turn, as `correct` does; the best of several rounds counts. `--map` also corrects a
+whole image of 10 000 × 8000 random pixels to a GeoTIFF. Every figure stands beside its demand;
+what is computed is checked first, and a wrong answer ends with exit status 1, whatever the time.
 
     ellipsoid      X, Y, Z on the ellipsoid           geodetic     the same to λ, φ, h
     terrain        first hit with a rough model       jacobian     ∂(X, Y, Z)/∂(3 angles, 3 shifts)
@@ -41,7 +41,7 @@ from jaxbundle.pushbroom.ancillary import attitude_table, position_table  # noqa
 from jaxbundle.pushbroom.frames import circular_orbit  # noqa: E402
 from jaxbundle.pushbroom.image import make_image  # noqa: E402
 from jaxbundle.pushbroom.locate import locate_lines  # noqa: E402
-from jaxbundle.pushbroom.project import make_search, project, project_from  # noqa: E402
+from jaxbundle.pushbroom.project import make_search, project_from, project_points  # noqa: E402
 from jaxbundle.pushbroom.scanner import FocalLine, LineTimes  # noqa: E402
 from jaxbundle.pushbroom.surfaces import Ground  # noqa: E402
 from jaxbundle.pushbroom.terrain import bilinear, make_terrain  # noqa: E402
@@ -127,7 +127,7 @@ def measure(rounds):
     found = back(blocks[0])
     check("raster", np.abs(found[0] - blocks[0][0][:, None]).max(), 1e-6)
     check("raster", np.abs(found[1] - U).max(), 1e-6)
-    places = project(scan, search, X)
+    places = project_points(scan, search, X)
     check("search", np.abs(np.stack([places.line[0], places.pixel[0]]) - spread).max(), 1e-6)
 
     return {
@@ -136,7 +136,7 @@ def measure(rounds):
         "terrain": rate(lambda l: locate(scan, terrain, l, U), lines(16), 16 * PIXELS, rounds),
         "jacobian": rate(lambda l: jacobian(scan, l), lines(8), 8 * PIXELS, rounds),
         "raster": rate(back, blocks, 8 * PIXELS, rounds),
-        "search": rate(lambda X: project(scan, search, X), [X] * 2, X.shape[1], rounds),
+        "search": rate(lambda X: project_points(scan, search, X), [X] * 2, X.shape[1], rounds),
     }, wrong  # fmt: skip
 
 

@@ -21,11 +21,17 @@ if TYPE_CHECKING:
     from jaxbundle.adjustment.batch import BatchCalibration as BatchCalibration
     from jaxbundle.adjustment.batch import calibrate_batch as calibrate_batch
     from jaxbundle.bundle import adjust as adjust
+    from jaxbundle.calibration import Board as Board
+    from jaxbundle.calibration import BoardViews as BoardViews
+    from jaxbundle.calibration import Calibration as Calibration
+    from jaxbundle.calibration import calibrate as calibrate
+    from jaxbundle.calibration import calibrate_cameras as calibrate_cameras
     from jaxbundle.configuration import enable_x64 as enable_x64
     from jaxbundle.configuration import use_cores as use_cores
     from jaxbundle.errors import InputError as InputError
     from jaxbundle.errors import NotSolvedError as NotSolvedError
     from jaxbundle.gradients import check_gradients as check_gradients
+    from jaxbundle.io import convert as convert
     from jaxbundle.io import read_network as read_network
     from jaxbundle.io import write_project as write_project
     from jaxbundle.network import Camera as Camera
@@ -42,17 +48,20 @@ if TYPE_CHECKING:
     from jaxbundle.network.stations import ring_of_stations as ring_of_stations
     from jaxbundle.network.stations import stations_looking_at as stations_looking_at
     from jaxbundle.orientation.network import Oriented as Oriented
-    from jaxbundle.orientation.network import orient as orient
+    from jaxbundle.oriented import orient as orient
     from jaxbundle.result import Adjustment as Adjustment
 
 _HOME = {
     "jaxbundle.adjustment": ("Problem", "make_problem", "solve"),
     "jaxbundle.adjustment.batch": ("BatchCalibration", "calibrate_batch"),
     "jaxbundle.bundle": ("adjust",),
+    "jaxbundle.calibration": (
+        "Board", "BoardViews", "Calibration", "calibrate", "calibrate_cameras",
+    ),
     "jaxbundle.configuration": ("enable_x64", "use_cores"),
     "jaxbundle.errors": ("InputError", "NotSolvedError"),
     "jaxbundle.gradients": ("check_gradients",),
-    "jaxbundle.io": ("read_network", "write_project"),
+    "jaxbundle.io": ("convert", "read_network", "write_project"),
     "jaxbundle.network": ("Camera", "Network"),
     "jaxbundle.network.arrays": ("Data", "Values"),
     "jaxbundle.network.build": ("make_network",),
@@ -62,7 +71,8 @@ _HOME = {
         "aerial_block", "cloud_of_targets", "grid_of_targets", "ring_of_stations",
         "stations_looking_at",
     ),
-    "jaxbundle.orientation.network": ("Oriented", "orient"),
+    "jaxbundle.orientation.network": ("Oriented",),
+    "jaxbundle.oriented": ("orient",),
     "jaxbundle.result": ("Adjustment",),
 }
 _MODULE = {name: module for module, names in _HOME.items() for name in names}

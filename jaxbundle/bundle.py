@@ -10,7 +10,8 @@ from jaxbundle.errors import InputError
 from jaxbundle.network.check import check_network
 from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.tables import Network
-from jaxbundle.orientation.network import lacks_start_values, orient
+from jaxbundle.orientation.network import lacks_start_values
+from jaxbundle.oriented import orient, screen
 from jaxbundle.repeated import eliminated_parameters, robustly, snooped, with_components
 from jaxbundle.result import Adjustment
 from jaxbundle.solution import minimise, names_of_defects, solved
@@ -47,7 +48,8 @@ def adjust(
       last weights are those of the result, its σ by some per cent too small.
     - `snooping`: `"pope"` or `"baarda"`: remove blunders at the level `significance`: with
       `"pope"` the probability to lose anything of a network without blunders, with `"baarda"`
-      that of a single observation.
+      that of a single observation. Where blunders leave no solution to begin with, image points
+      that contradict the start values altogether are left out first (also of `robust`).
     - `eliminate`: fix additional parameters with t < `critical_t` at 0, the least significant
       first, adjusting again each time.
     - `estimate_components`: scale the σ of each group of observations until its variance
@@ -66,13 +68,20 @@ def adjust(
         raise InputError("robust estimation or data snooping, not both at once")
     if lacks_start_values(network):
         network = orient(network).network
-    network = check_network(network)
-    network, check_points, check_rays = split_check_points(network)
-    problem = make_problem(network, reduction)
-    network, used = problem.network, problem.structure.reduction
     options = {"method": method, "max_steps": max_iterations + 1, "progress": progress}
     again = lambda problem, values: minimise(problem, values, **options)
-    minimum = again(problem, problem.data.start)
+
+    def begin(network):
+        network, *check = split_check_points(check_network(network))
+        problem = make_problem(network, reduction)
+        return problem, again(problem, problem.data.start), check
+
+    problem, minimum, check = begin(network)
+    if (robust or snooping) and not solved(with_factor(problem), minimum):
+        screened = screen(network)
+        if len(screened.observations) < len(network.observations):
+            problem, minimum, check = begin(screened)
+    network, used = problem.network, problem.structure.reduction
     problem = with_factor(problem)
 
     removed, eliminated, factors, weights = [], [], {}, None
@@ -92,14 +101,14 @@ def adjust(
     names = () if inspection else names_of_defects(problem, minimum)
     if not inspection and converged(int(minimum.termination)):
         names = names or UNNAMED
-    check = None
-    if len(check_points):
-        check = lambda result: intersect_check_points(
-            result.inspection, result.values, check_points, check_rays, factors
+    intersected = None
+    if len(check[0]):
+        intersected = lambda result: intersect_check_points(
+            result.inspection, result.values, *check, factors
         )
     return Adjustment(
         network, problem, minimum, removed=tuple(removed), eliminated=tuple(eliminated),
-        undetermined=tuple(names), check=check, method=method, reduction=used,
+        undetermined=tuple(names), check=intersected, method=method, reduction=used,
         sigma_factors=factors, inspection=inspection, robust=robust,
         weights=None if weights is None else np.asarray(weights)[problem.rays],
     )  # fmt: skip

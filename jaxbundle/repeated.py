@@ -48,7 +48,7 @@ def robustly(problem: Problem, minimum, again, estimator: str):
     if not rests:
         raise NotSolvedError(
             f"not solved by robust estimation: the weights of {estimator} do not come to rest; use "
-            "huber, or data snooping"
+            f"{'' if estimator == 'huber' else 'huber, or '}data snooping"
         )
     return problem, repeat.minimum, factors
 

@@ -1,4 +1,5 @@
-"""What the command line writes: a JSON file, and a folder of report, JSON, tables and plots.
+"""What the command line writes: a JSON file, and a folder of report, JSON, tables, plots and the
+adjusted network as a project.
 
 `check_targets` finds before an adjustment what could not be written after it.
 """
@@ -11,7 +12,10 @@ from pathlib import Path
 from jaxbundle import report
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.csv_tables import write_csv, write_text
+from jaxbundle.io.project import ADJUSTED, FILE_NAME, write_project
 from jaxbundle.io.result_json import result_text, unsolved_text
+from jaxbundle.io.result_project import adjusted_network
+from jaxbundle.io.settings import TABLES as NETWORK_TABLES
 from jaxbundle.network.tables import Network
 from jaxbundle.plotting import save_figures
 from jaxbundle.plotting.files import FIGURES
@@ -20,14 +24,26 @@ from jaxbundle.result import Adjustment
 REPORT, RESULT = "report.txt", "result.json"
 TABLES = ("cameras", "images", "points", "residuals", "checks")
 FILES = (REPORT, RESULT, *(f"{name}.csv" for name in TABLES))
+NETWORK_FILES = (FILE_NAME, *(f"{name}.csv" for name in NETWORK_TABLES))
+"""In the folder of the adjusted network."""
 
 
 def check_targets(input: Path, network: Network, json: str, out: Path | None) -> None:
     """Refuse a JSON file or a folder that cannot be written, or that would replace the input."""
+    tables = (network.images, network.points, network.observations, network.distances)
+    names = (*FILES, *(Path(ADJUSTED) / name for name in NETWORK_FILES))
+    check_writable(json, out, names, (input, *(t.source.name for t in tables)))
+
+
+def check_writable(
+    json: str, out: Path | None, names: Iterable[str | Path], inputs: Iterable[str | Path]
+) -> None:
+    """Refuse a JSON file, or a folder for files of these names, that cannot be written, or that
+    would replace one of the inputs."""
     written = []
     if out is not None:
         _check_folder(f"--out {out}", out)
-        written += [out / name for name in FILES]
+        written += [out / name for name in names]
     if json not in ("", "-"):
         path = Path(json)
         if path.is_dir():
@@ -37,8 +53,7 @@ def check_targets(input: Path, network: Network, json: str, out: Path | None) ->
                 raise InputError(f"--json {json}: there is no folder {path.parent}")
             _check_folder(f"--json {json}", path.parent)
         written.append(path)
-    tables = (network.images, network.points, network.observations, network.distances)
-    read = {os.path.realpath(path) for path in (input, *(t.source.name for t in tables))}
+    read = {os.path.realpath(path) for path in inputs}
     for path in written:
         if os.path.realpath(path) in read:
             raise InputError(f"{path} is part of the input and would be overwritten; give another")
@@ -72,6 +87,7 @@ def write_targets(
         write_text(Path(json), told)
     if out is not None and solved and result.converged:
         _write_tables(result, out)
+        write_project(adjusted_network(result), out / ADJUSTED)
         if plots:
             try:
                 save_figures(result, out)
@@ -85,12 +101,16 @@ def _make_empty(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         for path in _own_files(folder):
             path.unlink(missing_ok=True)
+        network = folder / ADJUSTED
+        if network.is_dir() and not any(network.iterdir()):
+            network.rmdir()
     except OSError as error:
         raise InputError(f"--out {folder}: cannot be written: {error.strerror}") from None
 
 
 def _own_files(folder: Path) -> Iterable[Path]:
     yield from (folder / name for name in FILES)
+    yield from (folder / ADJUSTED / name for name in NETWORK_FILES)
     for pattern in FIGURES:
         yield from folder.glob(pattern)
 

@@ -15,6 +15,11 @@ Batch them with `jax.vmap`. A model is a `CameraModel`, found by name:
 
 from .catalogue import MODEL_NAMES as MODEL_NAMES
 from .catalogue import get_model as get_model
+from .compare import Comparison as Comparison
+from .compare import compare_cameras as compare_cameras
+from .compare import difference_rings as difference_rings
+from .convert import Conversion as Conversion
+from .convert import convert_camera as convert_camera
 from .inverse import implicit_inverse as implicit_inverse
 from .model import CameraModel as CameraModel
 from .model import image_ray as image_ray

@@ -1,21 +1,45 @@
 """`jaxbundle convert`: one format into another."""
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from jaxbundle.cli.app import Format, Input, Settings, app
-from jaxbundle.io import read_network, write_project
+from jaxbundle.cli.app import Format, Input, Quiet, Settings, app
+from jaxbundle.cli.cameras_given import pair
+from jaxbundle.errors import InputError
+from jaxbundle.io.exchange import convert as convert_file
 
 
 @app.command()
 def convert(
     input: Input,
-    output: Annotated[Path, typer.Argument(help="folder of the project to write")],
+    output: Annotated[Path, typer.Argument(help="file or folder to write")],
+    to: Annotated[
+        str | None, typer.Option(help="kind of output, if not recognised by its name")
+    ] = None,
+    model: Annotated[str | None, typer.Option(help="camera model to convert to")] = None,
+    camera: Annotated[str | None, typer.Option(help="id, where the output holds one")] = None,
+    measured: Annotated[
+        bool, typer.Option("--measured", help="fit models over what is measured, not the image")
+    ] = False,
+    image_size: Annotated[str, typer.Option(help="W,H in pixels, of cameras without")] = "",
+    pixel_size: Annotated[str, typer.Option(help="W,H in mm, of cameras without")] = "",
     set: Settings = None,
     format: Format = None,
+    quiet: Quiet = False,
 ) -> None:
-    """Write any input as a project: project.toml and CSV tables."""
-    path = write_project(read_network(input, format, tuple(set or ())), output)
-    print(path)
+    """Write any input in another format: project, COLMAP, BAL, Bundler, OpenCV, PLY, DXF, CSV."""
+    overrides = tuple(set or ())
+    size = pair("--image-size", image_size)
+    if size is not None and not all(number.is_integer() for number in size):
+        raise InputError(f"--image-size {image_size}: whole numbers of pixels are expected")
+    done = convert_file(
+        input, output, to, model, camera, format, overrides, measured,
+        size and tuple(map(int, size)), pair("--pixel-size", pixel_size),
+    )  # fmt: skip
+    if not quiet:
+        print(str(done).split("\n", 1)[0])
+        for line in str(done).splitlines()[1:]:
+            print(line, file=sys.stderr if line.startswith("warning") else sys.stdout)

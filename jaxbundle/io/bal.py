@@ -20,12 +20,20 @@ import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
-from jaxbundle.geometry import matrix_from_rotation_vector, omega_phi_kappa_from_matrix
+from jaxbundle.geometry.pose_conventions import bundler_pose, exterior_from_bundler
+from jaxbundle.io.assemble import all_parameters
+from jaxbundle.io.csv_tables import write_bytes
+from jaxbundle.io.losses import need_values, what_is_lost
+from jaxbundle.io.poses import (
+    angles_of,
+    matrices_of,
+    matrices_of_rotation_vectors,
+    rotation_vectors_of,
+)
 from jaxbundle.io.settings import SETTINGS, apply_overrides, check_settings
 from jaxbundle.network.build import make_cameras, make_network
 from jaxbundle.network.columns import Columns
@@ -82,6 +90,7 @@ def read_bal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     for camera in document["camera"] if free is not None else ():
         camera["free"] = free
     check_settings(project, f"{path}: ")
+    angle_unit = project.pop("angle_unit", "rad")
     return make_network(
         make_cameras(document["camera"], f"{path}, "),
         _table(path, "camera", _images(given[:, :6])),
@@ -97,7 +106,36 @@ def read_bal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             Source(str(path), np.arange(rows) + 2, "line"),
         ),
         **project,
-    )  # fmt: skip
+    ).replace(angle_unit=angle_unit)  # fmt: skip
+
+
+def write_bal(network: Network, path: str | Path) -> tuple[str, ...]:
+    """Write a network as a problem, compressed if the name ends in .gz or .bz2.
+
+    Its cameras must be of model `snavely`. Images that share a camera each get a copy of it.
+
+    **Returns:** what the format has no place for, in words.
+    """
+    path = Path(path)
+    images, points, rays = network.images, network.points, network.observations
+    need_values(network, "snavely", "BAL")
+    R, t = bundler_pose(matrices_of(images.angles), images.position)
+    given = np.array([[*all_parameters(c).values()] for c in network.cameras])[images.camera]
+    cameras = np.concatenate([rotation_vectors_of(R), t, given], 1)
+    lines = [f"{len(images)} {len(points)} {len(rays)}"]
+    lines += [
+        f"{image} {point} {x!r} {y!r}"
+        for image, point, (x, y) in zip(rays.image.tolist(), rays.point.tolist(), rays.xy.tolist())
+    ]
+    lines += map(repr, [*cameras.ravel().tolist(), *points.position.ravel().tolist()])
+    text = ("\n".join(lines) + "\n").encode()
+    match path.suffix.lower():
+        case ".gz":
+            text = gzip.compress(text, mtime=0)
+        case ".bz2":
+            text = bz2.compress(text)
+    write_bytes(path, text)
+    return what_is_lost(network, shared_cameras=True, names=True)
 
 
 def _are_counts(words: Sequence[bytes]) -> bool:
@@ -149,14 +187,8 @@ def _not_a_number(path: Path, text: bytes) -> InputError:
 
 def _images(pose) -> dict:
     """Exterior orientation of the images from rotation vectors and shifts."""
-
-    def exterior(pose):
-        M = matrix_from_rotation_vector(pose[:3])
-        return -M.T @ pose[3:], omega_phi_kappa_from_matrix(M)
-
-    with jax.enable_x64(True):
-        centre, angles = jax.jit(jax.vmap(exterior))(pose)
-    columns = np.concatenate([centre, angles], 1).T
+    M, centre = exterior_from_bundler(matrices_of_rotation_vectors(pose[:, :3]), pose[:, 3:])
+    columns = np.concatenate([centre, angles_of(M)], 1).T
     ids = np.arange(len(pose))
     return {"id": ids, "camera": ids, **dict(zip(EXTERIOR, columns))}
 

@@ -4,6 +4,7 @@ import csv
 import io
 import os
 import re
+import tomllib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,8 @@ from jaxbundle.network.columns import Columns
 from jaxbundle.network.tables import Source
 
 
-def read_text(path: Path) -> str:
-    """The text of a file.
+def read_text(path: Path, fallback: str = "") -> str:
+    """The text of a file; `fallback` is the encoding of what is not UTF-8.
 
     **Raises:** `InputError` if there is none, it cannot be read, or it is not UTF-8.
     """
@@ -27,10 +28,26 @@ def read_text(path: Path) -> str:
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:
+        if fallback:
+            return error.object.decode(fallback)
         line = error.object[: error.start].count(b"\n") + 1
         raise InputError(
             f"{path}, line {line}: not UTF-8 text; save the file as UTF-8"
         ) from None
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The document of a TOML file.
+
+    **Raises:** `InputError` if it cannot be read or is not TOML.
+    """
+    text = read_text(path)
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise InputError(f"{path}: not valid TOML: brackets are nested too deeply") from None
+    except ValueError as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from None
 
 
 def read_csv(path: Path) -> Columns:
@@ -82,6 +99,11 @@ def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) 
 
 
 def write_text(path: Path, text: str) -> None:
+    """Write a text in UTF-8, whole or not at all (`write_bytes`)."""
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: Path, content: bytes) -> None:
     """Write a file whole or not at all: under a temporary name, then renamed.
 
     What is there and no file (a device, a pipe) is written to as it is.
@@ -89,10 +111,10 @@ def write_text(path: Path, text: str) -> None:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         if path.exists() and not path.is_file():
-            path.write_text(text, encoding="utf-8", newline="\n")
+            path.write_bytes(content)
             return
         try:
-            temporary.write_text(text, encoding="utf-8", newline="\n")
+            temporary.write_bytes(content)
             os.replace(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)

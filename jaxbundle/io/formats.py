@@ -1,14 +1,24 @@
-"""Which format a path is in, and who reads it."""
+"""Which format a path is in, who reads it, and who writes it."""
 
 import dataclasses
 import os
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.bal import is_bal, read_bal
+from jaxbundle.io.bal import OPENERS, is_bal, read_bal, write_bal
+from jaxbundle.io.bingo import is_bingo, read_bingo
+from jaxbundle.io.bundler import is_bundler, read_bundler, write_bundler
+from jaxbundle.io.colmap import is_colmap, read_colmap, write_colmap
+from jaxbundle.io.column_map import is_column_map, read_column_map
+from jaxbundle.io.coordinates import write_coordinates
+from jaxbundle.io.dxf import write_dxf
+from jaxbundle.io.metashape import is_metashape, read_metashape
 from jaxbundle.io.photo_list import read_photo_list
-from jaxbundle.io.project import FILE_NAME, read_project
+from jaxbundle.io.photomodeler import is_photomodeler, read_photomodeler
+from jaxbundle.io.ply import write_ply
+from jaxbundle.io.project import FILE_NAME, project_file, read_project, write_project
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.network.tables import Network
 
@@ -22,8 +32,23 @@ class Format:
     looks: str
 
 
+@dataclasses.dataclass(frozen=True)
+class Target:
+    """A kind of output: names it is recognised by, who writes it, and the camera models it has.
+
+    `write` returns what is not kept, in words; no `models`: all.
+    """
+
+    recognises: Callable[[Path], bool]
+    write: Callable[[Network, Path], Sequence[str]]
+    looks: str
+    models: tuple[str, ...] = ()
+
+
 def _is_project(path: Path) -> bool:
-    return path.suffix.lower() == ".toml" or (path / FILE_NAME).is_file()
+    if path.suffix.lower() == ".toml":
+        return not is_column_map(path)
+    return path.is_dir() and project_file(path).is_file()
 
 
 def _is_photo_list(path: Path) -> bool:
@@ -45,7 +70,60 @@ FORMATS: dict[str, Format] = {
         _is_photo_list, read_photo_list, "a .txt file whose first line is the focal length"
     ),
     "bal": Format(is_bal, read_bal, "a text file (.gz, .bz2) whose first line is three numbers"),
+    "column-map": Format(is_column_map, read_column_map, "a .toml file with [table.…] sections"),
+    "colmap": Format(is_colmap, read_colmap, "a folder with cameras.bin or cameras.txt"),
+    "bingo": Format(is_bingo, read_bingo, "a folder with image.dat and geoin.dat"),
+    "metashape": Format(is_metashape, read_metashape, "an .xml file of Metashape's cameras"),
+    "photomodeler": Format(
+        is_photomodeler, read_photomodeler, 'a .txt file that begins with "Bundle Soln"'
+    ),
+    "bundler": Format(is_bundler, read_bundler, 'a file that begins with "# Bundle file"'),
 }
+
+
+def _write_project(network: Network, path: Path) -> Sequence[str]:
+    write_project(network, path.parent if path.name == FILE_NAME else path)
+    return ()
+
+
+def _ends(*suffixes: str) -> Callable[[Path], bool]:
+    return lambda path: path.suffix.lower() in suffixes
+
+
+def _is_colmap_name(path: Path) -> bool:
+    return not path.suffix and any(
+        word in part.lower() for part in path.parts[-2:] for word in ("colmap", "sparse")
+    )
+
+
+def _is_bal_name(path: Path) -> bool:
+    return path.suffix.lower() in (".txt", ".bal", *OPENERS)
+
+
+PIXEL_MODELS = ("opencv", "kannala-brandt")
+TARGETS: dict[str, Target] = {
+    "ply": Target(_ends(".ply"), write_ply, "NAME.ply"),
+    "dxf": Target(_ends(".dxf"), write_dxf, "NAME.dxf"),
+    "csv": Target(_ends(".csv"), write_coordinates, "NAME.csv"),
+    "bundler": Target(_ends(".out"), write_bundler, "NAME.out", ("snavely",)),
+    "bal": Target(_is_bal_name, write_bal, "NAME.txt, .bal, .gz, .bz2", ("snavely",)),
+    "colmap": Target(
+        _is_colmap_name, partial(write_colmap, text=False), "a folder with colmap or sparse in its "
+        "name", PIXEL_MODELS,
+    ),
+    "colmap-text": Target(
+        lambda path: False, partial(write_colmap, text=True), "by --to only", PIXEL_MODELS
+    ),
+    "project": Target(
+        lambda path: not path.suffix or path.is_dir() or path.name == FILE_NAME, _write_project,
+        "another folder",
+    ),
+}  # fmt: skip
+
+
+def recognised_format(path: Path) -> str | None:
+    """The kind of an input, from its name and content; None where none fits."""
+    return next((name for name, kind in FORMATS.items() if kind.recognises(path)), None)
 
 
 def read_network(
@@ -66,8 +144,7 @@ def read_network(
         raise InputError(f"unknown format {format!r}{did_you_mean(format, FORMATS)}")
     if not os.path.exists(path):
         raise InputError(f"{path}: no such file or folder")
-    if format is None:
-        format = next((name for name, kind in FORMATS.items() if kind.recognises(path)), None)
+    format = format or recognised_format(path)
     if format is None:
         known = "; ".join(f"{name}: {kind.looks}" for name, kind in FORMATS.items())
         raise InputError(f"{path}: the kind of input is not recognised; known formats: {known}")

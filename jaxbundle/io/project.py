@@ -31,7 +31,6 @@ Small tables may stand in the file itself, one `[[image]]`, `[[point]]`, `[[obse
 
 import json
 import os
-import tomllib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -39,7 +38,7 @@ from types import MappingProxyType
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.csv_tables import read_csv, read_text, write_csv, write_text
+from jaxbundle.io.csv_tables import read_csv, read_toml, write_csv, write_text
 from jaxbundle.io.settings import SETTINGS, TABLES, Document, apply_overrides, network_of
 from jaxbundle.network.build import (
     DISTANCE_COLUMNS,
@@ -55,33 +54,40 @@ from jaxbundle.network.tables import Camera, Network, Source
 from jaxbundle.network.units import ANGLE_UNITS, to_image_unit
 
 FILE_NAME = "project.toml"
+ADJUSTED = "network"
+"""The folder of the adjusted network beside the tables of a result."""
 INLINE = {table: table.removesuffix("s") for table in TABLES}
 """The tables and the name of one of their rows in the TOML file."""
 
 
 def read_project(path: str | Path, overrides: Sequence[str] = ()) -> Network:
-    """The network of a project file (or of `project.toml` in a folder).
+    """The network of a project file, or of the one in a folder (`project_file`).
 
     `overrides` are settings `KEY=VALUE` that replace those of the file, see
     `jaxbundle.io.settings`.
 
     **Raises:** `InputError` naming file, line and column.
     """
-    path = Path(path)
-    path = path / FILE_NAME if path.is_dir() else path
+    path = project_file(Path(path))
     document = apply_overrides(_read_document(path), overrides, (*SETTINGS, *TABLES))
     document["project"].setdefault("name", path.resolve().parent.name)
     tables = {table: _read_table(document, table, path) for table in TABLES}
     return network_of(document, {k: v for k, v in tables.items() if v is not None}, str(path))
 
 
+def project_file(path: Path) -> Path:
+    """The project file a path stands for: itself, or the one in a folder.
+
+    In a folder written by `jaxbundle adjust --out` it is that of the adjusted network.
+    """
+    if not path.is_dir():
+        return path
+    places = (path / FILE_NAME, path / ADJUSTED / FILE_NAME)
+    return next((place for place in places if place.is_file()), places[0])
+
+
 def _read_document(path: Path) -> Document:
-    try:
-        document = tomllib.loads(read_text(path))
-    except RecursionError:
-        raise InputError(f"{path}: not valid TOML: brackets are nested too deeply") from None
-    except ValueError as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from None
+    document = read_toml(path)
     known = ("project", "camera", *INLINE.values())
     for key, value in document.items():
         if key not in known:
@@ -183,9 +189,13 @@ def _document_text(network: Network) -> str:
     if not network.datum_points:
         del settings["datum_points"]
     lines += ["[project]", *_assignments(settings)]
-    for camera in network.cameras:
-        lines += ["", "[[camera]]", *_assignments(_camera_entry(camera))]
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines) + "\n\n" + cameras_text(network.cameras)
+
+
+def cameras_text(cameras: Sequence[Camera]) -> str:
+    """Cameras as the `[[camera]]` entries of a TOML file."""
+    entries = (["[[camera]]", *_assignments(_camera_entry(camera)), ""] for camera in cameras)
+    return "\n".join(line for entry in entries for line in entry)
 
 
 def _camera_entry(camera: Camera) -> dict:

@@ -142,6 +142,10 @@ def _check_images(network: Network) -> None:
         lambda row, k: f"σ of {EXTERIOR[k]} is {sigma[row, k]:g}; it must be positive and finite, "
         'empty (no prior), or "fixed" (0) to hold the value',
     )  # fmt: skip
+    _refuse(
+        images, ~np.isnan(sigma) & np.isnan(values), "image",
+        lambda row, k: f"{EXTERIOR[k]} has a σ but no value; give the value, or leave the σ empty",
+    )  # fmt: skip
     held = (sigma[:, 3:] == 0).sum(1, keepdims=True)
     _refuse(
         images, (held > 0) & (held < 3), "image",
@@ -292,7 +296,8 @@ def _refuse_missing(table, values, names, thing):
     also = f" (and {more} more)" if more > 0 else ""
     _refuse(
         table, missing, thing,
-        lambda row, k: f"{names[k]} has no start value{also}; give start values",
+        lambda row, k: f"{names[k]} has no start value{also}; give start values, or find them with "
+        "jaxbundle.orient",
     )  # fmt: skip
 
 

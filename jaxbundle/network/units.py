@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbundle.cameras import get_model
+from jaxbundle.cameras.frames import pixel_frame
 from jaxbundle.errors import InputError
 from jaxbundle.network.tables import Camera
 
@@ -25,6 +26,37 @@ ANGLE_UNITS = {"rad": 1.0, "deg": math.pi / 180, "gon": math.pi / 200}
 """Radians in one unit."""
 
 IMAGE_UNITS = ("mm", "px")
+
+
+def image_from_pixel(
+    uv: Float[np.ndarray, "*any 2"], image_size: tuple[int, int], pixel_size: tuple[float, float]
+) -> Float[np.ndarray, "*any 2"]:
+    """Millimetres from the image centre, y up, of pixels, v down.
+
+    **Arguments:** `image_size` (columns, rows); `pixel_size` (width, height) in mm.
+    """
+    return _to_mm(uv, *_grid(image_size, pixel_size))
+
+
+def pixel_from_image(
+    xy: Float[np.ndarray, "*any 2"], image_size: tuple[int, int], pixel_size: tuple[float, float]
+) -> Float[np.ndarray, "*any 2"]:
+    """The inverse of `image_from_pixel`."""
+    return _to_px(xy, *_grid(image_size, pixel_size))
+
+
+def _to_mm(uv, centre, pitch):
+    return (uv - centre) * pitch
+
+
+def _to_px(xy, centre, pitch):
+    return xy / pitch + centre
+
+
+def _grid(image_size, pixel_size):
+    """The image centre (pixels) and the pixel size (mm, negative where v runs down)."""
+    centre, per_mm = pixel_frame(get_model("brown"), image_size, pixel_size)
+    return centre, 1 / per_mm
 
 
 def from_image_unit(
@@ -67,7 +99,8 @@ def _convert(cameras, camera, xy, sigma, given, wanted):
     centre, pitch = centre[camera], pitch[camera]
     to_mm = np.array([(h, w) == ("px", "mm") for h, w in zip(given, wanted)])[camera, None]
     to_px = np.array([(h, w) == ("mm", "px") for h, w in zip(given, wanted)])[camera, None]
-    xy = np.where(to_mm, (xy - centre) * pitch, np.where(to_px, xy / pitch + centre, xy))
+    converted = np.where(to_px, _to_px(xy, centre, pitch), xy)
+    xy = np.where(to_mm, _to_mm(xy, centre, pitch), converted)
     size = np.abs(pitch)
     return xy, np.where(to_mm, sigma * size, np.where(to_px, sigma / size, sigma))
 
@@ -82,7 +115,7 @@ def _pixel_grid(camera: Camera):
         return np.zeros(2), np.array(camera.pixel_size)
     if camera.image_size is None:
         raise _needed(camera, "image_size", "[columns, rows]")
-    return (np.array(camera.image_size) - 1) / 2, np.array(camera.pixel_size) * [1, -1]
+    return _grid(camera.image_size, camera.pixel_size)
 
 
 def _needed(camera, name, meaning):

@@ -31,6 +31,12 @@ from .resection import refine_resection as refine_resection
 from .resection import resection as resection
 from .robust import Consensus as Consensus
 from .robust import consensus as consensus
+from .robust import robust_absolute_orientation as robust_absolute_orientation
+from .robust import (
+    robust_direct_linear_transformation as robust_direct_linear_transformation,
+)
+from .robust import robust_homography as robust_homography
+from .robust import robust_intersection as robust_intersection
 from .robust import robust_relative_orientation as robust_relative_orientation
 from .robust import robust_resection as robust_resection
 from .robust import samples_needed as samples_needed

@@ -9,6 +9,7 @@ follows does the rest.
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -22,6 +23,8 @@ LEAST = 4
 """Known points an image needs: three, and one to choose among their solutions."""
 ENOUGH = 12
 """An image with so many known points need not wait for better ones."""
+DRIFTS, LARGER = 30, 2.5
+"""Images of a model that is improved first, and how much larger it becomes before the next time."""
 AGREE = 0.4
 """Least part of the points of an image, or a pair, that must agree."""
 
@@ -79,12 +82,22 @@ def controlled(points: Points) -> Bool[np.ndarray, " points"]:
     )
 
 
+Improve = Callable[[Sights, Model], None]
+"""Adjusts the images and points of a model among themselves, in place."""
+
+
 def grow(
-    sights: Sights, model: Model, among: Bool[np.ndarray, " images"] | None = None
+    sights: Sights,
+    model: Model,
+    among: Bool[np.ndarray, " images"] | None = None,
+    improve: Improve | None = None,
 ) -> None:
-    """Place what can be placed of the images (`among` these), and intersect the points they see."""
+    """Place what can be placed of the images (`among` these), and intersect the points they see.
+
+    A model that grows drifts; `improve` is called whenever it has become `LARGER` times as big."""
     among = np.ones(sights.images, bool) if among is None else among
     tried = np.zeros(sights.images, int)
+    due = max(DRIFTS, LARGER * model.placed.sum())
     intersect(sights, model, FOR_OTHERS)
     while True:
         known = np.bincount(sights.image, model.known[sights.point], minlength=sights.images)
@@ -96,6 +109,9 @@ def grow(
         tried[chosen] = known[chosen]
         if place_images(sights, model, chosen):
             intersect(sights, model, FOR_OTHERS)
+        if improve is not None and model.placed.sum() >= due:
+            improve(sights, model)
+            due = LARGER * model.placed.sum()
 
 
 def finish(sights: Sights, model: Model) -> None:

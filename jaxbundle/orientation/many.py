@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from jaxbundle.geometry import (
     matrix_from_omega_phi_kappa,
+    matrix_from_quaternion,
     omega_phi_kappa_from_matrix,
     transform_point,
 )
@@ -84,6 +85,11 @@ def matrices(angles):
     return _in_lanes(_matrix, POINT_LANES, angles)[0]
 
 
+def matrices_of_quaternions(q):
+    """M of unit quaternions."""
+    return _in_lanes(_matrix_of_quaternion, POINT_LANES, q)[0]
+
+
 def angles(M):
     """ω, φ, κ of M."""
     return _in_lanes(_angles, POINT_LANES, M)[0]
@@ -148,6 +154,12 @@ def _similarity(source, target, weights):
 @jax.vmap
 def _matrix(angles):
     return (matrix_from_omega_phi_kappa(angles),)
+
+
+@jax.jit
+@jax.vmap
+def _matrix_of_quaternion(q):
+    return (matrix_from_quaternion(q),)
 
 
 @jax.jit

@@ -14,7 +14,8 @@ from which little grows is replaced by the next.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool
@@ -85,44 +86,39 @@ def lacks_start_values(network: Network) -> bool:
     )
 
 
-def orient(network: Network) -> Oriented:
-    """Find the start values a network lacks; those it has stay.
+def find_start_values(network: Network, improve: Callable | None = None) -> Oriented:
+    """The start values a network lacks; those it has stay.
 
-    The principal distance of a camera should be right to some per cent; its distortion may be
-    unknown, and nearly half of the measurements of an image wrong.
-
-    **Returns:** the network with start values; images and points that could not be placed are left
-    out of it and named with the reason.
-
-    **Raises:** `InputError` for bad tables; `NotSolvedError` where no image could be placed.
+    `improve(network, sights, model)`: adjusts a part of a large network on the way, in place.
+    Returns and raises what `jaxbundle.orient` does, which is this with an adjustment on the way.
     """
     network = check_tables(network)
     seen = sights(network)
-    model, frame = _model(network, seen)
+    model, frame = _model(network, seen, improve and partial(improve, network))
     if not model.placed.any():
         why = _why_nothing(network, seen)
         raise NotSolvedError(f"no start values found: {why}", _names(network))
     return _result(network, seen, model, frame)
 
 
-def _model(network: Network, seen: Sights) -> tuple[Model, str]:
+def _model(network: Network, seen: Sights, improve) -> tuple[Model, str]:
     model, frame = _given(network, seen), "in the frame given"
-    grow(seen, model)
+    grow(seen, model, improve=improve)
     if not model.placed.any():
         approximate = _with_approximate_points(network, model)
-        grow(seen, approximate)
+        grow(seen, approximate, improve=improve)
         model = approximate if approximate.placed.any() else model
     fixed = model.placed.any()
     while not model.placed.all():
-        part = _from_a_pair(seen, model)
+        part = _from_a_pair(seen, model, improve)
         if part is None:
             break
         model = part if not model.placed.any() else joined(seen, model, part)
-        grow(seen, model)
+        grow(seen, model, improve=improve)
         if not fixed and (moved := onto_the_given(network, model)):
             fixed, frame = True, "in the frame given"
             model = _with_control(network, moved)
-            grow(seen, model)
+            grow(seen, model, improve=improve)
     finish(seen, model)
     return (model, frame) if fixed else to_scale(network, model)
 
@@ -149,7 +145,7 @@ def _with_approximate_points(network: Network, model: Model) -> Model:
     return dataclasses.replace(model, X=X, known=model.known | given, placed=model.placed.copy())
 
 
-def _from_a_pair(seen: Sights, model: Model) -> Model | None:
+def _from_a_pair(seen: Sights, model: Model, improve) -> Model | None:
     """The best of the models that grow from a few good pairs of the images not placed; if some are
     placed, from pairs with one of them, to a model that can be joined to theirs."""
     new, linked = ~model.placed, model.placed.any()
@@ -159,7 +155,7 @@ def _from_a_pair(seen: Sights, model: Model) -> Model | None:
         part = Model.empty(seen)
         part.place(image, np.zeros(3), np.eye(3))
         part.place(other, b, M)
-        grow(seen, part, new | old)
+        grow(seen, part, new | old, improve)
         rows = new[seen.image]
         good = int((misclosures(seen, part) < seen.tolerance[seen.image])[rows].sum())
         if good > most and not (linked and joined(seen, model, part) is None):

@@ -20,7 +20,13 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, PyTree
 
+from jaxbundle.geometry import transform_point
+
+from .absolute import AbsoluteOrientation, absolute_orientation
+from .dlt import direct_linear_transformation
 from .essential import five_points, orientations
+from .homography import apply_homography, homography
+from .intersection import Intersection, intersection
 from .linear import ones_unless
 from .pose import image_of, ray_of, to_camera
 from .relative import (
@@ -30,6 +36,7 @@ from .relative import (
     sampson_distance,
 )
 from .resection import Resection, refine_resection
+from .status import Status
 from .three_points import three_points
 
 FAR = 1e6
@@ -165,6 +172,114 @@ def robust_relative_orientation(
 
     good = jax.lax.fori_loop(0, ROUNDS, again, found.inliers)
     return relative_orientation(xy1, xy2, p * good), good
+
+
+def robust_homography(
+    key: Array,
+    source: Float[Array, "n 2"],
+    target: Float[Array, "n 2"],
+    weights: Float[Array, " n"] | None = None,
+    samples: int = 60,
+    threshold: float | None = None,
+) -> tuple[tuple[Float[Array, "3 3"], Array], Bool[Array, " n"]]:
+    """(H, status) of points with up to 40 % gross errors, and which points are good.
+
+    Arguments as in `homography` and `consensus`; the threshold is a length of the target.
+    """
+
+    def errors(found, source, target):
+        image = jax.vmap(apply_homography, (None, 0))(found[0], source)
+        return jnp.linalg.norm(image - target, axis=1)
+
+    data = (source, target)
+    return _robust_linear(key, homography, errors, data, weights, 4, samples, threshold)
+
+
+def robust_absolute_orientation(
+    key: Array,
+    source: Float[Array, "n 3"],
+    target: Float[Array, "n 3"],
+    weights: Float[Array, " n"] | None = None,
+    samples: int = 40,
+    threshold: float | None = None,
+) -> tuple[AbsoluteOrientation, Bool[Array, " n"]]:
+    """Absolute orientation of points with up to 40 % gross errors, and which points are good.
+
+    Arguments as in `absolute_orientation` and `consensus`; the threshold is a length of the target.
+    """
+
+    def errors(found, source, target):
+        moved = jax.vmap(transform_point, (None, 0))(found.tau, source)
+        return jnp.linalg.norm(moved - target, axis=1)
+
+    data = (source, target)
+    return _robust_linear(key, absolute_orientation, errors, data, weights, 3, samples, threshold)
+
+
+def robust_direct_linear_transformation(
+    key: Array,
+    xy: Float[Array, "n 2"],
+    X: Float[Array, "n 3"],
+    weights: Float[Array, " n"] | None = None,
+    samples: int = 300,
+    threshold: float | None = None,
+) -> tuple[tuple[Float[Array, "3 4"], Array], Bool[Array, " n"]]:
+    """(P, status) of points with up to 40 % gross errors, and which points are good.
+
+    Arguments as in `direct_linear_transformation` and `consensus`; the threshold is a length in the
+    image.
+    """
+
+    def errors(found, xy, X):
+        x, y, w = found[0] @ jnp.pad(X, ((0, 0), (0, 1)), constant_values=1).T
+        return jnp.where(w > 0, jnp.hypot(x / w - xy[:, 0], y / w - xy[:, 1]), FAR)
+
+    solve = direct_linear_transformation
+    return _robust_linear(key, solve, errors, (xy, X), weights, 6, samples, threshold)
+
+
+def robust_intersection(
+    key: Array,
+    X0: Float[Array, "n 3"],
+    rays: Float[Array, "n 3"],
+    weights: Float[Array, " n"] | None = None,
+    samples: int = 30,
+    threshold: float | None = None,
+) -> tuple[Intersection, Bool[Array, " n"]]:
+    """The point of rays of which up to 40 % are wrong, and which rays are good.
+
+    Arguments as in `intersection` and `consensus`; the threshold is an angle, radians.
+    """
+
+    def errors(found, X0, rays):
+        d = found.X - X0
+        along = jnp.sum(d * rays, 1)
+        angle = jnp.arctan2(jnp.linalg.norm(jnp.cross(d, rays), axis=1), jnp.abs(along))
+        return jnp.where(along > 0, angle, FAR)
+
+    return _robust_linear(key, intersection, errors, (X0, rays), weights, 2, samples, threshold)
+
+
+def _robust_linear(key, solve, errors, data, weights, size, samples, threshold):
+    """Consensus of a solution that takes the weights of its observations as its last argument."""
+    p = ones_unless(weights, data[0])
+
+    def of_sample(*sample):
+        found = solve(*sample)
+        sound = _status(found) == int(Status.SOUND)
+        return jax.tree.map(lambda a: jnp.asarray(a)[None], found), sound[None]
+
+    good = consensus(key, of_sample, errors, data, size, samples, threshold, p).inliers
+
+    def again(_, good):
+        return _good(errors(solve(*data, p * good), *data), p > 0, size, threshold)
+
+    good = jax.lax.fori_loop(0, ROUNDS, again, good)
+    return solve(*data, p * good), good
+
+
+def _status(found):
+    return found[1] if isinstance(found, tuple) else found.status
 
 
 def _good(e, present, size, threshold):

@@ -5,6 +5,8 @@ import os
 import re
 import tempfile
 import warnings
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -55,26 +57,42 @@ def save_figures(adjustment, folder: str | Path) -> list[Path]:
             drawings[names("correlations", camera)] = (
                 (side + 0.8, side), None, correlation_matrix, (camera,)
             )  # fmt: skip
+    return write_figures(folder, {
+        name: (size, projection, partial(draw, adjustment, *arguments))
+        for name, (size, projection, draw, arguments) in drawings.items()
+    })
+
+
+def write_figures(folder: str | Path, drawings: Mapping[str, tuple]) -> list[Path]:
+    """Write figures NAME.png into a folder, each file whole or not at all.
+
+    **Arguments:** `drawings`: by name the size in inches, the projection (None or "3d"), and the
+    function that draws on axes given as `ax`.
+
+    **Returns:** the paths written. **Raises:** as `save_figures`.
+    """
+    need_matplotlib()
+    folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot be made ({error.strerror})") from error
     written = []
-    for name, (size, projection, draw, arguments) in drawings.items():
+    for name, (size, projection, draw) in drawings.items():
         path = folder / f"{name}.png"
-        _write(path, _png(size, projection, lambda ax: draw(adjustment, *arguments, ax=ax)))  # noqa: B023
+        _write(path, png(size, projection, draw))
         written.append(path)
     return written
 
 
-def _png(size, projection, draw) -> bytes:
+def png(size, projection, draw) -> bytes:
     """One drawing as a PNG image."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size, dpi=DOTS_PER_INCH, layout="constrained")
     FigureCanvasAgg(figure)
-    draw(figure.add_subplot(projection=projection))
+    draw(ax=figure.add_subplot(projection=projection))
     data = io.BytesIO()
     with warnings.catch_warnings():
         # ids in a script that the font lacks: boxes in the figure, nothing to act on

@@ -25,7 +25,7 @@ from jaxbundle.geometry.ellipsoid import geodetic
 from jaxbundle.geometry.vectors import difference
 
 from .image import PushbroomImage
-from .locate import locate
+from .locate import locate_point
 from .noise import Noise, disturbed, draw, no_errors, sigmas
 from .surfaces import Surface
 
@@ -118,9 +118,9 @@ def _covariances(image, surface, lines, pixels, sigma):
     zero = no_errors(image)
 
     def of_place(line, pixel):
-        axes, X0 = _east_north(surface, locate(image, surface, line, pixel))
+        axes, X0 = _east_north(surface, locate_point(image, surface, line, pixel))
         move = lambda errors: _horizontal(
-            axes, X0, locate(disturbed(image, errors), surface, line, pixel)
+            axes, X0, locate_point(disturbed(image, errors), surface, line, pixel)
         )
         J = jax.jacrev(move)(zero)
         parts = [(j * s).reshape(2, -1) for j, s in zip(J, sigma)]
@@ -141,8 +141,8 @@ def _draws(image, surface, lines, pixels, noise, keys):
 @eqx.filter_jit
 def _differences(image, truth, surface, lines, pixels):
     def of_place(line, pixel):
-        axes, X0 = _east_north(surface, locate(truth, surface, line, pixel))
-        return _horizontal(axes, X0, locate(image, surface, line, pixel))
+        axes, X0 = _east_north(surface, locate_point(truth, surface, line, pixel))
+        return _horizontal(axes, X0, locate_point(image, surface, line, pixel))
 
     return jax.vmap(of_place)(lines, pixels)
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from jaxbundle.geometry.ellipsoid import earth_fixed, up
 
 from .image import PushbroomImage
-from .project import Search, project, project_from
+from .project import Search, project_from, project_points
 from .surfaces import Ground, Surface
 from .terrain import Terrain, bilinear
 
@@ -61,7 +61,7 @@ def block_places(
     """Where the pixels of a block are in the image; None if none of them is near it."""
     level = np.asarray(_level(surface))
     raised = nodes.X + level * nodes.up
-    found = project(image, search, jnp.asarray(raised.reshape(3, -1)), margin=BESIDE)
+    found = project_points(image, search, jnp.asarray(raised.reshape(3, -1)), margin=BESIDE)
     starts = np.stack([found.line[0], found.pixel[0]])
     seen = np.isfinite(starts[0])
     if not seen.any():

@@ -3,8 +3,8 @@
     [X, Y, Z] = P + s·R·[ξ, η, −1]
 
 One pose a line, the directions of the pixels once for all lines: a whole line costs little more
-than its intersections with the surface. `locate` is the textbook's formula of one pixel,
-`locate_lines` the same for lines × pixels, `locate_points` for scattered places.
+than its intersections with the surface. `locate_point` is the textbook's formula of one
+pixel, `locate_lines` the same for lines × pixels, `locate_points` for scattered places.
 """
 
 import jax
@@ -20,7 +20,7 @@ from .scanner import slopes_of
 from .surfaces import Surface
 
 
-def locate(
+def locate_point(
     image: PushbroomImage, surface: Surface, line: Float[Array, ""], pixel: Float[Array, ""]
 ) -> Vector:
     """The point (X, Y, Z), in metres, that a place in the image shows; NaN if the ray misses."""
@@ -77,4 +77,4 @@ def locate_points(
     pixels: Float[Array, " n"],
 ) -> Float[Array, "3 n"]:
     """The points of scattered places in the image, a pose for each."""
-    return jnp.stack(jax.vmap(lambda l, u: locate(image, surface, l, u))(lines, pixels))
+    return jnp.stack(jax.vmap(lambda l, u: locate_point(image, surface, l, u))(lines, pixels))

@@ -45,7 +45,7 @@ class Pieces(eqx.Module):
 def make_pieces(image: PushbroomImage, earth: Ellipsoid | None) -> Pieces:
     """The pieces from the edge of the first line to that of the last, as far as the tables reach.
 
-    `earth` as in `project`.
+    `earth` as in `make_search`.
 
     **Raises:** `InputError` if no pieces follow the trajectory.
     """

@@ -4,10 +4,10 @@ The point X is seen at the time t by the pixel u where
 
     r + ξ(u)·q = 0,    s + η(u)·q = 0,        [r, s, q] = Rᵀ(t)·(X − P(t)),    q < 0.
 
-`project` searches the whole image: the sign of the second equation, with the pixel that the first
-one gives, changes wherever the line of detectors passes over the point; from each change Newton's
-method in (t, u) goes on with the polynomials of `pieces`. Two passages within one step of the
-search (a piece, or 1/128 of the image) that turn back in between are not separated.
+`project_points` searches the whole image: the sign of the second equation, with the pixel that the
+first one gives, changes wherever the line of detectors passes over the point; from each change
+Newton's method in (t, u) goes on with the polynomials of `pieces`. Two passages within one step of
+the search (a piece, or 1/128 of the image) that turn back in between are not separated.
 
 `project_near` is the textbook's way for one point that is near a known place in the image, with the
 trajectory itself. By the implicit function theorem its derivatives are exact in everything.
@@ -40,6 +40,8 @@ SETTLED = 1e-3
 """A last step below this, in lines and pixels, leaves an error below its square."""
 EDGE = 1e-5
 """A root so many lines beyond the end of its piece stays with it."""
+STRAY = 1000
+"""A point that is sought so many lines off the image is given up."""
 CHUNK = 2048
 """Points that go through all steps together, so that they stay in the cache."""
 NEAR_STEPS = 6
@@ -93,7 +95,7 @@ class Search(eqx.Module):
 
 
 def make_search(image: PushbroomImage, earth: Ellipsoid | None = WGS84) -> Search:
-    """Prepare an image for `project`; `earth` is None in a local frame."""
+    """Prepare an image for `project_points`; `earth` is None in a local frame."""
     pieces = make_pieces(image, earth)
     chosen = np.unique(np.linspace(0, len(pieces.ends) - 1, SEARCH + 1).round().astype(int))
     u = np.linspace(0, max(image.pixels - 1, 1), 257)
@@ -103,7 +105,7 @@ def make_search(image: PushbroomImage, earth: Ellipsoid | None = WGS84) -> Searc
 
 
 @partial(jax.jit, static_argnames="most")
-def project(
+def project_points(
     image: PushbroomImage,
     search: Search,
     X: Float[Array, "3 n"],
@@ -273,20 +275,26 @@ def _refine(image, search, X, t, u):
     """Newton's method in (t, u): the place, and whether it settled.
 
     The points of one piece share its polynomials, so the pieces are gone through one by one: few if
-    the points are near each other. It is done when no point leaves its piece.
+    the points are near each other. It is done when no point leaves its piece; one that strays far
+    from the image is given up.
     """
-    inner = search.pieces.ends[1:-1]
+    ends = search.pieces.ends
+    far = STRAY * (image.times.time(1.0) - image.times.time(0.0))
+
+    def open_(t, settled):
+        return ~settled & (t >= ends[0] - far) & (t <= ends[-1] + far)
 
     def again(state):
-        _, _, settled, rounds = state
-        return (rounds < ROUNDS) & ~jnp.all(settled)
+        t, _, settled, rounds = state
+        return (rounds < ROUNDS) & jnp.any(open_(t, settled))
 
     def refine(state):
-        t, u, _, rounds = state
-        own = jnp.searchsorted(inner, t, side="right")
+        t, _, settled, rounds = state
+        own = jnp.searchsorted(ends[1:-1], t, side="right")
+        own = jnp.where(open_(t, settled), own, -1)
+        first = jnp.min(jnp.where(own < 0, len(ends), own))
         newton = partial(_newton, image, search, X, own)
-        state = (t, u, jnp.zeros(t.shape, bool))
-        return *jax.lax.fori_loop(own.min(), own.max() + 1, newton, state), rounds + 1
+        return *jax.lax.fori_loop(first, own.max() + 1, newton, state[:3]), rounds + 1
 
     t, u, settled, _ = jax.lax.while_loop(again, refine, (t, u, jnp.zeros(t.shape, bool), 0))
     return t, u, settled

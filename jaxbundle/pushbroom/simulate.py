@@ -30,8 +30,8 @@ from .trajectory import Trajectory
 
 MARGIN = 6
 """Rows of ancillary data before the first line and after the last."""
-TRUE_RATE = 100.0
-"""Rows a second of the true attitude, splined; more where the instrument has a tenth of it."""
+TRUE_RATE = 20.0
+"""Rows a second of the true attitude, splined; at least five times the rate of the instrument."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Flight:
 
 def true_image(flight: Flight) -> PushbroomImage:
     """The image with the true trajectory."""
-    rate = max(TRUE_RATE, 10 * flight.attitude_rate)
+    rate = max(TRUE_RATE, 5 * flight.attitude_rate)
     return _image(flight, _position(flight, 2.0, "lagrange"), _attitude(flight, rate, "spline"))
 
 

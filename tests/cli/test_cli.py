@@ -151,7 +151,7 @@ def test_what_nobody_thought_of_ends_in_one_line(error, status, monkeypatch, cap
     def fail(*_):
         raise error
 
-    monkeypatch.setattr(cli, "write_project", fail)
+    monkeypatch.setattr(cli.convert, "convert_file", fail)
     monkeypatch.setattr(sys, "argv", ["jaxbundle", "convert", str(EXAMPLE), "nowhere"])
     with pytest.raises(SystemExit) as ended:
         cli.main()
@@ -179,3 +179,28 @@ def test_not_converged_says_so(tmp_path):
     result = json.loads(file.read_text())
     assert result["converged"] is False
     assert "sigma0" not in result and "cameras" not in result
+
+
+@pytest.mark.slow
+def test_orient_writes_a_project_with_start_values(project, tmp_path):
+    images = (project / "images.csv").read_text().splitlines()
+    bare = [images[0], *(",".join(row.split(",")[:2] + [""] * 6) for row in images[1:])]
+    (project / "images.csv").write_text("\n".join(bare) + "\n")
+    done = run("orient", project / "project.toml", "--out", tmp_path / "oriented")
+    assert done.returncode == 0, done.stderr
+    assert "placed 4 images of 4 and 10 points of 10" in done.stdout
+    found = jaxbundle.read_network(tmp_path / "oriented")
+    given = jaxbundle.read_network(EXAMPLE)
+    # the approximate points that were left give the frame; those of the example are good to 1e-3
+    assert abs(found.images.position - given.images.position).max() < 0.05
+
+
+def test_orient_names_what_is_missing(project):
+    rays = (project / "observations.csv").read_text().splitlines()
+    (project / "observations.csv").write_text("\n".join([rays[0], *rays[1:4], rays[12]]) + "\n")
+    images = (project / "images.csv").read_text().splitlines()
+    bare = [images[0], *(",".join(row.split(",")[:2] + [""] * 6) for row in images[1:])]
+    (project / "images.csv").write_text("\n".join(bare) + "\n")
+    done = run("orient", project / "project.toml")
+    assert done.returncode == 3 and done.stdout == ""
+    assert "no start values found" in done.stderr and done.stderr.count("\n") == 1

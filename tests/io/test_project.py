@@ -216,7 +216,7 @@ def test_a_fault_in_a_file_is_refused_with_its_place(folder, name, old, new, sai
 
 
 @pytest.mark.parametrize("name, old, new, said", [
-    ("images.csv", "right,cam.1,10", "right,cam.1,", "line 5: image 'right': X0 has no start"),
+    ("images.csv", "right,cam.1,10", "right,cam.1,", "line 5: image 'right': X0 has a σ but no"),
     ("images.csv", "90,fixed", "900,fixed", "images.csv, line 5: image 'right': kappa is 900 deg"),
     ("points.csv", "5,5,0", "5,5,", "points.csv, line 6: tie point 'e, far': Z has no start value"),
     ("points.csv", "b,fixed", "b,fxed", "points.csv, line 3: point 'b': role must be one of"),

@@ -11,7 +11,8 @@ import jaxbundle
 from jaxbundle import Camera, InputError, NotSolvedError
 from jaxbundle.bundle import adjust
 from jaxbundle.network.stations import Stations
-from jaxbundle.orientation.network import lacks_start_values, orient
+from jaxbundle.orientation.network import lacks_start_values
+from jaxbundle.oriented import orient
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 CASES = Path(__file__).parents[3] / "shared" / "cases"
@@ -122,6 +123,18 @@ def test_one_measurement_in_twenty_wrong():
     assert abs(result.sigma0 - 1) < 0.15
 
 
+def test_blunders_that_leave_least_squares_no_solution():
+    """With good start values, too, what contradicts them altogether goes before data snooping."""
+    simulation = block(control=range(8), start=TRUE)
+    spoilt = with_blunders(simulation.network, 0.05, 20.0)
+    assert not adjust(spoilt).converged
+    result = adjust(spoilt, snooping="pope")
+    off = result.image_values[:, :3] - simulation.truth.images.position
+    sigma = np.stack([result.images[f"s{axis}"] for axis in ("X0", "Y0", "Z0")], 1)
+    assert np.abs(off / sigma).max() < 5
+    assert any("contradict the start values" in warning for warning in result.warnings)
+
+
 def test_a_strip_that_hangs_together_by_pairs():
     """With few points in three images resection stops; a pair takes it on."""
     simulation = block(1, 30, 350, control=())
@@ -137,6 +150,31 @@ def test_a_strip_that_hangs_together_by_pairs():
 def test_planes_and_solids_without_control(relief):
     network = close_up(jaxbundle.grid_of_targets(9, 9, 0.6, relief=relief))
     assert_same_answer(network, bare(network))
+
+
+def test_several_cameras_of_several_models():
+    """A metric camera, one in pixels and a fisheye around the same targets."""
+    pixels = {"fx": 2000.0, "fy": 2000.0, "cx": 1499.5, "cy": 999.5, "k1": -0.1}
+    fisheye = {"fx": 1200.0, "fy": 1200.0, "cx": 1499.5, "cy": 999.5, "k1": 0.02}
+    cameras = (
+        jaxbundle.Camera("metric", "brown", {"c": 24.0}, image_size=(3000, 2000),
+                         pixel_size=(0.012, 0.012)),
+        jaxbundle.Camera("pixels", "opencv", pixels, image_size=(3000, 2000)),
+        jaxbundle.Camera("fisheye", "kannala-brandt", fisheye, image_size=(3000, 2000)),
+    )  # fmt: skip
+    stations = jaxbundle.ring_of_stations(9, 6.0, 5.0, roll_every=2)
+    targets = jaxbundle.grid_of_targets(9, 9, 0.6, relief=0.5)
+    network = jaxbundle.simulate(
+        stations, targets, cameras, noise=0.01, camera_of_station=[0, 1, 2] * 3
+    )
+    found = orient(bare(network))
+    assert not found.images and not found.points
+    ratio = [
+        np.linalg.norm(n.images.position[:, None] - n.images.position[None], axis=-1)
+        for n in (found.network, network)
+    ]
+    scale = np.median(ratio[0][ratio[1] > 0] / ratio[1][ratio[1] > 0])
+    assert np.abs(ratio[0] / scale - ratio[1]).max() < 0.05 * ratio[1].max()
 
 
 def test_a_distance_gives_the_scale():

@@ -10,7 +10,6 @@ from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.frames import circular_orbit
 from jaxbundle.pushbroom.image import make_image
 from jaxbundle.pushbroom.locate import locate_lines
-from jaxbundle.pushbroom.project import project
 from jaxbundle.pushbroom.scanner import FocalLine, LineTimes
 from jaxbundle.pushbroom.trajectory import Trajectory, orbital_frame
 
@@ -21,7 +20,6 @@ PERIOD = 1 / 150
 PLACE = (505e3, np.radians(97.4), 1.9, 0.1)
 
 locate = jax.jit(locate_lines)
-search_and_project = project
 
 
 def wobble(t, size=1e-4):

@@ -34,7 +34,7 @@ roll = [{ kind = "sine", amplitude = 1.0, period = 3.0 }, 0.5]
 yaw = { kind = "linear", value = -5.0, rate = 0.2 }
 
 [instruments]
-attitude_rate = 20.0
+attitude_rate = 4.0
 
 [noise]
 attitude_bias = 0.05

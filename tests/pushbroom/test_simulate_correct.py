@@ -96,7 +96,7 @@ AIRCRAFT = Flight(
         "pitch": {"kind": "sine", "amplitude": 0.01, "period": 4.0},
         "yaw": {"kind": "linear", "value": -0.1, "rate": 0.005},
     },
-    attitude_rate=20.0,
+    attitude_rate=8.0,
 )  # fmt: skip
 
 

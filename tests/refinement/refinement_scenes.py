@@ -13,7 +13,7 @@ from jaxbundle.pushbroom.ancillary import attitude_table, position_table
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.frames import circular_orbit
 from jaxbundle.pushbroom.image import make_image
-from jaxbundle.pushbroom.locate import locate
+from jaxbundle.pushbroom.locate import locate_point
 from jaxbundle.pushbroom.scanner import FocalLine, LineTimes
 from jaxbundle.pushbroom.surfaces import Height
 from jaxbundle.pushbroom.trajectory import Trajectory
@@ -57,7 +57,7 @@ def ground(image, form, p, heights, places):
 
     def one(h, place):
         moved = changed(image, form, change_of(form, p), image.times.time(place[0]))
-        return jnp.stack(locate(moved, Height(h, WGS84), *place))
+        return jnp.stack(locate_point(moved, Height(h, WGS84), *place))
 
     return jax.vmap(one)(heights, places)
 
@@ -71,7 +71,7 @@ def ground_with_sine(image, bias, drift, amplitude, heights, places):
         turn = bias + amplitude * jnp.sin(2 * jnp.pi * t)
         offsets = dataclasses.replace(image.offsets, attitude=turn, attitude_rate=drift)
         return jnp.stack(
-            locate(dataclasses.replace(image, offsets=offsets), Height(h, WGS84), *place)
+            locate_point(dataclasses.replace(image, offsets=offsets), Height(h, WGS84), *place)
         )
 
     return jax.vmap(one)(heights, places)

@@ -21,8 +21,7 @@ from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed
 from jaxbundle.io.csv_tables import read_csv
 from jaxbundle.io.scanner import read_scanner
 from jaxbundle.network.columns import Columns
-from jaxbundle.pushbroom.project import Status, make_search
-from jaxbundle.pushbroom.project import project as project_points
+from jaxbundle.pushbroom.project import Status, make_search, project_points
 
 MOST = 4
 """So many lines that see one point are told."""

@@ -1,0 +1,127 @@
+"""What a calibration lacks, in words, and what to photograph next."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.calibration.quality import Coverage, CrossValidation
+
+FEW_VIEWS = 8
+TURNED = 60.0
+"""Degrees between two photographs' turns about the line of sight; 90 is best."""
+TILTED = 15.0
+"""Degrees of a line of sight from the board's normal."""
+FEW_TILTED = 3
+RANGE = 1.3
+"""Farthest over nearest distance of the board."""
+REACH, PART = 0.85, 0.6
+LARGE = 1.0
+"""An RMS of this many pixels does not come from finding corners."""
+CONTRADICTION = 3.0
+WEAK = 1.0
+"""A distortion coefficient with |value|/σ below this says nothing."""
+DISTANCES, VAGUE = ("c", "f", "fx", "fy"), 50.0
+"""A principal distance whose σ is above a fiftieth of it is as good as unknown."""
+STRONG = ("c", "x0", "y0", "fx", "fy", "cx", "cy", "f")
+
+
+def advice(
+    position: Float[np.ndarray, "views 3"],
+    rotation: Float[np.ndarray, "views 3 3"],
+    middle: Float[np.ndarray, "3"],
+    unit: str,
+    covered: Coverage,
+    rms: float,
+    t: dict[str, float],
+    validation: CrossValidation | None = None,
+) -> list[str]:
+    """Warnings in words, the gravest first; none if nothing is to be said.
+
+    **Arguments:** X0 and M of the views of a board in the plane Z = const, whose centre is
+    `middle`; `covered`; `rms` of the residuals in pixels; `t` = |value|/σ by parameter.
+    """
+    found = [
+        f"{name} is known to {100 / max(t[name], 1e-9):.0f} % only: the photographs do not "
+        "determine the principal distance; they need tilts and distances that differ"
+        for name in DISTANCES if t.get(name, np.inf) < VAGUE
+    ]  # fmt: skip
+    found += [*_geometry(position, rotation, middle, unit), *_image(covered)]
+    if rms > LARGE:
+        found.append(
+            f"the residuals are large (RMS {rms:.2f} px): look for blur, movement, a board that "
+            "bends (--board-sigma), or free more parameters"
+        )
+    if validation is not None and validation.test > CONTRADICTION:
+        found.append(
+            f"the two halves of the photographs contradict each other (test {validation.test:.1f}, "
+            "1 expected): the σ are too small; the camera may have changed (focus, zoom), or the "
+            "model or the board does not fit (--model, --board-sigma)"
+        )
+    weak = [name for name, value in t.items() if value < WEAK and name not in STRONG]
+    if weak:
+        found.append(
+            f"not significant: {', '.join(f'{n} (t {t[n]:.1f})' for n in weak)}; without "
+            f"{'it' if len(weak) == 1 else 'them'} (--free) the others are better determined"
+        )
+    return found
+
+
+def turns(rotation: Float[np.ndarray, "views 3 3"]) -> Float[np.ndarray, " views"]:
+    """The turn of every photograph about its line of sight, degrees: of the image's x axis in the
+    plane of the board."""
+    return np.degrees(np.arctan2(rotation[:, 0, 1], rotation[:, 0, 0]))
+
+
+def tilts(rotation: Float[np.ndarray, "views 3 3"]) -> Float[np.ndarray, " views"]:
+    """The angle between every line of sight and the normal of the board, degrees."""
+    return np.degrees(np.arccos(np.clip(np.abs(rotation[:, 2, 2]), 0, 1)))
+
+
+def _geometry(position, rotation, middle, unit) -> Iterator[str]:
+    number = len(position)
+    if number < FEW_VIEWS:
+        yield (
+            f"only {number} photographs show the board: take {FEW_VIEWS} to 20, from different "
+            "directions"
+        )
+    steep = (tilts(rotation) > TILTED).sum()
+    if steep < FEW_TILTED:
+        yield (
+            f"{steep} of {number} photographs look at the board from more than {TILTED:.0f}° "
+            "aside: the principal distance is hard to tell from the distance of the board; take "
+            "some tilted by 20° to 45°, to the left, to the right, up and down"
+        )
+    turn = turns(rotation)
+    apart = np.abs(turn[:, None] - turn) % 180
+    if np.minimum(apart, 180 - apart).max() < TURNED:
+        yield (
+            "no photograph is turned by 90° about the line of sight: the principal point leans on "
+            "the tilts alone; take some with the camera turned"
+        )
+    away = np.linalg.norm(position - middle, axis=1)
+    if away.max() < RANGE * away.min():
+        yield (
+            f"all photographs are from nearly one distance ({away.min():.3g} to {away.max():.3g} "
+            f"{unit}): take some from nearer and some from farther away"
+        )
+
+
+def _image(covered: Coverage) -> Iterator[str]:
+    empty = [name for name, there in covered.corners.items() if not there]
+    if empty:
+        corners = f"{', '.join(empty)} corner{'s' if len(empty) > 1 else ''}"
+        yield (
+            f"no point in the {corners} of the image: the distortion there is extrapolated; "
+            "photograph the board there"
+        )
+    elif covered.reach < REACH:
+        yield (
+            f"the points reach to {100 * covered.reach:.0f} % of the half diagonal: photograph the "
+            "board closer to the corners"
+        )
+    if covered.part < PART:
+        yield (
+            f"points cover {100 * covered.part:.0f} % of the image: move the board about in it, or "
+            "let it fill the image"
+        )

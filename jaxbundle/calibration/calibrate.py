@@ -1,0 +1,213 @@
+"""`calibrate`: photographs of a board in, a calibrated camera out.
+
+1. The board is found in every photograph (`measure`), or its image points are given.
+2. Start values of camera and poses; views that cannot be right are left out (`start`).
+3. Adjustment as a network with residuals in the measured image, with data snooping or robust. The
+   board is
+
+       known      its points are fixed: exact coordinates of a drawing
+       weighted   its points are control points with a σ: a print is not exact and not flat
+       free       its points are estimated, inner constraints on all of them (scale included)
+
+4. Where circles have a known diameter, the eccentricity of their images is taken off and the
+   adjustment repeated.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbundle.adjustment.problem import require_x64
+from jaxbundle.bundle import adjust
+from jaxbundle.calibration.frames import in_model_units, in_pixels, unit_size
+from jaxbundle.calibration.result import Calibration
+from jaxbundle.calibration.start import Start, default_free, start_values
+from jaxbundle.cameras import CameraModel, get_model
+from jaxbundle.errors import InputError
+from jaxbundle.geometry import matrix_from_quaternion
+from jaxbundle.measure.boards import Board
+from jaxbundle.measure.ellipses import rim_centre_shift
+from jaxbundle.measure.views import BoardViews, measure_boards
+from jaxbundle.network.build import make_network
+from jaxbundle.network.tables import Camera, Network
+from jaxbundle.orientation.pose import Pose
+
+SIGMA = 0.1
+"""A priori σ of an image coordinate in pixels; σ0 of the result says what it was."""
+ECCENTRICITY_ROUNDS = 2
+
+
+def calibrate(
+    photographs: Sequence[str | Path] | BoardViews,
+    board: Board | None = None,
+    *,
+    model: str = "opencv",
+    free: Sequence[str] | None = None,
+    given: Mapping[str, float] | None = None,
+    pixel_size: float | tuple[float, float] | None = None,
+    sigma_image: float = SIGMA,
+    board_sigma: float | None = None,
+    board_free: bool = False,
+    robust: str | None = None,
+    snooping: str | None = "pope",
+    camera: str = "cam",
+    object_unit: str = "m",
+    progress: Callable[[int, int], None] | None = None,
+    **options,
+) -> Calibration:
+    """Calibrate a camera from photographs of a board.
+
+    **Arguments:**
+
+    - `photographs`: files, patterns or folders; or `BoardViews`, image points already measured.
+    - `board`: what is in the photographs; its unit is the object unit.
+    - `model`, `free`: camera model and the parameters to estimate; the model's usual ones if not
+      named. `given`: values of parameters, held where they are not free.
+    - `pixel_size`: mm, for models in mm.
+    - `sigma_image`: a priori σ of an image coordinate, pixels.
+    - `board_sigma`: σ of a coordinate of the board (object unit); `board_free`: its points are
+      estimated. Neither: the board is exact.
+    - `robust`: "huber", "cauchy" or "tukey": points that fit badly count less, instead of being
+      removed; `snooping`: how they are removed, None: not at all. Both, and further `options`
+      (`significance`, `max_iterations`, …), are those of `jaxbundle.adjust`.
+    - `camera`: its name. `progress(done, total)`: photographs searched.
+
+    **Returns:** a `Calibration`; look at `converged` before anything else.
+
+    **Raises:** `InputError` where nothing can be calibrated; `NotSolvedError` where the photographs
+    determine no camera.
+    """
+    require_x64()
+    camera_model, free = _model(model, free)
+    pixel_size = _pair(pixel_size)
+    unit_size(camera_model, pixel_size)
+    _check(sigma_image, board_sigma, board_free)
+    views = photographs
+    if not isinstance(views, BoardViews):
+        if board is None:
+            raise InputError("calibrate: give the board that is in the photographs")
+        views = measure_boards(photographs, board, progress)
+    board = views.board
+    start = start_values(views, camera_model, free, pixel_size, given)
+    made = Camera(
+        camera, model, start.parameters, free, image_size=tuple(map(int, views.image_size)),
+        pixel_size=pixel_size,
+    )  # fmt: skip
+    network = board_network(
+        start, made, sigma_image, board_sigma=board_sigma, board_free=board_free,
+        object_unit=object_unit,
+    )  # fmt: skip
+    options |= {"robust": robust, "snooping": None if robust else snooping}
+    result = adjust(network, **options)
+    if board.diameter is not None and board.kind != "chessboard" and result.converged:
+        for _ in range(ECCENTRICITY_ROUNDS):
+            centred = _without_eccentricity(start, result, made)
+            network = board_network(
+                dataclasses.replace(start, views=centred), made, sigma_image,
+                board_sigma=board_sigma, board_free=board_free, object_unit=object_unit,
+            )  # fmt: skip
+            result = adjust(network, **options)
+        start = dataclasses.replace(start, views=centred)
+    return Calibration(start.views, result)
+
+
+def board_network(
+    start: Start,
+    camera: Camera,
+    sigma_image: float,
+    *,
+    board_sigma: float | None = None,
+    board_free: bool = False,
+    object_unit: str = "m",
+) -> Network:
+    """The network of one camera, its views of a board, and the board."""
+    views, model = start.views, get_model(camera.model)
+    board = views.board
+    view, point = np.nonzero(views.visible)
+    xy = in_model_units(views.xy[view, point], model, views.image_size, camera.pixel_size)
+    sx, sy = sigma_image * np.array(unit_size(model, camera.pixel_size))
+    role = "tie" if board_free else "fixed" if board_sigma is None else "control"
+    X, Y, Z = board.points.T
+    points = {"id": board.ids, "role": [role] * len(X), "X": X, "Y": Y, "Z": Z}
+    if role == "control":
+        points |= dict.fromkeys(("sX", "sY", "sZ"), np.full(len(X), board_sigma))
+    names, ids = np.array(views.names, dtype=object), np.array(board.ids, dtype=object)
+    exterior = np.concatenate([start.position, np.degrees(start.angles)], 1)
+    network = make_network(
+        [camera],
+        {"id": names, "camera": [camera.id] * len(names)}
+        | dict(zip(("X0", "Y0", "Z0", "omega", "phi", "kappa"), exterior.T)),
+        points,
+        {"image": names[view], "point": ids[point], "x": xy[:, 0], "y": xy[:, 1],
+         "sx": np.full(len(xy), sx), "sy": np.full(len(xy), sy)},
+        datum="inner" if board_free else "control", residuals="measured",
+        angle_unit="deg", image_unit=model.unit, object_unit=object_unit,
+        name=f"Calibration of {camera.id}",
+    )  # fmt: skip
+    if board_free and not board.unique:
+        network = network.warn(
+            f"a photograph does not tell the {board} from itself turned by 180°: its points are "
+            "estimated rightly only if it was never turned upside down"
+        )
+    return network
+
+
+def _without_eccentricity(start: Start, result, camera: Camera) -> BoardViews:
+    """The views as measured, their points moved from the centres of the ellipses to the images of
+    the centres of the circles."""
+    views, model = start.views, get_model(camera.model)
+    p = np.asarray(result.values.camera)[0][: len(model.parameters)]
+    M = np.asarray(jax.vmap(matrix_from_quaternion)(result.values.rotation))
+    poses = Pose(result.image_values[:, :3], M)
+    shift = _shifts(model, p, poses, views.board.points, views.board.diameter / 2)
+    xy = in_model_units(views.xy, model, views.image_size, camera.pixel_size) - np.asarray(shift)
+    return dataclasses.replace(
+        views, xy=in_pixels(xy, model, views.image_size, camera.pixel_size)
+    )
+
+
+@partial(jax.jit, static_argnums=0)
+def _shifts(model, p, poses, centres, radius):
+    up = jnp.array([0.0, 0.0, 1.0])
+    one = lambda pose, X: rim_centre_shift(model, p, pose, X, up, radius)
+    return jax.vmap(jax.vmap(one, (None, 0)), (0, None))(poses, centres)
+
+
+def _model(name: str, free) -> tuple[CameraModel, tuple[str, ...]]:
+    try:
+        model = get_model(name)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+    free = default_free(model) if free is None else tuple(free)
+    for parameter in free:
+        if parameter not in model.parameters or parameter in model.never_free:
+            known = [p for p in model.parameters if p not in model.never_free]
+            raise InputError(
+                f"free: camera model {name!r} has no free parameter {parameter!r}; its parameters "
+                f"are {', '.join(known)}"
+            )
+    return model, free
+
+
+def _pair(pixel_size) -> tuple[float, float] | None:
+    if pixel_size is None:
+        return None
+    pair = np.broadcast_to(np.asarray(pixel_size, float), 2)
+    if not (np.isfinite(pair) & (pair > 0)).all():
+        raise InputError(f"pixel size {pixel_size}: a positive length in mm is expected")
+    return float(pair[0]), float(pair[1])
+
+
+def _check(sigma_image, board_sigma, board_free) -> None:
+    for name, value in (("sigma of the image", sigma_image), ("sigma of the board", board_sigma)):
+        if value is not None and not (np.isfinite(value) and value > 0):
+            raise InputError(f"{name} is {value}; a positive number is expected")
+    if board_free and board_sigma is not None:
+        raise InputError("the board is either free or has a σ (--board-free, --board-sigma)")
+
+

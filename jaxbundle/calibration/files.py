@@ -1,0 +1,157 @@
+"""What a calibration writes into a folder.
+
+| file | |
+|---|---|
+| report.txt, result.json | the whole protocol; its numbers |
+| CAMERA.toml | the camera, to stand in a project; σ as comments |
+| CAMERA.yaml, colmap/ | the camera for OpenCV; camera, poses and board for COLMAP |
+| network/ | the adjusted network: `jaxbundle adjust FOLDER/network` goes on from it |
+| coverage, uncertainty, uncertainty_far, uncertainty_distance, halves .png | how good it is |
+| plan, perspective, histogram, residuals_…, distortion_…, correlations_… .png | as of `adjust` |
+
+A model that OpenCV and COLMAP do not have is converted to `opencv` for them; what that costs stands
+as a comment in the TOML.
+"""
+
+import json
+import re
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.calibration.report import rig_dict
+from jaxbundle.errors import InputError
+from jaxbundle.io import adjusted_network, write_colmap, write_opencv, write_project
+from jaxbundle.io.colmap import PARTS
+from jaxbundle.io.csv_tables import write_text
+from jaxbundle.io.project import ADJUSTED, cameras_text
+from jaxbundle.network.conversion import convert_cameras
+from jaxbundle.network.tables import Camera, Network
+from jaxbundle.plotting import save_figures, write_figures
+from jaxbundle.plotting.files import FIGURES
+
+REPORT, RESULT = "report.txt", "result.json"
+COLMAP = "colmap"
+OWN_FIGURES = ("coverage.png", "uncertainty*.png", "halves.png")
+FOREIGN = ("opencv", "kannala-brandt")
+"""Models that OpenCV and COLMAP have."""
+
+
+def camera_text(camera: Camera, sigma: Mapping[str, float], *remarks: str) -> str:
+    """A calibrated camera in our TOML, its σ and remarks as comments."""
+    comments = [f"# σ of {name}: {value:.4g}" for name, value in sigma.items()]
+    comments += [f"# {remark}" for remark in remarks]
+    return "\n".join([cameras_text([camera]).rstrip(), *comments]) + "\n"
+
+
+def file_name(name: str) -> str:
+    """A name that can stand in a file system."""
+    return re.sub(r"[^\w.-]+", "_", name, flags=re.ASCII).strip("._")[:60] or "camera"
+
+
+def write_calibration(calibration, folder: str | Path, plots: bool = True) -> None:
+    """Write everything about a calibration into a folder (see the module's docstring).
+
+    **Raises:** `InputError` where that cannot be done; `ImportError` for plots without matplotlib.
+    """
+    folder, name = Path(folder), file_name(calibration.name)
+    _make_empty(folder, name)
+    write_text(folder / REPORT, calibration.report())
+    write_text(folder / RESULT, json_text(calibration.to_dict()))
+    if not calibration.converged:
+        return
+    network = adjusted_network(calibration.adjustment)
+    write_project(network, folder / ADJUSTED)
+    remark = _write_foreign(network, folder, name)
+    text = camera_text(calibration.camera, calibration.sigma, *remark)
+    write_text(folder / f"{name}.toml", text)
+    if plots:
+        save_plots(calibration, folder)
+
+
+def _make_empty(folder: Path, name: str) -> None:
+    """Make the folder, and remove what an earlier calibration has written into it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for pattern in (REPORT, RESULT, f"{name}.toml", f"{name}.yaml", *OWN_FIGURES, *FIGURES,
+                        *(f"{COLMAP}/{part}.txt" for part in PARTS)):  # fmt: skip
+            for path in folder.glob(pattern):
+                path.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
+
+
+def _write_foreign(network: Network, folder: Path, name: str) -> list[str]:
+    """The camera for OpenCV and COLMAP; what a conversion of its model cost, in words."""
+    remark = []
+    if network.cameras[0].model not in FOREIGN:
+        try:
+            network, cost = convert_cameras(network, "opencv")
+        except InputError as error:
+            return [f"not written for OpenCV and COLMAP: {error}"]
+        remark = [f"{name}.yaml and {COLMAP}: {conversion}" for conversion in cost.values()]
+    write_opencv(network.cameras[0], folder / f"{name}.yaml")
+    write_colmap(network, folder / COLMAP, text=True)
+    return remark
+
+
+def write_calibrations(found, folder: str | Path, plots: bool = True) -> None:
+    """Write one calibration into a folder, several into folders of their own, and the rig beside.
+
+    A rig adds report.txt and result.json of the whole, and its cameras as rig_CAMERA.toml.
+    """
+    folder = Path(folder)
+    if len(found.cameras) == 1:
+        return write_calibration(next(iter(found.cameras.values())), folder, plots)
+    for name, one in found.cameras.items():
+        write_calibration(one, folder / file_name(name), plots)
+    write_text(folder / REPORT, found.report())
+    write_text(folder / RESULT, json_text(calibrations_dict(found)))
+    if found.rig is not None:
+        for name in found.rig.names:
+            text = camera_text(found.rig.camera(name), found.rig.sigma[name])
+            write_text(folder / f"rig_{file_name(name)}.toml", text)
+
+
+def calibrations_dict(found, brief: bool = False) -> dict:
+    """The JSON of one calibration, or of several under their names, with the rig."""
+    if len(found.cameras) == 1:
+        return next(iter(found.cameras.values())).to_dict(brief)
+    parts = {name: one.to_dict(brief) for name, one in found.cameras.items()}
+    document = {"converged": found.converged, "calibrations": parts}
+    if found.rig is not None:
+        document["rig"] = rig_dict(found.rig)
+    return document
+
+
+def save_plots(calibration, folder: Path) -> None:
+    """The figures of quality, and those of the adjustment."""
+    near = float(np.median(calibration.distances))
+    drawings = {
+        "coverage": ((7, 5.6), None, calibration.plot_coverage),
+        "uncertainty": ((7, 5.6), None, partial(calibration.plot_uncertainty, near)),
+        "uncertainty_far": ((7, 5.6), None, calibration.plot_uncertainty),
+        "uncertainty_distance": ((6.5, 4.2), None, calibration.plot_uncertainty_over_distance),
+    }
+    halves = calibration.cross_validation
+    if halves is not None and halves.comparison is not None:
+        drawings["halves"] = ((7.5, 6), None, calibration.plot_halves)
+    write_figures(folder, drawings)
+    save_figures(calibration.adjustment, folder)
+
+
+def json_text(document: dict) -> str:
+    """One JSON object; what is not a finite number is null."""
+    return json.dumps(_plain(document), ensure_ascii=False, indent=1) + "\n"
+
+
+def _plain(value):
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    return value.item() if isinstance(value, np.generic) else value

@@ -1,0 +1,277 @@
+"""How good is a calibration: maps of uncertainty, coverage of the image, two halves compared."""
+
+import dataclasses
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxbundle.bundle import adjust
+from jaxbundle.calibration.frames import in_model_units, in_pixels, unit_size
+from jaxbundle.cameras import get_model
+from jaxbundle.cameras.compare import Comparison, compare_cameras
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.network.tables import Camera, Network
+from jaxbundle.statistics.projection import (
+    FRAMES,
+    images_through_scene,
+    interior_covariance_of_images,
+)
+
+GRID = (11, 9)
+"""Columns and rows of the places a map is computed at."""
+CELLS = (12, 9)
+"""Columns and rows of the cells in which coverage is counted."""
+HELD_OUT_FEWEST = 4
+"""Photographs that are needed to calibrate from each half."""
+
+
+@dataclasses.dataclass(frozen=True)
+class UncertaintyMap:
+    """Standard deviations of a projected point over the image.
+
+    **Fields:** `frame`, `distance`: what the point is held in, see
+    `jaxbundle.statistics.projection`; `uv` pixels of the places; `covariance` and `sigma`,
+    √((σx² + σy²)/2), pixels; NaN where there is no image.
+    """
+
+    frame: str
+    distance: float
+    uv: Float[np.ndarray, "rows columns 2"]
+    covariance: Float[np.ndarray, "rows columns 2 2"]
+
+    @property
+    def sigma(self) -> Float[np.ndarray, "rows columns"]:
+        return np.sqrt(np.trace(self.covariance, axis1=2, axis2=3) / 2)
+
+    @property
+    def middle(self) -> float:
+        """σ in the middle of the image."""
+        rows, columns = self.sigma.shape
+        return float(self.sigma[rows // 2, columns // 2])
+
+    @property
+    def corners(self) -> float:
+        """The largest σ in the four corners."""
+        return float(np.nanmax(self.sigma[[0, 0, -1, -1], [0, -1, 0, -1]], initial=0.0))
+
+
+def grid_of(image_size, columns: int = GRID[0], rows: int = GRID[1]):
+    """Places from corner to corner of an image, pixels [rows, columns, 2]."""
+    w, h = image_size
+    return np.stack(np.meshgrid(np.linspace(0, w - 1, columns), np.linspace(0, h - 1, rows)), -1)
+
+
+def uncertainty_map(
+    adjustment,
+    camera: str,
+    distance: float = np.inf,
+    frame: str = "scene",
+    grid: tuple[int, int] = GRID,
+) -> UncertaintyMap:
+    """The uncertainty of a projected point over the image of an adjusted camera.
+
+    **Arguments:** `frame`: "scene", "rotation" or "camera"; `distance` (object unit) matters for
+    "scene" only; `grid`: columns and rows of the map.
+
+    **Raises:** `InputError` where the image size is not known or the distance impossible.
+    """
+    if frame not in FRAMES:
+        raise InputError(f"frame {frame!r}: {', '.join(FRAMES)}")
+    if not distance > 0:
+        raise InputError(f"distance {distance:g}: a positive distance is expected")
+    network = adjustment.problem.network
+    c = [given.id for given in network.cameras].index(camera)
+    given = network.cameras[c]
+    if given.image_size is None:
+        raise InputError(f"camera {camera!r}: image_size is needed for a map of its image")
+    model = get_model(given.model)
+    uv = grid_of(given.image_size, *grid)
+    xy = in_model_units(uv.reshape(-1, 2), model, given.image_size, given.pixel_size)
+    if frame == "scene":
+        views = np.flatnonzero(network.images.camera == c)
+        function = images_through_scene(model, c, views, adjustment.values, xy, distance)
+        Q = adjustment.covariance_of(function).reshape(len(xy), 2, len(xy), 2)
+        n = np.arange(len(xy))
+        C = Q[n, :, n]
+    else:
+        names, Q = adjustment.camera_covariance(camera)
+        columns = tuple(model.parameters.index(name) for name in names)
+        p = np.array(list(adjustment.camera_parameters(camera).values()))
+        C = interior_covariance_of_images(model, p, columns, Q, xy, frame)
+    per_unit = 1 / np.array(unit_size(model, given.pixel_size))
+    C = C * per_unit[:, None] * per_unit
+    return UncertaintyMap(frame, float(distance), uv, C.reshape(*uv.shape[:2], 2, 2))
+
+
+@dataclasses.dataclass(frozen=True)
+class Coverage:
+    """Where in the image points were measured.
+
+    **Fields:** `counts` of points in cells of the image; `part` of the cells that hold any;
+    `corners`: by name, whether the cells there hold any; `reach`: largest distance of a measured
+    point from the middle of the image, in half diagonals.
+    """
+
+    counts: Int[np.ndarray, "rows columns"]
+    corners: dict[str, bool]
+    reach: float
+
+    @property
+    def part(self) -> float:
+        return float((self.counts > 0).mean())
+
+
+def coverage(uv: Float[np.ndarray, "n 2"], image_size, cells=CELLS) -> Coverage:
+    """The coverage of an image by measured points, pixels."""
+    uv = uv[np.isfinite(uv).all(1)]
+    (w, h), (columns, rows) = image_size, cells
+    counts, *_ = np.histogram2d(
+        uv[:, 1], uv[:, 0], (rows, columns), ((-0.5, h - 0.5), (-0.5, w - 0.5))
+    )
+    top, left = max(rows // 4, 1), max(columns // 6, 1)
+    corners = {
+        "upper left": counts[:top, :left], "upper right": counts[:top, -left:],
+        "lower left": counts[-top:, :left], "lower right": counts[-top:, -left:],
+    }  # fmt: skip
+    away = np.linalg.norm(uv - (np.array(image_size) - 1) / 2, axis=1)
+    return Coverage(
+        counts.astype(int), {name: bool((c > 0).any()) for name, c in corners.items()},
+        float(away.max(initial=0.0) / (np.hypot(w, h) / 2)),
+    )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class CrossValidation:
+    """A camera calibrated from either half of its photographs.
+
+    **Fields:**
+
+    - `rms_own`: RMS of the residuals (pixels, |v| of a point) of the two halves adjusted freely;
+    - `rms_other`: the same with the camera held as the other half has it;
+    - `difference`: of the parameters, first half − second half, in units of its σ;
+    - `test`: dᵀ·C⁻¹·d/k of all k free parameters, near 1 if the halves differ by chance;
+    - `halves`: the parameters of both; `comparison`: how far their images are apart over the
+      image, the implied rotation removed (`jaxbundle.cameras.compare`), in the model's unit; None
+      where nothing can be compared.
+    """
+
+    rms_own: float
+    rms_other: float
+    difference: dict[str, float]
+    test: float
+    halves: tuple[dict[str, float], dict[str, float]]
+    comparison: Comparison | None
+
+
+def kept_rays(adjustment):
+    """Which observations of the adjusted network were not removed as gross errors."""
+    weight = np.asarray(adjustment.problem.data.image_weight)[adjustment.problem.rays]
+    return (weight > 0).all(1)
+
+
+def cross_validation(result) -> CrossValidation | None:
+    """Calibrate from every other photograph, and hold that camera against the rest.
+
+    **Arguments:** the adjustment of one camera: start values are taken from it, and what it has
+    removed stays away.
+
+    **Returns:** None where there are too few photographs, or a half determines no camera.
+    """
+    network = result.problem.network
+    if len(network.images) < 2 * HELD_OUT_FEWEST:
+        return None
+    network = _at(network, result)
+    turns = np.arange(len(network.images)) % 2
+    try:
+        again = partial(adjust, robust=result.robust)
+        halves = [again(part(network, turns == half)) for half in (0, 1)]
+        if not all(half.converged for half in halves):
+            return None
+        name = network.cameras[0].id
+        own = [half.camera_parameters(name) for half in halves]
+        held = [again(_held(part(network, turns == 1 - half), own[half])) for half in (0, 1)]
+    except (InputError, NotSolvedError):
+        return None
+    if not all(other.converged for other in held):
+        return None
+    names, C = halves[0].camera_covariance(name)
+    C = C + halves[1].camera_covariance(name)[1]
+    d = np.array([own[0][n] - own[1][n] for n in names])
+    scale = np.sqrt(np.diagonal(C))
+    test = float((d / scale) @ np.linalg.solve(C / np.outer(scale, scale), d / scale)) / len(d)
+    rms = lambda parts: float(np.sqrt(np.mean([_rms(p) ** 2 for p in parts])))
+    return CrossValidation(
+        rms(halves), rms(held), dict(zip(names, (d / scale).tolist())), test, tuple(own),
+        _compared(network.cameras[0], own),
+    )  # fmt: skip
+
+
+def _compared(camera: Camera, halves) -> Comparison | None:
+    model = get_model(camera.model)
+    try:
+        return compare_cameras(
+            *((model, parameters) for parameters in halves),
+            image_size=camera.image_size, pixel_size=camera.pixel_size,
+        )  # fmt: skip
+    except ValueError:
+        return None
+
+
+def _at(network: Network, result) -> Network:
+    """The network with the adjusted values for its start values."""
+    name = network.cameras[0].id
+    exterior = result.image_values
+    return network.replace(
+        cameras=(dataclasses.replace(
+            network.cameras[0], parameters=result.camera_parameters(name)),),
+        images=dataclasses.replace(
+            network.images, position=exterior[:, :3], angles=exterior[:, 3:]),
+        observations=network.observations.take(kept_rays(result)),
+        warnings=(),
+    )  # fmt: skip
+
+
+def part(network: Network, keep) -> Network:
+    """The network with some of its images and their rays."""
+    images, rays = network.images, network.observations
+    index = np.cumsum(keep) - 1
+    rays = rays.take(keep[rays.image])
+    chosen = np.flatnonzero(keep)
+    return network.replace(
+        images=dataclasses.replace(
+            images, id=tuple(images.id[i] for i in chosen), camera=images.camera[chosen],
+            position=images.position[chosen], angles=images.angles[chosen],
+            sigma=images.sigma[chosen], source=images.source.take(chosen),
+        ),
+        observations=dataclasses.replace(rays, image=index[rays.image]),
+    )  # fmt: skip
+
+
+def _held(network: Network, parameters) -> Network:
+    camera = dataclasses.replace(network.cameras[0], parameters=parameters, free=())
+    return network.replace(cameras=(camera,))
+
+
+def _rms(adjustment) -> float:
+    """√(Σ|v|²/points) in pixels."""
+    camera = adjustment.problem.network.cameras[0]
+    v, _ = residuals_in_pixels(adjustment, camera)
+    return float(np.sqrt(np.nanmean((v**2).sum(1))))
+
+
+def residuals_in_pixels(adjustment, camera):
+    """Residuals v [n, 2] of the image points of a camera, and the points [n, 2], in pixels; v is
+    NaN where a point was removed."""
+    s, data, model = adjustment.problem.structure, adjustment.problem.data, get_model(camera.model)
+    weight = np.asarray(data.image_weight)
+    rows = adjustment.problem.rays
+    v = np.asarray(adjustment.inspection.residuals.image)[rows]
+    used = (weight[rows] > 0).all(1)
+    v = np.where(used[:, None], v / np.where(used[:, None], weight[rows], 1.0), np.nan)
+    c = [given.id for given in adjustment.problem.network.cameras].index(camera.id)
+    own = np.asarray(s.camera)[rows] == c
+    xy = np.asarray(data.image_xy)[rows][own]
+    size = np.array(unit_size(model, camera.pixel_size))
+    uv = in_pixels(xy, model, camera.image_size, camera.pixel_size)
+    return v[own] / size, uv

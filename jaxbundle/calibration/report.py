@@ -1,0 +1,204 @@
+"""The protocol of a calibration and its JSON: photographs, camera, quality, the adjustment."""
+
+import numpy as np
+
+from jaxbundle.io.result_json import result_dict
+from jaxbundle.report.layout import (
+    clean,
+    estimate,
+    facts,
+    fixed,
+    heading,
+    paragraph,
+    shortened,
+    significant,
+    table,
+)
+
+MOST_FAILED = 50
+
+
+def text(calibration) -> str:
+    """Photographs, camera, quality and advice; after it the protocol of the adjustment."""
+    lines = [*_photographs(calibration)]
+    if calibration.converged:
+        lines += [*_camera(calibration), *_quality(calibration), *_advice(calibration)]
+    body = "\n".join(line.rstrip() for line in lines)
+    return f"{body}\n\n{calibration.adjustment.report()}"
+
+
+def _photographs(calibration):
+    views = calibration.views
+    size = " × ".join(map(str, views.image_size))
+    lines = [f"Calibration of {clean(calibration.name)}", "=" * 100]
+    found = int(views.visible.sum())
+    lines += facts([
+        ("Board", str(views.board)),
+        ("Photographs", f"{len(views)} used, {len(views.failed)} not; {size} pixels"),
+        ("Points", f"{found} of {views.visible.size} image points found"),
+    ])  # fmt: skip
+    if views.failed:
+        lines += heading("Photographs not used")
+        rows = facts((clean(name), clean(why)) for name, why in views.failed)
+        lines += shortened(rows, MOST_FAILED, "…")
+    return lines
+
+
+def _camera(calibration):
+    lines = heading(f"Camera ({calibration.adjustment.network.cameras[0].model})")
+    free = calibration.sigma
+    rows = []
+    for name, value in calibration.parameters.items():
+        if name in free:
+            rows.append((name, *estimate(value, free[name])))
+        elif value != 0:
+            rows.append((name, significant(value, 10), "held"))
+    lines += table(("parameter", "value", "σ"), rows, "lrr")
+    lines += ["", f"RMS of an image point {calibration.rms:.4f} px"]
+    return lines
+
+
+def _quality(calibration):
+    lines = heading("Quality")
+    covered = calibration.coverage
+    away, unit = calibration.distances, calibration.adjustment.network.object_unit
+    lines += facts([
+        ("Coverage", f"points in {100 * covered.part:.0f} % of the image's cells, out to "
+         f"{100 * covered.reach:.0f} % of the half diagonal"),
+        ("Distances", f"{away.min():.4g} to {away.max():.4g} {clean(unit)}"),
+    ])  # fmt: skip
+    lines += ["", "Uncertainty of a projected point (σ, pixels)"]
+    rows = [
+        (_held_in(m, clean(unit)), fixed(m.middle, 3), fixed(m.corners, 3))
+        for m in calibration.reported_maps
+    ]
+    lines += table(("point held in", "middle", "corners"), rows, "lrr")
+    checked = calibration.cross_validation
+    if checked is None:
+        return [*lines, "", "Cross-validation: too few photographs for two halves"]
+    largest = max(checked.difference, key=lambda n: abs(checked.difference[n]))
+    lines += ["", *paragraph(
+        f"Cross-validation: the camera of either half leaves an RMS of {checked.rms_other:.4f} px "
+        f"in the other half, where its own leaves {checked.rms_own:.4f} px. The two differ by "
+        f"{abs(checked.difference[largest]):.1f} σ in {largest}, the most; test of all parameters "
+        f"together {checked.test:.2f} (1 expected)."
+    )]  # fmt: skip
+    if checked.comparison is not None:
+        lines += paragraph(f"Their images, over the whole image: {checked.comparison}.")
+    return lines
+
+
+def _held_in(m, unit: str) -> str:
+    if m.frame == "scene":
+        return f"the scene, at {m.distance:.3g} {unit}" if m.distance < np.inf else (
+            "the scene, at infinity"
+        )
+    return {"rotation": "all rays, rotation removed", "camera": "the camera frame"}[m.frame]
+
+
+def _advice(calibration):
+    found = calibration.advice
+    lines = heading("Advice")
+    if not found:
+        return [*lines, "none: directions, distances and coverage are good"]
+    for item in found:
+        lines += paragraph(f"- {item}", hanging=2)
+    return lines
+
+
+def as_dict(calibration, brief: bool = False) -> dict:
+    """The JSON of the adjustment with a section `calibration`."""
+    views, adjustment = calibration.views, calibration.adjustment
+    about = {
+        "camera": calibration.name,
+        "board": {"kind": views.board.kind, "columns": views.board.columns,
+                  "rows": views.board.rows, "square": views.board.square},
+        "image_size": list(views.image_size),
+        "photographs": {"used": list(views.names), "failed": dict(views.failed)},
+    }  # fmt: skip
+    if calibration.converged:
+        about |= _quality_dict(calibration)
+    return {"calibration": about, **result_dict(adjustment, brief)}
+
+
+def _quality_dict(calibration) -> dict:
+    covered, checked = calibration.coverage, calibration.cross_validation
+    number = lambda x: float(x) if np.isfinite(x) else None
+    uncertain = [
+        {"frame": m.frame, "distance": number(m.distance), "middle": number(m.middle),
+         "corners": number(m.corners)}
+        for m in calibration.reported_maps
+    ]  # fmt: skip
+    return {
+        "rms": calibration.rms,
+        "distances": calibration.distances.tolist(),
+        "coverage": {"part": covered.part, "reach": covered.reach, "corners": covered.corners,
+                     "counts": covered.counts.tolist()},
+        "uncertainty": uncertain,
+        "cross_validation": None if checked is None else {
+            "rms_own": checked.rms_own, "rms_other": checked.rms_other, "test": checked.test,
+            "difference": checked.difference, "halves": list(checked.halves),
+            "images": None if checked.comparison is None else {
+                "rms": checked.comparison.rms, "largest": checked.comparison.largest,
+                "unit": checked.comparison.unit,
+            },
+        },
+        "advice": calibration.advice,
+    }  # fmt: skip
+
+
+
+def rig_text(rig) -> str:
+    """The mountings of a rig and its cameras in the common adjustment."""
+    unit = clean(next(iter(rig.cameras.values())).adjustment.network.object_unit)
+    lines = [f"Rig of {len(rig.cameras)} cameras, reference {clean(rig.names[0])}", "=" * 100]
+    lines += facts([
+        ("Epochs", f"{len(rig.epochs)} used, {len(rig.left_out)} left out"),
+        ("σ0", f"{rig.sigma0:.4f}, redundancy {rig.redundancy}"),
+        ("RMS", ", ".join(f"{clean(name)} {rms:.4f} px" for name, rms in rig.rms.items())),
+        ("Board", "exact" if rig.known.known else "its points estimated, inner constraints"
+         if rig.known.free else f"known with σ {rig.known.sigma:g} {unit}"),
+    ])  # fmt: skip
+    lines += facts((clean(epoch), clean(why)) for epoch, why in rig.left_out)
+    for name, m in rig.mountings.items():
+        lines += heading(f"Mounting of {clean(name)} in the frame of {clean(rig.names[0])}")
+        values = [*m.base, *m.angles]
+        rows = [
+            (label, *estimate(value, sigma), what)
+            for label, value, sigma, what in zip(
+                ("bx", "by", "bz", "ω", "φ", "κ"), values, m.sigma, [unit] * 3 + ["deg"] * 3
+            )
+        ]
+        rows.append(("length", *estimate(m.length, m.length_sigma), unit))
+        lines += table(("", "value", "σ", "unit"), rows, "lrrl")
+    for name in rig.names:
+        lines += heading(f"Camera {clean(name)} in the rig")
+        rows = [(n, *estimate(rig.parameters[name][n], s)) for n, s in rig.sigma[name].items()]
+        lines += table(("parameter", "value", "σ"), rows, "lrr")
+    return "\n".join(line.rstrip() for line in lines) + "\n"
+
+
+def rig_dict(rig) -> dict:
+    """The rig as plain dicts and numbers: object unit, degrees, pixels."""
+    return {
+        "reference": rig.names[0],
+        "epochs": list(rig.epochs),
+        "left_out": dict(rig.left_out),
+        "sigma0": rig.sigma0,
+        "redundancy": rig.redundancy,
+        "rms": rig.rms,
+        "mountings": {
+            name: {
+                "base": m.base.tolist(), "sigma_base": m.sigma[:3].tolist(),
+                "angles": m.angles.tolist(), "sigma_angles": m.sigma[3:].tolist(),
+                "rotation": m.rotation.tolist(), "covariance": m.covariance.tolist(),
+                "length": m.length, "sigma_length": m.length_sigma,
+            }
+            for name, m in rig.mountings.items()
+        },
+        "cameras": {
+            name: {n: {"value": value, "sigma": rig.sigma[name].get(n)}
+                   for n, value in rig.parameters[name].items()}
+            for name in rig.names
+        },
+    }  # fmt: skip

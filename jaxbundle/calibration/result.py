@@ -1,0 +1,199 @@
+"""The result of a calibration: the camera, its adjustment, and how good it is."""
+
+import dataclasses
+import functools
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle import plotting
+from jaxbundle.calibration import quality
+from jaxbundle.calibration.advice import advice
+from jaxbundle.calibration.quality import Coverage, CrossValidation, UncertaintyMap
+from jaxbundle.geometry import matrix_from_quaternion
+from jaxbundle.measure.views import BoardViews
+from jaxbundle.network.tables import Camera
+from jaxbundle.result import Adjustment
+
+DISTANCES = 15
+"""Distances of a curve of uncertainty."""
+
+
+class Calibration:
+    """A calibrated camera. Print it; `report()` is the whole protocol.
+
+    **Attributes:**
+
+    - `views`: what was measured, and which photographs failed and why;
+    - `adjustment`: the `Adjustment` of the network, with everything it can be asked;
+    - `camera`: the camera with its adjusted parameters, held; `parameters` and `sigma` by name
+      (in the unit of the model, a posteriori);
+    - `rms`: √(Σ(vx² + vy²)/points) in pixels, as OpenCV defines it;
+    - `coverage`, `advice`, `cross_validation`: how good it is, and what to photograph next.
+    """
+
+    def __init__(self, views: BoardViews, adjustment: Adjustment):
+        self.views = views
+        self.adjustment = adjustment
+        self._maps: dict[tuple, UncertaintyMap] = {}
+
+    @property
+    def converged(self) -> bool:
+        return self.adjustment.converged
+
+    @property
+    def name(self) -> str:
+        return self.adjustment.network.cameras[0].id
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """All parameters of the camera by name."""
+        return self.adjustment.camera_parameters(self.name)
+
+    @functools.cached_property
+    def sigma(self) -> dict[str, float]:
+        """σ of the free parameters by name."""
+        names, C = self.adjustment.camera_covariance(self.name)
+        return dict(zip(names, np.sqrt(np.diagonal(C)).tolist()))
+
+    @property
+    def camera(self) -> Camera:
+        """The calibrated camera, nothing of it free."""
+        given = self.adjustment.network.cameras[0]
+        return dataclasses.replace(given, parameters=self.parameters, free=(), sigma={})
+
+    @functools.cached_property
+    def _residuals(self):
+        return quality.residuals_in_pixels(self.adjustment, self.adjustment.network.cameras[0])
+
+    @property
+    def rms(self) -> float:
+        """√(Σ(vx² + vy²)/points) of the image points used, pixels."""
+        return float(np.sqrt(np.nanmean((self._residuals[0] ** 2).sum(1))))
+
+    @property
+    def measured(self) -> Float[np.ndarray, "n 2"]:
+        """All measured image points, pixels."""
+        return self._residuals[1]
+
+    @property
+    def rotation(self) -> Float[np.ndarray, "views 3 3"]:
+        """M of every view, board to camera."""
+        return np.asarray(_matrices(self.adjustment.values.rotation))
+
+    @property
+    def position(self) -> Float[np.ndarray, "views 3"]:
+        """X0 of every view in the system of the board, object unit."""
+        return self.adjustment.image_values[:, :3]
+
+    @property
+    def distances(self) -> Float[np.ndarray, " views"]:
+        """Of every view from the middle of the board, object unit."""
+        return np.linalg.norm(self.position - self.views.board.points.mean(0), axis=1)
+
+    @functools.cached_property
+    def coverage(self) -> Coverage:
+        """Where in the image points were measured."""
+        return quality.coverage(self._residuals[1], self.views.image_size)
+
+    @functools.cached_property
+    def cross_validation(self) -> CrossValidation | None:
+        """The camera calibrated from either half of the photographs; None where there are too few.
+
+        Four more adjustments, made when first asked for."""
+        return quality.cross_validation(self.adjustment)
+
+    @functools.cached_property
+    def advice(self) -> list[str]:
+        """Warnings in words, and what to photograph next (cross-validation not asked)."""
+        t = {name: abs(self.parameters[name]) / s for name, s in self.sigma.items() if s > 0}
+        return advice(
+            self.position, self.rotation, self.views.board.points.mean(0),
+            self._unit, self.coverage, self.rms, t,
+            self.__dict__.get("cross_validation"),
+        )  # fmt: skip
+
+    def uncertainty(
+        self, distance: float = np.inf, frame: str = "scene", grid=quality.GRID
+    ) -> UncertaintyMap:
+        """Uncertainty of a projected point over the image, pixels, for a distance in the object
+        unit; frames: see `jaxbundle.statistics.projection`."""
+        key = (distance, frame, grid)
+        if key not in self._maps:
+            self._maps[key] = quality.uncertainty_map(
+                self.adjustment, self.name, distance, frame, grid
+            )
+        return self._maps[key]
+
+    @property
+    def reported_maps(self) -> list[UncertaintyMap]:
+        """Near (the median distance of the board), at ten times that, at infinity; and without the
+        scene."""
+        near = float(np.median(self.distances))
+        chosen = (("scene", near), ("scene", 10 * near), ("scene", np.inf),
+                  ("rotation", np.inf), ("camera", np.inf))  # fmt: skip
+        return [self.uncertainty(distance, frame) for frame, distance in chosen]
+
+    def uncertainty_over_distance(self, distances: Float[np.ndarray, " n"]):
+        """σ of a projected point in the middle and in the corners, pixels, [n] each."""
+        maps = [self.uncertainty(d) for d in distances]
+        return np.array([m.middle for m in maps]), np.array([m.corners for m in maps])
+
+    @property
+    def _unit(self) -> str:
+        return self.adjustment.network.object_unit
+
+    def plot_coverage(self, ax=None):
+        """Where in the image points were measured; matplotlib axes."""
+        return plotting.coverage_map(
+            self.coverage, self.measured, self.views.image_size, self.name, ax
+        )
+
+    def plot_uncertainty(self, distance: float = np.inf, frame: str = "scene", ax=None):
+        """σ of a projected point over the image; matplotlib axes."""
+        found = self.uncertainty(distance, frame)
+        return plotting.uncertainty_image(found, self.views.image_size, self._unit, self.name, ax)
+
+    def plot_uncertainty_over_distance(self, ax=None):
+        """σ of a projected point in the middle and in the corners, from a quarter of the nearest
+        distance of the board to a hundred times the farthest; matplotlib axes."""
+        span = float(self.distances.min()), float(self.distances.max())
+        distances = np.geomspace(span[0] / 4, 100 * span[1], DISTANCES)
+        curves = self.uncertainty_over_distance(distances)
+        return plotting.uncertainty_curve(distances, *curves, span, self._unit, self.name, ax)
+
+    def plot_halves(self, ax=None):
+        """How far the images of the two halves' cameras are apart (`cross_validation`); matplotlib
+        axes."""
+        halves = self.cross_validation
+        if halves is None or halves.comparison is None:
+            raise ValueError("there are no two halves to compare: too few photographs")
+        title = f"Camera {self.name}: the two halves"
+        return plotting.difference_map(halves.comparison, ax, title)
+
+    def report(self) -> str:
+        """The whole protocol as text."""
+        from jaxbundle.calibration.report import text
+
+        return text(self)
+
+    def to_dict(self, brief: bool = False) -> dict:
+        """The result as plain dicts and numbers, as in JSON."""
+        from jaxbundle.calibration.report import as_dict
+
+        return as_dict(self, brief)
+
+    def __str__(self) -> str:
+        if not self.converged:
+            return f"Calibration of {self.name}: not solved ({self.adjustment.termination})"
+        shown = ", ".join(f"{n} {self.parameters[n]:.6g} ± {s:.2g}" for n, s in self.sigma.items())
+        return (
+            f"Calibration of {self.name}: {len(self.views)} photographs, "
+            f"{len(self.views.failed)} failed, RMS {self.rms:.3f} px\n{shown}"
+        )
+
+
+@jax.jit
+def _matrices(rotation):
+    return jax.vmap(matrix_from_quaternion)(rotation)

@@ -1,0 +1,68 @@
+"""Several cameras calibrated from one board: each by itself, and as a rig if they are mounted."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from jaxbundle.calibration.calibrate import calibrate
+from jaxbundle.calibration.result import Calibration
+from jaxbundle.calibration.rig import calibrate_rig
+from jaxbundle.calibration.rig_result import RigCalibration
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.measure.boards import Board
+from jaxbundle.measure.views import BoardViews
+
+
+@dataclasses.dataclass(frozen=True)
+class Calibrations:
+    """Calibrations by the name of the camera, and the rig, where there is one."""
+
+    cameras: dict[str, Calibration]
+    rig: RigCalibration | None = None
+
+    @property
+    def converged(self) -> bool:
+        return all(one.converged for one in self.cameras.values())
+
+    def report(self) -> str:
+        """The protocols of all cameras, that of the rig before them."""
+        from jaxbundle.calibration.report import rig_text
+
+        parts = [one.report() for one in self.cameras.values()]
+        if self.rig is not None:
+            parts.insert(0, rig_text(self.rig))
+        return "\n\n".join(parts)
+
+
+def calibrate_cameras(
+    photographs: Mapping[str, Sequence[str | Path] | BoardViews],
+    board: Board | None = None,
+    *,
+    rig: bool = False,
+    progress: Callable[[], None] | None = None,
+    **options,
+) -> Calibrations:
+    """Calibrate several cameras from photographs of one board.
+
+    **Arguments:** `photographs` by the name of the camera; `rig`: the cameras are mounted rigidly
+    and photographed in step (`jaxbundle.calibration.rig`), the first is the reference;
+    `progress()`: after every photograph; `options`: those of `calibrate`.
+
+    **Raises:** `InputError`, `NotSolvedError`, naming the camera where there are several.
+    """
+    if rig and len(photographs) < 2:
+        raise InputError("a rig has two cameras or more: give --camera NAME=PATTERN for each")
+    found = {}
+    for name, given in photographs.items():
+        tell = None if progress is None else lambda *_: progress()
+        try:
+            found[name] = calibrate(given, board, camera=name, progress=tell, **options)
+        except (InputError, NotSolvedError) as error:
+            if len(photographs) == 1:
+                raise
+            raise type(error)(f"camera {name}: {error}") from None
+    together = None
+    if rig and all(one.converged for one in found.values()):
+        known = {name: options[name] for name in ("board_sigma", "board_free") if name in options}
+        together = calibrate_rig(found, **known)
+    return Calibrations(found, together)

@@ -1,0 +1,167 @@
+r"""The difference of two calibrations of one camera, as a map over the image.
+
+A pixel u has the ray a(u) by calibration A; by B the ray has the image b(·). Two calibrations may
+differ by a rotation of the camera frame that no photograph shows, since every exterior orientation
+takes it up: a shift of the principal point is nearly one. The implied rotation is removed,
+
+    d(u) = b(exp([θ]×)·a(u)) − u,        Σ |d(u)|² → min over θ
+
+and d is what remains: how far images of one object would be apart.
+
+Source: the differencing of mrcal (Kogan), here at infinity, by least squares over the whole image.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.geometry import matrix_from_rotation_vector
+
+from .convert import image_area
+from .convert_fit import GRID, image_grid, images_of, rays_of
+from .frames import between_frames
+from .model import CameraModel, project
+from .parameters import default_parameters
+
+ITERATIONS = 20
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """A difference map, in the unit and axes of the first calibration.
+
+    `x` [columns], `y` [rows] of the grid; `difference` [rows, columns, 2], NaN where one of the
+    calibrations has no ray or image; `rotation` θ, radians, removed; `rms` and `largest` lengths of
+    the differences, `where` the place of the largest; `covered`: the part of the grid that has one.
+    """
+
+    unit: str
+    x: Float[np.ndarray, " columns"]
+    y: Float[np.ndarray, " rows"]
+    difference: Float[np.ndarray, "rows columns 2"]
+    rotation: Float[np.ndarray, "3"]
+    rms: float
+    largest: float
+    where: tuple[float, float]
+    covered: float
+
+    @property
+    def length(self) -> Float[np.ndarray, "rows columns"]:
+        """Lengths of the differences."""
+        return np.linalg.norm(self.difference, axis=2)
+
+    def __str__(self) -> str:
+        x, y = self.where
+        angles = ", ".join(f"{angle:.2f}" for angle in np.degrees(self.rotation) * 3600)
+        return (
+            f"RMS difference {self.rms:.4g} {self.unit}, largest {self.largest:.4g} {self.unit} at "
+            f"({x:.4g}, {y:.4g}); rotation removed: {angles} arc seconds about x, y, z"
+        )
+
+
+def compare_cameras(
+    a: tuple[CameraModel, Mapping[str, float]],
+    b: tuple[CameraModel, Mapping[str, float]],
+    *,
+    image_size: Sequence[float] | None = None,
+    pixel_size: Sequence[float] | None = None,
+    area: tuple[Sequence[float], Sequence[float]] | None = None,
+    rotate: bool = True,
+    radius: float = np.inf,
+) -> Comparison:
+    """How far the images of two calibrations are apart, the implied rotation removed.
+
+    **Arguments:**
+
+    - `a`, `b`: model and parameters by name (those left out have their defaults).
+    - `image_size` (pixels), `pixel_size` (mm): needed where the models differ in unit or axes, or
+      to know the area.
+    - `area`: corners (low, high) of the part of the image to compare, in a's coordinates.
+    - `rotate`: False: nothing is removed.
+    - `radius`: the rotation is fitted to what lies so near the middle of the area: where both
+      calibrations had measurements.
+
+    **Raises:** `ValueError` naming a size that is missing, or where nothing can be compared.
+    """
+    (source, values), (other, others) = (
+        (model, {**default_parameters(model), **given}) for model, given in (a, b)
+    )
+    low, high = area or image_area(source, image_size, pixel_size)
+    xy = image_grid(low, high)
+    shift, step = between_frames(other, source, image_size, pixel_size)
+    rays = rays_of(source, values, xy)
+    back = np.abs(images_of(source, values, rays) - xy).max(1) < 1e-9 * np.ptp(xy)
+    seen = back & np.isfinite(images_of(other, others, rays)).all(1)
+    if seen.sum() < 3:
+        raise ValueError("no part of the image has a ray in both calibrations")
+    near = seen & (np.linalg.norm(xy - xy.mean(0), axis=1) <= radius)
+    if rotate and near.sum() < 3:
+        raise ValueError(f"a radius of {radius:g} {source.unit} holds too few points to fit")
+    p = np.array([others[name] for name in other.parameters], float)
+    rotation = np.zeros(3)
+    with jax.enable_x64(True):
+        for _ in range(ITERATIONS if rotate else 0):
+            there, slopes = (np.array(part) for part in _turned(other, p, rotation, rays))
+            d = ((shift + step * there) - xy)[near]
+            good = np.isfinite(d).all(1)
+            J = (step[:, None] * slopes)[near][good].reshape(-1, 3)
+            change = np.linalg.lstsq(J, -d[good].ravel(), rcond=None)[0]
+            rotation = rotation + change
+            if np.abs(change).max() < 1e-14:
+                break
+        there = np.array(_turned(other, p, rotation, rays)[0])
+    difference = np.where(seen[:, None], shift + step * there - xy, np.nan)
+    length = np.linalg.norm(difference, axis=1)
+    known = np.isfinite(length)
+    worst = int(np.nanargmax(length))
+    columns, rows = GRID
+    grid = xy.reshape(rows, columns, 2)
+    return Comparison(
+        source.unit, grid[0, :, 0], grid[:, 0, 1], difference.reshape(rows, columns, 2), rotation,
+        float(np.sqrt(np.mean(length[known] ** 2))), float(length[worst]),
+        tuple(xy[worst].tolist()), float(known.mean()),
+    )  # fmt: skip
+
+
+def difference_rings(comparison: Comparison, step: float) -> dict[str, np.ndarray]:
+    """The differences by their distance from the image centre, in rings of a width.
+
+    **Returns:** columns r (outer radius of the ring), radial and tangential (means over the ring,
+    outward and counter-clockwise in the axes of the map), rms, largest, points.
+
+    **Raises:** `ValueError` if the width is not positive.
+    """
+    if not (np.isfinite(step) and step > 0):
+        raise ValueError(f"the width of rings is {step}; it must be positive")
+    x, y = np.meshgrid(comparison.x - comparison.x.mean(), comparison.y - comparison.y.mean())
+    r = np.hypot(x, y).ravel()
+    d = comparison.difference.reshape(-1, 2)
+    known = np.isfinite(d).all(1)
+    r, d, x, y = r[known], d[known], x.ravel()[known], y.ravel()[known]
+    ring = np.floor(r / step).astype(int)
+    out = np.stack([x, y], 1) / np.maximum(r, 1e-300)[:, None]
+    radial, tangential = (d * out).sum(1), out[:, 0] * d[:, 1] - out[:, 1] * d[:, 0]
+    rings = np.unique(ring)
+    of = lambda function, v: np.array([function(v[ring == k]) for k in rings])
+    length = np.hypot(*d.T)
+    return {
+        "r": (rings + 1) * step, "radial": of(np.mean, radial),
+        "tangential": of(np.mean, tangential), "rms": of(lambda v: np.sqrt(np.mean(v**2)), length),
+        "largest": of(np.max, length), "points": of(len, length),
+    }  # fmt: skip
+
+
+@partial(jax.jit, static_argnums=0)
+def _turned(model, p, rotation, rays):
+    """Images of the turned rays [n, 2], and their derivatives by θ [n, 2, 3]."""
+
+    def one(theta, ray):
+        return jnp.stack(project(model, tuple(p), *(matrix_from_rotation_vector(theta) @ ray)))
+
+    images = jax.vmap(one, (None, 0))(rotation, rays)
+    return images, jax.vmap(jax.jacfwd(one), (None, 0))(rotation, rays)

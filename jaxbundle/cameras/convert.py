@@ -1,0 +1,125 @@
+"""From one camera model to another: exactly where there is a formula, else by a fit over the image.
+
+What the conversion costs is always measured: points of a grid over the image go back along the
+rays of the source and forward through the target, and their displacement is reported.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from .convert_exact import NotExact, exact_parameters
+from .convert_fit import fit_parameters, image_grid, images_of, rays_of, start_values
+from .frames import between_frames
+from .model import CameraModel
+from .parameters import default_parameters
+
+Area = tuple[Sequence[float], Sequence[float]]
+MEASURABLE = 0.5
+"""The part of the image that must have rays, or a fit would mean nothing."""
+SAME_POINT = 1e-9
+"""Of the image's size: what rounding may displace a point on its way along the ray and back."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Conversion:
+    """A camera in its new model, and what that costs.
+
+    `largest` and `rms` are displacements in the measured image, in the target's `unit`, over the
+    area given; `where` (target's coordinates) is the place of the largest. `covered` is the part
+    of the area in which the source has rays. `reason` says why the conversion is not exact.
+    """
+
+    model: str
+    parameters: Mapping[str, float]
+    exact: bool
+    largest: float
+    rms: float
+    unit: str
+    where: tuple[float, float]
+    covered: float
+    reason: str = ""
+
+    def __str__(self) -> str:
+        how = "exact" if self.exact else f"fitted over the image, because {self.reason}"
+        x, y = self.where
+        text = (
+            f"{self.model}: {how}; largest difference {self.largest:.3g} {self.unit} at "
+            f"({x:.4g}, {y:.4g}), RMS {self.rms:.3g} {self.unit}"
+        )
+        if self.covered < 1:
+            text += f"; {100 * (1 - self.covered):.1f} % of the image has no ray in the source"
+        return text
+
+
+def convert_camera(
+    source: CameraModel,
+    parameters: Mapping[str, float],
+    target: CameraModel,
+    *,
+    image_size: Sequence[float] | None = None,
+    pixel_size: Sequence[float] | None = None,
+    area: Area | None = None,
+    r0: float = 0.0,
+    free: Sequence[str] = (),
+) -> Conversion:
+    """A camera of one model as a camera of another.
+
+    **Arguments:**
+
+    - `parameters`: of the source, by name; those left out have their defaults.
+    - `image_size` (pixels), `pixel_size` (mm): needed where pixels meet millimetres or image
+      centres.
+    - `area`: the corners of the image (low, high) in the source's coordinates; the whole image
+      if not given.
+    - `r0`: of the target, mm, if it has one.
+    - `free`: what a fit may change (`convert_fit.FITTED` if empty); the rest has its default.
+
+    **Raises:** `ValueError` naming what is missing, or why there is nothing to be fitted.
+    """
+    values = {**default_parameters(source), **parameters}
+    sizes = (image_size, pixel_size)
+    shift, step = between_frames(source, target, *sizes)
+    xy = image_grid(*(area or image_area(source, *sizes)))
+    rays = rays_of(source, values, xy)
+    # beyond the radius where a correction turns back, its rays belong to other points
+    there = np.abs(images_of(source, values, rays) - xy).max(1) < SAME_POINT * np.ptp(xy)
+    if there.mean() < MEASURABLE:
+        raise ValueError(
+            f"only {100 * there.mean():.0f} % of the image has a ray in model {source.name!r}: its "
+            "distortion turns back inside the image"
+        )
+    wanted, rays = (shift + step * xy)[there], rays[there]
+    if target.name != "kannala-brandt" and (rays[:, 2] >= 0).any():
+        raise ValueError(
+            f"part of the image looks 90° and more from the axis, where model {target.name!r} has "
+            "no image; convert a smaller area, or keep the fisheye model"
+        )
+    try:
+        found, reason = exact_parameters(source, values, target, sizes, r0), ""
+    except NotExact as why:
+        reason = str(why)
+        starts = start_values(source, values, target, sizes, r0)
+        found = fit_parameters(target, rays, wanted, starts, free)
+    length = np.linalg.norm(images_of(target, found, rays) - wanted, axis=1)
+    worst = int(np.argmax(np.where(np.isnan(length), np.inf, length)))
+    return Conversion(
+        target.name, {name: float(v) for name, v in found.items()}, not reason,
+        float(length[worst]), float(np.sqrt(np.mean(length**2))), target.unit,
+        tuple(wanted[worst].tolist()), float(there.mean()), reason,
+    )  # fmt: skip
+
+
+def image_area(source: CameraModel, image_size, pixel_size) -> Area:
+    """The corners of the whole image, in the model's coordinates."""
+    if image_size is None:
+        raise ValueError("image_size is needed to know the area of the image")
+    size = np.asarray(image_size, float)
+    if source.axes == "down":
+        return np.full(2, -0.5), size - 0.5
+    if source.unit == "mm":
+        if pixel_size is None:
+            raise ValueError("pixel_size is needed to know the area of the image in mm")
+        size = size * np.asarray(pixel_size, float)
+    return -size / 2, size / 2

@@ -1,0 +1,170 @@
+"""A camera of one model fitted to the rays of another: least squares over the image.
+
+Points of a grid over the image have rays by the source. The target's parameters are those with
+
+    Σ |image of the ray by the target − point|²  →  min        in the measured image
+
+No rotation is estimated: exterior orientations stay as they are.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from .convert_exact import (
+    CORRECTIONS,
+    DISTORTIONS,
+    Sizes,
+    Values,
+    distortion,
+    inverted_radial,
+    normalised_correction,
+)
+from .frames import between_frames
+from .model import CameraModel, image_ray, project
+from .parameters import default_parameters
+
+FITTED = {
+    "brown": ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2"),
+    "brown-projected": ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2"),
+    "usgs": ("c", "x0", "y0", "K1", "K2", "K3", "K4", "P1", "P2"),
+    "bingo": ("c", "x0", "y0", "p25", "p26"),
+    "opencv": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"),
+    "kannala-brandt": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "snavely": ("f", "k1", "k2"),
+}
+"""What is fitted if nothing else is asked for; all of it can be told apart."""
+
+GRID = (33, 25)
+MOST_EVALUATIONS = 200
+
+
+def image_grid(low: Sequence[float], high: Sequence[float]) -> Float[np.ndarray, "points 2"]:
+    """Points of a rectangle, its edges among them."""
+    columns, rows = (np.linspace(a, b, n) for a, b, n in zip(low, high, GRID))
+    return np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
+
+
+def rays_of(model: CameraModel, values: Values, xy) -> Float[np.ndarray, "points 3"]:
+    """Rays of measured image points; NaN where there are none."""
+    with jax.enable_x64(True):
+        return np.asarray(_rays(model, _ordered(model, values), np.asarray(xy, float)))
+
+
+def images_of(model: CameraModel, values: Values, rays) -> Float[np.ndarray, "points 2"]:
+    """Measured images of rays; NaN where there are none."""
+    with jax.enable_x64(True):
+        return np.asarray(_images(model, _ordered(model, values), np.asarray(rays, float)))
+
+
+def fit_parameters(
+    model: CameraModel,
+    rays: Float[np.ndarray, "points 3"],
+    xy: Float[np.ndarray, "points 2"],
+    starts: Sequence[Values],
+    free: Sequence[str] = (),
+) -> dict[str, float]:
+    """The parameters of a model that bring rays nearest to their images.
+
+    **Arguments:** `xy` in the model's unit and axes; `starts` complete sets of start values, the
+    best of them is taken; `free` what is fitted (`FITTED` of the model if empty).
+
+    **Raises:** `ValueError` if no start has an image of every ray, or the numbers are beyond it.
+    """
+    from scipy.optimize import least_squares
+
+    chosen = [model.parameters.index(name) for name in free or FITTED[model.name]]
+    cost = lambda p: float(np.square(_images(model, p, rays) - xy).sum())
+    with jax.enable_x64(True):
+        start = min((_ordered(model, values) for values in starts), key=lambda p: _finite(cost(p)))
+        if not np.isfinite(cost(start)):
+            raise ValueError("no start of the fit has an image of the whole area")
+
+        def complete(q):
+            p = start.copy()
+            p[chosen] = q
+            return p
+
+        residuals = lambda q: np.asarray(_images(model, complete(q), rays) - xy).ravel()
+        slopes = lambda q: np.asarray(_jacobian(model, complete(q), rays))[..., chosen]
+        try:
+            found = least_squares(
+                residuals, start[chosen], lambda q: slopes(q).reshape(-1, len(chosen)),
+                x_scale="jac", ftol=1e-15, xtol=1e-15, gtol=1e-15, max_nfev=MOST_EVALUATIONS,
+            )  # fmt: skip
+        except np.linalg.LinAlgError as error:
+            raise ValueError(f"the fit failed: {error}") from None
+    return dict(zip(model.parameters, complete(found.x).tolist()))
+
+
+def start_values(
+    source: CameraModel, values: Values, target: CameraModel, sizes: Sizes, r0: float = 0.0
+) -> list[dict[str, float]]:
+    """Start values of the target: without distortion, and, where the terms have counterparts, with
+    the source's to the first orders."""
+    shift, step = between_frames(source, target, *sizes)
+    of = lambda *names: next((values[name] for name in names if name in values), 0.0)
+    focal = np.array([of("fx", "f", "c"), of("fy", "f", "c")]) * np.abs(step)
+    point = shift + step * [of("cx", "x0"), of("cy", "y0")]
+    plain = default_parameters(target) | {"r0": r0, "format_factor": of("format_factor") or 1.0}
+    if "fx" in target.parameters:
+        plain |= {"fx": focal[0], "fy": focal[1], "cx": point[0], "cy": point[1]}
+    else:
+        plain |= {target.parameters[0]: focal.mean(), "x0": point[0], "y0": point[1]}
+    plain = {name: plain[name] for name in target.parameters}
+    k, p1, p2 = _first_orders(source, values)
+    backward = (source.name in CORRECTIONS) != (target.name in CORRECTIONS)
+    if backward:
+        k, p1, p2 = inverted_radial(k), -p1, -p2
+    c = focal.mean()
+    if target.name in ("opencv", "snavely"):
+        terms = {"k1": k[0], "k2": k[1], "k3": k[2], "p1": p1, "p2": p2}
+    elif target.name in (*CORRECTIONS, "brown-projected") and target.name != "bingo":
+        terms = {f"K{i}": k[i - 1] / c ** (2 * i) for i in (1, 2, 3)}
+        terms |= {"P1": p2 / c, "P2": -p1 / c}
+    else:
+        terms = {}
+    return [plain, plain | {n: float(v) for n, v in terms.items() if n in target.parameters}]
+
+
+def _first_orders(source, values):
+    """k1 … k3, p1, p2 of the source's own formula, for the principal distance 1 and v down."""
+    if source.name in DISTORTIONS:
+        common = distortion(source, values, sizes=((1, 1), (1, 1)))
+    elif source.name in CORRECTIONS:
+        common = normalised_correction(values)
+    else:
+        return (0.0, 0.0, 0.0), 0.0, 0.0
+    return tuple(common[f"k{i}"] for i in (1, 2, 3)), common["p1"], common["p2"]
+
+
+def _finite(cost: float) -> float:
+    return cost if np.isfinite(cost) else np.inf
+
+
+def _ordered(model: CameraModel, values: Values):
+    return np.array([values[name] for name in model.parameters], float)
+
+
+def _one_image(model, p, ray):
+    return jnp.stack(project(model, tuple(p), *ray))
+
+
+@partial(jax.jit, static_argnums=0)
+def _rays(model, p, xy):
+    return jax.vmap(lambda xy: jnp.stack(image_ray(model, tuple(p), *xy)))(xy)
+
+
+@partial(jax.jit, static_argnums=0)
+def _images(model, p, rays):
+    return jax.vmap(lambda ray: _one_image(model, p, ray))(rays)
+
+
+@partial(jax.jit, static_argnums=0)
+def _jacobian(model, p, rays):
+    derivative: Callable = jax.jacfwd(_one_image, 1)
+    return jax.vmap(lambda ray: derivative(model, p, ray))(rays)

@@ -1,0 +1,74 @@
+"""The distortion of a camera in steps of the radius, as calibration reports print it.
+
+At the radius r of the MEASURED image and all around it, the displacement d = measured − ideal has a
+radial part, whose mean is the symmetric radial distortion dr, and a tangential one, of which the
+first harmonic is the decentring. A correction (`brown`, `usgs`) has the opposite sign.
+"""
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .model import CameraModel
+from .parameters import default_parameters
+
+AZIMUTHS = 12
+ROUNDING = 1e-13
+"""Distortion below this fraction of an image coordinate is noise of the arithmetic."""
+
+
+def distortion_table(
+    model: CameraModel,
+    parameters: Mapping[str, float],
+    step: float,
+    largest: float,
+    about: Literal["principal point", "origin"] = "principal point",
+) -> dict[str, np.ndarray]:
+    """Radial distortion and decentring at step, 2·step, … to `largest`.
+
+    **Arguments:** `step` and `largest` in the model's unit; `about` what radii are counted from:
+    the image of the optical axis, or the origin of image coordinates, as BINGO has it.
+
+    **Returns:** columns r, radial, decentring, in the model's unit; NaN where there is no ray.
+
+    **Raises:** `ValueError` for a step or end that is not positive.
+    """
+    if not (0 < step <= largest < np.inf):
+        raise ValueError(f"the step is {step} and the end {largest}; 0 < step ≤ end is expected")
+    values = {**default_parameters(model), **parameters}
+    p = np.array([values[name] for name in model.parameters], float)
+    radius = step * np.arange(1, int(largest / step * (1 + 1e-12)) + 1)
+    azimuth = 2 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS
+    out = np.stack([np.cos(azimuth), np.sin(azimuth)], 1)
+    with jax.enable_x64(True):
+        centre = np.asarray(_of_ideal(model, p, np.zeros((1, 2))))[0]
+        point = _principal_point(values)
+        begin = centre if about == "principal point" else np.zeros(2)
+        xy = begin + radius[:, None, None] * out
+        ideal = np.asarray(_to_ideal(model, p, xy.reshape(-1, 2))).reshape(xy.shape)
+    d = xy - begin - (ideal if about == "principal point" else ideal + point)
+    radial = (d * out).sum(2).mean(1)
+    tangential = d[..., 1] * out[:, 0] - d[..., 0] * out[:, 1]
+    decentring = 2 * np.abs((tangential * np.exp(-1j * azimuth)).mean(1))
+    noise = ROUNDING * (np.abs(begin).max() + radius)
+    without = lambda d: np.where(np.abs(d) < noise, 0.0, d)
+    return {"r": radius, "radial": without(radial), "decentring": without(decentring)}
+
+
+def _principal_point(values: Mapping[str, float]):
+    names = ("cx", "cy") if "cx" in values else ("x0", "y0")
+    return np.array([values.get(name, 0.0) for name in names])
+
+
+@partial(jax.jit, static_argnums=0)
+def _to_ideal(model, p, xy):
+    return jax.vmap(lambda xy: jnp.stack(model.to_ideal(tuple(p), *xy)))(xy)
+
+
+@partial(jax.jit, static_argnums=0)
+def _of_ideal(model, p, xy):
+    return jax.vmap(lambda xy: jnp.stack(model.from_ideal(tuple(p), *xy)))(xy)

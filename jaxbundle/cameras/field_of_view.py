@@ -1,0 +1,84 @@
+"""The field of view of a camera, and what its principal distance is on a small-format camera.
+
+    FOV = 2·atan(d/(2c))        d: width, height or diagonal of the image
+
+the three definitions in use. By the rays themselves, distortion and principal point included, it
+is the angle between the rays through the ends of d; the two agree for an undistorted camera with
+its principal point at the image centre.
+
+Source: Wolf, Dewitt and Wilkinson (2014), Elements of Photogrammetry, section 3-3, whose classes
+are those of the diagonal: normal angle to 75°, wide angle to 100°, superwide beyond.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from .convert import image_area
+from .convert_fit import rays_of
+from .model import CameraModel
+from .parameters import default_parameters
+
+SMALL_FORMAT = (36.0, 24.0)
+"""Width and height of a small-format ("35 mm") image, mm."""
+CLASSES = ((75.0, "normal angle"), (100.0, "wide angle"), (np.inf, "superwide angle"))
+
+
+class FieldOfView(NamedTuple):
+    """Angles across the image, radians."""
+
+    horizontal: float
+    vertical: float
+    diagonal: float
+
+
+def field_of_view(c: float, size: Sequence[float]) -> FieldOfView:
+    """FOV = 2·atan(d/(2c)) of an image of (width, height), in the unit of c."""
+    width, height = size
+    angle = lambda d: float(2 * np.arctan(d / (2 * c)))
+    return FieldOfView(angle(width), angle(height), angle(np.hypot(width, height)))
+
+
+def field_of_view_of_rays(
+    model: CameraModel,
+    parameters: Mapping[str, float],
+    image_size: Sequence[float],
+    pixel_size: Sequence[float] | None = None,
+) -> FieldOfView:
+    """The angles between the rays through the middles of the edges, and the corners, of the image.
+
+    The diagonal is the larger of the two. NaN where the model has no ray.
+    """
+    low, high = image_area(model, image_size, pixel_size)
+    x, y = (low + high) / 2
+    ends = [((low[0], y), (high[0], y)), ((x, low[1]), (x, high[1])),
+            (low, high), ((low[0], high[1]), (high[0], low[1]))]  # fmt: skip
+    values = {**default_parameters(model), **parameters}
+    rays = rays_of(model, values, np.array(ends).reshape(-1, 2)).reshape(4, 2, 3)
+    a, b = rays[:, 0], rays[:, 1]
+    # the angle at the sphere by its tangent: exact for small and large ones alike
+    angles = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(1))
+    # beyond 180° the opening looks to the other side
+    middle = a + b
+    angles = np.where(middle[:, 2] > 0, 2 * np.pi - angles, angles)
+    return FieldOfView(float(angles[0]), float(angles[1]), float(angles[2:].max()))
+
+
+def angle_class(diagonal: float) -> str:
+    """Normal, wide or superwide angle, by the diagonal field of view in radians."""
+    return next(name for limit, name in CLASSES if np.degrees(diagonal) < limit)
+
+
+def equivalent_35mm(c: float, size: Sequence[float], by: str = "diagonal") -> float:
+    """The principal distance, mm, that has the same field of view on 36 × 24 mm.
+
+    **Arguments:** `c` and `size` (width, height) in one unit; `by` diagonal (as CIPA has it), width
+    or height.
+
+    **Raises:** `ValueError` for another definition.
+    """
+    lengths = {"diagonal": np.hypot, "width": lambda w, h: w, "height": lambda w, h: h}
+    if by not in lengths:
+        raise ValueError(f"the equivalent is by diagonal, width or height, not by {by!r}")
+    return float(c * lengths[by](*SMALL_FORMAT) / lengths[by](*size))

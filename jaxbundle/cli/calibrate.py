@@ -1,0 +1,177 @@
+"""`jaxbundle calibrate`: photographs of a board in, calibrated cameras out."""
+
+import re
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import jaxbundle
+from jaxbundle.calibration import Board, calibrate_cameras, write_calibrations
+from jaxbundle.calibration.files import REPORT, RESULT, calibrations_dict, json_text
+from jaxbundle.cli.app import Quiet, app
+from jaxbundle.cli.progress import counting
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.io.csv_tables import write_text
+from jaxbundle.io.result_json import unsolved_text
+from jaxbundle.measure.views import photographs
+from jaxbundle.targets import check_writable
+
+
+@app.command()
+def calibrate(
+    photos: Annotated[
+        list[str] | None, typer.Argument(help="photographs, patterns or folders of one camera")
+    ] = None,
+    board: Annotated[
+        str, typer.Option(help="COLUMNSxROWS: inner corners, circles, or squares of charuco")
+    ] = "",
+    square: Annotated[
+        float | None, typer.Option(help="side of a square, distance of circles, in --unit")
+    ] = None,
+    kind: Annotated[
+        str, typer.Option(help="chessboard, circles, asymmetric-circles, charuco")
+    ] = "chessboard",
+    camera: Annotated[
+        list[str] | None, typer.Option(help="NAME=PATTERN: one of several cameras")
+    ] = None,
+    rig: Annotated[
+        bool, typer.Option("--rig", help="the cameras are rigidly mounted, photographs in step")
+    ] = False,
+    model: Annotated[str, typer.Option(help="camera model")] = "opencv",
+    free: Annotated[str, typer.Option(help="parameters to estimate: fx,fy,…")] = "",
+    given: Annotated[
+        list[str] | None, typer.Option(help="NAME=VALUE of a parameter, held if not free")
+    ] = None,
+    pixel_size: Annotated[float | None, typer.Option(help="mm, for models in mm")] = None,
+    diameter: Annotated[
+        float | None, typer.Option(help="of the circles: their eccentricity is taken off")
+    ] = None,
+    marker: Annotated[float | None, typer.Option(help="side of a charuco marker")] = None,
+    dictionary: Annotated[str, typer.Option(help="of charuco markers")] = "DICT_4X4_50",
+    board_sigma: Annotated[
+        float | None, typer.Option(help="σ of a coordinate of the board, which is not flat")
+    ] = None,
+    board_free: Annotated[
+        bool, typer.Option("--board-free", help="estimate the points of the board")
+    ] = False,
+    sigma_image: Annotated[
+        float, typer.Option(help="a priori σ of an image coordinate, pixels")
+    ] = 0.1,
+    snooping: Annotated[
+        str, typer.Option(help="removal of gross errors: pope, baarda or none")
+    ] = "pope",
+    significance: Annotated[float, typer.Option(help="level of the test")] = 0.001,
+    robust: Annotated[
+        str | None, typer.Option(help="instead of removal: huber, cauchy or tukey")
+    ] = None,
+    unit: Annotated[str, typer.Option(help="name of the unit of the board")] = "m",
+    json: Annotated[str, typer.Option(help="write the result as JSON; - for stdout alone")] = "",
+    out: Annotated[
+        Path | None, typer.Option(help="folder for report, JSON, cameras, network, plots")
+    ] = None,
+    brief: Annotated[bool, typer.Option("--brief", help="no points and residuals in JSON")] = False,
+    quiet: Quiet = False,
+    plots: Annotated[bool, typer.Option(help="plots in the folder of --out")] = True,
+) -> None:
+    """Calibrate cameras from photographs of a board, and say how far to trust them."""
+    jaxbundle.enable_x64()
+    if snooping not in ("pope", "baarda", "none"):
+        raise InputError(f"--snooping {snooping!r}: pope, baarda or none")
+    if not 0 < significance < 1:
+        raise InputError(f"--significance {significance:g}: a number between 0 and 1")
+    columns, rows = _size(board)
+    if square is None:
+        raise InputError("--square is missing: the side of a square, or the distance of circles")
+    known = Board(columns, rows, square, kind, diameter, marker, dictionary)
+    cameras = _cameras(photos, camera)
+    files = [path for paths in cameras.values() for path in photographs(paths)]
+    check_writable(json, out, (REPORT, RESULT), files)
+    with counting(quiet or json == "-") as bar:
+        task = bar.add_task("searching the board", total=len(files))
+
+        def tell():
+            bar.advance(task)
+            if bar.tasks[task].finished:
+                bar.update(task, description="adjusting")
+
+        try:
+            found = calibrate_cameras(
+                cameras, known, rig=rig, model=model, free=_words(free) or None,
+                given=_values(given), pixel_size=pixel_size, sigma_image=sigma_image,
+                board_sigma=board_sigma, board_free=board_free,
+                snooping=None if snooping == "none" else snooping, significance=significance,
+                robust=robust, object_unit=unit, progress=tell,
+            )  # fmt: skip
+        except NotSolvedError as error:
+            _write_json(json, unsolved_text(error))
+            raise
+        bar.update(task, description="how good it is")
+        text = json_text(calibrations_dict(found, brief)) if json else ""
+        report = "" if quiet or json == "-" else found.report()
+        bar.update(task, description="writing")
+        if out is not None:
+            try:
+                write_calibrations(found, out, plots)
+            except ImportError as error:
+                print(f"no plots: {error}", file=sys.stderr)
+    _write_json(json, text)
+    if report:
+        print(report)
+    failed = [name for name, one in found.cameras.items() if not one.converged]
+    if failed:
+        names = found.cameras[failed[0]].adjustment.undetermined
+        what = f"; not determined: {', '.join(names[:12])}" if names else ""
+        raise NotSolvedError(
+            f"not solved: camera {failed[0]}: {found.cameras[failed[0]].adjustment.termination}"
+            f"{what}; free fewer parameters (--free), or take photographs from more directions"
+        )
+
+
+def _write_json(json: str, text: str) -> None:
+    if json == "-":
+        print(text, end="")
+    elif json:
+        write_text(Path(json), text)
+
+
+def _size(text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"\s*(\d{1,4})\s*[x×X,]\s*(\d{1,4})\s*", text)
+    if not found:
+        raise InputError(f"--board {text!r}: COLUMNSxROWS is expected, such as 9x6")
+    return int(found[1]), int(found[2])
+
+
+def _cameras(photos, named) -> dict[str, list[str]]:
+    """Photographs by camera: those named, or all of one."""
+    if photos and named:
+        raise InputError("give photographs either as arguments or by --camera NAME=PATTERN")
+    if not photos and not named:
+        raise InputError(
+            "no photographs: give files, patterns or folders, or --camera NAME=PATTERN"
+        )
+    cameras: dict[str, list[str]] = {}
+    for item in named or ():
+        name, equals, pattern = (part.strip() for part in item.partition("="))
+        if not (name and equals and pattern):
+            raise InputError(f"--camera {item}: NAME=PATTERN is expected, such as left=left/*.jpg")
+        cameras.setdefault(name, []).append(pattern)
+    return cameras or {"cam": list(photos)}
+
+
+def _words(text: str) -> list[str]:
+    return [word.strip() for word in text.split(",") if word.strip()]
+
+
+def _values(given) -> dict[str, float]:
+    values = {}
+    for item in given or ():
+        name, equals, text = (part.strip() for part in item.partition("="))
+        try:
+            values[name] = float(text)
+        except ValueError:
+            equals = ""
+        if not equals:
+            raise InputError(f"--given {item}: NAME=VALUE is expected, such as fx=1200")
+    return values

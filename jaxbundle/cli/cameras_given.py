@@ -1,0 +1,50 @@
+"""What the commands about cameras share: FILE or FILE#ID, pairs of numbers, figures."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from jaxbundle.errors import InputError
+from jaxbundle.io import read_network
+from jaxbundle.io.camera_files import chosen_camera, is_camera_file, read_cameras
+from jaxbundle.io.csv_tables import write_bytes
+from jaxbundle.network.tables import Camera
+
+
+def camera_given(text: str) -> Camera:
+    """The camera of a file of cameras or of any network; several need their #ID.
+
+    **Raises:** `InputError`.
+    """
+    file, mark, id = text.rpartition("#")
+    if not mark or Path(text).exists():
+        file, id = text, None
+    path = Path(file)
+    cameras = read_cameras(path) if is_camera_file(path) else read_network(path).cameras
+    return chosen_camera(cameras, id, f"{file} (FILE#ID)")
+
+
+def pair(option: str, text: str) -> tuple[float, float] | None:
+    """Two numbers A,B of an option; None where it is not given.
+
+    **Raises:** `InputError`.
+    """
+    if not text:
+        return None
+    try:
+        first, second = (float(word) for word in text.split(","))
+    except ValueError:
+        raise InputError(f"{option} {text}: two numbers A,B are expected") from None
+    return first, second
+
+
+def write_png(path: Path, size: tuple[float, float], draw: Callable) -> None:
+    """Write a figure; `draw` is given its axes.
+
+    **Raises:** `InputError` without matplotlib.
+    """
+    from jaxbundle.plotting.files import png
+
+    try:
+        write_bytes(path, png(size, None, draw))
+    except ImportError as error:
+        raise InputError(str(error)) from None

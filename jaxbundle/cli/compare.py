@@ -1,0 +1,73 @@
+"""`jaxbundle compare`: two calibrations of one camera."""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+import jaxbundle
+from jaxbundle.cameras import get_model
+from jaxbundle.cameras.compare import compare_cameras, difference_rings
+from jaxbundle.cli.app import app
+from jaxbundle.cli.cameras_given import camera_given, pair, write_png
+from jaxbundle.errors import InputError
+from jaxbundle.io.assemble import all_parameters
+from jaxbundle.io.csv_tables import write_csv
+
+RINGS = 10
+
+
+@app.command()
+def compare(
+    a: Annotated[str, typer.Argument(help="camera: a file of cameras or a network, or FILE#ID")],
+    b: Annotated[str, typer.Argument(help="the other one")],
+    step: Annotated[float | None, typer.Option(help="width of rings, in the unit of A")] = None,
+    rotate: Annotated[bool, typer.Option(help="remove the implied rotation")] = True,
+    radius: Annotated[
+        float, typer.Option(help="about the middle where the rotation is fitted, unit of A")
+    ] = float("inf"),
+    image_size: Annotated[str, typer.Option(help="W,H in pixels, if A has none")] = "",
+    pixel_size: Annotated[str, typer.Option(help="W,H in mm, if A has none")] = "",
+    csv: Annotated[Path | None, typer.Option(help="file for the table of rings")] = None,
+    plot: Annotated[Path | None, typer.Option(help="PNG file for the map")] = None,
+) -> None:
+    """Compare two calibrations: parameters, and how far images are apart over the image."""
+    jaxbundle.enable_x64()
+    first, second = camera_given(a), camera_given(b)
+    if None not in (first.image_size, second.image_size) and first.image_size != second.image_size:
+        raise InputError(
+            f"{a}, {b}: images of {list(first.image_size)} and {list(second.image_size)} pixels "
+            "are not of one camera"
+        )
+    size = pair("--image-size", image_size) or first.image_size or second.image_size
+    pitch = pair("--pixel-size", pixel_size) or first.pixel_size or second.pixel_size
+    try:
+        found = compare_cameras(
+            (get_model(first.model), first.parameters), (get_model(second.model),
+            second.parameters), image_size=size, pixel_size=pitch, rotate=rotate,
+            radius=radius,
+        )  # fmt: skip
+        reach = np.hypot(np.ptp(found.x), np.ptp(found.y)) / 2
+        rings = difference_rings(found, step if step is not None else reach / RINGS)
+    except ValueError as error:
+        raise InputError(f"{a}, {b}: {error}; see --image-size, --pixel-size, --step") from None
+    if first.model == second.model:
+        print(f"{'':14}{'A':>16}{'B':>16}{'B − A':>16}")
+        p, q = all_parameters(first), all_parameters(second)
+        for name in p:
+            if p[name] or q[name]:
+                print(f"{name:14}{p[name]:16.8g}{q[name]:16.8g}{q[name] - p[name]:16.6g}")
+    print(found)
+    if found.covered < 1:
+        print(f"{100 * (1 - found.covered):.1f} % of the image has no ray in one of them")
+    columns = ("r", "radial", "tangential", "rms", "largest")
+    print("".join(f"{name:>12}" for name in columns) + f"  [{found.unit}]")
+    for row in zip(*(rings[name] for name in columns)):
+        print("".join(f"{value:12.4g}" for value in row))
+    if csv is not None:
+        write_csv(csv, list(rings), zip(*(column.tolist() for column in rings.values())))
+    if plot is not None:
+        from jaxbundle.plotting.calibrations import difference_map
+
+        write_png(plot, (7.5, 6), lambda ax: difference_map(found, ax))

@@ -1,0 +1,224 @@
+"""From any input to any output: reading, the camera model, writing, and what that costs.
+
+A network becomes a network, or points and cameras in a drawing or table, or one of its cameras a
+camera file; a camera file becomes a camera file. Nothing is written before everything is known.
+"""
+
+import dataclasses
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from jaxbundle.cameras import Conversion
+from jaxbundle.errors import InputError
+from jaxbundle.io.camera_files import (
+    chosen_camera,
+    is_camera_file,
+    read_cameras,
+    write_cameras,
+)
+from jaxbundle.io.colmap import write_colmap_cameras
+from jaxbundle.io.coordinates import images_path
+from jaxbundle.io.formats import PIXEL_MODELS, TARGETS, read_network
+from jaxbundle.io.opencv_file import SUFFIXES, write_opencv
+from jaxbundle.io.project import FILE_NAME
+from jaxbundle.network.columns import did_you_mean
+from jaxbundle.network.conversion import convert_cameras, convert_one
+from jaxbundle.network.rules import check_camera
+from jaxbundle.network.tables import Camera, Network
+
+CAMERA_KINDS = {
+    "opencv": "NAME.yaml, .yml, .json", "cameras": "NAME.toml", "colmap-cameras": "cameras.txt"
+}  # fmt: skip
+"""Outputs that hold cameras alone."""
+MOST_SHOWN = 8
+"""Conversions told one by one, the worst first."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Converted:
+    """What was written: its kind and place, what the cameras cost, what is not kept, warnings."""
+
+    kind: str
+    path: Path
+    conversions: dict[str, Conversion]
+    lost: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    def __str__(self) -> str:
+        lines = [f"{self.path}: {self.kind}"]
+        costs = sorted(self.conversions.items(), key=lambda item: -item[1].largest)
+        lines += [f"camera {id!r} → {cost}" for id, cost in costs[:MOST_SHOWN]]
+        if len(costs) > MOST_SHOWN:
+            lines.append(f"and {len(costs) - MOST_SHOWN} more cameras, with smaller differences")
+        lines += [f"not kept: {'; '.join(self.lost)}"] if self.lost else []
+        return "\n".join([*lines, *(f"warning: {warning}" for warning in self.warnings)])
+
+
+def convert(
+    input: str | Path,
+    output: str | Path,
+    to: str | None = None,
+    model: str | None = None,
+    camera: str | None = None,
+    format: str | None = None,
+    overrides: Sequence[str] = (),
+    measured: bool = False,
+    image_size: Sequence[float] | None = None,
+    pixel_size: Sequence[float] | None = None,
+) -> Converted:
+    """Write an input in another format.
+
+    **Arguments:**
+
+    - `to`: kind of output, a name of `TARGETS` or `CAMERA_KINDS`; recognised from the name of
+      the output if not given.
+    - `model`: camera model to convert to. Without it cameras are converted only where the output
+      has not their model and the conversion is exact.
+    - `camera`: which camera, where the output holds one.
+    - `format`, `overrides`: of the input, as in `read_network`.
+    - `measured`: what is fitted is fitted over the area of the measurements, not the whole image.
+    - `image_size` (pixels), `pixel_size` (mm): of all cameras that have none.
+
+    **Raises:** `InputError`; nothing is written then.
+    """
+    input, output = Path(input), Path(output)
+    kind = _kind(output, to)
+    _check_output(output, kind)
+    if format is None and is_camera_file(input):
+        cameras = _sized(read_cameras(input), image_size, pixel_size)
+        return _convert_cameras(input, cameras, output, kind, model, camera)
+    network = read_network(input, format, overrides)
+    network = network.replace(cameras=_sized(network.cameras, image_size, pixel_size))
+    _keep_input(input, network, output, kind)
+    if kind in CAMERA_KINDS:
+        if model is not None and measured:
+            network, costs = convert_cameras(network, model, measured=True)
+            made = _convert_cameras(input, network.cameras, output, kind, None, camera)
+            made = dataclasses.replace(made, conversions=costs)
+        else:
+            made = _convert_cameras(input, network.cameras, output, kind, model, camera)
+        return dataclasses.replace(made, lost=("images and points",), warnings=network.warnings)
+    if camera is not None:
+        raise InputError(f"--camera {camera}: {kind} holds all cameras; leave it out")
+    network, costs = _with_model(network, kind, model, measured)
+    lost = TARGETS[kind].write(network, output)
+    return Converted(kind, output, costs, tuple(lost), network.warnings)
+
+
+def _kind(output: Path, to: str | None) -> str:
+    kinds = {**{name: target.looks for name, target in TARGETS.items()}, **CAMERA_KINDS}
+    if to is not None:
+        if to not in kinds:
+            raise InputError(f"--to {to}: cannot be written{did_you_mean(to, kinds)}")
+        return to
+    if output.suffix.lower() in SUFFIXES:
+        return "opencv"
+    if output.name.lower() == "cameras.txt":
+        return "colmap-cameras"
+    found = next((name for name, target in TARGETS.items() if target.recognises(output)), None)
+    if found is None and output.suffix.lower() == ".toml":
+        return "cameras"
+    if found is None:
+        known = "; ".join(f"{name}: {looks}" for name, looks in kinds.items())
+        raise InputError(f"{output}: what to write is not recognised; give --to or a name: {known}")
+    return found
+
+
+def _sized(cameras: Sequence[Camera], image_size, pixel_size) -> tuple[Camera, ...]:
+    """The cameras, with sizes where they had none."""
+    given = {"image_size": image_size, "pixel_size": pixel_size}
+    made = tuple(
+        dataclasses.replace(camera, **{
+            name: tuple(size) for name, size in given.items()
+            if size is not None and getattr(camera, name) is None
+        })
+        for camera in cameras
+    )  # fmt: skip
+    for camera in made:
+        check_camera(camera)
+    return made
+
+
+def _check_output(output: Path, kind: str) -> None:
+    """Refuse a place where nothing can be written."""
+    folder = kind in ("project", "colmap", "colmap-text") and output.name != FILE_NAME
+    if folder and output.exists() and not output.is_dir():
+        raise InputError(f"{output}: is a file; {kind} is written into a folder")
+    if not folder and output.is_dir():
+        raise InputError(f"{output}: is a folder; give the name of a file for {kind}")
+    if not folder and kind != "project" and not output.absolute().parent.is_dir():
+        raise InputError(f"{output}: there is no folder {output.parent}")
+
+
+def _keep_input(input: Path, network: Network, output: Path, kind: str) -> None:
+    """Refuse to replace what is read."""
+    tables = (network.images, network.points, network.observations, network.distances)
+    read = {os.path.realpath(p) for p in (input, *(table.source.name for table in tables))}
+    folders = {os.path.realpath(Path(p).parent) for p in read}
+    written = {os.path.realpath(p) for p in (output, output / FILE_NAME)}
+    if kind == "csv":
+        written.add(os.path.realpath(images_path(output)))
+    inside = kind in ("project", "colmap", "colmap-text") and os.path.realpath(
+        output.parent if output.name == FILE_NAME else output
+    ) in folders
+    if read & written or inside:
+        raise InputError(f"{output} is the input and would be overwritten; give another place")
+
+
+def _with_model(network: Network, kind: str, model: str | None, measured: bool):
+    """The network with cameras the output has, and by camera what that cost."""
+    models = TARGETS[kind].models
+    if model is not None:
+        if models and model not in models:
+            raise InputError(f"--model {model}: {kind} has {' and '.join(models)} only")
+        return convert_cameras(network, model, measured=measured)
+    foreign = [c.id for c in network.cameras if models and c.model not in models]
+    if not foreign:
+        return network, {}
+    converted, costs = convert_cameras(network, models[0], only=foreign, measured=measured)
+    for id, cost in costs.items():
+        _refuse_inexact(network.cameras, id, kind, cost)
+    return converted, costs
+
+
+def _refuse_inexact(cameras: Sequence[Camera], id: str, kind: str, cost: Conversion) -> None:
+    if not cost.exact:
+        model = next(camera.model for camera in cameras if camera.id == id)
+        raise InputError(
+            f"camera {id!r}: {kind} has no model {model!r}, and {cost.model} is not the same: "
+            f"{cost.reason}; fitted over the image the largest difference is {cost.largest:.3g} "
+            f"{cost.unit}; give --model {cost.model} to accept that"
+        )
+
+
+def _convert_cameras(
+    input: Path, cameras: Sequence[Camera], output: Path, kind: str, model: str | None,
+    id: str | None,
+) -> Converted:  # fmt: skip
+    if kind not in CAMERA_KINDS:
+        raise InputError(
+            f"{input}: holds cameras alone; they can be written as {', '.join(CAMERA_KINDS)}, not "
+            f"as {kind}"
+        )
+    if os.path.realpath(input) == os.path.realpath(output):
+        raise InputError(f"{output} is the input and would be overwritten; give another place")
+    if kind == "opencv" or id is not None:
+        cameras = [chosen_camera(cameras, id, str(input))]
+    costs, made = {}, []
+    for camera in cameras:
+        foreign = kind != "cameras" and camera.model not in PIXEL_MODELS
+        target = model or ("opencv" if foreign else camera.model)
+        if target != camera.model:
+            converted, costs[camera.id] = convert_one(camera, target)
+            if model is None:
+                _refuse_inexact(cameras, camera.id, kind, costs[camera.id])
+            camera = converted
+        made.append(camera)
+    if kind == "opencv":
+        write_opencv(made[0], output)
+    elif kind == "colmap-cameras":
+        write_colmap_cameras(made, output)
+    else:
+        write_cameras(made, output)
+    return Converted(kind, output, costs, (), ())

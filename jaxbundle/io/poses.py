@@ -1,0 +1,68 @@
+"""Rotations of many images at once, in the forms files have them.
+
+All are computed in batches of one shape, so that any number of images shares one compiled program.
+"""
+
+from functools import partial
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle import geometry
+
+AT_ONCE = 256
+
+Matrices = Float[np.ndarray, "images 3 3"]
+Triples = Float[np.ndarray, "images 3"]
+Quaternions = Float[np.ndarray, "images 4"]
+
+
+def angles_of(M: Matrices) -> Triples:
+    """ω, φ, κ in radians of rotation matrices."""
+    return batched(geometry.omega_phi_kappa_from_matrix, M, (3, 3), (3,))
+
+
+def matrices_of(angles: Triples) -> Matrices:
+    """M of ω, φ, κ in radians."""
+    return batched(geometry.matrix_from_omega_phi_kappa, angles, (3,), (3, 3))
+
+
+def quaternions_of(M: Matrices) -> Quaternions:
+    """Unit quaternions (w, x, y, z) of rotation matrices."""
+    return batched(geometry.quaternion_from_matrix, M, (3, 3), (4,))
+
+
+def matrices_of_quaternions(q: Quaternions) -> Matrices:
+    """Rotation matrices of quaternions (w, x, y, z) of any length but 0."""
+    return batched(geometry.matrix_from_quaternion, q, (4,), (3, 3))
+
+
+def rotation_vectors_of(M: Matrices) -> Triples:
+    """v with M = exp([v]×)."""
+    return batched(geometry.rotation_vector_from_matrix, M, (3, 3), (3,))
+
+
+def matrices_of_rotation_vectors(v: Triples) -> Matrices:
+    """M = exp([v]×)."""
+    return batched(geometry.matrix_from_rotation_vector, v, (3,), (3, 3))
+
+
+@partial(jax.jit, static_argnums=0)
+def _batch(function, rows):
+    return jax.vmap(function)(rows)
+
+
+def batched(function, rows, shape, result_shape):
+    """A function of one image's array applied to all, in batches of one shape.
+
+    **Arguments:** `rows` [images, *shape]. **Returns:** [images, *result_shape].
+    """
+    rows = np.reshape(rows, (-1, *shape))
+    results = np.zeros((len(rows), *result_shape))
+    with jax.enable_x64(True):
+        for begin in range(0, len(rows), AT_ONCE):
+            part = rows[begin : begin + AT_ONCE]
+            batch = np.concatenate([part, np.zeros((AT_ONCE - len(part), *shape))])
+            results[begin : begin + AT_ONCE] = _batch(function, batch)[: len(part)]
+    return results

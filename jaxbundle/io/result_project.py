@@ -1,0 +1,42 @@
+"""The adjusted network as a project: what other programs are given of a result."""
+
+import dataclasses
+
+import numpy as np
+
+from jaxbundle.network.tables import Images, Network, Observations, Points
+
+
+def adjusted_network(adjustment) -> Network:
+    """The network of a solved `Adjustment` at its solution.
+
+    Cameras, orientations and points have their adjusted values; observations that data snooping has
+    removed are gone. Control points with σ are tie points here and priors are dropped: what they
+    said has been used, and around the adjusted values they would say it twice. So the datum is
+    inner; adjusted again, the network stays as it is. σ of image coordinates are those given, also
+    where variance components were estimated. Check points are not in it.
+    """
+    problem = adjustment.problem
+    network = problem.network
+    values = adjustment.image_values
+    images, points, rays = network.images, network.points, network.observations
+    gone = {(name.id, name.parameter) for name in adjustment.eliminated}
+    cameras = tuple(
+        dataclasses.replace(
+            camera, parameters=adjustment.camera_parameters(camera.id), sigma={},
+            free=tuple(name for name in camera.free if (camera.id, name) not in gone),
+        )
+        for camera in network.cameras
+    )  # fmt: skip
+    used = (np.asarray(problem.data.image_weight)[problem.rays] > 0).any(1)
+    roles = tuple("tie" if role == "control" else role for role in points.role)
+    return network.replace(
+        cameras=cameras,
+        images=Images(images.id, images.camera, values[:, :3], values[:, 3:],
+                      np.full_like(images.sigma, np.nan), images.source),
+        points=Points(points.id, roles, adjustment.point_values,
+                      np.full_like(points.sigma, np.nan), points.source),
+        observations=Observations(rays.image, rays.point, rays.xy, rays.sigma,
+                                  rays.source).take(used),
+        datum="inner", datum_points=(), warnings=("the adjusted network",),
+    )  # fmt: skip

@@ -1,0 +1,107 @@
+"""Boards: flat objects with points that are found and numbered in photographs.
+
+The points lie in rows, which are numbered from the top, in each from the left: "1-1", "1-2", ….
+X runs along the rows to the right, Y up, Z towards the viewer; the origin is the left point of the
+last row.
+
+| kind | points | COLUMNS × ROWS counts |
+|---|---|---|
+| `chessboard` | corners of the squares | inner corners |
+| `circles` | centres of the circles | circles |
+| `asymmetric-circles` | the same, every other row shifted by half a step | circles of a row, rows |
+| `charuco` | corners of the squares; may be hidden in part | squares |
+
+Which corner is the first: of a chessboard the one whose square beyond, to the upper left, is black,
+or, where a half turn leaves the colours as they are (columns + rows even), of the two that are
+possible the upper one in the photograph. Circles in straight rows cannot tell a half turn either.
+A board that is taken as it is known does not mind; one whose points are estimated does
+(`Board.unique`).
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.network.columns import did_you_mean
+
+KINDS = ("chessboard", "circles", "asymmetric-circles", "charuco")
+LEAST = {"chessboard": 3, "circles": 2, "asymmetric-circles": 2, "charuco": 3}
+MARKER = 0.75
+"""Side of a marker, in sides of a square, if it is not given."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Board:
+    """A board: how many points, how far apart, and what they are.
+
+    **Fields:**
+
+    - `columns`, `rows`: as the table above counts them.
+    - `square`: side of a square, or distance of neighbouring circles, in the object unit; of
+      `asymmetric-circles` the distance of neighbouring rows, half of that of circles of a row.
+    - `kind`: see the table.
+    - `diameter`: of the circles, object unit: their images are then corrected for eccentricity.
+    - `marker`, `dictionary`: side and OpenCV dictionary of the markers of `charuco`.
+
+    **Raises:** `InputError` for a board that cannot be.
+    """
+
+    columns: int
+    rows: int
+    square: float
+    kind: str = "chessboard"
+    diameter: float | None = None
+    marker: float | None = None
+    dictionary: str = "DICT_4X4_50"
+
+    def __post_init__(self):
+        if self.kind not in KINDS:
+            raise InputError(f"kind of board {self.kind!r}{did_you_mean(self.kind, KINDS)}")
+        least = LEAST[self.kind]
+        if min(self.columns, self.rows) < least or self.columns * self.rows > 100_000:
+            raise InputError(
+                f"board {self.columns}x{self.rows}: a {self.kind} board needs at least "
+                f"{least} columns and rows"
+            )
+        for name, value in (("square", self.square), ("diameter", self.diameter),
+                            ("marker", self.marker)):  # fmt: skip
+            if value is not None and not (np.isfinite(value) and value > 0):
+                raise InputError(f"board: {name} is {value}; a positive length is expected")
+        if self.marker is not None and self.marker >= self.square:
+            raise InputError(
+                f"board: a marker of {self.marker:g} does not fit into a square of {self.square:g}"
+            )
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Rows and columns of points."""
+        less = self.kind == "charuco"
+        return self.rows - less, self.columns - less
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Names of the points, row after row from the top: "row-column"."""
+        rows, columns = self.grid
+        return tuple(f"{i}-{j}" for i in range(1, rows + 1) for j in range(1, columns + 1))
+
+    @property
+    def points(self) -> Float[np.ndarray, "points 3"]:
+        """Coordinates in the object unit, in the order of `ids`."""
+        rows, columns = self.grid
+        i, j = np.mgrid[0:rows, 0:columns].reshape(2, -1)
+        along = 2 * j + i % 2 if self.kind == "asymmetric-circles" else j
+        return self.square * np.stack([along, rows - 1 - i, np.zeros(len(i))], 1)
+
+    @property
+    def unique(self) -> bool:
+        """Whether a photograph tells which point is which, a half turn of the board included."""
+        if self.kind == "chessboard":
+            return (self.columns + self.rows) % 2 == 1
+        if self.kind == "asymmetric-circles":
+            return self.rows % 2 == 1
+        return self.kind == "charuco"
+
+    def __str__(self) -> str:
+        return f"{self.kind} {self.columns}x{self.rows}, square {self.square:g}"

@@ -1,0 +1,25 @@
+"""A cloud of points made regular: cubes that hold enough points, each replaced by its corner."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxbundle.errors import InputError
+
+
+def filter_cloud(
+    points: Float[np.ndarray, "n 3"], size: float, least: int = 1
+) -> tuple[Float[np.ndarray, "cubes 3"], Int[np.ndarray, " cubes"]]:
+    """The lowest corners of the cubes of side `size` that hold at least `least` points.
+
+    The cubes stand on whole multiples of their side; points on a face belong to the higher one.
+
+    **Returns:** corners in the unit of the points, in ascending order, and numbers of points.
+    """
+    points = np.asarray(points, float)
+    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+        raise InputError("point cloud: finite coordinates [points, 3] are expected")
+    if not (np.isfinite(size) and size > 0) or least < 1:
+        raise InputError(f"point cloud: cubes of {size:g} with at least {least} points cannot be")
+    cubes, counts = np.unique(np.floor(points / size), axis=0, return_counts=True)
+    full = counts >= least
+    return cubes[full] * size, counts[full]

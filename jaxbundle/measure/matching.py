@@ -1,0 +1,135 @@
+"""A point of one image found in another: vertical line locus with normalised cross-correlation.
+
+A point (x, y) of the base image that lies between the heights Zmin and Zmax is, in the other image,
+on the segment between the images of its ground points at both. For heights along it, so close that
+the segment is covered in steps of half a pixel, the window around (x, y) is carried to the other
+image by way of the horizontal plane of that height, which takes the differences of scale and
+rotation with it, and compared:
+
+    ρ = Σ(g − ḡ)(h − h̄)/√(Σ(g − ḡ)²·Σ(h − h̄)²)
+
+The largest ρ wins; a parabola through it and its neighbours gives the height between the steps.
+
+Source: Bethel (1986), The DSR11 image correlator; Kraus (2007), section 6.8.
+"""
+
+import dataclasses
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.measure.transfer import View, ground_point, image_point
+
+STEP = 0.5
+"""Distance of the heights tried, as pixels of the other image."""
+FEWEST, MOST = 16, 4096
+"""Heights tried at least and at most."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Match:
+    """The best match: its image point [2] in the other image, pixels; its ground point [3]; ρ."""
+
+    xy: Float[np.ndarray, "2"]
+    point: Float[np.ndarray, "3"]
+    correlation: float
+
+
+def correlation(a: Float[Array, " n"], b: Float[Array, " n"]) -> Float[Array, ""]:
+    """Normalised cross-correlation ρ of two windows; −1 where one of them has no contrast."""
+    a, b = a - jnp.mean(a), b - jnp.mean(b)
+    square = jnp.sum(a * a) * jnp.sum(b * b)
+    there = square > 0
+    return jnp.where(there, jnp.sum(a * b) / jnp.sqrt(jnp.where(there, square, 1.0)), -1.0)
+
+
+def find_match(
+    base: Float[np.ndarray, "rows columns"],
+    other: Float[np.ndarray, "rows columns"],
+    view: View,
+    other_view: View,
+    xy: Float[np.ndarray, "2"],
+    Zmin: float,
+    Zmax: float,
+    window: int = 15,
+) -> Match:
+    """The point of another image that best matches a point of the base image, with its height.
+
+    **Arguments:** both photographs as grey values; both oriented views, of models in pixels with v
+    down; `xy` pixels in `base`; heights in the object unit; `window`: its side in pixels, odd.
+
+    **Raises:** `InputError` where the window or the whole segment is outside the images.
+    """
+    if any(v.model.unit != "px" or v.model.axes != "down" for v in (view, other_view)):
+        raise InputError("matching needs cameras in pixels, v down (opencv, kannala-brandt)")
+    if not Zmin < Zmax:
+        raise InputError(f"matching: Zmin {Zmin:g} must be below Zmax {Zmax:g}")
+    if window < 3 or window % 2 == 0:
+        raise InputError(f"matching: window {window} must be an odd number of at least 3 pixels")
+    base, other = jnp.asarray(base, float), jnp.asarray(other, float)
+    xy, half = jnp.asarray(xy, float), window // 2
+    rows, columns = base.shape
+    if not (half <= xy[0] <= columns - 1 - half and half <= xy[1] <= rows - 1 - half):
+        x, y = np.asarray(xy)
+        raise InputError(f"matching: the window at ({x:.1f}, {y:.1f}) is not within the base image")
+    ends = np.asarray(_locus(view, other_view, xy, jnp.array([Zmin, Zmax])))
+    length = np.linalg.norm(ends[1] - ends[0])
+    steps = FEWEST if not np.isfinite(length) else math.ceil(length / STEP) + 1
+    # a power of two, lest every point compile a program of its own
+    steps = min(2 ** math.ceil(math.log2(max(steps, FEWEST))), MOST)
+    Z = jnp.linspace(Zmin, Zmax, steps)
+    rho = np.asarray(_correlations(base, other, view, other_view, xy, Z, half))
+    best = int(np.nanargmax(rho)) if np.isfinite(rho).any() else -1
+    if best < 0 or rho[best] <= -1:
+        raise InputError("matching: no height puts the window into the other image with contrast")
+    height = float(Z[best]) + _peak(rho, best) * float(Z[1] - Z[0])
+    point = np.asarray(_ground(view, xy, height))
+    found = np.asarray(_locus(view, other_view, xy, jnp.array([height])))[0]
+    return Match(found, point, float(rho[best]))
+
+
+def _peak(rho, best):
+    """Where a parabola through three neighbours has its top, in steps from the middle one."""
+    if not 0 < best < len(rho) - 1 or not np.isfinite(rho[best - 1 : best + 2]).all():
+        return 0.0
+    left, middle, right = rho[best - 1 : best + 2]
+    bend = left - 2 * middle + right
+    return 0.5 * (left - right) / bend if bend < 0 else 0.0
+
+
+_ground = eqx.filter_jit(ground_point)
+
+
+def _carry(view, other_view, xy, Z):
+    return image_point(other_view, ground_point(view, xy, Z))
+
+
+@eqx.filter_jit
+def _locus(view, other_view, xy, Z):
+    return jax.vmap(lambda Z: _carry(view, other_view, xy, Z))(Z)
+
+
+@eqx.filter_jit
+def _correlations(base, other, view, other_view, xy, Z, half: int):
+    offset = jnp.arange(-half, half + 1.0)
+    window = xy + jnp.stack(jnp.meshgrid(offset, offset), -1).reshape(-1, 2)
+    grey = _sample(base, window)
+    high = jnp.array(other.shape)[::-1] - 1
+
+    def one(Z):
+        places = jax.vmap(lambda place: _carry(view, other_view, place, Z))(window)
+        inside = jnp.all((places >= 0) & (places <= high))
+        rho = correlation(grey, _sample(other, jnp.where(inside, places, 0.0)))
+        return jnp.where(inside, rho, jnp.nan)
+
+    return jax.lax.map(one, Z, batch_size=16)
+
+
+def _sample(grey, places):
+    """Grey values between the pixels, bilinear."""
+    return jax.scipy.ndimage.map_coordinates(grey, [places[:, 1], places[:, 0]], order=1)

@@ -1,0 +1,183 @@
+"""A board measured in many photographs; photographs that fail are listed, the others are used."""
+
+import dataclasses
+import glob
+import hashlib
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxbundle.configuration import available_cores
+from jaxbundle.errors import InputError
+from jaxbundle.measure.boards import Board
+from jaxbundle.measure.corners import find_board, other_sizes
+from jaxbundle.measure.photographs import read_photograph
+
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".jp2")
+"""Files of a folder that are taken for photographs."""
+SEARCHED = 3
+"""In so many photographs boards of other sizes are looked for, where none has the right one."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BoardViews:
+    """What was measured of a board: image points of every view, and which photographs failed.
+
+    **Fields:** `names` of the views; `image_size` (columns, rows); `xy` pixels, NaN where a point
+    was not found; `failed`: name and reason of every photograph that is no view.
+    """
+
+    board: Board
+    names: tuple[str, ...]
+    image_size: tuple[int, int]
+    xy: Float[np.ndarray, "views points 2"]
+    failed: tuple[tuple[str, str], ...] = ()
+
+    def __post_init__(self):
+        points = len(self.board.ids)
+        if np.shape(self.xy) != (len(self.names), points, 2):
+            raise InputError(
+                f"image points of {len(self.names)} views of a board of {points} points must have "
+                f"the shape [{len(self.names)}, {points}, 2], but have {np.shape(self.xy)}"
+            )
+        size = self.image_size
+        if np.shape(size) != (2,) or not all(np.isfinite(n) and n > 0 for n in size):
+            raise InputError(f"image_size must be columns and rows, but is {size!r}")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def visible(self) -> Bool[np.ndarray, "views points"]:
+        """Which points were found."""
+        return np.isfinite(self.xy).all(2)
+
+    def take(self, rows, why: str = "") -> "BoardViews":
+        """Some of the views (a mask or indices); the others count as failed where `why` says so."""
+        keep = np.zeros(len(self), bool)
+        keep[rows] = True
+        out = [(name, why) for name, kept in zip(self.names, keep) if not kept and why]
+        names = tuple(name for name, kept in zip(self.names, keep) if kept)
+        failed = (*self.failed, *out)
+        return dataclasses.replace(self, names=names, xy=self.xy[keep], failed=failed)
+
+
+def photographs(given: Sequence[str | Path]) -> list[Path]:
+    """Files of paths, patterns (`left/*.jpg`) and folders, each once and in order.
+
+    **Raises:** `InputError` where a pattern or a folder has none.
+    """
+    found: dict[Path, None] = {}
+    for item in given:
+        path = Path(item)
+        if path.is_dir():
+            files = sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES)
+            if not files:
+                raise InputError(f"{path}: no photographs in this folder ({', '.join(SUFFIXES)})")
+        elif not path.exists() and any(c in str(item) for c in "*?["):
+            files = sorted(map(Path, glob.glob(str(item))))
+            if not files:
+                raise InputError(f"{item}: no file matches this pattern")
+        else:
+            files = [path]
+        found |= dict.fromkeys(files)
+    return list(found)
+
+
+def measure_boards(
+    paths: Sequence[str | Path],
+    board: Board,
+    progress: Callable[[int, int], None] | None = None,
+) -> BoardViews:
+    """Find a board in photographs.
+
+    **Arguments:** `paths`: files, patterns, folders; `progress(done, total)`.
+
+    **Returns:** the views that show it, of the image size most of them have.
+
+    **Raises:** `InputError` where no photograph shows the board.
+    """
+    files = photographs(paths)
+    if not files:
+        raise InputError("no photographs are given")
+    names = _names(files)
+    paths = dict(zip(names, files))
+    repeated = _repeated(paths)
+    found, failed = [], {}
+    look = lambda name: repeated.get(name) or _look(paths[name], board)
+    with ThreadPoolExecutor(available_cores()) as pool:
+        for done, (name, result) in enumerate(zip(names, pool.map(look, names)), 1):
+            if isinstance(result, str):
+                failed[name] = result
+            else:
+                found.append((name, *result))
+            if progress is not None:
+                progress(done, len(names))
+    if not found:
+        raise InputError(_nothing_found(files, board, failed))
+    sizes = Counter(size for _, size, _ in found)
+    size = sizes.most_common(1)[0][0]
+    for name, other, _ in found:
+        if other != size:
+            turned = ": it was turned after it was taken" if other == size[::-1] else ""
+            failed[name] = (
+                f"has {other[0]} × {other[1]} pixels, most have {size[0]} × {size[1]}{turned}"
+            )
+    used = [(name, xy) for name, other, xy in found if other == size]
+    order = {name: i for i, name in enumerate(names)}
+    return BoardViews(
+        board, tuple(name for name, _ in used), size, np.array([xy for _, xy in used]),
+        tuple(sorted(failed.items(), key=lambda item: order[item[0]])),
+    )  # fmt: skip
+
+
+def _repeated(paths: Mapping[str, Path]) -> dict[str, str]:
+    """The files that have the content of an earlier one, and which that is."""
+    first: dict[bytes, str] = {}
+    found = {}
+    for name, path in paths.items():
+        try:
+            content = path.read_bytes()
+        except OSError:
+            continue
+        same = first.setdefault(hashlib.blake2b(content).digest(), name)
+        if same != name and content:
+            found[name] = f"is the same file as {same}"
+    return found
+
+
+def _look(path, board):
+    """Size and image points, or why there are none, without the path."""
+    try:
+        grey = read_photograph(path)
+        return (grey.shape[1], grey.shape[0]), find_board(grey, board)
+    except InputError as error:
+        return str(error).removeprefix(f"{path}: ")
+
+
+def _nothing_found(files, board, failed) -> str:
+    """One line about photographs without a board, with the size they have instead."""
+    first = next(iter(failed))
+    text = f"no photograph of {len(files)} shows the board: {first}: {failed[first]}"
+    for path in files[:SEARCHED]:
+        try:
+            other = other_sizes(read_photograph(path), board)
+        except InputError:
+            continue
+        if other is not None:
+            size = f"{other.columns}x{other.rows}"
+            return f"{text}. But {path} shows one of {size} inner points: give --board {size}"
+    return text
+
+
+def _names(files: Sequence[Path]) -> list[str]:
+    """File names, with as much of the folders as makes each one different."""
+    for parts in range(1, max(len(p.parts) for p in files) + 1):
+        names = ["/".join(p.parts[-parts:]) for p in files]
+        if len({*names}) == len(names):
+            return names
+    return [str(p) for p in files]

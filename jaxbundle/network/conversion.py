@@ -1,0 +1,118 @@
+"""A network with its cameras in another model: parameters, image points and their σ.
+
+Exterior orientations and object points stay as they are. An image point keeps its pixel, or, where
+source and target have the same unit and axes, its coordinates. The one exception is `snavely`,
+which has no principal point: its image points count from the camera's own.
+
+What a fit costs is told for every camera (`jaxbundle.cameras.Conversion`).
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from jaxbundle.cameras import MODEL_NAMES, Conversion, convert_camera, get_model
+from jaxbundle.cameras.frames import between_frames
+from jaxbundle.errors import InputError
+from jaxbundle.network.columns import did_you_mean
+from jaxbundle.network.tables import Camera, Network, Observations
+
+SIZES = ("image_size", "pixel_size")
+COUNTERPARTS = (
+    ("c", "f", "fx", "fy"), ("x0", "cx"), ("y0", "cy"), ("K1", "k1"), ("K2", "k2"), ("K3", "k3"),
+    ("P1", "P2", "p1", "p2"),
+)  # fmt: skip
+"""Parameters of different models that mean the same; what is free in one is free in the other."""
+
+
+def convert_cameras(
+    network: Network, model: str, r0: float = 0.0, only: Sequence[str] | None = None,
+    measured: bool = False,
+) -> tuple[Network, dict[str, Conversion]]:  # fmt: skip
+    """The network with all cameras, or `only` some, in the model of this name.
+
+    **Arguments:** `r0` of the target, mm, where it has one; `measured`: a fit looks at the area the
+    measurements cover, as it does where the camera has no image size, and not at the whole image.
+
+    **Returns:** the network, and by camera what its conversion cost.
+
+    **Raises:** `InputError` where a size is missing, or nothing can be fitted.
+    """
+    if model not in MODEL_NAMES:
+        raise InputError(f"unknown camera model {model!r}{did_you_mean(model, MODEL_NAMES)}")
+    rays = network.observations
+    xy, sigma = rays.xy.copy(), rays.sigma.copy()
+    of_ray = network.images.camera[rays.image]
+    cameras, done = [], {}
+    for c, camera in enumerate(network.cameras):
+        if camera.model == model or (only is not None and camera.id not in only):
+            cameras.append(camera)
+            continue
+        mine = of_ray == c
+        made, conversion, shift, step = _converted(camera, model, r0, xy[mine], measured)
+        xy[mine], sigma[mine] = shift + step * xy[mine], np.abs(step) * sigma[mine]
+        cameras.append(made)
+        done[camera.id] = conversion
+    units = {get_model(camera.model).unit for camera in cameras}
+    converted = network.replace(
+        cameras=tuple(cameras),
+        observations=Observations(rays.image, rays.point, xy, sigma, rays.source),
+        image_unit=units.pop() if done and len(units) == 1 else network.image_unit,
+    )
+    dropped = [c.id for c in network.cameras if c.id in done and c.sigma]
+    if dropped:
+        converted = converted.warn(
+            f"prior σ of the parameters of {', '.join(dropped)} are dropped: they belong to the "
+            "model before the conversion"
+        )
+    return converted, done
+
+
+def convert_one(camera: Camera, model: str, r0: float = 0.0) -> tuple[Camera, Conversion]:
+    """A camera in the model of this name, and what the conversion cost."""
+    made, conversion, _, _ = _converted(camera, model, r0, np.zeros((0, 2)))
+    return made, conversion
+
+
+def _converted(camera: Camera, model: str, r0: float, xy, measured: bool = False):
+    """The camera, the conversion, and shift and step of its image points."""
+    source, target = get_model(camera.model), get_model(model)
+    sizes = camera.image_size, camera.pixel_size
+    parameters, centre = dict(camera.parameters), np.zeros(2)
+    if model == "snavely" and camera.model != "bingo":
+        parameters, centre, sizes = _centred(camera)
+    area = None
+    if len(xy) and (measured or camera.image_size is None):
+        area = xy.min(0) - centre, xy.max(0) - centre
+    try:
+        conversion = convert_camera(
+            source, parameters, target, image_size=sizes[0], pixel_size=sizes[1], area=area, r0=r0
+        )
+        shift, step = between_frames(source, target, *sizes)
+    except ValueError as error:
+        size = next((name for name in SIZES if str(error).startswith(name)), None)
+        remedy = f"; give --{size.replace('_', '-')} WIDTH,HEIGHT" if size else ""
+        raise InputError(f"camera {camera.id!r}: {error}{remedy}") from None
+    made = dataclasses.replace(
+        camera, model=model, parameters=conversion.parameters, sigma={},
+        free=_counterparts(camera.free, target.parameters),
+    )  # fmt: skip
+    return made, conversion, shift - step * centre, step
+
+
+def _centred(camera: Camera):
+    """The camera with its principal point at the image centre, and how far it was from there."""
+    model, parameters = get_model(camera.model), dict(camera.parameters)
+    names = ("cx", "cy") if model.axes == "down" else ("x0", "y0")
+    size = camera.image_size or (1, 1)
+    middle = (np.array(size) - 1) / 2 if model.axes == "down" else np.zeros(2)
+    centre = np.array([parameters.get(name, 0.0) for name in names]) - middle
+    parameters |= dict(zip(names, middle.tolist()))
+    return parameters, centre, (size, camera.pixel_size)
+
+
+def _counterparts(free: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
+    groups: Mapping[str, tuple[str, ...]] = {n: group for group in COUNTERPARTS for n in group}
+    wanted = {other for name in free for other in groups.get(name, (name,))}
+    return tuple(name for name in names if name in wanted)

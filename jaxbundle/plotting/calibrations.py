@@ -1,0 +1,79 @@
+"""Calibrations without an adjustment: their distortion curves, and the difference of two as a map.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from jaxbundle.cameras.compare import Comparison
+from jaxbundle.plotting.style import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    RUST,
+    axes,
+    label,
+    legend,
+    micrometres,
+    plain,
+    quiet,
+    round_number,
+    title,
+)
+
+COLOURS = (BLUE, RUST, GREEN, INK)
+
+
+def radial_curves(tables: Mapping[str, Mapping[str, np.ndarray]], unit: str, ax=None):
+    """Radial distortion of cameras over the radius; matplotlib axes.
+
+    **Arguments:** `tables` by name, as `jaxbundle.cameras.distortion_table` gives them, all in
+    `unit`.
+    """
+    ax = axes(ax, (6.5, 4.2))
+    factor, small = micrometres(unit)
+    for k, (name, table) in enumerate(tables.items()):
+        style = ("-", "--", ":")[k // len(COLOURS) % 3]
+        r, dr = (np.concatenate([[0.0], table[key]]) for key in ("r", "radial"))
+        ax.plot(r, factor * dr, style, color=COLOURS[k % len(COLOURS)], label=plain(name), lw=1.4)
+    ax.axhline(0, color=GREY, lw=0.8)
+    quiet(ax)
+    label(ax, "x", "radius in the measured image", unit)
+    label(ax, "y", "measured − ideal", small)
+    legend(ax)
+    title(ax, "Radial distortion")
+    return ax
+
+
+def difference_map(comparison: Comparison, ax=None, name: str = "Difference of two calibrations"):
+    """Lengths of the differences in colour, the differences themselves as arrows; matplotlib axes.
+
+    Every other point of the grid has an arrow; the key says how long one is.
+    """
+    ax = axes(ax, (7.5, 6))
+    factor, unit = micrometres(comparison.unit)
+    mesh = ax.pcolormesh(
+        comparison.x, comparison.y, factor * comparison.length, shading="nearest", cmap="viridis"
+    )
+    bar = ax.figure.colorbar(mesh, ax=ax, shrink=0.8)
+    label(bar.ax, "y", "length of the difference", unit)
+    every = np.s_[::2, ::2]
+    known = np.isfinite(comparison.length[every])
+    x, y = (grid[every][known] for grid in np.meshgrid(comparison.x, comparison.y))
+    u, v = np.moveaxis(factor * comparison.difference[every][known], -1, 0)
+    if comparison.unit == "px":
+        ax.invert_yaxis()
+    key = round_number(factor * comparison.largest) or 1.0
+    arrows = ax.quiver(
+        x, y, u, v, angles="xy", color="white", scale=12 * key, scale_units="width", width=0.002
+    )
+    ax.quiverkey(
+        arrows, 0.9, 1.02, key, f"{key:g} {unit}", labelpos="E", color=INK, coordinates="axes"
+    )
+    ax.set_aspect("equal")
+    quiet(ax, grid=False)
+    for axis in "xy":
+        label(ax, axis, axis, comparison.unit)
+    title(ax, name, f"RMS {factor * comparison.rms:.3g} {unit}, rotation removed")
+    return ax

@@ -1,0 +1,107 @@
+"""How good a calibration is: where points were measured, how uncertain a projected point is."""
+
+import numpy as np
+
+from jaxbundle.plotting.style import (
+    BLUE,
+    GREY,
+    INK,
+    RUST,
+    axes,
+    label,
+    legend,
+    quiet,
+    title,
+)
+
+SMALL = 0.02
+"""Scales of σ begin here, in pixels, at the least."""
+
+
+def _frame(ax, image_size):
+    """An image's frame and axes, v down."""
+    w, h = image_size
+    ax.set_xlim(-0.5, w - 0.5)
+    ax.set_ylim(h - 0.5, -0.5)
+    ax.set_aspect("equal")
+    quiet(ax, grid=False)
+    label(ax, "x", "u", "px")
+    label(ax, "y", "v", "px")
+
+
+def coverage_map(coverage, uv, image_size, name: str = "camera", ax=None):
+    """Points measured in all photographs [n, 2], and how many there are in each cell of the image.
+
+    **Returns:** matplotlib `Axes`, pixels.
+    """
+    ax = axes(ax, (7, 5.6))
+    w, h = image_size
+    shown = ax.imshow(
+        np.ma.masked_equal(coverage.counts, 0), cmap="Blues", vmin=0, alpha=0.85,
+        extent=(-0.5, w - 0.5, h - 0.5, -0.5), interpolation="nearest",
+    )  # fmt: skip
+    ax.plot(*uv.T, ".", color=INK, markersize=1.2, alpha=0.5)
+    _frame(ax, image_size)
+    bar = ax.figure.colorbar(shown, ax=ax, shrink=0.8, pad=0.02)
+    bar.set_label("points in a cell", fontsize=9, color=INK)
+    bar.ax.tick_params(labelsize=8)
+    missing = [corner for corner, there in coverage.corners.items() if not there]
+    detail = f"{100 * coverage.part:.0f} % of the cells hold points"
+    detail += f"; none in the {', '.join(missing)} corner" if missing else ""
+    title(ax, f"Camera {name}: coverage", detail)
+    return ax
+
+
+def uncertainty_image(uncertainty, image_size, unit: str = "m", name: str = "camera", ax=None):
+    """σ of a projected point over the image, with the larger axis of its error ellipse.
+
+    **Returns:** matplotlib `Axes`, pixels.
+    """
+    ax = axes(ax, (7, 5.6))
+    from matplotlib.colors import LogNorm
+
+    sigma = uncertainty.sigma
+    finite = sigma[np.isfinite(sigma)]
+    low = max(float(finite.min(initial=np.inf)), SMALL / 10) if len(finite) else SMALL
+    high = max(float(finite.max(initial=0.0)), 1.01 * low)
+    u, v = uncertainty.uv[0, :, 0], uncertainty.uv[:, 0, 1]
+    levels = np.geomspace(low, high, 13)
+    shown = ax.contourf(u, v, np.ma.masked_invalid(sigma), levels, cmap="viridis",
+                        norm=LogNorm(low, high), extend="both")  # fmt: skip
+    lines = ax.contour(u, v, np.ma.masked_invalid(sigma), levels[2:-1:3], colors="white",
+                       linewidths=0.7)  # fmt: skip
+    ax.clabel(lines, fmt="%.2g", fontsize=7)
+    _frame(ax, image_size)
+    bar = ax.figure.colorbar(shown, ax=ax, shrink=0.8, pad=0.02, format="%.2g")
+    bar.set_label("σ of a projected point [px]", fontsize=9, color=INK)
+    bar.ax.tick_params(labelsize=8)
+    where = {
+        "scene": f"points at {uncertainty.distance:.3g} {unit}, held in the scene",
+        "rotation": "rays, the implied rotation removed",
+        "camera": "rays held in the camera frame",
+    }[uncertainty.frame]
+    if np.isinf(uncertainty.distance) and uncertainty.frame == "scene":
+        where = "points at infinity, held in the scene"
+    title(ax, f"Camera {name}: uncertainty of projection", where)
+    return ax
+
+
+def uncertainty_curve(distances, middle, corners, range_=None, unit="m", name="camera", ax=None):
+    """σ of a projected point over its distance, in the middle and in the corners of the image.
+
+    **Arguments:** `range_`: nearest and farthest distance of the object the camera was calibrated
+    from, drawn as a band.
+
+    **Returns:** matplotlib `Axes`: pixels over the object unit, both logarithmic.
+    """
+    ax = axes(ax, (6.5, 4.2))
+    if range_ is not None:
+        ax.axvspan(*range_, color=GREY, alpha=0.2, linewidth=0, label="distances of the board")
+    ax.loglog(distances, middle, color=BLUE, linewidth=1.5, label="middle of the image")
+    ax.loglog(distances, corners, color=RUST, linewidth=1.5, label="worst corner")
+    quiet(ax)
+    label(ax, "x", "distance", unit)
+    label(ax, "y", "σ of a projected point", "px")
+    title(ax, f"Camera {name}: uncertainty over distance")
+    legend(ax)
+    return ax

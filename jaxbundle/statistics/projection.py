@@ -1,0 +1,108 @@
+"""How well a calibrated camera projects: the covariance of an image point, over image and distance.
+
+The image of a ray depends on the parameters p of the camera, ∂x/∂p by automatic differentiation of
+the projection, exact. What is asked is, of what does the ray stay fixed while p is uncertain?
+
+    "camera"   of the camera frame:      Cx = A·Cp·Aᵀ,  A = ∂x/∂p. The least useful one: a shift of
+               the principal point is nearly a rotation, which every later orientation takes up.
+    "rotation" of the scene, after the rotation θ that moves the images of all rays least:
+               A' = A − B·(BᵀB)⁻¹·BᵀA over the image, B = ∂x/∂θ.
+    "scene"    of the object points the camera was calibrated from: a point at a distance d along
+               the ray is held in the object frame of every view, and projected through the view's
+               pose as it varies together with p; the mean over the views. It depends on d: small
+               where the object was, larger in front of it and beyond.
+
+Source of the last: Kogan, mrcal documentation, "Projection uncertainty" (mean of the boards'
+frames); of the second: the implied rotation of a difference of two calibrations, linearised.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.cameras import CameraModel, image_ray, project
+from jaxbundle.geometry import matrix_from_quaternion
+from jaxbundle.network.arrays import Values
+
+FRAMES = ("camera", "rotation", "scene")
+
+
+@partial(jax.jit, static_argnums=0)
+def _slopes(model, p, xy):
+    """∂x/∂p [n, 2, parameters] and ∂x/∂θ [n, 2, 3] of the rays that have the images `xy`."""
+
+    def image(p, theta, ray):
+        return jnp.stack(project(model, tuple(p), *(ray + jnp.cross(theta, ray))))
+
+    def one(xy):
+        ray = jnp.stack(image_ray(model, tuple(p), xy[0], xy[1]))
+        return jax.jacfwd(image, (0, 1))(p, jnp.zeros(3), ray)
+
+    return jax.vmap(one)(xy)
+
+
+def interior_covariance_of_images(
+    model: CameraModel,
+    p: Float[np.ndarray, " parameters"],
+    free: tuple[int, ...],
+    covariance: Float[np.ndarray, "k k"],
+    xy: Float[np.ndarray, "n 2"],
+    frame: str = "rotation",
+) -> Float[np.ndarray, "n 2 2"]:
+    """Covariance of image points whose rays are held in the frame "camera" or "rotation".
+
+    **Arguments:** `free`: columns of the parameters the covariance is of; `xy`: image points, in
+    the unit of the model; for "rotation" they stand for the image, in which the rotation is sought.
+    NaN, where a point has no ray, takes no part.
+    """
+    if frame not in ("camera", "rotation"):
+        raise ValueError(f"frame must be \"camera\" or \"rotation\", not {frame!r}")
+    A, B = (np.asarray(x) for x in _slopes(model, jnp.asarray(p, float), jnp.asarray(xy, float)))
+    A = A[:, :, list(free)]
+    if frame == "rotation":
+        good = np.isfinite(A).all((1, 2)) & np.isfinite(B).all((1, 2))
+        turn = np.linalg.lstsq(
+            B[good].reshape(-1, 3), A[good].reshape(-1, A.shape[2]), rcond=None
+        )[0]
+        A = A - B @ turn
+    return A @ covariance @ A.swapaxes(1, 2)
+
+
+def images_through_scene(
+    model: CameraModel,
+    column: int,
+    views: Float[np.ndarray, " views"],
+    estimate: Values,
+    xy: Float[np.ndarray, "n 2"],
+    distance: float,
+):
+    """A function of the adjusted unknowns: the images [2n] of points held in the scene.
+
+    Their covariance is that of the frame "scene". At the estimate itself they are `xy`.
+
+    **Arguments:** `column`: the camera among those of the network; `views`: indices of its images;
+    `distance` from the projection centre in the object unit; infinity as well.
+    """
+    number = len(model.parameters)
+    views = jnp.asarray(views)
+    near = 1.0 / distance
+    p = tuple(estimate.camera[column, :number])
+    rays = jax.vmap(lambda xy: jnp.stack(image_ray(model, p, xy[0], xy[1])))(jnp.asarray(xy, float))
+    matrices = jax.vmap(matrix_from_quaternion)
+    M, X0 = matrices(estimate.rotation[views]), estimate.position[views]
+    # lines of sight in the object frame, and 1/d: homogeneous points, infinity included
+    directions = jnp.einsum("vji,nj->vni", M, rays)
+
+    def images(values: Values):
+        q = tuple(values.camera[column, :number])
+        change = near * (X0 - values.position[views])
+        turned = jnp.einsum(
+            "vij,vnj->vni", matrices(values.rotation[views]), directions + change[:, None]
+        )
+        image = jax.vmap(jax.vmap(lambda ray: jnp.stack(project(model, q, *ray))))(turned)
+        return jnp.mean(image, 0).ravel()
+
+    return images

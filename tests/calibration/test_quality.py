@@ -1,0 +1,229 @@
+"""How good is a calibration: Monte Carlo of projections, halves, coverage, words."""
+
+import dataclasses
+import json
+
+import board_photographs as taken
+import numpy as np
+import pytest
+import render
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+from test_calibrate import NOISE, simulated
+
+from jaxbundle.adjustment.batch import calibrate_batch
+from jaxbundle.calibration import calibrate
+from jaxbundle.calibration.advice import advice
+from jaxbundle.calibration.files import write_calibration
+from jaxbundle.calibration.quality import coverage, grid_of, uncertainty_map
+from jaxbundle.cameras import get_model
+from jaxbundle.errors import InputError
+from jaxbundle.io import read_cameras, read_network, read_opencv
+from jaxbundle.plotting import write_figures
+
+pytestmark = pytest.mark.xdist_group("calibration")
+
+DRAWS = 400
+GRID = (3, 3)
+UV = grid_of((480, 360), *GRID).reshape(-1, 2)
+
+
+def rays_of(p, uv):
+    lens = render.Lens(tuple(p), (480, 360))
+    return np.array(render._rays(get_model("opencv"), lens.parameters, uv[:, 0], uv[:, 1]))
+
+
+def image_of(p, rays):
+    """OpenCV's formula, for arrays of cameras [draws, parameters, 1] and rays [draws, n, 3]."""
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = np.moveaxis(p[:, :9, None], 1, 0)
+    x, y = -rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
+    r2 = x * x + y * y
+    k = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    u = fx * (x * k + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + cx
+    v = fy * (y * k + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + cy
+    return np.stack([u, v], -1)
+
+
+@pytest.fixture(scope="module")
+def sample():
+    """One calibration, and 400 others of the same views under other noise."""
+    views = simulated()
+    exact = simulated(noise=0.0).xy
+    draws = exact + NOISE * np.random.default_rng(11).normal(size=(DRAWS, *exact.shape))
+    batch = calibrate_batch(taken.BOARD.points, draws, views.image_size)
+    assert batch.converged.all()
+    return calibrate(views, snooping=None), batch
+
+
+def root_mean_square(images):
+    """σ as a map gives it, of a sample [draws, n, 2]."""
+    return np.sqrt(images.var(0, ddof=1).mean(1))
+
+
+def test_uncertainty_in_the_camera_frame_is_that_of_a_sample(sample):
+    calibration, batch = sample
+    images = image_of(batch.interior, rays_of(render.LENS.parameters, UV)[None])
+    stated = calibration.uncertainty(frame="camera", grid=GRID)
+    np.testing.assert_allclose(stated.sigma.ravel(), root_mean_square(images), rtol=0.1)
+
+
+def test_uncertainty_without_rotation_is_that_of_a_sample(sample):
+    """Of every calibration the rotation that moves its images least is taken off."""
+    calibration, batch = sample
+    rays = rays_of(render.LENS.parameters, UV)
+    truth = image_of(np.array([render.LENS.parameters]), rays[None])[0]
+
+    def turned(theta, p):
+        return image_of(p[None], Rotation.from_rotvec(theta).apply(rays)[None])[0]
+
+    images = []
+    for p in batch.interior[:150]:
+        away = lambda theta, p=p: (turned(theta, p) - truth).ravel()
+        images.append(turned(least_squares(away, np.zeros(3), x_scale=1e-3).x, p))
+    stated = calibration.uncertainty(frame="rotation", grid=GRID).sigma.ravel()
+    # what is left in the middle is a thirtieth of what is left in the corners, and of fewer draws
+    corner = [0, 2, 6, 8]
+    found = root_mean_square(np.array(images))
+    np.testing.assert_allclose(stated[corner], found[corner], rtol=0.12)
+    np.testing.assert_allclose(stated, found, atol=0.1 * stated.max())
+
+
+@pytest.mark.parametrize("distance", [0.5, 3.0, np.inf])
+def test_uncertainty_in_the_scene_is_that_of_a_sample(sample, distance):
+    calibration, batch = sample
+    rays = rays_of(render.LENS.parameters, UV)
+    near = 1 / distance
+    images = []
+    for i, (M, X0) in enumerate(taken.poses(len(calibration.views))):
+        fixed = rays @ M + near * X0
+        seen = fixed - near * batch.position[:, i, None]
+        images.append(image_of(batch.interior, seen @ batch.rotation[:, i].swapaxes(1, 2)))
+    found = root_mean_square(np.mean(images, 0))
+    stated = calibration.uncertainty(distance, grid=GRID)
+    np.testing.assert_allclose(stated.sigma.ravel(), found, rtol=0.1)
+    assert stated.middle == stated.sigma[1, 1]
+    assert stated.corners == stated.sigma[[0, 0, 2, 2], [0, 2, 0, 2]].max()
+
+
+def test_maps_that_cannot_be(sample):
+    adjustment = sample[0].adjustment
+    with pytest.raises(InputError, match="frame 'board': camera, rotation, scene"):
+        uncertainty_map(adjustment, "cam", frame="board")
+    with pytest.raises(InputError, match="distance 0: a positive"):
+        uncertainty_map(adjustment, "cam", 0.0)
+
+
+def test_two_halves_agree_unless_the_camera_changed(calibration):
+    found = calibration.cross_validation
+    assert 0.1 < found.test < 3
+    assert 0 < found.comparison.rms < 0.5 and found.comparison.unit == "px"
+    assert found.rms_own < calibration.rms < found.rms_other < 1.3 * calibration.rms
+    views = simulated()
+    zoomed = dataclasses.replace(
+        render.LENS, parameters=(660.0, 661.0, *render.LENS.parameters[2:])
+    )
+    other = simulated(zoomed).xy
+    mixed = np.where((np.arange(len(views)) % 2 == 1)[:, None, None], other, views.xy)
+    changed = calibrate(dataclasses.replace(views, xy=mixed), snooping=None)
+    assert changed.cross_validation.test > 100
+    assert changed.cross_validation.comparison.largest > 10 * found.comparison.largest
+    assert any("halves of the photographs contradict" in text for text in changed.advice)
+
+
+def test_coverage_counts_cells_and_corners():
+    rng = np.random.default_rng(0)
+    uv = rng.uniform([120, -0.5], [479.5, 359.5], (3000, 2))
+    found = coverage(uv, (480, 360))
+    assert found.counts.sum() == 3000 and found.part == pytest.approx(0.75)
+    assert found.corners == {"upper left": False, "upper right": True,
+                             "lower left": False, "lower right": True}  # fmt: skip
+    assert found.reach == pytest.approx(1, abs=0.03)
+    k, (u, v) = found.counts[3, 7], uv.T
+    assert k == ((u >= 279.5) & (u < 319.5) & (v >= 119.5) & (v < 159.5)).sum()
+
+
+def poses_in_words(poses, **changes):
+    M, X0 = map(np.array, zip(*poses))
+    full = coverage(UV.repeat(60, 0) * [1, 1], (480, 360), (3, 3))
+    given = dict(position=X0, rotation=M, middle=np.array([0.12, 0.075, 0]), unit="m",
+                 covered=full, rms=0.1, t={"fx": 500.0, "k1": 9.0})  # fmt: skip
+    return advice(**(given | changes))
+
+
+def test_what_is_missing_is_said():
+    middle = (0.12, 0.075)
+    good = [render.pose(*angles, middle, d) for *angles, d in (
+        (30, 0, 0, 0.4), (-30, 0, 0, 0.6), (0, 30, 90, 0.4), (0, -30, 90, 0.6),
+        (25, 20, 0, 0.5), (-25, 20, 90, 0.5), (0, 0, 0, 0.4), (0, 0, 90, 0.7),
+    )]  # fmt: skip
+    assert poses_in_words(good) == []
+    straight = [render.pose(0, 0, 10 * i, middle, 0.4 + 0.1 * (i % 3)) for i in range(9)]
+    said = poses_in_words(straight)
+    assert "0 of 9 photographs look at the board from more than 15° aside" in said[0]
+    unturned = [
+        render.pose(30 * np.cos(i), 30 * np.sin(i), 180 * (i % 2), middle, 0.3 + 0.1 * (i % 3))
+        for i in range(8)
+    ]
+    assert ["turned by 90°" in text for text in poses_in_words(unturned)] == [True]
+    assert poses_in_words(good, t={"fx": 2.0})[0].startswith("fx is known to 50 % only")
+    near = [render.pose(*angles, middle, 0.5) for angles in (
+        (30, 0, 0), (-30, 0, 0), (0, 30, 90), (0, -30, 90), (20, 20, 0), (0, 0, 0))]  # fmt: skip
+    said = poses_in_words(near)
+    assert "only 6 photographs" in said[0] and "nearly one distance (0.5 to 0.5 m)" in said[1]
+    left = coverage(np.array([[10.0, 10], [10, 350], [470, 10]]), (480, 360))
+    said = poses_in_words(good, covered=left, rms=2.0, t={"fx": 900.0, "k3": 0.4})
+    assert "no point in the lower right corner" in said[0] and "cover 3 %" in said[1]
+    assert "RMS 2.00 px" in said[2] and said[3].startswith("not significant: k3 (t 0.4)")
+
+
+def test_report_and_json_and_files(calibration, folder, tmp_path):
+    report = calibration.report()
+    for part in ("photo", "empty.jpg   the file is empty", "Uncertainty of a projected point",
+                 "Cross-validation", "Advice", "Variance factor"):  # fmt: skip
+        assert part in report
+    assert max(map(len, report.splitlines())) <= 100
+    (tmp_path / "out").mkdir()
+    for old in ("uncertainty_far.png", "residuals_3.png", "mine.png"):
+        (tmp_path / "out" / old).write_bytes(b"from an earlier run")
+    write_calibration(calibration, tmp_path / "out", plots=False)
+    assert [path.name for path in (tmp_path / "out").glob("*.png")] == ["mine.png"]
+    document = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert document["converged"] and document["redundancy"] == calibration.adjustment.redundancy
+    about = document["calibration"]
+    assert about["photographs"]["failed"]["empty.jpg"] == "the file is empty"
+    assert about["rms"] == pytest.approx(calibration.rms)
+    assert about["uncertainty"][2] == {
+        "frame": "scene", "distance": None,
+        "middle": pytest.approx(calibration.uncertainty().middle),
+        "corners": pytest.approx(calibration.uncertainty().corners),
+    }  # fmt: skip
+    again = read_network(tmp_path / "out" / "network")
+    removed = len(calibration.adjustment.removed)
+    assert len(again.observations) == len(calibration.measured) - removed
+    for camera in (read_opencv(tmp_path / "out" / "cam.yaml"),
+                   *read_cameras(tmp_path / "out" / "colmap" / "cameras.txt")):  # fmt: skip
+        assert camera.image_size == (480, 360)
+        for name, value in calibration.camera.parameters.items():
+            assert camera.parameters.get(name, 0.0) == pytest.approx(value, abs=1e-9)
+    text = (tmp_path / "out" / "cam.toml").read_text()
+    assert f"fx = {calibration.parameters['fx']!r}" in text and "free = []" in text
+    assert "# σ of fx: 0." in text
+
+
+def test_figures(calibration, tmp_path):
+    axes = {}
+    drawings = {
+        "coverage": calibration.plot_coverage, "map": calibration.plot_uncertainty,
+        "curve": calibration.plot_uncertainty_over_distance, "halves": calibration.plot_halves,
+    }  # fmt: skip
+    written = write_figures(tmp_path, {
+        name: ((6, 5), None, lambda ax, name=name, draw=draw: axes.update({name: draw(ax=ax)}))
+        for name, draw in drawings.items()
+    })
+    assert [path.stem for path in written] == list(drawings)
+    assert axes["map"].get_ylim() == (359.5, -0.5)
+    assert axes["curve"].get_xscale() == "log"
+    shown = axes["coverage"].images[0].get_array()
+    np.testing.assert_array_equal(shown.filled(0), calibration.coverage.counts)
+    near = axes["curve"].lines[0].get_ydata().min()
+    assert near < calibration.uncertainty().middle

@@ -1,0 +1,104 @@
+"""`jaxbundle calibrate` as a person meets it."""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import jaxbundle.calibration.files
+import jaxbundle.calibration.quality
+from jaxbundle import cli
+
+pytestmark = pytest.mark.xdist_group("calibration")
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "board"
+VIEWS = 12
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("command")
+    for photograph in EXAMPLE.glob("*.jpg"):
+        shutil.copy(photograph, folder)
+    (folder / "text.jpg").write_text("no photograph")
+    return folder
+
+
+def run(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr(sys, "argv", ["jaxbundle", "calibrate", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    told = capsys.readouterr()
+    return ended.value.code or 0, told.out, told.err
+
+
+@pytest.fixture
+def command(monkeypatch, capsys):
+    return lambda *arguments: run(monkeypatch, capsys, *arguments)
+
+
+def test_photographs_to_camera(command, folder, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(jaxbundle.calibration.files, "save_plots", lambda *a: drawn.append(a))
+    out, file = tmp_path / "out", tmp_path / "result.json"
+    code, told, error = command(
+        folder, "--board", "9x6", "--square", 0.03, "--out", out, "--json", file
+    )
+    assert (code, error) == (0, "")
+    assert "photo_13.jpg  no chessboard" in told and "text.jpg      not an image" in told
+    assert "Cross-validation" in told
+    result = json.loads(file.read_text())
+    assert result["converged"] and len(result["calibration"]["photographs"]["used"]) == VIEWS
+    fx = result["cameras"]["cam"]["parameters"]["fx"]
+    assert abs(fx["value"] - 620) < 3 * fx["sigma"]
+    written = {path.name for path in out.iterdir()}
+    cameras = {"cam.toml", "cam.yaml", "colmap", "network"}
+    assert written == {"report.txt", "result.json"} | cameras and len(drawn) == 1
+    assert (out / "report.txt").read_text().strip() in told
+
+
+def test_two_cameras_and_brief_json_alone(command, folder, monkeypatch):
+    monkeypatch.setattr(jaxbundle.calibration.quality, "cross_validation", lambda result: None)
+    code, told, error = command(
+        "--camera", f"a={folder}/photo_*.jpg", "--camera", f"b={folder}/photo_*.jpg",
+        "--board", "9x6", "--square", 0.03, "--json", "-", "--brief",
+    )  # fmt: skip
+    assert (code, error) == (0, "")
+    result = json.loads(told)
+    assert result["converged"] and set(result["calibrations"]) == {"a", "b"}
+    assert "residuals" not in result["calibrations"]["a"] and "rig" not in result
+    assert result["calibrations"]["b"]["calibration"]["cross_validation"] is None
+
+
+@pytest.mark.parametrize("arguments, said", [
+    (["--board", "9x6", "--square", "0.03"], "no photographs: give files"),
+    (["FOLDER", "--board", "9by6", "--square", "1"], "--board '9by6': COLUMNSxROWS is expected"),
+    (["FOLDER", "--board", "9x6"], "--square is missing"),
+    (["FOLDER", "--board", "9x6", "--square", "1", "--kind", "dots"], "kind of board 'dots'"),
+    (["FOLDER", "--board", "9x6", "--square", "1", "--free", "fx,fz"], "no free parameter 'fz'"),
+    (["FOLDER", "--board", "9x6", "--square", "1", "--given", "fx"], "NAME=VALUE is expected"),
+    (["FOLDER", "--board", "9x6", "--square", "1", "--camera", "a"], "either as arguments or by"),
+    (["--board", "9x6", "--square", "1", "--camera", "a"], "--camera a: NAME=PATTERN"),
+    (["FOLDER", "--board", "9x6", "--square", "1", "--snooping", "x"], "--snooping 'x'"),
+    (["FOLDER", "--board", "9x6", "--square", "1", "--rig"], "a rig has two cameras or more"),
+    (["FOLDER", "--board", "9x6", "--square", "1", "--json", "FOLDER"], "is a folder"),
+    (["FOLDER", "--board", "9x6", "--square", "1", "--json", "FOLDER/text.jpg"], "overwritten"),
+])  # fmt: skip
+def test_bad_arguments_are_one_line(command, folder, arguments, said):
+    code, told, error = command(*(a.replace("FOLDER", str(folder)) for a in arguments))
+    assert code == 2 and told == ""
+    assert said in error and error.count("\n") == 1
+
+
+def test_photographs_that_show_no_board(command, folder, tmp_path):
+    cv2.imwrite(str(tmp_path / "grey.png"), np.full((360, 480), 99, np.uint8))
+    out = tmp_path / "out"
+    code, _, error = command(tmp_path, "--board", "9x6", "--square", 0.03, "--out", out)
+    assert code == 2 and "no photograph of 1 shows the board: grey.png: no chessboard" in error
+    assert not out.exists()
+    code, _, error = command(folder / "photo_01.jpg", "--board", "10x7", "--square", 0.03)
+    assert code == 2 and "give --board 9x6" in error

@@ -1,0 +1,234 @@
+"""COLMAP's sparse models: round trips, an independent reading, and broken files."""
+
+import struct
+
+import numpy as np
+import pytest
+from exchange_cases import POINTS, assert_same, network
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.colmap import (
+    is_colmap,
+    read_colmap,
+    read_colmap_cameras,
+    write_colmap,
+)
+from jaxbundle.io.colmap_models import MODELS, from_colmap, to_colmap
+from jaxbundle.network import Camera
+
+FILES = {
+    "cameras.txt": "# Camera list\n1 SIMPLE_RADIAL 640 480 500 320 240 -0.1\n"
+    "7 OPENCV_FISHEYE 640 480 300 301 320 240 0.1 0.01 0 0\n",
+    "images.txt": "# Image list\n"
+    "1 1 0 0 0 0.5 -0.25 4 1 left.jpg\n345.5 214.5 58396 100 100 -1 420.5 240.5 59027\n"
+    "2 0 1 0 0 0 0 4 7 right.jpg\n\n",
+    "points3D.txt": "58396 0 0 0 115 121 122 1.3 1 0\n59027 1 0.25 0 115 121 122 1.3 1 2\n",
+}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    made = tmp_path / "sparse"
+    made.mkdir()
+    for name, text in FILES.items():
+        (made / name).write_text(text)
+    return made
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("model", ["opencv", "kannala-brandt"])
+def test_round_trip(tmp_path, model, text):
+    before = network(model, ("a.jpg", "b.jpg", "c.jpg"))
+    assert write_colmap(before, tmp_path, text) == ()
+    assert is_colmap(tmp_path)
+    assert {p.suffix for p in tmp_path.iterdir()} == {".txt" if text else ".bin"}
+    after = read_colmap(tmp_path)
+    assert_same(before, after)
+    assert after.cameras[0].image_size == (1280, 720)
+    write_colmap(after, tmp_path, not text)
+    assert {p.suffix for p in tmp_path.iterdir()} == {".bin" if text else ".txt"}
+    assert_same(before, read_colmap(tmp_path))
+
+
+def test_the_text_says_what_colmap_means(tmp_path):
+    """The pinhole formula of COLMAP's documentation, applied to the numbers of the files."""
+    before = network("opencv")
+    write_colmap(before, tmp_path, text=True)
+    lines = lambda name: [
+        line.split() for line in (tmp_path / name).read_text().splitlines() if line[:1] != "#"
+    ]
+    ((_, model, width, height, *values),) = lines("cameras.txt")
+    assert (model, width, height) == ("OPENCV", "1280", "720")
+    fx, fy, cx, cy, k1, k2, p1, p2 = map(float, values)
+    assert (cx, cy) == (641.5, 359.0)
+    points = {row[0]: np.array(row[1:4], float) for row in lines("points3D.txt")}
+    images = lines("images.txt")
+    for head, observed in zip(images[::2], images[1::2]):
+        qw, qx, qy, qz, *t = map(float, head[1:8])
+        R = Rotation.from_quat([qx, qy, qz, qw]).as_matrix()
+        for u, v, point in zip(observed[::3], observed[1::3], observed[2::3]):
+            X, Y, Z = R @ points[point] + t
+            assert Z > 0
+            x, y = X / Z, Y / Z
+            r2 = x * x + y * y
+            radial = 1 + k1 * r2 + k2 * r2**2
+            xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+            yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+            assert_allclose((fx * xd + cx, fy * yd + cy), (float(u), float(v)), atol=1e-9)
+
+
+def test_tracks_point_at_image_points(tmp_path):
+    write_colmap(network("opencv"), tmp_path)
+    data = (tmp_path / "points3D.bin").read_bytes()
+    (count,), position = struct.unpack_from("<Q", data), 8
+    assert count == len(POINTS)
+    rays = 0
+    for _ in range(count):
+        id, *_, n = struct.unpack_from("<Q3d3BdQ", data, position)
+        position += struct.calcsize("<Q3d3BdQ")
+        track = struct.unpack_from(f"<{2 * n}I", data, position)
+        position += 8 * n
+        assert list(track[::2]) == [i for i in (1, 2, 3) if (i, id) not in ((1, 4), (3, 8))]
+        rays += n
+    assert rays == 34 and position == len(data)
+
+
+def test_a_written_example(folder):
+    net = read_colmap(folder)
+    assert net.images.id == ("left.jpg", "right.jpg") and net.points.id == ("58396", "59027")
+    radial, fisheye = net.cameras
+    assert radial.parameters == dict(fx=500, fy=500, cx=319.5, cy=239.5, k1=-0.1)
+    assert fisheye.model == "kannala-brandt" and fisheye.parameters["k2"] == 0.01
+    assert len(net.observations) == 2
+    assert_allclose(net.observations.xy[0], (345, 214))
+    assert_allclose(net.images.position[0], (-0.5, 0.25, -4))
+    assert_allclose(net.images.position[1], (0, 0, 4), atol=1e-15)
+    assert_allclose(net.images.angles[1], 0, atol=1e-15)  # turned by 180° about x: looks down
+    assert read_colmap_cameras(folder / "cameras.txt") == net.cameras
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_every_model_we_have_comes_back(model):
+    _, _, names = MODELS[model]
+    sizes = {"f": 500.0, "fx": 500.0, "fy": 510.0, "cx": 320.5, "cy": 240.5}
+    values = [sizes.get(name, 0.01 * (k + 1)) for k, name in enumerate(names)]
+    camera = from_colmap("1", model, (640, 480), values)
+    assert to_colmap(camera) == (model, pytest.approx(values, rel=1e-15))
+
+
+def test_what_colmap_cannot_express():
+    size = dict(image_size=(640, 480))
+    with pytest.raises(InputError, match="no model 'brown'.*--model opencv"):
+        to_colmap(Camera("c", "brown", {"c": 5.0}, **size))
+    with pytest.raises(InputError, match="needs the image size"):
+        to_colmap(Camera("c", "opencv", {"fx": 5.0, "fy": 5.0}))
+    with pytest.raises(InputError, match="no thin prism"):
+        to_colmap(Camera("c", "opencv", {"fx": 5.0, "fy": 5.0, "s1": 1e-3}, **size))
+
+
+def test_names_with_blanks(tmp_path):
+    before = network("opencv", ("a 1", "b", "c"))
+    write_colmap(before, tmp_path / "binary")
+    assert_same(before, read_colmap(tmp_path / "binary"))
+    with pytest.raises(InputError, match="image 'a 1': names in COLMAP's text files have no"):
+        write_colmap(before, tmp_path / "text", text=True)
+    assert not (tmp_path / "text").exists()
+
+
+def test_what_is_lost_is_told(tmp_path):
+    before = network("opencv", ("a", "b", "c"))
+    points = before.points
+    changed = before.replace(points=type(points)(
+        ("x", *points.id[1:]), ("fixed", *points.role[1:]), points.position, points.sigma
+    ))  # fmt: skip
+    lost = write_colmap(changed, tmp_path)
+    assert "roles" in lost[0] and "numbered from 1" in lost[1]
+
+
+BROKEN = {
+    "unknown model": ("cameras.txt", "SIMPLE_RADIAL", "FISHY", "line 2: the camera model FISHY is"),
+    "no such model here": ("cameras.txt", "SIMPLE_RADIAL", "FOV", "FOV is not offered"),
+    "too few parameters": ("cameras.txt", " -0.1\n", "\n", "3 values where 4 are expected"),
+    "too many": ("cameras.txt", "-0.1\n", "-0.1 7\n", "5 values where 4"),
+    "focal": ("cameras.txt", " 500 ", " -500 ", "fx must be positive"),
+    "size": ("cameras.txt", "1 SIMPLE_RADIAL 640", "1 SIMPLE_RADIAL 0", "WIDTH is '0'"),
+    "twice": ("cameras.txt", "\n7 ", "\n1 ", "camera 1 stands there twice"),
+    "NaN pose": ("images.txt", "0.5 -0.25", "nan -0.25", "line 2: TX is 'nan'"),
+    "zero quaternion": ("images.txt", "1 1 0 0 0 ", "1 0 0 0 0 ", "quaternion is 0"),
+    "unknown camera": ("images.txt", "4 1 left", "4 5 left", "the camera 5, which is not in"),
+    "unknown point": ("images.txt", "59027", "59028", "the object point 59028 is not in points3D"),
+    "cut line": ("images.txt", " 420.5 240.5 59027", " 420.5 240.5", "8 numbers; X, Y, POINT3D_ID"),
+    "cut head": ("images.txt", " 4 7 right.jpg", "", "image is expected: IMAGE_ID"),
+    "same image": ("images.txt", "\n2 0 1", "\n1 0 1", "image 1 stands there twice"),
+    "same name": ("images.txt", "right", "left", "two images are called 'left.jpg'"),
+    "text": ("points3D.txt", "0.25", "O.25", "line 2: Y is 'O.25'"),
+    "unknown image": ("points3D.txt", "1.3 1 2", "1.3 9 2", "the image 9 of the track"),
+    "half track": ("points3D.txt", "1.3 1 2", "1.3 1", "without its POINT2D_IDX"),
+    "same point": ("points3D.txt", "58396", "59027", "point 59027 stands there twice"),
+    "binary": ("images.txt", "left", "\udcff", "not UTF-8"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_broken_text(folder, name):
+    file, old, new, message = BROKEN[name]
+    text = (folder / file).read_text()
+    assert old in text
+    changed = text.replace(old, new, 1)
+    (folder / file).write_bytes(changed.encode("utf-8", "surrogateescape"))
+    with pytest.raises(InputError, match=message) as caught:
+        read_colmap(folder)
+    assert str(folder) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("part", ["cameras", "images", "points3D"])
+def test_a_binary_file_cut_anywhere(tmp_path, part):
+    write_colmap(network("opencv"), tmp_path)
+    path = tmp_path / f"{part}.bin"
+    data = path.read_bytes()
+    for size in [0, 7, 8, 20, *np.linspace(30, len(data) - 1, 12).astype(int)]:
+        path.write_bytes(data[:size])
+        with pytest.raises(InputError, match=f"{part}.bin, .*(cut off|bytes follow)"):
+            read_colmap(tmp_path)
+    path.write_bytes(data + b"x")
+    with pytest.raises(InputError, match="1 bytes follow the last entry"):
+        read_colmap(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "part, position, bytes_, message",
+    [
+        ("points3D", 0, struct.pack("<Q", 10**18), f"{10**18} points are announced"),
+        ("images", 0, struct.pack("<Q", 2**63), "images are announced"),
+        ("images", 8 + 64 + 2, struct.pack("<Q", 10**18), f"image 1: {10**18} image points"),
+        ("images", 12, struct.pack("<d", np.nan), "image 1: pose: nan"),
+        ("images", 8 + 64, b"\xff", "not UTF-8"),
+        ("cameras", 12, struct.pack("<i", 10), "THIN_PRISM_FISHEYE is not offered"),
+        ("cameras", 12, struct.pack("<i", 99), "number 99 is unknown"),
+        ("cameras", 16, struct.pack("<Q", 2**60), "image size"),
+        ("points3D", 8, struct.pack("<Q", 2**64 - 5), "point 1: its number"),
+    ],
+)
+def test_hostile_bytes(tmp_path, part, position, bytes_, message):
+    write_colmap(network("opencv"), tmp_path)
+    path = tmp_path / f"{part}.bin"
+    data = bytearray(path.read_bytes())
+    data[position : position + len(bytes_)] = bytes_
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=message):
+        read_colmap(tmp_path)
+
+
+def test_missing_files(tmp_path, folder):
+    (folder / "points3D.txt").unlink()
+    with pytest.raises(InputError, match="points3D.txt: no such file"):
+        read_colmap(folder)
+    with pytest.raises(InputError, match="no cameras.bin or cameras.txt"):
+        read_colmap(tmp_path)
+
+
+def test_rigs_are_told(folder):
+    (folder / "rigs.txt").write_text("1 1 CAMERA 1\n")
+    assert "rigs and frames are not read" in read_colmap(folder).warnings[-1]

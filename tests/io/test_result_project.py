@@ -1,0 +1,58 @@
+"""The adjusted network: adjusted again it stays as it is, and other programs can have it."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+import jaxbundle
+from jaxbundle.io import adjusted_network, read_network, write_project
+from jaxbundle.targets import NETWORK_FILES, check_targets, write_targets
+
+pytestmark = pytest.mark.xdist_group("convergent4")
+
+
+def test_it_is_a_fixed_point(convergent4, tmp_path):
+    network = adjusted_network(convergent4)
+    assert network.datum == "inner" and network.cameras[0].free == convergent4.network.cameras[
+        0].free  # fmt: skip
+    assert_array_equal(network.points.position, convergent4.point_values)
+    back = read_network(write_project(network, tmp_path))
+    again = jaxbundle.adjust(back)
+    assert again.sigma0 == pytest.approx(convergent4.sigma0, rel=1e-9)
+    assert again.iterations <= 3
+    scale = np.ptp(convergent4.point_values)
+    assert_allclose(again.point_values, convergent4.point_values, atol=1e-6 * scale)
+    before, after = (r.camera_parameters("cam") for r in (convergent4, again))
+    for name, value in before.items():
+        assert after[name] == pytest.approx(value, rel=1e-4), name
+
+
+def test_removed_and_held_things(convergent4):
+    import dataclasses
+
+    import equinox as eqx
+
+    weight = np.asarray(convergent4.problem.data.image_weight).copy()
+    gone = 7
+    weight[convergent4.problem.rays[gone]] = 0
+    problem = dataclasses.replace(
+        convergent4.problem,
+        data=eqx.tree_at(lambda d: d.image_weight, convergent4.problem.data, weight),
+        network=convergent4.problem.network,
+    )
+    result = jaxbundle.Adjustment(convergent4.network, problem, convergent4.minimum)
+    rays, kept = convergent4.problem.network.observations, adjusted_network(result).observations
+    assert len(kept) == len(rays) - 1
+    assert_array_equal(kept.xy, np.delete(rays.xy, gone, axis=0))
+
+
+def test_it_is_written_with_the_result_and_read_from_its_folder(convergent4, tmp_path):
+    write_targets(convergent4, "", tmp_path, brief=True, plots=False)
+    folder = tmp_path / "network"
+    assert {p.name for p in folder.iterdir()} == set(NETWORK_FILES) - {"distances.csv"}
+    network = read_network(tmp_path)
+    assert_allclose(network.images.position, convergent4.image_values[:, :3], rtol=1e-15)
+    with pytest.raises(jaxbundle.InputError, match="part of the input and would be overwritten"):
+        check_targets(tmp_path / "network" / "project.toml", network, "", tmp_path)
+    write_targets(jaxbundle.NotSolvedError("why"), "", tmp_path, brief=True, plots=False)
+    assert {p.name for p in tmp_path.iterdir()} == {"report.txt", "result.json"}

@@ -1,0 +1,128 @@
+"""Boards in rendered photographs: where their points are, and which is which."""
+
+import cv2
+import numpy as np
+import pytest
+import render
+
+from jaxbundle.errors import InputError
+from jaxbundle.measure import Board, find_board, read_photograph
+from jaxbundle.measure.corners import other_sizes
+
+MARGIN = 0.03
+CHESS = Board(9, 6, 0.03)
+CIRCLES = Board(8, 6, 0.03, "circles", diameter=0.012)
+UNEVEN = Board(4, 7, 0.02, "asymmetric-circles", diameter=0.012)
+CHARUCO = Board(9, 6, 0.03, "charuco")
+POSES = [(25, -20, 90, 0.5), (-20, 15, -80, 0.5), (10, 20, 175, 0.5)]
+
+
+def printed(board):
+    """The pattern of a board, with its points where `Board.points` says."""
+    if board.kind == "chessboard":
+        return render.chessboard(board.columns, board.rows, board.square)
+    if board.kind == "charuco":
+        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+        size = (board.columns, board.rows)
+        drawn = cv2.aruco.CharucoBoard(size, board.square, 0.75 * board.square, dictionary)
+        picture = drawn.generateImage((120 * board.columns, 120 * board.rows), marginSize=0)
+        pattern = render.print_of(picture, board.columns * board.square, MARGIN)
+        return lambda X, Y: pattern(X + board.square, Y + board.square)
+    return render.discs(board.points[:, :2], board.diameter / 2, margin=MARGIN)
+
+
+def taken(board, omega, phi, kappa, distance, seed=0):
+    M, X0 = render.pose(omega, phi, kappa, board.points.mean(0)[:2], distance)
+    picture = render.photograph(render.LENS, M, X0, printed(board), seed=seed)
+    return picture, render.LENS.image_of(M, X0, board.points)
+
+
+@pytest.mark.parametrize("board", [CHESS, CIRCLES, UNEVEN, CHARUCO], ids=lambda b: b.kind)
+@pytest.mark.parametrize("seed", range(3))
+def test_every_point_is_found_and_numbered(board, seed):
+    picture, true = taken(board, *POSES[seed], seed)
+    found = find_board(picture, board)
+    if not board.unique:
+        # no photograph tells a half turn of it: the upper of the two possible points is the first
+        assert found[0, 1] <= found[-1, 1]
+        true = true if true[0, 1] <= true[-1, 1] else true[::-1]
+    missing = np.isnan(found).any(1)
+    assert missing.sum() <= (2 if board.kind == "charuco" else 0)
+    error = (found - true)[~missing]
+    assert np.sqrt((error**2).mean()) < 0.06
+    assert np.abs(error).max() < 0.3
+
+
+@pytest.mark.parametrize("board", [CHESS, CIRCLES], ids=lambda b: b.kind)
+def test_large_photographs_are_searched_in_small(board):
+    """A photograph five times as large: found in a copy, measured in itself."""
+    picture, true = taken(board, 20, 15, 10, 0.5)
+    large = cv2.resize(picture, None, fx=5, fy=5, interpolation=cv2.INTER_CUBIC)
+    found = find_board(large[:, :-3], board)
+    true = 5 * true + 2
+    assert np.abs(found - true).max() < 1.0
+    assert np.sqrt(np.mean((found - true) ** 2)) < 0.3
+
+
+def test_a_hidden_part_of_a_charuco_board_is_missing():
+    picture, true = taken(CHARUCO, 10, 10, 0, 0.5)
+    picture[:, 260:] = 128
+    found = find_board(picture, CHARUCO)
+    there = ~np.isnan(found).any(1)
+    assert 8 < there.sum() < len(there) - 8
+    assert np.abs((found - true)[there]).max() < 0.3
+    assert (true[there, 0] < 262).all()
+
+
+def test_coordinates_and_names():
+    assert CHESS.ids[0] == "1-1" and CHESS.ids[9] == "2-1" and len(CHESS.ids) == 54
+    some = [[0, 0.15, 0], [0.03, 0.15, 0], [0, 0.12, 0]]
+    np.testing.assert_allclose(CHESS.points[[0, 1, 9]], some)
+    assert len(CHARUCO.ids) == 40
+    apart = np.linalg.norm(UNEVEN.points[:, None] - UNEVEN.points, axis=2)
+    np.testing.assert_allclose(apart[apart > 0].min(), 0.02 * np.sqrt(2))
+    assert CHESS.unique and not Board(8, 6, 1.0).unique and not CIRCLES.unique
+
+
+@pytest.mark.parametrize("given, said", [
+    ((1, 6, 0.03), "board 1x6: a chessboard board needs at least 3"),
+    ((9, 6, -1.0), "square is -1.0; a positive length"),
+    ((9, 6, float("nan")), "square is nan"),
+    ((9, 6, 1.0, "chessbord"), "did you mean 'chessboard'"),
+    ((9, 6, 1.0, "charuco", None, 1.5), "a marker of 1.5 does not fit into a square of 1"),
+])  # fmt: skip
+def test_impossible_boards(given, said):
+    with pytest.raises(InputError, match=said):
+        Board(*given)
+
+
+def test_what_cannot_be_found_says_so():
+    picture, _ = taken(CHESS, 20, 10, 5, 0.5)
+    with pytest.raises(InputError, match="no chessboard of 8 × 5 inner corners"):
+        find_board(np.full_like(picture, 100), Board(8, 5, 0.03))
+    with pytest.raises(InputError, match="no grid of 8 × 6 circles"):
+        find_board(picture, CIRCLES)
+    with pytest.raises(InputError, match="fewer than 4 corners of a ChArUco"):
+        find_board(picture, CHARUCO)
+    with pytest.raises(InputError, match="no dictionary 'DICT_9'"):
+        find_board(picture, Board(9, 6, 0.03, "charuco", dictionary="DICT_9"))
+    with pytest.raises(InputError, match="5 × 5 pixels is too small"):
+        find_board(picture[:5, :5], CHESS)
+    assert other_sizes(picture, Board(10, 7, 0.03)) == CHESS
+    assert other_sizes(np.full_like(picture, 100), CHESS) is None
+
+
+def test_reading_photographs(tmp_path):
+    picture, _ = taken(CHESS, 0, 0, 0, 0.5)
+    cv2.imwrite(str(tmp_path / "good.png"), picture)
+    np.testing.assert_array_equal(read_photograph(tmp_path / "good.png"), picture)
+    (tmp_path / "empty.jpg").write_bytes(b"")
+    (tmp_path / "text.jpg").write_text("not an image")
+    whole = (tmp_path / "good.png").read_bytes()
+    (tmp_path / "cut.png").write_bytes(whole[:40])
+    for name, said in (
+        ("missing.jpg", "no such file"), (".", "is a folder"), ("empty.jpg", "is empty"),
+        ("text.jpg", "not an image"), ("cut.png", "not an image|decoded"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=said):
+            read_photograph(tmp_path / name)
