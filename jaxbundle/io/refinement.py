@@ -57,7 +57,7 @@ from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable, FocalLine, Optics
 from jaxbundle.refinement.freedom import Freedom
-from jaxbundle.refinement.refine import TESTS, east_north_up
+from jaxbundle.refinement.refining import TESTS, east_north_up
 from jaxbundle.refinement.tables import GroundPoints, ScannerImage, check_points_table
 
 SECTIONS = {

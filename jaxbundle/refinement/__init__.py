@@ -7,8 +7,8 @@ from .equations import residuals as residuals
 from .freedom import FREE as FREE
 from .freedom import HELD as HELD
 from .freedom import Freedom as Freedom
-from .refine import Refinement as Refinement
-from .refine import refine as refine
+from .refining import Refinement as Refinement
+from .refining import refine as refine
 from .report import report as report
 from .report import to_json as to_json
 from .tables import GroundPoints as GroundPoints

@@ -267,9 +267,25 @@ def _frame_sights(rays):
 
 
 def check_input(
-    images: list[ScannerImage], points: GroundPoints, observations: Observations
+    images: list[ScannerImage],
+    points: GroundPoints,
+    observations: Observations,
+    frames: Network | None,
 ) -> None:
     """All that can be refused before anything is computed."""
+    if not images:
+        raise InputError("refine: no scanner image; photographs alone are adjusted by `adjust`")
+    if len({one.id for one in images}) < len(images):
+        raise InputError("refine: two scanner images have the same id; give each its own")
+    if frames is not None:
+        table = frames.images
+        lacking = ~np.isfinite(np.c_[table.position, table.angles]).all(1)
+        if lacking.any():
+            row = int(lacking.argmax())
+            raise InputError(
+                f"{table.source(row)}: photograph {table.id[row]!r} has no start values; give "
+                "X0, Y0, Z0, omega, phi, kappa, or find them by `jaxbundle orient`"
+            )
     for one in images:
         if one.freedom.knot_spacing <= 0:
             raise InputError(f"image {one.id!r}: knot_spacing must be positive, in seconds")

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxbundle.refinement.inspection import Blunder
-from jaxbundle.refinement.refine import Refinement
+from jaxbundle.refinement.refining import Refinement
 from jaxbundle.statistics.reliability import minimal_detectable
 
 STRONG = 0.9

@@ -55,7 +55,7 @@ def local_points(
 ) -> GroundPoints:
     """Points with σ along X, Y, Z; without `sigma` control points are held."""
     X = np.asarray(X, float)
-    sigma = np.zeros_like(X) if sigma is None else np.asarray(sigma, float)
+    sigma = np.broadcast_to(0.0 if sigma is None else np.asarray(sigma, float), X.shape)
     axes = np.tile(np.eye(3), (len(X), 1, 1))
     return GroundPoints(tuple(id), tuple(role), X, sigma, axes, source=source)
 

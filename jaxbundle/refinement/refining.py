@@ -142,10 +142,12 @@ def refine(
         raise InputError(f"snooping {snooping!r}; one of {', '.join(TESTS)} is expected")
     images = list(images)
     points = with_frames(points, frames)
-    check_input(images, points, observations)
-    points = _checks_upright(points, images[0].earth if images else None)
+    check_input(images, points, observations, frames)
+    points = _checks_upright(points, images[0].earth)
     columns = make_columns(images, frames)
     rays, check_rays, warnings = choose_rays(points, observations, frames)
+    if frames is not None and len(frames.distances):
+        warnings.append("distances of the photographs' project take no part")
     system = make_system(images, points, observations, frames, columns, rays)
     check_near(system, images, points, observations, rays)
     weak = lambda system, unknowns: [
