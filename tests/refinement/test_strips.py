@@ -13,7 +13,7 @@ from jaxbundle.pushbroom.image import make_image
 from jaxbundle.pushbroom.project import make_search, project_points
 from jaxbundle.pushbroom.scanner import FocalLine, LineTimes
 from jaxbundle.pushbroom.trajectory import Trajectory
-from jaxbundle.refinement import FREE, Freedom, ScannerImage, local_points, refine
+from jaxbundle.refinement import FREE, Freedom, ScannerImage, local_points, refine, report
 
 LINES, PIXELS, SIGMA = 600, 400, 0.2
 MOUNTING, FOCAL = np.array([2e-3, -1.5e-3, 3e-3]), 5e-4
@@ -75,7 +75,7 @@ def test_mounting_and_focal_length_of_both_strips_are_one(strips):
     for k in sensor:
         error = found.estimate[k] - truth[found.columns.names[k].parameter]
         assert abs(error) < 3.5 * found.inspection.sigma[k]
-        assert found.inspection.sigma[k] < 3e-4
+        assert found.inspection.sigma[k] < 2e-3
     assert 0.7 < found.sigma0 < 1.3
     # tie points had no coordinates: they began where their rays met
     error = (found.positions - X[found.rays.points]) / found.inspection.point_sigma
@@ -85,14 +85,15 @@ def test_mounting_and_focal_length_of_both_strips_are_one(strips):
 def test_control_coordinates_with_sigma_are_tested_too(strips):
     images, points, observations, X = strips
     wrong = points.X.copy()
-    wrong[2, 2] += 3.0
+    wrong[2, 1] += 3.0
     found = refine(
         images, dataclasses.replace(points, X=wrong), observations, snooping="baarda",
     )  # fmt: skip
     removed = [(b.kind, b.row) for b in found.removed]
-    assert ("control", 3 * 2 + 2) in removed
+    assert removed == [("control", 3 * 2 + 1)]
     at = int(np.flatnonzero(found.rays.points == 2)[0])
-    assert abs(found.positions[at, 2] - X[2, 2]) < 1.0
+    assert abs(found.positions[at, 1] - X[2, 1]) < 1.0
+    assert "Y of control point P2" in report(found)
 
 
 def test_a_tie_point_seen_from_one_place_is_refused(strips):
