@@ -11,6 +11,7 @@ neighbours. It keeps its row with weight zero.
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -21,6 +22,9 @@ from jaxbundle.errors import NotSolvedError
 from jaxbundle.refinement.equations import System, Unknowns
 from jaxbundle.refinement.solver import Reduced, normal, polished, solve
 from jaxbundle.statistics.distributions import normal_quantile, tau_quantile
+
+Weak = Callable[[System, Unknowns], list[str]]
+"""Sentences on what is not determined."""
 
 UNCONTROLLED = 1e-8
 """Redundancy numbers below this are rounding."""
@@ -108,10 +112,10 @@ def count_redundancy(system: System) -> int:
     return int((weights(system) > 0).sum() - len(system.prior) - unknown.sum())
 
 
-def adjust(system: System, start: Unknowns, weak) -> Inspection:
+def adjust(system: System, start: Unknowns, weak: Weak) -> Inspection:
     """Solve and inspect.
 
-    **Raises:** `NotSolvedError` that names, by `weak(reduced)`, what is not determined.
+    **Raises:** `NotSolvedError` that says, by `weak(system, unknowns)`, what is not determined.
     """
     redundancy = count_redundancy(system)
     found = solve(system, start, jnp.asarray(float(redundancy)))
@@ -163,7 +167,7 @@ def critical_value(found: Inspection, test: str, significance: float) -> float:
 
 
 def snoop(
-    found: Inspection, test: str, significance: float, weak, limit: int | None = None
+    found: Inspection, test: str, significance: float, weak: Weak, limit: int | None = None
 ) -> tuple[Inspection, list[Blunder]]:
     """Remove blunders, the worst first, until none is left (or `limit` of them)."""
     removed = []

@@ -161,6 +161,7 @@ def refine(
     check = None
     if len(check_rays.points):
         other = make_system(images, points, observations, frames, columns, check_rays)
+        check_near(other, images, points, observations, check_rays)
         check = intersect(other, found, tuple(points.id[k] for k in check_rays.points))
     return Refinement(
         tuple(images), points, observations, frames, columns, rays, found, tuple(removed), check,

@@ -1,4 +1,4 @@
-"""Two strips flown to and fro with one scanner, in a local frame: what they share is one unknown."""
+"""Two strips flown to and fro with one scanner, in a local frame: what they share is one."""
 
 import dataclasses
 
