@@ -26,8 +26,8 @@ from jaxbundle.refinement.equations import (
     FrameRays,
     ScannerRays,
     System,
-    image_residuals,
-    rescaled,
+    compiled_image_residuals,
+    compiled_rescaled,
 )
 from jaxbundle.refinement.freedom import Form, Name, make_form, names, of_sensor, priors
 from jaxbundle.refinement.tables import (
@@ -193,7 +193,7 @@ def make_system(
         jnp.asarray(np.where(held, 0.0, 1.0)), jnp.zeros(X.shape), jnp.asarray(weight),
         jnp.asarray(1 / columns.sigma),
     )  # fmt: skip
-    return eqx.filter_jit(rescaled)(system, system.start())
+    return compiled_rescaled(system, system.start())
 
 
 def _photographs(points, network, columns, rays, index):
@@ -298,7 +298,7 @@ def check_near(
     rays: Rays,
 ) -> None:  # fmt: skip
     """Refuse control points that lie far from where they are measured: swapped or in error."""
-    v = eqx.filter_jit(image_residuals)(system, system.start())
+    v = compiled_image_residuals(system, system.start())
     for i, one in enumerate(images):
         rows = rays.scanner[observations.image[rays.scanner] == i]
         size = np.array([one.image.lines, one.image.pixels])

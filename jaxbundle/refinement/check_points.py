@@ -16,7 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.refinement.equations import System, Unknowns, image_residuals, rescaled, residuals
+from jaxbundle.refinement.equations import (
+    System,
+    Unknowns,
+    compiled_image_residuals,
+    compiled_rescaled,
+    residuals,
+)
 from jaxbundle.refinement.inspection import Inspection
 from jaxbundle.refinement.solver import jacobian
 
@@ -50,14 +56,14 @@ def intersect(system: System, found: Inspection, ids: tuple[str, ...]) -> CheckP
     """The check points of a system of their own, with the refined images of another."""
     shared = found.unknowns.shared
     start = eqx.tree_at(lambda u: u.shared, system.start(), shared)
-    system = eqx.filter_jit(rescaled)(system, start)
+    system = compiled_rescaled(system, start)
     number = np.bincount(np.concatenate([r.point for r in system.rays]), minlength=len(ids))
     free = np.where((number < 2)[:, None], [1.0, 1.0, 0.0], 1.0)
     system = eqx.tree_at(
         lambda s: (s.free, s.prior), system,
         (jnp.asarray(free), jnp.zeros_like(system.prior)),
     )  # fmt: skip
-    v0 = np.concatenate([np.asarray(v) for v in _residuals(system, start)])
+    v0 = np.concatenate([np.asarray(v) for v in compiled_image_residuals(system, start)])
     A, _, _, = _rows(system, start)[1:]
     change = np.zeros((len(ids), 3))
     for _ in range(STEPS):
@@ -79,9 +85,6 @@ def intersect(system: System, found: Inspection, ids: tuple[str, ...]) -> CheckP
         ids, np.where(known, change, np.nan), np.where(known, sigma, np.nan), number, v0,
         found.sigma0 * np.sqrt(1 + spread) / weight,
     )  # fmt: skip
-
-
-_residuals = eqx.filter_jit(image_residuals)
 
 
 @eqx.filter_jit

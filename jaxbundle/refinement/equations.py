@@ -194,3 +194,8 @@ def rescaled(system: System, unknowns: Unknowns) -> System:
         scales(rays, vector_of(rays, unknowns.shared), X[rays.point]) for rays in system.scanners
     )
     return eqx.tree_at(lambda s: [r.scale for r in s.scanners], system, list(found))
+
+
+compiled_rescaled = eqx.filter_jit(rescaled)
+compiled_image_residuals = eqx.filter_jit(image_residuals)
+"""Compiled once and shared by all that look at a system."""

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.errors import NotSolvedError
-from jaxbundle.refinement.equations import System, Unknowns
+from jaxbundle.refinement.equations import System, Unknowns, compiled_rescaled
 from jaxbundle.refinement.solver import Reduced, normal, polished, solve
 from jaxbundle.statistics.distributions import normal_quantile, tau_quantile
 
@@ -118,7 +118,10 @@ def adjust(system: System, start: Unknowns, weak: Weak) -> Inspection:
     **Raises:** `NotSolvedError` that says, by `weak(system, unknowns)`, what is not determined.
     """
     redundancy = count_redundancy(system)
-    found = solve(system, start, jnp.asarray(float(redundancy)))
+    first = solve(system, start, jnp.asarray(float(redundancy)))
+    system = compiled_rescaled(system, first.unknowns)
+    found = solve(system, first.unknowns, jnp.asarray(float(redundancy)))
+    steps = int(first.steps + found.steps)
     system, unknowns = polished(system, found.unknowns)
     reduced, v = normal(system, unknowns)
     if not np.isfinite(np.asarray(reduced.lower)).all() or redundancy < 0:
@@ -129,10 +132,10 @@ def adjust(system: System, start: Unknowns, weak: Weak) -> Inspection:
         )  # fmt: skip
     if not bool(found.settled):
         raise NotSolvedError(
-            f"the adjustment did not settle in {int(found.steps)} steps; look at start values and "
+            f"the adjustment did not settle in {steps} steps; look at start values and "
             "blunders"
         )
-    return _inspect(system, unknowns, int(found.steps), reduced, v, redundancy)
+    return _inspect(system, unknowns, steps, reduced, v, redundancy)
 
 
 def _inspect(system, unknowns, steps, reduced, v, redundancy) -> Inspection:

@@ -25,7 +25,7 @@ from jaxbundle.refinement.build import (
     make_system,
 )
 from jaxbundle.refinement.check_points import CheckPoints, intersect
-from jaxbundle.refinement.equations import image_residuals, positions, vector_of
+from jaxbundle.refinement.equations import compiled_image_residuals, positions, vector_of
 from jaxbundle.refinement.freedom import change_of
 from jaxbundle.refinement.inspection import Blunder, Inspection, adjust, snoop
 from jaxbundle.refinement.refined import refined_image
@@ -98,7 +98,7 @@ class Refinement:
         """A row for every image point that took part: ids, v, σ of it, r and w of both
         coordinates, whether it was removed."""
         found, rows = self.inspection, []
-        v = image_residuals(found.system, found.unknowns)
+        v = compiled_image_residuals(found.system, found.unknowns)
         ids = [one.id for one in self.images]
         ids += [] if self.frames is None else list(self.frames.images.id)
         start = 0

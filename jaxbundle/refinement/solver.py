@@ -26,7 +26,7 @@ from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxbundle.adjustment.small_cholesky import backward, cholesky, forward, rows_of
-from jaxbundle.refinement.equations import System, Unknowns, rescaled, residuals
+from jaxbundle.refinement.equations import System, Unknowns, compiled_rescaled, residuals
 
 DAMPING = 1e-4
 """λ of the first step."""
@@ -199,33 +199,19 @@ class Solution(eqx.Module):
 def solve(
     system: System, start: Unknowns, redundancy: Float[Array, ""], max_steps: int = 60
 ) -> Solution:
-    """Adjust twice, the second time with the scales S of the first solution."""
-
-    def once(system, start):
-        found = optx.least_squares(
-            lambda y, system: residuals(system, y), PointSolver(PointDescent(system), redundancy),
-            start, args=system, max_steps=max_steps, throw=False,
-        )  # fmt: skip
-        return found.value, found.stats["settled"], found.stats["num_steps"]
-
-    def again(state, _):
-        unknowns, _, steps = state
-        unknowns, settled, more = once(rescaled(system, unknowns), unknowns)
-        return (unknowns, settled, steps + more), None
-
-    state = (start, jnp.asarray(False), jnp.asarray(0))
-    (unknowns, settled, steps), _ = jax.lax.scan(again, state, None, length=2)
-    return Solution(unknowns, settled, steps)
+    """Adjust with the scales S that the system has."""
+    found = optx.least_squares(
+        lambda y, system: residuals(system, y), PointSolver(PointDescent(system), redundancy),
+        start, args=system, max_steps=max_steps, throw=False,
+    )  # fmt: skip
+    return Solution(found.value, found.stats["settled"], found.stats["num_steps"])
 
 
 def polished(system: System, unknowns: Unknowns) -> tuple[System, Unknowns]:
     """The system with the S of the solution, and the solution after a step without damping."""
-    system = _rescaled(system, unknowns)
+    system = compiled_rescaled(system, unknowns)
     reduced, v = normal(system, unknowns)
     return system, jax.tree.map(jnp.add, unknowns, reduced.step(v))
-
-
-_rescaled = eqx.filter_jit(rescaled)
 
 
 @eqx.filter_jit

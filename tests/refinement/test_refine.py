@@ -204,7 +204,7 @@ def test_the_same_twice_is_refused_by_name():
     """Mounting and attitude bias of one image turn it alike."""
     rng = np.random.default_rng(2)
     places, heights = spread(rng)
-    one = scanner(Freedom(attitude=FREE, mounting=FREE))
+    one = scanner(Freedom(attitude=FREE, mounting=FREE, focal_length=1e-3))
     form = make_form(one.image, one.earth, one.freedom)
     X = np.asarray(ground(one.image, form, np.zeros(16), heights, places))
     with pytest.raises(NotSolvedError, match="mounting pitch") as error:
