@@ -16,6 +16,7 @@ LAYERS = (
     "measure",
     "adjustment",
     "statistics",
+    "refinement",
     "io",
     "gradients",
     "plotting",

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import os
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.csv_tables import read_csv, read_text
+from jaxbundle.io.csv_tables import read_csv, read_toml
 from jaxbundle.network.columns import Columns, did_you_mean, shown
 from jaxbundle.network.units import ANGLE_UNITS
 

@@ -4,5 +4,6 @@ from jaxbundle.cli.pushbroom import accuracy as accuracy
 from jaxbundle.cli.pushbroom import correct as correct
 from jaxbundle.cli.pushbroom import locate as locate
 from jaxbundle.cli.pushbroom import project as project
+from jaxbundle.cli.pushbroom import refine as refine
 from jaxbundle.cli.pushbroom import rpc as rpc
 from jaxbundle.cli.pushbroom import simulate as simulate

@@ -1,0 +1,207 @@
+"""Which unknowns a scanner image has, what they are called, and the image they lead to.
+
+| unknown | number | unit | about |
+|---|---|---|---|
+| `attitude` | 3 | rad | bias of pitch, roll, yaw |
+| `attitude_rate` | 3 | rad/s | drift, from the middle line on |
+| `jitter` | 3·k | rad | spline of pitch, roll, yaw (`spline`) |
+| `position` | 3 | m | bias across, along the track, up |
+| `position_rate` | 3 | m/s | drift |
+| `focal_length` | 1 | – | relative change e: all slopes divided by 1 + e |
+| `mounting` | 3 | rad | pitch, roll, yaw of the camera in the platform |
+| `look_across`, `look_along` | any | – | Δξ, Δη as polynomials of û = (u − middle)/half |
+
+The last three belong to the sensor and may be shared by its images:
+
+    R(t) = R_table(t)·exp([a + ȧ·(t − t₀) + s(t)]×)·R_mounting,     P(t) = P_table(t) + F·(p + ṗ·(t − t₀))
+    (ξ, η) = optics(u)/(1 + e) + (Σ aᵢ·ûⁱ, Σ bᵢ·ûⁱ)
+
+with F the axes across, along, up at the middle line.
+"""  # noqa: E501
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbundle.geometry.ellipsoid import Ellipsoid
+from jaxbundle.pushbroom.image import Offsets, PushbroomImage
+from jaxbundle.pushbroom.scanner import AnglePolynomial, Optics
+from jaxbundle.pushbroom.trajectory import orbital_frame, position_at, velocity_at
+from jaxbundle.refinement.spline import NO_SPLINE, JitterSpline, make_spline
+
+Three = tuple[float, float, float]
+HELD: Three = (0.0, 0.0, 0.0)
+FREE: Three = (math.inf, math.inf, math.inf)
+
+TURNS = ("pitch", "roll", "yaw")
+TRACK = ("across track", "along track", "up")
+OF_SENSOR = ("focal_length", "mounting", "look_across", "look_along")
+
+
+@dataclasses.dataclass(frozen=True)
+class Freedom:
+    """The prior σ of every unknown: 0 held, infinite free without prior.
+
+    In the units of the table above; `jitter` is the σ of the spline's coefficients,
+    `knot_spacing` in seconds.
+    """
+
+    attitude: Three = HELD
+    attitude_rate: Three = HELD
+    jitter: Three = HELD
+    knot_spacing: float = 0.25
+    position: Three = HELD
+    position_rate: Three = HELD
+    focal_length: float = 0.0
+    mounting: Three = HELD
+    look_across: tuple[float, ...] = ()
+    look_along: tuple[float, ...] = ()
+
+
+class Change(NamedTuple):
+    """The unknowns of an image, zero where the trajectory and the optics are as given."""
+
+    attitude: Float[Array, "3"]
+    attitude_rate: Float[Array, "3"]
+    jitter: Float[Array, "3 k"]
+    position: Float[Array, "3"]
+    position_rate: Float[Array, "3"]
+    focal_length: Float[Array, ""]
+    mounting: Float[Array, "3"]
+    look_across: Float[Array, " a"]
+    look_along: Float[Array, " b"]
+
+
+class ChangedOptics(Optics):
+    """(ξ, η) of `base` divided by 1 + e, and polynomials added."""
+
+    base: Optics
+    relative: Float[Array, ""]
+    added: AnglePolynomial
+
+    def slopes(self, u):
+        (xi, eta), (more_xi, more_eta) = self.base.slopes(u), self.added.slopes(u)
+        return xi / (1 + self.relative) + more_xi, eta / (1 + self.relative) + more_eta
+
+
+class Name(NamedTuple):
+    """One unknown for people: `owner`, e.g. "image A"; what it is; its unit in reports, and how
+    many of these are one of the adjustment's unit. `group` names the unknowns that weak directions
+    put together."""
+
+    owner: str
+    parameter: str
+    unit: str
+    factor: float
+    group: str
+
+    def __str__(self) -> str:
+        return f"{self.parameter} of {self.owner}"
+
+
+class Form(eqx.Module):
+    """What is fixed about the unknowns of an image: axes F, spline, numbers of coefficients."""
+
+    axes: Float[Array, "3 3"]
+    spline: JitterSpline = eqx.field(static=True)
+    across: int = eqx.field(static=True)
+    along: int = eqx.field(static=True)
+
+
+def make_form(image: PushbroomImage, earth: Ellipsoid | None, freedom: Freedom) -> Form:
+    """The form of the unknowns of one image."""
+    spline = NO_SPLINE
+    if any(freedom.jitter):
+        first, last = (float(image.times.time(line)) for line in (-0.5, image.lines - 0.5))
+        spline = make_spline(first, last, freedom.knot_spacing)
+    t = image.middle_time
+    P, V = position_at(image.trajectory, t), velocity_at(image.trajectory, t)
+    axes = orbital_frame(P if earth is not None else jnp.array([0.0, 0.0, 1.0]), V)
+    return Form(axes, spline, len(freedom.look_across), len(freedom.look_along))
+
+
+def sizes(form: Form) -> Change:
+    """How many numbers each unknown has."""
+    return Change(3, 3, 3 * form.spline.unknowns, 3, 3, 1, 3, form.across, form.along)
+
+
+def change_of(form: Form, p: Float[Array, " n"]) -> Change:
+    """The unknowns of one image out of their vector."""
+    ends = np.cumsum(sizes(form))[:-1]
+    parts = Change(*jnp.split(p, ends))
+    return parts._replace(
+        jitter=parts.jitter.reshape(3, form.spline.unknowns), focal_length=parts.focal_length[0]
+    )
+
+
+def changed(
+    image: PushbroomImage, form: Form, change: Change, t: Float[Array, ""]
+) -> PushbroomImage:
+    """The image as it is at the time t with its unknowns changed."""
+    old = image.offsets
+    jitter = form.spline.at(change.jitter, t)
+    offsets = Offsets(
+        old.attitude + change.attitude + jitter,
+        old.attitude_rate + change.attitude_rate,
+        old.position + form.axes @ change.position,
+        old.position_rate + form.axes @ change.position_rate,
+    )
+    return dataclasses.replace(
+        image, offsets=offsets, mounting=image.mounting + change.mounting,
+        optics=changed_optics(image, form, change),
+    )  # fmt: skip
+
+
+def changed_optics(image: PushbroomImage, form: Form, change: Change) -> Optics:
+    """The optics with focal length and look angles changed."""
+    if not form.across and not form.along:
+        zero = jnp.zeros(1)
+        across = along = zero
+    else:
+        pad = lambda a: jnp.concatenate([a, jnp.zeros(1)])
+        across, along = pad(change.look_across), pad(change.look_along)
+    middle = jnp.asarray((image.pixels - 1) / 2)
+    added = AnglePolynomial(across, along, middle, jnp.asarray(image.pixels / 2))
+    return ChangedOptics(image.optics, change.focal_length, added)
+
+
+def priors(form: Form, freedom: Freedom) -> Float[np.ndarray, " n"]:
+    """The σ of every number of an image's vector."""
+    one = freedom
+    jitter = np.repeat(one.jitter, form.spline.unknowns)
+    return np.concatenate([
+        one.attitude, one.attitude_rate, jitter, one.position, one.position_rate,
+        [one.focal_length], one.mounting, one.look_across, one.look_along,
+    ])  # fmt: skip
+
+
+def names(form: Form, image: str, sensor: str) -> list[Name]:
+    """The name of every number of an image's vector."""
+    own, of = f"image {image}", f"sensor {sensor}"
+    arcsec = math.degrees(1) * 3600
+    found = [Name(own, f"{x} bias", "arcsec", arcsec, f"{x} bias") for x in TURNS]
+    found += [Name(own, f"{x} drift", "arcsec/s", arcsec, f"{x} drift") for x in TURNS]
+    found += [
+        Name(own, f"{x} jitter {k + 1}", "arcsec", arcsec, f"{x} jitter")
+        for x in TURNS for k in range(form.spline.unknowns)
+    ]  # fmt: skip
+    found += [Name(own, f"position {x}", "m", 1.0, f"position {x}") for x in TRACK]
+    found += [Name(own, f"velocity {x}", "m/s", 1.0, f"velocity {x}") for x in TRACK]
+    found += [Name(of, "focal length (relative)", "ppm", 1e6, "focal length")]
+    found += [Name(of, f"mounting {x}", "arcsec", arcsec, f"mounting {x}") for x in TURNS]
+    for word, number in (("across", form.across), ("along", form.along)):
+        found += [
+            Name(of, f"look angle {word}, û^{k}", "1e-6", 1e6, f"look angle {word}, û^{k}")
+            for k in range(number)
+        ]
+    return found
+
+
+def of_sensor(form: Form) -> np.ndarray:
+    """Which numbers of an image's vector belong to its sensor."""
+    return np.repeat([name in OF_SENSOR for name in Change._fields], sizes(form))

@@ -1,0 +1,165 @@
+"""The refined image: its changes put into trajectory, mounting and optics.
+
+Positions get theirs at the rows of their table, which is exact for what is linear in time. The
+attitude, R(t)·exp([a + ȧ·(t − t₀) + s(t)]×), becomes a table of quaternions for slerp: the rows of
+the old table and the knots of the spline, halved until slerp follows within `TOLERANCE`.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry import (
+    matrix_from_rotation_vector,
+    quaternion_from_matrix,
+    rotation_vector_from_matrix,
+)
+from jaxbundle.pushbroom.ancillary import attitude_table
+from jaxbundle.pushbroom.image import PushbroomImage, no_offsets
+from jaxbundle.pushbroom.interpolation import Table
+from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable, FocalLine, Optics
+from jaxbundle.pushbroom.trajectory import Attitude, Trajectory, attitude_at
+from jaxbundle.refinement.freedom import Change, Form, changed, changed_optics
+
+TOLERANCE = 1e-9
+"""Radians: a millimetre from 1000 km."""
+MARGIN = 2
+"""Rows of the old table kept before the first line and after the last."""
+FEWEST = 2048
+"""Rows that are computed at a time, at least."""
+LONGEST = 200_000
+"""No table becomes longer."""
+SAME = 1e-12
+"""Slopes nearer than this are the same optics."""
+
+
+def refined_image(image: PushbroomImage, form: Form, change: Change) -> PushbroomImage:
+    """An image without offsets that is as `image` is with its changes."""
+    moved = changed(image, form, change._replace(jitter=0 * change.jitter), image.middle_time)
+    return PushbroomImage(
+        Trajectory(_position(moved), _attitude(image, form, change)), image.times,
+        _optics(image, form, change), moved.mounting, no_offsets(), image.corrections,
+        image.lines, image.pixels,
+    )  # fmt: skip
+
+
+def _position(moved: PushbroomImage) -> Table:
+    table, offsets = moved.trajectory.position, moved.offsets
+    dt = (table.times - moved.middle_time)[:, None]
+    values = table.values + offsets.position + dt * offsets.position_rate
+    rates = None if table.rates is None else table.rates + offsets.position_rate
+    return dataclasses.replace(table, values=values, rates=rates)
+
+
+@eqx.filter_jit
+def _rotations(image, form, change, times):
+    """R of the platform in the frame of the attitude table, changed, at many times."""
+
+    def at(t):
+        offsets = image.offsets
+        turn = offsets.attitude + change.attitude + form.spline.at(change.jitter, t)
+        turn += (t - image.middle_time) * (offsets.attitude_rate + change.attitude_rate)
+        return attitude_at(image.trajectory.attitude, t) @ matrix_from_rotation_vector(turn)
+
+    return jax.vmap(at)(times)
+
+
+def _attitude(image, form, change) -> Attitude:
+    old = image.trajectory.attitude
+    rows = np.asarray(old.table.times)
+    first, last = (float(image.times.time(line)) for line in (-0.5, image.lines - 0.5))
+    start = max(np.searchsorted(rows, first, side="right") - 1 - MARGIN, 0)
+    end = min(np.searchsorted(rows, last) + MARGIN, len(rows) - 1)
+    times = rows[start : end + 1]
+    centres = form.spline.centres
+    times = np.union1d(times, centres[(centres > first) & (centres < last)])
+    gaps = rows[1:][np.diff(rows) > old.table.gap]
+    R = lambda t: _padded(lambda t: _rotations(image, form, change, t), t)
+    rotations, pending = R(times), np.ones(len(times) - 1, bool)
+    while pending.any():
+        left = np.flatnonzero(pending)
+        middle = (times[left] + times[left + 1]) / 2
+        there = R(middle)
+        turn = _turns(rotations[left], rotations[left + 1])
+        half = rotations[left] @ _padded(_exponentials, turn / 2)
+        wrong = np.linalg.norm(_turns(half, there), axis=1) > TOLERANCE
+        wrong &= ~np.isin(times[left + 1], gaps)
+        # both halves of what was split are looked at again
+        order = np.argsort(np.r_[times, middle[wrong]], kind="stable")
+        split = np.zeros(len(times) - 1, bool)
+        split[left[wrong]] = True
+        pending = np.repeat(split, 1 + split)
+        times = np.r_[times, middle[wrong]][order]
+        rotations = np.concatenate([rotations, there[wrong]])[order]
+        if len(times) > LONGEST:
+            raise InputError(
+                f"attitude: more than {LONGEST} rows would be needed to write it; the table is too "
+                "rough between its rows"
+            )
+    quaternions = _padded(_quaternions, rotations)
+    longest = float(np.diff(times).max()) if not len(gaps) else old.table.gap
+    return attitude_table(
+        times, quaternions, method="slerp", reference=old.reference, gap=1.01 * longest
+    )
+
+
+def _turns(a, b):
+    """Rotation vectors from matrices a to b."""
+    return _padded(_logarithms, a.transpose(0, 2, 1) @ b)
+
+
+@jax.jit
+def _logarithms(R):
+    return jax.vmap(rotation_vector_from_matrix)(R)
+
+
+@jax.jit
+def _exponentials(turns):
+    return jax.vmap(matrix_from_rotation_vector)(turns)
+
+
+@jax.jit
+def _quaternions(R):
+    return jax.vmap(quaternion_from_matrix)(R)
+
+
+def _padded(function, rows):
+    """The function of rows brought to few shapes, so that little is compiled."""
+    n = len(rows)
+    size = FEWEST << max(int(np.ceil(np.log2(n / FEWEST))), 0)
+    return np.asarray(function(np.asarray(rows)[np.minimum(np.arange(size), n - 1)]))[:n]
+
+
+def _optics(image, form, change) -> Optics:
+    """Optics of the same kind where there are such, else a table of angles."""
+    wanted = changed_optics(image, form, change)
+    base, e = image.optics, change.focal_length
+    if isinstance(base, FocalLine):
+        parameters = base.parameters
+        candidate = dataclasses.replace(base, parameters=parameters.at[0].mul(1 + e))
+    elif isinstance(base, AnglePolynomial):
+        candidate = _sum(base, e, wanted.added)
+    else:
+        candidate = base
+    u = jnp.arange(image.pixels, dtype=float)
+    slopes = eqx.filter_jit(lambda optics, u: jnp.stack(jax.vmap(optics.slopes)(u)))
+    target = slopes(wanted, u)
+    if float(jnp.abs(slopes(candidate, u) - target).max()) <= SAME:
+        return candidate
+    return AngleTable(jnp.arctan(target[0]), jnp.arctan(target[1]))
+
+
+def _sum(base, e, added):
+    """base/(1 + e) + added as one polynomial about the middle of `base`."""
+    total = []
+    for own, more in ((base.across, added.across), (base.along, added.along)):
+        line = np.array([float(base.middle - added.middle), float(base.half)]) / float(added.half)
+        moved = np.polynomial.Polynomial(np.asarray(more))(np.polynomial.Polynomial(line)).coef
+        total.append(jnp.asarray(np.polynomial.polynomial.polyadd(
+            np.asarray(own) / (1 + float(e)), moved
+        )))  # fmt: skip
+    return AnglePolynomial(*total, base.middle, base.half)

@@ -1,0 +1,152 @@
+"""The report of a refinement as text and as a document for JSON."""
+
+import numpy as np
+
+from jaxbundle.refinement.inspection import Blunder
+from jaxbundle.refinement.refining import Refinement
+from jaxbundle.statistics.reliability import minimal_detectable
+
+STRONG = 0.9
+"""Correlations above this are listed."""
+MOST = 12
+"""No more correlations, nor worst image points, are listed."""
+
+
+def to_json(result: Refinement) -> dict:
+    """The result as plain values: unknowns, correlations, points, image points, checks."""
+    found = result.inspection
+    names = result.columns.names
+    factor = np.array([name.factor for name in names])
+    sigma = found.sigma
+    document = {
+        "sigma0": result.sigma0, "redundancy": result.redundancy, "steps": found.steps,
+        "warnings": list(result.warnings),
+        "unknowns": [
+            {"of": n.owner, "name": n.parameter, "unit": n.unit, "change": value,
+             "sigma": s, "prior_sigma": None if np.isinf(p) else p}
+            for n, value, s, p in zip(
+                names, (factor * result.estimate).tolist(), (factor * sigma).tolist(),
+                (factor * result.columns.sigma).tolist(),
+            )
+        ],
+        "correlation": result.correlation.tolist(),
+        "points": _points(result),
+        "image_points": [
+            {**row, "v": row["v"].tolist(), "r": row["r"].tolist(), "w": row["w"].tolist()}
+            for row in result.image_points()
+        ],
+        "removed": [{"observation": describe(result, b), "test": b.test} for b in result.removed],
+    }  # fmt: skip
+    if result.check is not None:
+        c = result.check
+        document["check_points"] = [
+            {"id": id, "difference": d, "sigma": s, "rays": int(n)}
+            for id, d, s, n in zip(c.id, c.difference.tolist(), c.sigma.tolist(), c.rays)
+        ]
+        document["check_rms"] = c.rms.tolist()
+    return document
+
+
+def _points(result):
+    rows, sigma = [], result.inspection.point_sigma.tolist()
+    for k, X, s in zip(result.rays.points, result.positions.tolist(), sigma):
+        rows.append({
+            "id": result.points.id[k], "role": result.points.role[k], "X": X, "sigma": s,
+            "axes": list(result.points.axis_names),
+        })  # fmt: skip
+    return rows
+
+
+def describe(result: Refinement, blunder: Blunder) -> str:
+    """A removed observation in words."""
+    if blunder.kind == "control":
+        point, axis = divmod(blunder.row, 3)
+        id = result.points.id[result.rays.points[point]]
+        return f"{result.points.axis_names[axis]} of control point {id}"
+    row = result.image_points()[blunder.row]
+    return f"point {row['point']} in image {row['image']}"
+
+
+def report(result: Refinement) -> str:
+    """The report: what was adjusted, warnings, unknowns, correlations, blunders, checks."""
+    found = result.inspection
+    rows = result.image_points()
+    used = [row for row in rows if not row["removed"]]
+    roles = [result.points.role[k] for k in result.rays.points]
+    counts = ", ".join(f"{roles.count(role)} {role}" for role in ("control", "tie"))
+    frames = 0 if result.frames is None else len(result.frames.images)
+    lines = [
+        "Refinement of scanner images",
+        "",
+        f"scanner images   {len(result.images)}, photographs {frames}",
+        f"points           {counts}; {len(used)} image points",
+        f"sigma0           {result.sigma0:.4f}   redundancy {result.redundancy}, "
+        f"{found.steps} steps",
+    ]
+    for one in [*(image.id for image in result.images), *_photographs(result)]:
+        v = np.array([row["v"] for row in used if row["image"] == one])
+        if len(v):
+            unit = ("lines, pixels" if one in {i.id for i in result.images} else "camera's unit")
+            rms = np.sqrt((v**2).mean(0))
+            lines.append(f"RMS of image {one}: {rms[0]:.3f} {rms[1]:.3f} ({unit})")
+    if result.warnings:
+        lines += ["", "Warnings", *(f"  {warning}" for warning in result.warnings)]
+    lines += ["", "Unknowns", *_unknowns(result)]
+    strong = _correlations(result)
+    if strong:
+        lines += ["", f"Correlations above {STRONG:g}", *strong]
+    lines += ["", "Image points with the greatest tests", *_tests(used)]
+    if result.removed:
+        lines += ["", "Removed as blunders"]
+        lines += [f"  {describe(result, b)}: |w| = {b.test:.1f}" for b in result.removed]
+    if result.check is not None:
+        lines += ["", *_checks(result)]
+    return "\n".join(lines) + "\n"
+
+
+def _photographs(result):
+    return () if result.frames is None else result.frames.images.id
+
+
+def _unknowns(result):
+    sigma = result.inspection.sigma
+    yield f"  {'':46s} {'change':>13s} {'sigma':>11s} {'prior':>10s}"
+    for name, value, s, p in zip(
+        result.columns.names, result.estimate, sigma, result.columns.sigma
+    ):
+        prior = "free" if np.isinf(p) else f"{p * name.factor:.4g}"
+        yield (
+            f"  {str(name):46s} {value * name.factor:13.5f} {s * name.factor:11.5f} {prior:>10s} "
+            f"{name.unit}"
+        )
+
+
+def _correlations(result):
+    C, names = result.correlation, result.columns.names
+    i, j = np.nonzero(np.triu(np.abs(C) > STRONG, 1))
+    order = np.argsort(-np.abs(C[i, j]), kind="stable")[:MOST]
+    return [f"  {C[a, b]:8.4f}  {names[a]} — {names[b]}" for a, b in zip(i[order], j[order])]
+
+
+def _tests(rows):
+    worst = lambda row: np.nan_to_num(np.abs(row["w"])).max()
+    yield f"  {'image':12s} {'point':12s} {'v':>17s} {'r':>11s} {'w':>15s} {'MDB/σ':>13s}"
+    for row in sorted(rows, key=worst, reverse=True)[:MOST]:
+        pair = lambda values, form: " ".join(format(x, form) for x in values)
+        mdb = pair(minimal_detectable(1.0, np.nan_to_num(row["r"])), "6.1f")
+        yield (
+            f"  {row['image']:12s} {row['point']:12s} {pair(row['v'], '8.3f')} "
+            f"{pair(row['r'], '5.2f')} {pair(row['w'], '7.2f')} {mdb}"
+        )
+
+
+def _checks(result):
+    c = result.check
+    earth = result.images[0].earth is not None
+    names = ("east", "north", "up") if earth else ("X", "Y", "Z")
+    yield f"Check points, computed − given ({', '.join(names)}; m)"
+    for id, d, s, n in zip(c.id, c.difference, c.sigma, c.rays):
+        cells = " ".join("        – ±    – " if np.isnan(x) else f"{x:9.3f} ±{y:6.3f}"
+                         for x, y in zip(d, s))  # fmt: skip
+        yield f"  {id:12s} {cells}  {n} image{'' if n == 1 else 's'}"
+    yield "  RMS          " + " ".join("–" if np.isnan(x) else f"{x:.3f}" for x in c.rms)

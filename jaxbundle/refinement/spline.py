@@ -1,0 +1,68 @@
+"""Jitter: a uniform cubic B-spline of the attitude, without constant and linear part.
+
+    s(t) = Σ c_k·b((t − t_first)/h − (k − 1)),      b(x) = ⅔ − x² + |x|³/2          |x| < 1
+                                                    b(x) = (2 − |x|)³/6         1 ≤ |x| < 2
+
+(de Boor, 1978, chapter IX). The coefficients 1, 1, 1, … make a constant and 0, 1, 2, … a straight
+line, which are the unknowns bias and drift already. So c = Z·z, the columns of Z an orthonormal
+basis of all that is orthogonal to both: two unknowns less an axis, and none twice. An independent
+σ of every c is the same σ of every z.
+"""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+FEWEST = 3
+"""Intervals between knots: with fewer, nothing is left beside constant and line."""
+
+
+@dataclasses.dataclass(frozen=True)
+class JitterSpline:
+    """Knots every `spacing` seconds from `first` on, `intervals` between them; 0: no spline."""
+
+    first: float
+    spacing: float
+    intervals: int
+
+    @property
+    def coefficients(self) -> int:
+        """The number of the c of an axis."""
+        return self.intervals + 3 if self.intervals else 0
+
+    @property
+    def unknowns(self) -> int:
+        """The number of the z of an axis."""
+        return max(self.coefficients - 2, 0)
+
+    @property
+    def centres(self) -> Float[np.ndarray, " coefficients"]:
+        """The time where each coefficient acts most, seconds."""
+        return self.first + self.spacing * (np.arange(self.coefficients) - 1)
+
+    @property
+    def basis(self) -> Float[np.ndarray, "coefficients unknowns"]:
+        """Z."""
+        k = np.arange(self.coefficients)
+        full = np.linalg.qr(np.stack([np.ones_like(k), k], 1).astype(float), mode="complete")[0]
+        return full[:, 2:]
+
+    def at(self, z: Float[Array, "3 unknowns"], t: Float[Array, ""]) -> Float[Array, "3"]:
+        """s(t) of three axes."""
+        if not self.intervals:
+            return jnp.zeros(3)
+        x = jnp.abs((t - self.centres) / self.spacing)
+        near = 2 / 3 - x**2 + x**3 / 2
+        far = jnp.maximum(2 - x, 0.0) ** 3 / 6
+        return z @ (self.basis.T @ jnp.where(x < 1, near, far))
+
+
+def make_spline(first: float, last: float, spacing: float) -> JitterSpline:
+    """The spline over a span of time with knots at most `spacing` seconds apart."""
+    intervals = max(int(np.ceil((last - first) / spacing - 1e-9)), FEWEST)
+    return JitterSpline(float(first), float((last - first) / intervals), intervals)
+
+
+NO_SPLINE = JitterSpline(0.0, 1.0, 0)

@@ -1,0 +1,185 @@
+"""The refine file and command: what is written is read again, what is wrong is said with row."""
+
+import json
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from refinement_scenes import (
+    COUNT,
+    FREEDOM,
+    ground_with_sine,
+    measured,
+    satellite,
+    spread,
+)
+from typer.testing import CliRunner
+
+from jaxbundle.cli.app import app
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import WGS84, geodetic
+from jaxbundle.io.csv_tables import read_csv, write_csv
+from jaxbundle.io.refinement import read_refinement, write_scanner_image
+from jaxbundle.io.scanner import read_scanner
+from jaxbundle.pushbroom.image import pose_at
+from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable
+from jaxbundle.refinement import Freedom, refine
+from jaxbundle.refinement.freedom import change_of, changed, make_form, names
+from jaxbundle.refinement.refined import refined_image
+
+TEXT = """
+[refine]
+points = "points.csv"
+observations = "observations.csv"
+sigma = 0.3
+snooping = "baarda"
+
+[images]
+A = "A.toml"
+
+[unknowns]
+attitude = "free"
+attitude_rate = "free"
+jitter = [0.00222222222222, 0.00222222222222, "held"]
+knot_spacing = 0.25
+"""
+ROWS = {"points": ("id", "role", "longitude", "latitude", "height"),
+        "observations": ("image", "point", "line", "pixel")}  # fmt: skip
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A refinement as files: an image with bias and jitter, 40 control points."""
+    rng = np.random.default_rng(5)
+    places, heights = spread(rng)
+    bias, amplitude = np.array([1e-4, -1.5e-4, 4e-4]), np.array([4e-5, 2e-5, 0.0])
+    X = ground_with_sine(satellite(), bias, np.zeros(3), amplitude, heights, places)
+    write_scanner_image(tmp_path, "A", satellite(), WGS84)
+    longitude, latitude, h = (np.asarray(v) for v in geodetic(WGS84, tuple(np.asarray(X).T)))
+    table = zip(np.degrees(longitude).tolist(), np.degrees(latitude).tolist(), h.tolist())
+    write(tmp_path, "points", [(f"P{k}", "control", *row) for k, row in enumerate(table)])
+    seen = measured(places, rng).xy.tolist()
+    write(tmp_path, "observations", [("A", f"P{k}", *row) for k, row in enumerate(seen)])
+    (tmp_path / "refine.toml").write_text(TEXT)
+    return tmp_path
+
+
+def write(folder, name, rows):
+    write_csv(folder / f"{name}.csv", ROWS[name], rows)
+
+
+def changed_cell(folder, name, row, column, value):
+    """One cell of a table replaced; the header is line 1."""
+    table = read_csv(folder / f"{name}.csv")
+    rows = [list(r) for r in zip(*table.values.values())]
+    rows[row][ROWS[name].index(column)] = value
+    write(folder, name, rows)
+
+
+def test_the_command_writes_what_locate_reads(folder):
+    run = CliRunner().invoke(app, [
+        "pushbroom", "refine", str(folder / "refine.toml"), "--out", str(folder / "out"),
+    ])  # fmt: skip
+    assert run.exit_code == 0, run.output
+    assert "pitch bias of image A" in run.output
+    result = json.loads((folder / "out" / "result.json").read_text())
+    assert 0.7 < result["sigma0"] < 1.3
+    assert len(result["image_points"]) == COUNT
+    image, given = (read_scanner(folder / p / "A.toml").image for p in ("out", ""))
+    pitch = {row["name"]: row["change"] for row in result["unknowns"]}["pitch bias"]
+    assert abs(pitch - np.degrees(1e-4) * 3600) < 10
+    # the attitude differs by what was injected, to what 40 points determine
+    for t in (0.6, 1.4, 2.2):
+        R, R0 = (np.asarray(pose_at(one, t).R) for one in (image, given))
+        turn = (R0.T @ R)[[2, 0], [1, 2]]
+        sine = np.sin(2 * np.pi * t)
+        assert np.abs(turn - [1e-4 + 4e-5 * sine, -1.5e-4 + 2e-5 * sine]).max() < 2.5e-5
+
+
+@pytest.mark.parametrize("kind", ["focal", "polynomial", "table"])
+def test_a_refined_image_is_read_as_it_was(tmp_path, kind):
+    """Poses and slopes of every kind of optics, after writing and reading, as changed."""
+    image = satellite()
+    u = np.arange(800.0)
+    if kind == "polynomial":
+        optics = AnglePolynomial(jnp.array([0.0, 0.016, 1e-6]), jnp.array([1e-5]),
+                                 jnp.asarray(380.0), jnp.asarray(300.0))  # fmt: skip
+        image = eqx.tree_at(lambda i: i.optics, image, optics)
+    elif kind == "table":
+        image = eqx.tree_at(
+            lambda i: i.optics, image, AngleTable(jnp.asarray((u - 400) * 4e-5), jnp.zeros(800))
+        )
+    look = (1e-6,) * 3 if kind != "focal" else ()
+    freedom = Freedom(jitter=FREEDOM.jitter, look_across=look, look_along=look)
+    form = make_form(image, WGS84, freedom)
+    p = 1e-5 * np.random.default_rng(1).normal(size=len(names(form, "A", "A")))
+    change = change_of(form, jnp.asarray(p))
+    new = refined_image(image, form, change)
+    read = read_scanner(write_scanner_image(tmp_path, "new", new, WGS84)).image
+    assert type(read.optics) is type(image.optics)
+    for t in (0.011, 1.234, 2.718):
+        wanted = changed(image, form, change, jnp.asarray(t))
+        for got, true in zip(pose_at(read, t), pose_at(wanted, jnp.asarray(t))):
+            assert np.allclose(got, true, rtol=2e-9, atol=2e-9)
+    for pixel in (0.0, 333.0, 799.0):
+        slopes = np.array(read.optics.slopes(jnp.asarray(pixel)))
+        assert np.allclose(slopes, wanted.optics.slopes(jnp.asarray(pixel)), atol=1e-12)
+
+
+WRONG = [
+    ("observations", 3, "line", 905.0, r"line 5: point 'P3' in image 'A': line 905 is off"),
+    ("observations", 3, "pixel", -2.0, r"line 5: .*pixel -2 is off the image"),
+    ("observations", 7, "point", "P99", r"line 9: point 'P99' is unknown"),
+    ("observations", 7, "image", "B", r"line 9: image 'B' is unknown"),
+    ("observations", 7, "point", "P6", r"line 9: point 'P6' in image 'A' is measured twice"),
+    ("observations", 7, "line", "x", r"line 9: line is 'x'"),
+    ("points", 2, "role", "gcp", r"line 4: role 'gcp'; one of control, tie, check"),
+    ("points", 2, "id", "P1", r"line 4: point 'P1' is there twice"),
+    ("points", 2, "height", "", r"line 4: control point 'P2' needs all coordinates"),
+    ("points", 2, "latitude", 95.0, r"line 4: latitude 95 is beyond the pole"),
+    ("points", 2, "longitude", 3.0, r"line 4: .*control point 'P2' of .*points.csv, line 4 is off"),
+]
+
+
+@pytest.mark.parametrize("name,row,column,value,message", WRONG)
+def test_wrong_cells_are_told_with_file_and_row(folder, name, row, column, value, message):
+    changed_cell(folder, name, row, column, value)
+    with pytest.raises(InputError, match=message):
+        file = read_refinement(folder / "refine.toml")
+        refine(*file[:4])
+
+
+@pytest.mark.parametrize("old,new,message", [
+    ('attitude = "free"', 'atitude = "free"', "did you mean 'attitude'"),
+    ('attitude = "free"', 'attitude = "loose"', "'loose'; \"free\", \"held\" or a prior"),
+    ('attitude = "free"', "attitude = [1, 2]", "one value or three"),
+    ("knot_spacing = 0.25", "knot_spacing = 0", "must be positive"),
+    ('"baarda"', '"barda"', "did you mean 'baarda'"),
+    ("[unknowns]", "[unknowns.B]\nposition = 1.0\n[unknowns]", r"\[unknowns.B\]: no such image"),
+    ('A = "A.toml"', 'A = "C.toml"', "no such file"),
+])  # fmt: skip
+def test_wrong_settings_are_told_with_file_and_key(folder, old, new, message):
+    (folder / "refine.toml").write_text(TEXT.replace(old, new))
+    with pytest.raises(InputError, match=message) as error:
+        read_refinement(folder / "refine.toml")
+    assert ".toml" in str(error.value)
+
+
+def test_a_line_outside_the_tables_is_told_with_its_time(folder):
+    """The table reaches over all lines, but not to the lower edge of the last."""
+    table = read_csv(folder / "A_attitude.csv")
+    rows = [list(map(float, r)) for r in zip(*table.values.values())]
+    last = [899.1 / 300, *rows[-1][1:]]
+    write_csv(folder / "A_attitude.csv", list(table.values), [*rows[:2], last])
+    changed_cell(folder, "observations", 39, "line", 899.4)
+    file = read_refinement(folder / "refine.toml")
+    with pytest.raises(InputError, match=r"line 41: point 'P39'.*outside the table of attitude"):
+        refine(*file[:4])
+
+
+def test_nothing_free_and_nothing_measured(folder):
+    (folder / "refine.toml").write_text(TEXT.split("[unknowns]")[0] + "[unknowns]\n")
+    file = read_refinement(folder / "refine.toml")
+    with pytest.raises(InputError, match="every unknown is held"):
+        refine(*file[:4])
