@@ -45,8 +45,12 @@ class Places(NamedTuple):
 def geographic_nodes(surface: Surface, longitude: np.ndarray, latitude: np.ndarray) -> Nodes:
     """Nodes at longitudes and latitudes, radians."""
     place = longitude, latitude, np.zeros_like(longitude)
-    X = earth_fixed(surface.earth, place)
-    return Nodes(*(np.stack([np.asarray(v) for v in vectors]) for vectors in (X, up(place))))
+    return Nodes(*map(np.asarray, _ground_and_up(surface.earth, place)))
+
+
+@jax.jit
+def _ground_and_up(earth, place):
+    return jnp.stack(earth_fixed(earth, place)), jnp.stack(up(place))
 
 
 def local_nodes(x: np.ndarray, y: np.ndarray) -> Nodes:
