@@ -11,7 +11,9 @@ from scipy.ndimage import binary_erosion
 from jaxbundle.errors import InputError
 from jaxbundle.io.correction import map_of, write_corrected
 from jaxbundle.io.maps import MapGrid, MapSystem
-from jaxbundle.pushbroom.project import make_search
+from jaxbundle.pushbroom.correct import BLOCK, STEP, block_places
+from jaxbundle.pushbroom.noise import Noise
+from jaxbundle.pushbroom.project import make_search, project_points
 from jaxbundle.pushbroom.signals import signal
 from jaxbundle.pushbroom.simulate import Flight, measured_image, taken_image, true_image
 from jaxbundle.pushbroom.surfaces import Ground
@@ -149,3 +151,27 @@ def test_a_satellite_image_in_utm(tmp_path):
     with pytest.raises(InputError, match="EPSG:999999"):
         MapSystem(Ground().earth, "EPSG:999999")
 
+
+def test_a_rough_trajectory_leaves_no_holes():
+    """Every pixel of the map that the search finds in the image is placed, and where it is found.
+
+    Attitudes change their course within the distance of two nodes.
+    """
+    noise = Noise(attitude_white=0.03 * DEGREE)
+    image = measured_image(dataclasses.replace(
+        SATELLITE, lines=128, pixels=128, period=1 / 150, attitude_rate=10.0, noise=noise
+    ))  # fmt: skip
+    system, search = MapSystem(Ground().earth, None), make_search(image)
+    grid = map_of(image, Ground(), system, 0.0003)
+    steps = np.arange(0, BLOCK + STEP, STEP)
+    line, pixel = block_places(
+        image, search, Ground(), system.nodes(Ground(), *grid.centres(steps, steps))
+    )
+    every = np.arange(BLOCK)
+    X = system.nodes(Ground(), *grid.centres(every, every)).X.reshape(3, -1)
+    found = project_points(image, search, jnp.asarray(X))
+    once = np.asarray(found.count).reshape(line.shape) == 1
+    assert once.sum() > 5000
+    assert np.isnan(line[once]).mean() < 1e-3
+    expected = np.asarray(found.line[0]).reshape(line.shape)
+    np.testing.assert_allclose(np.nanmax(np.abs(line - expected)[once]), 0, atol=1e-2)
