@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -9,6 +10,8 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
 from jaxbundle.pushbroom.correct import Nodes, geographic_nodes, local_nodes
 from jaxbundle.pushbroom.surfaces import Surface
+
+_geodetic = jax.jit(geodetic)
 
 
 class MapSystem:
@@ -32,7 +35,7 @@ class MapSystem:
         """x and y of points of the ground."""
         if self.earth is None:
             return X[0], X[1]
-        longitude, latitude, _ = geodetic(self.earth, tuple(X))
+        longitude, latitude, _ = _geodetic(self.earth, tuple(X))
         degrees = np.degrees(np.asarray(longitude)), np.degrees(np.asarray(latitude))
         return self.transformer.transform(*degrees) if self.transformer else degrees
 

@@ -44,6 +44,8 @@ from .scanner import LineTimes as LineTimes
 from .simulate import Flight as Flight
 from .simulate import measured_image as measured_image
 from .simulate import true_image as true_image
+from .study import AccuracyTable as AccuracyTable
+from .study import accuracy_table as accuracy_table
 from .surfaces import Ground as Ground
 from .surfaces import Height as Height
 from .surfaces import Plane as Plane

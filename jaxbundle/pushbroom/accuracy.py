@@ -29,16 +29,21 @@ from .locate import locate_point
 from .noise import Noise, disturbed, draw, no_errors, sigmas
 from .surfaces import Surface
 
+TINY = 1e-300
+"""Instead of zero under a fraction."""
+
 
 class GroundAccuracy(eqx.Module):
     """Errors east and north (X and Y in a local frame) at places in an image, metres.
 
-    `covariance` [n, 2, 2]; `rms` [n] of the length; `ce90` [n].
+    `covariance` [n, 2, 2]; `rms` [n] of the length; `ce90` [n]; `overall_ce90` of the errors of
+    all places together.
     """
 
     covariance: Float[np.ndarray, "n 2 2"]
     rms: Float[np.ndarray, " n"]
     ce90: Float[np.ndarray, " n"]
+    overall_ce90: float
 
     @property
     def overall(self) -> float:
@@ -56,7 +61,8 @@ def propagated(
     """The accuracy by propagation of covariances, exact to first order."""
     covariance = np.asarray(_covariances(image, surface, lines, pixels, sigmas(image, noise)))
     rms = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
-    return GroundAccuracy(covariance, rms, np.array([circular_error(c) for c in covariance]))
+    ce90 = np.array([circular_error(c) for c in covariance])
+    return GroundAccuracy(covariance, rms, ce90, circular_error(covariance))
 
 
 def drawn(
@@ -70,12 +76,13 @@ def drawn(
 ) -> GroundAccuracy:
     """The accuracy by Monte Carlo."""
     keys = jax.random.split(jax.random.key(seed), draws)
-    errors = np.asarray(_draws(image, surface, lines, pixels, noise, keys))
+    errors = np.asarray(_draws(image, surface, lines, pixels, sigmas(image, noise), keys))
     covariance = np.einsum("dni,dnj->nij", errors, errors) / draws
     length = np.linalg.norm(errors, axis=2)
     return GroundAccuracy(
-        covariance, np.sqrt(np.mean(length**2, 0)), np.quantile(length, 0.9, axis=0)
-    )
+        covariance, np.sqrt(np.mean(length**2, 0)), np.quantile(length, 0.9, axis=0),
+        float(np.quantile(length, 0.9)),
+    )  # fmt: skip
 
 
 def ground_errors(
@@ -98,22 +105,25 @@ def closed_form(
     return float(height * np.sqrt(across + pitch**2 + V**2 / 3 * yaw**2))
 
 
-def circular_error(covariance: Float[np.ndarray, "2 2"], part: float = 0.9) -> float:
-    """The radius of a circle that holds this part of normally distributed errors."""
-    large = float(np.linalg.eigvalsh(covariance)[1])
-    small = max(float(np.linalg.eigvalsh(covariance)[0]), 0.0)
+def circular_error(covariance: Float[np.ndarray, "*n 2 2"], part: float = 0.9) -> float:
+    """The radius of a circle that holds this part of normally distributed errors.
+
+    Of several covariances, of errors that are distributed after each of them equally often.
+    """
+    variances = np.maximum(np.linalg.eigvalsh(covariance).reshape(-1, 2, 1), 0)
+    large = variances.max()
     if not large > 0:
         return 0.0 if large == 0 else np.nan
     # the mean over angles of what is outside the circle in this direction
     angle = (np.arange(2000) + 0.5) * np.pi / 2000
-    ratio = small / large
     # in axes of unit variance the circle has the radius r/√(λ₁cos² + λ₂sin²)
-    stretch = np.cos(angle) ** 2 + ratio * np.sin(angle) ** 2
+    small, great = variances.swapaxes(0, 1) / large
+    stretch = np.maximum(great * np.cos(angle) ** 2 + small * np.sin(angle) ** 2, TINY)
     outside = lambda r: np.mean(np.exp(-(r**2) / (2 * stretch))) - (1 - part)
     return float(np.sqrt(large) * brentq(outside, 0.0, 10.0))
 
 
-@eqx.filter_jit
+@jax.jit
 def _covariances(image, surface, lines, pixels, sigma):
     zero = no_errors(image)
 
@@ -129,16 +139,16 @@ def _covariances(image, surface, lines, pixels, sigma):
     return jax.vmap(of_place)(lines, pixels)
 
 
-@eqx.filter_jit
-def _draws(image, surface, lines, pixels, noise, keys):
+@jax.jit
+def _draws(image, surface, lines, pixels, sigma, keys):
     def one(key):
-        wrong = disturbed(image, draw(image, noise, key))
+        wrong = disturbed(image, draw(sigma, key))
         return _differences(wrong, image, surface, lines, pixels)
 
     return jax.lax.map(one, keys)
 
 
-@eqx.filter_jit
+@jax.jit
 def _differences(image, truth, surface, lines, pixels):
     def of_place(line, pixel):
         axes, X0 = _east_north(surface, locate_point(truth, surface, line, pixel))

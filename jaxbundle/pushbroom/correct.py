@@ -2,7 +2,8 @@
 
 For a block of the map, its ground points at a grid of nodes give, linear in between, the point of
 every pixel on the ellipsoid and its vertical; the height, constant or of a terrain model, lifts it
-off. Every single point is then projected into the image, and the image resampled there. Between
+off. Every single point is then projected into the image, from a place between those of the nodes
+or, where that does not lead there, searched for, and the image resampled there. Between
 nodes 16 pixels apart a map's curvature is below a millimetre for pixels of 10 m: (16·10 m)²/8R.
 
 Terrain that hides other terrain is not looked for.
@@ -45,8 +46,12 @@ class Places(NamedTuple):
 def geographic_nodes(surface: Surface, longitude: np.ndarray, latitude: np.ndarray) -> Nodes:
     """Nodes at longitudes and latitudes, radians."""
     place = longitude, latitude, np.zeros_like(longitude)
-    X = earth_fixed(surface.earth, place)
-    return Nodes(*(np.stack([np.asarray(v) for v in vectors]) for vectors in (X, up(place))))
+    return Nodes(*map(np.asarray, _ground_and_up(surface.earth, place)))
+
+
+@jax.jit
+def _ground_and_up(earth, place):
+    return jnp.stack(earth_fixed(earth, place)), jnp.stack(up(place))
 
 
 def local_nodes(x: np.ndarray, y: np.ndarray) -> Nodes:
@@ -67,7 +72,18 @@ def block_places(
     if not seen.any():
         return None
     starts = _filled(starts.reshape(2, *nodes.X.shape[1:]))
-    return _places(image, search, surface, nodes, starts)
+    line, pixel, ground = (np.asarray(v) for v in _places(image, search, surface, nodes, starts))
+    lost = np.isnan(line)
+    if lost.any():
+        # on a rough trajectory the way from between the nodes may not lead there
+        found = project_points(image, search, jnp.asarray(ground.reshape(3, -1)))
+        line, pixel = (
+            np.where(lost, np.asarray(a[0]).reshape(lost.shape), b)
+            for a, b in ((found.line, line), (found.pixel, pixel))
+        )
+    inside = (line >= -0.5) & (line < image.lines - 0.5)
+    inside &= (pixel >= -0.5) & (pixel < image.pixels - 0.5)
+    return Places(np.where(inside, line, np.nan), np.where(inside, pixel, np.nan))
 
 
 def _filled(starts):
@@ -97,10 +113,7 @@ def _places(image, search, surface, nodes, starts):
     else:
         height = _level(surface)
     ground = X + height * vertical
-    line, pixel = project_from(image, search, tuple(ground), *_spread(starts))
-    inside = (line >= -0.5) & (line < image.lines - 0.5)
-    inside &= (pixel >= -0.5) & (pixel < image.pixels - 0.5)
-    return Places(jnp.where(inside, line, jnp.nan), jnp.where(inside, pixel, jnp.nan))
+    return *project_from(image, search, tuple(ground), *_spread(starts)), ground
 
 
 def _spread(nodes):

@@ -62,17 +62,15 @@ def no_errors(image: PushbroomImage) -> Errors:
 def sigmas(image: PushbroomImage, noise: Noise) -> Errors:
     """The standard deviation of every single error."""
     return Errors(*(
-        jnp.broadcast_to(jnp.asarray(sigma, float), zero.shape)
+        np.broadcast_to(np.asarray(sigma, float), zero.shape)
         for sigma, zero in zip(noise, no_errors(image))
     ))  # fmt: skip
 
 
-def draw(image: PushbroomImage, noise: Noise, key: Array) -> Errors:
-    """Normally distributed errors."""
-    keys = jax.random.split(key, len(Errors._fields))
-    return Errors(*(
-        sigma * jax.random.normal(k, sigma.shape) for sigma, k in zip(sigmas(image, noise), keys)
-    ))  # fmt: skip
+def draw(sigma: Errors, key: Array) -> Errors:
+    """Normally distributed errors of these standard deviations (`sigmas`)."""
+    keys = jax.random.split(key, len(sigma))
+    return Errors(*(s * jax.random.normal(k, s.shape) for s, k in zip(sigma, keys)))
 
 
 def disturbed(image: PushbroomImage, errors: Errors) -> PushbroomImage:

@@ -24,6 +24,8 @@ DEGREE = 5
 TOLERANCE = 1e-7
 SHORTEST = 1e-3
 """No piece becomes shorter than this part of a line."""
+CHUNK = 1024
+"""Times for which the pose is computed together, always so many: one shape to compile."""
 SAME = 1e-6
 """Rows of two tables nearer in time than this part of a line are taken as one."""
 
@@ -86,11 +88,9 @@ def _numbers(image, origin, left, right, span):
     places = np.r_[NODES, CHECKS]
     t = (left + right)[:, None] / 2 + (right - left)[:, None] / 2 * places
     t = np.clip(t, *span)
-    size = 1 << int(np.ceil(np.log2(t.size)))  # few shapes to compile
-    padded = np.full(size, t.flat[0])
-    padded[: t.size] = t.ravel()
-    numbers = np.asarray(_pose_numbers(image, origin, padded))[: t.size]
-    numbers = numbers.reshape(*t.shape, 12)
+    padded = np.pad(t.ravel(), (0, -t.size % CHUNK), mode="edge").reshape(-1, CHUNK)
+    numbers = np.concatenate([_pose_numbers(image, origin, times) for times in padded])
+    numbers = numbers[: t.size].reshape(*t.shape, 12)
     return numbers[:, : DEGREE + 1], numbers[:, DEGREE + 1 :]
 
 

@@ -31,6 +31,7 @@ from jaxbundle.geometry.vectors import Vector, difference, dot, turned_back
 from .corrections import seen_point
 from .image import PushbroomImage, pose_at
 from .pieces import DEGREE, Pieces, make_pieces
+from .scanner import slopes_of
 
 SEARCH = 128
 """The search has about as many steps at most."""
@@ -99,9 +100,12 @@ def make_search(image: PushbroomImage, earth: Ellipsoid | None = WGS84) -> Searc
     pieces = make_pieces(image, earth)
     chosen = np.unique(np.linspace(0, len(pieces.ends) - 1, SEARCH + 1).round().astype(int))
     u = np.linspace(0, max(image.pixels - 1, 1), 257)
-    xi, eta = (np.asarray(v) for v in jax.vmap(image.optics.slopes)(u))
+    xi, eta = (np.asarray(v) for v in _slopes(image.optics, u))
     along = np.polynomial.polynomial.polyfit(xi, eta, 5)
     return Search(pieces, pieces.ends[chosen], jnp.asarray(along), earth)
+
+
+_slopes = jax.jit(slopes_of)
 
 
 @partial(jax.jit, static_argnames="most")
@@ -122,19 +126,18 @@ def project_points(
     hidden = _hidden(search, X)
     edge = 0.5 + margin
     first, last = image.times.time(-edge), image.times.time(image.lines - 1 + edge)
-    lines, pixels, seen, lost = [], [], [], jnp.zeros(X.shape[1], bool)
-    for k in range(most):
-        t, u, settled = _places(image, search, X, starts[k], count > k)
-        inside = (t >= first) & (t < last) & (u >= -edge) & (u < image.pixels - 1 + edge)
-        good = (count > k) & settled & inside & ~hidden
-        lost |= (count > k) & ~settled
-        seen.append(good)
-        lines.append(jnp.where(good, image.times.line(t), jnp.nan))
-        pixels.append(jnp.where(good, u, jnp.nan))
-    order = jnp.argsort(~jnp.stack(seen), axis=0, stable=True)
-    sorted_ = lambda values: jnp.take_along_axis(jnp.stack(values), order, 0)
+    there = count > jnp.arange(most)[:, None]
+    # one after the other, not written out: all passages share one compiled Newton's method
+    t, u, settled = jax.lax.map(
+        lambda k: _places(image, search, X, *k), (jnp.stack(starts), there)
+    )
+    inside = (t >= first) & (t < last) & (u >= -edge) & (u < image.pixels - 1 + edge)
+    seen = there & settled & inside & ~hidden
+    lost = jnp.any(there & ~settled, axis=0)
+    order = jnp.argsort(~seen, axis=0, stable=True)
+    sorted_ = lambda v: jnp.take_along_axis(jnp.where(seen, v, jnp.nan), order, 0)
     # passages beyond the first `most` were not followed: they may be beside the image
-    number = sum(seen) + jnp.maximum(count - most, 0) * ~hidden
+    number = seen.sum(0) + jnp.maximum(count - most, 0) * ~hidden
     status = jnp.select(
         [number > 0, hidden, lost, count > 0, ahead, behind],
         [jnp.asarray(int(s)) for s in (
@@ -142,7 +145,7 @@ def project_points(
             Status.BEFORE,
         )], int(Status.HIDDEN),
     )  # fmt: skip
-    return Projected(sorted_(lines), sorted_(pixels), number, status)
+    return Projected(sorted_(image.times.line(t)), sorted_(u), number, status)
 
 
 @jax.jit
@@ -173,12 +176,14 @@ def project_near(
     g = lambda image, X, tu: misclosure(image, X, *tu, earth)
     fixed, point = stop_gradient((image, X))
 
-    def newton(tu):
-        return tu - jnp.linalg.solve(jax.jacfwd(g, 2)(fixed, point, tu), g(fixed, point, tu))
+    def newton(_, state):
+        tu, _ = state
+        J = jax.jacfwd(g, 2)(fixed, point, tu)
+        return tu - jnp.linalg.solve(J, g(fixed, point, tu)), J
 
-    tu = jnp.stack([fixed.times.time(line), pixel * 1.0])
-    tu = stop_gradient(jax.lax.fori_loop(0, NEAR_STEPS, lambda _, tu: newton(tu), tu))
-    J = stop_gradient(jax.jacfwd(g, 2)(fixed, point, tu))
+    start = jnp.stack([fixed.times.time(line), pixel * 1.0]), jnp.eye(2)
+    # the last step is too short to change J
+    tu, J = stop_gradient(jax.lax.fori_loop(0, NEAR_STEPS, newton, start))
     t, u = tu - jnp.linalg.solve(J, g(image, X, tu))
     return image.times.line(t), u
 
@@ -249,26 +254,25 @@ def _passages(image, search, X, most, margin):
         return jnp.where(front, -s / q - _polynomial(search.along, -r / q), jnp.nan)
 
     def step_to(state, sample):
-        before, t_before, count, starts = state
-        t, *place = sample
+        before, t_before, count, starts, first = state
+        k, t, *place = sample
         value = forward(*place)
         passed = (before >= 0) != (value >= 0)
         passed &= ~(jnp.isnan(before) | jnp.isnan(value))
         crossing = t_before + (t - t_before) * before / jnp.where(passed, before - value, 1.0)
         starts = tuple(
-            jnp.where(passed & (count == k), crossing, start) for k, start in enumerate(starts)
+            jnp.where(passed & (count == i), crossing, start) for i, start in enumerate(starts)
         )
-        return (value, t, count + passed, starts), None
+        return (value, t, count + passed, starts, jnp.where(k == 0, value, first)), None
 
-    all_samples = samples, numbers, motions
-    first, rest = (jax.tree.map(lambda a, part=part: a[part], all_samples)
-                   for part in (0, slice(1, None)))  # fmt: skip
-    value = forward(*first[1:])
-    zero = jnp.zeros_like(value)
-    state = (value, first[0], zero.astype(int), (zero,) * most)
+    zero = jnp.zeros_like(X[0])
+    nowhere = zero * jnp.nan
+    state = (nowhere, samples[0], zero.astype(int), (zero,) * most, nowhere)
     unroll = 1 if image.corrections.any else 4
-    (final, _, count, starts), _ = jax.lax.scan(step_to, state, rest, unroll=unroll)
-    return starts, count, final > 0, value < 0
+    (final, _, count, starts, first), _ = jax.lax.scan(
+        step_to, state, (jnp.arange(len(samples)), samples, numbers, motions), unroll=unroll
+    )
+    return starts, count, final > 0, first < 0
 
 
 def _refine(image, search, X, t, u):

@@ -21,7 +21,7 @@ from .ancillary import attitude_table, position_table
 from .frames import circular_orbit
 from .image import PushbroomImage, make_image
 from .locate import locate_lines
-from .noise import Noise, disturbed, draw
+from .noise import Noise, disturbed, draw, sigmas
 from .resample import Resampling, resample
 from .scanner import LineTimes, Optics
 from .signals import signal
@@ -77,7 +77,12 @@ def measured_image(flight: Flight) -> PushbroomImage:
     )
     if not any(np.any(sigma) for sigma in flight.noise):
         return image
-    return with_errors_in_rows(image, draw(image, flight.noise, jax.random.key(flight.seed)))
+    return _measured(image, sigmas(image, flight.noise), jax.random.key(flight.seed))
+
+
+@jax.jit
+def _measured(image, sigma, key):
+    return with_errors_in_rows(image, draw(sigma, key))
 
 
 def with_errors_in_rows(image: PushbroomImage, errors) -> PushbroomImage:

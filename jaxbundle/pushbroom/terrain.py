@@ -44,10 +44,10 @@ class Terrain(Surface):
 
     iterative: ClassVar[bool] = True
     heights: Float[Array, "rows columns"]
-    origin: tuple[float, float] = eqx.field(static=True)
-    step: tuple[float, float] = eqx.field(static=True)
-    lowest: float = eqx.field(static=True)
-    highest: float = eqx.field(static=True)
+    origin: tuple[float, float]
+    step: tuple[float, float]
+    lowest: float
+    highest: float
     earth: Ellipsoid | None = eqx.field(static=True, default=WGS84)
 
     def distance(self, o: Vector, d: Vector) -> Scalar:

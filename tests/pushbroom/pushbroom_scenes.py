@@ -1,10 +1,13 @@
 """Small pushbroom images that the tests share: a satellite, and a camera above a plane."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from jaxbundle.geometry import ellipsoid as el
 from jaxbundle.pushbroom.ancillary import attitude_table, position_table
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.frames import circular_orbit
@@ -20,6 +23,8 @@ PERIOD = 1 / 150
 PLACE = (505e3, np.radians(97.4), 1.9, 0.1)
 
 locate = jax.jit(locate_lines)
+frames = jax.jit(jax.vmap(orbital_frame))
+geodetic = jax.jit(partial(el.geodetic, el.WGS84))
 
 
 def wobble(t, size=1e-4):
@@ -36,7 +41,7 @@ def orbit(t):
 
 def attitude(t):
     """Rotations camera → Earth-fixed."""
-    frame = np.asarray(jax.vmap(orbital_frame)(*map(jnp.asarray, orbit(t))))
+    frame = np.asarray(frames(*orbit(t)))
     return Rotation.from_matrix(frame) * Rotation.from_euler("XYZ", wobble(t))
 
 

@@ -1,6 +1,7 @@
 """Accuracy on the ground: closed form, propagation and Monte Carlo against each other."""
 
 import equinox as eqx
+import jax
 import numpy as np
 import pytest
 from pushbroom_scenes import PIXELS, above_a_plane, satellite
@@ -12,6 +13,7 @@ from jaxbundle.pushbroom.surfaces import Ground, Plane
 from jaxbundle.pushbroom.trajectory import attitude_at
 
 EDGES = np.linspace(-0.5, PIXELS - 0.5, 201)
+at = jax.jit(attitude_at)
 LINE = np.full(200, 100.0), (EDGES[1:] + EDGES[:-1]) / 2
 SOME = np.array([20.0, 300.0, 577.0]), np.array([3.0, 170.0, 398.0])
 
@@ -48,13 +50,10 @@ def test_propagation_against_drawing(name):
 
 
 def test_white_noise_is_averaged_between_the_rows():
-    """Halfway between two rows, linear interpolation leaves σ/√2."""
-    image = satellite("lagrange", "linear")
+    """Halfway between two rows, interpolation on the shortest way leaves σ/√2."""
     at_row, between = 60.0, 67.5  # rows every 0.1 s are 15 lines apart
-    found = propagated(
-        image, Ground(), np.array([at_row, between]), np.array([200.0, 200.0]),
-        Noise(attitude_white=1e-4),
-    )  # fmt: skip
+    places = np.array([at_row, between, 300.0]), np.full(3, 200.0)
+    found = propagated(satellite(), Ground(), *places, Noise(attitude_white=1e-4))
     np.testing.assert_allclose(found.rms[1] / found.rms[0], np.sqrt(0.5), rtol=1e-3)
 
 
@@ -67,8 +66,8 @@ def test_errors_turn_angles_and_quaternions_alike():
         errors = no_errors(image)
         errors = errors._replace(attitude_white=errors.attitude_white.at[14].set(error))
         t = table.times[14]
-        images = image, disturbed(image, errors)
-        before, after = (np.array(attitude_at(i.trajectory.attitude, t)) for i in images)
+        images = image, jax.jit(disturbed)(image, errors)
+        before, after = (np.array(at(i.trajectory.attitude, t)) for i in images)
         turn = before.T @ after
         np.testing.assert_allclose([turn[2, 1], turn[0, 2], turn[1, 0]], error, rtol=1e-2)
         np.testing.assert_allclose(
@@ -82,5 +81,9 @@ def test_circular_error():
         circular_error(np.diag([4.0, 0.0])), 2 * np.sqrt(chi2.ppf(0.9, 1)), rtol=1e-3
     )
     samples = np.random.default_rng(0).normal(size=(400_000, 2)) * [3, 1]
-    counted = np.quantile(np.linalg.norm(samples, axis=1), 0.9)
+    length = np.linalg.norm(samples, axis=1)
+    counted = np.quantile(length, 0.9)
     np.testing.assert_allclose(circular_error(np.diag([9.0, 1.0])), counted, rtol=0.005)
+    mixed = np.quantile(np.r_[length, 0.1 * length], 0.9)
+    both = np.diag([9.0, 1.0]), np.diag([0.09, 0.01])
+    np.testing.assert_allclose(circular_error(np.array(both)), mixed, rtol=0.005)

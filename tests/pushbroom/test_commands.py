@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+from scipy.ndimage import binary_erosion
 from test_simulate_correct import pattern
 
 from jaxbundle import cli
@@ -14,8 +15,8 @@ rasterio = pytest.importorskip("rasterio")
 FLIGHT = """
 [scanner]
 name = "aircraft"
-lines = 300
-pixels = 200
+lines = 128
+pixels = 128
 earth = "local"
 
 [times]
@@ -65,10 +66,10 @@ def flight(tmp_path):
 
 
 def write_scene(path):
-    x, y = np.meshgrid(np.arange(-100, 900) + 0.5, 800 - np.arange(800) - 0.5)
+    x, y = np.meshgrid(np.arange(-100, 900) + 0.5, 900 - np.arange(900) - 0.5)
     with rasterio.open(
-        path, "w", driver="GTiff", height=800, width=1000, count=2, dtype="float32",
-        transform=rasterio.transform.Affine(1, 0, -100, 0, -1, 800),
+        path, "w", driver="GTiff", height=900, width=1000, count=2, dtype="float32",
+        transform=rasterio.transform.Affine(1, 0, -100, 0, -1, 900),
     ) as target:  # fmt: skip
         target.write(pattern(x, y).astype("float32"))
     return path
@@ -83,15 +84,17 @@ def test_from_a_flight_to_a_map(tmp_path, flight, run):
     assert names == {"scanner.toml", "positions.csv", "attitude.csv", "truth", "image.tif"}
     truth = out / "truth" / "scanner.toml"
     status, said, err = run("correct", truth, out / "image.tif", "--out", tmp_path / "map.tif",
-                            "--spacing", 2)  # fmt: skip
+                            "--spacing", 0.5, "--resampling", "cubic")  # fmt: skip
     assert status == 0, err
     with rasterio.open(tmp_path / "map.tif") as result:
         found, t = result.read(), result.transform
     x, y = np.meshgrid(t.c + t.a * (np.arange(found.shape[2]) + 0.5),
                        t.f + t.e * (np.arange(found.shape[1]) + 0.5))  # fmt: skip
     shown = np.isfinite(found[0])
+    # on the outer pixel of the image its own values go on
+    within = binary_erosion(shown, iterations=4)
     assert shown.mean() > 0.4
-    assert np.quantile(np.abs(found - pattern(x, y))[:, shown], 0.98) < 0.2
+    assert np.abs(found - pattern(x, y))[:, within].max() < 0.1
     status, said, _ = run("accuracy", out / "scanner.toml", "--truth", truth, "--json", "-")
     told = json.loads(said)
     # one draw of a bias of 0.05° about three axes, 800 m above the ground

@@ -1,5 +1,7 @@
 """Image to ground against independent computations, corrections, and derivatives."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -35,9 +37,10 @@ from jaxbundle.pushbroom.corrections import (
 from jaxbundle.pushbroom.frames import EARTH_RATE
 from jaxbundle.pushbroom.image import make_image, pose_at
 from jaxbundle.pushbroom.locate import ground_point, locate_points
-from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable, LineTimes
+from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable, LineTimes, slopes_of
 from jaxbundle.pushbroom.surfaces import Ground, Height, Plane
 
+pose_of, slopes = jax.jit(pose_at), jax.jit(slopes_of)
 SOME_LINES = np.linspace(0, LINES - 1, 8)
 SOME_PIXELS = np.linspace(0, PIXELS - 1, 5)
 
@@ -86,11 +89,12 @@ def test_against_scipy_and_pyproj():
 def test_points_are_on_the_ellipsoid_and_on_the_ray(earth):
     image = satellite()
     X = locate(image, Ground(earth), SOME_LINES, SOME_PIXELS)
-    assert np.abs(el.residual(earth, X)).max() < 1e-12
-    pose = pose_at(image, image.times.time(SOME_LINES[3]))
-    xi, eta = image.optics.slopes(SOME_PIXELS[2])
-    ray = pose.R @ jnp.array([xi, eta, -1.0])
-    assert np.linalg.norm(np.cross(X[:, 3, 2] - pose.P, ray / np.linalg.norm(ray))) < 1e-8
+    assert np.abs(el.residual(earth, np.array(X))).max() < 1e-12
+    pose = pose_of(image, SOME_LINES[3] * PERIOD)
+    xi, eta = slopes(image.optics, SOME_PIXELS[2:3])
+    ray = np.array(pose.R) @ [xi[0], eta[0], -1.0]
+    sight = np.array(X)[:, 3, 2] - np.array(pose.P)
+    assert np.linalg.norm(np.cross(sight, ray / np.linalg.norm(ray))) < 1e-8
 
 
 def test_scattered_points_are_those_of_the_lines():
@@ -111,15 +115,15 @@ def test_rays_off_the_earth_have_no_point():
 def test_optics_of_all_kinds_see_the_same():
     line = focal_line()
     u = np.arange(PIXELS, dtype=float)
-    xi, eta = jax.vmap(line.slopes)(u)
-    table = AngleTable(jnp.arctan(xi), jnp.arctan(eta))
+    xi, eta = (np.array(v) for v in slopes(line, u))
+    table = AngleTable(jnp.asarray(np.arctan(xi)), jnp.asarray(np.arctan(eta)))
     middle, half = (PIXELS - 1) / 2, PIXELS / 2
     fit = lambda y: jnp.asarray(np.polynomial.polynomial.polyfit((u - middle) / half, y, 6))
     polynomial = AnglePolynomial(fit(xi), fit(eta), jnp.float64(middle), jnp.float64(half))
     for other in (table, polynomial):
-        np.testing.assert_allclose(jax.vmap(other.slopes)(u), (xi, eta), atol=1e-12)
-    between = np.array(jax.vmap(table.slopes)(u[:-1] + 0.5))
-    np.testing.assert_allclose(between, jax.vmap(line.slopes)(u[:-1] + 0.5), atol=1e-9)
+        np.testing.assert_allclose(slopes(other, u), (xi, eta), atol=1e-12)
+    between = u - 0.5  # also beyond the first pixel
+    np.testing.assert_allclose(slopes(table, between), slopes(line, between), atol=1e-9)
 
 
 def test_times_of_lines():
@@ -142,12 +146,12 @@ V = tuple(orbit([0.0])[1][0])
 
 def test_aberration_is_the_sum_of_velocities():
     seen = (0.1, -0.2, -1.0)
-    l = np.array(true_direction(seen, V))
+    l = np.array(jax.jit(true_direction)(seen, V))
     np.testing.assert_allclose(np.linalg.norm(l), 1)
     sight = 299792458 * l + np.array(V)
     np.testing.assert_allclose(np.cross(sight / np.linalg.norm(sight), seen), 0, atol=1e-14)
-    back = np.array(seen_direction(tuple(l), V))
-    np.testing.assert_allclose(np.cross(back / np.linalg.norm(back), seen), 0, atol=1e-14)
+    again = np.array(jax.jit(seen_direction)(tuple(l), V))
+    np.testing.assert_allclose(np.cross(again / np.linalg.norm(again), seen), 0, atol=1e-14)
 
 
 def test_light_time_turns_the_earth():
@@ -158,16 +162,29 @@ def test_light_time_turns_the_earth():
     np.testing.assert_allclose(earlier_earth(tuple(v), 5e5), turn.apply(v), atol=1e-9)
 
 
+through_air = jax.jit(refracted)
+
+
 def test_refraction_keeps_the_invariant_of_bouguer():
     """On a sphere n·r·sin z is the same above the air and at the ground."""
     earth = el.sphere(6371e3)
     o = (6371e3 + 6e5, 0.0, 0.0)
     for tangent in (0.03, 0.5, 1.2):
         d = np.array([-1, tangent, 0]) / np.hypot(1, tangent)
-        start, bent = (np.array(v) for v in refracted(earth, 0.0, o, tuple(d)))
+        start, bent = (np.array(v) for v in through_air(earth, 0.0, o, tuple(d)))
         before = np.linalg.norm(np.cross(o, d))
         after = np.linalg.norm(np.cross(start, bent)) * INDICES[-2]
         np.testing.assert_allclose(after, before, rtol=1e-12)
+
+
+@partial(jax.jit, static_argnums=1)
+def sight(pose, corrections):
+    return ground_point(pose, (0.3, 0.1), Ground(), corrections)
+
+
+@partial(jax.jit, static_argnums=0)
+def back(corrections, P, V, X):
+    return seen_point(corrections, el.WGS84, P, V, X)
 
 
 @pytest.mark.parametrize("name, least, most", [
@@ -175,14 +192,12 @@ def test_refraction_keeps_the_invariant_of_bouguer():
 ])  # fmt: skip
 def test_size_and_inverse_of_corrections(name, least, most):
     """`seen_point` undoes what the correction did to the ray."""
-    pose = pose_at(satellite(), jnp.float64(1.0))
-    of = lambda corrections: np.array(
-        ground_point(pose, (jnp.float64(0.3), jnp.float64(0.1)), Ground(), corrections)
-    )
+    pose = pose_of(satellite(), 1.0)
+    of = lambda corrections: np.array(sight(pose, corrections))
     corrections = Corrections(**{name: True})
     plain, moved = of(Corrections()), of(corrections)
     assert least < np.linalg.norm(moved - plain) < most
-    seen = seen_point(corrections, el.WGS84, tuple(pose.P), tuple(pose.V), tuple(moved))
+    seen = back(corrections, tuple(pose.P), tuple(pose.V), tuple(moved))
     sights = [np.array(X) - pose.P for X in (seen, plain)]
     a, b = (sight / np.linalg.norm(sight) for sight in sights)
     assert np.linalg.norm(np.cross(a, b)) * 6e5 < 1e-7
@@ -193,20 +208,19 @@ def test_derivatives_by_every_parameter():
     image = satellite("hermite", "slerp")
     lines, pixels = np.array([10.3, 222.0, 541.7]), SOME_PIXELS  # between the rows of the tables
     arrays, static = eqx.partition(image, eqx.is_inexact_array)
-    at = jax.jit(lambda a: locate_points(eqx.combine(a, static), Height(50.0), lines, pixels[:3]))
-    change = jax.jit(lambda a, da: jax.jvp(at, (a,), (da,))[1])
-    leaves, tree = jax.tree.flatten(arrays)
+    at = lambda a: locate_points(eqx.combine(a, static), Height(50.0), lines, pixels[:3])
+    change = jax.jit(lambda a, da: jax.jvp(at, (a,), (da,)))
+    leaves, tree = jax.tree.flatten(jax.tree.map(np.asarray, arrays))
     rng = np.random.default_rng(3)
     # a step that moves the ground by a centimetre, whatever the unit of the parameter
     for k, leaf in enumerate(leaves):
-        direction = [jnp.zeros_like(a) for a in leaves]
-        direction[k] = jnp.asarray(rng.normal(size=leaf.shape))
-        exact = np.array(change(arrays, jax.tree.unflatten(tree, direction)))
+        direction = [np.zeros_like(a) for a in leaves]
+        direction[k] = rng.normal(size=leaf.shape)
+        turn = jax.tree.unflatten(tree, direction)
+        exact = np.array(change(arrays, turn)[1])
         step = min(0.01 / max(np.abs(exact).max(), 1e-9), 1e3)
-        moved = [
-            at(jax.tree.unflatten(tree, [a + sign * step * d for a, d in zip(leaves, direction)]))
-            for sign in (1, -1)
-        ]
+        ends = [leaves[:k] + [leaf + s * step * direction[k]] + leaves[k + 1 :] for s in (1, -1)]
+        moved = [np.array(change(jax.tree.unflatten(tree, end), turn)[0]) for end in ends]
         difference = (moved[0] - moved[1]) / (2 * step)
         np.testing.assert_allclose(exact, difference, atol=1e-5 * np.abs(exact).max() + 1e-7)
 

@@ -5,13 +5,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pushbroom_scenes import LINES, PERIOD, PIXELS, above_a_plane, locate, satellite
+from pushbroom_scenes import LINES, PERIOD, PIXELS, above_a_plane, geodetic, locate, satellite
 
 from jaxbundle.geometry import ellipsoid as el
 from jaxbundle.pushbroom.ancillary import attitude_table
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.locate import locate_points
 from jaxbundle.pushbroom.project import (
+    SEARCH,
     Status,
     make_search,
     project_from,
@@ -27,19 +28,24 @@ SOME_LINES = np.r_[-0.4, np.linspace(0, LINES - 1, 21), LINES - 0.6]
 SOME_PIXELS = np.r_[-0.45, np.linspace(0, PIXELS - 1, 17), PIXELS - 0.55]
 
 
-def on_all_surfaces(image):
-    """Points on the ellipsoid, at heights, a sphere, a rough terrain: [surfaces, 3, n]."""
-    surfaces = [Ground(), Height(-400.0), Height(8000.0), Ground(el.sphere(6360e3))]
+def at_heights(image):
+    """Points on the ellipsoid, below it and high above it: [surfaces, 3, lines, pixels]."""
+    heights = [Height(h) for h in (0.0, -400.0, 1500.0, 4000.0, 8000.0)]
+    return [np.array(locate(image, s, SOME_LINES, SOME_PIXELS)) for s in heights]
+
+
+def on_other_surfaces(image):
+    """Points on the ellipsoid, a sphere, a rough terrain: [surfaces, 3, lines, pixels]."""
+    surfaces = [Ground(), Ground(el.sphere(6360e3))]
     points = [np.array(locate(image, s, SOME_LINES, SOME_PIXELS)) for s in surfaces]
-    longitude, latitude, _ = np.array(el.geodetic(el.WGS84, points[0]))
+    longitude, latitude, _ = np.array(geodetic(tuple(points[0])))
     step = 5e-4
     corner = longitude.min() - 4 * step, latitude.max() + 4 * step
     size = [int((v.max() - v.min()) / step) + 9 for v in (latitude, longitude)]
     terrain = make_terrain(500 * rng.random((40, 40)), corner, (
         (size[1] * step) / 39, -(size[0] * step) / 39
     ))  # fmt: skip
-    points.append(np.array(locate(image, terrain, SOME_LINES, SOME_PIXELS)))
-    return np.stack(points).reshape(len(points), 3, -1)
+    return [*points, np.array(locate(image, terrain, SOME_LINES, SOME_PIXELS))]
 
 
 def table_optics():
@@ -62,13 +68,27 @@ CASES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_project_undoes_locate(name):
+SIZE = 5 * len(SOME_LINES) * len(SOME_PIXELS)
+"""Points in one call, more than a chunk; always so many, to share a compiled program."""
+
+
+def placed(image, X, earth=el.WGS84, most=1):
+    """`project_points` of few points [3, n], among others that are not looked at."""
+    n = X.shape[1]
+    found = project_points(
+        image, make_search(image, earth), np.pad(X, [(0, 0), (0, SIZE - n)], "wrap"), most=most
+    )
+    return jax.tree.map(lambda a: np.asarray(a)[..., :n], found)
+
+
+@pytest.mark.parametrize("name, points", [
+    *((name, at_heights) for name in CASES), ("lagrange, slerp", on_other_surfaces)
+])  # fmt: skip
+def test_project_undoes_locate(name, points):
     """To 1e-6 pixel over the whole image, on every surface."""
-    image = CASES[name]
-    X = np.concatenate(on_all_surfaces(image), axis=1)
+    X = np.concatenate([p.reshape(3, -1) for p in points(CASES[name])], axis=1)
     assert np.isfinite(X).all()
-    found = project_points(image, make_search(image), X)
+    found = placed(CASES[name], X)
     lines, pixels = (a.ravel() for a in np.meshgrid(SOME_LINES, SOME_PIXELS, indexing="ij"))
     times = X.shape[1] // lines.size
     np.testing.assert_allclose(found.line[0], np.tile(lines, times), atol=1e-6)
@@ -84,27 +104,37 @@ def test_project_from_a_place_near_by():
     np.testing.assert_allclose(pixel, np.broadcast_to(SOME_PIXELS, line.shape), atol=1e-6)
 
 
+def rocking(size, period, angles=(0.0, 0.0, 0.0)):
+    """A camera above a plane that nods, so that the ground is seen forth, back, and forth again."""
+    image = above_a_plane()
+    t = np.arange(-0.1, 6.2, 0.02)
+    nod = np.stack([size * np.sin(2 * np.pi * t / period), 0 * t, 0 * t], 1) + angles
+    return eqx.tree_at(
+        lambda i: i.trajectory.attitude, image, attitude_table(t, nod, method="spline")
+    )
+
+
 def test_in_a_local_frame():
-    image = above_a_plane((0.01, 0.1, 0.2))
+    image = rocking(0.0, 1.0, (0.01, 0.1, 0.2))
     X = np.array(locate(image, Plane(30.0), SOME_LINES, SOME_PIXELS)).reshape(3, -1)
-    found = project_points(image, make_search(image, None), X)
+    found = placed(image, X, None, most=3)
     lines = np.repeat(SOME_LINES, len(SOME_PIXELS))
     np.testing.assert_allclose(found.line[0], lines, atol=1e-6)
 
 
 def test_where_a_point_is_that_is_not_in_the_image():
-    image = above_a_plane()
+    image = rocking(0.0, 1.0)
     # the line of detectors is 0.3 mm ahead of the axis of 120 mm: 2.5 m on the ground
     X = np.array([
         [0.0, 100.0, 0.0], [0.0, 0.0, 0.0], [0.0, 400.0, 0.0], [150.0, 100.0, 0.0],
         [0.0, 100.0, 2000.0],
     ]).T  # fmt: skip
-    found = project_points(image, make_search(image, None), X)
+    found = placed(image, X, None, most=3)
     assert list(found.status) == [
         Status.SEEN, Status.BEFORE, Status.AFTER, Status.BESIDE, Status.HIDDEN
     ]  # fmt: skip
     np.testing.assert_allclose(found.line[0, 0], (100 - 2.5) / 0.5)
-    assert np.isnan(found.line[0, 1:]).all() and list(found.count) == [1, 0, 0, 0, 0]
+    assert np.isnan(found.line[:, 1:]).all() and list(found.count) == [1, 0, 0, 0, 0]
     assert all(status.meaning for status in Status)
 
 
@@ -114,18 +144,8 @@ def test_the_other_side_of_the_earth():
     o = np.array(image.trajectory.position.values[6])
     d = (seen - o) / np.linalg.norm(seen - o)
     behind = o + 1.29e7 * d
-    found = project_points(image, make_search(image), np.stack([seen, behind], 1))
+    found = placed(image, np.stack([seen, behind], 1))
     assert list(found.status) == [Status.SEEN, Status.HIDDEN]
-
-
-def rocking(size, period):
-    """A camera above a plane that nods, so that the ground is seen forth, back, and forth again."""
-    image = above_a_plane()
-    t = np.arange(-0.1, 6.2, 0.02)
-    nod = np.stack([size * np.sin(2 * np.pi * t / period), 0 * t, 0 * t], 1)
-    return eqx.tree_at(
-        lambda i: i.trajectory.attitude, image, attitude_table(t, nod, method="spline")
-    )
 
 
 def test_all_lines_that_see_a_point():
@@ -133,20 +153,24 @@ def test_all_lines_that_see_a_point():
     size, period = 0.06, 2.0
     image = rocking(size, period)
     X = np.stack([rng.uniform(-40, 40, 50), rng.uniform(40, 260, 50), rng.uniform(0, 30, 50)])
-    found = project_points(image, make_search(image, None), X, most=3)
+    found = placed(image, X, None, most=3)
     t = np.linspace(-0.5 * 0.01, (LINES - 0.5) * 0.01, 100_001)
     pitch = size * np.sin(2 * np.pi * t / period)
     # the sight through the detectors, turned by the pitch, meets Z at Y:
+    checked = 0
     for k in range(X.shape[1]):
         down = 1000 - X[2, k]
         angle = pitch + np.arctan(0.3 / 120)
         ahead = X[1, k] - (50 * t + down * np.tan(angle))
         place = np.flatnonzero(ahead[1:] * ahead[:-1] < 0)
+        if len(place) > 1 and np.diff(place).min() < len(t) / SEARCH:
+            continue  # within one step of the search
+        checked += 1
         assert found.count[k] == len(place)
         lines = np.array(found.line[:, k])
         np.testing.assert_allclose(lines[: len(place)], t[place] / 0.01, atol=0.01)
         assert np.isnan(lines[len(place) :]).all()
-    assert set(np.unique(found.count)) >= {1, 3}
+    assert set(np.unique(found.count)) >= {1, 3} and checked > 40
 
 
 def test_derivatives_by_every_parameter():
@@ -156,22 +180,20 @@ def test_derivatives_by_every_parameter():
     X = jax.jit(locate_points)(image, Ground(), *places).T
     arrays, static = eqx.partition(image, eqx.is_inexact_array)
 
-    @jax.jit
     def at(arrays, X):
         near = jax.vmap(project_near, (None, 0, 0, 0))
         return jnp.stack(near(eqx.combine(arrays, static), X, places[0] + 3, places[1] - 2))
 
-    np.testing.assert_allclose(at(arrays, X), places, atol=1e-6)
-    change = jax.jit(lambda a, da: jax.jvp(at, a, da)[1])
-    leaves, tree = jax.tree.flatten((arrays, X))
+    change = jax.jit(lambda a, da: jax.jvp(at, a, da))
+    leaves, tree = jax.tree.flatten(jax.tree.map(np.asarray, (arrays, X)))
     for k, leaf in enumerate(leaves):
-        direction = [jnp.zeros_like(a) for a in leaves]
-        direction[k] = jnp.asarray(rng.normal(size=leaf.shape))
-        exact = np.array(change((arrays, X), jax.tree.unflatten(tree, direction)))
+        direction = [np.zeros_like(a) for a in leaves]
+        direction[k] = rng.normal(size=leaf.shape)
+        turn = jax.tree.unflatten(tree, direction)
+        found, exact = (np.array(v) for v in change((arrays, X), turn))
+        np.testing.assert_allclose(found, places, atol=1e-6)
         step = min(1e-3 / max(np.abs(exact).max(), 1e-9), 1e3)
-        ends = [
-            at(*jax.tree.unflatten(tree, [a + s * step * d for a, d in zip(leaves, direction)]))
-            for s in (1, -1)
-        ]
-        difference = (ends[0] - ends[1]) / (2 * step)
+        ends = [leaves[:k] + [leaf + s * step * direction[k]] + leaves[k + 1 :] for s in (1, -1)]
+        moved = [np.array(change(jax.tree.unflatten(tree, end), turn)[0]) for end in ends]
+        difference = (moved[0] - moved[1]) / (2 * step)
         np.testing.assert_allclose(exact, difference, atol=3e-5 * np.abs(exact).max() + 1e-8)

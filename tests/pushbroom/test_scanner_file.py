@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 import pytest
-from pushbroom_scenes import LINES, PIXELS, locate, orbit, quaternions, satellite
+from pushbroom_scenes import LINES, PIXELS, geodetic, locate, orbit, quaternions, satellite
 from scanner_files import TEXT, write_scanner
 
 from jaxbundle import cli
@@ -140,11 +140,11 @@ def test_what_the_commands_refuse(tmp_path, monkeypatch, capsys):
     scanner = write_scanner(tmp_path)
     off, gone = tmp_path / "off.csv", tmp_path / "gone.csv"
     off.write_text("line,pixel\n1,2\n3,400\n")
-    gone.write_text("X,Y,Z\n6378137,0,0\n")
+    gone.write_text("X,Y,Z\n6378137,0,0\n6378137,0,1\n")  # as many as there and back
     cases = [
         (["locate", scanner, "--points", off], ["off.csv, line 3", "pixel 400", "399.5"]),
         (["locate", scanner, "--grid", "few"], ["--grid 'few'", "11x11"]),
-        (["locate", scanner, "--height", "7e6"], ["misses the surface", "121 of 121"]),
+        (["locate", scanner, "--height", "7e6", "--grid", "1x2"], ["misses the surface", "2 of 2"]),
         (["project", scanner, "--points", gone], ["gone.csv, line 2", "not", "in the image"]),
         (["project", scanner, "--points", tmp_path / "none.csv"], ["none.csv", "no such file"]),
     ]
@@ -169,7 +169,7 @@ def test_terrain_rasters(tmp_path, monkeypatch, capsys):
     """Heights of a plane over longitude and latitude; the same in UTM; a model elsewhere."""
     scanner = write_scanner(tmp_path)
     X = locate(satellite(), Ground(), *PLACES)
-    longitude, latitude, _ = (np.degrees(v) for v in el.geodetic(el.WGS84, tuple(X)))
+    longitude, latitude, _ = (np.degrees(v) for v in geodetic(tuple(X)))
     west, north = float(longitude.min()) - 0.05, float(latitude.max()) + 0.05
     size = int((latitude.max() - latitude.min() + 0.1) / 0.01), int(np.ptp(longitude) / 0.01 + 10)
     column, row = np.meshgrid(np.arange(size[1]) + 0.5, np.arange(size[0]) + 0.5)
@@ -182,7 +182,8 @@ def test_terrain_rasters(tmp_path, monkeypatch, capsys):
         y = (north - float(found["latitude"])) / 0.01
         assert abs(float(found["height"]) - (100 + 3 * x - 2 * y)) < 1e-4
     elsewhere = write_raster(tmp_path / "far.tif", slope, "EPSG:4326", (0.01, 0, 170, 0, -0.01, 0))
-    status, out, err = run(monkeypatch, capsys, "locate", scanner, "--dem", elsewhere)
+    status, out, err = run(monkeypatch, capsys, "locate", scanner, "--dem", elsewhere,
+                           "--grid", "3x3")  # fmt: skip
     assert status == 2 and "no terrain" in err and "covers the image" in err
     bare = write_raster(tmp_path / "bare.tif", slope, None, (0.01, 0, 0, 0, -0.01, 0))
     with pytest.raises(InputError, match="no coordinate system"):

@@ -1,14 +1,13 @@
 """Terrain: first hits on steep ground against dense sampling, gaps, and the ellipsoid."""
 
+import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from pushbroom_scenes import LINES, PIXELS, locate, satellite
+from pushbroom_scenes import LINES, PIXELS, geodetic, locate, satellite
 from scipy.interpolate import RegularGridInterpolator
 
 from jaxbundle.errors import InputError
-from jaxbundle.geometry import ellipsoid as el
 from jaxbundle.pushbroom.surfaces import Height
 from jaxbundle.pushbroom.terrain import bilinear, make_terrain
 
@@ -80,41 +79,45 @@ def test_no_height_no_point():
     assert np.isnan(distance(terrain, o, -d)).all()
 
 
+IMAGE = satellite()
+PLACES = np.linspace(0, LINES - 1, 4), np.linspace(0, PIXELS - 1, 4)
+SIZE = 500, 400
+
+
+@jax.jit
+def located(terrain, z, dz):
+    """Points on a terrain with the heights z, and their derivative in the direction dz."""
+    of = lambda z: locate(IMAGE, eqx.tree_at(lambda t: t.heights, terrain, z), *PLACES)
+    return jax.jvp(of, (z,), (dz,))
+
+
+def under(X):
+    """Corner and step of a model of `SIZE` under all points."""
+    longitude, latitude, _ = np.array(geodetic(tuple(X)))
+    margin = 0.001
+    step = [(np.ptp(v) + 2 * margin) / n for v, n in ((longitude, SIZE[1]), (latitude, SIZE[0]))]
+    return (longitude.min() - margin, latitude.max() + margin), (step[0], -step[1])
+
+
 def test_level_terrain_is_a_height():
-    image = satellite()
-    lines, pixels = np.linspace(0, LINES - 1, 4), np.linspace(0, PIXELS - 1, 4)
-    level = np.array(locate(image, Height(750.0), lines, pixels))
-    longitude, latitude, _ = np.array(el.geodetic(el.WGS84, level))
-    step = 0.002
-    corner = longitude.min() - 0.01, latitude.max() + 0.01
-    size = [int((v.max() - v.min() + 0.02) / step) + 2 for v in (latitude, longitude)]
+    level = np.array(locate(IMAGE, Height(750.0), *PLACES))
+    corner, step = under(level)
     for shift in (0.0, 2 * np.pi):  # the same model, told with longitudes a turn further
-        terrain = make_terrain(np.full(size, 750.0), (corner[0] + shift, corner[1]), (step, -step))
-        np.testing.assert_allclose(locate(image, terrain, lines, pixels), level, atol=1e-7)
+        terrain = make_terrain(np.full(SIZE, 750.0), (corner[0] + shift, corner[1]), step)
+        X, _ = located(terrain, terrain.heights, np.zeros(SIZE))
+        np.testing.assert_allclose(X, level, atol=1e-7)
 
 
 def test_point_is_on_terrain_and_ray_and_moves_with_both():
     """Residual; derivative by a height against differences; on a rough geographic model."""
-    image = satellite()
-    lines, pixels = np.array([100.3]), np.linspace(3, PIXELS - 5, 6)
-    flat = np.array(locate(image, Height(0.0), lines, pixels))
-    longitude, latitude, _ = np.array(el.geodetic(el.WGS84, flat))
-    step = 2e-5
-    corner = longitude.min() - 40 * step, latitude.max() + 40 * step
-    size = [int((v.max() - v.min()) / step) + 80 for v in (latitude, longitude)]
-    z = 400 + 60 * rng.random(size)
-    terrain = make_terrain(z, corner, (step, -step))
-    of = jax.jit(lambda z: locate(image, type(terrain)(
-        z, terrain.origin, terrain.step, terrain.lowest, terrain.highest
-    ), lines, pixels))  # fmt: skip
-    X = np.array(of(terrain.heights))
-    column, row, h = (np.array(v).ravel() for v in terrain.grid(tuple(X)))
-    np.testing.assert_allclose(
-        h, [bilinear(terrain.heights, a, b) for a, b in zip(column, row)], atol=1e-5
-    )
-    dz = jnp.asarray(rng.normal(size=size))
-    _, exact = jax.jvp(of, (terrain.heights,), (dz,))
-    ends = [np.array(of(terrain.heights + k * dz)) for k in (1e-3, -1e-3)]
+    corner, step = under(locate(IMAGE, Height(0.0), *PLACES))
+    terrain = make_terrain(400 + 60 * rng.random(SIZE), corner, step)
+    z, dz = np.array(terrain.heights), rng.normal(size=SIZE)
+    X, exact = (np.array(v) for v in located(terrain, z, dz))
+    column, row, h = (np.array(v).ravel() for v in jax.jit(type(terrain).grid)(terrain, tuple(X)))
+    np.testing.assert_allclose(h, jax.jit(jax.vmap(bilinear, (None, 0, 0)))(z, column, row),
+                               atol=1e-5)  # fmt: skip
+    ends = [np.array(located(terrain, z + k * dz, dz)[0]) for k in (1e-3, -1e-3)]
     np.testing.assert_allclose(exact, (ends[0] - ends[1]) / 2e-3, atol=2e-3)
 
 

@@ -1,5 +1,6 @@
 """Interpolation of positions and attitudes against scipy, and what is refused."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +27,14 @@ RATES = np.stack([np.cos(TIMES), -0.7 * np.sin(0.7 * TIMES), 2 * TIMES], 1)
 BETWEEN = np.r_[TIMES[0], rng.uniform(TIMES[0], TIMES[-1], 40), TIMES[5], TIMES[-1]]
 at = jax.jit(jax.vmap(interpolate, (None, 0)))
 turned = jax.jit(jax.vmap(attitude_at, (None, 0)))
+
+
+@jax.jit
+def with_derivatives(table, values, change, t):
+    """Value, rate, and the derivative in the direction of a change of the values."""
+    of = lambda values: interpolate(eqx.tree_at(lambda table: table.values, table, values), t)
+    value, weight = jax.jvp(of, (values,), (change,))
+    return value, rate(table, t), weight
 
 
 def lagrange(order):
@@ -68,21 +77,12 @@ def test_rates_and_derivatives_by_the_rows(name):
     t = TIMES[4] + 0.3
     h = 1e-5
     difference = (ORACLES[name]([t + h]) - ORACLES[name]([t - h]))[0] / (2 * h)
-    np.testing.assert_allclose(rate(table, jnp.float64(t)), difference, atol=1e-6)
-    _, weight = jax.jvp(
-        lambda values: interpolate(table_like(table, values), t), (table.values,),
-        (jnp.zeros_like(table.values).at[4].set(1.0),),
-    )  # fmt: skip
-    moved = VALUES.copy()
-    moved[4] += 1
-    change = interpolate(table_like(table, moved), t) - interpolate(table, t)
-    np.testing.assert_allclose(weight, change, atol=1e-11)
-
-
-def table_like(table, values):
-    return type(table)(
-        table.times, jnp.asarray(values), table.rates, table.gap, table.method, table.order
-    )
+    change = np.zeros_like(VALUES)
+    change[4] = 1
+    value, speed, weight = with_derivatives(table, VALUES, change, t)
+    np.testing.assert_allclose(speed, difference, atol=1e-6)
+    moved, *_ = with_derivatives(table, VALUES + change, change, t)
+    np.testing.assert_allclose(weight, moved - value, atol=1e-11)
 
 
 @pytest.mark.parametrize("name", ORACLES)
@@ -136,7 +136,8 @@ def test_angles_of_the_published_order():
     pitch, roll, yaw = 0.1, 0.2, 0.3
     c1, s1, c2, s2 = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
     c3, s3 = np.cos(yaw), np.sin(yaw)
-    np.testing.assert_allclose(matrix_from_pitch_roll_yaw(jnp.array([pitch, roll, yaw])), [
+    R = jax.jit(matrix_from_pitch_roll_yaw)(jnp.array([pitch, roll, yaw]))
+    np.testing.assert_allclose(R, [
         [c1 * c3, -c1 * s3, s1],
         [c2 * s3 + c3 * s1 * s2, c2 * c3 - s1 * s2 * s3, -c1 * s2],
         [s2 * s3 - c2 * c3 * s1, c3 * s2 + c2 * s1 * s3, c1 * c2],
@@ -145,16 +146,17 @@ def test_angles_of_the_published_order():
 
 def test_orbital_frame():
     """Right, forward, up of a platform above the equator that flies north."""
-    axes = orbital_frame(jnp.array([7e6, 0, 0]), jnp.array([100.0, 0, 7e3]))
+    axes = jax.jit(orbital_frame)(jnp.array([7e6, 0, 0]), jnp.array([100.0, 0, 7e3]))
     np.testing.assert_allclose(axes.T, [[0, 1, 0], [0, 0, 1], [1, 0, 0]], atol=1e-15)
     position = position_table(TIMES, 7e6 * np.stack(
         [np.cos(1e-3 * TIMES), 0 * TIMES, np.sin(1e-3 * TIMES)], 1
     ))  # fmt: skip
     level = attitude_table(TIMES, np.zeros((12, 3)), method="linear", reference="orbit")
-    t = jnp.float64(TIMES[6])
+    t = TIMES[6]
     a = 1e-3 * t
-    expected = [[0, 1, 0], [-jnp.sin(a), 0, jnp.cos(a)], [jnp.cos(a), 0, jnp.sin(a)]]
-    np.testing.assert_allclose(rotation_at(Trajectory(position, level), t).T, expected, atol=1e-10)
+    expected = [[0, 1, 0], [-np.sin(a), 0, np.cos(a)], [np.cos(a), 0, np.sin(a)]]
+    R = jax.jit(rotation_at)(Trajectory(position, level), t)
+    np.testing.assert_allclose(R.T, expected, atol=1e-10)
 
 
 SOURCE = Source("att.csv", np.arange(12) + 2, "line")

@@ -7,6 +7,7 @@ import numpy as np
 import typer
 
 import jaxbundle
+from jaxbundle.cli.pushbroom.accuracy_table import table_of, write_table
 from jaxbundle.cli.pushbroom.app import (
     Csv,
     Dem,
@@ -40,6 +41,10 @@ def accuracy(
     draws: Annotated[int, typer.Option(min=0, help="Monte Carlo beside the closed form")] = 0,
     seed: int = 0,
     grid: Annotated[str, typer.Option(help="LINESxPIXELS places over the image")] = "11x11",
+    table: Annotated[
+        str, typer.Option(help="bias or white: the table of a flight file, given as SCANNER")
+    ] = "",
+    levels: Annotated[str, typer.Option(help="accuracies of that table, degrees")] = "0.01,0.1",
     height: Level = None,
     dem: Dem = None,
     csv: Csv = None,
@@ -47,6 +52,11 @@ def accuracy(
 ) -> None:
     """RMS and CE90 on the ground of errors with given σ; or the errors against a known truth."""
     jaxbundle.enable_x64()
+    if table:
+        if dem is not None:
+            raise InputError("--dem: with --table give --height; a terrain has no reverse mode")
+        write_table(table_of(scanner, table, levels, draws, seed, height), csv, json)
+        return
     file = read_scanner(scanner)
     surface = surface_of(file.earth, height, dem)
     _, line, pixel, _ = places(file.image, None, grid)
@@ -69,11 +79,13 @@ def accuracy(
             raise InputError("--dem: with σ give --height instead; a terrain has no reverse mode")
         found = propagated(file.image, surface, line, pixel, noise)
         columns |= {"rms": found.rms, "ce90": found.ce90}
-        head = {"rms": found.overall}
+        head = {"rms": found.overall, "ce90": found.overall_ce90}
         if draws:
             counted = drawn(file.image, surface, line, pixel, noise, draws, seed)
             columns |= {"drawn_rms": counted.rms, "drawn_ce90": counted.ce90}
-            head |= {"drawn_rms": counted.overall, "draws": draws}
+            head |= {
+                "drawn_rms": counted.overall, "drawn_ce90": counted.overall_ce90, "draws": draws
+            }  # fmt: skip
     write_rows(columns, csv, json, {"scanner": file.name, **head})
     if json != "-":
         typer.echo("; ".join(f"{k} {v:.6g}" for k, v in head.items()), err=True)

@@ -63,7 +63,7 @@ def locate(
     columns = {"id": ids} if ids else {}
     columns |= {"line": line, "pixel": pixel, "X": X[0], "Y": X[1], "Z": X[2]}
     if file.earth is not None and file.earth.a == file.earth.b:
-        longitude, latitude, h = (np.asarray(v) for v in geodetic(file.earth, tuple(X)))
+        longitude, latitude, h = (np.asarray(v) for v in jax.jit(geodetic)(file.earth, tuple(X)))
         columns |= {"longitude": np.degrees(longitude), "latitude": np.degrees(latitude)}
         columns |= {"height": h}
     columns["status"] = ["found" if not m else reason for m in missed]

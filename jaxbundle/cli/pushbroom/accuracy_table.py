@@ -1,0 +1,76 @@
+"""`jaxbundle pushbroom accuracy --table`: attitude trajectories against attitude accuracies."""
+
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.cli.pushbroom.app import surface_of, write_rows
+from jaxbundle.errors import InputError
+from jaxbundle.io.flight import read_flight
+from jaxbundle.pushbroom.study import TRAJECTORIES, AccuracyTable, accuracy_table
+
+KINDS = ("bias", "white")
+WAYS = ("drawn", "propagated", "closed")
+
+
+def table_of(
+    path: Path, kind: str, levels: str, draws: int, seed: int, height: float | None
+) -> AccuracyTable:
+    """The table of a flight file, the levels as `0.01,0.1` in degrees."""
+    if kind not in KINDS:
+        raise InputError(f"--table {kind!r}: one of {', '.join(KINDS)} is expected")
+    try:
+        sigmas = [float(level) for level in levels.split(",")]
+        if not min(sigmas) > 0:
+            raise ValueError
+    except ValueError:
+        raise InputError(
+            f"--levels {levels!r}: positive numbers are expected, such as 0.01,0.1"
+        ) from None
+    given = read_flight(path)
+    surface = surface_of(given.earth, height, None)
+    return accuracy_table(given.flight, surface, np.radians(sigmas), kind, draws or 1000, seed)
+
+
+def write_table(table: AccuracyTable, csv: Path | None, json: str) -> None:
+    """As CSV or JSON, one row a trajectory and accuracy; or set out for a person."""
+    if csv is None and not json:
+        print(set_out(table))
+        return
+    rows = [(cell.trajectory, 0.0, cell.interpolation, cell.rms, cell.ce90, *[np.nan] * 4)
+            for cell in table.error_free]  # fmt: skip
+    rows += [
+        (cell.trajectory, _degrees(cell.sigma), "", cell.drawn_rms, cell.drawn_ce90,
+         cell.propagated_rms, cell.propagated_ce90, cell.closed_rms, cell.closed_ce90)
+        for cell in table.erring
+    ]  # fmt: skip
+    names = ["trajectory", "sigma", "interpolation", "rms", "ce90"]
+    names += [f"{way}_{value}" for way in WAYS[1:] for value in names[3:5]]
+    write_rows(dict(zip(names, zip(*rows))), csv, json, {
+        "altitude": table.altitude, "field_of_view": _degrees(table.field_of_view),
+        "kind": table.kind, "draws": table.draws,
+    })  # fmt: skip
+
+
+def set_out(table: AccuracyTable) -> str:
+    """The table for a person: trajectories across, accuracies down."""
+    what = {"bias": "one error an image", "white": "an error in every row of the table"}
+    text = [
+        f"altitude {table.altitude / 1e3:.1f} km, field of view {_degrees(table.field_of_view):g}°",
+        f"error of attitude about each axis: {what[table.kind]}; {table.draws} draws",
+    ]
+    line = lambda name, values, form: f"{name:22}" + "".join(f"{v:>10{form}}" for v in values)
+    for value in ("rms", "ce90"):
+        text += ["", line(f"{value.upper()} [m]", TRAJECTORIES, "")]
+        for method in dict.fromkeys(cell.interpolation for cell in table.error_free):
+            cells = [getattr(c, value) for c in table.error_free if c.interpolation == method]
+            text.append(line(f"no error, {method}", cells, ".4f"))
+        for sigma in dict.fromkeys(cell.sigma for cell in table.erring):
+            for way in WAYS:
+                cells = [getattr(c, f"{way}_{value}") for c in table.erring if c.sigma == sigma]
+                text.append(line(f"{_degrees(sigma):g}°, {way}", cells, ".2f"))
+    return "\n".join(text)
+
+
+def _degrees(angle):
+    return float(f"{np.degrees(angle):.6g}")

@@ -1,0 +1,133 @@
+"""Tables of the accuracy on the ground: attitude trajectories against attitude accuracies.
+
+The columns are trajectories: of the angles of a flight only roll, only pitch, only yaw, or all
+three vary. The rows are standard deviations of the attitude, about all three axes alike, each in
+three ways beside one another: drawn (Monte Carlo), propagated through the exact Jacobian of the
+image with this trajectory, and in the closed form of a level camera above a plane (`accuracy`).
+The row without error is what the interpolation of the instruments' samples leaves, against the
+truth. Tables 4-1 to 4-3 of Hakim et al. (LAPAN-A3) have this form, without altitude, field of view
+and rate of the samples; here they are stated.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import jax
+import numpy as np
+
+from .accuracy import circular_error, closed_form, drawn, ground_errors, propagated
+from .image import PushbroomImage, pose_at
+from .locate import locate_points
+from .noise import Noise
+from .scanner import slopes_of
+from .simulate import Flight, measured_image, true_image
+from .surfaces import Surface
+
+TRAJECTORIES = {
+    "roll": ("roll",), "pitch": ("pitch",), "yaw": ("yaw",), "3 axes": ("pitch", "roll", "yaw"),
+}  # fmt: skip
+FLOORS = ("linear", "spline")
+Kind = Literal["bias", "white"]
+
+
+class ErrorFree(NamedTuple):
+    """RMS and CE90, metres, that an interpolation of samples without error leaves."""
+
+    trajectory: str
+    interpolation: str
+    rms: float
+    ce90: float
+
+
+class Erring(NamedTuple):
+    """RMS and CE90, metres, of attitudes with the standard deviation `sigma`, radians."""
+
+    trajectory: str
+    sigma: float
+    drawn_rms: float
+    propagated_rms: float
+    closed_rms: float
+    drawn_ce90: float
+    propagated_ce90: float
+    closed_ce90: float
+
+
+class AccuracyTable(NamedTuple):
+    """`altitude` above the surface in metres, `field_of_view` in radians, and the cells."""
+
+    altitude: float
+    field_of_view: float
+    kind: Kind
+    draws: int
+    error_free: list[ErrorFree]
+    erring: list[Erring]
+
+
+def accuracy_table(
+    flight: Flight,
+    surface: Surface,
+    sigmas: Sequence[float] = (np.radians(0.01), np.radians(0.1)),
+    kind: Kind = "bias",
+    draws: int = 1000,
+    seed: int = 0,
+    lines: int = 13,
+    pixels: int = 6,
+) -> AccuracyTable:
+    """The table of a flight, whose angles are taken one by one and together.
+
+    **Arguments:** `sigmas` in radians; `kind` of the error: `"bias"`, one for the whole image, or
+    `"white"`, another in every row of the attitude table, which interpolation averages and the
+    closed form does not know; `lines` × `pixels` places, the middles of equal parts of the image
+    (a prime number of lines: its places do not keep step with the samples of the attitude). The
+    surface is any but a terrain.
+    """
+    middles = lambda n, size: (np.arange(n) + 0.5) * size / n - 0.5
+    places = tuple(
+        v.ravel() for v in np.meshgrid(
+            middles(lines, flight.lines), middles(pixels, flight.pixels), indexing="ij"
+        )
+    )  # fmt: skip
+    quiet = dataclasses.replace(flight, noise=Noise())
+    altitude, view = altitude_and_view(true_image(quiet), surface)
+    error_free, erring = [], []
+    for name, axes in TRAJECTORIES.items():
+        angles = {axis: flight.angles[axis] for axis in axes if axis in flight.angles}
+        varied = dataclasses.replace(quiet, angles=angles)
+        truth = true_image(varied)
+        for method in FLOORS:
+            image = measured_image(dataclasses.replace(varied, attitude_interpolation=method))
+            length = np.linalg.norm(ground_errors(image, truth, surface, *places), axis=1)
+            rms, ce90 = np.sqrt(np.mean(length**2)), np.quantile(length, 0.9)
+            error_free.append(ErrorFree(name, method, float(rms), float(ce90)))
+        image = measured_image(varied)
+        for sigma in sigmas:
+            noise = Noise(**{f"attitude_{kind}": sigma})
+            counted = drawn(image, surface, *places, noise, draws, seed)
+            exact = propagated(image, surface, *places, noise)
+            level = closed_form(altitude, view, sigma, sigma, sigma)
+            # above a plane, near the nadir, errors along and across are almost alike
+            round_ = circular_error(np.eye(2) * level**2 / 2)
+            erring.append(Erring(
+                name, float(sigma), counted.overall, exact.overall, level, counted.overall_ce90,
+                exact.overall_ce90, round_,
+            ))  # fmt: skip
+    return AccuracyTable(altitude, view, kind, draws, error_free, erring)
+
+
+def altitude_and_view(image: PushbroomImage, surface: Surface) -> tuple[float, float]:
+    """Height of the middle line above the surface, metres, and the angle of the line, radians."""
+    P = np.asarray(_position(image))
+    ground = np.asarray(_locate(image, surface, *(np.array([(n - 1) / 2]) for n in (
+        image.lines, image.pixels
+    ))))[:, 0]  # fmt: skip
+    heights = [float(surface.height(tuple(X))) for X in (P, ground)]
+    edges = np.array([-0.5, image.pixels - 0.5])
+    left, right = (np.append(slope, -1.0) for slope in np.stack(_slopes(image.optics, edges), 1))
+    cosine = left @ right / (np.linalg.norm(left) * np.linalg.norm(right))
+    return heights[0] - heights[1], float(np.arccos(cosine))
+
+
+_position = jax.jit(lambda image: pose_at(image, image.middle_time).P)
+_locate = jax.jit(locate_points)
+_slopes = jax.jit(slopes_of)
