@@ -2,7 +2,8 @@
 
 Compiled programs are kept in .cache/jax, so that test processes, the command line and notebooks
 share them; a process drops its own after a file of tests when it holds many, because each takes
-memory maps, of which Linux allows 65 530 a process.
+memory maps, of which Linux allows 65 530 a process. Programs are compiled with little optimisation:
+here compiling takes longer than running.
 """
 
 import os
@@ -14,6 +15,7 @@ EXAMPLES = ROOT / "examples"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.05")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
