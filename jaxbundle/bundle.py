@@ -6,11 +6,12 @@ import numpy as np
 
 from jaxbundle.adjustment.problem import make_problem, with_factor
 from jaxbundle.adjustment.solve import converged
-from jaxbundle.errors import InputError
+from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.check import check_network
+from jaxbundle.network.columns import count, some
 from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.tables import Network
-from jaxbundle.orientation.network import lacks_start_values
+from jaxbundle.orientation.network import Oriented, lacks_start_values
 from jaxbundle.oriented import orient, screen
 from jaxbundle.repeated import eliminated_parameters, robustly, snooped, with_components
 from jaxbundle.result import Adjustment
@@ -67,7 +68,7 @@ def adjust(
     if robust and snooping:
         raise InputError("robust estimation or data snooping, not both at once")
     if lacks_start_values(network):
-        network = orient(network).network
+        network = _placed(orient(network))
     options = {"method": method, "max_steps": max_iterations + 1, "progress": progress}
     again = lambda problem, values: minimise(problem, values, **options)
 
@@ -112,3 +113,21 @@ def adjust(
         sigma_factors=factors, inspection=inspection, robust=robust,
         weights=None if weights is None else np.asarray(weights)[problem.rays],
     )  # fmt: skip
+
+
+def _placed(found: Oriented) -> Network:
+    """The network with start values; refused where it is half a network or less.
+
+    **Raises:** `NotSolvedError`."""
+    network = found.network
+    for thing, reasons, left in (
+        ("image", found.images, len(network.images)), ("point", found.points, len(network.points))
+    ):  # fmt: skip
+        if len(reasons) >= left:
+            said = some((f"{thing} {id} ({why})" for id, why in reasons.items()), 5, str)
+            raise NotSolvedError(
+                f"not solved: no start values were found for {len(reasons)} of "
+                f"{count(len(reasons) + left, thing)}: {said}; jaxbundle orient lists all of them",
+                [f"{thing} {id}" for id in reasons],
+            )
+    return network

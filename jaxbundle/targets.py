@@ -30,9 +30,14 @@ NETWORK_FILES = (FILE_NAME, *(f"{name}.csv" for name in NETWORK_TABLES))
 
 def check_targets(input: Path, network: Network, json: str, out: Path | None) -> None:
     """Refuse a JSON file or a folder that cannot be written, or that would replace the input."""
-    tables = (network.images, network.points, network.observations, network.distances)
     names = (*FILES, *(Path(ADJUSTED) / name for name in NETWORK_FILES))
-    check_writable(json, out, names, (input, *(t.source.name for t in tables)))
+    check_writable(json, out, names, network_files(input, network))
+
+
+def network_files(input: Path, network: Network) -> tuple[str | Path, ...]:
+    """The files a network was read from."""
+    tables = (network.images, network.points, network.observations, network.distances)
+    return (input, input / FILE_NAME, *(table.source.name for table in tables))
 
 
 def check_writable(

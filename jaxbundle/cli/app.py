@@ -52,7 +52,7 @@ def main() -> None:
         print(f"jaxbundle: {error}", file=sys.stderr)
         sys.exit(BAD_INPUT if isinstance(error, InputError) else NOT_SOLVED)
     except MemoryError:
-        print("jaxbundle: not enough memory for this network", file=sys.stderr)
+        print("jaxbundle: not enough memory for this", file=sys.stderr)
         sys.exit(NOT_SOLVED)
     except (OSError, OverflowError, RecursionError) as error:
         print(f"jaxbundle: {' '.join(str(error).split())}", file=sys.stderr)

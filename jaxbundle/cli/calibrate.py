@@ -9,7 +9,7 @@ import typer
 
 import jaxbundle
 from jaxbundle.calibration import Board, calibrate_cameras, write_calibrations
-from jaxbundle.calibration.files import REPORT, RESULT, calibrations_dict, json_text
+from jaxbundle.calibration.files import REPORT, RESULT, calibrations_dict, file_name, json_text
 from jaxbundle.cli.app import Quiet, app
 from jaxbundle.cli.progress import counting
 from jaxbundle.errors import InputError, NotSolvedError
@@ -88,6 +88,7 @@ def calibrate(
     cameras = _cameras(photos, camera)
     files = [path for paths in cameras.values() for path in photographs(paths)]
     check_writable(json, out, (REPORT, RESULT), files)
+    _check_folders(out, files, cameras)
     with counting(quiet or json == "-") as bar:
         task = bar.add_task("searching the board", total=len(files))
 
@@ -127,6 +128,24 @@ def calibrate(
             f"not solved: camera {failed[0]}: {found.cameras[failed[0]].adjustment.termination}"
             f"{what}; free fewer parameters (--free), or take photographs from more directions"
         )
+
+
+def _check_folders(out: Path | None, files, cameras) -> None:
+    """Refuse a folder with the photographs in it, from which earlier results are removed, and
+    cameras whose results would have one folder."""
+    if out is not None:
+        target = out.resolve()
+        for file in files:
+            if target in Path(file).resolve().parents:
+                raise InputError(f"--out {out}: {file} is in it; give a folder of its own")
+    folders: dict[str, str] = {}
+    for name in cameras:
+        other = folders.setdefault(file_name(name).casefold(), name)
+        if other != name:
+            raise InputError(
+                f"--camera: {other!r} and {name!r} would have the same folder {file_name(name)!r}; "
+                "choose other names"
+            )
 
 
 def _write_json(json: str, text: str) -> None:

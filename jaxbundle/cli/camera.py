@@ -24,6 +24,7 @@ from jaxbundle.network.tables import Camera
 
 STEPS, CURVE = 12, 200
 """Rows of a table without --step, points of a curve."""
+MOST_ROWS = 100_000
 
 
 @app.command()
@@ -51,6 +52,10 @@ def camera(
         extent = np.multiply(size, pitch if unit == "mm" else 1.0)
         reach = float(np.hypot(*extent) / 2)
         width = reach / STEPS if step is None else step
+        if width * MOST_ROWS < reach:
+            raise InputError(
+                f"--step {width:g}: more than {MOST_ROWS} rows to a radius of {reach:.4g} {unit}"
+            )
         tables.append(_table(given, reach, width, about_origin))
         _print(given, extent, size, pitch, tables[-1])
         name = given.id if given.id not in curves else f"{given.id} ({file})"

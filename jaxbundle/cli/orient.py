@@ -8,6 +8,7 @@ import typer
 import jaxbundle
 from jaxbundle.cli.app import Format, Input, Quiet, Settings, app
 from jaxbundle.io import read_network, write_project
+from jaxbundle.targets import NETWORK_FILES, check_writable, network_files
 
 
 @app.command()
@@ -22,7 +23,10 @@ def orient(
 ) -> None:
     """Find the start values of images and points; what cannot be placed is named, with why."""
     jaxbundle.enable_x64()
-    found = jaxbundle.orient(read_network(input, format, tuple(set or ())))
+    network = read_network(input, format, tuple(set or ()))
+    if out is not None:
+        check_writable("", out, NETWORK_FILES, network_files(input, network))
+    found = jaxbundle.orient(network)
     path = None if out is None else write_project(found.network, out)
     if not quiet:
         print(found)

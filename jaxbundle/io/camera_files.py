@@ -41,7 +41,10 @@ def read_cameras(path: str | Path) -> tuple[Camera, ...]:
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     if path.name.lower() in COLMAP_FILES:
-        return read_colmap_cameras(path)
+        cameras = read_colmap_cameras(path)
+        if not cameras:
+            raise InputError(f"{path}: there is no camera in it")
+        return cameras
     if _is_toml(path):
         cameras = read_toml(path).get("camera", [])
         if not isinstance(cameras, list) or not all(isinstance(c, dict) for c in cameras):

@@ -10,14 +10,16 @@ from jaxbundle.orientation.sights import Sights
 
 APART = 3.0
 """Points that miss the similarity by more than so many times the median take no part in it."""
+LEAST_RAYS = 5
+"""To control points: four give seven unknowns, and one more."""
 FEW = 6
 """So few points are all believed: none can be told from the others."""
 ROUNDS = 3
 
 
-def onto_the_given(network: Network, model: Model) -> Model | None:
+def onto_the_given(network: Network, sights: Sights, model: Model) -> Model | None:
     """The model in the frame of control points and of images whose position is given, else of the
-    approximate coordinates of points; None where there are not three."""
+    rays to control points, else of the approximate coordinates of points; None without enough."""
     points, images = network.points, network.images
     control = controlled(points) & model.known
     stations = model.placed & np.isfinite(images.position).all(1)
@@ -26,9 +28,37 @@ def onto_the_given(network: Network, model: Model) -> Model | None:
         np.concatenate([points.position[control], images.position[stations]]),
     )
     if found is None:
+        found = _by_rays(network, sights, model)
+    if found is None:
         tie = np.isfinite(points.position).all(1) & model.known & ~points.has_role("check")
         found = similarity(model.X[tie], points.position[tie])
     return None if found is None else model.moved(*found)
+
+
+def _by_rays(network: Network, sights: Sights, model: Model):
+    """A and t from the rays to control points, many of which may be seen but once.
+
+    A point at the usual distance along each ray gives the start."""
+    points = network.points
+    rows = np.flatnonzero(model.placed[sights.image] & controlled(points)[sights.point])
+    if len(rows) < LEAST_RAYS or len(np.unique(sights.point[rows])) < 3 or not model.known.any():
+        return None
+    image, point = sights.image[rows], sights.point[rows]
+    rays = np.pad(sights.xy[rows], ((0, 0), (0, 1)), constant_values=-1.0)
+    rays = np.einsum("nij,ni->nj", model.M[image], rays)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    seen = model.known[sights.point] & model.placed[sights.image]
+    off = model.X[sights.point[seen]] - model.X0[sights.image[seen]]
+    usual = np.median(np.linalg.norm(off, axis=1))
+    there = np.where(model.known[point, None], model.X[point], model.X0[image] + usual * rays)
+    start = similarity(points.position[point], there)
+    if start is None:
+        return None
+    A, t, off = many.similarity_by_rays(points.position[point], model.X0[image], rays, *start)
+    if not np.median(off) < np.median(sights.tolerance[image]):
+        return None
+    back = np.linalg.inv(A)
+    return back, -back @ t
 
 
 def to_scale(network: Network, model: Model) -> tuple[Model, str]:

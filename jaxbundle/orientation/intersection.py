@@ -80,10 +80,13 @@ def _widest(d, p):
 
 
 def _misclosures(X, X0, d, root):
-    return jax.vmap(_misclosure, (None, 0, 0, 0))(X, X0, d, root).ravel()
+    return jax.vmap(misclosure, (None, 0, 0, 0))(X, X0, d, root).ravel()
 
 
-def _misclosure(X, X0, d, root):
+def misclosure(
+    X: Float[Array, "3"], X0: Float[Array, "3"], d: Float[Array, "3"], root: Float[Array, ""]
+) -> Float[Array, "2"]:
+    """√p·v of a point and a ray: tangents of the angles across it; `d` of length 1."""
     axis = jnp.eye(3, dtype=d.dtype)[jnp.argmin(jnp.abs(stop_gradient(d)))]
     e = jnp.cross(d, axis)
     e = e / jnp.linalg.norm(e)

@@ -15,11 +15,13 @@ from jaxbundle.geometry import (
     matrix_from_omega_phi_kappa,
     matrix_from_quaternion,
     omega_phi_kappa_from_matrix,
+    rotation_vector_from_matrix,
     transform_point,
 )
 
 from .absolute import absolute_orientation
-from .intersection import intersection
+from .intersection import intersection, misclosure
+from .least_squares import minimise
 from .pose import Pose
 from .resection import refine_resection
 from .robust import robust_relative_orientation, robust_resection
@@ -30,6 +32,8 @@ SLOTS = 64
 RAYS = 8
 """Rays of a point."""
 LANES, POINT_LANES = 8, 1024
+BY_RAYS = 40
+"""Steps of a similarity by rays, whose start is rough."""
 
 
 def resect(
@@ -78,6 +82,15 @@ def similarity(source, target, weights):
         _filled([weights], rows, SLOTS) * _weights(rows, SLOTS),
     )  # fmt: skip
     return (A[0], t[0]) if status[0] == int(Status.SOUND) else None
+
+
+def similarity_by_rays(X, X0, rays, A, t):
+    """A and t of X' = A·X + t by which points X come to lie on rays, from start values; and the
+    misclosure of every ray, the tangent of its angle."""
+    rows = [spread(len(X))]
+    filled = (_filled([a], rows, SLOTS) for a in (X, X0, rays))
+    A, t, off = _in_lanes(_similarity_by_rays, 1, *filled, _weights(rows, SLOTS), A[None], t[None])
+    return A[0], t[0], off[0][: len(rows[0])]
 
 
 def matrices(angles):
@@ -145,9 +158,29 @@ def _intersect(X0, rays, weights):
 @jax.vmap
 def _similarity(source, target, weights):
     found = absolute_orientation(source, target, weights)
-    t = transform_point(found.tau, jnp.zeros(3))
-    A = jax.vmap(transform_point, (None, 0), 1)(found.tau, jnp.eye(3)) - t[:, None]
-    return A, t, found.status
+    return (*_as_matrix(found.tau), found.status)
+
+
+@jax.jit
+@jax.vmap
+def _similarity_by_rays(X, X0, rays, weights, A, t):
+    scale = jnp.cbrt(jnp.linalg.det(A))
+    omega = rotation_vector_from_matrix(A / scale)
+    start = jnp.concatenate([t, omega, jnp.log(scale)[None]])
+
+    def misclosures(tau, X, X0, rays, root):
+        moved = jax.vmap(transform_point, (None, 0))(tau, X)
+        return jax.vmap(misclosure)(moved, X0, rays, root).ravel()
+
+    tau, _ = minimise(misclosures, jnp.add, start, (X, X0, rays, weights), 7, BY_RAYS)
+    off = misclosures(tau, X, X0, rays, weights).reshape(-1, 2)
+    return (*_as_matrix(tau), jnp.linalg.norm(off, axis=1))
+
+
+def _as_matrix(tau):
+    """A = exp(s)·R and t."""
+    t = transform_point(tau, jnp.zeros(3))
+    return jax.vmap(transform_point, (None, 0), 1)(tau, jnp.eye(3)) - t[:, None], t
 
 
 @jax.jit

@@ -115,7 +115,7 @@ def _model(network: Network, seen: Sights, improve) -> tuple[Model, str]:
             break
         model = part if not model.placed.any() else joined(seen, model, part)
         grow(seen, model, improve=improve)
-        if not fixed and (moved := onto_the_given(network, model)):
+        if not fixed and (moved := onto_the_given(network, seen, model)):
             fixed, frame = True, "in the frame given"
             model = _with_control(network, moved)
             grow(seen, model, improve=improve)
@@ -240,8 +240,8 @@ def _result(network: Network, seen: Sights, model: Model, frame: str) -> Oriente
     if len(wrong):
         names = (f"{points.id[rays.point[k]]} in {images.id[rays.image[k]]}" for k in wrong)
         said.append(
-            f"left out {count(len(wrong), 'image point')} that contradict the start values "
-            f"altogether: {some(names, 5, str)}"
+            f"left out {count(len(wrong), 'image point')} in contradiction to the start values: "
+            f"{some(names, 5, str)}"
         )
     return Oriented(network.warn(f"start values found, {frame}", *said), frame, *reasons)
 

@@ -108,6 +108,48 @@ def test_control_in_the_corners_of_a_block():
     assert_same_answer(simulation.network, bare(simulation.network))
 
 
+@pytest.mark.parametrize(("shift", "scale"), [((4.6e5, 5.1e6, 300.0), 1.0), ((0, 0, 0), 1000.0)])
+def test_control_seen_once_gives_the_frame(shift, scale):
+    """Of the four control points of this network two are in one image each."""
+    network = jaxbundle.read_network(EXAMPLES / "bingo_indoor" / "project.toml")
+    points, images = network.points, network.images
+    network = network.replace(
+        points=dataclasses.replace(
+            points, position=points.position * scale + shift, sigma=points.sigma * scale
+        ),
+        images=dataclasses.replace(images, position=images.position * scale + shift),
+    )
+    found = orient(bare(network))
+    assert found.frame == "in the frame given"
+    off = found.network.images.position - network.images.position
+    assert np.abs(off).max() < 0.5 * scale
+    assert adjust(bare(network)).sigma0 == pytest.approx(adjust(network).sigma0, rel=1e-6)
+
+
+def test_control_seen_once_throughout():
+    """Eight control points, each measured in a single image."""
+    simulation = block(control=range(8), start=TRUE)
+    rays = simulation.network.observations
+    first = np.zeros(len(rays), bool)
+    first[np.unique(rays.point, return_index=True)[1]] = True
+    network = simulation.network.replace(observations=rays.take(first | (rays.point >= 8)))
+    found = orient(bare(network))
+    assert found.frame == "in the frame given" and not found.images
+    off = found.network.images.position - simulation.truth.images.position
+    assert np.abs(off).max() < 0.05 * 1000
+
+
+def test_half_a_network_is_none():
+    """Two parts that share nothing: `orient` places one and names the other, `adjust` refuses."""
+    network = bare(close_up(jaxbundle.grid_of_targets(9, 9, 0.6, relief=0.5)))
+    rays = network.observations
+    apart = (rays.image < 5) == (rays.point < 40)
+    network = network.replace(observations=rays.take(apart))
+    assert len(orient(network).images) == 5
+    with pytest.raises(NotSolvedError, match="for 5 of 10 images"):
+        adjust(network)
+
+
 def test_one_measurement_in_twenty_wrong():
     """Most of what is wrong is left out with the start values, the rest by data snooping."""
     simulation = block(control=range(8), start=TRUE)
@@ -132,7 +174,7 @@ def test_blunders_that_leave_least_squares_no_solution():
     off = result.image_values[:, :3] - simulation.truth.images.position
     sigma = np.stack([result.images[f"s{axis}"] for axis in ("X0", "Y0", "Z0")], 1)
     assert np.abs(off / sigma).max() < 5
-    assert any("contradict the start values" in warning for warning in result.warnings)
+    assert any("in contradiction to the start values" in warning for warning in result.warnings)
 
 
 def test_a_strip_that_hangs_together_by_pairs():
