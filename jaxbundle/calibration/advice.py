@@ -90,7 +90,8 @@ def _geometry(position, rotation, middle, unit) -> Iterator[str]:
         yield (
             f"only {steep} of {number} photographs look at the board from more than {TILTED:.0f}° "
             f"aside, fewer than {FEW_TILTED}: the principal distance is hard to tell from the "
-            "distance of the board; take some tilted by 20° to 45°, to the left, to the right, up and down"
+            "distance of the board; take some tilted by 20° to 45°, to the left, to the right, up "
+            "and down"
         )
     turn = turns(rotation)
     apart = np.abs(turn[:, None] - turn) % 180
