@@ -117,7 +117,7 @@ def test_cut_off(tmp_path, share):
 
 
 def test_points_it_does_not_list_are_found_from_its_orientations(tmp_path):
-    from jaxbundle.orientation.network import orient
+    from jaxbundle import orient
 
     lines = export().splitlines()
     net = read(tmp_path, "\n".join(line for line in lines if not line.startswith((" 3 ", " 8 "))))
