@@ -7,7 +7,7 @@ import typer
 
 import jaxbundle
 from jaxbundle import report
-from jaxbundle.cli.app import Format, Input, Quiet, Settings, app
+from jaxbundle.cli.app import Format, Input, Quiet, Settings, app, check_test
 from jaxbundle.cli.progress import iterating
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io import read_network
@@ -59,10 +59,7 @@ def adjust(
         raise InputError(f"--method {method!r}: levenberg-marquardt or gauss-newton")
     if reduction not in (None, *REDUCTIONS):
         raise InputError(f"--reduction {reduction!r}: {', '.join(REDUCTIONS)}")
-    if snooping not in (None, "pope", "baarda"):
-        raise InputError(f"--snooping {snooping!r}: pope or baarda")
-    if not 0 < significance < 1:
-        raise InputError(f"--significance {significance:g}: a number between 0 and 1")
+    check_test(snooping, significance)
     check_targets(input, network, json, out)
     try:
         with iterating(quiet or json == "-") as tell:

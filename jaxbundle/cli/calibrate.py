@@ -10,7 +10,7 @@ import typer
 import jaxbundle
 from jaxbundle.calibration import Board, calibrate_cameras, write_calibrations
 from jaxbundle.calibration.files import REPORT, RESULT, calibrations_dict, file_name, json_text
-from jaxbundle.cli.app import Quiet, app
+from jaxbundle.cli.app import Quiet, app, check_test
 from jaxbundle.cli.progress import counting
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.csv_tables import write_text
@@ -77,10 +77,8 @@ def calibrate(
 ) -> None:
     """Calibrate cameras from photographs of a board, and say how far to trust them."""
     jaxbundle.enable_x64()
-    if snooping not in ("pope", "baarda", "none"):
-        raise InputError(f"--snooping {snooping!r}: pope, baarda or none")
-    if not 0 < significance < 1:
-        raise InputError(f"--significance {significance:g}: a number between 0 and 1")
+    test = None if snooping == "none" else snooping
+    check_test(test, significance)
     columns, rows = _size(board)
     if square is None:
         raise InputError("--square is missing: the side of a square, or the distance of circles")
@@ -102,7 +100,7 @@ def calibrate(
                 cameras, known, rig=rig, model=model, free=_words(free) or None,
                 given=_values(given), pixel_size=pixel_size, sigma_image=sigma_image,
                 board_sigma=board_sigma, board_free=board_free,
-                snooping=None if snooping == "none" else snooping, significance=significance,
+                snooping=test, significance=significance,
                 robust=robust, object_unit=unit, progress=tell,
             )  # fmt: skip
         except NotSolvedError as error:

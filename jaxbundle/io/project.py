@@ -29,9 +29,8 @@ Small tables may stand in the file itself, one `[[image]]`, `[[point]]`, `[[obse
 `[[distance]]` a row.
 """
 
-import json
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import MappingProxyType
 
@@ -40,6 +39,7 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.io.csv_tables import read_csv, read_toml, write_csv, write_text
 from jaxbundle.io.settings import SETTINGS, TABLES, Document, apply_overrides, network_of
+from jaxbundle.io.toml_text import assignments
 from jaxbundle.network.build import (
     DISTANCE_COLUMNS,
     IMAGE_COLUMNS,
@@ -188,13 +188,13 @@ def _document_text(network: Network) -> str:
         del settings["distances"]
     if not network.datum_points:
         del settings["datum_points"]
-    lines += ["[project]", *_assignments(settings)]
+    lines += ["[project]", *assignments(settings)]
     return "\n".join(lines) + "\n\n" + cameras_text(network.cameras)
 
 
 def cameras_text(cameras: Sequence[Camera]) -> str:
     """Cameras as the `[[camera]]` entries of a TOML file."""
-    entries = (["[[camera]]", *_assignments(_camera_entry(camera)), ""] for camera in cameras)
+    entries = (["[[camera]]", *assignments(_camera_entry(camera)), ""] for camera in cameras)
     return "\n".join(line for entry in entries for line in entry)
 
 
@@ -208,17 +208,3 @@ def _camera_entry(camera: Camera) -> dict:
     if camera.sigma:
         entry["sigma"] = {name: float(value) for name, value in camera.sigma.items()}
     return entry
-
-
-def _assignments(table: dict) -> Iterable[str]:
-    return (f"{key} = {_toml(value)}" for key, value in table.items())
-
-
-def _toml(value) -> str:
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, dict):
-        return f"{{ {', '.join(_assignments(value))} }}"
-    if isinstance(value, tuple | list):
-        return f"[{', '.join(map(_toml, value))}]"
-    return repr(value)

@@ -1,7 +1,6 @@
 """TOML files of named sections: what is there, of what type, in the words of one message."""
 
 import dataclasses
-import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.csv_tables import read_csv, read_toml
+from jaxbundle.io.toml_text import assignments
 from jaxbundle.network.columns import Columns, did_you_mean, shown
 from jaxbundle.network.units import ANGLE_UNITS
 
@@ -125,15 +125,5 @@ def toml_text(document: Mapping[str, Mapping[str, Any]]) -> str:
     """Sections as text that `read_sections` reads."""
     parts = []
     for name, section in document.items():
-        parts.append("\n".join([f"[{name}]", *(f"{k} = {_value(v)}" for k, v in section.items())]))
+        parts.append("\n".join([f"[{name}]", *assignments(section)]))
     return "\n\n".join(parts) + "\n"
-
-
-def _value(value) -> str:
-    if isinstance(value, bool | str):
-        return json.dumps(value, ensure_ascii=False)
-    if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{k} = {_value(v)}" for k, v in value.items()) + " }"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_value, value)) + "]"
-    return repr(value.item() if isinstance(value, np.generic) else value)

@@ -21,13 +21,11 @@ from jaxtyping import Float
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.refinement.equations import System, Unknowns, compiled_rescaled
 from jaxbundle.refinement.solver import Reduced, normal, polished, solve
-from jaxbundle.statistics.distributions import normal_quantile, tau_quantile
+from jaxbundle.statistics.distributions import critical_w
+from jaxbundle.statistics.reliability import UNCONTROLLED
 
 Weak = Callable[[System, Unknowns], list[str]]
 """Sentences on what is not determined."""
-
-UNCONTROLLED = 1e-8
-"""Redundancy numbers below this are rounding."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,13 +158,9 @@ def _hat(reduced: Reduced):
 
 
 def critical_value(found: Inspection, test: str, significance: float) -> float:
-    """The greatest |w| that is no blunder: Baarda's of one observation, Pope's of the largest."""
-    if test == "baarda":
-        return normal_quantile(1 - significance / 2)
-    rows = found.layout
-    tested = np.isfinite(found.w[: rows.control.stop]).sum()
-    of_one = -np.expm1(np.log1p(-significance) / max(tested, 1))
-    return found.sigma0 * tau_quantile(1 - of_one / 2, found.redundancy)
+    """The greatest |w| that is no blunder."""
+    tested = int(np.isfinite(found.w[: found.layout.control.stop]).sum())
+    return critical_w(test, significance, tested, found.redundancy, found.sigma0)
 
 
 def snoop(

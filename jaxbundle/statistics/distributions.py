@@ -1,4 +1,4 @@
-"""Quantiles of the normal, χ², t and τ distributions."""
+"""Quantiles of the normal, χ², t and τ distributions, and the critical values of the tests."""
 
 import math
 
@@ -27,3 +27,17 @@ def tau_quantile(probability: float, redundancy: float) -> float:
         return math.inf
     t = t_quantile(probability, f - 1)
     return math.sqrt(f) * t / math.sqrt(f - 1 + t * t)
+
+
+def critical_w(
+    test: str, significance: float, observations: int, redundancy: float, sigma0: float
+) -> float:
+    """The greatest |w| that is no blunder.
+
+    Of `"baarda"` (1968) that of a single observation, with the a priori σ; of `"pope"` (1976) that
+    of the largest of n observations, α' = 1 − (1 − α)^(1/n), with the a posteriori σ0.
+    """
+    if test == "baarda":
+        return normal_quantile(1 - significance / 2)
+    of_one = -math.expm1(math.log1p(-significance) / max(observations, 1))
+    return sigma0 * tau_quantile(1 - of_one / 2, redundancy)

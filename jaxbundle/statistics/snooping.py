@@ -20,7 +20,7 @@ import numpy as np
 
 from jaxbundle.adjustment.problem import Problem, count_rows
 from jaxbundle.network.arrays import Values
-from jaxbundle.statistics.distributions import normal_quantile, tau_quantile
+from jaxbundle.statistics.distributions import critical_w
 from jaxbundle.statistics.inspection import Inspection
 
 TOGETHER = 0.5
@@ -67,9 +67,12 @@ def snoop(
         if problem.counts.redundancy < 2:
             return problem, values, removed
         found = Inspection(problem, values)
-        critical = _critical(problem, found, test, significance)
+        counts = problem.counts
+        tested = counts.observations + counts.control + counts.distances
+        sigma0 = float(np.sqrt(found.vtpv / counts.redundancy))
+        critical = critical_w(test, significance, tested, counts.redundancy, sigma0)
         room = len(removed) if limit is None else limit - len(removed)
-        worst = _worst(problem, found, critical)[: None if limit is None else max(room, 0)]
+        worst = _worst(problem, found, critical, sigma0)[: None if limit is None else max(room, 0)]
         if worst:
             removed += worst
             problem = without(problem, *worst)
@@ -82,20 +85,11 @@ def snoop(
         problem = without(whole, *removed)
 
 
-def _critical(problem: Problem, found: Inspection, test: str, significance: float) -> float:
-    """The greatest |w|, with the a priori σ, that is no blunder."""
-    if test == "baarda":
-        return normal_quantile(1 - significance / 2)
-    counts = problem.counts
-    tested = counts.observations + counts.control + counts.distances
-    of_one = -np.expm1(np.log1p(-significance) / max(tested, 1))
-    sigma0 = float(np.sqrt(found.vtpv / counts.redundancy))
-    return sigma0 * tau_quantile(1 - of_one / 2, counts.redundancy)
-
-
-def _worst(problem: Problem, found: Inspection, critical: float) -> list[Removed]:
+def _worst(
+    problem: Problem, found: Inspection, critical: float, sigma0: float
+) -> list[Removed]:
     """What has to go now, the worst first."""
-    w, sigma0 = found.reliability.w, np.sqrt(found.vtpv / problem.counts.redundancy)
+    w = found.reliability.w
     image = _finite(w.image).max(1, initial=0.0)
     most = {
         "image": image,

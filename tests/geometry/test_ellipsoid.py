@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+import pyproj
 import pytest
 
 from jaxbundle.geometry import ellipsoid as el
@@ -46,7 +47,6 @@ def test_geodetic_coordinates_are_exact_to_rounding(ellipsoid):
 
 
 def test_against_pyproj():
-    pyproj = pytest.importorskip("pyproj")
     longitude, latitude, h = given = places()
     peer = pyproj.Transformer.from_crs(4979, 4978, always_xy=True)
     X = np.array(peer.transform(np.degrees(longitude), np.degrees(latitude), h))

@@ -5,12 +5,11 @@ import sys
 
 import numpy as np
 import pytest
+import rasterio
 from scipy.ndimage import binary_erosion
 from test_simulate_correct import pattern
 
 from jaxbundle import cli
-
-rasterio = pytest.importorskip("rasterio")
 
 FLIGHT = """
 [scanner]

@@ -1,5 +1,6 @@
 """Frames against the steps of the IERS conventions; orbits against sgp4 and Kepler."""
 
+import erfa
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -17,8 +18,6 @@ from jaxbundle.pushbroom.frames import (
     turn_quaternions,
     two_line_orbit,
 )
-
-erfa = pytest.importorskip("erfa")
 
 EPOCH = "2016-06-22T04:00:12.25"
 TIMES = np.arange(0.0, 60.0, 7.0)
@@ -86,7 +85,6 @@ def test_attitudes_turn_with_the_frame():
 
 def test_two_line_elements():
     """Position in TEME at the elements' epoch as published (Vallado et al., 2006, 00005)."""
-    pytest.importorskip("sgp4")
     epoch = "2000-06-27T18:50:19.733568"
     P, V = two_line_orbit(*TLE, epoch, np.array([0.0, 1e-2]))
     teme = np.array([7022.46529266, -1400.08296755, 0.03995155]) * 1e3

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pyproj
 import pytest
 from pushbroom_scenes import (
     LINES,
@@ -59,7 +60,6 @@ def test_plane_by_the_published_equations():
 
 def test_against_scipy_and_pyproj():
     """Hermite orbit, slerp, Brown's correction in numpy, pyproj's height as the surface: 1e-6 m."""
-    pyproj = pytest.importorskip("pyproj")
     peer = pyproj.Transformer.from_crs(4978, 4979, always_xy=True)
     image = satellite("hermite", "slerp")
     X = np.array(locate(image, Height(321.0), SOME_LINES, SOME_PIXELS))

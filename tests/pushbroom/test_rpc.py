@@ -134,7 +134,6 @@ def test_what_leads_nowhere_is_said():
 
 def test_against_rasterio(tmp_path):
     """GDAL's own transformer, whose pixels count from the corner: half a pixel more."""
-    pytest.importorskip("rasterio")
     from rasterio.rpc import RPC as Theirs
     from rasterio.transform import RPCTransformer
 

@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+import rasterio
 from rpc_scenes import made_up
 
 from jaxbundle.errors import InputError
@@ -17,7 +18,6 @@ def assert_same(found, expected=RPC):
 
 
 def write_raster(path):
-    rasterio = pytest.importorskip("rasterio")
     with rasterio.open(
         path, "w", driver="GTiff", height=4, width=4, count=1, dtype="uint8",
         transform=rasterio.transform.Affine(1, 0, 5, 0, -1, 9),
@@ -42,7 +42,6 @@ def test_round_trips(tmp_path, name):
 @pytest.mark.parametrize("name", ["image_RPC.TXT", "image.RPB"])
 def test_gdal_reads_what_is_written(tmp_path, name):
     """The file beside a raster gives GDAL the same coefficients."""
-    rasterio = pytest.importorskip("rasterio")
     write_rpc(tmp_path / name, RPC)
     write_raster(tmp_path / "image.tif")
     with rasterio.open(tmp_path / "image.tif") as source:

@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+import rasterio
 from pushbroom_scenes import LINES, PIXELS, geodetic, locate, orbit, quaternions, satellite
 from scanner_files import TEXT, write_scanner
 
@@ -36,7 +37,6 @@ def test_a_file_is_the_image_it_describes(tmp_path):
 @pytest.mark.parametrize("frame", ["GCRF", "TEME"])
 def test_inertial_tables(tmp_path, frame):
     """The tables turned back to an inertial frame describe the same image."""
-    pytest.importorskip("erfa")
     eop = EarthOrientation(-0.2, 0.1, 0.4)
     t = np.arange(-6.0, 11.0)
     R = to_earth(frame, EPOCH, t, eop)
@@ -156,7 +156,6 @@ def test_what_the_commands_refuse(tmp_path, monkeypatch, capsys):
 
 
 def write_raster(path, heights, crs, transform):
-    rasterio = pytest.importorskip("rasterio")
     with rasterio.open(
         path, "w", driver="GTiff", height=heights.shape[0], width=heights.shape[1], count=1,
         dtype="float64", crs=crs, transform=rasterio.transform.Affine(*transform), nodata=-9999,

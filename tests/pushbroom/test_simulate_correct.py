@@ -5,6 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import rasterio
 from pushbroom_scenes import focal_line
 from scipy.ndimage import binary_erosion
 
@@ -69,7 +70,6 @@ def pattern(x, y):
 
 
 def write_image(path, bands, dtype="float32"):
-    rasterio = pytest.importorskip("rasterio")
     import warnings
 
     with warnings.catch_warnings():
@@ -85,7 +85,6 @@ def write_image(path, bands, dtype="float32"):
 @pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
 def test_a_corrected_image_is_the_scene(tmp_path):
     """Of a terrain; of a plane in test_commands."""
-    rasterio = pytest.importorskip("rasterio")
     truth = true_image(AIRCRAFT)
     x, y = np.meshgrid(np.arange(-200, 1000, 20.0), np.arange(0, 1000, 20.0))
     height = 20 + 15 * np.sin(x / 90) * np.cos(y / 120)
@@ -123,7 +122,6 @@ def test_a_corrected_image_is_the_scene(tmp_path):
 @pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
 def test_a_satellite_image_in_utm(tmp_path):
     """Whole numbers, georeferenced; the map shows what the truth locates."""
-    rasterio = pytest.importorskip("rasterio")
     flight = dataclasses.replace(
         SATELLITE, lines=128, pixels=128, period=1 / 120, angles={"roll": 0.1, "yaw": 0.3}
     )
