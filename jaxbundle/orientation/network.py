@@ -19,7 +19,6 @@ from functools import partial
 
 import numpy as np
 from jaxtyping import Bool
-from scipy.sparse import coo_array, triu
 
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.check import check_tables
@@ -190,6 +189,8 @@ def _good_pairs(seen: Sights, among: Bool[np.ndarray, " images"], old, linked: b
 def _pairs_in_common(seen: Sights, among, old, linked):
     """Up to `PAIRS` pairs of images, and the number of their points: those with the most, and
     others with enough, which lie wider apart."""
+    from scipy.sparse import coo_array, triu
+
     rows = among[seen.image]
     shape = (seen.images, seen.points)
     sees = coo_array((np.ones(rows.sum(), int), (seen.image[rows], seen.point[rows])), shape)
