@@ -11,8 +11,8 @@ from jaxbundle.geometry import ellipsoid as el
 from jaxbundle.pushbroom.ancillary import attitude_table
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.locate import locate_points
+from jaxbundle.pushbroom.passages import SEARCH
 from jaxbundle.pushbroom.project import (
-    SEARCH,
     Status,
     make_search,
     project_from,
