@@ -8,8 +8,8 @@ of `passages` is continuous in time, since no point is ever beside or behind the
 
     ∂F/∂t ≠ 0 wherever F = 0,    so that a second zero would need one of the other sign between.
 
-∂F/∂t of the points of a detector at the heights is the speed of its footprint over the ground. It is
-looked at, four times in each piece, for all slopes ξ that a point of the footprint has in the whole
+∂F/∂t of what a detector sees at the heights is the speed of its footprint over the ground. It is
+looked at four times in each piece, for all slopes ξ that a point of the footprint has in the whole
 image. An image that turns back, or spins, or is too rough for the polynomials, has no footprint:
 all its points are searched for.
 """
@@ -95,8 +95,8 @@ def make_footprint(
         return None
     xi = np.linspace(*reach, ACROSS)
     eta = np.polynomial.polynomial.polyval(xi, np.asarray(line))
-    k, tau = (v.ravel() for v in np.meshgrid(np.arange(len(pieces.ends) - 1), WITHIN, indexing="ij"))
-    _, speed = _speeds_at(pieces, k, tau, xi, eta, levels, line, earth)
+    k, within = np.indices((len(pieces.ends) - 1, len(WITHIN))).reshape(2, -1)
+    _, speed = _speeds_at(pieces, k, WITHIN[within], xi, eta, levels, line, earth)
     speed = speed[np.isfinite(speed)]  # a ray that misses sees no point
     same = speed.min() * speed.max() > 0
     return footprint if same and np.abs(speed).min() > STEEP * np.abs(speed).max() else None
@@ -180,7 +180,7 @@ def _reach(pieces, samples, D):
 
 
 def _cubic(c, x, y, z):
-    """The polynomial of degree 3 with coefficients in the order of `POWERS`, Horner in all three."""
+    """The cubic polynomial with coefficients in the order of `POWERS`, Horner in all three."""
     c = iter(c)
     rows = [[value([next(c) for _ in range(4 - i - j)], z) for j in range(4 - i)]
             for i in range(4)]  # fmt: skip
