@@ -104,6 +104,8 @@ def _round(image, pieces, earth, X, t, u):
     if image.corrections.any:
         numbers, rates = zip(*(value_and_rate(p, tau) for p in zip(*c)))
         X = seen_from(image, earth, motion(numbers, [r / half for r in rates], pieces.origin), X)
+        # else XLA computes it anew for each of the twelve sums below
+        X = jax.lax.optimization_barrier(X)
     D = difference(X, pieces.origin)
     rsq = [[_component(n, D, i) for n in c] for i in range(3)]
     (r, dr), (s, ds), (q, dq) = (value_and_rate(p, tau) for p in rsq)
