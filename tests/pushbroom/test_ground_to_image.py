@@ -205,7 +205,7 @@ def test_an_image_that_turns_back_or_spins_has_no_footprint():
     assert make_search(rocking(0.012, 2.0), None).footprint is None
     image, t = above_a_plane(), np.arange(-0.1, 6.2, 0.02)
     # at 90 m beside the track a turn of 1 rad/s is faster than the flight
-    for turn, once in ((0.2, True), (1.0, False)):
+    for turn, once in ((0.02, True), (1.0, False)):
         turns = np.stack([0 * t, 0 * t, turn * t], 1)
         spinning = eqx.tree_at(
             lambda i: i.trajectory.attitude, image, attitude_table(t, turns, method="spline")
