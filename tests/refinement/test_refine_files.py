@@ -86,6 +86,8 @@ def test_the_command_writes_what_locate_reads(folder):
     result = json.loads((folder / "out" / "result.json").read_text())
     assert 0.7 < result["sigma0"] < 1.3
     assert len(result["image_points"]) == COUNT
+    points = read_csv(folder / "out" / "points.csv")
+    assert len(points) == COUNT and set(points.values["role"]) == {"control"}
     image, given = (read_scanner(folder / p / "A.toml").image for p in ("out", ""))
     pitch = {row["name"]: row["change"] for row in result["unknowns"]}["pitch bias"]
     assert abs(pitch - np.degrees(1e-4) * 3600) < 10
