@@ -20,8 +20,9 @@ from jaxbundle.cli.app import app
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, geodetic
 from jaxbundle.io.csv_tables import read_csv, write_csv
-from jaxbundle.io.refinement import read_refinement, write_scanner_image
+from jaxbundle.io.refinement import read_refinement
 from jaxbundle.io.scanner import read_scanner
+from jaxbundle.io.scanner_writing import write_scanner_image
 from jaxbundle.pushbroom.image import pose_at
 from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable
 from jaxbundle.refinement import Freedom, refine

@@ -10,8 +10,9 @@ import jaxbundle
 from jaxbundle.cli.pushbroom.app import pushbroom, warn
 from jaxbundle.io.csv_tables import write_csv, write_text
 from jaxbundle.io.project import write_project
-from jaxbundle.io.refinement import read_refinement, write_scanner_image
+from jaxbundle.io.refinement import read_refinement
 from jaxbundle.io.result_json import without_nan
+from jaxbundle.io.scanner_writing import write_scanner_image
 from jaxbundle.refinement import adjusted_photographs, point_rows, report, to_json
 from jaxbundle.refinement import refine as refine_images
 
@@ -20,7 +21,7 @@ from jaxbundle.refinement import refine as refine_images
 def refine(
     input: Annotated[Path, typer.Argument(help="refine file, .toml (docs/pushbroom.md)")],
     out: Annotated[
-        Path | None, typer.Option(help="folder for report, JSON, refined scanners, points, photographs")
+        Path | None, typer.Option(help="folder for report, JSON, refined files")
     ] = None,
     json: Annotated[str, typer.Option(help="write the result as JSON; - for stdout alone")] = "",
 ) -> None:
