@@ -27,9 +27,9 @@ STILL = 1e-3
 """A sight with corrections may move by so many lines in its last round."""
 ROUNDS = 8
 """Rounds after which a point is given up."""
-FEW = 256
+FEW = 64
 """Points that are collected for another round, at a time."""
-MANY = 3
+MANY = 8
 """If more than this part of all points needs another round, all go through it."""
 EDGE = 1e-5
 """A root so many lines beyond the end of its piece stays with it."""
