@@ -75,5 +75,6 @@ def difference_map(comparison: Comparison, ax=None, name: str = "Difference of t
     quiet(ax, grid=False)
     for axis in "xy":
         label(ax, axis, axis, comparison.unit)
-    title(ax, name, f"RMS {factor * comparison.rms:.3g} {unit}, rotation removed")
+    removed = ", rotation removed" if comparison.rotation.any() else ""
+    title(ax, name, f"RMS {factor * comparison.rms:.3g} {unit}{removed}")
     return ax
