@@ -55,6 +55,7 @@ def calibrate(
     board_free: bool = False,
     robust: str | None = None,
     snooping: str | None = "pope",
+    cross_validation: bool = True,
     camera: str = "cam",
     object_unit: str = "m",
     progress: Callable[[int, int], None] | None = None,
@@ -75,6 +76,7 @@ def calibrate(
     - `robust`: "huber", "cauchy" or "tukey": points that fit badly count less, instead of being
       removed; `snooping`: how they are removed, None: not at all. Both, and further `options`
       (`significance`, `max_iterations`, …), are those of `jaxbundle.adjust`.
+    - `cross_validation`: False: the camera is not calibrated again from halves of the photographs.
     - `camera`: its name. `progress(done, total)`: photographs searched.
 
     **Returns:** a `Calibration`; look at `converged` before anything else.
@@ -113,7 +115,7 @@ def calibrate(
             )  # fmt: skip
             result = adjust(network, **options)
         start = dataclasses.replace(start, views=centred)
-    return Calibration(start.views, result)
+    return Calibration(start.views, result, cross_validation)
 
 
 def board_network(

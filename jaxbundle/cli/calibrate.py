@@ -66,6 +66,9 @@ def calibrate(
     robust: Annotated[
         str | None, typer.Option(help="instead of removal: huber, cauchy or tukey")
     ] = None,
+    cross_validation: Annotated[
+        bool, typer.Option(help="calibrate again from halves of the photographs: 4 adjustments")
+    ] = True,
     unit: Annotated[str, typer.Option(help="name of the unit of the board")] = "m",
     json: Annotated[str, typer.Option(help="write the result as JSON; - for stdout alone")] = "",
     out: Annotated[
@@ -101,7 +104,8 @@ def calibrate(
                 given=_values(given), pixel_size=pixel_size, sigma_image=sigma_image,
                 board_sigma=board_sigma, board_free=board_free,
                 snooping=test, significance=significance,
-                robust=robust, object_unit=unit, progress=tell,
+                robust=robust, cross_validation=cross_validation, object_unit=unit,
+                progress=tell,
             )  # fmt: skip
         except NotSolvedError as error:
             _write_json(json, unsolved_text(error))

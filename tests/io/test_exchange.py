@@ -95,7 +95,7 @@ def test_a_conversion_that_is_not_exact_must_be_asked_for(brown, tmp_path):
     cost = done.conversions["1"]
     assert not cost.exact and 1e-6 < cost.largest < 1
     assert f"largest difference {cost.largest:.3g} px" in str(done)
-    measured = convert(brown, out, model="opencv", measured=True).conversions["1"]
+    measured = convert(brown, out, model="opencv", measured=True, force=True).conversions["1"]
     assert measured.largest < cost.largest
     back = tmp_path / "back"
     with pytest.raises(InputError, match="pixel_size is needed.*give --pixel-size WIDTH,HEIGHT"):
