@@ -27,7 +27,7 @@ from jaxbundle.network.columns import count, some
 from jaxbundle.network.sightings import keep_images, keep_points
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation import many
-from jaxbundle.orientation.frames import joined, onto_the_given, to_scale
+from jaxbundle.orientation.frames import joined, mirrored, onto_the_given, to_scale
 from jaxbundle.orientation.growth import (
     AGREE,
     FOR_OTHERS,
@@ -48,6 +48,8 @@ SEEDS = 6
 """Pairs a model is grown from, at most."""
 OUT_OF_THE_QUESTION = 3.0
 """Image points that miss by more than so many tolerances are left out."""
+CONTRADICTED = 0.1
+"""Part of the rays to control points that miss them, above which a mirror is thought of."""
 MOST = 0.8
 """A model in which this part of the image points finds its place need not compete."""
 WIDE = 0.5
@@ -96,9 +98,25 @@ def find_start_values(network: Network, improve: Callable | None = None) -> Orie
     seen = sights(network)
     model, frame = _model(network, seen, improve and partial(improve, network))
     if not model.placed.any():
-        why = _why_nothing(network, seen)
+        why = _mirrored(network, seen) or _why_nothing(network, seen)
         raise NotSolvedError(f"no start values found: {why}", _names(network))
-    return _result(network, seen, model, frame)
+    found = _result(network, seen, model, frame)
+    if _control_contradicts(network, seen, model) and (why := _mirrored(network, seen)):
+        raise NotSolvedError(f"no start values found: {why}", _names(network))
+    return found
+
+
+def _control_contradicts(network: Network, seen: Sights, model: Model) -> bool:
+    """Whether many rays to control points miss them altogether."""
+    rays = controlled(network.points)[seen.point] & model.placed[seen.image]
+    wrong = misclosures(seen, model) > OUT_OF_THE_QUESTION * seen.tolerance[seen.image]
+    return bool(wrong[rays].sum() > CONTRADICTED * rays.sum())
+
+
+def _mirrored(network: Network, seen: Sights) -> str:
+    """Whether a model without control fits it as in a mirror only, in words."""
+    model = _from_a_pair(seen, Model.empty(seen), None)
+    return "" if model is None else mirrored(network, model)
 
 
 def _model(network: Network, seen: Sights, improve) -> tuple[Model, str]:

@@ -174,3 +174,27 @@ def test_on_the_command_line(brown, tmp_path, monkeypatch, capsys):
     assert not ended.value.code
     out = capsys.readouterr().out
     assert "sparse: colmap\n" in out and "camera '1' → opencv: fitted" in out
+
+
+BESIDE = {
+    "o.yaml": ("opencv", "o.yaml"),
+    "p.csv": ("opencv", "p_images.csv"),
+    "bundle.out": ("snavely", "list.txt"),
+    "folder": ("opencv", "folder/points.csv"),
+    "colmap": ("opencv", "colmap/frames.txt"),
+}
+
+
+@pytest.mark.parametrize("name", BESIDE)
+def test_what_is_there_is_replaced_only_by_force(tmp_path, name):
+    model, other = BESIDE[name]
+    write_project(network(model, ("a", "b", "c")), tmp_path / "given")
+    there = tmp_path / other
+    there.parent.mkdir(exist_ok=True)
+    there.write_text("of somebody else")
+    with pytest.raises(InputError, match=rf"{other}: already there.*--force"):
+        convert(tmp_path / "given", tmp_path / name)
+    assert there.read_text() == "of somebody else"
+    assert [p.name for p in there.parent.iterdir() if p != tmp_path / "given"] == [there.name]
+    convert(tmp_path / "given", tmp_path / name, force=True)
+    assert not there.exists() or there.read_text() != "of somebody else"

@@ -283,3 +283,25 @@ def test_bad_data_is_found_before():
     rays = dataclasses.replace(network.observations, xy=xy)
     with pytest.raises(InputError, match="row 4: y of point"):
         orient(network.replace(observations=rays))
+
+
+@pytest.mark.parametrize("what", ["y downward", "X and Y exchanged", "right"])
+def test_a_mirror_is_named(what):
+    """Control in a left-handed system, or images with y downward: both fit in part, and are a
+    mirror image in truth."""
+    network = bare(block(control=range(8)).network)
+    rays, points = network.observations, network.points
+    if what == "y downward":
+        network = network.replace(
+            observations=dataclasses.replace(rays, xy=rays.xy * np.array([1, -1]))
+        )
+    elif what == "X and Y exchanged":
+        exchanged = dataclasses.replace(
+            points, position=points.position[:, [1, 0, 2]], sigma=points.sigma[:, [1, 0, 2]]
+        )
+        network = network.replace(points=exchanged)
+    if what == "right":
+        assert not orient(network).images
+    else:
+        with pytest.raises(NotSolvedError, match="8 control points .* only as in a mirror"):
+            orient(network)
