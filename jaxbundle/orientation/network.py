@@ -49,7 +49,8 @@ SEEDS = 6
 OUT_OF_THE_QUESTION = 3.0
 """Image points that miss by more than so many tolerances are left out."""
 CONTRADICTED = 0.1
-"""Part of the rays to control points that miss them, above which a mirror is thought of."""
+"""Part of the rays to control points that miss them, or of the points whose rays do not meet, above
+which a mirror is thought of."""
 MOST = 0.8
 """A model in which this part of the image points finds its place need not compete."""
 WIDE = 0.5
@@ -107,10 +108,18 @@ def find_start_values(network: Network, improve: Callable | None = None) -> Orie
 
 
 def _control_contradicts(network: Network, seen: Sights, model: Model) -> bool:
-    """Whether many rays to control points miss them altogether."""
-    rays = controlled(network.points)[seen.point] & model.placed[seen.image]
+    """Whether many rays to control points miss them altogether, or many points have rays that do
+    not meet."""
+    control = controlled(network.points)
+    placed = model.placed[seen.image]
+    rays = control[seen.point] & placed
     wrong = misclosures(seen, model) > OUT_OF_THE_QUESTION * seen.tolerance[seen.image]
-    return bool(wrong[rays].sum() > CONTRADICTED * rays.sum())
+    seen_twice = np.bincount(seen.point[placed], minlength=seen.points) > 1
+    unmet = seen_twice & ~model.known
+    return bool(control.any()) and bool(
+        wrong[rays].sum() > CONTRADICTED * rays.sum()
+        or unmet.sum() > CONTRADICTED * seen_twice.sum()
+    )
 
 
 def _mirrored(network: Network, seen: Sights) -> str:
