@@ -289,7 +289,8 @@ def test_bad_data_is_found_before():
 def test_a_mirror_is_named(what):
     """Control in a left-handed system, or images with y downward: both fit in part, and are a
     mirror image in truth."""
-    network = bare(block(control=range(8)).network)
+    targets = jaxbundle.cloud_of_targets(40, (4.0, 3.0, 1.5), seed=3)
+    network = bare(close_up(targets, control=range(8), control_sigma=1e-3, datum="control"))
     rays, points = network.observations, network.points
     if what == "y downward":
         network = network.replace(
