@@ -36,6 +36,7 @@ from jaxbundle.measure.views import BoardViews, measure_boards
 from jaxbundle.network.build import make_network
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.orientation.pose import Pose
+from jaxbundle.statistics.snooping import check_test
 
 SIGMA = 0.1
 """A priori σ of an image coordinate in pixels; σ0 of the result says what it was."""
@@ -89,6 +90,7 @@ def calibrate(
     pixel_size = _pair(pixel_size)
     unit_size(camera_model, pixel_size)
     _check(sigma_image, board_sigma, board_free)
+    check_test(snooping, options.get("significance", 0.001))
     views = photographs
     if not isinstance(views, BoardViews):
         if board is None:

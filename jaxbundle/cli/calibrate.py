@@ -10,12 +10,13 @@ import typer
 import jaxbundle
 from jaxbundle.calibration import Board, calibrate_cameras, write_calibrations
 from jaxbundle.calibration.files import REPORT, RESULT, calibrations_dict, file_name, json_text
-from jaxbundle.cli.app import Quiet, app, check_test
+from jaxbundle.cli.app import Quiet, app
 from jaxbundle.cli.progress import counting
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.csv_tables import write_text
 from jaxbundle.io.result_json import unsolved_text
 from jaxbundle.measure.views import photographs
+from jaxbundle.statistics.snooping import check_test
 from jaxbundle.targets import check_writable
 
 
@@ -81,7 +82,7 @@ def calibrate(
     """Calibrate cameras from photographs of a board, and say how far to trust them."""
     jaxbundle.enable_x64()
     test = None if snooping == "none" else snooping
-    check_test(test, significance)
+    check_test(test, significance, "--")
     columns, rows = _size(board)
     if square is None:
         raise InputError("--square is missing: the side of a square, or the distance of circles")

@@ -62,6 +62,7 @@ def compare(
     if found.covered < 1:
         print(f"{100 * (1 - found.covered):.1f} % of the image has no ray in one of them")
     columns = ("r", "radial", "tangential", "rms", "largest")
+    print("rings about the image centre, each out to r; means of the radial and tangential parts")
     print("".join(f"{name:>12}" for name in columns) + f"  [{found.unit}]")
     for row in zip(*(rings[name] for name in columns)):
         print("".join(f"{value:12.4g}" for value in row))

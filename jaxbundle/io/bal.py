@@ -40,6 +40,8 @@ from jaxbundle.network.columns import Columns
 from jaxbundle.network.tables import EXTERIOR, Network, Source
 
 OPENERS = {".gz": gzip.open, ".bz2": bz2.open}
+MOST_DIGITS = 18
+"""Of a count."""
 UNREADABLE = (OSError, EOFError, zlib.error)
 MODEL = get_model("snavely")
 
@@ -140,7 +142,7 @@ def write_bal(network: Network, path: str | Path) -> tuple[str, ...]:
 
 def _are_counts(words: Sequence[bytes]) -> bool:
     """Whether these are three whole numbers."""
-    return len(words) == 3 and all(word.isdigit() and len(word) < 19 for word in words)
+    return len(words) == 3 and all(word.isdigit() for word in words)
 
 
 def _numbers(path: Path):
@@ -153,6 +155,11 @@ def _numbers(path: Path):
     if not _are_counts(first):
         raise InputError(
             f"{path}, line 1: three whole numbers are expected: cameras, points, observations"
+        )
+    if max(map(len, first)) > MOST_DIGITS:
+        raise InputError(
+            f"{path}, line 1: {b' '.join(first)[:60].decode()}: more cameras, points, observations "
+            f"than a file of {len(text)} characters can hold"
         )
     cameras, points, rows = counts = tuple(map(int, first))
     expected = 4 * rows + 9 * cameras + 3 * points

@@ -90,7 +90,7 @@ def convert(
     input, output = Path(input), Path(output)
     kind = _kind(output, to)
     _check_output(output, kind)
-    if format is None and is_camera_file(input):
+    if format in (None, *CAMERA_KINDS) and is_camera_file(input):
         _keep_camera_file(input, output)
         _keep_others(output, kind, force)
         cameras = _sized(read_cameras(input), image_size, pixel_size)

@@ -217,19 +217,25 @@ def _good_pairs(seen: Sights, among: Bool[np.ndarray, " images"], old, linked: b
 def _pairs_in_common(seen: Sights, among, old, linked):
     """Up to `PAIRS` pairs of images, and the number of their points: those with the most, and
     others with enough, which lie wider apart."""
-    rows = among[seen.image]
-    shape = (seen.images, seen.points)
-    sees = coo_array((np.ones(rows.sum(), int), (seen.image[rows], seen.point[rows])), shape)
-    sees = sees.tocsr()
-    common = triu(sees @ sees.T, k=1)
-    use = (common.data >= IN_COMMON) & ((old[common.row] != old[common.col]) | (not linked))
-    pairs, number = np.stack([common.row, common.col], 1)[use], common.data[use]
+    pairs, number = _all_pairs(seen, among)
+    use = (number >= IN_COMMON) & ((old[pairs[:, 0]] != old[pairs[:, 1]]) | (not linked))
+    pairs, number = pairs[use], number[use]
     order = np.argsort(-number, kind="stable")
     enough = order[number[order] >= 0.3 * number.max(initial=0)]
     chosen = np.unique(np.concatenate(
         [order[: PAIRS // 2], enough[many.spread(len(enough), PAIRS - PAIRS // 2)]]
     ))
     return pairs[chosen], number[chosen]
+
+
+def _all_pairs(seen: Sights, among):
+    """Pairs of these images that share points [pairs, 2], and how many."""
+    rows = among[seen.image]
+    shape = (seen.images, seen.points)
+    sees = coo_array((np.ones(rows.sum(), int), (seen.image[rows], seen.point[rows])), shape)
+    sees = sees.tocsr()
+    common = triu(sees @ sees.T, k=1)
+    return np.stack([common.row, common.col], 1), common.data
 
 
 def _common_points(seen: Sights, image: int, other: int):
@@ -305,15 +311,34 @@ def _reasons(network: Network, seen: Sights, model: Model, known):
 
 
 def _why_nothing(network: Network, seen: Sights) -> str:
-    rays = np.bincount(seen.image, minlength=seen.images)
     control = np.bincount(seen.image, controlled(network.points)[seen.point], minlength=seen.images)
     best = int(control.argmax())
-    return (
+    begin = (
         f"no image sees {LEAST} control points that agree ({int(control[best])} in "
-        f"{network.images.id[best]!r} at most), and no two images share {IN_COMMON} points whose "
-        f"rays meet at an angle (up to {rays.max()} points in an image); measure more points in "
-        "common, or give start values"
+        f"{network.images.id[best]!r} at most), and "
     )
+    one, other, most = _most_in_common(seen)
+    if most < IN_COMMON:
+        pair = f" ({network.images.id[one]!r}, {network.images.id[other]!r})" if most else ""
+        return (
+            f"{begin}no two images have the {IN_COMMON} points in common that a relative "
+            f"orientation needs: {most} at most{pair}; measure more points in the same images, or "
+            "give start values"
+        )
+    return (
+        f"{begin}no two images that share {IN_COMMON} points or more ({most} at most) have rays "
+        "that meet at an angle: take images from places that lie apart, look for wrong point "
+        "numbers, or give start values"
+    )
+
+
+def _most_in_common(seen: Sights) -> tuple[int, int, int]:
+    """The two images with the most points in common, and how many."""
+    pairs, number = _all_pairs(seen, np.ones(seen.images, bool))
+    if not len(number):
+        return 0, 0, 0
+    best = int(number.argmax())
+    return int(pairs[best, 0]), int(pairs[best, 1]), int(number[best])
 
 
 def _names(network: Network) -> list[str]:
