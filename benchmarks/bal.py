@@ -106,14 +106,17 @@ def ceres(path: Path, binary: str, solver: str, iterations: int, repeat: int) ->
     for _ in range(repeat):
         text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
         rows = [ROW.match(line) for line in text.splitlines()]
-        rows = [(float(m[2]), float(m[4])) for m in rows if m]
-        cost, at = np.array(rows).T
-        runs.append((at[-1] - at[0], cost, at - at[0]))
+        rows = [[float(m[i]) for i in (2, 3, 4)] for m in rows if m]
+        cost, iteration, at = np.array(rows).T
+        # From the first evaluation on, without the preprocessor before it.
+        at = at - at[0] + iteration[0]
+        runs.append((at[-1] - at[0], cost, at))
     seconds, cost, at = min(runs, key=lambda run: run[0])
     cost = np.minimum.accumulate(cost)
     return {
         "cost": float(cost[-1]), "costs": cost.tolist(), "iterations": len(cost) - 1,
-        "seconds": seconds, "iteration_s": seconds / max(len(cost) - 1, 1), "at_s": at.tolist(),
+        "seconds": seconds, "iteration_s": (seconds - at[0]) / max(len(cost) - 1, 1),
+        "at_s": at.tolist(),
     }  # fmt: skip
 
 

@@ -90,7 +90,8 @@ def adjust(
     removed, eliminated, factors, weights = [], [], {}, None
     if robust:
         problem, minimum, weights = robustly(problem, minimum, again, robust)
-    if solved(problem, minimum):
+    inspection = solved(problem, minimum)
+    if inspection and (snooping or estimate_components or eliminate):
         if snooping:
             problem, minimum, removed = snooped(problem, minimum, again, snooping, significance)
         if estimate_components:
@@ -100,7 +101,7 @@ def adjust(
                 problem, minimum, again, critical_t
             )
 
-    inspection = solved(problem, minimum)
+        inspection = solved(problem, minimum)
     names = () if inspection else names_of_defects(problem, minimum)
     if not inspection and converged(int(minimum.termination)):
         names = names or UNNAMED

@@ -167,7 +167,8 @@ def _motion_to_datum(s: Structure, point, target, steps: int = 50):
 def _newton_step(s: Structure, point, target) -> Float[Array, " defect"]:
     """The motion that meets Bᵀ(x − x_start) = 0 to first order; its slope is held constant."""
     x, still = jax.lax.stop_gradient((point, target))
-    after = lambda tau: _datum_equations(s, _moved_points(s, s.gauge @ tau, x), still)[0]
+    G = jax.vmap(helmert_point)(x) @ s.gauge * (s.point_free > 0)[..., None]
+    after = lambda tau: _datum_equations(s, x + G @ tau, still)[0]
     slope = jax.jacfwd(after)(jnp.zeros(s.defect))
     return -jnp.linalg.solve(slope, _datum_equations(s, point, target)[0])
 

@@ -168,6 +168,8 @@ def jacobian(structure: Structure, values: Values, data: Data) -> BundleJacobian
 
 def exterior_blocks(s: Structure, values: Values, data: Data) -> Float[Array, "exterior 6 6"]:
     """Derivatives of the priors of exterior orientations by the change of their images."""
+    if not s.exterior.shape[0]:
+        return jnp.zeros((0, 6, 6))  # Nothing to trace.
     return jax.vmap(jax.jacfwd(exterior_residual, 4), (0, 0, 0, 0, None))(
         values.position[s.exterior], values.rotation[s.exterior],
         data.exterior, data.exterior_weight, jnp.zeros(6),

@@ -163,10 +163,7 @@ def residuals(structure: Structure, values: Values, data: Data) -> Residuals:
     return Residuals(
         image=gather_groups(structure, parts),
         control=control_residual(values.point[s.control], data.control, data.control_weight, 0.0),
-        exterior=jax.vmap(exterior_residual, (0, 0, 0, 0, None))(
-            values.position[s.exterior], values.rotation[s.exterior],
-            data.exterior, data.exterior_weight, jnp.zeros(6),
-        ),
+        exterior=_exterior_residuals(s, values, data),
         interior=interior_residual(
             values.camera[s.interior], data.interior, data.interior_weight, 0.0
         ),
@@ -174,6 +171,15 @@ def residuals(structure: Structure, values: Values, data: Data) -> Residuals:
             values.point[a], values.point[b], data.distance, data.distance_weight, zero3, zero3
         ),
     )
+
+
+def _exterior_residuals(s, values, data):
+    if not s.exterior.shape[0]:
+        return jnp.zeros((0, 6))  # Nothing to trace.
+    return jax.vmap(exterior_residual, (0, 0, 0, 0, None))(
+        values.position[s.exterior], values.rotation[s.exterior],
+        data.exterior, data.exterior_weight, jnp.zeros(6),
+    )  # fmt: skip
 
 
 compiled_residuals = eqx.filter_jit(residuals)

@@ -121,13 +121,15 @@ def _cut(problem: Problem, parts: int) -> list[np.ndarray]:
 
 def _values_of(values: Values, chosen) -> Values:
     """The values of the chosen points, and all images and cameras."""
-    return eqx.tree_at(lambda v: v.point, values, values.point[chosen])
+    return eqx.tree_at(lambda v: v.point, values, np.asarray(values.point)[chosen])
 
 
 def _part(problem: Problem, chosen, first: bool) -> tuple[Structure, Data]:
     """Structure and data of some of the points; the priors of images and cameras, and distances,
     count in the first part."""
-    network, s, data = problem.network, problem.structure, problem.data
+    # In numpy: JAX would compile a little program for every lookup.
+    s, data = jax.tree.map(np.asarray, (problem.structure, problem.data))
+    network = problem.network
     local = np.full(len(network.points), -1)
     local[chosen] = np.arange(len(chosen))
     rows = np.flatnonzero(local[network.observations.point] >= 0)
@@ -153,12 +155,12 @@ def _part(problem: Problem, chosen, first: bool) -> tuple[Structure, Data]:
         band=s.band, pins=s.pins,
     )  # fmt: skip
     placed = lambda column: _at_rows(structure.rays, rays, column[problem.rays[rows]])
-    control = np.isin(np.asarray(s.control), chosen)
+    control = np.isin(s.control, chosen)
     here = 1.0 if first else 0.0
     return structure, Data(
         start=_values_of(data.start, chosen),
-        image_xy=placed(np.asarray(data.image_xy)),
-        image_weight=placed(np.asarray(data.image_weight)),
+        image_xy=placed(data.image_xy),
+        image_weight=placed(data.image_weight),
         control=data.control[control],
         control_weight=data.control_weight[control],
         exterior=data.exterior,
@@ -170,7 +172,7 @@ def _part(problem: Problem, chosen, first: bool) -> tuple[Structure, Data]:
     )
 
 
-def _at_rows(rows: int, index, values) -> Float[Array, "rows ..."]:
+def _at_rows(rows: int, index, values) -> Float[np.ndarray, "rows ..."]:
     whole = np.zeros((rows, *values.shape[1:]))
     whole[index] = values
-    return jnp.asarray(whole)
+    return whole

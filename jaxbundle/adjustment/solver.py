@@ -64,6 +64,9 @@ INEXACT = 1e-2
 NEAR = 1e-3
 """Near the solution: the last step promised to decrease vᵀPv by less than this fraction."""
 
+KEPT, FALLING = 0.95, 0.1
+"""And it kept so much of the promise, which was less than this fraction of the one before."""
+
 REFUSALS = 2
 """So many undamped steps refused where the damped ones have settled: singular, if not exactly."""
 
@@ -168,6 +171,7 @@ class SolverState(eqx.Module):
     step_size: Float[Array, ""]
     singular: Bool[Array, ""]
     near: Float[Array, ""]
+    promised: Float[Array, ""]
     trial: Bool[Array, ""]
     tried: Bool[Array, ""]
     refusals: Int[Array, ""]
@@ -206,6 +210,7 @@ class BundleSolver(optx.AbstractLeastSquaresSolver):
             step_size=jnp.asarray(float(self.search.initial)),
             singular=no,
             near=jnp.asarray(NEAR),
+            promised=zero,
             trial=no,
             tried=no,
             refusals=jnp.asarray(0),
@@ -235,8 +240,9 @@ class BundleSolver(optx.AbstractLeastSquaresSolver):
         # Near the solution, and where the step already is one of rounding, drop the damping.
         undamped = isinstance(self.search, FullStep)
         if not undamped:
-            quadratic = accept & (search.ratio > 0.5) & ~state.singular & ~state.first
+            quadratic = accept & (search.ratio > KEPT) & ~state.singular & ~state.first
             quadratic = quadratic & (search.predicted < near * cost_here)
+            quadratic = quadratic & (search.predicted < FALLING * state.promised)
             step_size = jnp.where(quadratic | state.trial, jnp.inf, step_size)
         change, _ = descent.step(step_size, damped)
         finite = s.total(1 - _all_finite(change).astype(int)) == 0
@@ -289,10 +295,12 @@ class BundleSolver(optx.AbstractLeastSquaresSolver):
         )
         if self.progress is not None:
             jax.debug.callback(self.progress, i, cost, 1 / state.step_size)
+        promised = jnp.where(accept, search.predicted, state.promised)
         search = eqx.tree_at(lambda s: (s.predicted, s.noise), search, (predicted, noise))
         new = SolverState(
             first=jnp.asarray(False), y_eval=y_eval, accepted_info=accepted_info, search=search,
             step_size=step_size, singular=singular, near=near,
+            promised=promised,
             trial=trial, tried=state.trial, refusals=refusals, termination=termination, done=done,
             steps=i + 1, history=history,
         )  # fmt: skip

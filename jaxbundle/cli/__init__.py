@@ -3,13 +3,19 @@
 Exit status: 0 solved; 2 bad input (one line, nothing written); 3 not solved (says why).
 """
 
-from jaxbundle.cli import adjust as adjust
-from jaxbundle.cli import batch as batch
-from jaxbundle.cli import calibrate as calibrate
-from jaxbundle.cli import camera as camera
-from jaxbundle.cli import compare as compare
-from jaxbundle.cli import convert as convert
-from jaxbundle.cli import orient as orient
-from jaxbundle.cli import plan as plan
-from jaxbundle.cli import pushbroom as pushbroom
-from jaxbundle.cli.app import main as main
+import importlib
+import sys
+
+from jaxbundle.cli.app import run
+
+COMMANDS = (
+    "orient", "adjust", "calibrate", "batch", "plan", "camera", "compare", "convert", "pushbroom",
+)  # fmt: skip
+
+
+def main() -> None:
+    """Run the command line. Only the command asked for is imported, for help all of them."""
+    asked = sys.argv[1:2]
+    for command in asked if asked and asked[0] in COMMANDS else COMMANDS:
+        importlib.import_module(f"jaxbundle.cli.{command}")
+    run()

@@ -44,8 +44,8 @@ def _main(
         raise typer.Exit(BAD_INPUT)
 
 
-def main() -> None:
-    """Run the command line; errors of the input, the solution, the machine end in one line."""
+def run() -> None:
+    """Run the application; errors of the input, the solution, the machine end in one line."""
     try:
         sys.exit(app(standalone_mode=False))
     except (InputError, NotSolvedError) as error:

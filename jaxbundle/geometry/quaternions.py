@@ -36,6 +36,7 @@ traced_once = partial(jax.jit, inline=True)
 """Traced once for all callers, and compiled as a part of each."""
 
 
+@traced_once
 def quaternion_multiply(a: Float[Array, "4"], b: Float[Array, "4"]) -> Float[Array, "4"]:
     """The product a∘b, of which the rotation is M(a)·M(b): b acts first (Hamilton, 1844)."""
     aw, ax, ay, az = a
@@ -91,6 +92,7 @@ def quaternion_from_matrix(M: Float[Array, "3 3"]) -> Float[Array, "4"]:
     return jnp.where(q[0] < 0, -q, q)
 
 
+@traced_once
 def quaternion_from_rotation_vector(v: Float[Array, "3"]) -> Float[Array, "4"]:
     """The unit quaternion of exp([v]×), v in radians (Solà, 2017, Exp)."""
     half = v / 2
@@ -99,6 +101,7 @@ def quaternion_from_rotation_vector(v: Float[Array, "3"]) -> Float[Array, "4"]:
     return jnp.concatenate([cosine[None], _sine_over_angle(square) * half])
 
 
+@traced_once
 def rotation_vector_from_quaternion(q: Float[Array, "4"]) -> Float[Array, "3"]:
     """The rotation vector v, |v| ≤ π, in radians: 2 arctan(|u|/w)·u/|u| (Solà, 2017, Log).
 
@@ -125,6 +128,7 @@ def rotation_vector_from_matrix(M: Float[Array, "3 3"]) -> Float[Array, "3"]:
     return rotation_vector_from_quaternion(quaternion_from_matrix(M))
 
 
+@traced_once
 def retract_quaternion(q: Float[Array, "4"], delta: Float[Array, "3"]) -> Float[Array, "4"]:
     """The unit quaternion q ⊞ δ of exp([δ]×)·M(q): q turned by δ, radians, in the camera frame."""
     return _normalise(quaternion_multiply(quaternion_from_rotation_vector(delta), q))

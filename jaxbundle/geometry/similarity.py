@@ -29,9 +29,11 @@ from .quaternions import (
     quaternion_from_rotation_vector,
     quaternion_multiply,
     rotation_vector_from_quaternion,
+    traced_once,
 )
 
 
+@traced_once
 def transform_point(tau: Float[Array, "7"], X: Float[Array, "3"]) -> Float[Array, "3"]:
     """X' = exp(s)·Rs·X + t, in the object unit."""
     return jnp.exp(tau[6]) * matrix_from_rotation_vector(tau[3:6]) @ X + tau[:3]
@@ -69,6 +71,7 @@ def compose(outer: Float[Array, "7"], inner: Float[Array, "7"]) -> Float[Array, 
     )
 
 
+@traced_once
 def helmert_point(X: Float[Array, "3"]) -> Float[Array, "3 7"]:
     """The rows of the Helmert matrix of a point, ∂X'/∂τ = [I, −[X]×, X] at τ = 0.
 

@@ -16,6 +16,7 @@ Source: Agarwal, Snavely, Seitz and Szeliski (2010), Bundle Adjustment in the La
 
 import bz2
 import gzip
+import warnings
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -164,8 +165,10 @@ def _numbers(path: Path):
     cameras, points, rows = counts = tuple(map(int, first))
     expected = 4 * rows + 9 * cameras + 3 * points
     try:
-        numbers = np.array(text.split(), float)
-    except ValueError:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # Of text that is no number.
+            numbers = np.fromstring(text, sep=" ")
+    except (ValueError, DeprecationWarning):
         raise _not_a_number(path, text) from None
     if len(numbers) != expected:
         raise InputError(

@@ -12,9 +12,7 @@ which need no pairs of rays at all.
 
 import equinox as eqx
 import numpy as np
-import scipy.sparse as sparse
 from jaxtyping import Array, Int
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 REDUCTIONS = ("dense", "banded", "iterative")
 FACTORS = ("dense", "banded")
@@ -39,8 +37,25 @@ class Band(eqx.Module):
     blocks: int = eqx.field(static=True)
 
 
+def plan_reduction(
+    blocks, images: int, block: int, others: int, rays: int, ways=REDUCTIONS
+) -> tuple[str | None, Band | None]:
+    """The way for a network whose pairs of images have these blocks (rows, columns), and the band
+    where that is its way; see `choose_reduction`. A single one of `ways` is taken as it is."""
+    if len(ways) > 1 and images * block + others < SMALL:
+        return "dense", None
+    band = find_band(*blocks, images) if "banded" in ways else None
+    way = ways[0]
+    if len(ways) > 1:
+        way = choose_reduction(band, images, block, others, rays, ways)
+    return way, band if way == "banded" else None
+
+
 def find_band(row, column, images: int) -> Band:
     """A narrow band of the blocks (row, column) of pairs of images."""
+    from scipy import sparse  # A tenth of a second, which small networks are spared.
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
     row, column = np.asarray(row), np.asarray(column)
     links = sparse.coo_matrix((np.ones(len(row)), (row, column)), (images, images))
     order = reverse_cuthill_mckee((links + links.T).tocsr(), symmetric_mode=True)
@@ -56,8 +71,6 @@ def choose_reduction(
     """The way for a reduced system of `images` blocks of `block` unknowns and `others`; None where
     none of `ways` fits into memory."""
     unknowns = images * block + others
-    if unknowns < SMALL:
-        return "dense"
     work = {
         "dense": (unknowns**3 / 3, unknowns**2),
         "banded": (

@@ -29,8 +29,7 @@ from jaxbundle.network.reduction import (
     MOST_PAIRS,
     REDUCTIONS,
     Band,
-    choose_reduction,
-    find_band,
+    plan_reduction,
 )
 from jaxbundle.network.tables import Network
 
@@ -244,14 +243,10 @@ def make_structure(
     pairs = _image_pairs(
         image, point, paired, len(images), chunk > 1, pair_lengths, pair_blocks
     )
-    reduction, band = ways[0], None
-    if "banded" in ways:
-        band = find_band(pairs.row, pairs.column, len(images))
-    if len(ways) > 1:
-        others = (0 if own_camera else k * len(network.cameras)) + 3 * len(kept)
-        reduction = choose_reduction(
-            band, len(images), width, others, len(observations), ways
-        )
+    others = (0 if own_camera else k * len(network.cameras)) + 3 * len(kept)
+    reduction, band = plan_reduction(
+        (pairs.row, pairs.column), len(images), width, others, len(observations), ways
+    )
     structure = Structure(
         domain=network.residuals,
         axis=None,
@@ -278,7 +273,7 @@ def make_structure(
         image_pairs=pairs,
         image_camera_pairs=camera_plans[0],
         camera_pairs=camera_plans[1],
-        band=band if reduction == "banded" else None,
+        band=band,
         pins=np.zeros((len(images), width)),
         datum_weight=np.zeros((len(points), 3)),
         gauge=np.zeros((7, 0)),

@@ -19,7 +19,6 @@ from functools import partial
 
 import numpy as np
 from jaxtyping import Bool
-from scipy.sparse import coo_array, triu
 
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.check import check_tables
@@ -230,6 +229,8 @@ def _pairs_in_common(seen: Sights, among, old, linked):
 
 def _all_pairs(seen: Sights, among):
     """Pairs of these images that share points [pairs, 2], and how many."""
+    from scipy.sparse import coo_array, triu
+
     rows = among[seen.image]
     shape = (seen.images, seen.points)
     sees = coo_array((np.ones(rows.sum(), int), (seen.image[rows], seen.point[rows])), shape)

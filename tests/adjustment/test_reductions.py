@@ -20,7 +20,7 @@ from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.network import Camera
 from jaxbundle.network.build import make_network
 from jaxbundle.network.padding import common_sizes, pad, sizes_of, without_filling
-from jaxbundle.network.reduction import FACTORS, choose_reduction, find_band
+from jaxbundle.network.reduction import FACTORS, choose_reduction, find_band, plan_reduction
 from jaxbundle.statistics.cofactors import cofactors, undamped_factor
 from jaxbundle.statistics.reliability import hat_diagonal
 
@@ -68,7 +68,8 @@ def test_the_way_is_chosen_by_size_and_fill():
     narrow = find_band(np.arange(199), np.arange(1, 200), 200)
     assert (full.width, narrow.width) == (199, 1)
     way = lambda band, images, rays: choose_reduction(band, images, 9, 0, rays)
-    assert way(narrow, 100, 10_000) == "dense"  # small
+    small = plan_reduction((np.arange(99), np.arange(1, 100)), 100, 9, 0, 10_000)
+    assert small == ("dense", None)
     assert way(full, 200, 200_000) == "dense"
     assert way(narrow, 200, 200_000) == "banded"
     everywhere = dataclasses.replace(full, width=9999, blocks=2)

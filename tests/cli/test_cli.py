@@ -11,6 +11,7 @@ import pytest
 import jaxbundle
 from jaxbundle import cli
 from jaxbundle.__main__ import is_writable
+from jaxbundle.cli import convert
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "convergent4"
@@ -151,7 +152,7 @@ def test_what_nobody_thought_of_ends_in_one_line(error, status, monkeypatch, cap
     def fail(*_):
         raise error
 
-    monkeypatch.setattr(cli.convert, "convert_file", fail)
+    monkeypatch.setattr(convert, "convert_file", fail)
     monkeypatch.setattr(sys, "argv", ["jaxbundle", "convert", str(EXAMPLE), "nowhere"])
     with pytest.raises(SystemExit) as ended:
         cli.main()

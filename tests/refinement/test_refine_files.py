@@ -17,6 +17,7 @@ from refinement_scenes import (
 from typer.testing import CliRunner
 
 from jaxbundle.cli.app import app
+from jaxbundle.cli.pushbroom import refine as _refine  # noqa: F401
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, geodetic
 from jaxbundle.io.csv_tables import read_csv, write_csv
