@@ -327,9 +327,9 @@ def _why_nothing(network: Network, seen: Sights) -> str:
             "give start values"
         )
     return (
-        f"{begin}no two images that share {IN_COMMON} points or more ({most} at most) have rays "
-        "that meet at an angle: take images from places that lie apart, look for wrong point "
-        "numbers, or give start values"
+        f"{begin}no two images share {IN_COMMON} points whose rays meet at an angle ({most} points "
+        "in common at most): take images from places that lie apart, look for wrong point numbers, "
+        "or give start values"
     )
 
 

@@ -268,6 +268,13 @@ def test_what_cannot_be_placed_is_named_with_the_reason():
     assert result.converged and warning in result.warnings
 
 
+def test_too_few_points_in_common_are_counted():
+    """Five, where a relative orientation needs six."""
+    network = bare(close_up(jaxbundle.cloud_of_targets(5, (4.0, 3.0, 1.5), seed=3)))
+    with pytest.raises(NotSolvedError, match=r"6 points in common .* needs: 5 at most \('1', '"):
+        orient(network)
+
+
 def test_images_from_one_place_have_no_answer():
     turns = Stations(np.zeros((4, 3)), 0.1 * np.random.default_rng(0).normal(size=(4, 3)))
     targets = jaxbundle.cloud_of_targets(60, (4, 4, 2), centre=(0, 0, -10))
