@@ -17,6 +17,7 @@ from jaxbundle.repeated import eliminated_parameters, robustly, snooped, with_co
 from jaxbundle.result import Adjustment
 from jaxbundle.solution import minimise, names_of_defects, solved
 from jaxbundle.statistics import ESTIMATORS, intersect_check_points
+from jaxbundle.statistics.snooping import check_test
 
 UNNAMED = ("a combination of unknowns that spreads over many of them",)
 """What is not determined, where none stands out."""
@@ -65,6 +66,7 @@ def adjust(
     """
     if robust not in (None, *ESTIMATORS):
         raise InputError(f"robust must be one of {', '.join(ESTIMATORS)}, not {robust!r}")
+    check_test(snooping, significance)
     if robust and snooping:
         raise InputError("robust estimation or data snooping, not both at once")
     if lacks_start_values(network):

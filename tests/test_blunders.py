@@ -178,3 +178,15 @@ def test_what_cannot_be_asked_for(network):
         adjust(network, robust="l1")
     with pytest.raises(InputError, match="not both"):
         adjust(network, robust="huber", snooping="pope")
+
+
+@pytest.mark.parametrize("options, said", [
+    ({"snooping": "x"}, "snooping 'x': pope or baarda"),
+    ({"snooping": "pope", "significance": 2.0}, "significance 2: a number between 0 and 1"),
+])  # fmt: skip
+def test_a_test_that_is_none_is_refused_at_once(options, said):
+    """Before the network is looked at."""
+    with pytest.raises(InputError, match=said):
+        jaxbundle.adjust(None, **options)
+    with pytest.raises(InputError, match=said):
+        jaxbundle.calibrate(["nowhere.jpg"], jaxbundle.Board(9, 6, 0.03), **options)

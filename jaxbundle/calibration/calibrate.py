@@ -36,6 +36,7 @@ from jaxbundle.measure.views import BoardViews, measure_boards
 from jaxbundle.network.build import make_network
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.orientation.pose import Pose
+from jaxbundle.statistics.snooping import check_test
 
 SIGMA = 0.1
 """A priori σ of an image coordinate in pixels; σ0 of the result says what it was."""
@@ -55,6 +56,7 @@ def calibrate(
     board_free: bool = False,
     robust: str | None = None,
     snooping: str | None = "pope",
+    cross_validation: bool = True,
     camera: str = "cam",
     object_unit: str = "m",
     progress: Callable[[int, int], None] | None = None,
@@ -75,6 +77,7 @@ def calibrate(
     - `robust`: "huber", "cauchy" or "tukey": points that fit badly count less, instead of being
       removed; `snooping`: how they are removed, None: not at all. Both, and further `options`
       (`significance`, `max_iterations`, …), are those of `jaxbundle.adjust`.
+    - `cross_validation`: False: the camera is not calibrated again from halves of the photographs.
     - `camera`: its name. `progress(done, total)`: photographs searched.
 
     **Returns:** a `Calibration`; look at `converged` before anything else.
@@ -87,6 +90,7 @@ def calibrate(
     pixel_size = _pair(pixel_size)
     unit_size(camera_model, pixel_size)
     _check(sigma_image, board_sigma, board_free)
+    check_test(snooping, options.get("significance", 0.001))
     views = photographs
     if not isinstance(views, BoardViews):
         if board is None:
@@ -113,7 +117,7 @@ def calibrate(
             )  # fmt: skip
             result = adjust(network, **options)
         start = dataclasses.replace(start, views=centred)
-    return Calibration(start.views, result)
+    return Calibration(start.views, result, cross_validation)
 
 
 def board_network(

@@ -100,7 +100,8 @@ def _write_foreign(network: Network, folder: Path, name: str) -> list[str]:
 def write_calibrations(found, folder: str | Path, plots: bool = True) -> None:
     """Write one calibration into a folder, several into folders of their own, and the rig beside.
 
-    A rig adds report.txt and result.json of the whole, and its cameras as rig_CAMERA.toml.
+    A rig adds report.txt and result.json of the whole, its cameras as rig_CAMERA.toml, and figures
+    of their coverage and uncertainty in it.
     """
     folder = Path(folder)
     if len(found.cameras) == 1:
@@ -113,6 +114,8 @@ def write_calibrations(found, folder: str | Path, plots: bool = True) -> None:
         for name in found.rig.names:
             text = camera_text(found.rig.camera(name), found.rig.sigma[name])
             write_text(folder / f"rig_{file_name(name)}.toml", text)
+        if plots:
+            save_rig_plots(found.rig, folder)
 
 
 def calibrations_dict(found, brief: bool = False) -> dict:
@@ -140,6 +143,20 @@ def save_plots(calibration, folder: Path) -> None:
         drawings["halves"] = ((7.5, 6), None, calibration.plot_halves)
     write_figures(folder, drawings)
     save_figures(calibration.adjustment, folder)
+
+
+def save_rig_plots(rig, folder: Path) -> None:
+    """Coverage and uncertainty of every camera, as it is in the rig."""
+    drawings = {}
+    for name in rig.names:
+        file = f"rig_{file_name(name)}"
+        draw = partial(rig.plot_uncertainty, name)
+        drawings |= {
+            f"{file}_coverage": ((7, 5.6), None, partial(rig.plot_coverage, name)),
+            f"{file}_uncertainty": ((7, 5.6), None, partial(draw, rig.distance)),
+            f"{file}_uncertainty_far": ((7, 5.6), None, draw),
+        }
+    write_figures(folder, drawings)
 
 
 def json_text(document: dict) -> str:

@@ -75,7 +75,8 @@ def _quality(calibration):
     lines += table(("point held in", "middle", "corners"), rows, "lrr")
     checked = calibration.cross_validation
     if checked is None:
-        return [*lines, "", "Cross-validation: too few photographs for two halves"]
+        why = "too few photographs for two halves" if calibration.validated else "not made"
+        return [*lines, "", f"Cross-validation: {why}"]
     largest = max(checked.difference, key=lambda n: abs(checked.difference[n]))
     lines += ["", *paragraph(
         f"Cross-validation: the camera of either half leaves an RMS of {checked.rms_other:.4f} px "
@@ -89,10 +90,9 @@ def _quality(calibration):
 
 
 def _held_in(m, unit: str) -> str:
-    if m.frame == "scene":
-        return f"the scene, at {m.distance:.3g} {unit}" if m.distance < np.inf else (
-            "the scene, at infinity"
-        )
+    if m.frame in ("scene", "rig"):
+        away = f"{m.distance:.3g} {unit}" if m.distance < np.inf else "infinity"
+        return f"the {m.frame}, at {away}"
     return {"rotation": "all rays, rotation removed", "camera": "the camera frame"}[m.frame]
 
 
@@ -123,18 +123,11 @@ def as_dict(calibration, brief: bool = False) -> dict:
 
 def _quality_dict(calibration) -> dict:
     covered, checked = calibration.coverage, calibration.cross_validation
-    number = lambda x: float(x) if np.isfinite(x) else None
-    uncertain = [
-        {"frame": m.frame, "distance": number(m.distance), "middle": number(m.middle),
-         "corners": number(m.corners)}
-        for m in calibration.reported_maps
-    ]  # fmt: skip
     return {
         "rms": calibration.rms,
         "distances": calibration.distances.tolist(),
-        "coverage": {"part": covered.part, "reach": covered.reach, "corners": covered.corners,
-                     "counts": covered.counts.tolist()},
-        "uncertainty": uncertain,
+        "coverage": _coverage_dict(covered),
+        "uncertainty": _maps_dict(calibration.reported_maps),
         "cross_validation": None if checked is None else {
             "rms_own": checked.rms_own, "rms_other": checked.rms_other, "test": checked.test,
             "difference": checked.difference, "halves": list(checked.halves),
@@ -146,6 +139,25 @@ def _quality_dict(calibration) -> dict:
         "advice": calibration.advice,
     }  # fmt: skip
 
+
+
+def _coverage_dict(covered) -> dict:
+    return {"part": covered.part, "reach": covered.reach, "corners": covered.corners,
+            "counts": covered.counts.tolist()}  # fmt: skip
+
+
+def _maps_dict(maps) -> list[dict]:
+    number = lambda x: float(x) if np.isfinite(x) else None
+    return [
+        {"frame": m.frame, "distance": number(m.distance), "middle": number(m.middle),
+         "corners": number(m.corners)}
+        for m in maps
+    ]  # fmt: skip
+
+
+def _rig_quality(rig, name: str) -> dict:
+    return {"coverage": _coverage_dict(rig.coverage(name)),
+            "uncertainty": _maps_dict(rig.reported_maps(name))}  # fmt: skip
 
 
 def rig_text(rig) -> str:
@@ -175,6 +187,15 @@ def rig_text(rig) -> str:
         lines += heading(f"Camera {clean(name)} in the rig")
         rows = [(n, *estimate(rig.parameters[name][n], s)) for n, s in rig.sigma[name].items()]
         lines += table(("parameter", "value", "σ"), rows, "lrr")
+        covered = rig.coverage(name)
+        lines += ["", *paragraph(
+            f"Points in {100 * covered.part:.0f} % of the image's cells, out to "
+            f"{100 * covered.reach:.0f} % of the half diagonal. Uncertainty of a projected point "
+            "(σ, pixels):"
+        )]  # fmt: skip
+        rows = [(_held_in(m, unit), fixed(m.middle, 3), fixed(m.corners, 3))
+                for m in rig.reported_maps(name)]  # fmt: skip
+        lines += table(("point held in", "middle", "corners"), rows, "lrr")
     return "\n".join(line.rstrip() for line in lines) + "\n"
 
 
@@ -201,4 +222,5 @@ def rig_dict(rig) -> dict:
                    for n, value in rig.parameters[name].items()}
             for name in rig.names
         },
+        "quality": {name: _rig_quality(rig, name) for name in rig.names},
     }  # fmt: skip

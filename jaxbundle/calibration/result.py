@@ -10,6 +10,7 @@ from jaxtyping import Float
 from jaxbundle import plotting
 from jaxbundle.calibration import quality
 from jaxbundle.calibration.advice import advice
+from jaxbundle.calibration.left_out import left_out
 from jaxbundle.calibration.quality import Coverage, CrossValidation, UncertaintyMap
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.measure.views import BoardViews
@@ -30,11 +31,13 @@ class Calibration:
     - `camera`: the camera with its adjusted parameters, held; `parameters` and `sigma` by name
       (in the unit of the model, a posteriori);
     - `rms`: √(Σ(vx² + vy²)/points) in pixels, as OpenCV defines it;
-    - `coverage`, `advice`, `cross_validation`: how good it is, and what to photograph next.
+    - `coverage`, `advice`, `cross_validation`: how good it is, and what to photograph next;
+      `validated`: whether the last is wanted.
     """
 
-    def __init__(self, views: BoardViews, adjustment: Adjustment):
+    def __init__(self, views: BoardViews, adjustment: Adjustment, validated: bool = True):
         self.views = views
+        self.validated = validated
         self.adjustment = adjustment
         self._maps: dict[tuple, UncertaintyMap] = {}
 
@@ -99,20 +102,23 @@ class Calibration:
 
     @functools.cached_property
     def cross_validation(self) -> CrossValidation | None:
-        """The camera calibrated from either half of the photographs; None where there are too few.
+        """The camera calibrated from either half of the photographs; None where there are too few,
+        or where it is not wanted (`validated`).
 
         Four more adjustments, made when first asked for."""
-        return quality.cross_validation(self.adjustment)
+        return quality.cross_validation(self.adjustment) if self.validated else None
 
     @functools.cached_property
     def advice(self) -> list[str]:
         """Warnings in words, and what to photograph next (cross-validation not asked)."""
         t = {name: abs(self.parameters[name]) / s for name, s in self.sigma.items() if s > 0}
-        return advice(
+        found = advice(
             self.position, self.rotation, self.views.board.points.mean(0),
             self._unit, self.coverage, self.rms, t,
             self.__dict__.get("cross_validation"),
         )  # fmt: skip
+        missed = left_out(self.adjustment)
+        return [*found, str(missed)] if missed is not None and missed.missed else found
 
     def uncertainty(
         self, distance: float = np.inf, frame: str = "scene", grid=quality.GRID

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle import plotting
 from jaxbundle.adjustment.rig import RigSolution
 from jaxbundle.adjustment.rig_normal import (
     RigCamera,
@@ -16,7 +17,9 @@ from jaxbundle.adjustment.rig_normal import (
     mounting_columns,
 )
 from jaxbundle.calibration.frames import unit_size
+from jaxbundle.calibration.quality import GRID, Coverage, UncertaintyMap
 from jaxbundle.calibration.result import Calibration
+from jaxbundle.calibration.rig_quality import rig_coverage, rig_points, rig_uncertainty
 from jaxbundle.cameras import get_model
 from jaxbundle.geometry import matrix_from_rotation_vector, omega_phi_kappa_near
 from jaxbundle.geometry import omega_phi_kappa_from_matrix as angles_of
@@ -50,12 +53,14 @@ class RigCalibration:
 
     **Attributes:** `cameras`: the calibrations of each by itself; `mountings`, `parameters`,
     `sigma` of the common adjustment, by camera; `board`: its points [points, 3]; `epochs`;
-    `left_out`: epoch and reason; `rms` (pixels) by camera; `sigma0`, `redundancy`, `converged`.
+    `measured`: the image points used; `left_out`: epoch and reason; `rms` (pixels) by camera;
+    `sigma0`, `redundancy`, `converged`.
     """
 
     def __init__(self, cameras, rig, known: RigObject, epochs, left_out, solution: RigSolution):
         self.cameras: dict[str, Calibration] = cameras
-        self._rig: list[RigCamera] = rig
+        self.measured: list[RigCamera] = rig
+        self._maps: dict[tuple, UncertaintyMap] = {}
         self.known = known
         self.epochs: tuple[str, ...] = epochs
         self.left_out: tuple[tuple[str, str], ...] = left_out
@@ -106,10 +111,10 @@ class RigCalibration:
         """σ of the free parameters of every camera, a posteriori."""
         Q, found = self.solution.cofactors, {}
         for k, name in enumerate(self.names):
-            own = interior_columns(self._rig, k)
+            own = interior_columns(self.measured, k)
             sigma = self.sigma0 * np.sqrt(np.diagonal(Q)[own])
             names = get_model(self.cameras[name].camera.model).parameters
-            found[name] = {names[c]: float(s) for c, s in zip(self._rig[k].free, sigma)}
+            found[name] = {names[c]: float(s) for c, s in zip(self.measured[k].free, sigma)}
         return found
 
     @functools.cached_property
@@ -117,7 +122,7 @@ class RigCalibration:
         """The mounting of every camera but the reference, the first."""
         found = {}
         for k, name in enumerate(self.names[1:], 1):
-            own = mounting_columns(self._rig, k)
+            own = mounting_columns(self.measured, k)
             C = self.sigma0**2 * self.solution.cofactors[own, own]
             at = self.solution.values
             found[name] = _mounting(at.base[k], at.turn[k], C)
@@ -126,6 +131,42 @@ class RigCalibration:
     def camera(self, name: str) -> Camera:
         """A camera with the parameters of the common adjustment, held."""
         return dataclasses.replace(self.cameras[name].camera, parameters=self.parameters[name])
+
+    @property
+    def distance(self) -> float:
+        """The median distance of the board from the reference camera, object unit."""
+        return float(np.median(np.linalg.norm(self.solution.values.shift, axis=1)))
+
+    def coverage(self, name: str) -> Coverage:
+        """Where in the image of a camera the rig has points."""
+        return rig_coverage(self, name)
+
+    def uncertainty(
+        self, name: str, distance: float = np.inf, frame: str = "rig", grid=GRID
+    ) -> UncertaintyMap:
+        """Uncertainty of a projected point over the image of a camera, pixels; frames: see
+        `jaxbundle.calibration.rig_quality`."""
+        key = (name, distance, frame, grid)
+        if key not in self._maps:
+            self._maps[key] = rig_uncertainty(self, name, distance, frame, grid)
+        return self._maps[key]
+
+    def reported_maps(self, name: str) -> list[UncertaintyMap]:
+        """At the distance of the board, at ten times that, at infinity; and without mounting."""
+        chosen = (("rig", self.distance), ("rig", 10 * self.distance), ("rig", np.inf),
+                  ("rotation", np.inf))  # fmt: skip
+        return [self.uncertainty(name, distance, frame) for frame, distance in chosen]
+
+    def plot_coverage(self, name: str, ax=None):
+        """Where in the image of a camera the rig has points; matplotlib axes."""
+        size = self.cameras[name].views.image_size
+        return plotting.coverage_map(self.coverage(name), rig_points(self, name), size, name, ax)
+
+    def plot_uncertainty(self, name: str, distance: float = np.inf, frame: str = "rig", ax=None):
+        """σ of a projected point over the image of a camera; matplotlib axes."""
+        found, one = self.uncertainty(name, distance, frame), self.cameras[name]
+        unit = one.adjustment.network.object_unit
+        return plotting.uncertainty_image(found, one.views.image_size, unit, name, ax)
 
     def __str__(self) -> str:
         lines = [f"Rig of {len(self.cameras)} cameras, {len(self.epochs)} epochs, σ0 "

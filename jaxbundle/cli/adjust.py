@@ -7,13 +7,14 @@ import typer
 
 import jaxbundle
 from jaxbundle import report
-from jaxbundle.cli.app import Format, Input, Quiet, Settings, app, check_test
+from jaxbundle.cli.app import Format, Input, Quiet, Settings, app
 from jaxbundle.cli.progress import iterating
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io import read_network
 from jaxbundle.network.columns import some
 from jaxbundle.network.reduction import REDUCTIONS
 from jaxbundle.result import Adjustment
+from jaxbundle.statistics.snooping import check_test
 from jaxbundle.targets import check_targets, write_targets
 
 
@@ -59,7 +60,7 @@ def adjust(
         raise InputError(f"--method {method!r}: levenberg-marquardt or gauss-newton")
     if reduction not in (None, *REDUCTIONS):
         raise InputError(f"--reduction {reduction!r}: {', '.join(REDUCTIONS)}")
-    check_test(snooping, significance)
+    check_test(snooping, significance, "--")
     check_targets(input, network, json, out)
     try:
         with iterating(quiet or json == "-") as tell:

@@ -25,14 +25,6 @@ Format = Annotated[str | None, typer.Option(help="kind of input, if not recognis
 Quiet = Annotated[bool, typer.Option("--quiet", help="print nothing but errors")]
 
 
-def check_test(snooping: str | None, significance: float) -> None:
-    """Refuse a test of data snooping that is none, and a level that is no probability."""
-    if snooping not in (None, "pope", "baarda"):
-        raise InputError(f"--snooping {snooping!r}: pope or baarda")
-    if not 0 < significance < 1:
-        raise InputError(f"--significance {significance:g}: a number between 0 and 1")
-
-
 def _version(asked: bool) -> None:
     if asked:
         print(f"jaxbundle {jaxbundle.__version__}")

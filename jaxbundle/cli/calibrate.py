@@ -10,12 +10,13 @@ import typer
 import jaxbundle
 from jaxbundle.calibration import Board, calibrate_cameras, write_calibrations
 from jaxbundle.calibration.files import REPORT, RESULT, calibrations_dict, file_name, json_text
-from jaxbundle.cli.app import Quiet, app, check_test
+from jaxbundle.cli.app import Quiet, app
 from jaxbundle.cli.progress import counting
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.csv_tables import write_text
 from jaxbundle.io.result_json import unsolved_text
 from jaxbundle.measure.views import photographs
+from jaxbundle.statistics.snooping import check_test
 from jaxbundle.targets import check_writable
 
 
@@ -66,6 +67,9 @@ def calibrate(
     robust: Annotated[
         str | None, typer.Option(help="instead of removal: huber, cauchy or tukey")
     ] = None,
+    cross_validation: Annotated[
+        bool, typer.Option(help="calibrate again from halves of the photographs: 4 adjustments")
+    ] = True,
     unit: Annotated[str, typer.Option(help="name of the unit of the board")] = "m",
     json: Annotated[str, typer.Option(help="write the result as JSON; - for stdout alone")] = "",
     out: Annotated[
@@ -78,7 +82,7 @@ def calibrate(
     """Calibrate cameras from photographs of a board, and say how far to trust them."""
     jaxbundle.enable_x64()
     test = None if snooping == "none" else snooping
-    check_test(test, significance)
+    check_test(test, significance, "--")
     columns, rows = _size(board)
     if square is None:
         raise InputError("--square is missing: the side of a square, or the distance of circles")
@@ -101,7 +105,8 @@ def calibrate(
                 given=_values(given), pixel_size=pixel_size, sigma_image=sigma_image,
                 board_sigma=board_sigma, board_free=board_free,
                 snooping=test, significance=significance,
-                robust=robust, object_unit=unit, progress=tell,
+                robust=robust, cross_validation=cross_validation, object_unit=unit,
+                progress=tell,
             )  # fmt: skip
         except NotSolvedError as error:
             _write_json(json, unsolved_text(error))

@@ -5,9 +5,11 @@ from pathlib import Path
 
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_network
+from jaxbundle.io.calibrated import is_result, read_calibrated
 from jaxbundle.io.camera_files import chosen_camera, is_camera_file, read_cameras
 from jaxbundle.io.csv_tables import write_bytes
 from jaxbundle.network.tables import Camera
+from jaxbundle.statistics.difference import Covariance
 
 
 def camera_given(text: str) -> Camera:
@@ -15,12 +17,26 @@ def camera_given(text: str) -> Camera:
 
     **Raises:** `InputError`.
     """
+    return calibration_given(text)[0]
+
+
+def calibration_given(text: str) -> tuple[Camera, Covariance | None]:
+    """The same, with the covariance of its free parameters where it is from a result in JSON.
+
+    **Raises:** `InputError`.
+    """
     file, mark, id = text.rpartition("#")
     if not mark or Path(text).exists():
         file, id = text, None
     path = Path(file)
-    cameras = read_cameras(path) if is_camera_file(path) else read_network(path).cameras
-    return chosen_camera(cameras, id, f"{file} (FILE#ID)")
+    found = {}
+    if is_result(path):
+        results = read_calibrated(path)
+        cameras, found = [camera for camera, _ in results], {c.id: C for c, C in results}
+    else:
+        cameras = read_cameras(path) if is_camera_file(path) else read_network(path).cameras
+    camera = chosen_camera(cameras, id, f"{file} (FILE#ID)")
+    return camera, found.get(camera.id)
 
 
 def pair(option: str, text: str) -> tuple[float, float] | None:

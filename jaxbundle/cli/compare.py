@@ -1,5 +1,7 @@
 """`jaxbundle compare`: two calibrations of one camera."""
 
+import dataclasses
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -10,10 +12,11 @@ import jaxbundle
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.compare import compare_cameras, difference_rings
 from jaxbundle.cli.app import app
-from jaxbundle.cli.cameras_given import camera_given, pair, write_png
+from jaxbundle.cli.cameras_given import calibration_given, pair, write_png
 from jaxbundle.errors import InputError
 from jaxbundle.io.assemble import all_parameters
 from jaxbundle.io.csv_tables import write_csv
+from jaxbundle.statistics.difference import expected_difference
 
 RINGS = 10
 
@@ -34,7 +37,7 @@ def compare(
 ) -> None:
     """Compare two calibrations: parameters, and how far images are apart over the image."""
     jaxbundle.enable_x64()
-    first, second = camera_given(a), camera_given(b)
+    (first, C_first), (second, C_second) = calibration_given(a), calibration_given(b)
     if None not in (first.image_size, second.image_size) and first.image_size != second.image_size:
         raise InputError(
             f"{a}, {b}: images of {list(first.image_size)} and {list(second.image_size)} pixels "
@@ -42,12 +45,10 @@ def compare(
         )
     size = pair("--image-size", image_size) or first.image_size or second.image_size
     pitch = pair("--pixel-size", pixel_size) or first.pixel_size or second.pixel_size
+    one, other = ((get_model(c.model), c.parameters) for c in (first, second))
+    known = {"image_size": size, "pixel_size": pitch, "rotate": rotate}
     try:
-        found = compare_cameras(
-            (get_model(first.model), first.parameters), (get_model(second.model),
-            second.parameters), image_size=size, pixel_size=pitch, rotate=rotate,
-            radius=radius,
-        )  # fmt: skip
+        found = compare_cameras(one, other, radius=radius, **known)
         reach = np.hypot(np.ptp(found.x), np.ptp(found.y)) / 2
         rings = difference_rings(found, step if step is not None else reach / RINGS)
     except ValueError as error:
@@ -62,12 +63,26 @@ def compare(
     if found.covered < 1:
         print(f"{100 * (1 - found.covered):.1f} % of the image has no ray in one of them")
     columns = ("r", "radial", "tangential", "rms", "largest")
+    C = None
+    if C_first is not None and C_second is not None:
+        C = expected_difference(found, one, other, (C_first, C_second), **known)
+        expected = np.sqrt(np.trace(C, axis1=2, axis2=3))
+        as_map = dataclasses.replace(found, difference=expected[..., None] * [1.0, 0.0])
+        width = step if step is not None else reach / RINGS
+        rings["expected"] = difference_rings(as_map, width)["rms"]
+        columns += ("expected",)
+        times = np.sqrt(np.nanmean((found.length / expected) ** 2))
+        print(
+            f"expected by the σ of both: RMS {np.sqrt(np.nanmean(expected**2)):.4g} {found.unit}; "
+            f"the difference is {times:.2g} times its σ (1: by chance)"
+        )
+    print("rings about the image centre, each out to r; means of the radial and tangential parts")
     print("".join(f"{name:>12}" for name in columns) + f"  [{found.unit}]")
     for row in zip(*(rings[name] for name in columns)):
         print("".join(f"{value:12.4g}" for value in row))
     if csv is not None:
         write_csv(csv, list(rings), zip(*(column.tolist() for column in rings.values())))
     if plot is not None:
-        from jaxbundle.plotting.calibrations import difference_map
+        from jaxbundle.plotting.calibrations import difference_maps
 
-        write_png(plot, (7.5, 6), lambda ax: difference_map(found, ax))
+        write_png(plot, (7.5, 6) if C is None else (14, 6), partial(difference_maps, found, C))

@@ -26,6 +26,9 @@ def convert(
     ] = False,
     image_size: Annotated[str, typer.Option(help="W,H in pixels, of cameras without")] = "",
     pixel_size: Annotated[str, typer.Option(help="W,H in mm, of cameras without")] = "",
+    force: Annotated[
+        bool, typer.Option("--force", help="replace files that are there")
+    ] = False,
     set: Settings = None,
     format: Format = None,
     quiet: Quiet = False,
@@ -37,7 +40,7 @@ def convert(
         raise InputError(f"--image-size {image_size}: whole numbers of pixels are expected")
     done = convert_file(
         input, output, to, model, camera, format, overrides, measured,
-        size and tuple(map(int, size)), pair("--pixel-size", pixel_size),
+        size and tuple(map(int, size)), pair("--pixel-size", pixel_size), force,
     )  # fmt: skip
     if not quiet:
         print(str(done).split("\n", 1)[0])

@@ -41,6 +41,8 @@ from jaxbundle.network.columns import Columns
 from jaxbundle.network.tables import EXTERIOR, Network, Source
 
 OPENERS = {".gz": gzip.open, ".bz2": bz2.open}
+MOST_DIGITS = 18
+"""Of a count."""
 UNREADABLE = (OSError, EOFError, zlib.error)
 MODEL = get_model("snavely")
 
@@ -141,7 +143,7 @@ def write_bal(network: Network, path: str | Path) -> tuple[str, ...]:
 
 def _are_counts(words: Sequence[bytes]) -> bool:
     """Whether these are three whole numbers."""
-    return len(words) == 3 and all(word.isdigit() and len(word) < 19 for word in words)
+    return len(words) == 3 and all(word.isdigit() for word in words)
 
 
 def _numbers(path: Path):
@@ -154,6 +156,11 @@ def _numbers(path: Path):
     if not _are_counts(first):
         raise InputError(
             f"{path}, line 1: three whole numbers are expected: cameras, points, observations"
+        )
+    if max(map(len, first)) > MOST_DIGITS:
+        raise InputError(
+            f"{path}, line 1: {b' '.join(first)[:60].decode()}: more cameras, points, observations "
+            f"than a file of {len(text)} characters can hold"
         )
     cameras, points, rows = counts = tuple(map(int, first))
     expected = 4 * rows + 9 * cameras + 3 * points
@@ -179,13 +186,13 @@ def _not_a_number(path: Path, text: bytes) -> InputError:
     for line, row in enumerate(text.splitlines(), 2):
         for word in row.split():
             try:
-                good = np.isfinite(float(word))
+                good = np.isfinite(float(word)) and b"_" not in word
             except ValueError:
                 good = False
             if not good:
                 word = word.decode(errors="replace")
                 return InputError(f"{path}, line {line}: {word!r} where a number is expected")
-    raise AssertionError("every word is a number")
+    return InputError(f"{path}: there is something between the numbers that is none")
 
 
 def _images(pose) -> dict:

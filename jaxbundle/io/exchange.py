@@ -11,18 +11,21 @@ from pathlib import Path
 
 from jaxbundle.cameras import Conversion
 from jaxbundle.errors import InputError
+from jaxbundle.io.bundler import LIST
 from jaxbundle.io.camera_files import (
     chosen_camera,
     is_camera_file,
     read_cameras,
     write_cameras,
 )
-from jaxbundle.io.colmap import write_colmap_cameras
+from jaxbundle.io.colmap import PARTS, RIGS, write_colmap_cameras
+from jaxbundle.io.colmap import SUFFIXES as MODEL_SUFFIXES
 from jaxbundle.io.coordinates import images_path
 from jaxbundle.io.formats import PIXEL_MODELS, TARGETS, read_network
 from jaxbundle.io.opencv_file import SUFFIXES, write_opencv
 from jaxbundle.io.project import FILE_NAME
-from jaxbundle.network.columns import did_you_mean
+from jaxbundle.io.settings import TABLES
+from jaxbundle.network.columns import did_you_mean, some
 from jaxbundle.network.conversion import convert_cameras, convert_one
 from jaxbundle.network.rules import check_camera
 from jaxbundle.network.tables import Camera, Network
@@ -66,6 +69,7 @@ def convert(
     measured: bool = False,
     image_size: Sequence[float] | None = None,
     pixel_size: Sequence[float] | None = None,
+    force: bool = False,
 ) -> Converted:
     """Write an input in another format.
 
@@ -79,18 +83,22 @@ def convert(
     - `format`, `overrides`: of the input, as in `read_network`.
     - `measured`: what is fitted is fitted over the area of the measurements, not the whole image.
     - `image_size` (pixels), `pixel_size` (mm): of all cameras that have none.
+    - `force`: files that are there, the output and those written beside it, are replaced.
 
     **Raises:** `InputError`; nothing is written then.
     """
     input, output = Path(input), Path(output)
     kind = _kind(output, to)
     _check_output(output, kind)
-    if format is None and is_camera_file(input):
+    if format in (None, *CAMERA_KINDS) and is_camera_file(input):
+        _keep_camera_file(input, output)
+        _keep_others(output, kind, force)
         cameras = _sized(read_cameras(input), image_size, pixel_size)
         return _convert_cameras(input, cameras, output, kind, model, camera)
     network = read_network(input, format, overrides)
     network = network.replace(cameras=_sized(network.cameras, image_size, pixel_size))
     _keep_input(input, network, output, kind)
+    _keep_others(output, kind, force)
     if kind in CAMERA_KINDS:
         if model is not None and measured:
             network, costs = convert_cameras(network, model, measured=True)
@@ -166,6 +174,32 @@ def _keep_input(input: Path, network: Network, output: Path, kind: str) -> None:
         raise InputError(f"{output} is the input and would be overwritten; give another place")
 
 
+def _keep_camera_file(input: Path, output: Path) -> None:
+    if os.path.realpath(input) == os.path.realpath(output):
+        raise InputError(f"{output} is the input and would be overwritten; give another place")
+
+
+def files_of(output: Path, kind: str) -> list[Path]:
+    """The files an output of a kind may consist of."""
+    if kind == "project":
+        folder = output.parent if output.name == FILE_NAME else output
+        return [folder / name for name in (FILE_NAME, *(f"{table}.csv" for table in TABLES))]
+    if kind in ("colmap", "colmap-text"):
+        return [output / f"{part}{suffix}" for part in (*PARTS, *RIGS) for suffix in MODEL_SUFFIXES]
+    beside = {"csv": [images_path(output)], "bundler": [output.parent / LIST]}
+    return [output, *beside.get(kind, [])]
+
+
+def _keep_others(output: Path, kind: str, force: bool) -> None:
+    """Refuse to replace files that are there."""
+    there = [path for path in files_of(output, kind) if os.path.lexists(path)]
+    if there and not force:
+        raise InputError(
+            f"{some([str(path) for path in there], 3, str)}: already there and would be replaced; "
+            "give another place, or --force"
+        )
+
+
 def _with_model(network: Network, kind: str, model: str | None, measured: bool):
     """The network with cameras the output has, and by camera what that cost."""
     models = TARGETS[kind].models
@@ -201,8 +235,6 @@ def _convert_cameras(
             f"{input}: holds cameras alone; they can be written as {', '.join(CAMERA_KINDS)}, not "
             f"as {kind}"
         )
-    if os.path.realpath(input) == os.path.realpath(output):
-        raise InputError(f"{output} is the input and would be overwritten; give another place")
     if kind == "opencv" or id is not None:
         cameras = [chosen_camera(cameras, id, str(input))]
     costs, made = {}, []

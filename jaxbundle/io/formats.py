@@ -10,6 +10,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.bal import OPENERS, is_bal, read_bal, write_bal
 from jaxbundle.io.bingo import is_bingo, read_bingo
 from jaxbundle.io.bundler import is_bundler, read_bundler, write_bundler
+from jaxbundle.io.camera_files import is_camera_file
 from jaxbundle.io.colmap import is_colmap, read_colmap, write_colmap
 from jaxbundle.io.column_map import is_column_map, read_column_map
 from jaxbundle.io.coordinates import write_coordinates
@@ -141,10 +142,20 @@ def read_network(
     """
     path = Path(path)
     if format is not None and format not in FORMATS:
+        if format in TARGETS or format == "opencv":
+            what = "holds a camera alone" if format == "opencv" else "is written only"
+            raise InputError(
+                f"--format {format}: {what}; a network is read as {', '.join(FORMATS)}"
+            )
         raise InputError(f"unknown format {format!r}{did_you_mean(format, FORMATS)}")
     if not os.path.exists(path):
         raise InputError(f"{path}: no such file or folder")
     format = format or recognised_format(path)
+    if format is None and is_camera_file(path):
+        raise InputError(
+            f"{path}: holds cameras alone, without images and points; a project, or another "
+            "network, is expected (jaxbundle camera, compare and convert read it)"
+        )
     if format is None:
         known = "; ".join(f"{name}: {kind.looks}" for name, kind in FORMATS.items())
         raise InputError(f"{path}: the kind of input is not recognised; known formats: {known}")

@@ -19,6 +19,10 @@ from jaxbundle.measure.photographs import read_photograph
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".jp2")
 """Files of a folder that are taken for photographs."""
+SAME, ALIKE = 0.05, 0.8
+"""Photographs are one if their points agree to so many pixels (RMS), in this part of the board at
+least. JPEG at quality 40 moves corners by 0.05; a second photograph of one pose, whose noise moves
+them by no more, says nothing about the camera either."""
 SEARCHED = 3
 """In so many photographs boards of other sizes are looked for, where none has the right one."""
 
@@ -128,6 +132,8 @@ def measure_boards(
                 f"has {other[0]} × {other[1]} pixels, most have {size[0]} × {size[1]}{turned}"
             )
     used = [(name, xy) for name, other, xy in found if other == size]
+    failed |= _saved_again(used)
+    used = [(name, xy) for name, xy in used if name not in failed]
     order = {name: i for i, name in enumerate(names)}
     return BoardViews(
         board, tuple(name for name, _ in used), size, np.array([xy for _, xy in used]),
@@ -147,6 +153,26 @@ def _repeated(paths: Mapping[str, Path]) -> dict[str, str]:
         same = first.setdefault(hashlib.blake2b(content).digest(), name)
         if same != name and content:
             found[name] = f"is the same file as {same}"
+    return found
+
+
+def _saved_again(used: Sequence[tuple[str, np.ndarray]]) -> dict[str, str]:
+    """Views whose points are where those of an earlier one are: one photograph in another
+    compression or format."""
+    found: dict[str, str] = {}
+    for i, (name, xy) in enumerate(used):
+        for other, earlier in used[:i]:
+            away = np.linalg.norm(xy - earlier, axis=1)
+            same = np.isfinite(away)
+            if other in found or same.mean() < ALIKE:
+                continue
+            rms = float(np.sqrt(np.mean(away[same] ** 2)))
+            if rms < SAME:
+                found[name] = (
+                    f"shows the board where {other} does, to {rms:.1g} px: the same photograph "
+                    "saved again, or another of the same pose; one is used"
+                )
+                break
     return found
 
 

@@ -21,6 +21,7 @@ from jaxbundle.network.sightings import (
     without_distances,
 )
 from jaxbundle.network.sightings import split_check_points as split_check_points
+from jaxbundle.network.single_strip import check_single_strip
 from jaxbundle.network.tables import EXTERIOR, ROLES, Images, Network, Points, Source
 from jaxbundle.network.units import ANGLE_UNITS
 
@@ -40,6 +41,7 @@ def check_network(network: Network) -> Network:
     _check_start_values(network)
     check_parts(network)
     check_redundancy(network)
+    network = check_single_strip(network)
     network = _warn_of_points_behind(network)
     return network.replace(warnings=tuple(dict.fromkeys(network.warnings)))
 

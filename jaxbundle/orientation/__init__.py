@@ -21,6 +21,8 @@ from .homography import interior_from_homographies as interior_from_homographies
 from .homography import pose_from_homography as pose_from_homography
 from .intersection import Intersection as Intersection
 from .intersection import intersection as intersection
+from .planar import PlanarOrientations as PlanarOrientations
+from .planar import planar_orientations as planar_orientations
 from .pose import Pose as Pose
 from .pose import image_of as image_of
 from .pose import ray_of as ray_of

@@ -15,6 +15,10 @@ LEAST_RAYS = 5
 FEW = 6
 """So few points are all believed: none can be told from the others."""
 ROUNDS = 3
+LEAST_TO_TELL = 4
+"""Control points by which an object is told from its mirror image."""
+MIRRORED, FITS = 5.0, 30.0
+"""As in a mirror: it fits so many times better, and to this part of the extent."""
 
 
 def onto_the_given(network: Network, sights: Sights, model: Model) -> Model | None:
@@ -108,6 +112,35 @@ def _by_an_image(model, part, image, both):
     to, off = (np.linalg.norm(m.X[both] - m.X0[image], axis=1) for m in (model, part))
     A = np.median(to / off) * model.M[image].T @ part.M[image]
     return A, model.X0[image] - A @ part.X0[image]
+
+
+def mirrored(network: Network, model: Model) -> str:
+    """Whether a model in a frame of its own fits the control points only as in a mirror, in words;
+    empty where it does not, or where it cannot be told (fewer than four, or in a plane)."""
+    points = network.points
+    control = controlled(points) & model.known
+    source, target = model.X[control], points.position[control]
+    if len(source) < LEAST_TO_TELL:
+        return ""
+    off = [_misfit(source, target * axes) for axes in ([1, 1, 1], [-1, 1, 1])]
+    extent = float(np.ptp(target, axis=0).max())
+    if not off[1] < min(off[0] / MIRRORED, extent / FITS):
+        return ""
+    return (
+        f"the {len(source)} control points fit the images only as in a mirror (by "
+        f"{off[1]:.3g} {network.object_unit}, otherwise {off[0]:.3g}): X and Y are exchanged, or "
+        "one of X, Y, Z has the wrong sign, or the image coordinates count y downward; turn one "
+        "axis round"
+    )
+
+
+def _misfit(source, target) -> float:
+    """The median distance of points after the similarity that takes one list to the other."""
+    found = similarity(source, target)
+    if found is None:
+        return np.inf
+    A, t = found
+    return float(np.median(np.linalg.norm(source @ A.T + t - target, axis=1)))
 
 
 def similarity(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]):

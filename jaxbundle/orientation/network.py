@@ -26,7 +26,7 @@ from jaxbundle.network.columns import count, some
 from jaxbundle.network.sightings import keep_images, keep_points
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation import many
-from jaxbundle.orientation.frames import joined, onto_the_given, to_scale
+from jaxbundle.orientation.frames import joined, mirrored, onto_the_given, to_scale
 from jaxbundle.orientation.growth import (
     AGREE,
     FOR_OTHERS,
@@ -47,6 +47,9 @@ SEEDS = 6
 """Pairs a model is grown from, at most."""
 OUT_OF_THE_QUESTION = 3.0
 """Image points that miss by more than so many tolerances are left out."""
+CONTRADICTED = 0.1
+"""Part of the rays to control points that miss them, or of the points whose rays do not meet, above
+which a mirror is thought of."""
 MOST = 0.8
 """A model in which this part of the image points finds its place need not compete."""
 WIDE = 0.5
@@ -95,9 +98,33 @@ def find_start_values(network: Network, improve: Callable | None = None) -> Orie
     seen = sights(network)
     model, frame = _model(network, seen, improve and partial(improve, network))
     if not model.placed.any():
-        why = _why_nothing(network, seen)
+        why = _mirrored(network, seen) or _why_nothing(network, seen)
         raise NotSolvedError(f"no start values found: {why}", _names(network))
-    return _result(network, seen, model, frame)
+    found = _result(network, seen, model, frame)
+    if _control_contradicts(network, seen, model) and (why := _mirrored(network, seen)):
+        raise NotSolvedError(f"no start values found: {why}", _names(network))
+    return found
+
+
+def _control_contradicts(network: Network, seen: Sights, model: Model) -> bool:
+    """Whether many rays to control points miss them altogether, or many points have rays that do
+    not meet."""
+    control = controlled(network.points)
+    placed = model.placed[seen.image]
+    rays = control[seen.point] & placed
+    wrong = misclosures(seen, model) > OUT_OF_THE_QUESTION * seen.tolerance[seen.image]
+    seen_twice = np.bincount(seen.point[placed], minlength=seen.points) > 1
+    unmet = seen_twice & ~model.known
+    return bool(control.any()) and bool(
+        wrong[rays].sum() > CONTRADICTED * rays.sum()
+        or unmet.sum() > CONTRADICTED * seen_twice.sum()
+    )
+
+
+def _mirrored(network: Network, seen: Sights) -> str:
+    """Whether a model without control fits it as in a mirror only, in words."""
+    model = _from_a_pair(seen, Model.empty(seen), None)
+    return "" if model is None else mirrored(network, model)
 
 
 def _model(network: Network, seen: Sights, improve) -> tuple[Model, str]:
@@ -189,6 +216,19 @@ def _good_pairs(seen: Sights, among: Bool[np.ndarray, " images"], old, linked: b
 def _pairs_in_common(seen: Sights, among, old, linked):
     """Up to `PAIRS` pairs of images, and the number of their points: those with the most, and
     others with enough, which lie wider apart."""
+    pairs, number = _all_pairs(seen, among)
+    use = (number >= IN_COMMON) & ((old[pairs[:, 0]] != old[pairs[:, 1]]) | (not linked))
+    pairs, number = pairs[use], number[use]
+    order = np.argsort(-number, kind="stable")
+    enough = order[number[order] >= 0.3 * number.max(initial=0)]
+    chosen = np.unique(np.concatenate(
+        [order[: PAIRS // 2], enough[many.spread(len(enough), PAIRS - PAIRS // 2)]]
+    ))
+    return pairs[chosen], number[chosen]
+
+
+def _all_pairs(seen: Sights, among):
+    """Pairs of these images that share points [pairs, 2], and how many."""
     from scipy.sparse import coo_array, triu
 
     rows = among[seen.image]
@@ -196,14 +236,7 @@ def _pairs_in_common(seen: Sights, among, old, linked):
     sees = coo_array((np.ones(rows.sum(), int), (seen.image[rows], seen.point[rows])), shape)
     sees = sees.tocsr()
     common = triu(sees @ sees.T, k=1)
-    use = (common.data >= IN_COMMON) & ((old[common.row] != old[common.col]) | (not linked))
-    pairs, number = np.stack([common.row, common.col], 1)[use], common.data[use]
-    order = np.argsort(-number, kind="stable")
-    enough = order[number[order] >= 0.3 * number.max(initial=0)]
-    chosen = np.unique(np.concatenate(
-        [order[: PAIRS // 2], enough[many.spread(len(enough), PAIRS - PAIRS // 2)]]
-    ))
-    return pairs[chosen], number[chosen]
+    return np.stack([common.row, common.col], 1), common.data
 
 
 def _common_points(seen: Sights, image: int, other: int):
@@ -279,15 +312,34 @@ def _reasons(network: Network, seen: Sights, model: Model, known):
 
 
 def _why_nothing(network: Network, seen: Sights) -> str:
-    rays = np.bincount(seen.image, minlength=seen.images)
     control = np.bincount(seen.image, controlled(network.points)[seen.point], minlength=seen.images)
     best = int(control.argmax())
-    return (
+    begin = (
         f"no image sees {LEAST} control points that agree ({int(control[best])} in "
-        f"{network.images.id[best]!r} at most), and no two images share {IN_COMMON} points whose "
-        f"rays meet at an angle (up to {rays.max()} points in an image); measure more points in "
-        "common, or give start values"
+        f"{network.images.id[best]!r} at most), and "
     )
+    one, other, most = _most_in_common(seen)
+    if most < IN_COMMON:
+        pair = f" ({network.images.id[one]!r}, {network.images.id[other]!r})" if most else ""
+        return (
+            f"{begin}no two images have the {IN_COMMON} points in common that a relative "
+            f"orientation needs: {most} at most{pair}; measure more points in the same images, or "
+            "give start values"
+        )
+    return (
+        f"{begin}no two images share {IN_COMMON} points whose rays meet at an angle ({most} points "
+        "in common at most): take images from places that lie apart, look for wrong point numbers, "
+        "or give start values"
+    )
+
+
+def _most_in_common(seen: Sights) -> tuple[int, int, int]:
+    """The two images with the most points in common, and how many."""
+    pairs, number = _all_pairs(seen, np.ones(seen.images, bool))
+    if not len(number):
+        return 0, 0, 0
+    best = int(number.argmax())
+    return int(pairs[best, 0]), int(pairs[best, 1]), int(number[best])
 
 
 def _names(network: Network) -> list[str]:

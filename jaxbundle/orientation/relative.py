@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.lax import stop_gradient
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.geometry import matrix_from_quaternion, matrix_from_rotation_vector
 
@@ -45,7 +45,8 @@ class RelativeOrientation(eqx.Module):
 
     `cofactor`: of three turns δθ in radians in the frame of the second camera, and of the two
     components of b, radians, across it. `in_front`: weight of the points in front of both cameras,
-    in parts of the whole.
+    in parts of the whole. `flat`: a homography explains the images as well: of a plane there may be
+    a second solution, see `planar_orientations`.
     """
 
     M: Float[Array, "3 3"]
@@ -53,6 +54,7 @@ class RelativeOrientation(eqx.Module):
     vtpv: Float[Array, ""]
     cofactor: Float[Array, "5 5"]
     in_front: Float[Array, ""]
+    flat: Bool[Array, ""]
     status: Int[Array, ""]
 
 
@@ -97,7 +99,7 @@ def relative_orientation(
         (~fit.determined, Status.UNDETERMINED),
         (front < 0.5, Status.BEHIND_THE_CAMERA),
     )
-    return RelativeOrientation(M, b, fit.vtpv, fit.cofactor, front, status)
+    return RelativeOrientation(M, b, fit.vtpv, fit.cofactor, front, flat & ~no_base, status)
 
 
 def sampson_distance(

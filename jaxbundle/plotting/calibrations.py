@@ -75,5 +75,39 @@ def difference_map(comparison: Comparison, ax=None, name: str = "Difference of t
     quiet(ax, grid=False)
     for axis in "xy":
         label(ax, axis, axis, comparison.unit)
-    title(ax, name, f"RMS {factor * comparison.rms:.3g} {unit}, rotation removed")
+    removed = ", rotation removed" if comparison.rotation.any() else ""
+    title(ax, name, f"RMS {factor * comparison.rms:.3g} {unit}{removed}")
     return ax
+
+
+def expected_map(comparison: Comparison, covariance, ax=None, name: str = "Expected by their σ"):
+    """σ of the length of a difference over the image, √(σx² + σy²); matplotlib axes.
+
+    **Arguments:** `covariance` [rows, columns, 2, 2] of the differences, as
+    `jaxbundle.statistics.difference.expected_difference` gives it.
+    """
+    ax = axes(ax, (7.5, 6))
+    factor, unit = micrometres(comparison.unit)
+    sigma = factor * np.sqrt(np.trace(covariance, axis1=2, axis2=3))
+    mesh = ax.pcolormesh(comparison.x, comparison.y, sigma, shading="nearest", cmap="viridis")
+    bar = ax.figure.colorbar(mesh, ax=ax, shrink=0.8)
+    label(bar.ax, "y", "σ of the difference", unit)
+    if comparison.unit == "px":
+        ax.invert_yaxis()
+    ax.set_aspect("equal")
+    quiet(ax, grid=False)
+    for axis in "xy":
+        label(ax, axis, axis, comparison.unit)
+    title(ax, name, f"RMS {np.sqrt(np.nanmean(sigma**2)):.3g} {unit}")
+    return ax
+
+
+def difference_maps(comparison: Comparison, covariance, ax):
+    """The difference map, and beside it what is expected, where there is a covariance."""
+    if covariance is None:
+        return difference_map(comparison, ax)
+    figure = ax.figure
+    ax.remove()
+    left, right = figure.subplots(1, 2)
+    difference_map(comparison, left)
+    return expected_map(comparison, covariance, right)

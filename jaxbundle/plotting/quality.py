@@ -79,9 +79,10 @@ def uncertainty_image(uncertainty, image_size, unit: str = "m", name: str = "cam
         "scene": f"points at {uncertainty.distance:.3g} {unit}, held in the scene",
         "rotation": "rays, the implied rotation removed",
         "camera": "rays held in the camera frame",
+        "rig": f"points at {uncertainty.distance:.3g} {unit}, held in the rig",
     }[uncertainty.frame]
-    if np.isinf(uncertainty.distance) and uncertainty.frame == "scene":
-        where = "points at infinity, held in the scene"
+    if np.isinf(uncertainty.distance) and uncertainty.frame in ("scene", "rig"):
+        where = f"points at infinity, held in the {uncertainty.frame}"
     title(ax, f"Camera {name}: uncertainty of projection", where)
     return ax
 

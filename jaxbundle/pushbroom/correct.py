@@ -109,7 +109,7 @@ def _occluded(image, search, surface, line, pixel, ground):
     half = length(ground[:, 0, 1] - ground[:, 0, 0]) / 2
 
     def of_point(line, pixel, X):
-        numbers, (P, V) = sample(search.pieces, image.times.time(line))
+        numbers, _, (P, V) = sample(search.pieces, image.times.time(line))
         pose = Pose(jnp.stack(P), numbers[:9].reshape(3, 3).T, jnp.stack(V))
         hit = ground_point(pose, image.optics.slopes(pixel), surface, image.corrections)
         gap = difference(X, hit)

@@ -3,8 +3,9 @@
     F(t) = −s/q − η(ξ),    ξ = −r/q,    [r, s, q] = M(t)·D + m(t),
 
 the slope at which the point is ahead of the line of detectors, η a polynomial of ξ, changes its
-sign at every passage. Two passages within one step of the search (a piece, or 1/128 of the image)
-that turn back in between are not separated.
+sign at every passage. Between two times of the search (a piece, or 1/128 of the image) F is taken
+as the cubic with its values and rates at both: one that goes to zero and turns back within the step
+passes twice. While the Earth is between point and camera nothing is seen.
 """
 
 from functools import partial
@@ -13,7 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbundle.geometry.vectors import difference
+from jaxbundle.geometry.ellipsoid import normal
+from jaxbundle.geometry.vectors import difference, dot
 
 from .newton import line_period, motion, seen_from
 from .pieces import value, value_and_rate
@@ -53,41 +55,73 @@ def ahead(numbers, D, along):
 
 
 def sample(pieces, t):
-    """The twelve numbers at a time, and (P, V)."""
+    """The twelve numbers at a time, their rates, and (P, V)."""
     k = jnp.searchsorted(pieces.ends[1:-1], t, side="right")
     start, end, c = pieces.ends[k], pieces.ends[k + 1], pieces.coefficients[k]
     half = (end - start) / 2
     numbers, rates = value_and_rate(c, (t - start) / half - 1)
-    return numbers, motion(numbers, rates / half, pieces.origin)
+    return numbers, rates / half, motion(numbers, rates / half, pieces.origin)
 
 
 def passages(image, search, X, most, margin):
-    """When the line of detectors passes over the points, about, and how often; before or after?
+    """When the line of detectors passes over the points, about, and how often; whether they are
+    ahead of the last line, behind the first, and never above the horizon.
 
     The search begins and ends a line outside the image, so that its edges are within.
     """
     step = (1 + margin) * line_period(image)
     samples = search.samples.at[0].add(-step).at[-1].add(step)
-    numbers, motions = jax.vmap(partial(sample, search.pieces))(samples)
+    numbers, rates, motions = jax.vmap(partial(sample, search.pieces))(samples)
+    up = None if search.earth is None else normal(search.earth, X)
 
     def step_to(state, sample):
-        before, t_before, count, starts, first = state
-        k, t, numbers, motion = sample
+        before, rate_before, t_before, count, starts, first, risen = state
+        k, t, numbers, rates, motion = sample
         D = difference(seen_from(image, search.earth, motion, X), search.pieces.origin)
-        value, _ = ahead(numbers, D, search.along)
-        passed = (before >= 0) != (value >= 0)
-        passed &= ~(jnp.isnan(before) | jnp.isnan(value))
-        crossing = t_before + (t - t_before) * before / jnp.where(passed, before - value, 1.0)
+        value, rate = jax.jvp(lambda n: ahead(n, D, search.along)[0], (numbers,), (rates,))
+        if up is not None:
+            above = dot(up, difference(motion[0], X)) > 0
+            value, risen = jnp.where(above, value, jnp.nan), risen | above
+        h = t - t_before
+        once, twice, places = _zeros(before, value, rate_before * h, rate * h)
+        new = once + 2 * twice
         starts = tuple(
-            jnp.where(passed & (count == i), crossing, start) for i, start in enumerate(starts)
-        )
-        return (value, t, count + passed, starts, jnp.where(k == 0, value, first)), None
+            jnp.select([(count + j == i) & (new > j) for j in range(2)],
+                       [t_before + h * s for s in places], start)
+            for i, start in enumerate(starts)
+        )  # fmt: skip
+        first = jnp.where(k == 0, value, first)
+        return (value, rate, t, count + new, starts, first, risen), None
 
     zero = jnp.zeros_like(X[0])
-    nowhere = zero * jnp.nan
-    state = (nowhere, samples[0], zero.astype(int), (zero,) * most, nowhere)
+    nowhere, never = zero * jnp.nan, zero > 1
+    state = (
+        nowhere, zero, samples[0], zero.astype(int), (zero,) * most, nowhere,
+        never if up is not None else ~never,
+    )  # fmt: skip
     unroll = 1 if image.corrections.any else 4
-    (final, _, count, starts, first), _ = jax.lax.scan(
-        step_to, state, (jnp.arange(len(samples)), samples, numbers, motions), unroll=unroll
+    (final, _, _, count, starts, first, risen), _ = jax.lax.scan(
+        step_to, state, (jnp.arange(len(samples)), samples, numbers, rates, motions), unroll=unroll
     )
-    return jnp.stack(starts), count, final > 0, first < 0
+    return jnp.stack(starts), count, final > 0, first < 0, ~risen
+
+
+def _zeros(a, b, da, db):
+    """Whether a function passes zero once or twice from 0 to 1, and where, about; from its values
+    and rates at both ends (cubic), false where one is NaN."""
+    known = ~(jnp.isnan(a) | jnp.isnan(b))
+    once = known & ((a >= 0) != (b >= 0))
+    straight = a / jnp.where(once, a - b, 1.0)
+    turns = known & ~once & (a * da < 0) & (b * db > 0)
+    # the zero of the rate, c + 2h·s + k·s², between ends of different sign
+    rise = b - a
+    c, h, k = da, 3 * rise - 2 * da - db, 3 * (da + db - 2 * rise)
+    q = -(h + jnp.copysign(jnp.sqrt(jnp.maximum(h * h - c * k, 0.0)), h))
+    s = c / jnp.where(turns, q, 1.0)
+    s = jnp.where((s > 0) & (s < 1), s, q / jnp.where(turns & (k != 0), k, 1.0))
+    turn = a + s * (da + s * (h + s * k / 3))
+    twice = turns & ((turn >= 0) != (a >= 0))
+    # a parabola on each side of the turn
+    part = lambda end: jnp.sqrt(turn / jnp.where(twice, turn - end, 1.0))
+    before, after = s * (1 - part(a)), s + (1 - s) * part(b)
+    return once, twice, (jnp.where(once, straight, before), after)

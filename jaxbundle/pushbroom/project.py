@@ -183,12 +183,12 @@ def _in_chunks(function, arrays):
 
 def _found(image, search, X, most, margin):
     """The places of a chunk of points, a triple of arrays."""
-    hidden = _hidden(search, X)
     if search.footprint is None:
-        return _searched(image, search, X, hidden, most, margin)
+        return _searched(image, search, X, most, margin)
     start = search.footprint.start(difference(X, search.pieces.origin))
     t, u, settled = refine(image, search.pieces, search.earth, X, *start)
-    once = settled & _inside(image, t, u, 0.0) & search.footprint.level(search.earth, X) & ~hidden
+    once = settled & _inside(image, t, u, 0.0) & search.footprint.level(search.earth, X)
+    once &= _above(search, X)
     only = lambda v: jnp.full((most, v.size), jnp.nan).at[0].set(v)
     count = once.astype(int)
     found = Projected(only(image.times.line(t)), only(u), count, jnp.zeros_like(count))
@@ -196,15 +196,15 @@ def _found(image, search, X, most, margin):
     def search_on(state):
         found, known = state
         chosen = first_of(~known, min(SEARCHED, known.size))
-        few = _searched(image, search, *collected((X, hidden), chosen), most, margin)
+        few = _searched(image, search, collected(X, chosen), most, margin)
         return replaced(found, few, chosen), known.at[chosen].set(True, mode="drop")
 
     return jax.lax.while_loop(lambda s: ~jnp.all(s[1]), search_on, (found, once))[0]
 
 
-def _searched(image, search, X, hidden, most, margin):
+def _searched(image, search, X, most, margin):
     """The places of points that may be anywhere."""
-    starts, count, ahead, behind = passages(image, search, X, most, margin)
+    starts, count, ahead, behind, hidden = passages(image, search, X, most, margin)
     there = count > jnp.arange(most)[:, None]
 
     def place(args):
@@ -217,12 +217,12 @@ def _searched(image, search, X, hidden, most, margin):
 
     # one after the other, not written out: all passages share one compiled Newton's method
     t, u, settled = jax.lax.map(place, (starts, there))
-    seen = there & settled & _inside(image, t, u, margin) & ~hidden
+    seen = there & settled & _inside(image, t, u, margin)
     lost = jnp.any(there & ~settled, axis=0)
     order = jnp.argsort(~seen, axis=0, stable=True)
     sorted_ = lambda v: jnp.take_along_axis(jnp.where(seen, v, jnp.nan), order, 0)
     # passages beyond the first `most` were not followed: they may be beside the image
-    number = seen.sum(0) + jnp.maximum(count - most, 0) * ~hidden
+    number = seen.sum(0) + jnp.maximum(count - most, 0)
     status = jnp.select(
         [number > 0, hidden, lost, count > 0, ahead, behind],
         [jnp.asarray(int(s)) for s in (
@@ -240,9 +240,9 @@ def _inside(image, t, u, margin):
     return (t >= first) & (t < last) & (u >= -edge) & (u < image.pixels - 1 + edge)
 
 
-def _hidden(search, X):
-    """Whether the Earth is between the points and the camera at the middle of the image."""
+def _above(search, X):
+    """Whether the camera is above the horizon of the points at the middle of the image."""
     if search.earth is None:
-        return jnp.zeros(X[0].shape, bool)
-    _, (P, _) = sample(search.pieces, search.samples[len(search.samples) // 2])
-    return dot(normal(search.earth, X), difference(P, X)) <= 0
+        return jnp.ones(X[0].shape, bool)
+    _, _, (P, _) = sample(search.pieces, search.samples[len(search.samples) // 2])
+    return dot(normal(search.earth, X), difference(P, X)) > 0

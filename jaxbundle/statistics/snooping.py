@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.adjustment.problem import Problem, count_rows
+from jaxbundle.errors import InputError
 from jaxbundle.network.arrays import Values
 from jaxbundle.statistics.distributions import critical_w
 from jaxbundle.statistics.inspection import Inspection
@@ -35,6 +36,21 @@ class Removed:
     row: int
     name: str
     test: float
+
+
+TESTS = ("pope", "baarda")
+
+
+def check_test(test: str | None, significance: float, option: str = "") -> None:
+    """Refuse a test that is none, and a level that is no probability; `option` stands before the
+    names in the message.
+
+    **Raises:** `InputError`.
+    """
+    if test not in (None, *TESTS):
+        raise InputError(f"{option}snooping {test!r}: {' or '.join(TESTS)}")
+    if not 0 < significance < 1:
+        raise InputError(f"{option}significance {significance:g}: a number between 0 and 1")
 
 
 def snoop(
@@ -58,9 +74,10 @@ def snoop(
 
     **Returns:** the problem without the removed observations, its solution, and what was removed
     in the order of removal.
+
+    **Raises:** `InputError` for another test, or a level that is no probability.
     """
-    if test not in ("pope", "baarda"):
-        raise ValueError(f"test must be \"pope\" or \"baarda\", not {test!r}")
+    check_test(test, significance)
     whole, removed, returned = problem, [], set()
     while True:
         values = adjust_from(problem, values)

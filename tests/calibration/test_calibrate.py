@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from jaxbundle.adjustment.batch import calibrate_batch
 from jaxbundle.calibration import Board, BoardViews, calibrate
 from jaxbundle.calibration.calibrate import board_network
+from jaxbundle.calibration.left_out import left_out
 from jaxbundle.calibration.start import default_free, start_values
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError, NotSolvedError
@@ -264,6 +265,41 @@ def test_a_photograph_counts_once(folder, tmp_path):
     views = measure_boards([tmp_path], taken.BOARD, lambda *done: told.append(done))
     assert views.names == ("a.png",) and views.failed == (("b.png", "is the same file as a.png"),)
     assert told == [(1, 2), (2, 2)]
+
+
+def test_a_photograph_saved_again_counts_once(folder, tmp_path):
+    """Another compression and another format are found by their corners."""
+    first, second = (cv2.imread(str(p)) for p in sorted(folder.glob("photo_*.png"))[:2])
+    cv2.imwrite(str(tmp_path / "a.png"), first)
+    cv2.imwrite(str(tmp_path / "b.jpg"), first, [cv2.IMWRITE_JPEG_QUALITY, 85])
+    cv2.imwrite(str(tmp_path / "c.bmp"), first)
+    cv2.imwrite(str(tmp_path / "d.png"), second)
+    # noise of its own: another photograph of the same pose
+    noise = np.random.default_rng(0).normal(0, 12, first.shape)
+    cv2.imwrite(str(tmp_path / "e.png"), np.clip(first + noise, 0, 255).astype(np.uint8))
+    views = measure_boards([tmp_path], taken.BOARD)
+    assert views.names == ("a.png", "d.png", "e.png")
+    assert [name for name, _ in views.failed] == ["b.jpg", "c.bmp"]
+    assert all("where a.png does" in why for _, why in views.failed)
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1.002])
+def test_an_affinity_that_is_left_out_is_told(ratio):
+    """fy/fx = 1 + b1 in `brown`, whose one principal distance is that of y."""
+    lens = render.Lens.of(**TRUTH | {"fx": 620.0, "fy": 620.0 * ratio})
+    free = ("c", "x0", "y0", "K1", "K2", "P1", "P2")
+    views = simulated(lens)
+    found = calibrate(views, model="brown", pixel_size=0.01, free=free, snooping=None)
+    missed = left_out(found.adjustment)
+    assert missed.names == ("b1", "b2")
+    np.testing.assert_array_less(np.abs(missed.values - [ratio - 1, 0]), 4 * missed.sigma)
+    assert missed.missed == (ratio != 1)
+    told = [text for text in found.advice if "b1 and b2" in text]
+    assert len(told) == (ratio != 1)
+    if told:
+        half = (ratio - 1) * 240
+        assert missed.largest == pytest.approx(half, rel=0.25)
+        assert f"up to {missed.largest:.2f} px" in told[0]
 
 
 def test_names_and_patterns(tmp_path):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import sys
 
 import board_photographs as taken
 import numpy as np
@@ -11,15 +12,18 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from test_calibrate import NOISE, simulated
 
+from jaxbundle import cli
 from jaxbundle.adjustment.batch import calibrate_batch
 from jaxbundle.calibration import calibrate
 from jaxbundle.calibration.advice import advice
-from jaxbundle.calibration.files import write_calibration
+from jaxbundle.calibration.files import json_text, write_calibration
 from jaxbundle.calibration.quality import coverage, grid_of, uncertainty_map
-from jaxbundle.cameras import get_model
+from jaxbundle.cameras import compare_cameras, get_model
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_cameras, read_network, read_opencv
+from jaxbundle.io.calibrated import read_calibrated
 from jaxbundle.plotting import write_figures
+from jaxbundle.statistics.difference import expected_difference
 
 pytestmark = pytest.mark.xdist_group("calibration")
 
@@ -227,3 +231,42 @@ def test_figures(calibration, tmp_path):
     np.testing.assert_array_equal(shown.filled(0), calibration.coverage.counts)
     near = axes["curve"].lines[0].get_ydata().min()
     assert near < calibration.uncertainty().middle
+
+
+def test_the_expected_difference_is_that_of_a_sample(sample):
+    """Pairs of simulated calibrations, over the σ stated."""
+    calibration, batch = sample
+    model, C = get_model("opencv"), calibration.adjustment.camera_covariance("cam")
+    names = model.parameters
+    of = lambda k: (model, dict(zip(names, batch.interior[k][: len(names)].tolist())))
+    ratio = []
+    for k in range(0, 120, 2):
+        one, other = of(k), of(k + 1)
+        found = compare_cameras(one, other, image_size=(480, 360))
+        expected = expected_difference(found, one, other, (C, C), image_size=(480, 360))
+        ratio.append(found.length**2 / np.trace(expected, axis1=2, axis2=3))
+    # the middle of the image, where the first order holds
+    assert np.nanmean(np.array(ratio)[:, 8:-8, 8:-8]) == pytest.approx(1, abs=0.25)
+
+
+def test_compare_tells_what_is_expected(calibration, tmp_path, monkeypatch, capsys):
+    file, plot = tmp_path / "result.json", tmp_path / "map.png"
+    file.write_text(json_text(calibration.to_dict(brief=True)))
+    monkeypatch.setattr(
+        sys, "argv", ["jaxbundle", "compare", str(file), str(file), "--plot", str(plot)]
+    )
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    said = capsys.readouterr().out
+    assert not ended.value.code and plot.stat().st_size > 10_000
+    assert "expected by the σ of both" in said and "largest    expected" in said
+    ((camera, (names, C)),) = read_calibrated(file)
+    expected = calibration.adjustment.camera_covariance(calibration.name)
+    assert tuple(names) == tuple(expected[0]) and camera.image_size == (480, 360)
+    np.testing.assert_allclose(C, expected[1], rtol=1e-9, atol=1e-20)
+    for text, complaint in (("{", "not a result in JSON"), ("[]", "not the result of adjust"),
+                            ('{"converged": false}', "was not solved"),
+                            ("[" * 100_000, "not a result in JSON")):  # fmt: skip
+        file.write_text(text)
+        with pytest.raises(InputError, match=complaint):
+            read_calibrated(file)

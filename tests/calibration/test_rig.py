@@ -1,9 +1,12 @@
 """Cameras on one mounting: truth, Monte Carlo, OpenCV, photographs that do not belong together."""
 
 import dataclasses
+from functools import partial
 
 import board_photographs as taken
 import cv2
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import render
@@ -12,8 +15,10 @@ from test_calibrate import TRUTH, VIEWS, simulated
 from jaxbundle.adjustment.rig import adjust_rig
 from jaxbundle.adjustment.rig_normal import RigCamera, RigObject, RigValues, interior_columns
 from jaxbundle.calibration import BoardViews, calibrate, calibrate_cameras, calibrate_rig
+from jaxbundle.calibration.files import save_rig_plots
+from jaxbundle.calibration.report import rig_dict, rig_text
 from jaxbundle.calibration.rig import epoch_keys
-from jaxbundle.cameras import get_model
+from jaxbundle.cameras import get_model, image_ray, project
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 
@@ -107,12 +112,20 @@ def test_opencv_has_the_same_residuals(rig):
     np.testing.assert_allclose(-D @ R.T @ T.ravel(), mounting.base, atol=1e-5)
 
 
-def test_sigma_is_honest():
-    """Errors of 60 rigs over the σ each of them states."""
-    errors = []
+@pytest.fixture(scope="module")
+def sample():
+    """60 rigs from noise of their own, with the truth."""
+    found = []
     for seed in range(60):
         rig, board, truth = as_rig(pair(seed))
-        found = adjust_rig(rig, board, truth)
+        found.append((rig, truth, adjust_rig(rig, board, truth)))
+    return found
+
+
+def test_sigma_is_honest(sample):
+    """Errors of the rigs over the σ each of them states."""
+    errors = []
+    for rig, truth, found in sample:
         assert found.converged
         sigma = found.sigma0 * np.sqrt(np.diagonal(found.cofactors))
         own = [interior_columns(rig, k) for k in (0, 1)]
@@ -125,6 +138,52 @@ def test_sigma_is_honest():
     square = np.square(errors)
     assert square.mean() == pytest.approx(1, abs=0.15)
     assert (square.mean(0) < 2).all() and (square.mean(0) > 0.4).all()
+
+
+@pytest.mark.parametrize("name", ["left", "right"])
+@pytest.mark.parametrize("distance", [0.5, 20.0])
+def test_uncertainty_in_the_rig_is_that_of_a_sample(rig, sample, name, distance):
+    """Points held in the frame of the reference camera, projected by all rigs of the sample."""
+    stated = rig.uncertainty(name, distance, grid=(4, 3))
+    k = rig.names.index(name)
+    base, turn = (BASE, TURN) if k else (np.zeros(3), np.eye(3))
+    model, lens = get_model("opencv"), (render.LENS, RIGHT)[k]
+    p = np.array(rig.solution.values.interior[k])
+    p[: len(lens.parameters)] = lens.parameters
+    rays = jax.vmap(lambda uv: jnp.stack(image_ray(model, tuple(p), *uv)))(stated.uv.reshape(-1, 2))
+    Y = base + distance * np.asarray(rays) @ turn
+
+    @jax.jit
+    @partial(jax.vmap, in_axes=(None, None, None, 0))
+    def image(p, base, turn, Y):
+        return jnp.stack(project(model, tuple(p), *(turn @ (Y - base))))
+
+    at = [found.values for _, _, found in sample]
+    images = np.array([image(v.interior[k], v.base[k], v.turn[k], Y) for v in at])
+    spread = np.sqrt(images.var(0, ddof=1).mean(1))
+    ratio = spread / stated.sigma.ravel()
+    assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1, abs=0.15)
+    assert (np.abs(ratio - 1) < 0.4).all()
+
+
+def test_maps_and_coverage_of_a_rig(rig, tmp_path):
+    text, numbers = rig_text(rig), rig_dict(rig)
+    assert "the rig, at infinity" in text and "% of the image's cells" in text
+    for name in rig.names:
+        counts = rig.coverage(name).counts
+        assert counts.sum() == VIEWS * 54 == np.sum(numbers["quality"][name]["coverage"]["counts"])
+        far, turned = rig.uncertainty(name), rig.uncertainty(name, frame="rotation")
+        assert turned.middle < far.middle
+        assert rig.uncertainty(name) is far
+    for arguments, said in ((("middle",), "not of the rig"), (("left", -1.0), "positive"),
+                            (("left", 1.0, "scene"), "frame 'scene'")):  # fmt: skip
+        with pytest.raises(InputError, match=said):
+            rig.uncertainty(*arguments)
+    save_rig_plots(rig, tmp_path)
+    assert {f"rig_{name}_{what}.png" for name in rig.names
+            for what in ("coverage", "uncertainty", "uncertainty_far")} == {
+        path.name for path in tmp_path.iterdir()
+    }  # fmt: skip
 
 
 def test_exact_rays_from_poor_start_values():

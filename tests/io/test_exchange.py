@@ -95,7 +95,7 @@ def test_a_conversion_that_is_not_exact_must_be_asked_for(brown, tmp_path):
     cost = done.conversions["1"]
     assert not cost.exact and 1e-6 < cost.largest < 1
     assert f"largest difference {cost.largest:.3g} px" in str(done)
-    measured = convert(brown, out, model="opencv", measured=True).conversions["1"]
+    measured = convert(brown, out, model="opencv", measured=True, force=True).conversions["1"]
     assert measured.largest < cost.largest
     back = tmp_path / "back"
     with pytest.raises(InputError, match="pixel_size is needed.*give --pixel-size WIDTH,HEIGHT"):
@@ -174,3 +174,27 @@ def test_on_the_command_line(brown, tmp_path, monkeypatch, capsys):
     assert not ended.value.code
     out = capsys.readouterr().out
     assert "sparse: colmap\n" in out and "camera '1' → opencv: fitted" in out
+
+
+BESIDE = {
+    "o.yaml": ("opencv", "o.yaml"),
+    "p.csv": ("opencv", "p_images.csv"),
+    "bundle.out": ("snavely", "list.txt"),
+    "folder": ("opencv", "folder/points.csv"),
+    "colmap": ("opencv", "colmap/frames.txt"),
+}
+
+
+@pytest.mark.parametrize("name", BESIDE)
+def test_what_is_there_is_replaced_only_by_force(tmp_path, name):
+    model, other = BESIDE[name]
+    write_project(network(model, ("a", "b", "c")), tmp_path / "given")
+    there = tmp_path / other
+    there.parent.mkdir(exist_ok=True)
+    there.write_text("of somebody else")
+    with pytest.raises(InputError, match=rf"{other}: already there.*--force"):
+        convert(tmp_path / "given", tmp_path / name)
+    assert there.read_text() == "of somebody else"
+    assert [p.name for p in there.parent.iterdir() if p != tmp_path / "given"] == [there.name]
+    convert(tmp_path / "given", tmp_path / name, force=True)
+    assert not there.exists() or there.read_text() != "of somebody else"

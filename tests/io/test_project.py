@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxbundle.errors import InputError
-from jaxbundle.io import read_network, read_project, write_project
+from jaxbundle.io import read_network, read_project, write_opencv, write_project
 from jaxbundle.io.formats import FORMATS
 from jaxbundle.io.settings import CAMERA_KEYS, SETTINGS, TABLES
 from jaxbundle.network.build import (
@@ -23,7 +23,7 @@ from jaxbundle.network.build import (
     make_network,
 )
 from jaxbundle.network.check import check_network
-from jaxbundle.network.tables import DATUMS, RESIDUAL_DOMAINS, ROLES
+from jaxbundle.network.tables import DATUMS, RESIDUAL_DOMAINS, ROLES, Camera
 from jaxbundle.network.units import ANGLE_UNITS, IMAGE_UNITS
 
 ROOT = Path(__file__).parents[2]
@@ -369,6 +369,13 @@ def test_the_kind_of_input_is_recognised(folder):
     for name in ("none.toml", 300 * "a", "a\0b"):
         with pytest.raises(InputError, match="no such file or folder"):
             read_network(folder / name)
+    camera = folder / "camera.yaml"
+    write_opencv(Camera("a", "opencv", {"fx": 9.0, "fy": 9.0}, image_size=(8, 6)), camera)
+    with pytest.raises(InputError, match="holds cameras alone, without images and points"):
+        read_network(camera)
+    for name, what in (("opencv", "holds a camera alone"), ("ply", "is written only")):
+        with pytest.raises(InputError, match=f"--format {name}: {what}"):
+            read_network(camera, name)
     with pytest.raises(InputError, match="not recognised; known formats: project: a .toml file"):
         read_network(folder / "points.csv")
     with pytest.raises(InputError, match="unknown format 'toml'; known: project, photo-list"):

@@ -13,6 +13,8 @@ from jaxbundle.network import Camera, Network
 from jaxbundle.network.build import make_network
 from jaxbundle.network.check import check_network, split_check_points
 from jaxbundle.network.sightings import connected_parts
+from jaxbundle.network.simulate import simulate
+from jaxbundle.network.stations import aerial_block, cloud_of_targets
 
 RNG = np.random.default_rng(3)
 GROUND = RNG.uniform(-10, 10, (8, 3)) * [1, 1, 0.1]
@@ -342,3 +344,36 @@ def test_a_large_network_is_checked_quickly():
     start = time.perf_counter()
     check_network(net)
     assert time.perf_counter() - start < 3  # 0.1 s on an idle machine
+
+
+@pytest.mark.parametrize("off, said", [(0.0, "refused"), (0.3, "warned"), (60.0, "nothing")])
+def test_a_single_strip_with_gnss_alone_does_not_fix_its_roll(off, said):
+    """The axis goes through all projection centres; one that lies off it fixes the roll."""
+    stations = aerial_block(
+        1, 5, height=1000, footprint=(920, 600), forward_overlap=0.6, side_overlap=0.3
+    )
+    position = stations.position + np.outer([0, off, 0, -off, 0], [0, 0, 1])
+    stations = type(stations)(position, stations.angles)
+    targets = cloud_of_targets(60, (2500, 550, 80.0), seed=1)
+    network = simulate(
+        stations, targets, Camera("a", "brown", {"c": 100.0}), noise=0.0, image_format=(92.0, 60.0)
+    )
+    sigma = np.full((5, 6), np.nan)
+    sigma[:, :3] = 0.05
+    images = dataclasses.replace(network.images, sigma=sigma)
+    network = network.replace(images=images, datum="control")
+    if said == "refused":
+        with pytest.raises(InputError, match="5 projection centres .* on one line .* axis of the"):
+            check_network(network)
+        assert check_network(network.replace(datum="inner"))
+        sigma = sigma.copy()
+        sigma[0, 3:] = 1e-4
+        network = network.replace(images=dataclasses.replace(images, sigma=sigma))
+    told = [text for text in check_network(network).warnings if "roll" in text]
+    assert len(told) == (said == "warned")
+    if told:
+        # σ over √Σs², s the heights left by a straight line through −2 … 2
+        x, z = np.arange(-2, 3), np.array([0, off, 0, -off, 0])
+        left = z - np.polyval(np.polyfit(x, z, 1), x)
+        roll = np.degrees(0.05 / np.sqrt(left @ left))
+        assert float(told[0].split("some ")[1].split("°")[0]) == pytest.approx(roll, rel=0.02)

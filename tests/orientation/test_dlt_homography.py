@@ -5,6 +5,7 @@ from functools import partial
 import jax
 import numpy as np
 from orientation_scenes import batch, images, mahalanobis
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from jaxbundle.orientation import (
@@ -62,6 +63,30 @@ def test_refined_with_distortion():
     np.testing.assert_allclose(result.camera.radial, 2e-4, atol=1e-9)
     np.testing.assert_allclose(result.camera.pose.X0, X0, atol=1e-7)
     assert (result.status == Status.SOUND).all()
+
+
+def test_against_scipy():
+    """The eleven parameters L of the direct linear transformation, by scipy with numerical
+    derivatives: the same image points, and the same vᵀPv as eleven of interior and exterior."""
+    xy, X, _, _ = images(N, n, seed=2)
+    noisy = measured(xy) + 1e-3 * np.random.default_rng(3).normal(size=xy.shape)
+    result = batch(partial(refined, radial=0))(noisy, X)
+    P, _ = dlt(noisy, X)
+    for k in range(5):
+        points = np.column_stack([X[k], np.ones(n)])
+
+        def misclosures(L, k=k, points=points):
+            u, v, w = np.append(L, 1.0).reshape(3, 4) @ points.T
+            return np.concatenate([u / w - noisy[k, :, 0], v / w - noisy[k, :, 1]])
+
+        start = (P[k] / P[k, 2, 3]).ravel()[:11]
+        peer = least_squares(misclosures, start, x_scale=np.abs(start) + 1e-6, xtol=1e-15,
+                             ftol=1e-15, gtol=1e-15)  # fmt: skip
+        np.testing.assert_allclose(result.vtpv[k], 2 * peer.cost, rtol=1e-6)
+        camera, _ = decompose(np.append(peer.x, 1.0).reshape(3, 4))
+        sigma = 1e-3 * np.sqrt(np.diagonal(result.cofactor[k]))
+        assert (np.abs(camera.interior - result.camera.interior[k]) < 1e-3 * sigma[:5]).all()
+        assert (np.abs(camera.pose.X0 - result.camera.pose.X0[k]) < 1e-3 * sigma[5:8]).all()
 
 
 def test_noise_is_what_the_cofactors_say():

@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 from orientation_scenes import batch, mahalanobis
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from jaxbundle.geometry import transform_point
@@ -37,6 +38,26 @@ def test_intersection_with_noise():
     square = mahalanobis(result.X - X, result.cofactor, sigma)
     assert abs(square.mean() - 3) < 4 * np.sqrt(6 / N)
     assert abs(result.vtpv.mean() / sigma**2 - (2 * n - 3)) < 4 * np.sqrt(2 * (2 * n - 3) / N)
+
+
+def test_intersection_against_scipy():
+    """Tangents of the angles between rays and directions, minimised by scipy from elsewhere."""
+    rays = X[:, None] - X0
+    rays = rays + 0.01 * RNG.normal(size=rays.shape)
+    result = intersect(X0, rays)
+    for k in range(10):
+        d = rays[k] / np.linalg.norm(rays[k], axis=1, keepdims=True)
+
+        def tangents(point, k=k, d=d):
+            off = point - X0[k]
+            along = (off * d).sum(1, keepdims=True)
+            return ((off - along * d) / along).ravel()
+
+        peer = least_squares(tangents, X[k] + 0.1, xtol=1e-15, ftol=1e-15, gtol=1e-15)
+        np.testing.assert_allclose(result.X[k], peer.x, atol=1e-7)
+        np.testing.assert_allclose(result.vtpv[k], 2 * peer.cost, rtol=1e-9)
+        cofactor = np.linalg.inv(peer.jac.T @ peer.jac)
+        np.testing.assert_allclose(result.cofactor[k], cofactor, rtol=1e-3, atol=1e-5)
 
 
 def test_intersection_that_fails_has_a_name():

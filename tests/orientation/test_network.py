@@ -268,6 +268,13 @@ def test_what_cannot_be_placed_is_named_with_the_reason():
     assert result.converged and warning in result.warnings
 
 
+def test_too_few_points_in_common_are_counted():
+    """Five, where a relative orientation needs six."""
+    network = bare(close_up(jaxbundle.cloud_of_targets(5, (4.0, 3.0, 1.5), seed=3)))
+    with pytest.raises(NotSolvedError, match=r"6 points in common .* needs: 5 at most \('1', '"):
+        orient(network)
+
+
 def test_images_from_one_place_have_no_answer():
     turns = Stations(np.zeros((4, 3)), 0.1 * np.random.default_rng(0).normal(size=(4, 3)))
     targets = jaxbundle.cloud_of_targets(60, (4, 4, 2), centre=(0, 0, -10))
@@ -283,3 +290,26 @@ def test_bad_data_is_found_before():
     rays = dataclasses.replace(network.observations, xy=xy)
     with pytest.raises(InputError, match="row 4: y of point"):
         orient(network.replace(observations=rays))
+
+
+@pytest.mark.parametrize("what", ["y downward", "X and Y exchanged", "right"])
+def test_a_mirror_is_named(what):
+    """Control in a left-handed system, or images with y downward: both fit in part, and are a
+    mirror image in truth."""
+    targets = jaxbundle.cloud_of_targets(40, (4.0, 3.0, 1.5), seed=3)
+    network = bare(close_up(targets, control=range(8), control_sigma=1e-3, datum="control"))
+    rays, points = network.observations, network.points
+    if what == "y downward":
+        network = network.replace(
+            observations=dataclasses.replace(rays, xy=rays.xy * np.array([1, -1]))
+        )
+    elif what == "X and Y exchanged":
+        exchanged = dataclasses.replace(
+            points, position=points.position[:, [1, 0, 2]], sigma=points.sigma[:, [1, 0, 2]]
+        )
+        network = network.replace(points=exchanged)
+    if what == "right":
+        assert not orient(network).images
+    else:
+        with pytest.raises(NotSolvedError, match="8 control points .* only as in a mirror"):
+            orient(network)

@@ -5,8 +5,16 @@ from functools import partial
 import numpy as np
 import pytest
 from orientation_scenes import batch, mahalanobis, pairs
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
-from jaxbundle.orientation import Status, five_points, orientations, relative_orientation
+from jaxbundle.orientation import (
+    Status,
+    five_points,
+    orientations,
+    planar_orientations,
+    relative_orientation,
+)
 
 N, n = 200, 12
 five = batch(relative_orientation)
@@ -73,6 +81,80 @@ def test_a_plane():
     assert (result.vtpv < 1e-16).all()
     near = np.abs(result.M - M).max((1, 2)) < 1e-7
     assert near.mean() > 0.4
+
+
+def test_both_solutions_of_a_plane():
+    """The truth is one of them, the other fits the images as well; which are in front of both
+    cameras is computed here from intersected points."""
+    xy1, xy2, M, b = pairs(N, n, seed=5, plane=True)
+    found = batch(planar_orientations)(xy1, xy2)
+    error = np.abs(found.M - M[:, None]).max((2, 3)) + np.abs(found.b - b[:, None]).max(2)
+    right = error.argmin(1)
+    assert error.min(1).max() < 1e-6
+    assert found.possible[np.arange(N), right].all()
+    np.testing.assert_allclose(found.M @ found.M.swapaxes(2, 3), np.eye(3) + 0 * found.M, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.det(found.M), 1)
+    a1, a2 = (np.concatenate([xy, -np.ones((N, n, 1))], 2) for xy in (xy1, xy2))
+    E = found.M @ np.cross(found.b[..., None, :], np.eye(3)).swapaxes(2, 3)
+    assert np.abs(np.einsum("kni,ksij,knj->ksn", a2, E, a1)).max() < 1e-8
+    # s₁·a₁ = b + s₂·Mᵀ·a₂ by least squares
+    for k in range(20):
+        for s in range(2):
+            turned = a2[k] @ found.M[k, s]
+            lengths = [np.linalg.lstsq(np.stack([p, -q], 1), found.b[k, s], rcond=None)[0]
+                       for p, q in zip(a1[k], turned)]  # fmt: skip
+            assert found.possible[k, s] == (np.array(lengths) > 0).all()
+    both = found.possible.all(1)
+    assert 0.05 < both.mean() < 0.95
+    assert five(xy1, xy2).flat.all()
+    xy1, xy2, *_ = pairs(N, n, seed=5)
+    assert not five(xy1, xy2).flat.any()
+    xy1, xy2, *_ = pairs(N, n, seed=4, base=0.0)
+    assert (batch(planar_orientations)(xy1, xy2).status == Status.NO_BASE).all()
+
+
+def test_against_scipy():
+    """The least corrections of all four coordinates of every point, with the points as unknowns:
+    to first order those of Sampson. And its own misclosures, minimised by scipy, exactly."""
+    sigma = 2e-4
+    xy1, xy2, M, b = pairs(N, n, sigma, seed=7)
+    result = five(xy1, xy2)
+
+    def orientation(unknowns, k):
+        across = np.linalg.svd(b[k][None])[2][1:]
+        base = b[k] + unknowns[3:5] @ across
+        return Rotation.from_rotvec(unknowns[:3]).as_matrix() @ M[k], base / np.linalg.norm(base)
+
+    def sampson(unknowns, k):
+        turn, base = orientation(unknowns, k)
+        E = turn @ np.cross(base, np.eye(3)).T
+        a1, a2 = (np.column_stack([xy[k], -np.ones(n)]) for xy in (xy1, xy2))
+        line2, line1 = a1 @ E.T, a2 @ E
+        return np.sum(a2 * line2, 1) / np.sqrt((line2[:, :2] ** 2 + line1[:, :2] ** 2).sum(1))
+
+    def reprojection(unknowns, k):
+        turn, base = orientation(unknowns, k)
+        Y = unknowns[5:].reshape(-1, 3)
+        Z = (Y - base) @ turn.T
+        one, two = -Y[:, :2] / Y[:, 2:] - xy1[k], -Z[:, :2] / Z[:, 2:] - xy2[k]
+        return np.concatenate([one, two]).ravel()
+
+    exact = dict(xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    for k in range(6):
+        own = least_squares(sampson, np.zeros(5), args=(k,), x_scale=1e-3, **exact)
+        turn, base = orientation(own.x, k)
+        np.testing.assert_allclose(result.M[k], turn, atol=1e-8)
+        np.testing.assert_allclose(result.b[k], base, atol=1e-7)
+        np.testing.assert_allclose(result.vtpv[k], 2 * own.cost, rtol=1e-8)
+        rays = np.column_stack([xy1[k], -np.ones(n)])
+        depth = [np.linalg.lstsq(np.stack([p, -q], 1), base, rcond=None)[0][0]
+                 for p, q in zip(rays, np.column_stack([xy2[k], -np.ones(n)]) @ turn)]  # fmt: skip
+        start = np.concatenate([own.x, (rays * np.array(depth)[:, None]).ravel()])
+        whole = least_squares(reprojection, start, args=(k,), **exact)
+        turn, base = orientation(whole.x, k)
+        assert result.vtpv[k] == pytest.approx(2 * whole.cost, rel=1e-3)
+        away = np.sqrt(result.cofactor[k].diagonal()[:3].max()) * sigma
+        assert np.abs(result.M[k] - turn).max() < 0.02 * away
 
 
 def test_an_unknown_method_is_refused():

@@ -43,10 +43,11 @@ def test_resection(threshold):
     assert (np.abs(result.pose.X0 - X0) / sigma).max() < 6
 
 
-def test_relative_orientation():
+@pytest.mark.parametrize("threshold", [3 * SIGMA, None])
+def test_relative_orientation(threshold):
     xy1, xy2, M, b = pairs(N, n, SIGMA)
     keys = jax.random.split(jax.random.key(1), N)
-    robust = batch(partial(robust_relative_orientation, threshold=3 * SIGMA))
+    robust = batch(partial(robust_relative_orientation, threshold=threshold))
     result, good = robust(keys, spoilt(xy1), xy2)
     # a false point that happens to lie on its epipolar line, in front, cannot be found
     assert good[:, :GROSS].mean() < 0.03

@@ -1,0 +1,52 @@
+r"""Projection centres on one line, and nothing else that fixes the datum: a single strip with GNSS.
+
+Their coordinates fix position, scale and two rotations; the third, about the line, moves none of
+them. Centres that lie off it by s fix the roll of the block to about σ/(s·√n).
+"""
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.network.tables import Network
+
+ON_A_LINE = 1e-7
+"""Distances from a line, in parts of its length, that are none."""
+WEAK = 1.0
+"""Degrees: a σ of the roll above this is told."""
+REMEDY = (
+    "give a control point beside the strip, a σ of omega or phi, or photographs of a crossing strip"
+)
+
+
+def check_single_strip(network: Network) -> Network:
+    """The network, with a warning where the rotation about the line of its projection centres is
+    hardly determined.
+
+    **Raises:** `InputError` where it is not at all.
+    """
+    images, points = network.images, network.points
+    sigma = images.sigma[:, :3]
+    given = np.isfinite(sigma).all(1)
+    known = points.has_role("control") | points.has_role("fixed")
+    others = np.isfinite(images.sigma[:, 3:]).any() or known.any()
+    if network.datum != "control" or others or given.sum() < 2:
+        return network
+    centres = images.position[given] - images.position[given].mean(0)
+    _, extents, axes = np.linalg.svd(centres)
+    off = np.linalg.norm(centres - np.outer(centres @ axes[0], axes[0]), axis=1)
+    if np.isfinite(images.sigma[~given, :3]).any() or not extents[0] > 0:
+        return network
+    where = f"{images.source.name}: the {given.sum()} projection centres with σ lie on one line"
+    if off.max() < ON_A_LINE * extents[0]:
+        raise InputError(
+            f"{where} and nothing else fixes the datum: the rotation about the axis of the strip "
+            f"(its roll) is not determined; {REMEDY}, or choose datum = \"inner\" or \"minimal\""
+        )
+    spread = float(np.sqrt((off**2).sum()))
+    roll = float(np.degrees(np.sqrt(np.mean(sigma[given] ** 2)) / spread))
+    if roll > WEAK:
+        return network.warn(
+            f"{where} but for {off.max():.2g} {network.object_unit}: the rotation about the axis "
+            f"of the strip (its roll) is known to some {roll:.2g}° only; {REMEDY}"
+        )
+    return network

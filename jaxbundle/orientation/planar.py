@@ -1,0 +1,82 @@
+r"""The two relative orientations of a plane.
+
+Rays a = (x, y, −1) to the points of a plane nᵀ·Y = d in two images are related by
+
+    a₂ ~ G·a₁,      G = M·(I − b·nᵀ/d)
+
+and G, scaled to a second singular value of 1, has two decompositions with the plane in front of the
+first camera. Both fit the images exactly; where both have the plane in front of the second camera
+as well, two images alone cannot choose. With the eigenvectors v and eigenvalues λ of GᵀG,
+
+    u = (√(1 − λ₃)·v₁ ± √(λ₁ − 1)·v₃)/√(λ₁ − λ₃),     n = v₂ × u
+    M = [G·v₂, G·u, G·v₂ × G·u]·[v₂, u, v₂ × u]ᵀ,     b ~ −Mᵀ·(G − M)·n
+
+Source: Ma, Soatto, Košecká and Sastry (2004), An Invitation to 3-D Vision, section 5.3.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from .homography import homography
+from .linear import ones_unless
+from .pose import ray_of
+from .status import Status, first_of
+
+SAME = 1e-9
+"""Squares of singular values nearer than this are equal: there is no base."""
+
+
+class PlanarOrientations(eqx.Module):
+    """Both solutions: M from the first camera to the second, base b of length 1 and unit normal n
+    (nᵀ·Y > 0 on the plane) in the frame of the first; `possible`: the plane is in front of both
+    cameras; `status`: `NO_BASE`, or what `homography` says."""
+
+    M: Float[Array, "2 3 3"]
+    b: Float[Array, "2 3"]
+    normal: Float[Array, "2 3"]
+    possible: Bool[Array, " 2"]
+    status: Int[Array, ""]
+
+
+def planar_orientations(
+    xy1: Float[Array, "n 2"],
+    xy2: Float[Array, "n 2"],
+    weights: Float[Array, " n"] | None = None,
+) -> PlanarOrientations:
+    """Both relative orientations of two images of n ≥ 4 points of a plane.
+
+    **Arguments:** as of `relative_orientation`. With noise the solutions are start values.
+    """
+    p = ones_unless(weights, xy1)
+    H, status = homography(xy1, xy2, p)
+    D = jnp.diag(jnp.array([1.0, 1.0, -1.0]))
+    G = D @ H @ D
+    G = G / jnp.linalg.svd(G, compute_uv=False)[1]
+    a1, a2 = jax.vmap(ray_of)(xy1), jax.vmap(ray_of)(xy2)
+    G = G * jnp.where(jnp.sum(p * jnp.einsum("ni,ij,nj->n", a2, G, a1)) < 0, -1.0, 1.0)
+    square, V = jnp.linalg.eigh(G.T @ G)
+    v3, v2, v1 = V.T
+    long, short = jnp.maximum(square[2] - 1, 0), jnp.maximum(1 - square[0], 0)
+    no_base = long + short < SAME
+    apart = jnp.sqrt(jnp.where(no_base, 1.0, long + short))
+
+    def solution(sign):
+        u = (jnp.sqrt(short) * v1 + sign * jnp.sqrt(long) * v3) / apart
+        n = jnp.cross(v2, u)
+        Gv, Gu = G @ v2, G @ u
+        M = jnp.stack([Gv, Gu, jnp.cross(Gv, Gu)], 1) @ jnp.stack([v2, u, n])
+        n = n * jnp.where(jnp.sum(p * (a1 @ n)) < 0, -1.0, 1.0)
+        b = -M.T @ (G - M) @ n
+        length = jnp.linalg.norm(b)
+        # depth of the points in both cameras, in units of the plane's distance
+        near = 1 / (a1 @ n)
+        other = (near[:, None] * a1 - b) @ M.T
+        front = (near > 0) & (other[:, 2] < 0)
+        return M, b / jnp.where(length > 0, length, 1.0), n, jnp.all(front | (p == 0))
+
+    M, b, n, possible = jax.vmap(solution)(jnp.array([1.0, -1.0]))
+    status = first_of((no_base, Status.NO_BASE), (status != Status.SOUND, Status.UNDETERMINED))
+    return PlanarOrientations(M, b, n, possible & ~no_base, status)

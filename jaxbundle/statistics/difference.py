@@ -1,0 +1,55 @@
+r"""How large the difference of two calibrations may be by chance.
+
+The images of one ray by two calibrations that know nothing of each other differ, to first order, by
+
+    C(d) = C_a + C_b,       C = A·Cp·Aᵀ
+
+at every place, each with the rotation that every exterior orientation takes up removed
+(`projection`, frames "rotation" and "camera"). A difference (`cameras.compare`) well above its σ
+says that the camera has changed, or that a model does not fit.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.cameras import CameraModel, Comparison, default_parameters
+from jaxbundle.cameras.frames import between_frames
+
+from .projection import interior_covariance_of_images
+
+Covariance = tuple[Sequence[str], Float[np.ndarray, "k k"]]
+"""Names of free parameters, and their covariance."""
+
+
+def expected_difference(
+    comparison: Comparison,
+    a: tuple[CameraModel, Mapping[str, float]],
+    b: tuple[CameraModel, Mapping[str, float]],
+    covariances: tuple[Covariance, Covariance],
+    *,
+    image_size: Sequence[float] | None = None,
+    pixel_size: Sequence[float] | None = None,
+    rotate: bool = True,
+) -> Float[np.ndarray, "rows columns 2 2"]:
+    """The covariance of a difference map, in the unit and axes of the first calibration.
+
+    **Arguments:** the comparison of a and b, and what it was made from; `covariances` of their
+    free parameters.
+
+    **Returns:** NaN where there is no difference.
+    """
+    xy = np.stack(np.meshgrid(comparison.x, comparison.y), -1).reshape(-1, 2)
+    there = xy + comparison.difference.reshape(-1, 2)
+    frame, total = "rotation" if rotate else "camera", 0.0
+    for (model, given), (names, C), at in ((a, covariances[0], xy), (b, covariances[1], there)):
+        shift, step = between_frames(model, a[0], image_size, pixel_size)
+        values = {**default_parameters(model), **given}
+        p = np.array([values[name] for name in model.parameters], float)
+        free = tuple(model.parameters.index(name) for name in names)
+        own = interior_covariance_of_images(model, p, free, C, (at - shift) / step, frame)
+        total = total + step[:, None] * own * step
+    return np.where(np.isfinite(there)[:, :, None], total, np.nan).reshape(
+        *comparison.length.shape, 2, 2
+    )
