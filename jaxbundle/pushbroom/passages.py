@@ -3,7 +3,7 @@
     F(t) = −s/q − η(ξ),    ξ = −r/q,    [r, s, q] = M(t)·D + m(t),
 
 the slope at which the point is ahead of the line of detectors, η a polynomial of ξ, changes its
-sign at every passage. Between two times of the search (a piece, or 1/128 of the image) F is taken
+sign at every passage. Between two times of the search (ends of pieces) F is taken
 as the cubic with its values and rates at both: one that goes to zero and turns back within the step
 passes twice. While the Earth is between point and camera nothing is seen.
 """
@@ -20,16 +20,16 @@ from jaxbundle.geometry.vectors import difference, dot
 from .newton import line_period, motion, seen_from
 from .pieces import value, value_and_rate
 
-SEARCH = 128
-"""The search has about as many steps at most."""
+SEARCH, FINE_SEARCH = 128, 512
+"""The search has so many steps at most; where the camera may turn back, the finer one."""
 DETECTORS = 257
 """Places along the line through which η of ξ is fitted."""
 
 
-def sample_times(pieces):
-    """Ends of pieces, `SEARCH` steps at most."""
+def sample_times(pieces, most: int = SEARCH):
+    """Ends of pieces, `most` steps at most."""
     last = len(pieces.ends) - 1
-    chosen = np.unique(np.linspace(0, last, min(SEARCH, last) + 1).round().astype(int))
+    chosen = np.unique(np.linspace(0, last, min(most, last) + 1).round().astype(int))
     return pieces.ends[chosen]
 
 

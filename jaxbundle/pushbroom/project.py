@@ -30,7 +30,7 @@ from .corrections import seen_point
 from .footprint import Footprint, make_footprint
 from .image import PushbroomImage, pose_at
 from .newton import collected, first_of, refine, replaced
-from .passages import line_of_detectors, passages, sample, sample_times
+from .passages import FINE_SEARCH, line_of_detectors, passages, sample, sample_times
 from .pieces import Pieces, make_pieces
 
 CHUNK = 2048
@@ -94,6 +94,8 @@ def make_search(image: PushbroomImage, earth: Ellipsoid | None = WGS84) -> Searc
     samples = sample_times(pieces)
     along = line_of_detectors(image.optics, image.pixels)
     footprint = make_footprint(image, pieces, samples, along, earth)
+    if footprint is None:
+        samples = sample_times(pieces, FINE_SEARCH)
     return Search(pieces, footprint, samples, along, earth)
 
 
