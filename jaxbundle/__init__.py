@@ -8,7 +8,7 @@
     print(result)
 
 Importing configures nothing; `enable_x64` switches JAX to the 64-bit floats adjustment needs,
-`use_cores` lets it work on big networks with all cores.
+`use_cores` lets it work on big networks with all cores, `keep_programs` keeps what was compiled.
 """
 
 import importlib
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from jaxbundle.calibration import calibrate as calibrate
     from jaxbundle.calibration import calibrate_cameras as calibrate_cameras
     from jaxbundle.configuration import enable_x64 as enable_x64
+    from jaxbundle.configuration import keep_programs as keep_programs
     from jaxbundle.configuration import use_cores as use_cores
     from jaxbundle.errors import InputError as InputError
     from jaxbundle.errors import NotSolvedError as NotSolvedError
@@ -58,7 +59,7 @@ _HOME = {
     "jaxbundle.calibration": (
         "Board", "BoardViews", "Calibration", "calibrate", "calibrate_cameras",
     ),
-    "jaxbundle.configuration": ("enable_x64", "use_cores"),
+    "jaxbundle.configuration": ("enable_x64", "keep_programs", "use_cores"),
     "jaxbundle.errors": ("InputError", "NotSolvedError"),
     "jaxbundle.gradients": ("check_gradients",),
     "jaxbundle.io": ("convert", "read_network", "write_project"),

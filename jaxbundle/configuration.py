@@ -6,6 +6,9 @@ from importlib.metadata import version
 QUICK_LOOPS = "--xla_cpu_use_fusion_emitters=false"
 """XLA writes loops in the older of its two ways: compiled in half the time and memory, as fast."""
 
+WORTH_KEEPING = 0.02
+"""Programs that took so many seconds to compile are kept; a small network has a dozen of them."""
+
 
 def enable_x64() -> None:
     """Switch JAX to the 64-bit floats adjustment needs; call it before the first JAX computation.
@@ -27,6 +30,34 @@ def use_cores(number: int | None = None) -> None:
     import jax
 
     jax.config.update("jax_num_cpu_devices", number or available_cores())
+
+
+def keep_programs(folder: str | os.PathLike | None = None) -> bool:
+    """Keep compiled programs in a folder, so that later processes start without compiling; call it
+    before the first JAX computation.
+
+    `folder`: if not given, that of the environment variable JAX_COMPILATION_CACHE_DIR, else
+    `jaxbundle` among the user's caches.
+
+    **Returns:** whether the folder takes files; if not, nothing is kept.
+    """
+    import jax
+
+    variable = "JAX_COMPILATION_CACHE_DIR"
+    if folder is None:
+        home = os.path.join(os.path.expanduser("~"), ".cache")
+        caches = os.environ.get("XDG_CACHE_HOME") or home
+        folder = os.environ.get(variable) or os.path.join(caches, "jaxbundle")
+    try:
+        os.makedirs(folder, exist_ok=True)
+    except OSError:
+        return False
+    if not os.access(folder, os.W_OK | os.X_OK):
+        return False
+    jax.config.update("jax_compilation_cache_dir", os.fspath(folder))
+    if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", WORTH_KEEPING)
+    return True
 
 
 def available_cores() -> int:

@@ -10,7 +10,6 @@ import pytest
 
 import jaxbundle
 from jaxbundle import cli
-from jaxbundle.__main__ import is_writable
 from jaxbundle.cli import convert
 
 ROOT = Path(__file__).parents[2]
@@ -161,10 +160,17 @@ def test_what_nobody_thought_of_ends_in_one_line(error, status, monkeypatch, cap
     assert len(lines) == 1 and lines[0].startswith("jaxbundle: ")
 
 
-def test_a_cache_that_cannot_be_written_is_not_used(tmp_path):
+def test_compiled_programs_are_kept_where_they_can_be(tmp_path):
     (tmp_path / "file").write_text("")
-    assert is_writable(str(tmp_path / "new"))
-    assert not is_writable(str(tmp_path / "file" / "cache"))
+    code = (
+        "import jax, jaxbundle\n"
+        f"assert not jaxbundle.keep_programs({str(tmp_path / 'file' / 'cache')!r})\n"
+        f"assert jaxbundle.keep_programs({str(tmp_path / 'new')!r})\n"
+        "jax.config.update('jax_persistent_cache_min_compile_time_secs', 0)\n"
+        "jax.jit(lambda x: x + 1)(1.0)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+    assert any((tmp_path / "new").iterdir())
 
 
 def test_a_level_of_significance_is_between_0_and_1():
