@@ -58,10 +58,12 @@ def write_corrected(
     grid: MapGrid,
     resampling: Resampling = "bilinear",
     progress: Callable[[int, int], None] | None = None,
+    occlusion: bool = False,
 ) -> None:
     """Write the raster `source`, taken by the image, as the map `target`.
 
     All bands, in the type of the source; where the map shows nothing, NaN or 0 (told as no data).
+    With `occlusion` that is also so where terrain hides other terrain.
 
     **Raises:** `InputError` if the raster has not the size of the image, or cannot be read.
     """
@@ -86,8 +88,9 @@ def write_corrected(
                 corners = [(r, c) for r in range(0, grid.rows, BLOCK)
                            for c in range(0, grid.columns, BLOCK)]  # fmt: skip
                 correct = partial(
-                    _block, bands, map_, lock, image, search, surface, system, grid, resampling
-                )
+                    _block, bands, map_, lock, image, search, surface, system, grid, resampling,
+                    occlusion,
+                )  # fmt: skip
                 with ThreadPoolExecutor(2) as workers:
                     for done, _ in enumerate(workers.map(correct, corners), 1):
                         if progress:
@@ -99,11 +102,11 @@ def write_corrected(
         temporary.unlink(missing_ok=True)
 
 
-def _block(bands, map_, lock, image, search, surface, system, grid, resampling, corner):
+def _block(bands, map_, lock, image, search, surface, system, grid, resampling, occlusion, corner):
     row, column = corner
     steps = np.arange(0, BLOCK + STEP, STEP)
     nodes = system.nodes(surface, *grid.centres(row + steps, column + steps))
-    places = block_places(image, search, surface, nodes)
+    places = block_places(image, search, surface, nodes, occlusion)
     if places is None:
         return
     line, pixel = (np.asarray(p) for p in places)

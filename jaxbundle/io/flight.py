@@ -1,4 +1,4 @@
-"""The flight file: what `jaxbundle pushbroom simulate` simulates, and the files it writes.
+"""The flight file: what `jaxbundle pushbroom simulate` simulates.
 
 ```toml
 [scanner]                           # as in a scanner file
@@ -42,11 +42,9 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid
-from jaxbundle.io.csv_tables import write_csv, write_text
 from jaxbundle.io.scanner import ANGLES, earth_of, mounting_of, optics_of
-from jaxbundle.io.sections import Section, TomlFile, read_sections, toml_text
+from jaxbundle.io.sections import Section, TomlFile, read_sections
 from jaxbundle.network.columns import did_you_mean
-from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.noise import Noise
 from jaxbundle.pushbroom.signals import KEYS
 from jaxbundle.pushbroom.simulate import Flight
@@ -103,34 +101,6 @@ def read_flight(path: str | Path) -> FlightFile:
         seed=int(file.section("simulation").number("seed", 0)), **options,
     )  # fmt: skip
     return FlightFile(file, flight, earth)
-
-
-def write_scanner(
-    folder: Path, given: FlightFile, image: PushbroomImage, interpolation: tuple[str, str]
-) -> Path:
-    """Write `scanner.toml`, `positions.csv` and `attitude.csv` of an image; returns the first."""
-    radians = given.file.radians
-    position, attitude = image.trajectory.position, image.trajectory.attitude.table
-    folder.mkdir(parents=True, exist_ok=True)
-    names = ("t", "X", "Y", "Z")
-    write_csv(folder / "positions.csv", names, _rows(position.times, position.values))
-    write_csv(
-        folder / "attitude.csv", ("t", *ANGLES),
-        _rows(attitude.times, np.asarray(attitude.values) / radians),
-    )  # fmt: skip
-    sections = {k: given.file.document[k] for k in ("scanner", "times")}
-    sections["position"] = {"table": "positions.csv", "interpolation": interpolation[0]}
-    sections["attitude"] = {"table": "attitude.csv", "interpolation": interpolation[1]}
-    if given.earth is not None:
-        sections["attitude"]["frame"] = image.trajectory.attitude.reference
-    document = given.file.document
-    sections |= {k: document[k] for k in ("optics", "mounting") if k in document}
-    write_text(folder / "scanner.toml", toml_text(sections))
-    return folder / "scanner.toml"
-
-
-def _rows(times, values):
-    return np.column_stack([np.asarray(times), np.asarray(values)]).tolist()
 
 
 def _track(file: TomlFile, earth: Ellipsoid | None) -> dict[str, Any]:

@@ -43,19 +43,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
-from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, earth_fixed
-from jaxbundle.io.csv_tables import read_csv, write_csv, write_text
+from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed
+from jaxbundle.io.csv_tables import read_csv
 from jaxbundle.io.formats import read_network
-from jaxbundle.io.scanner import ANGLES, read_scanner
-from jaxbundle.io.sections import Section, read_sections, toml_text
+from jaxbundle.io.scanner import read_scanner
+from jaxbundle.io.sections import Section, read_sections
 from jaxbundle.network.columns import Columns, did_you_mean, shown
 from jaxbundle.network.tables import Network, Observations
 from jaxbundle.network.units import ANGLE_UNITS
-from jaxbundle.pushbroom.corrections import Corrections
-from jaxbundle.pushbroom.image import PushbroomImage
-from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable, FocalLine, Optics
 from jaxbundle.refinement.freedom import Freedom
 from jaxbundle.refinement.refining import TESTS, east_north_up
 from jaxbundle.refinement.tables import GroundPoints, ScannerImage, check_points_table
@@ -223,72 +219,3 @@ def _observations(table, ids, images, section, where) -> Observations:
         np.stack([table.numbers(n, required=True) for n in ("line", "pixel")], 1),
         np.where(np.isnan(given), sigma, given), table.source,
     )  # fmt: skip
-
-
-def write_scanner_image(
-    folder: str | Path, name: str, image: PushbroomImage, earth: Ellipsoid | None
-) -> Path:
-    """Write an image without offsets as `NAME.toml` with its tables beside it; angles in radians.
-
-    `read_scanner` reads the same image.
-    """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    position, attitude = image.trajectory.position, image.trajectory.attitude
-    scanner = {"name": name, "lines": image.lines, "pixels": image.pixels, "angle_unit": "rad"}
-    scanner["earth"] = (
-        "local" if earth is None else "WGS84" if earth == WGS84 else [float(v) for v in earth]
-    )
-    file = lambda kind: f"{name}_{kind}.csv"
-    rates = [] if position.rates is None else [np.asarray(position.rates)]
-    _write(folder / file("positions"), ("t", "X", "Y", "Z", "VX", "VY", "VZ")[: 4 + 3 * len(rates)],
-           position.times, position.values, *rates)  # fmt: skip
-    quaternions = attitude.table.values.shape[1] == 4
-    columns = ("q0", "q1", "q2", "q3") if quaternions else ANGLES
-    _write(folder / file("attitude"), ("t", *columns), attitude.table.times, attitude.table.values)
-    times = {"first": float(image.times.first), "period": float(image.times.period)}
-    if image.times.table is not None:
-        _write(folder / file("times"), ("t",), image.times.table)
-        times = {"table": file("times")}
-    frame = "local" if earth is None else "ITRF"
-    turning = "orbit" if attitude.reference == "orbit" else frame
-    document = {
-        "scanner": scanner, "times": times,
-        "position": {"table": file("positions"), "frame": frame, **_options(position)},
-        "attitude": {"table": file("attitude"), "frame": turning,
-                     **_options(attitude.table, "slerp" if attitude.slerp else None)},
-        "optics": _optics(image.optics, folder, file),
-        "mounting": dict(zip(ANGLES, np.asarray(image.mounting).tolist())),
-        "corrections": {k: v for k, v in zip(Corrections._fields, image.corrections)},
-    }  # fmt: skip
-    path = folder / f"{name}.toml"
-    write_text(path, toml_text(document))
-    return path
-
-
-def _options(table, method=None):
-    options = {"interpolation": method or table.method}
-    if options["interpolation"] == "lagrange":
-        options["order"] = table.order
-    if np.isfinite(table.gap):
-        options["gap"] = table.gap
-    return options
-
-
-def _optics(optics: Optics, folder: Path, file) -> dict[str, Any]:
-    if isinstance(optics, FocalLine):
-        parameters = dict(zip(get_model(optics.model).parameters, optics.parameters.tolist()))
-        more = {k: float(getattr(optics, k)) for k in ("pitch", "middle", "row")}
-        return {"model": optics.model, **parameters, **more}
-    if isinstance(optics, AnglePolynomial):
-        return {
-            "across": optics.across.tolist(), "along": optics.along.tolist(),
-            "middle": float(optics.middle), "half": float(optics.half),
-        }  # fmt: skip
-    assert isinstance(optics, AngleTable)
-    _write(folder / file("angles"), ("across", "along"), optics.across, optics.along)
-    return {"table": file("angles")}
-
-
-def _write(path, header, *columns):
-    write_csv(path, header, np.column_stack([np.asarray(c) for c in columns]).tolist())

@@ -4,11 +4,15 @@
     X = locate_lines(image, Ground(), lines, pixels)      # [3, lines, pixels], metres
     found = project_points(image, make_search(image), X.reshape(3, -1))
 
+    fit, check = fit_image(image, WGS84, (0.0, 3000.0))   # rational polynomials in its place:
+    line, sample, status = rpc.project_points(fit.rpc, longitude, latitude, height)
+
 Every array of a `PushbroomImage` is a parameter: `equinox.tree_at` replaces it, `jax.jacfwd`
 differentiates by it. Times are in seconds, angles in radians, the Earth is WGS 84 unless another
 ellipsoid is given. `docs/pushbroom.md` has the conventions.
 """
 
+from . import rpc as rpc
 from .accuracy import closed_form as closed_form
 from .accuracy import drawn as drawn
 from .accuracy import ground_errors as ground_errors
@@ -37,6 +41,16 @@ from .project import make_search as make_search
 from .project import project_from as project_from
 from .project import project_near as project_near
 from .project import project_points as project_points
+from .rpc import Rpc as Rpc
+from .rpc import RpcStatus as RpcStatus
+from .rpc_bias import compensated as compensated
+from .rpc_bias import fit_bias as fit_bias
+from .rpc_fit import RpcCheck as RpcCheck
+from .rpc_fit import RpcFit as RpcFit
+from .rpc_fit import RpcTable as RpcTable
+from .rpc_fit import check_rpc as check_rpc
+from .rpc_fit import fit_image as fit_image
+from .rpc_fit import fit_rpc as fit_rpc
 from .scanner import AnglePolynomial as AnglePolynomial
 from .scanner import AngleTable as AngleTable
 from .scanner import FocalLine as FocalLine

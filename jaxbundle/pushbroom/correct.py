@@ -6,7 +6,9 @@ off. Every single point is then projected into the image, from a place between t
 or, where that does not lead there, searched for, and the image resampled there. Between
 nodes 16 pixels apart a map's curvature is below a millimetre for pixels of 10 m: (16·10 m)²/8R.
 
-Terrain that hides other terrain is not looked for.
+Terrain hides other terrain where the ray of the place in the image ends before it comes to the
+point: on request the first hit of every pixel's ray is sought, and what is farther from it than
+half a pixel of the map is not shown.
 """
 
 from typing import NamedTuple
@@ -17,8 +19,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbundle.geometry.ellipsoid import earth_fixed, up
+from jaxbundle.geometry.vectors import difference, dot, length
 
-from .image import PushbroomImage
+from .image import Pose, PushbroomImage
+from .locate import ground_point
+from .passages import sample
 from .project import Search, project_from, project_points
 from .surfaces import Ground, Surface
 from .terrain import Terrain, bilinear
@@ -61,9 +66,16 @@ def local_nodes(x: np.ndarray, y: np.ndarray) -> Nodes:
 
 
 def block_places(
-    image: PushbroomImage, search: Search, surface: Surface, nodes: Nodes
+    image: PushbroomImage,
+    search: Search,
+    surface: Surface,
+    nodes: Nodes,
+    occlusion: bool = False,
 ) -> Places | None:
-    """Where the pixels of a block are in the image; None if none of them is near it."""
+    """Where the pixels of a block are in the image; None if none of them is near it.
+
+    With `occlusion` pixels that other terrain hides are nowhere.
+    """
     level = np.asarray(_level(surface))
     raised = nodes.X + level * nodes.up
     found = project_points(image, search, jnp.asarray(raised.reshape(3, -1)), margin=BESIDE)
@@ -83,7 +95,28 @@ def block_places(
         )
     inside = (line >= -0.5) & (line < image.lines - 0.5)
     inside &= (pixel >= -0.5) & (pixel < image.pixels - 0.5)
+    if occlusion and isinstance(surface, Terrain):
+        inside &= ~np.asarray(_occluded(image, search, surface, line, pixel, ground))
     return Places(np.where(inside, line, np.nan), np.where(inside, pixel, np.nan))
+
+
+@jax.jit
+def _occluded(image, search, surface, line, pixel, ground):
+    """Whether the rays of places end before they come to their points [3, rows, columns].
+
+    A ray that finds no height on its way to the point hides nothing.
+    """
+    half = length(ground[:, 0, 1] - ground[:, 0, 0]) / 2
+
+    def of_point(line, pixel, X):
+        numbers, (P, V) = sample(search.pieces, image.times.time(line))
+        pose = Pose(jnp.stack(P), numbers[:9].reshape(3, 3).T, jnp.stack(V))
+        hit = ground_point(pose, image.optics.slopes(pixel), surface, image.corrections)
+        gap = difference(X, hit)
+        return (dot(gap, difference(X, P)) > 0) & (length(gap) > half)
+
+    of_row = lambda args: jax.vmap(of_point)(*args)
+    return jax.lax.map(of_row, (line, pixel, jnp.moveaxis(ground, 0, -1)))
 
 
 def _filled(starts):

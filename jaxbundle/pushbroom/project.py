@@ -4,10 +4,9 @@ The point X is seen at the time t by the pixel u where
 
     r + ξ(u)·q = 0,    s + η(u)·q = 0,        [r, s, q] = Rᵀ(t)·(X − P(t)),    q < 0.
 
-`project_points` searches the whole image: the sign of the second equation, with the pixel that the
-first one gives, changes wherever the line of detectors passes over the point; from each change
-Newton's method in (t, u) goes on with the polynomials of `pieces`. Two passages within one step of
-the search (a piece, or 1/128 of the image) that turn back in between are not separated.
+`project_points` begins, in the footprint of the image, where polynomials say that the point is
+(`footprint`), and elsewhere with a search of the whole image (`passages`). From there Newton's
+method goes on with the polynomials of `pieces` (`newton`).
 
 `project_near` is the textbook's way for one point that is near a known place in the image, with the
 trajectory itself. By the implicit function theorem its derivatives are exact in everything.
@@ -21,7 +20,6 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
@@ -29,20 +27,12 @@ from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, normal
 from jaxbundle.geometry.vectors import Vector, difference, dot, turned_back
 
 from .corrections import seen_point
+from .footprint import Footprint, make_footprint
 from .image import PushbroomImage, pose_at
-from .pieces import DEGREE, Pieces, make_pieces
-from .scanner import slopes_of
+from .newton import FEW, collected, first_of, refine, replaced
+from .passages import line_of_detectors, passages, sample, sample_times
+from .pieces import Pieces, make_pieces
 
-SEARCH = 128
-"""The search has about as many steps at most."""
-ROUNDS, STEPS = 5, 2
-"""How often the piece of a point may be chosen anew, and Newton's steps with its polynomials."""
-SETTLED = 1e-3
-"""A last step below this, in lines and pixels, leaves an error below its square."""
-EDGE = 1e-5
-"""A root so many lines beyond the end of its piece stays with it."""
-STRAY = 1000
-"""A point that is sought so many lines off the image is given up."""
 CHUNK = 2048
 """Points that go through all steps together, so that they stay in the cache."""
 NEAR_STEPS = 6
@@ -87,9 +77,10 @@ class Projected(eqx.Module):
 
 
 class Search(eqx.Module):
-    """What the search needs of an image: its pieces, times to begin with, η of ξ about."""
+    """What the search needs of an image: pieces, footprint, times to begin with, η of ξ about."""
 
     pieces: Pieces
+    footprint: Footprint | None
     samples: Float[Array, " k"]
     along: Float[Array, " 6"]
     earth: Ellipsoid | None = eqx.field(static=True)
@@ -98,14 +89,10 @@ class Search(eqx.Module):
 def make_search(image: PushbroomImage, earth: Ellipsoid | None = WGS84) -> Search:
     """Prepare an image for `project_points`; `earth` is None in a local frame."""
     pieces = make_pieces(image, earth)
-    chosen = np.unique(np.linspace(0, len(pieces.ends) - 1, SEARCH + 1).round().astype(int))
-    u = np.linspace(0, max(image.pixels - 1, 1), 257)
-    xi, eta = (np.asarray(v) for v in _slopes(image.optics, u))
-    along = np.polynomial.polynomial.polyfit(xi, eta, 5)
-    return Search(pieces, pieces.ends[chosen], jnp.asarray(along), earth)
-
-
-_slopes = jax.jit(slopes_of)
+    samples = sample_times(pieces)
+    along = line_of_detectors(image.optics, image.pixels)
+    footprint = make_footprint(image, pieces, samples, along, earth)
+    return Search(pieces, footprint, samples, along, earth)
 
 
 @partial(jax.jit, static_argnames="most")
@@ -119,33 +106,11 @@ def project_points(
     """The places of points in the whole image, the first `most` of each.
 
     **Arguments:** `search` of the same image, by `make_search`; X in metres, coordinates first;
-    what is beside the image by up to `margin` lines and pixels is taken as in it.
+    what is beside the image by up to `margin` lines and pixels is taken as in it. Points inside
+    the image are found some ten times as fast as those outside, which must be searched for.
     """
-    passages = lambda X: _passages(image, search, X, most, margin)
-    starts, count, ahead, behind = _in_chunks(passages, tuple(X))
-    hidden = _hidden(search, X)
-    edge = 0.5 + margin
-    first, last = image.times.time(-edge), image.times.time(image.lines - 1 + edge)
-    there = count > jnp.arange(most)[:, None]
-    # one after the other, not written out: all passages share one compiled Newton's method
-    t, u, settled = jax.lax.map(
-        lambda k: _places(image, search, X, *k), (jnp.stack(starts), there)
-    )
-    inside = (t >= first) & (t < last) & (u >= -edge) & (u < image.pixels - 1 + edge)
-    seen = there & settled & inside & ~hidden
-    lost = jnp.any(there & ~settled, axis=0)
-    order = jnp.argsort(~seen, axis=0, stable=True)
-    sorted_ = lambda v: jnp.take_along_axis(jnp.where(seen, v, jnp.nan), order, 0)
-    # passages beyond the first `most` were not followed: they may be beside the image
-    number = seen.sum(0) + jnp.maximum(count - most, 0) * ~hidden
-    status = jnp.select(
-        [number > 0, hidden, lost, count > 0, ahead, behind],
-        [jnp.asarray(int(s)) for s in (
-            Status.SEEN, Status.HIDDEN, Status.NOT_CONVERGED, Status.BESIDE, Status.AFTER,
-            Status.BEFORE,
-        )], int(Status.HIDDEN),
-    )  # fmt: skip
-    return Projected(sorted_(image.times.line(t)), sorted_(u), number, status)
+    find = lambda X: _found(image, search, X, most, margin)
+    return _in_chunks(find, tuple(X))
 
 
 @jax.jit
@@ -154,12 +119,11 @@ def project_from(
 ) -> tuple[Array, Array]:
     """Line and pixel of points near the given places; arrays of any one shape, not searched for.
 
-    NaN where Newton's method does not settle. What is near in the image should be near in the
-    arrays, as it is in a raster: points of one piece are gone through together.
+    NaN where Newton's method does not settle.
     """
     flat = [jnp.ravel(a) for a in jnp.broadcast_arrays(*X, image.times.time(line), pixel * 1.0)]
-    place = lambda *args: _refine(image, search, args[:3], *args[3:])
-    t, u, settled = _in_chunks(lambda args: place(*args), tuple(flat))
+    place = lambda args: refine(image, search.pieces, search.earth, args[:3], *args[3:])
+    t, u, settled = _in_chunks(place, tuple(flat))
     shape = jnp.broadcast_shapes(*(jnp.shape(a) for a in (*X, line, pixel)))
     found = lambda a: jnp.where(settled, a, jnp.nan).reshape(shape)
     return found(image.times.line(t)), found(u)
@@ -204,194 +168,79 @@ def misclosure(
 
 
 def _in_chunks(function, arrays):
-    """The function of arrays [n] by chunks."""
+    """The function of arrays [n], whose values are [..., n], by chunks."""
     n = arrays[0].shape[0]
     if n <= CHUNK:
         return function(arrays)
     chunks = -(-n // CHUNK)
     cut = lambda a: jnp.pad(a, (0, chunks * CHUNK - n), mode="edge").reshape(chunks, CHUNK)
     found = jax.lax.map(function, tuple(cut(a) for a in arrays))
-    return jax.tree.map(lambda a: a.reshape(-1)[:n], found)
+    joined = lambda a: jnp.moveaxis(a, 0, -2).reshape(*a.shape[1:-1], -1)[..., :n]
+    return jax.tree.map(joined, found)
+
+
+def _found(image, search, X, most, margin):
+    """The places of a chunk of points, a triple of arrays."""
+    hidden = _hidden(search, X)
+    if search.footprint is None:
+        return _searched(image, search, X, hidden, most, margin)
+    start = search.footprint.start(difference(X, search.pieces.origin))
+    t, u, settled = refine(image, search.pieces, search.earth, X, *start)
+    once = settled & _inside(image, t, u, 0.0) & search.footprint.level(search.earth, X) & ~hidden
+    only = lambda v: jnp.full((most, v.size), jnp.nan).at[0].set(v)
+    count = once.astype(int)
+    found = Projected(only(image.times.line(t)), only(u), count, jnp.zeros_like(count))
+
+    def search_on(state):
+        found, known = state
+        chosen = first_of(~known, min(FEW, known.size))
+        few = _searched(image, search, *collected((X, hidden), chosen), most, margin)
+        return replaced(found, few, chosen), known.at[chosen].set(True, mode="drop")
+
+    return jax.lax.while_loop(lambda s: ~jnp.all(s[1]), search_on, (found, once))[0]
+
+
+def _searched(image, search, X, hidden, most, margin):
+    """The places of points that may be anywhere."""
+    starts, count, ahead, behind = passages(image, search, X, most, margin)
+    there = count > jnp.arange(most)[:, None]
+
+    def place(args):
+        start, there = args
+        middle = jnp.zeros_like(start) + (image.pixels - 1) / 2
+        return jax.lax.cond(
+            jnp.any(there), lambda: refine(image, search.pieces, search.earth, X, start, middle),
+            lambda: (start, start, start != start),
+        )  # fmt: skip
+
+    # one after the other, not written out: all passages share one compiled Newton's method
+    t, u, settled = jax.lax.map(place, (starts, there))
+    seen = there & settled & _inside(image, t, u, margin) & ~hidden
+    lost = jnp.any(there & ~settled, axis=0)
+    order = jnp.argsort(~seen, axis=0, stable=True)
+    sorted_ = lambda v: jnp.take_along_axis(jnp.where(seen, v, jnp.nan), order, 0)
+    # passages beyond the first `most` were not followed: they may be beside the image
+    number = seen.sum(0) + jnp.maximum(count - most, 0) * ~hidden
+    status = jnp.select(
+        [number > 0, hidden, lost, count > 0, ahead, behind],
+        [jnp.asarray(int(s)) for s in (
+            Status.SEEN, Status.HIDDEN, Status.NOT_CONVERGED, Status.BESIDE, Status.AFTER,
+            Status.BEFORE,
+        )], int(Status.HIDDEN),
+    )  # fmt: skip
+    return Projected(sorted_(image.times.line(t)), sorted_(u), number, status)
+
+
+def _inside(image, t, u, margin):
+    """Whether places are in the image, or beside it by up to `margin` lines and pixels."""
+    edge = 0.5 + margin
+    first, last = image.times.time(-edge), image.times.time(image.lines - 1 + edge)
+    return (t >= first) & (t < last) & (u >= -edge) & (u < image.pixels - 1 + edge)
 
 
 def _hidden(search, X):
     """Whether the Earth is between the points and the camera at the middle of the image."""
     if search.earth is None:
-        return jnp.zeros(X.shape[1], bool)
-    _, (P, _) = _sample(search.pieces, search.samples[len(search.samples) // 2])
-    return dot(normal(search.earth, tuple(X)), difference(P, tuple(X))) <= 0
-
-
-def _places(image, search, X, start, there):
-    """(t, u, settled) from start times, in the order of time so that neighbours share a piece."""
-
-    def place(start):
-        order = jnp.argsort(start)
-        refine = lambda args: _refine(image, search, args[:3], args[3], args[4])
-        u = jnp.zeros_like(start) + (image.pixels - 1) / 2
-        found = _in_chunks(refine, (*X[:, order], start[order], u))
-        return tuple(jnp.zeros_like(a).at[order].set(a) for a in found)
-
-    nothing = lambda start: (start, start, start != start)
-    return jax.lax.cond(jnp.any(there), place, nothing, start)
-
-
-def _passages(image, search, X, most, margin):
-    """When the line of detectors passes over the points, about, and how often; before or after?
-
-    The search begins and ends a line outside the image, so that its edges are within.
-    """
-    step = (1 + margin) * (image.times.time(1.0) - image.times.time(0.0))
-    samples = search.samples.at[0].add(-step).at[-1].add(step)
-    numbers, motions = jax.vmap(partial(_sample, search.pieces))(samples)
-
-    def forward(numbers, motion):
-        """The slope at which a point is ahead of the line of detectors; NaN behind the camera."""
-        D = _sights(image, search, X, motion)
-        r, s, q = (_combined(numbers, D, i) for i in range(3))
-        front = q < 0
-        q = jnp.where(front, q, -1.0)
-        return jnp.where(front, -s / q - _polynomial(search.along, -r / q), jnp.nan)
-
-    def step_to(state, sample):
-        before, t_before, count, starts, first = state
-        k, t, *place = sample
-        value = forward(*place)
-        passed = (before >= 0) != (value >= 0)
-        passed &= ~(jnp.isnan(before) | jnp.isnan(value))
-        crossing = t_before + (t - t_before) * before / jnp.where(passed, before - value, 1.0)
-        starts = tuple(
-            jnp.where(passed & (count == i), crossing, start) for i, start in enumerate(starts)
-        )
-        return (value, t, count + passed, starts, jnp.where(k == 0, value, first)), None
-
-    zero = jnp.zeros_like(X[0])
-    nowhere = zero * jnp.nan
-    state = (nowhere, samples[0], zero.astype(int), (zero,) * most, nowhere)
-    unroll = 1 if image.corrections.any else 4
-    (final, _, count, starts, first), _ = jax.lax.scan(
-        step_to, state, (jnp.arange(len(samples)), samples, numbers, motions), unroll=unroll
-    )
-    return starts, count, final > 0, first < 0
-
-
-def _refine(image, search, X, t, u):
-    """Newton's method in (t, u): the place, and whether it settled.
-
-    The points of one piece share its polynomials, so the pieces are gone through one by one: few if
-    the points are near each other. It is done when no point leaves its piece; one that strays far
-    from the image is given up.
-    """
-    ends = search.pieces.ends
-    far = STRAY * (image.times.time(1.0) - image.times.time(0.0))
-
-    def open_(t, settled):
-        return ~settled & (t >= ends[0] - far) & (t <= ends[-1] + far)
-
-    def again(state):
-        t, _, settled, rounds = state
-        return (rounds < ROUNDS) & jnp.any(open_(t, settled))
-
-    def refine(state):
-        t, _, settled, rounds = state
-        own = jnp.searchsorted(ends[1:-1], t, side="right")
-        own = jnp.where(open_(t, settled), own, -1)
-        first = jnp.min(jnp.where(own < 0, len(ends), own))
-        newton = partial(_newton, image, search, X, own)
-        return *jax.lax.fori_loop(first, own.max() + 1, newton, state[:3]), rounds + 1
-
-    t, u, settled, _ = jax.lax.while_loop(again, refine, (t, u, jnp.zeros(t.shape, bool), 0))
-    return t, u, settled
-
-
-def _newton(image, search, X, own, k, state):
-    """Steps for the points of the piece k; the others stay where they are."""
-    t, u, settled = state
-    pieces = search.pieces
-    start, end, c = pieces.ends[k], pieces.ends[k + 1], pieces.coefficients[k]
-    middle, half = (start + end) / 2, (end - start) / 2
-    tau = first = (t - middle) / half
-    v = u
-    motion = _motion(c, tau, half, pieces.origin) if image.corrections.any else None
-    D = _sights(image, search, X, motion)
-    rsq = [[_combined(c[p], D, i) for p in range(DEGREE + 1)] for i in range(3)]
-    (r, dr), (s, ds), (q, dq) = (_value_and_rate(p, tau) for p in rsq)
-    (xi, eta), (dxi, deta) = jax.jvp(image.optics.slopes, (v,), (jnp.ones_like(v),))
-    ft, gt, fu, gu = dr + xi * dq, ds + eta * dq, dxi * q, deta * q
-    inverse = 1 / (ft * gu - fu * gt)
-    for step in range(STEPS):
-        if step:  # with the derivatives of the first one
-            r, s, q = (_value(p, tau) for p in rsq)
-            xi, eta = image.optics.slopes(v)
-        f, g = r + xi * q, s + eta * q
-        dtau, dv = inverse * (gu * f - fu * g), inverse * (ft * g - gt * f)
-        tau, v = tau - dtau, v - dv
-    # a sight with corrections belongs to the time at which the round began
-    moved = tau - first if image.corrections.any else dtau
-    line = (image.times.time(1.0) - image.times.time(0.0)) / half
-    short = (jnp.abs(moved) < SETTLED * line) & (jnp.abs(dv) < SETTLED) & (q < 0)
-    last = len(pieces.coefficients) - 1
-    # a root at the very end of a piece would go to and fro
-    ends = 1 + EDGE * line
-    stays = ((tau >= -ends) | (k == 0)) & ((tau <= ends) | (k == last))
-    chosen = own == k
-    new = middle + tau * half, v, short & stays
-    return tuple(jnp.where(chosen, a, b) for a, b in zip(new, state))
-
-
-def _sample(pieces, t):
-    """The twelve numbers at a time, and (P, V)."""
-    k = jnp.searchsorted(pieces.ends[1:-1], t, side="right")
-    start, end, c = pieces.ends[k], pieces.ends[k + 1], pieces.coefficients[k]
-    half = (end - start) / 2
-    tau = (t - start) / half - 1
-    return _value_and_rate(c, tau)[0], _motion(c, tau, half, pieces.origin)
-
-
-def _sights(image, search, X, motion):
-    """Where the points are seen by a camera of this motion, from the origin of the pieces."""
-    if image.corrections.any:
-        X = seen_point(image.corrections, search.earth, *motion, X)
-    return difference(X, tuple(search.pieces.origin))
-
-
-def _motion(coefficients, tau, half, origin):
-    """P = O − Mᵀ·m at τ, and its rate."""
-
-    def position(tau):
-        n = [_value_and_rate(c, tau)[0] for c in coefficients.T]
-        return tuple(origin[k] - sum(n[3 * i + k] * n[9 + i] for i in range(3)) for k in range(3))
-
-    P, V = jax.jvp(position, (tau,), (jnp.ones_like(tau),))
-    return P, tuple(v / half for v in V)
-
-
-def _combined(numbers, D, i):
-    """Component i of M·D + m."""
-    return (
-        numbers[3 * i] * D[0] + numbers[3 * i + 1] * D[1] + numbers[3 * i + 2] * D[2]
-        + numbers[9 + i]
-    )  # fmt: skip
-
-
-def _value(coefficients, tau):
-    """A polynomial (Horner)."""
-    value = coefficients[-1]
-    for c in coefficients[-2::-1]:
-        value = value * tau + c
-    return value
-
-
-def _value_and_rate(coefficients, tau):
-    """A polynomial and its derivative (Horner)."""
-    value, rate = coefficients[-1], jnp.zeros_like(tau)
-    for c in coefficients[-2::-1]:
-        value, rate = value * tau + c, rate * tau + value
-    return value, rate
-
-
-def _polynomial(coefficients, x):
-    value = coefficients[-1] + 0 * x
-    for c in coefficients[-2::-1]:
-        value = value * x + c
-    return value
+        return jnp.zeros(X[0].shape, bool)
+    _, (P, _) = sample(search.pieces, search.samples[len(search.samples) // 2])
+    return dot(normal(search.earth, X), difference(P, X)) <= 0

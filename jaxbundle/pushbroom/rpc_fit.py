@@ -70,11 +70,12 @@ class RpcTable(NamedTuple):
 
 
 class RpcCheck(NamedTuple):
-    """Computed less given lines and samples [n, 2], their RMS and largest amount, in pixels."""
+    """Computed less given lines and samples of a table, their RMS and largest amount, in pixels."""
 
     residuals: Float[np.ndarray, "n 2"]
     rms: Float[np.ndarray, "2"]
     largest: Float[np.ndarray, "2"]
+    table: RpcTable
 
     @property
     def worst(self) -> int:
@@ -179,7 +180,7 @@ def check_rpc(rpc: Rpc, table: RpcTable) -> RpcCheck:
     """How well coefficients follow a table."""
     line, sample, _ = project_points(rpc, table.longitude, table.latitude, table.height)
     v = np.stack([np.asarray(line) - table.line, np.asarray(sample) - table.sample], 1)
-    return RpcCheck(v, np.sqrt(np.mean(v**2, 0)), np.abs(v).max(0))
+    return RpcCheck(v, np.sqrt(np.mean(v**2, 0)), np.abs(v).max(0), table)
 
 
 @jax.jit

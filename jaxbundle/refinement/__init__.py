@@ -1,5 +1,7 @@
 """Refinement of scanner images, alone or with photographs, by least squares."""
 
+from .adjusted import adjusted_photographs as adjusted_photographs
+from .adjusted import point_rows as point_rows
 from .equations import System as System
 from .equations import Unknowns as Unknowns
 from .equations import line_residual as line_residual

@@ -82,6 +82,7 @@ def test_from_a_flight_to_a_map(tmp_path, flight, run):
     names = {p.name for p in out.iterdir()}
     assert names == {"scanner.toml", "positions.csv", "attitude.csv", "truth", "image.tif"}
     truth = out / "truth" / "scanner.toml"
+    assert 'angle_unit = "deg"' in truth.read_text()
     status, said, err = run("correct", truth, out / "image.tif", "--out", tmp_path / "map.tif",
                             "--spacing", 0.5, "--resampling", "cubic")  # fmt: skip
     assert status == 0, err
@@ -107,6 +108,8 @@ def test_from_a_flight_to_a_map(tmp_path, flight, run):
 
 
 def test_what_is_refused(tmp_path, flight, run):
+    status, _, err = run("correct", flight, flight, "--out", tmp_path / "map.tif", "--occlusion")
+    assert status == 2 and "--occlusion" in err and "--dem" in err
     for old, new, words in [
         ("roll", "rol", ["[angles]", "'rol'", "'roll'"]), ('"sine"', '"sin"', ["'sin'", "'sine'"]),
         ("amplitude", "amplitud", ["roll", "amplitude"]), ("start", "begin", ["[track]", "begin"]),

@@ -11,8 +11,8 @@ from jaxbundle.geometry import ellipsoid as el
 from jaxbundle.pushbroom.ancillary import attitude_table
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.locate import locate_points
+from jaxbundle.pushbroom.passages import SEARCH
 from jaxbundle.pushbroom.project import (
-    SEARCH,
     Status,
     make_search,
     project_from,
@@ -68,6 +68,7 @@ CASES = {
 }  # fmt: skip
 
 
+points_at = jax.jit(locate_points)
 SIZE = 5 * len(SOME_LINES) * len(SOME_PIXELS)
 """Points in one call, more than a chunk; always so many, to share a compiled program."""
 
@@ -171,6 +172,45 @@ def test_all_lines_that_see_a_point():
         np.testing.assert_allclose(lines[: len(place)], t[place] / 0.01, atol=0.01)
         assert np.isnan(lines[len(place) :]).all()
     assert set(np.unique(found.count)) >= {1, 3} and checked > 40
+
+
+@pytest.mark.parametrize("name", [
+    "spline, angles in the orbit, uneven times", "hermite, spline, light time, aberration"
+])  # fmt: skip
+def test_the_footprint_changes_nothing(name):
+    """With it and without, on points in the image, beside it, and above all heights it knows."""
+    image = CASES[name]
+    search = make_search(image)
+    assert search.footprint is not None
+    lines = rng.uniform(-0.5, LINES - 0.5, SIZE // 5)
+    pixels = rng.uniform(-0.5, PIXELS - 0.5, SIZE // 5)
+    X = [np.array(points_at(image, Height(h), lines, pixels)) for h in (-2e3, -900, 9e3, 2e4)]
+    X.append(X[1] + rng.uniform(-2e4, 2e4, X[1].shape))
+    X = np.concatenate(X, axis=1)
+    every = eqx.tree_at(lambda s: s.footprint, search, None)
+    fast, slow = (project_points(image, s, X) for s in (search, every))
+    np.testing.assert_array_equal(fast.status, slow.status)
+    np.testing.assert_array_equal(fast.count, slow.count)
+    np.testing.assert_allclose(fast.line, slow.line, atol=1e-6)
+    np.testing.assert_allclose(fast.pixel, slow.pixel, atol=1e-6)
+    assert len(set(np.asarray(fast.status).tolist())) >= 4
+    known = np.array(fast.line[0, : 4 * len(lines)])
+    np.testing.assert_allclose(known, np.tile(lines, 4), atol=1e-6)
+
+
+def test_an_image_that_turns_back_or_spins_has_no_footprint():
+    """There is one while the flight, 50 m/s, is faster than the nod, 1500·π·size 500 m below."""
+    assert make_search(rocking(0.0, 1.0), None).footprint is not None
+    assert make_search(rocking(0.006, 2.0), None).footprint is not None
+    assert make_search(rocking(0.012, 2.0), None).footprint is None
+    image, t = above_a_plane(), np.arange(-0.1, 6.2, 0.02)
+    # at 90 m beside the track a turn of 1 rad/s is faster than the flight
+    for turn, once in ((0.02, True), (1.0, False)):
+        turns = np.stack([0 * t, 0 * t, turn * t], 1)
+        spinning = eqx.tree_at(
+            lambda i: i.trajectory.attitude, image, attitude_table(t, turns, method="spline")
+        )
+        assert (make_search(spinning, None).footprint is not None) == once
 
 
 def test_derivatives_by_every_parameter():

@@ -41,6 +41,10 @@ def test_a_table_is_fitted(tmp_path, run):
     status, out, _ = run("fit", table, "--out", tmp_path / "fit_RPC.TXT", "--json", "-")
     told = json.loads(out)
     assert status == 0 and told["points"] == 196 and told["fit_largest_line"] < 1e-3
+    largest = max(abs(row["v_line"]) for row in told["rows"])
+    assert len(told["rows"]) == 196 and largest == told["fit_largest_line"]
+    given = table_of(RPC)
+    np.testing.assert_allclose([r["longitude"] for r in told["rows"]], np.degrees(given.longitude))
     check = check_rpc(read_rpc(tmp_path / "fit_RPC.TXT"), table_of(RPC, (5, 4, 3)))
     assert check.largest.max() < 1e-3
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import rasterio
 from pushbroom_scenes import focal_line
+from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import binary_erosion
 
 from jaxbundle.errors import InputError
@@ -117,6 +118,36 @@ def test_a_corrected_image_is_the_scene(tmp_path):
     assert 0.5 < shown.mean() < 0.95 and told[-1][0] == told[-1][1]
     assert np.abs(found - expected)[:, within].max() < 0.1
     assert sorted(p.name for p in tmp_path.iterdir()) == ["image.tif", "map.tif"]
+
+
+def test_terrain_that_hides_terrain():
+    """A ridge seen from the side, against heights along the sights in numpy."""
+    flight = dataclasses.replace(AIRCRAFT, angles={"roll": 0.6}, attitude_rate=1.0)
+    image = true_image(flight)
+    x, y = np.arange(-500.0, -259, 10), np.arange(150.0, 351, 10)
+    heights = np.interp(np.abs(x + 385), [0, 20], [60, 0]) + 5 * np.sin(y[:, None] / 15)
+    surface = make_terrain(heights, (x[0], y[0]), (10.0, 10.0), None)
+    grid = MapGrid(-475.0, 330.0, 0.7, BLOCK, BLOCK)
+    steps, every = np.arange(0, BLOCK + STEP, STEP), np.arange(BLOCK)
+    system, search = MapSystem(None, None), make_search(image, None)
+    nodes = system.nodes(surface, *grid.centres(steps, steps))
+    all_, seen = (block_places(image, search, surface, nodes, o) for o in (False, True))
+    chosen = np.flatnonzero(np.isfinite(all_.line.ravel()))[::17]
+    east, north = (v.ravel()[chosen] for v in grid.centres(every, every))
+    height = RegularGridInterpolator((y, x), heights, bounds_error=False, fill_value=-99.0)
+    X = np.stack([east, north, height((north, east))])
+    t = all_.line.ravel()[chosen] * flight.period
+    P = np.array(flight.track["start"])[:, None] + np.outer(flight.track["velocity"], t)
+    # from half a pixel of the map upwards, as far as the ridge is high
+    d = (P - X) / np.linalg.norm(P - X, axis=0)
+    way = X[..., None] + d[..., None] * np.r_[0.35, np.arange(0.5, 110, 0.1)]
+    hidden = (height((way[1], way[0])) > way[2]).any(1)
+    found = np.isnan(seen.line.ravel()[chosen])
+    # at the edge of a shadow the steps of this test decide
+    assert (found != hidden).mean() < 0.005
+    assert 0.05 < hidden.mean() < 0.6 and len(chosen) > 500
+    places = np.isfinite(seen.line)
+    np.testing.assert_array_equal(seen.line[places], all_.line[places])
 
 
 @pytest.mark.filterwarnings("ignore:Dataset has no geotransform")

@@ -21,8 +21,9 @@ from jaxbundle.cli.pushbroom import refine as _refine  # noqa: F401
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, geodetic
 from jaxbundle.io.csv_tables import read_csv, write_csv
-from jaxbundle.io.refinement import read_refinement, write_scanner_image
+from jaxbundle.io.refinement import read_refinement
 from jaxbundle.io.scanner import read_scanner
+from jaxbundle.io.scanner_writing import write_scanner_image
 from jaxbundle.pushbroom.image import pose_at
 from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable
 from jaxbundle.refinement import Freedom, refine
@@ -87,6 +88,8 @@ def test_the_command_writes_what_locate_reads(folder):
     result = json.loads((folder / "out" / "result.json").read_text())
     assert 0.7 < result["sigma0"] < 1.3
     assert len(result["image_points"]) == COUNT
+    points = read_csv(folder / "out" / "points.csv")
+    assert len(points) == COUNT and set(points.values["role"]) == {"control"}
     image, given = (read_scanner(folder / p / "A.toml").image for p in ("out", ""))
     pitch = {row["name"]: row["change"] for row in result["unknowns"]}["pitch bias"]
     assert abs(pitch - np.degrees(1e-4) * 3600) < 10

@@ -11,9 +11,19 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, omega_phi_kappa_from_matrix
+from jaxbundle.io.formats import read_network
+from jaxbundle.io.project import write_project
 from jaxbundle.network.tables import Camera, Images, Network, Observations, Points
 from jaxbundle.pushbroom.image import pose_at
-from jaxbundle.refinement import FREE, Freedom, Unknowns, refine, residuals
+from jaxbundle.refinement import (
+    FREE,
+    Freedom,
+    Unknowns,
+    adjusted_photographs,
+    point_rows,
+    refine,
+    residuals,
+)
 from jaxbundle.refinement.freedom import make_form
 from jaxbundle.refinement.inspection import layout_of
 from jaxbundle.refinement.solver import normal
@@ -176,3 +186,27 @@ def test_biases_come_back(case):
     assert {n.owner for n in result.columns.names} == {
         "image A", "sensor A", "photograph F", "camera frame"
     }  # fmt: skip
+
+
+def test_photographs_and_points_at_the_solution(case, tmp_path):
+    """Written and read; collinearity in numpy leaves the residuals of the adjustment."""
+    result, _, _, unknown = case
+    network = read_network(write_project(adjusted_photographs(result), tmp_path))
+    M = matrix_from_omega_phi_kappa(jnp.asarray(network.images.angles[0]))
+    camera, rays = network.cameras[0], network.observations
+    r, s, q = np.asarray(M) @ (network.points.position[rays.point] - network.images.position[0]).T
+    c, K1 = camera.parameters["c"], camera.parameters["K1"]
+    assert c != CAMERA.parameters["c"] and K1 == CAMERA.parameters["K1"]
+    corrected = rays.xy * (1 + K1 * (rays.xy**2).sum(1, keepdims=True))
+    v = -c * np.stack([r / q, s / q], 1) - corrected
+    told = [row for row in result.image_points() if row["image"] == "F"]
+    by_id = {row["point"]: row["v"] for row in told}
+    assert len(v) == len(told) == POINTS
+    expected = [by_id[network.points.id[p]] for p in rays.point]
+    np.testing.assert_allclose(v, expected, atol=1e-7)
+    rows = point_rows(result)
+    np.testing.assert_array_equal([[row[k] for k in "XYZ"] for row in rows], result.positions)
+    sigma = np.array([[row[f"s{k}"] for k in "XYZ"] for row in rows])
+    # the axes of these points are those of the coordinates; control points are held
+    np.testing.assert_allclose(sigma[unknown], result.inspection.point_sigma[unknown])
+    assert not sigma[~unknown].any() and [row["role"] for row in rows].count("tie") == unknown.sum()

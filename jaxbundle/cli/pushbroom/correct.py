@@ -35,6 +35,9 @@ def correct(
     height: Level = None,
     dem: Dem = None,
     resampling: Annotated[str, typer.Option(help="nearest, bilinear, cubic")] = "bilinear",
+    occlusion: Annotated[
+        bool, typer.Option("--occlusion", help="leave out what other terrain of --dem hides")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Correct an image to a map, in blocks."""
@@ -46,6 +49,8 @@ def correct(
         raise InputError(f"--out {out}: there is no folder {out.parent}")
     if out.exists() and out.samefile(image):
         raise InputError(f"--out {out} is the image itself; give another name")
+    if occlusion and dem is None:
+        raise InputError("--occlusion: only terrain hides terrain; give --dem")
     file = read_scanner(scanner)
     surface = surface_of(file.earth, height, dem)
     system = MapSystem(file.earth, crs)
@@ -55,6 +60,7 @@ def correct(
         write_corrected(
             image, out, file.image, make_search(file.image, file.earth), surface, system, grid,
             resampling, lambda done, total: bar.update(task, completed=done, total=total),
+            occlusion,
         )  # fmt: skip
     if not quiet:
         print(f"{out}: {grid.rows} × {grid.columns} pixels of {grid.size:g}")

@@ -8,18 +8,20 @@ import typer
 
 import jaxbundle
 from jaxbundle.cli.pushbroom.app import pushbroom, warn
-from jaxbundle.io.csv_tables import write_text
-from jaxbundle.io.refinement import read_refinement, write_scanner_image
+from jaxbundle.io.csv_tables import write_csv, write_text
+from jaxbundle.io.project import write_project
+from jaxbundle.io.refinement import read_refinement
 from jaxbundle.io.result_json import without_nan
+from jaxbundle.io.scanner_writing import write_scanner_image
+from jaxbundle.refinement import adjusted_photographs, point_rows, report, to_json
 from jaxbundle.refinement import refine as refine_images
-from jaxbundle.refinement import report, to_json
 
 
 @pushbroom.command()
 def refine(
     input: Annotated[Path, typer.Argument(help="refine file, .toml (docs/pushbroom.md)")],
     out: Annotated[
-        Path | None, typer.Option(help="folder for report, JSON and refined scanner files")
+        Path | None, typer.Option(help="folder for report, JSON, refined files")
     ] = None,
     json: Annotated[str, typer.Option(help="write the result as JSON; - for stdout alone")] = "",
 ) -> None:
@@ -36,6 +38,11 @@ def refine(
         out.mkdir(parents=True, exist_ok=True)
         for one in file.images:
             write_scanner_image(out, one.id, result.image(one.id), one.earth)
+        rows = point_rows(result)
+        write_csv(out / "points.csv", list(rows[0]), [list(row.values()) for row in rows])
+        photographs = adjusted_photographs(result)
+        if photographs is not None:
+            write_project(photographs, out / "photographs")
         write_text(out / "report.txt", text)
         write_text(out / "result.json", as_json)
     if json == "-":

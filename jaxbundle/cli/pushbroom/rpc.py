@@ -74,7 +74,7 @@ def fit(
     write_rpc(out, found.rpc)
     head = {"points": len(found.check.residuals), **_told("fit", found.check), **head}
     head |= {"ridge_line": found.ridge[0], "ridge_sample": found.ridge[1]}
-    _tell(head, json)
+    _tell(head, json, found.check)
 
 
 @rpc.command()
@@ -189,11 +189,13 @@ def _told(name: str, check: RpcCheck) -> dict[str, float]:
     return told | {f"{name}_largest_{axis}": float(v) for axis, v in zip(axes, check.largest)}
 
 
-def _tell(head: dict, json: str) -> None:
-    """Figures as a table of name and value, or as JSON."""
+def _tell(head: dict, json: str, check: RpcCheck) -> None:
+    """Figures as a table of name and value; as JSON with a row for every point fitted."""
     head = {name: float(v) if isinstance(v, np.floating) else v for name, v in head.items()}
     if json:
-        write_rows({}, None, json, head)
+        east, north, *rest = check.table
+        values = np.degrees(east), np.degrees(north), *rest, *check.residuals.T
+        write_rows(dict(zip((*COLUMNS, "v_line", "v_sample"), values)), None, json, head)
     else:
         for name, value in head.items():
             print(f"{name:22} {value:.6g}")

@@ -11,7 +11,8 @@ import jaxbundle
 from jaxbundle.cli.app import Quiet
 from jaxbundle.cli.progress import counting
 from jaxbundle.cli.pushbroom.app import Dem, Level, check_resampling, pushbroom, surface_of
-from jaxbundle.io.flight import read_flight, write_scanner
+from jaxbundle.io.flight import read_flight
+from jaxbundle.io.scanner_writing import write_scanner_image
 from jaxbundle.io.scenes import read_scene, write_taken
 from jaxbundle.pushbroom.simulate import measured_image, true_image
 
@@ -33,12 +34,12 @@ def simulate(
     truth, measured = true_image(given.flight), measured_image(given.flight)
     surface = surface_of(given.earth, height, dem)
     shown = None if scene is None else read_scene(scene, given.earth)
-    methods = given.flight.position_interpolation, given.flight.attitude_interpolation
-    if "start" in given.flight.track:
-        methods = "linear", methods[1]
-    path = write_scanner(out, given, measured, methods)
-    write_scanner(out / "truth", given, truth, (("linear" if "start" in given.flight.track
-                                                 else "lagrange"), "spline"))  # fmt: skip
+    unit = given.file.section("scanner").text("angle_unit", "deg")
+    write = lambda folder, image: write_scanner_image(
+        folder, "scanner", image, given.earth, prefix="", angle_unit=unit
+    )
+    path = write(out, measured)
+    write(out / "truth", truth)
     if shown is not None:
         with counting(quiet) as bar:
             task = bar.add_task("lines", total=None)

@@ -1,0 +1,187 @@
+"""The footprint of an image, where each point is seen once, and about where: start values.
+
+The footprint is what the pixels see between two heights. Time and pixel over it are fitted by
+cubic polynomials of normalised coordinates. Newton's method goes on from there, and if it ends in
+the image, at a point between the heights, that is the only place, because `make_footprint` has
+made sure that the line of detectors passes over every point of the footprint in the same sense: F
+of `passages` is continuous in time, since no point is ever beside or behind the camera, and
+
+    ∂F/∂t ≠ 0 wherever F = 0,    so that a second zero would need one of the other sign between.
+
+∂F/∂t of what a detector sees at the heights is the speed of its footprint over the ground. It is
+looked at four times in each piece, for all slopes ξ that a point of the footprint has in the whole
+image. An image that turns back, or spins, or is too rough for the polynomials, has no footprint:
+all its points are searched for.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbundle.geometry.ellipsoid import Ellipsoid, at_height, residual
+from jaxbundle.geometry.vectors import along, difference
+
+from .newton import motion
+from .passages import ahead, slopes
+from .pieces import CHUNK, Pieces, value, value_and_rate
+from .surfaces import Ground, Plane
+
+HEIGHTS = -1000.0, 10_000.0
+"""Lowest and highest height, metres, if the camera is more than twice as high."""
+TIMES, ACROSS, LEVELS = 17, 9, 4
+"""Times, pixels and heights of the lattice through which the polynomials are fitted."""
+WITHIN = np.array([-1.0, -1 / 3, 1 / 3, 1.0])
+"""Where in each piece the speed is looked at."""
+STEEP = 0.1
+"""The least speed in parts of the greatest; the least cosine between a sight and the axis."""
+WIDER = 1.2
+"""Slopes are looked at so many times as far out as the points of the lattice have them."""
+FAR = 50.0
+"""Lines and pixels by which the polynomials may err."""
+POWERS = np.array([
+    (i, j, k) for i in range(4) for j in range(4 - i) for k in range(4 - i - j)
+])  # fmt: skip
+
+
+class Footprint(eqx.Module):
+    """Heights in metres; (t, u) as polynomials of A·D, D the sight from the origin of the pieces.
+
+    `frame`: A and the point −A·D₀ that makes the middle of the footprint zero.
+    """
+
+    heights: Float[Array, "2"]
+    frame: Float[Array, "3 4"]
+    coefficients: Float[Array, "2 20"]
+
+    def start(self, D):
+        """Time and pixel, about, of sights D."""
+        x, y, z = (row[0] * D[0] + row[1] * D[1] + row[2] * D[2] + row[3] for row in self.frame)
+        return _cubic(self.coefficients[0], x, y, z), _cubic(self.coefficients[1], x, y, z)
+
+    def level(self, earth, X):
+        """Whether points are between the heights."""
+        low, high = self.heights
+        if earth is None:
+            return (X[2] >= low) & (X[2] <= high)
+        return (residual(at_height(earth, low), X) >= 0) & (
+            residual(at_height(earth, high), X) <= 0
+        )
+
+
+def make_footprint(
+    image, pieces: Pieces, samples: Float[Array, " k"], line: Float[Array, " 6"],
+    earth: Ellipsoid | None,
+) -> Footprint | None:  # fmt: skip
+    """The footprint, or None if it is not sure that every point is seen once."""
+    heights = _heights(image, earth)
+    if heights is None:
+        return None
+    times = np.linspace(*np.asarray(pieces.ends)[[0, -1]], TIMES)
+    u = np.linspace(-0.5, image.pixels - 0.5, ACROSS)
+    xi, eta = (np.asarray(v) for v in slopes(image.optics, u))
+    k, tau = _places(pieces, times)
+    levels = np.linspace(*heights, LEVELS)
+    D, _ = _speeds_at(pieces, k, tau, xi, eta, levels, line, earth)
+    if not np.isfinite(D).all():
+        return None
+    footprint, errors = _fitted(D, times, u, heights)
+    period = float(image.times.time(1.0) - image.times.time(0.0))
+    if not (errors <= FAR * np.array([period, 1.0])).all():
+        return None
+    reach = _reach(pieces, np.asarray(samples), D.reshape(-1, 3))
+    if reach is None:
+        return None
+    xi = np.linspace(*reach, ACROSS)
+    eta = np.polynomial.polynomial.polyval(xi, np.asarray(line))
+    k, within = np.indices((len(pieces.ends) - 1, len(WITHIN))).reshape(2, -1)
+    _, speed = _speeds_at(pieces, k, WITHIN[within], xi, eta, levels, line, earth)
+    speed = speed[np.isfinite(speed)]  # a ray that misses sees no point
+    same = speed.min() * speed.max() > 0
+    return footprint if same and np.abs(speed).min() > STEEP * np.abs(speed).max() else None
+
+
+def _heights(image, earth):
+    """Between which heights points are looked at; None if the camera is not above the ground."""
+    P = np.asarray(image.trajectory.position.values)
+    if earth is None:
+        above = P[:, 2].min()
+    else:
+        above = (np.sqrt(1 + np.asarray(residual(earth, tuple(P.T)))).min() - 1) * earth.c
+    return np.clip(HEIGHTS, -above / 2, above / 2) if above > 0 else None
+
+
+def _places(pieces, times):
+    """Pieces of times, and τ in them."""
+    ends = np.asarray(pieces.ends)
+    k = np.clip(np.searchsorted(ends, times, side="right") - 1, 0, len(ends) - 2)
+    return k, 2 * (times - ends[k]) / (ends[k + 1] - ends[k]) - 1
+
+
+def _speeds_at(pieces, k, tau, xi, eta, heights, line, earth):
+    """Sights D [times, slopes, heights, 3] and ∂F/∂t [times, slopes, heights] at many times."""
+    half = np.diff(np.asarray(pieces.ends))[k] / 2
+    c = np.asarray(pieces.coefficients)[k]
+    pad = lambda a: np.pad(a, [(0, -len(k) % CHUNK)] + [(0, 0)] * (a.ndim - 1), mode="edge")
+    parts = [
+        _speeds(*part, pieces.origin, xi, eta, heights, line, earth)
+        for part in zip(*(pad(a).reshape(-1, CHUNK, *a.shape[1:]) for a in (c, tau, half)))
+    ]
+    D, speed = (np.concatenate([np.asarray(v) for v in values])[: len(k)] for values in zip(*parts))
+    return D, speed
+
+
+@jax.jit
+def _speeds(c, tau, half, origin, xi, eta, heights, line, earth):
+    def at(c, tau, half, xi, eta, h):
+        numbers, rates = value_and_rate(c, tau)
+        P, _ = motion(numbers, rates, origin)
+        d = tuple(numbers[k] * xi + numbers[3 + k] * eta - numbers[6 + k] for k in range(3))
+        surface = Plane(h) if earth is None else Ground(at_height(earth, h))
+        D = difference(along(P, d, surface.distance(P, d)), origin)
+        speed = jax.jvp(lambda n: ahead(n, D, line)[0], (numbers,), (rates / half,))[1]
+        return jnp.stack(D), speed
+
+    over_heights = jax.vmap(at, (None, None, None, None, None, 0))
+    over_slopes = jax.vmap(over_heights, (None, None, None, 0, 0, None))
+    return jax.vmap(over_slopes, (0, 0, 0, None, None, None))(c, tau, half, xi, eta, heights)
+
+
+def _fitted(D, times, u, heights):
+    """The footprint through a lattice, and the largest errors of t and u there."""
+    points = D.reshape(-1, 3)
+    middle = points.mean(0)
+    axes = np.linalg.svd(points - middle, full_matrices=False)[2]
+    A = axes / np.abs((points - middle) @ axes.T).max(0)[:, None]
+    x = (points - middle) @ A.T
+    terms = np.prod(x[:, None, :] ** POWERS, axis=2)
+    shape = D.shape[:3]
+    tu = np.stack([
+        np.broadcast_to(times[:, None, None], shape), np.broadcast_to(u[None, :, None], shape)
+    ], -1).reshape(-1, 2)  # fmt: skip
+    coefficients = np.linalg.lstsq(terms, tu, rcond=None)[0]
+    errors = np.abs(terms @ coefficients - tu).max(0)
+    frame = np.c_[A, -A @ middle]
+    return Footprint(jnp.asarray(heights), jnp.asarray(frame), jnp.asarray(coefficients.T)), errors
+
+
+def _reach(pieces, samples, D):
+    """Least and greatest ξ that the points have in the image, and more; None if out of sight."""
+    k, tau = _places(pieces, samples)
+    c = np.asarray(pieces.coefficients)[k]
+    numbers = np.einsum("kpn,pk->kn", c, tau ** np.arange(c.shape[1])[:, None])
+    rsq = np.einsum("kij,nj->kni", numbers[:, :9].reshape(-1, 3, 3), D) + numbers[:, None, 9:]
+    if (-rsq[..., 2] < STEEP * np.linalg.norm(rsq, axis=2)).any():
+        return None
+    xi = -rsq[..., 0] / rsq[..., 2]
+    middle, half = (xi.max() + xi.min()) / 2, (xi.max() - xi.min()) / 2
+    return middle - WIDER * half, middle + WIDER * half
+
+
+def _cubic(c, x, y, z):
+    """The cubic polynomial with coefficients in the order of `POWERS`, Horner in all three."""
+    c = iter(c)
+    rows = [[value([next(c) for _ in range(4 - i - j)], z) for j in range(4 - i)]
+            for i in range(4)]  # fmt: skip
+    return value([value(row, y) for row in rows], x)
