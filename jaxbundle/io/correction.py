@@ -11,14 +11,15 @@ import jax
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.maps import MapGrid, MapSystem, grid_around
-from jaxbundle.io.rasters import as_type, rasterio, unreadable
+from jaxbundle.io.maps import MapGrid, MapSystem, contiguous, grid_around
+from jaxbundle.io.rasters import as_type, open_plain, rasterio, unreadable
 from jaxbundle.pushbroom.correct import BLOCK, STEP, block_places
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.locate import locate_lines
 from jaxbundle.pushbroom.project import Search
 from jaxbundle.pushbroom.resample import Resampling, resample
 from jaxbundle.pushbroom.surfaces import Surface
+from jaxbundle.pushbroom.terrain import Terrain
 
 REACH = 3
 """Pixels beyond the outermost place that resampling may ask for."""
@@ -26,6 +27,8 @@ ROUND = 128
 """Windows of the image are widened to a multiple of this: few shapes to compile."""
 BORDER = 33
 """Places along each border of the image that bound the map."""
+MOST = 10_000
+"""A map with so many times the pixels of the image is a mistake in its spacing."""
 
 _resample = jax.jit(resample, static_argnums=3)
 _locate = jax.jit(locate_lines)
@@ -34,16 +37,30 @@ _locate = jax.jit(locate_lines)
 def map_of(
     image: PushbroomImage, surface: Surface, system: MapSystem, size: float | None
 ) -> MapGrid:
-    """The pixels of a map that hold the whole image, by default of its own size on the ground."""
+    """The pixels of a map that hold the whole image, by default of its own size on the ground.
+
+    **Raises:** `InputError` if the image shows nothing of the surface, its map does not hold
+    together, or is too large.
+    """
     lines = np.linspace(-0.5, image.lines - 0.5, BORDER)
     pixels = np.linspace(-0.5, image.pixels - 0.5, BORDER)
     inner = np.clip(lines, 0, image.lines - 1)  # the tables may end at the outer lines' centres
-    x, y = system.from_ground(np.asarray(_locate(image, surface, inner, pixels)))
+    X = np.asarray(_locate(image, surface, inner, pixels))
+    if not np.isfinite(X).any():
+        raise InputError(
+            "the terrain model has no height where the image looks; give one that covers it"
+            if isinstance(surface, Terrain) else
+            "no point of the image is on the ground; look at attitude and mounting"
+        )
+    x, y = system.from_ground(X)
+    if not np.isfinite(x).any():
+        raise InputError(f"coordinate system {system.crs}: it has no place for the image")
+    x = contiguous(system, x)
     if size is None:
         rows = np.hypot(np.diff(x, axis=0), np.diff(y, axis=0)) / np.diff(inner)[:, None]
         columns = np.hypot(np.diff(x, axis=1), np.diff(y, axis=1)) / np.diff(pixels)
         size = float(f"{min(np.nanmedian(rows), np.nanmedian(columns)):.2g}")
-    grid = grid_around(x, y, size)
+    grid = grid_around(x, y, size, MOST * image.lines * image.pixels)
     # a line beyond the outermost centres, which the border leaves out
     return MapGrid(grid.x - size, grid.y + size, size, grid.columns + 2, grid.rows + 2)
 
@@ -70,7 +87,7 @@ def write_corrected(
     package = rasterio()
     temporary = Path(target).with_name(f".{Path(target).name}.{os.getpid()}.tif")
     try:
-        with package.open(source) as bands:
+        with open_plain(source) as bands:
             if (bands.height, bands.width) != (image.lines, image.pixels):
                 raise InputError(
                     f"{source}: {bands.height} lines of {bands.width} pixels; the scanner file has "

@@ -1,5 +1,6 @@
 """Rasters through rasterio: terrain models, and what all readers and writers share."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,14 @@ def rasterio():
 def unreadable(path: str | Path, error: Exception) -> InputError:
     """What rasterio says about a file, in one line."""
     return InputError(f"{path}: {' '.join(str(error).split())}")
+
+
+def open_plain(path: str | Path, *arguments, **options):
+    """As `rasterio.open`; an image without georeference is what is expected, and not warned of."""
+    package = rasterio()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", package.errors.NotGeoreferencedWarning)
+        return package.open(path, *arguments, **options)
 
 
 def as_type(values: np.ndarray, dtype: np.dtype | str) -> np.ndarray:

@@ -74,7 +74,6 @@ def write_scene(path):
     return path
 
 
-@pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
 def test_from_a_flight_to_a_map(tmp_path, flight, run):
     scene, out = write_scene(tmp_path / "scene.tif"), tmp_path / "out"
     status, said, _ = run("simulate", flight, "--out", out, "--scene", scene)
@@ -130,6 +129,7 @@ def test_what_is_refused(tmp_path, flight, run):
           "EPSG:4326"], ["local frame"]),
         (["correct", scanner, tmp_path / "no.tif", "--out", tmp_path / "m.tif", "--resampling",
           "best"], ["best", "bilinear"]),
+        (["correct", scanner, tmp_path / "no.tif", "--out", tmp_path], ["is a folder", "map.tif"]),
     ]:  # fmt: skip
         status, said, err = run(*arguments)
         assert status == 2 and len(err.splitlines()) == 1

@@ -83,7 +83,6 @@ def write_image(path, bands, dtype="float32"):
     return path
 
 
-@pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
 def test_a_corrected_image_is_the_scene(tmp_path):
     """Of a terrain; of a plane in test_commands."""
     truth = true_image(AIRCRAFT)
@@ -150,7 +149,6 @@ def test_terrain_that_hides_terrain():
     np.testing.assert_array_equal(seen.line[places], all_.line[places])
 
 
-@pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
 def test_a_satellite_image_in_utm(tmp_path):
     """Whole numbers, georeferenced; the map shows what the truth locates."""
     flight = dataclasses.replace(

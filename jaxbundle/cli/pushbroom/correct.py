@@ -47,6 +47,8 @@ def correct(
         raise InputError(f"--spacing {spacing:g}: a positive number is expected")
     if not out.absolute().parent.is_dir():
         raise InputError(f"--out {out}: there is no folder {out.parent}")
+    if out.is_dir():
+        raise InputError(f"--out {out} is a folder; name a file in it, such as {out / 'map.tif'}")
     if out.exists() and out.samefile(image):
         raise InputError(f"--out {out} is the image itself; give another name")
     if occlusion and dem is None:
