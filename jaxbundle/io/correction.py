@@ -35,9 +35,15 @@ _locate = jax.jit(locate_lines)
 
 
 def map_of(
-    image: PushbroomImage, surface: Surface, system: MapSystem, size: float | None
+    image: PushbroomImage,
+    surface: Surface,
+    system: MapSystem,
+    size: float | None,
+    model: str | Path | None = None,
 ) -> MapGrid:
     """The pixels of a map that hold the whole image, by default of its own size on the ground.
+
+    `model` names the file of a terrain in messages.
 
     **Raises:** `InputError` if the image shows nothing of the surface, its map does not hold
     together, or is too large.
@@ -48,7 +54,7 @@ def map_of(
     X = np.asarray(_locate(image, surface, inner, pixels))
     if not np.isfinite(X).any():
         raise InputError(
-            "the terrain model has no height where the image looks; give one that covers it"
+            f"{model or 'terrain'}: no height where the image looks; give a model that covers it"
             if isinstance(surface, Terrain) else
             "no point of the image is on the ground; look at attitude and mounting"
         )

@@ -136,7 +136,7 @@ def test_times_of_lines():
 
 def test_an_image_longer_than_its_tables_is_refused():
     image = satellite()
-    with pytest.raises(InputError, match="attitude: line 810 .* outside the table"):
+    with pytest.raises(InputError, match="attitude: image line 810 .* outside the table"):
         make_image(image.trajectory, image.times, image.optics, 1000, PIXELS)
 
 

@@ -108,7 +108,7 @@ def elsewhere(axis, shift):
     (elsewhere("height", 1500), {}, ["row 4", "height", "-260 to 1060 m", "ellipsoid"]),
     (elsewhere("line", 99999), {}, ["row 4", "line", "-300.6 to 6301.6", "measurement"]),
     (elsewhere("sample", -5000), {}, ["row 4", "sample"]),
-], ids=["model", "few", "one line", "sigma", "inf", "north", "east", "up", "line", "sample"])  # fmt: skip
+], ids=["model", "few", "on a line", "sigma", "inf", "north", "east", "up", "line", "sample"])
 def test_what_is_refused(table, options, words):
     with pytest.raises(InputError) as refused:
         fit_bias(RPC, table, **options)

@@ -91,16 +91,19 @@ def test_nothing_is_extrapolated(name):
     assert np.isnan(at(table_of(name), np.r_[ends, BETWEEN][: len(BETWEEN)])[:2]).all()
 
 
+POSITIONS = Source("positions.csv", 10 + np.arange(20) + (np.arange(20) > 4) * 2, "line")
+
+
 def test_gaps_are_not_bridged():
     keep = np.r_[0:5, 11]
     table = position_table(TIMES[keep], VALUES[keep], method="linear", gap=3)
     inside, before = TIMES[8], TIMES[3] + 0.1
     found = at(table, np.r_[inside, before, BETWEEN][: len(BETWEEN)])
     assert np.isnan(found[0]).all() and np.isfinite(found[1]).all()
-    with pytest.raises(InputError, match="gap of .* between rows 5 and 6"):
-        check_covered(table, [before, inside], "positions.csv")
+    with pytest.raises(InputError, match="positions.csv, line 17: image line 1 .* in the gap"):
+        check_covered(table, [before, inside], POSITIONS)
     wide = position_table(TIMES[keep], VALUES[keep], method="linear", gap=100)
-    check_covered(wide, [before, inside], "positions.csv")
+    check_covered(wide, [before, inside], POSITIONS)
 
 
 ROTATIONS = Rotation.from_euler(
@@ -190,5 +193,5 @@ def test_bad_tables_are_refused_with_their_row(make, words):
 
 
 def test_times_outside_are_refused():
-    with pytest.raises(InputError, match="line 1 is at .* outside the table"):
-        check_covered(table_of("linear"), [TIMES[2], TIMES[-1] + 1], "positions.csv")
+    with pytest.raises(InputError, match="positions.csv: image line 1 is at .* outside the table"):
+        check_covered(table_of("linear"), [TIMES[2], TIMES[-1] + 1], POSITIONS)

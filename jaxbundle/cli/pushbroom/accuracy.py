@@ -58,7 +58,7 @@ def accuracy(
         write_table(table_of(scanner, table, levels, draws, seed, height), csv, json)
         return
     file = read_scanner(scanner)
-    surface = surface_of(file.earth, height, dem)
+    surface = surface_of(file.earth, height, dem, file.image)
     _, line, pixel, _ = places(file.image, None, grid)
     columns = {"line": line, "pixel": pixel}
     if truth is not None:

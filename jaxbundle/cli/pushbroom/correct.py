@@ -54,9 +54,9 @@ def correct(
     if occlusion and dem is None:
         raise InputError("--occlusion: only terrain hides terrain; give --dem")
     file = read_scanner(scanner)
-    surface = surface_of(file.earth, height, dem)
+    surface = surface_of(file.earth, height, dem, file.image)
     system = MapSystem(file.earth, crs)
-    grid = map_of(file.image, surface, system, spacing)
+    grid = map_of(file.image, surface, system, spacing, dem)
     with counting(quiet) as bar:
         task = bar.add_task("blocks", total=None)
         write_corrected(

@@ -27,6 +27,9 @@ from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.locate import locate_points
 
+TOLD = ("id", "X", "Y", "Z", "longitude", "latitude", "height", "count", "status")
+"""What `locate` and `project` write beside line and pixel: their tables are taken as they are."""
+
 
 @pushbroom.command()
 def locate(
@@ -43,7 +46,7 @@ def locate(
     """Where on the ground places of the image are; (0, 0) is the centre of the first pixel."""
     jaxbundle.enable_x64()
     file = read_scanner(scanner)
-    surface = surface_of(file.earth, height, dem)
+    surface = surface_of(file.earth, height, dem, file.image)
     ids, line, pixel, source = places(file.image, points, grid)
     X = np.array(jax.jit(locate_points)(file.image, surface, line, pixel))
     missed = np.isnan(X).any(0)
@@ -51,7 +54,8 @@ def locate(
     if missed.any():
         row = int(missed.argmax())
         remedy = (
-            "give a model that covers the image" if dem else "look at attitude, mounting and height"
+            f"give a model that covers the image instead of {dem}" if dem
+            else "look at attitude, mounting and height"
         )
         said = (
             f"{source(row)}: the ray of line {line[row]:g}, pixel {pixel[row]:g}: {reason}; "
@@ -83,7 +87,7 @@ def places(image: PushbroomImage, points: Path | None, grid: str):
         pixels = np.tile(np.linspace(0, image.pixels - 1, columns), rows)
         return (), lines, pixels, Source("grid", None, "place")
     table = read_csv(points)
-    table.check_names(("line", "pixel"), ("id",))
+    table.check_names(("line", "pixel"), TOLD)
     line, pixel = (table.numbers(name, required=True) for name in ("line", "pixel"))
     for name, values, size in (("line", line, image.lines), ("pixel", pixel, image.pixels)):
         outside = ~((values >= -0.5) & (values <= size - 0.5))

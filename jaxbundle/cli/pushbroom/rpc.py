@@ -13,6 +13,7 @@ from jaxbundle.cli.pushbroom.app import (
     Json,
     Level,
     check_spheroid,
+    geographic,
     pushbroom,
     surface_of,
     warn,
@@ -96,16 +97,14 @@ def apply(
     if "line" in table.values:
         table.check_names(("line", "sample"), ("id",))
         place = [table.numbers(name, required=True) for name in ("line", "sample")]
-        surface = surface_of(WGS84, height, dem)
+        surface = surface_of(WGS84, height, dem, given)
         east, north, h, status = map(np.asarray, locate_points_on(given, surface, *place))
         columns = dict(zip(COLUMNS, (np.degrees(east), np.degrees(north), h, *place)))
     else:
         table.check_names(COLUMNS[:3], ("id",))
-        east, north, h = (table.numbers(name, required=True) for name in COLUMNS[:3])
-        line, sample, status = map(
-            np.asarray, project_points(given, np.radians(east), np.radians(north), h)
-        )
-        columns = dict(zip(COLUMNS, (east, north, h, line, sample)))
+        place = geographic(table)
+        line, sample, status = map(np.asarray, project_points(given, *place))
+        columns = dict(zip(COLUMNS, (*np.degrees(place[:2]), place[2], line, sample)))
     if (bad := status != RpcStatus.INSIDE).any():
         row = int(bad.argmax())
         said = (
@@ -167,8 +166,8 @@ def compensate(
 def _table(path: Path, optional: tuple[str, ...] = ()) -> tuple[RpcTable, Columns]:
     columns = read_csv(path)
     columns.check_names(COLUMNS, ("id", *optional))
-    values = [columns.numbers(name, required=True) for name in COLUMNS]
-    return RpcTable(np.radians(values[0]), np.radians(values[1]), *values[2:]), columns
+    measured = (columns.numbers(name, required=True) for name in COLUMNS[3:])
+    return RpcTable(*geographic(columns), *measured), columns
 
 
 def _heights(text: str) -> tuple[float, float]:
