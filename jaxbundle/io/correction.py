@@ -1,5 +1,6 @@
 """A raster corrected to a map: GeoTIFF, block by block, a few blocks in memory at a time."""
 
+import itertools
 import os
 import threading
 from collections.abc import Callable
@@ -24,7 +25,9 @@ from jaxbundle.pushbroom.terrain import Terrain
 REACH = 3
 """Pixels beyond the outermost place that resampling may ask for."""
 ROUND = 128
-"""Windows of the image are widened to a multiple of this: few shapes to compile."""
+"""Windows of the image are widened to a multiple of this, or an eighth: few shapes to compile."""
+WINDOW = 2**22
+"""Values of the image, of all bands, that are in memory for a part of a block."""
 BORDER = 33
 """Places along each border of the image that bound the map."""
 MOST = 10_000
@@ -135,22 +138,39 @@ def _block(bands, map_, lock, image, search, surface, system, grid, resampling, 
     line, pixel = (np.asarray(p) for p in places)
     if not np.isfinite(line).any():
         return
-    window, origin = _window(line, pixel, image)
-    with lock:
-        part = bands.read(window=window)
-    pad = [(0, -part.shape[1] % ROUND), (0, -part.shape[2] % ROUND)]
-    part = np.pad(part.astype(float), [(0, 0), *pad], mode="edge")
-    values = np.asarray(_resample(part, line - origin[0], pixel - origin[1], resampling))
+    values = np.full((bands.count, *line.shape), np.nan)
+    for part, window in _parts(line, pixel, image, WINDOW / bands.count):
+        with lock:
+            seen = bands.read(window=window)
+        pad = [(0, -n % max(ROUND, 2 ** (n.bit_length() - 3))) for n in seen.shape[1:]]
+        seen = np.pad(seen.astype(float), [(0, 0), *pad], mode="edge")
+        (top, _), (left, _) = window
+        values[:, *part] = _resample(seen, line[part] - top, pixel[part] - left, resampling)
     rows, columns = min(BLOCK, grid.rows - row), min(BLOCK, grid.columns - column)
     values = as_type(values[:, :rows, :columns], map_.dtypes[0])
     with lock:
         map_.write(values, window=((row, row + rows), (column, column + columns)))
 
 
-def _window(line, pixel, image):
-    """The rows and columns of the image that a block needs, and where they begin."""
-    ends = [
+def _parts(line, pixel, image, most, part=(slice(0, BLOCK), slice(0, BLOCK))):
+    """Quarters of a block, quartered again until each sees at most so many pixels of the image.
+
+    Each as slices of the block, with the rows and columns of the image that it needs. What sees
+    nothing is left out.
+    """
+    seen = line[part], pixel[part]
+    if not np.isfinite(seen[0]).any():
+        return
+    window = tuple(
         (max(int(np.nanmin(v)) - REACH, 0), min(int(np.nanmax(v)) + REACH + 1, size))
-        for v, size in ((line, image.lines), (pixel, image.pixels))
+        for v, size in zip(seen, (image.lines, image.pixels))
+    )
+    side = part[0].stop - part[0].start
+    if side == 1 or (window[0][1] - window[0][0]) * (window[1][1] - window[1][0]) <= most:
+        yield part, window
+        return
+    halves = [
+        [slice(s.start, s.start + side // 2), slice(s.start + side // 2, s.stop)] for s in part
     ]
-    return tuple(ends), (ends[0][0], ends[1][0])
+    for quarter in itertools.product(*halves):
+        yield from _parts(line, pixel, image, most, quarter)
