@@ -106,6 +106,20 @@ def test_gaps_are_not_bridged():
     check_covered(wide, [before, inside], POSITIONS)
 
 
+@pytest.mark.parametrize("rows", [(0, 4, 12), (0, 5, 8, 12), (0, 2, 7, 12), (0, 1, 12)])
+def test_splines_end_at_gaps(rows):
+    """Against scipy's splines of the rows between gaps: of two a line, of three a parabola."""
+    runs = list(zip(rows, rows[1:]))
+    t = TIMES + 50.0 * np.repeat(np.arange(len(runs)), np.diff(rows))
+    table = position_table(t, VALUES, method="spline", gap=10)
+    for first, last in runs:
+        if last - first > 1:
+            inside = np.linspace(t[first], t[last - 1], len(BETWEEN), endpoint=False)
+            own = CubicSpline(t[first:last], VALUES[first:last])
+            np.testing.assert_allclose(at(table, inside), own(inside), rtol=1e-12, atol=1e-10)
+    assert np.isnan(at(table, np.full(len(BETWEEN), t[rows[1]] - 1.0))).all()
+
+
 ROTATIONS = Rotation.from_euler(
     "XYZ", np.stack([0.2 * np.sin(TIMES), 3 + 0.1 * TIMES, 0.3 * np.cos(TIMES)], 1)
 )
