@@ -11,6 +11,12 @@ is a parabola too, and its first root, where there is one, is the first hit: nei
 ridge nor a peak between two samples is ever taken or passed. One Newton step on the exact
 coordinates puts the point on ray and surface, and carries the derivatives.
 
+Where the model has no height, beyond its edges too, a ray goes on: the sea, or what was cut away,
+is seldom higher than what is behind it. A ray that comes out of such a place below the terrain has
+met the ground in it, and has no point. One that comes out above is taken to its hit, which unknown
+terrain could hide all the same: `over_voids=False` lets no ray pass, and the difference tells which
+points stand on that.
+
 The grid is regular in longitude and latitude (`earth` an ellipsoid of revolution, heights above
 it), or in X and Y of a local frame (`earth` None).
 """
@@ -38,8 +44,8 @@ more than the 6e-6·h by which an ellipsoid with longer axes leaves the surface 
 class Terrain(Surface):
     """Heights at (x, y) = (x₀ + column·dx, y₀ + row·dy): radians, or metres in a local frame.
 
-    NaN: no height there. A ray that meets such a cell, or leaves the grid, before it hits, has no
-    point.
+    NaN: no height there. A ray that would hit in such a cell, or beyond the grid, has no point;
+    with `over_voids` false neither has one that passes over such a cell before it hits.
     """
 
     iterative: ClassVar[bool] = True
@@ -49,11 +55,12 @@ class Terrain(Surface):
     lowest: float
     highest: float
     earth: Ellipsoid | None = eqx.field(static=True, default=WGS84)
+    over_voids: bool = eqx.field(static=True, default=True)
 
     def distance(self, o: Vector, d: Vector) -> Scalar:
         top, bottom = self._slab(o, d)
         path = self._path(*stop_gradient((o, d, top, bottom)))
-        tau = _first_hit(path, self.heights)
+        tau = _first_hit(path, self.heights, self.over_voids)
         s = stop_gradient(top + tau * (bottom - top))
         x, y, h = self.grid(along(o, d, s))
         slope = _rate(path, tau, self.heights) / stop_gradient(bottom - top)
@@ -90,8 +97,12 @@ def make_terrain(
     origin: tuple[float, float],
     step: tuple[float, float],
     earth: Ellipsoid | None = WGS84,
+    over_voids: bool = True,
 ) -> Terrain:
     """A terrain model of heights in metres, the first at `origin`, columns and rows `step` apart.
+
+    **Arguments:** `over_voids`: rays pass over cells without a height, and come from beyond the
+    edges.
 
     **Raises:** `InputError` for fewer than 2 × 2 heights, or none that is a number.
     """
@@ -103,8 +114,9 @@ def make_terrain(
     low, high = float(np.nanmin(heights)), float(np.nanmax(heights))
     heights = np.where(np.isfinite(heights), heights, np.nan)
     return Terrain(
-        jnp.asarray(heights), tuple(map(float, origin)), tuple(map(float, step)), low, high, earth
-    )
+        jnp.asarray(heights), tuple(map(float, origin)), tuple(map(float, step)), low, high, earth,
+        over_voids,
+    )  # fmt: skip
 
 
 def bilinear(heights: Float[Array, "rows columns"], x: Scalar, y: Scalar) -> Scalar:
@@ -145,8 +157,9 @@ def _rate(path, tau, heights):
     return dh - along_x * dx - along_y * dy
 
 
-def _first_hit(path, heights):
+def _first_hit(path, heights, over_voids):
     """τ in [0, 1] of the first hit, cell by cell; NaN where there is none."""
+    rows, columns = heights.shape
     px, py, ph = path
     speed = jnp.abs(px[1]) + jnp.abs(py[1])
     least = 1e-9 / jnp.maximum(speed, 1.0)  # a billionth of a cell: the traverse never stands still
@@ -159,10 +172,20 @@ def _first_hit(path, heights):
         step = (target - value) / jnp.where(rate == 0, 1, rate)
         return jnp.where(rate == 0, jnp.inf, tau + step)
 
+    def entry(p, tau, last):
+        """When the coordinate comes to [0, last], from where it is; −∞ inside, ∞ if never."""
+        a, b, c = p
+        value, rate = a + tau * (b + tau * c), b + 2 * tau * c
+        target = jnp.where(value < 0, 0.0, 1.0 * last)
+        towards = (target - value) * rate > 0
+        step = jnp.where(towards, (target - value) / jnp.where(rate == 0, 1, rate), jnp.inf)
+        return jnp.where((value < 0) | (value > last), tau + step, -jnp.inf)
+
     def step(state):
-        tau, hit, _ = state
-        out = jnp.minimum(jnp.minimum(border(px, tau), border(py, tau)), 1.0)
-        out = jnp.maximum(out, tau + least)
+        tau, hit, void, _ = state
+        out = jnp.minimum(border(px, tau), border(py, tau))
+        enters = jnp.maximum(entry(px, tau, columns - 1), entry(py, tau, rows - 1))
+        out = jnp.clip(jnp.where(enters > -jnp.inf, enters, out), tau + least, 1.0)
         middle = (tau + out) / 2
         cell = _cell(heights, jnp.floor(_parabola(px, middle)), jnp.floor(_parabola(py, middle)))
         f = [
@@ -170,15 +193,19 @@ def _first_hit(path, heights):
             for t in (tau, middle, out)
         ]
         part = _first_root(*f)
-        hit = tau + part * (out - tau)
-        # without a height (NaN) the ray ends here, and has no point
-        done = (part <= 1) | jnp.isnan(f[1]) | (out >= 1)
-        return out, jnp.where(part <= 1, hit, jnp.nan), done
+        # below the terrain where heights begin again: it was met where there are none
+        under = void & (f[0] < 0)
+        void = jnp.isnan(f[1])
+        found = (part <= 1) & ~under
+        done = found | under | (out >= 1)
+        if not over_voids:
+            done = done | void
+        return out, jnp.where(found, tau + part * (out - tau), jnp.nan), void, done
 
     start = jnp.zeros_like(speed)
     lost = jnp.isnan(speed)
-    _, hit, _ = jax.lax.while_loop(lambda s: ~s[2], step, (start, start * jnp.nan, lost))
-    return hit
+    state = start, start * jnp.nan, start > 0, lost
+    return jax.lax.while_loop(lambda s: ~s[3], step, state)[1]
 
 
 def _first_root(f0, fm, f1):

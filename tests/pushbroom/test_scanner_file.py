@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import sys
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -221,6 +222,37 @@ def test_terrain_rasters(tmp_path, monkeypatch, capsys):
     heights = np.asarray(terrain.heights)
     assert np.allclose(heights[np.isfinite(heights)], 250) and terrain.step[1] < 0
     assert abs(np.degrees(terrain.origin[1]) - 49.65) < 0.01
+
+
+def test_ground_behind_a_place_without_height(tmp_path, monkeypatch, capsys):
+    """Flat land seen obliquely over a sea without height, and a high mountain elsewhere."""
+    mounting = TEXT[TEXT.index("[mounting]") :]
+    scanner = write_scanner(tmp_path, TEXT.replace(mounting, "[mounting]\nroll = 40.0\n"))
+    file = read_scanner(scanner)
+    X = locate(file.image, Ground(), *PLACES)
+    camera = np.array(file.image.trajectory.position.values)[:1].T
+    longitude, latitude, _ = (np.degrees(v) for v in geodetic(tuple(X)))
+    beneath = float(np.degrees(geodetic(tuple(camera))[0])[0])
+    west, north = float(longitude.min()) - 0.05, float(latitude.max()) + 0.05
+    size = int((latitude.max() - latitude.min() + 0.1) / 0.01), int(np.ptp(longitude) / 0.01 + 10)
+    column = np.tile(np.arange(size[1]) + 0.5, (size[0], 1))
+    middle = (float(longitude.mean()) - west) / 0.01
+    sea = (column < middle) == (beneath < longitude.mean())
+    heights = np.where(sea, -9999, 100.0)
+    heights[0, 0 if sea[0, -1] else -1] = 4000.0
+    transform = 0.01, 0, west, 0, -0.01, north
+    path = write_raster(tmp_path / "dem.tif", heights, "EPSG:4326", transform)
+    status, out, err = run(monkeypatch, capsys, "locate", scanner, "--dem", path, "--grid", "3x31")
+    rows = list(csv.DictReader(io.StringIO(out)))
+    assert status == 0 and "dem.tif" in err
+    for row in rows:
+        if row["status"] != "no terrain there":
+            assert abs(float(row["height"]) - 100) < 1e-6
+            # rays come down from 4000 m at about 45°
+            shore = abs(float(row["longitude"]) - west - 0.01 * middle) * 111
+            assert shore < 7 if "without height" in row["status"] else shore > 2
+    counted = Counter(row["status"] for row in rows)
+    assert min(counted.values()) >= 3 and len(counted) == 3
 
 
 def test_terrain_across_180(tmp_path):

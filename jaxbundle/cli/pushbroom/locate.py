@@ -1,5 +1,6 @@
 """`jaxbundle pushbroom locate`: from the image to the ground."""
 
+import dataclasses
 from pathlib import Path
 from typing import Annotated
 
@@ -26,7 +27,9 @@ from jaxbundle.io.scanner import read_scanner
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.locate import locate_points
+from jaxbundle.pushbroom.terrain import Terrain
 
+OVER = "found beyond a place without height"
 TOLD = ("id", "X", "Y", "Z", "longitude", "latitude", "height", "count", "status")
 """What `locate` and `project` write beside line and pixel: their tables are taken as they are."""
 
@@ -48,8 +51,13 @@ def locate(
     file = read_scanner(scanner)
     surface = surface_of(file.earth, height, dem, file.image)
     ids, line, pixel, source = places(file.image, points, grid)
-    X = np.array(jax.jit(locate_points)(file.image, surface, line, pixel))
+    find = jax.jit(locate_points)
+    X = np.array(find(file.image, surface, line, pixel))
     missed = np.isnan(X).any(0)
+    over = np.zeros_like(missed)
+    if isinstance(surface, Terrain):
+        strict = dataclasses.replace(surface, over_voids=False)
+        over = ~missed & np.isnan(np.array(find(file.image, strict, line, pixel))).any(0)
     reason = "no terrain there" if dem else "misses the surface"
     if missed.any():
         row = int(missed.argmax())
@@ -70,7 +78,7 @@ def locate(
         longitude, latitude, h = (np.asarray(v) for v in jax.jit(geodetic)(file.earth, tuple(X)))
         columns |= {"longitude": np.degrees(longitude), "latitude": np.degrees(latitude)}
         columns |= {"height": h}
-    columns["status"] = ["found" if not m else reason for m in missed]
+    columns["status"] = [reason if m else OVER if o else "found" for m, o in zip(missed, over)]
     write_rows(columns, csv, json, {"scanner": file.name})
 
 
