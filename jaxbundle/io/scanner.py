@@ -12,7 +12,7 @@ angle_unit = "deg"                  # rad | deg | gon, of every angle in this fi
 first = 0.0
 period = 0.00066
 
-[position]                          # table, or tle, or circle
+[position]                          # table, or tle, or circle, or state
 table = "positions.csv"             # t,X,Y,Z[,VX,VY,VZ]
 frame = "ITRF"                      # ITRF | GCRF | J2000 | TEME, or "local"
 interpolation = "lagrange"          # linear | lagrange | hermite | spline
@@ -60,16 +60,19 @@ from jaxbundle.pushbroom.ancillary import attitude_table, check_times, position_
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.image import PushbroomImage, check_size, make_image
 from jaxbundle.pushbroom.interpolation import Table
+from jaxbundle.pushbroom.orbit import state_orbit
 from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable, FocalLine, LineTimes, Optics
 from jaxbundle.pushbroom.trajectory import Attitude, Trajectory
 
 FRAMES = (*frames.FRAMES, "local")
 ANGLES = ("pitch", "roll", "yaw")
+MOST_ROWS = 1_000_000
 INTERPOLATION = ("interpolation", "order", "gap")
+KINDS = ("table", "tle", "circle", "state")
 SECTIONS = {
     "scanner": ("name", "lines", "pixels", "epoch", "earth", "angle_unit"),
     "times": ("first", "period", "table"),
-    "position": ("table", "tle", "circle", "frame", "span", "step", *INTERPOLATION),
+    "position": (*KINDS, "at", "j2", "frame", "span", "step", *INTERPOLATION),
     "attitude": ("table", "frame", *INTERPOLATION),
     "optics": (),  # depends on its kind
     "mounting": ANGLES,
@@ -205,11 +208,11 @@ def _frame(section: Section, earth: Ellipsoid | None, known: Sequence[str]) -> s
 
 def _position(file: TomlFile, earth: Ellipsoid | None) -> tuple[Table, Source]:
     section = file.section("position")
-    kinds = [kind for kind in ("table", "tle", "circle") if kind in section]
+    kinds = [kind for kind in KINDS if kind in section]
     if len(kinds) != 1:
-        raise InputError(f"{section.where}give one of table, tle, circle, not {kinds}")
+        raise InputError(f"{section.where}give one of {', '.join(KINDS)}, not {kinds}")
     if kinds != ["table"]:
-        return _orbit(file, section, kinds[0])
+        return _orbit(file, section, kinds[0], earth)
     frame = _frame(section, earth, FRAMES)
     columns = section.table()
     names, rates = ("X", "Y", "Z"), ("VX", "VY", "VZ")
@@ -225,15 +228,35 @@ def _position(file: TomlFile, earth: Ellipsoid | None) -> tuple[Table, Source]:
     return table, columns.source
 
 
-def _orbit(file: TomlFile, section: Section, kind: str) -> tuple[Table, Source]:
-    """Two-line elements or a circle, at the steps of a table from which is interpolated."""
+def _orbit(
+    file: TomlFile, section: Section, kind: str, earth: Ellipsoid | None
+) -> tuple[Table, Source]:
+    """Two-line elements, a circle, a state: at the steps of a table from which is interpolated."""
     start, end = section.numbers("span", 2)
-    t = np.arange(start, end, section.number("step", 1.0))
+    step = section.number("step", 1.0)
+    if not (step > 0 and 0 < (end - start) / step <= MOST_ROWS):
+        raise InputError(
+            f"{section.where}span from {start:g} to {end:g} s in steps of {step:g} s; 1 to "
+            f"{MOST_ROWS} steps forward are expected"
+        )
+    t = np.arange(start, end, step)
     if kind == "tle":
         lines = section.values["tle"]
         if not (isinstance(lines, list) and len(lines) == 2):
             raise InputError(f"{section.where}tle: a list of the two lines is expected")
         P, V = frames.two_line_orbit(*lines, _epoch(file), t, _orientation(file))
+    elif kind == "state":
+        frame = _frame(section, earth, frames.FRAMES)
+        at = section.number("at", 0.0)
+        state = section.numbers("state", 6)[None]
+        P, V = state[:, :3], state[:, 3:]
+        if frame != "ITRF":
+            R = frames.to_earth(frame, _epoch(file), [at], _orientation(file))
+            P, V = frames.turn_positions(R, P, V, _orientation(file))
+        try:
+            P, V = state_orbit(t, P[0], V[0], at, section.switch("j2") or "j2" not in section)
+        except InputError as error:
+            raise InputError(f"{section.where}{error}") from None
     else:
         circle = Section(file, f"{section.where}circle: ", section.values["circle"])
         angles = (circle.number(k, 0.0) for k in ("inclination", "node", "argument"))
