@@ -1,20 +1,18 @@
 """A raster corrected to a map: GeoTIFF, block by block, a few blocks in memory at a time."""
 
 import itertools
-import os
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 
 import jax
 import numpy as np
 
 from jaxbundle.errors import InputError
+from jaxbundle.io.map_blocks import write_map
 from jaxbundle.io.maps import MapGrid, MapSystem, contiguous, grid_around
-from jaxbundle.io.rasters import as_type, open_plain, rasterio, unreadable
-from jaxbundle.pushbroom.correct import BLOCK, STEP, block_places
+from jaxbundle.io.rasters import open_plain, rasterio, unreadable
+from jaxbundle.pushbroom.correct import BLOCK, block_places
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.locate import locate_lines
 from jaxbundle.pushbroom.project import Search
@@ -94,7 +92,6 @@ def write_corrected(
     **Raises:** `InputError` if the raster has not the size of the image, or cannot be read.
     """
     package = rasterio()
-    temporary = Path(target).with_name(f".{Path(target).name}.{os.getpid()}.tif")
     try:
         with open_plain(source) as bands:
             if (bands.height, bands.width) != (image.lines, image.pixels):
@@ -102,54 +99,33 @@ def write_corrected(
                     f"{source}: {bands.height} lines of {bands.width} pixels; the scanner file has "
                     f"{image.lines} of {image.pixels}"
                 )
-            floating = np.issubdtype(bands.dtypes[0], np.floating)
-            with package.open(
-                temporary, "w", driver="GTiff", width=grid.columns, height=grid.rows,
-                count=bands.count, dtype=bands.dtypes[0], crs=system.text,
-                transform=package.transform.Affine(grid.size, 0, grid.x, 0, -grid.size, grid.y),
-                nodata=np.nan if floating else 0, tiled=True, blockxsize=BLOCK, blockysize=BLOCK,
-                BIGTIFF="IF_SAFER",
-            ) as map_:  # fmt: skip
-                lock = threading.Lock()
-                corners = [(r, c) for r in range(0, grid.rows, BLOCK)
-                           for c in range(0, grid.columns, BLOCK)]  # fmt: skip
-                correct = partial(
-                    _block, bands, map_, lock, image, search, surface, system, grid, resampling,
-                    occlusion,
-                )  # fmt: skip
-                with ThreadPoolExecutor(2) as workers:
-                    for done, _ in enumerate(workers.map(correct, corners), 1):
-                        if progress:
-                            progress(done, len(corners))
-        os.replace(temporary, target)
+            reading = threading.Lock()
+
+            def block(nodes):
+                places = block_places(image, search, surface, nodes, occlusion)
+                if places is None:
+                    return None
+                return _values(bands, reading, image, places, resampling)
+
+            write_map(
+                target, system, grid, surface, bands.count, bands.dtypes[0], block, progress
+            )
     except package.errors.RasterioError as error:
         raise unreadable(source, error) from None
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
-def _block(bands, map_, lock, image, search, surface, system, grid, resampling, occlusion, corner):
-    row, column = corner
-    steps = np.arange(0, BLOCK + STEP, STEP)
-    nodes = system.nodes(surface, *grid.centres(row + steps, column + steps))
-    places = block_places(image, search, surface, nodes, occlusion)
-    if places is None:
-        return
+def _values(bands, reading, image, places, resampling):
+    """All bands at the places of a block."""
     line, pixel = (np.asarray(p) for p in places)
-    if not np.isfinite(line).any():
-        return
     values = np.full((bands.count, *line.shape), np.nan)
     for part, window in _parts(line, pixel, image, WINDOW / bands.count):
-        with lock:
+        with reading:
             seen = bands.read(window=window)
         pad = [(0, -n % max(ROUND, 2 ** (n.bit_length() - 3))) for n in seen.shape[1:]]
         seen = np.pad(seen.astype(float), [(0, 0), *pad], mode="edge")
         (top, _), (left, _) = window
         values[:, *part] = _resample(seen, line[part] - top, pixel[part] - left, resampling)
-    rows, columns = min(BLOCK, grid.rows - row), min(BLOCK, grid.columns - column)
-    values = as_type(values[:, :rows, :columns], map_.dtypes[0])
-    with lock:
-        map_.write(values, window=((row, row + rows), (column, column + columns)))
+    return values
 
 
 def _parts(line, pixel, image, most, part=(slice(0, BLOCK), slice(0, BLOCK))):

@@ -94,13 +94,38 @@ def test_from_a_flight_to_a_map(tmp_path, flight, run):
     within = binary_erosion(shown, iterations=4)
     assert shown.mean() > 0.4
     assert np.abs(found - pattern(x, y))[:, within].max() < 0.1
-    status, said, _ = run("accuracy", out / "scanner.toml", "--truth", truth, "--json", "-")
+    status, said, _ = run("accuracy", out / "scanner.toml", "--truth", truth, "--json", "-",
+                          "--map", tmp_path / "errors.tif")  # fmt: skip
     told = json.loads(said)
+    with rasterio.open(tmp_path / "errors.tif") as raster:
+        places = raster.read(3)
+        assert raster.descriptions == ("east [m]", "north [m]", "error [m]")
+        assert raster.xy(10, 0) == (0.0, 127.0)
+    np.testing.assert_allclose(places.ravel(), [r["error"] for r in told["rows"]], rtol=1e-6)
     # one draw of a bias of 0.05° about three axes, 800 m above the ground
     assert status == 0 and 0.05 < told["rms"] < 4
     assert len(told["rows"]) == 121 and {"east", "north", "error"} <= set(told["rows"][0])
+    status, said, err = run(
+        "correct", out / "scanner.toml", out / "image.tif", "--out", tmp_path / "wrong.tif",
+        "--spacing", 4, "--truth", truth, "--error-map", tmp_path / "error_map.tif",
+    )  # fmt: skip
+    assert status == 0, err
+    with rasterio.open(tmp_path / "error_map.tif") as raster, \
+         rasterio.open(tmp_path / "wrong.tif") as wrong:  # fmt: skip
+        east, north, length = raster.read()
+        assert raster.transform == wrong.transform
+        np.testing.assert_array_equal(np.isfinite(length), np.isfinite(wrong.read(1)))
+    np.testing.assert_allclose(length, np.hypot(east, north), rtol=1e-5)
+    # the same errors as at the places of the image, which are spread otherwise
+    shown = np.isfinite(length)
+    assert abs(np.nanmean(length) / places.mean() - 1) < 0.02 and shown.sum() > 100
+    assert np.nanmin(length) > 0.9 * places.min() and np.nanmax(length) < 1.1 * places.max()
+    assert float(said.split("RMS")[1].split()[0]) == pytest.approx(
+        np.sqrt(np.mean(length[shown] ** 2)), rel=1e-4
+    )
     status, said, _ = run("accuracy", truth, "--attitude-bias", 0.05, "--draws", 900, "--json", "-",
-                          "--grid", "3x3")  # fmt: skip
+                          "--grid", "3x3", "--map", tmp_path / "rms.png")  # fmt: skip
+    assert (tmp_path / "rms.png").read_bytes()[:4] == b"\x89PNG"
     told = json.loads(said)
     assert status == 0 and abs(told["drawn_rms"] / told["rms"] - 1) < 0.08
     assert abs(told["rms"] / (800 * np.radians(0.05) * np.sqrt(2)) - 1) < 0.05
@@ -124,6 +149,9 @@ def test_what_is_refused(tmp_path, flight, run):
     scanner = tmp_path / "out" / "scanner.toml"
     for arguments, words in [
         (["accuracy", scanner], ["no σ", "--attitude-white"]),
+        (["accuracy", scanner, "--map", "a.jpg"], ["a.jpg", ".tif or .png"]),
+        (["correct", scanner, tmp_path / "no.tif", "--out", tmp_path / "m.tif", "--truth",
+          scanner], ["--truth", "--error-map", "both"]),
         (["correct", scanner, tmp_path / "no.tif", "--out", tmp_path / "m.tif"], ["no.tif"]),
         (["correct", scanner, tmp_path / "no.tif", "--out", tmp_path / "m.tif", "--crs",
           "EPSG:4326"], ["local frame"]),
