@@ -53,7 +53,7 @@ from jaxbundle.pushbroom.trajectory import Trajectory, orbital_frame  # noqa: E4
 
 LINES, PIXELS, PERIOD, ORBIT = 10_000, 8000, 1 / 1500, (5e5, np.radians(97.4), 0.3, 0.6)
 DEMANDS = {
-    "ellipsoid": 50, "geodetic": 10, "terrain": 2, "jacobian": 3, "raster": 10, "search": None,
+    "ellipsoid": 50, "geodetic": 10, "terrain": 2, "jacobian": 3, "raster": 10, "search": 10,
     "rpc_project": None, "rpc_locate": None,
 }  # fmt: skip
 U = jnp.arange(float(PIXELS))

@@ -27,8 +27,10 @@ STILL = 1e-3
 """A sight with corrections may move by so many lines in its last round."""
 ROUNDS = 8
 """Rounds after which a point is given up."""
-FEW = 256
-"""Points that are collected for another round."""
+FEW = 64
+"""Points that are collected for another round, at a time."""
+MANY = 8
+"""If more than this part of all points needs another round, all go through it."""
 EDGE = 1e-5
 """A root so many lines beyond the end of its piece stays with it."""
 STRAY = 1000
@@ -38,23 +40,33 @@ STRAY = 1000
 def refine(image, pieces, earth, X, t, u):
     """(t, u, settled) of points X, a triple of arrays [n], from times and pixels near by."""
     round_ = partial(_round, image, pieces, earth)
-    t, u, settled = round_(X, t, u)
     far = STRAY * line_period(image)
-    n, few = t.size, min(t.size, FEW)
+    n = t.size
+    few = min(n, FEW)
 
     def open_(state):
         t, _, settled, rounds = state
         near = (t >= pieces.ends[0] - far) & (t <= pieces.ends[-1] + far)
         return ~settled & near & (rounds < ROUNDS)
 
-    def again(state):
-        t, u, settled, rounds = state
-        chosen = first_of(open_(state), few)
-        found = round_(*collected((X, t, u), chosen))
-        t, u, settled = replaced((t, u, settled), found, chosen)
-        return t, u, settled, rounds.at[chosen].add(1, mode="drop")
+    def all_again(state):
+        wanted, (*place, settled, rounds) = open_(state), state
+        found = round_(X, *place)
+        chosen = tuple(jnp.where(wanted, a, b) for a, b in zip(found, (*place, settled)))
+        return *chosen, rounds + wanted
 
-    state = t, u, settled, jnp.ones(n, int)
+    def few_again(state):
+        *place, settled, rounds = state
+        chosen = first_of(open_(state), few)
+        found = round_(*collected((X, *place), chosen))
+        return *replaced((*place, settled), found, chosen), rounds.at[chosen].add(1, mode="drop")
+
+    def again(state):
+        if n == few:
+            return all_again(state)
+        return jax.lax.cond(jnp.sum(open_(state)) > n // MANY, all_again, few_again, state)
+
+    state = t, u, jnp.zeros(n, bool), jnp.zeros(n, int)
     return jax.lax.while_loop(lambda s: jnp.any(open_(s)), again, state)[:3]
 
 

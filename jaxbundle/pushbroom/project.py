@@ -29,12 +29,14 @@ from jaxbundle.geometry.vectors import Vector, difference, dot, turned_back
 from .corrections import seen_point
 from .footprint import Footprint, make_footprint
 from .image import PushbroomImage, pose_at
-from .newton import FEW, collected, first_of, refine, replaced
+from .newton import collected, first_of, refine, replaced
 from .passages import line_of_detectors, passages, sample, sample_times
 from .pieces import Pieces, make_pieces
 
 CHUNK = 2048
 """Points that go through all steps together, so that they stay in the cache."""
+SEARCHED = 256
+"""Points that are searched for together, of those that the footprint does not tell."""
 NEAR_STEPS = 6
 
 
@@ -193,7 +195,7 @@ def _found(image, search, X, most, margin):
 
     def search_on(state):
         found, known = state
-        chosen = first_of(~known, min(FEW, known.size))
+        chosen = first_of(~known, min(SEARCHED, known.size))
         few = _searched(image, search, *collected((X, hidden), chosen), most, margin)
         return replaced(found, few, chosen), known.at[chosen].set(True, mode="drop")
 
