@@ -16,7 +16,7 @@ import numpy as np
 from jaxbundle.geometry.vectors import difference
 
 from .newton import line_period, motion, seen_from
-from .pieces import value, value_and_rate
+from .polynomial import value, value_and_rate
 
 SEARCH = 128
 """The search has about as many steps at most."""

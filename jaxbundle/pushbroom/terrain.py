@@ -34,6 +34,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, at_height, geodetic, ray_to_ellipsoid
 from jaxbundle.geometry.vectors import Scalar, Vector, along
 
+from .polynomial import value, value_and_rate
 from .surfaces import Surface
 
 MARGIN = 1.0
@@ -141,15 +142,9 @@ def _in_cell(cell, x, y):
     return (1 - v) * ((1 - u) * z00 + u * z01) + v * ((1 - u) * z10 + u * z11)
 
 
-def _parabola(coefficients, tau):
-    a, b, c = coefficients
-    return a + tau * (b + tau * c)
-
-
 def _rate(path, tau, heights):
     """∂(h − bilinear)/∂τ."""
-    x, y, h = (_parabola(p, tau) for p in path)
-    dx, dy, dh = (b + 2 * tau * c for _, b, c in path)
+    (x, dx), (y, dy), (h, dh) = (value_and_rate(p, tau) for p in path)
     x0, y0, (z00, z01, z10, z11) = _cell(heights, jnp.floor(x), jnp.floor(y))
     u, v = x - x0, y - y0
     along_x = (1 - v) * (z01 - z00) + v * (z11 - z10)
@@ -166,20 +161,18 @@ def _first_hit(path, heights, over_voids):
 
     def border(p, tau):
         """Where the coordinate reaches the next line of the grid."""
-        a, b, c = p
-        value, rate = a + tau * (b + tau * c), b + 2 * tau * c
-        target = jnp.where(rate > 0, jnp.floor(value) + 1, jnp.ceil(value) - 1)
-        step = (target - value) / jnp.where(rate == 0, 1, rate)
+        at, rate = value_and_rate(p, tau)
+        target = jnp.where(rate > 0, jnp.floor(at) + 1, jnp.ceil(at) - 1)
+        step = (target - at) / jnp.where(rate == 0, 1, rate)
         return jnp.where(rate == 0, jnp.inf, tau + step)
 
     def entry(p, tau, last):
         """When the coordinate comes to [0, last], from where it is; −∞ inside, ∞ if never."""
-        a, b, c = p
-        value, rate = a + tau * (b + tau * c), b + 2 * tau * c
-        target = jnp.where(value < 0, 0.0, 1.0 * last)
-        towards = (target - value) * rate > 0
-        step = jnp.where(towards, (target - value) / jnp.where(rate == 0, 1, rate), jnp.inf)
-        return jnp.where((value < 0) | (value > last), tau + step, -jnp.inf)
+        at, rate = value_and_rate(p, tau)
+        target = jnp.where(at < 0, 0.0, 1.0 * last)
+        towards = (target - at) * rate > 0
+        step = jnp.where(towards, (target - at) / jnp.where(rate == 0, 1, rate), jnp.inf)
+        return jnp.where((at < 0) | (at > last), tau + step, -jnp.inf)
 
     def step(state):
         tau, hit, void, _ = state
@@ -187,9 +180,9 @@ def _first_hit(path, heights, over_voids):
         enters = jnp.maximum(entry(px, tau, columns - 1), entry(py, tau, rows - 1))
         out = jnp.clip(jnp.where(enters > -jnp.inf, enters, out), tau + least, 1.0)
         middle = (tau + out) / 2
-        cell = _cell(heights, jnp.floor(_parabola(px, middle)), jnp.floor(_parabola(py, middle)))
+        cell = _cell(heights, jnp.floor(value(px, middle)), jnp.floor(value(py, middle)))
         f = [
-            _parabola(ph, t) - _in_cell(cell, _parabola(px, t), _parabola(py, t))
+            value(ph, t) - _in_cell(cell, value(px, t), value(py, t))
             for t in (tau, middle, out)
         ]
         part = _first_root(*f)

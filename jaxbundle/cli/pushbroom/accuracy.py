@@ -30,6 +30,8 @@ from jaxbundle.pushbroom.terrain import Terrain
 
 Sigma = Annotated[float, typer.Option(min=0, help="standard deviation: degrees, metres, a second")]
 
+FEWEST_DRAWS = 20
+
 
 @pushbroom.command()
 def accuracy(
@@ -59,6 +61,11 @@ def accuracy(
 ) -> None:
     """RMS and CE90 on the ground of errors with given σ; or the errors against a known truth."""
     jaxbundle.enable_x64()
+    if 0 < draws < FEWEST_DRAWS:
+        raise InputError(
+            f"--draws {draws}: an RMS of so few says nothing; {FEWEST_DRAWS} at least, 1000 are "
+            "good to 3 %"
+        )
     if map_ is not None:
         _check_map(map_, table)
     if table:

@@ -37,6 +37,9 @@ GROUND_SIGMA = ("seast", "snorth", "sheight")
 TERMS = ("shift", "by_line", "by_sample")
 
 RpcFile = Annotated[Path, typer.Argument(help="coefficients: _RPC.TXT, .RPB, or a tagged GeoTIFF")]
+Figures = Annotated[
+    str, typer.Option(help="the figures and every point as JSON; - for standard output")
+]
 Out = Annotated[Path, typer.Option(help="file for the coefficients: .txt, .rpb, an existing .tif")]
 
 
@@ -50,7 +53,7 @@ def fit(
         str, typer.Option(help="LOW:HIGH of the ground, metres above the ellipsoid")
     ] = "0:3000",
     ridge: Annotated[float | None, typer.Option(min=0, help="ridge, chosen if not given")] = None,
-    json: Json = "",
+    json: Figures = "",
 ) -> None:
     """Fit coefficients to a scanner, or to a table; tell what they leave, in pixels."""
     jaxbundle.enable_x64()
@@ -131,7 +134,7 @@ def compensate(
     model: Annotated[str, typer.Option(help="shift or affine, in the image")] = "shift",
     sigma: Annotated[float, typer.Option(help="σ of measured lines and samples, pixels")] = 1.0,
     csv: Csv = None,
-    json: Json = "",
+    json: Figures = "",
 ) -> None:
     """Remove the bias that control points tell of; residuals, redundancy numbers and w of each."""
     jaxbundle.enable_x64()
