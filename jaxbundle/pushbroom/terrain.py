@@ -166,39 +166,47 @@ def _first_hit(path, heights, over_voids):
         step = (target - at) / jnp.where(rate == 0, 1, rate)
         return jnp.where(rate == 0, jnp.inf, tau + step)
 
-    def entry(p, tau, last):
-        """When the coordinate comes to [0, last], from where it is; −∞ inside, ∞ if never."""
-        at, rate = value_and_rate(p, tau)
-        target = jnp.where(at < 0, 0.0, 1.0 * last)
-        towards = (target - at) * rate > 0
-        step = jnp.where(towards, (target - at) / jnp.where(rate == 0, 1, rate), jnp.inf)
-        return jnp.where((at < 0) | (at > last), tau + step, -jnp.inf)
-
     def step(state):
         tau, hit, void, _ = state
-        out = jnp.minimum(border(px, tau), border(py, tau))
-        enters = jnp.maximum(entry(px, tau, columns - 1), entry(py, tau, rows - 1))
-        out = jnp.clip(jnp.where(enters > -jnp.inf, enters, out), tau + least, 1.0)
+        out = jnp.clip(jnp.minimum(border(px, tau), border(py, tau)), tau + least, 1.0)
         middle = (tau + out) / 2
-        cell = _cell(heights, jnp.floor(value(px, middle)), jnp.floor(value(py, middle)))
+        x, y = value(px, middle), value(py, middle)
+        cell = _cell(heights, jnp.floor(x), jnp.floor(y))
         f = [
-            value(ph, t) - _in_cell(cell, value(px, t), value(py, t))
-            for t in (tau, middle, out)
+            value(ph, t) - _in_cell(cell, value(px, t), value(py, t)) for t in (tau, middle, out)
         ]
         part = _first_root(*f)
         # below the terrain where heights begin again: it was met where there are none
         under = void & (f[0] < 0)
         void = jnp.isnan(f[1])
         found = (part <= 1) & ~under
-        done = found | under | (out >= 1)
+        done = found | under | (out >= 1) | _leaves(px, x, columns) | _leaves(py, y, rows)
         if not over_voids:
             done = done | void
         return out, jnp.where(found, tau + part * (out - tau), jnp.nan), void, done
 
-    start = jnp.zeros_like(speed)
-    lost = jnp.isnan(speed)
-    state = start, start * jnp.nan, start > 0, lost
+    start = jnp.maximum(_entry(px, columns), _entry(py, rows))
+    lost = jnp.isnan(speed) | ~(start < 1)
+    if not over_voids:
+        lost = lost | (start > 0)
+    state = start, jnp.full_like(speed, jnp.nan), start > 0, lost
     return jax.lax.while_loop(lambda s: ~s[3], step, state)[1]
+
+
+def _leaves(p, x, size):
+    """Whether a coordinate is off the grid and does not come back."""
+    return jnp.where(p[1] > 0, x > size - 1, x < 0)
+
+
+def _entry(p, size):
+    """τ where a coordinate comes to the grid, 0 if it is there at first, ∞ if it never is."""
+    target = jnp.where(p[0] < 0, 0.0, size - 1.0)
+    tau = jnp.zeros_like(p[0])
+    for _ in range(3):
+        at, rate = value_and_rate(p, tau)
+        tau = tau + (target - at) / jnp.where(rate == 0, jnp.nan, rate)
+    outside = (p[0] < 0) | (p[0] > size - 1)
+    return jnp.where(outside, jnp.where(tau > 0, tau, jnp.inf), 0.0)
 
 
 def _first_root(f0, fm, f1):
