@@ -10,6 +10,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.scanner import read_scanner
 from jaxbundle.pushbroom.frames import EARTH_RATE, GM
 from jaxbundle.pushbroom.orbit import J2, RADIUS, acceleration, state_orbit
+from jaxbundle.pushbroom.simulate import Flight, true_image
 from jaxbundle.pushbroom.surfaces import Ground
 
 START = tuple(v[0] for v in orbit([0.0]))
@@ -75,6 +76,15 @@ def test_a_state_in_a_file(tmp_path, frame):
         moved.append(np.linalg.norm(X - expected, axis=0))
     assert moved[0].max() < (1e-3 if frame == "ITRF" else 0.3)
     assert moved[1][0].max() < 0.5 and 0.01 < moved[1][1].max() < 1.0
+
+
+def test_a_flight_from_a_state():
+    """The simulated trajectory of a circle, and of one of its states."""
+    circle = dict(zip(("height", "inclination", "node", "argument"), PLACE))
+    state = {"state": np.concatenate(START), "j2": False}
+    flights = [Flight(100, 50, 0.01, satellite().optics, track) for track in (circle, state)]
+    tables = [true_image(flight).trajectory.position for flight in flights]
+    np.testing.assert_allclose(*(np.asarray(table.values) for table in tables), atol=1e-4)
 
 
 @pytest.mark.parametrize("old, new, words", [

@@ -130,7 +130,8 @@ def _write_map(path: Path, columns: dict[str, np.ndarray], head: dict) -> None:
         return
     name = "error" if "error" in columns else "rms"
     told = f"RMS {head['rms']:.3g} m, CE90 {head['ce90']:.3g} m"
-    draw = lambda ax: image_map(lines, pixels, bands[f"{name} [m]"], name, "m", told, ax)
+    title = "Error on the ground" if name == "error" else "RMS on the ground"
+    draw = lambda ax: image_map(lines, pixels, bands[f"{name} [m]"], title, "m", told, ax)
     try:
         write_figures(path.parent, {path.stem: ((7.5, 6), None, draw)})
     except ImportError as error:
