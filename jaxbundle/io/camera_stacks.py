@@ -11,12 +11,19 @@
 
 import dataclasses
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
 
 from jaxbundle.adjustment.batch_input import check_shapes
 from jaxbundle.errors import InputError
+
+UNREADABLE = (
+    OSError, EOFError, ValueError, KeyError, NotImplementedError, RuntimeError, MemoryError,
+    zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+"""What numpy and zipfile raise for an archive that is cut, garbled, or claims too much."""
 
 NEEDED = ("object_points", "image_points", "image_size")
 
@@ -47,13 +54,17 @@ def read_camera_stack(path: str | Path) -> CameraStack:
 
     **Raises:** `InputError` if an array is missing or its shape does not fit the others.
     """
+    if not Path(path).is_file():
+        raise InputError(f"{path}: no such file")
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in (*NEEDED, "visible", "ids") if name in file}
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: not a readable .npz file of plain arrays ({error})") from None
+        with open(path, "rb") as stream:
+            if not zipfile.is_zipfile(stream):
+                raise zipfile.BadZipFile("it is no archive")
+            with np.load(stream, allow_pickle=False) as file:
+                arrays = {name: file[name] for name in (*NEEDED, "visible", "ids") if name in file}
+    except UNREADABLE as error:
+        why = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: not a readable .npz file of plain arrays ({why})") from None
     missing = [name for name in NEEDED if name not in arrays]
     if missing:
         raise InputError(

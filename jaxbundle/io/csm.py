@@ -35,7 +35,7 @@ from jaxbundle.io.scanner import Scanner
 from jaxbundle.network.columns import shown
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.ancillary import attitude_table, check_times, position_table
-from jaxbundle.pushbroom.image import make_image
+from jaxbundle.pushbroom.image import check_size, make_image
 from jaxbundle.pushbroom.scanner import AngleTable, FocalLine, LineTimes
 from jaxbundle.pushbroom.trajectory import Trajectory
 
@@ -44,6 +44,8 @@ UNITS = {"m": 1.0, "km": 1000.0}
 FEWEST, ORDER = 25, 7
 """Positions are resampled to so many rows at least."""
 ALIGNED = 1e-9
+ORTHOGONAL = 1e-4
+"""Products of the rows of a rotation may differ by this from those of axes, as quaternions do."""
 ROUNDING = 5e-7
 """Seconds since J2000 are rounded to 6e-8 s; tables may end that much inside the first line."""
 
@@ -58,9 +60,9 @@ def read_csm(path: str | Path) -> Scanner:
     name = isd.get("name_model", MODEL)
     if name != MODEL:
         raise InputError(f"{path}: name_model is {shown(name)}; {MODEL} is expected")
-    lines, pixels = (int(isd.number(key)) for key in ("image_lines", "image_samples"))
-    if min(lines, pixels) < 2:
-        raise InputError(f"{path}: {lines} lines of {pixels} samples; 2 of each at least")
+    lines, pixels = (isd.number(key) for key in ("image_lines", "image_samples"))
+    check_size(lines, pixels, f"{path}: image_lines, image_samples")
+    lines, pixels = int(lines), int(pixels)
     times = _line_times(isd, lines)
     t, P, (rows, R) = _states(isd)
     middle = float(times.time((lines - 1) / 2))
@@ -69,11 +71,12 @@ def read_csm(path: str | Path) -> Scanner:
     t, rows = (_reaching(table, *ends) for table in (t, rows))
     q = np.roll((R * turn).as_quat(), 1, axis=1)
     degree = lambda n: {"method": "lagrange", "order": min(ORDER, n - 1), "gap": np.inf}
-    position = position_table(t, P, **degree(len(t)), source=isd.source("instrument_position"))
-    attitude = attitude_table(
-        rows, q, **degree(len(rows)), source=isd.source("instrument_pointing")
+    sources = isd.source("instrument_position"), isd.source("instrument_pointing")
+    position = position_table(t, P, **degree(len(t)), source=sources[0])
+    attitude = attitude_table(rows, q, **degree(len(rows)), source=sources[1])
+    image = make_image(
+        Trajectory(position, attitude), times, optics, lines, pixels, sources=sources
     )
-    image = make_image(Trajectory(position, attitude), times, optics, lines, pixels)
     return Scanner(str(isd.get("name_sensor", Path(path).stem)), image, _earth(isd))
 
 
@@ -82,8 +85,11 @@ class _Isd:
 
     def __init__(self, path):
         self.path = path
+        text = read_text(path)
         try:
-            self.document = json.loads(read_text(path))
+            self.document = json.loads(text)
+        except RecursionError:
+            raise InputError(f"{path}: not valid JSON: brackets are nested too deeply") from None
         except ValueError as error:
             raise InputError(f"{path}: not valid JSON: {error}") from None
         if not isinstance(self.document, dict):
@@ -199,6 +205,11 @@ def _turns(isd, key):
     t = _times(isd, key)
     R = _rotations(isd, key, isd.array(f"{key}.quaternions", (len(t), 4))[:, [1, 2, 3, 0]])
     fixed = isd.array(f"{key}.constant_rotation", (9,), np.eye(3).ravel()).reshape(3, 3)
+    if not np.abs(fixed @ fixed.T - np.eye(3)).max() < ORTHOGONAL or np.linalg.det(fixed) < 0:
+        raise InputError(
+            f"{isd.path}: {key}.constant_rotation is no rotation; nine numbers of an orthogonal "
+            "matrix are expected, row by row"
+        )
     constant = Rotation.from_matrix(fixed)
     if len(t) == 1:
         rate = isd.array(f"{key}.angular_velocities", (1, 3), np.zeros((1, 3)))[0]
@@ -223,6 +234,8 @@ def _middle(t, P, rows, R, middle):
 def _optics(isd, pixels, down, forward):
     """The optics, and the rotation from its camera frame into that of the ISD."""
     f = isd.number("focal_length_model.focal_length")
+    if f == 0:
+        raise InputError(f"{isd.path}: focal_length_model.focal_length is 0; millimetres, please")
     x, y = _focal_plane(isd, np.arange(pixels))
     kind, undistorted = _distortion(isd, x, y)
     sights = np.stack([x / f, y / f])

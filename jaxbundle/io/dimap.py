@@ -33,7 +33,7 @@ from jaxbundle.pushbroom.ancillary import (
     check_times,
     position_table,
 )
-from jaxbundle.pushbroom.image import make_image
+from jaxbundle.pushbroom.image import check_size, make_image
 from jaxbundle.pushbroom.interpolation import interpolate
 from jaxbundle.pushbroom.scanner import AngleTable, LineTimes
 from jaxbundle.pushbroom.trajectory import Trajectory, orbital_frame
@@ -48,20 +48,22 @@ def read_dimap(path: str | Path) -> Scanner:
     time, not as many look angles as pixels, times that do not increase.
     """
     file = _Dimap(Path(path))
-    lines, pixels = (int(file.number(f"Raster_Dimensions/{n}")) for n in ("NROWS", "NCOLS"))
+    lines, pixels = (file.number(f"Raster_Dimensions/{n}") for n in ("NROWS", "NCOLS"))
+    check_size(lines, pixels, f"{path}: Raster_Dimensions")
+    lines, pixels = int(lines), int(pixels)
     setting = "Sensor_Configuration//"
     period = file.number(f"{setting}LINE_PERIOD")
     centre = file.number(f"{setting}SCENE_CENTER_LINE") - 1
     epoch = file.time(f"{setting}SCENE_CENTER_TIME")
-    if period <= 0 or min(lines, pixels) < 2:
-        raise InputError(f"{path}: {lines} lines of {pixels} pixels, {period:g} s each")
+    if period <= 0:
+        raise InputError(f"{path}: LINE_PERIOD is {period:g} s; a positive number is expected")
     times = LineTimes(jnp.asarray(-period * centre), jnp.asarray(period))
 
     t, orbit = file.rows(
         "Ephemeris/Points/Point", [f"{a}/{b}" for a in ("Location", "Velocity") for b in "XYZ"],
         epoch,
     )  # fmt: skip
-    source = Source(f"{path}, Ephemeris", None, "point")
+    source = points = Source(f"{path}, Ephemeris", None, "point")
     options = {"method": "lagrange", "order": min(ORDER, len(t) - 1), "gap": np.inf}
     both = position_table(t, orbit, **options, source=source)
     position = position_table(t, orbit[:, :3], **options, source=source)
@@ -74,7 +76,7 @@ def read_dimap(path: str | Path) -> Scanner:
     check_times(rows, source)
     ends = [float(times.time(line)) for line in (0.0, lines - 1.0)]
     rows, angles = _continued(rows, angles, *ends)
-    check_covered(position, rows, f"{path}, Ephemeris", "attitude row")
+    check_covered(position, rows, points, "attitude row")
     state = np.asarray(jax.vmap(lambda at: interpolate(both, at))(rows))
     frame = np.asarray(jax.vmap(orbital_frame)(state[:, :3], state[:, 3:]))
     turn = Rotation.from_matrix(frame) * Rotation.from_euler("XYZ", angles * [-1, -1, 1])
@@ -87,7 +89,9 @@ def read_dimap(path: str | Path) -> Scanner:
     if len(psi) != pixels:
         raise InputError(f"{path}: {len(psi)} Look_Angles for {pixels} columns; one a column")
     optics = AngleTable(jnp.asarray(-psi[:, 1]), jnp.asarray(psi[:, 0]))
-    image = make_image(Trajectory(position, attitude), times, optics, lines, pixels)
+    image = make_image(
+        Trajectory(position, attitude), times, optics, lines, pixels, sources=(points, source)
+    )
     return Scanner(file.text("Dataset_Id/DATASET_NAME", Path(path).stem), image, WGS84)
 
 

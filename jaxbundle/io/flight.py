@@ -14,7 +14,8 @@ period = 0.00066
 c = 700.0
 pitch = 0.0065
 
-[track]                             # height, inclination, node, argument; or start and velocity
+[track]                             # height, inclination, node, argument; or state; or start and
+                                    # velocity
 height = 505000.0
 inclination = 97.4
 
@@ -51,6 +52,7 @@ from jaxbundle.pushbroom.simulate import Flight
 
 ORBIT = ("height", "inclination", "node", "argument")
 LINE = ("start", "velocity")
+STATE = ("state", "at", "j2")
 RATES = ("position_rate", "attitude_rate")
 METHODS = ("position_interpolation", "attitude_interpolation")
 SECTIONS = {
@@ -58,7 +60,7 @@ SECTIONS = {
     "times": ("period",),
     "optics": (),
     "mounting": ANGLES,
-    "track": (*ORBIT, *LINE),
+    "track": (*ORBIT, *LINE, *STATE),
     "angles": ANGLES,
     "instruments": (*RATES, *METHODS),
     "noise": Noise._fields,
@@ -108,6 +110,10 @@ def _track(file: TomlFile, earth: Ellipsoid | None) -> dict[str, Any]:
     if earth is None:
         track.check_keys(LINE)
         return {k: track.numbers(k, 3) for k in LINE}
+    if "state" in track:
+        track.check_keys(STATE)
+        j2 = track.switch("j2") or "j2" not in track
+        return {"state": track.numbers("state", 6), "at": track.number("at", 0.0), "j2": j2}
     track.check_keys(ORBIT)
     angles = {k: file.radians * track.number(k, 0.0) for k in ORBIT[1:]}
     return {"height": track.number("height"), **angles}

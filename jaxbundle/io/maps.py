@@ -1,4 +1,8 @@
-"""Coordinates of maps: pyproj's systems, and grids of pixels in them."""
+"""Coordinates of maps: pyproj's systems, and grids of pixels in them.
+
+Longitudes of a map have no seam: they go on beyond ±180° where what is mapped does, as 179.9 to
+180.4, which GDAL and its users read. A projected system that has its edge there is refused.
+"""
 
 from typing import NamedTuple
 
@@ -11,6 +15,11 @@ from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
 from jaxbundle.pushbroom.correct import Nodes, geographic_nodes, local_nodes
 from jaxbundle.pushbroom.surfaces import Surface
 
+JUMP = 0.25
+"""Neighbouring places farther apart than this part of all lie on both sides of an edge."""
+LARGEST = 2**31 - 1
+"""Rows and columns of a GeoTIFF."""
+
 _geodetic = jax.jit(geodetic)
 
 
@@ -18,26 +27,35 @@ class MapSystem:
     """A coordinate system of maps, for points of an Earth or of a local frame.
 
     `crs` is anything pyproj reads, such as `"EPSG:32633"`; None: longitude and latitude in degrees,
-    or X and Y of the local frame.
+    or X and Y of the local frame. `turn` is what x gains in a turn around the Earth, None if x is
+    no longitude.
 
-    **Raises:** `InputError` for what pyproj does not know.
+    **Raises:** `InputError` for what pyproj does not know, and what is no system of maps.
     """
 
     def __init__(self, earth: Ellipsoid | None, crs: str | None):
         self.earth, self.crs = earth, crs
         self.transformer = None
+        self.turn = None if earth is None else 360.0
         if earth is None and crs is not None:
             raise InputError(f"coordinate system {crs}: a local frame has none; leave it away")
         if earth is not None and crs is not None:
-            self.transformer = _transformer(crs)
+            self.transformer, self.turn = _transformer(crs)
 
     def from_ground(self, X: Float[np.ndarray, "3 *shape"]) -> tuple[np.ndarray, np.ndarray]:
-        """x and y of points of the ground."""
+        """x and y of points of the ground; NaN where the system has no place for one."""
         if self.earth is None:
             return X[0], X[1]
         longitude, latitude, _ = _geodetic(self.earth, tuple(X))
         degrees = np.degrees(np.asarray(longitude)), np.degrees(np.asarray(latitude))
-        return self.transformer.transform(*degrees) if self.transformer else degrees
+        if not self.transformer:
+            return degrees
+        x, y = (np.asarray(v) for v in self.transformer.transform(*degrees))
+        return np.where(np.isfinite(x), x, np.nan), np.where(np.isfinite(y), y, np.nan)
+
+    def around(self, x: np.ndarray, middle: float) -> np.ndarray:
+        """The same longitudes, turns away from their own, within half a turn of the middle."""
+        return x if self.turn is None else x - self.turn * np.round((x - middle) / self.turn)
 
     def nodes(self, surface: Surface, x: np.ndarray, y: np.ndarray) -> Nodes:
         """Ground points at x and y."""
@@ -51,6 +69,13 @@ class MapSystem:
     def text(self) -> str | None:
         """As rasterio writes it."""
         return self.crs if self.crs or self.earth is None else "EPSG:4326"
+
+    @property
+    def unit(self) -> str:
+        """What a size of pixels is in, for messages."""
+        if self.earth is None:
+            return "metres"
+        return "degrees" if self.transformer is None else f"units of {self.crs}"
 
 
 class MapGrid(NamedTuple):
@@ -73,24 +98,60 @@ class MapGrid(NamedTuple):
         return (self.y - y) / self.size - 0.5, (x - self.x) / self.size - 0.5
 
 
-def grid_around(x: np.ndarray, y: np.ndarray, size: float) -> MapGrid:
+def contiguous(system: MapSystem, x: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "r c"]:
+    """x of a lattice of places, longitudes made contiguous about its middle.
+
+    **Raises:** `InputError` if a projected system has its edge among the places.
+    """
+    seen = np.flatnonzero(np.isfinite(x))
+    if not len(seen):
+        return x
+    middle = x.ravel()[seen[np.abs(seen - x.size // 2).argmin()]]
+    x = system.around(x, middle)
+    if system.transformer and system.turn is None:
+        steps = [np.abs(np.diff(x, axis=axis)).ravel() for axis in (0, 1)]
+        longest = np.nanmax(np.concatenate([np.zeros(1), *steps]))
+        if longest > JUMP * (np.nanmax(x) - np.nanmin(x)):
+            raise InputError(
+                f"coordinate system {system.crs}: the image lies on both sides of its edge (x "
+                f"jumps by {longest:.6g}); give a system with its middle there, such as EPSG:3832 "
+                "at 180°, the zone of UTM, or leave it away: longitude and latitude"
+            )
+    return x
+
+
+def grid_around(x: np.ndarray, y: np.ndarray, size: float, most: float = np.inf) -> MapGrid:
     """The pixels of this size that hold all places, their edges at multiples of it.
 
-    **Raises:** `InputError` if there are none.
+    **Raises:** `InputError` for more than `most` pixels, or rows or columns than a GeoTIFF holds.
     """
-    if not np.isfinite(x).any():
-        raise InputError("no point of the image is on the ground; look at attitude and mounting")
     left, right = np.floor(np.nanmin(x) / size), np.ceil(np.nanmax(x) / size)
     bottom, top = np.floor(np.nanmin(y) / size), np.ceil(np.nanmax(y) / size)
-    return MapGrid(left * size, top * size, size, int(right - left), int(top - bottom))
+    columns, rows = right - left, top - bottom
+    if not (max(rows, columns) < LARGEST and rows * columns <= most):
+        raise InputError(
+            f"--spacing {size:g}: the map would have {rows:.3g} × {columns:.3g} pixels; give a "
+            "greater one, in the unit of the map, or another --crs"
+        )
+    return MapGrid(left * size, top * size, size, int(columns), int(rows))
 
 
 def _transformer(crs):
+    """From degrees to a system, and what x gains in a turn there."""
     try:
         import pyproj
     except ImportError:
         raise InputError("coordinate systems need pyproj: pip install 'jaxbundle[geo]'") from None
     try:
-        return pyproj.Transformer.from_crs("EPSG:4326", crs, always_xy=True)
+        system = pyproj.CRS.from_user_input(crs)
+        if not (system.is_geographic or system.is_projected):
+            raise InputError(
+                f"coordinate system {crs!r} ({system.name}): {system.type_name} is none of maps; "
+                "give a projected one, such as EPSG:32633, or a geographic one, such as EPSG:4326"
+            )
+        transformer = pyproj.Transformer.from_crs("EPSG:4326", system, always_xy=True)
     except pyproj.exceptions.CRSError as error:
         raise InputError(f"coordinate system {crs!r}: {' '.join(str(error).split())}") from None
+    if not system.is_geographic:
+        return transformer, None
+    return transformer, 2 * np.pi / system.axis_info[0].unit_conversion_factor

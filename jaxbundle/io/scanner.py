@@ -12,7 +12,7 @@ angle_unit = "deg"                  # rad | deg | gon, of every angle in this fi
 first = 0.0
 period = 0.00066
 
-[position]                          # table, or tle, or circle
+[position]                          # table, or tle, or circle, or state
 table = "positions.csv"             # t,X,Y,Z[,VX,VY,VZ]
 frame = "ITRF"                      # ITRF | GCRF | J2000 | TEME, or "local"
 interpolation = "lagrange"          # linear | lagrange | hermite | spline
@@ -54,21 +54,25 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid
 from jaxbundle.io.sections import Section, TomlFile, read_sections
 from jaxbundle.network.columns import did_you_mean, shown
+from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom import frames
 from jaxbundle.pushbroom.ancillary import attitude_table, check_times, position_table
 from jaxbundle.pushbroom.corrections import Corrections
-from jaxbundle.pushbroom.image import PushbroomImage, make_image
+from jaxbundle.pushbroom.image import PushbroomImage, check_size, make_image
 from jaxbundle.pushbroom.interpolation import Table
+from jaxbundle.pushbroom.orbit import state_orbit
 from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable, FocalLine, LineTimes, Optics
 from jaxbundle.pushbroom.trajectory import Attitude, Trajectory
 
 FRAMES = (*frames.FRAMES, "local")
 ANGLES = ("pitch", "roll", "yaw")
+MOST_ROWS = 1_000_000
 INTERPOLATION = ("interpolation", "order", "gap")
+KINDS = ("table", "tle", "circle", "state")
 SECTIONS = {
     "scanner": ("name", "lines", "pixels", "epoch", "earth", "angle_unit"),
     "times": ("first", "period", "table"),
-    "position": ("table", "tle", "circle", "frame", "span", "step", *INTERPOLATION),
+    "position": (*KINDS, "at", "j2", "frame", "span", "step", *INTERPOLATION),
     "attitude": ("table", "frame", *INTERPOLATION),
     "optics": (),  # depends on its kind
     "mounting": ANGLES,
@@ -104,9 +108,10 @@ def read_scanner(path: str | Path) -> Scanner:
     file = read_sections(path, SECTIONS, NEEDED)
     scanner = file.section("scanner")
     lines, pixels = (scanner.whole(key) for key in ("lines", "pixels"))
+    check_size(lines, pixels, scanner.where.removesuffix(": "))
     earth = earth_of(scanner)
-    position = _position(file, earth)
-    attitude = _attitude(file, earth)
+    position, positions = _position(file, earth)
+    attitude, attitudes = _attitude(file, earth)
     mounting = mounting_of(file)
     switches = file.section("corrections")
     corrections = Corrections(*(switches.switch(name) for name in Corrections._fields))
@@ -114,7 +119,7 @@ def read_scanner(path: str | Path) -> Scanner:
         raise InputError(f"{switches.where}corrections need an Earth; set [scanner] earth")
     image = make_image(
         Trajectory(position, attitude), _times(file, lines), optics_of(file, pixels), lines, pixels,
-        mounting, corrections,
+        mounting, corrections, (positions, attitudes),
     )  # fmt: skip
     return Scanner(scanner.text("name", path.stem), image, earth)
 
@@ -142,6 +147,11 @@ def _options(section: Section, method: str) -> dict[str, Any]:
         options["order"] = int(section.number("order"))
     if "gap" in section:
         options["gap"] = section.number("gap")
+        if options["gap"] <= 0:
+            raise InputError(
+                f"{section.where}gap is {options['gap']:g}; the longest step that is "
+                "interpolated, in seconds, is expected, a positive number"
+            )
     return options
 
 
@@ -196,13 +206,13 @@ def _frame(section: Section, earth: Ellipsoid | None, known: Sequence[str]) -> s
     return frame
 
 
-def _position(file: TomlFile, earth: Ellipsoid | None) -> Table:
+def _position(file: TomlFile, earth: Ellipsoid | None) -> tuple[Table, Source]:
     section = file.section("position")
-    kinds = [kind for kind in ("table", "tle", "circle") if kind in section]
+    kinds = [kind for kind in KINDS if kind in section]
     if len(kinds) != 1:
-        raise InputError(f"{section.where}give one of table, tle, circle, not {kinds}")
+        raise InputError(f"{section.where}give one of {', '.join(KINDS)}, not {kinds}")
     if kinds != ["table"]:
-        return _orbit(file, section, kinds[0])
+        return _orbit(file, section, kinds[0], earth)
     frame = _frame(section, earth, FRAMES)
     columns = section.table()
     names, rates = ("X", "Y", "Z"), ("VX", "VY", "VZ")
@@ -214,27 +224,49 @@ def _position(file: TomlFile, earth: Ellipsoid | None) -> Table:
         check_times(t, columns.source)
         R = frames.to_earth(frame, _epoch(file), t, _orientation(file))
         P, V = frames.turn_positions(R, P, V, _orientation(file))
-    return position_table(t, P, V, **_options(section, "lagrange"), source=columns.source)
+    table = position_table(t, P, V, **_options(section, "lagrange"), source=columns.source)
+    return table, columns.source
 
 
-def _orbit(file: TomlFile, section: Section, kind: str) -> Table:
-    """Two-line elements or a circle, at the steps of a table from which is interpolated."""
+def _orbit(
+    file: TomlFile, section: Section, kind: str, earth: Ellipsoid | None
+) -> tuple[Table, Source]:
+    """Two-line elements, a circle, a state: at the steps of a table from which is interpolated."""
     start, end = section.numbers("span", 2)
-    t = np.arange(start, end, section.number("step", 1.0))
+    step = section.number("step", 1.0)
+    if not (step > 0 and 0 < (end - start) / step <= MOST_ROWS):
+        raise InputError(
+            f"{section.where}span from {start:g} to {end:g} s in steps of {step:g} s; 1 to "
+            f"{MOST_ROWS} steps forward are expected"
+        )
+    t = np.arange(start, end, step)
     if kind == "tle":
         lines = section.values["tle"]
         if not (isinstance(lines, list) and len(lines) == 2):
             raise InputError(f"{section.where}tle: a list of the two lines is expected")
         P, V = frames.two_line_orbit(*lines, _epoch(file), t, _orientation(file))
+    elif kind == "state":
+        frame = _frame(section, earth, frames.FRAMES)
+        at = section.number("at", 0.0)
+        state = section.numbers("state", 6)[None]
+        P, V = state[:, :3], state[:, 3:]
+        if frame != "ITRF":
+            R = frames.to_earth(frame, _epoch(file), [at], _orientation(file))
+            P, V = frames.turn_positions(R, P, V, _orientation(file))
+        try:
+            P, V = state_orbit(t, P[0], V[0], at, section.switch("j2") or "j2" not in section)
+        except InputError as error:
+            raise InputError(f"{section.where}{error}") from None
     else:
         circle = Section(file, f"{section.where}circle: ", section.values["circle"])
         angles = (circle.number(k, 0.0) for k in ("inclination", "node", "argument"))
         angles = [file.radians * angle for angle in angles]
         P, V = frames.circular_orbit(t, circle.number("height"), *angles)
-    return position_table(t, P, V, **_options(section, "lagrange"))
+    source = Source(f"{section.where}span")
+    return position_table(t, P, V, **_options(section, "lagrange"), source=source), source
 
 
-def _attitude(file: TomlFile, earth: Ellipsoid | None) -> Attitude:
+def _attitude(file: TomlFile, earth: Ellipsoid | None) -> tuple[Attitude, Source]:
     section = file.section("attitude")
     frame = _frame(section, earth, (*FRAMES, "orbit"))
     columns = section.table()
@@ -252,10 +284,11 @@ def _attitude(file: TomlFile, earth: Ellipsoid | None) -> Attitude:
         R = frames.to_earth(frame, _epoch(file), t, _orientation(file))
         lengths = np.linalg.norm(values, axis=1, keepdims=True)
         values = lengths * frames.turn_quaternions(R, values)
-    return attitude_table(
+    attitude = attitude_table(
         t, values, **_options(section, "slerp" if quaternions else "linear"),
         reference="orbit" if frame == "orbit" else "earth", source=columns.source,
     )  # fmt: skip
+    return attitude, columns.source
 
 
 def optics_of(file: TomlFile, pixels: int) -> Optics:

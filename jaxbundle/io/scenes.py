@@ -1,7 +1,6 @@
 """Scenes for simulation: a raster with map coordinates, and the image that is taken of it."""
 
 import os
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -12,7 +11,7 @@ from jaxtyping import Array, Float
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.maps import MapSystem
-from jaxbundle.io.rasters import as_type, rasterio, unreadable
+from jaxbundle.io.rasters import as_type, open_plain, rasterio, unreadable
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.resample import Resampling
 from jaxbundle.pushbroom.simulate import taken_image
@@ -34,7 +33,7 @@ def read_scene(path: str | Path, earth: Ellipsoid | None) -> Scene:
     """A raster in any coordinate system; for a local frame its own coordinates are X and Y."""
     package = rasterio()
     try:
-        with package.open(path) as source:
+        with open_plain(path) as source:
             bands, transform, crs = source.read().astype(float), source.transform, source.crs
             dtype = source.dtypes[0]
     except package.errors.RasterioError as error:
@@ -43,9 +42,11 @@ def read_scene(path: str | Path, earth: Ellipsoid | None) -> Scene:
         raise InputError(f"{path}: the raster has no coordinate system; give one that has")
     system = MapSystem(earth, None if earth is None else crs.to_wkt())
     back = ~transform
+    middle = transform.c + transform.a * bands.shape[2] / 2 + transform.b * bands.shape[1] / 2
 
     def place(X):
         x, y = system.from_ground(X)
+        x = system.around(x, middle)
         column = back.a * x + back.b * y + back.c
         row = back.d * x + back.e * y + back.f
         return row - 0.5, column - 0.5
@@ -67,28 +68,25 @@ def write_taken(
 
     **Raises:** `InputError` if the scene is nowhere in the image.
     """
-    package = rasterio()
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tif")
     seen = False
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", package.errors.NotGeoreferencedWarning)
-            with package.open(
-                temporary, "w", driver="GTiff", width=image.pixels, height=image.lines,
-                count=len(bands), dtype=dtype, BIGTIFF="IF_SAFER",
-            ) as target:  # fmt: skip
-                for first in range(0, image.lines, PORTION):
-                    lines = np.arange(first, first + PORTION, dtype=float)
-                    inside = np.minimum(lines, image.lines - 1)
-                    values = taken_image(image, surface, bands, place, inside, resampling)
-                    values = values[:, : image.lines - first]
-                    seen |= bool(np.isfinite(values).any())
-                    target.write(
-                        as_type(values, dtype),
-                        window=((first, first + values.shape[1]), (0, image.pixels)),
-                    )
-                    if progress:
-                        progress(first + values.shape[1], image.lines)
+        with open_plain(
+            temporary, "w", driver="GTiff", width=image.pixels, height=image.lines,
+            count=len(bands), dtype=dtype, BIGTIFF="IF_SAFER",
+        ) as target:  # fmt: skip
+            for first in range(0, image.lines, PORTION):
+                lines = np.arange(first, first + PORTION, dtype=float)
+                inside = np.minimum(lines, image.lines - 1)
+                values = taken_image(image, surface, bands, place, inside, resampling)
+                values = values[:, : image.lines - first]
+                seen |= bool(np.isfinite(values).any())
+                target.write(
+                    as_type(values, dtype),
+                    window=((first, first + values.shape[1]), (0, image.pixels)),
+                )
+                if progress:
+                    progress(first + values.shape[1], image.lines)
         if not seen:
             raise InputError("the image shows nothing of the scene: look at track and coordinates")
         os.replace(temporary, path)

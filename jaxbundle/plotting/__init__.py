@@ -12,6 +12,7 @@ from jaxbundle.plotting.distortion import DistortionProfile as DistortionProfile
 from jaxbundle.plotting.distortion import distortion_profile as distortion_profile
 from jaxbundle.plotting.files import save_figures as save_figures
 from jaxbundle.plotting.files import write_figures as write_figures
+from jaxbundle.plotting.image_map import image_map as image_map
 from jaxbundle.plotting.images import residual_histogram as residual_histogram
 from jaxbundle.plotting.images import residual_vectors as residual_vectors
 from jaxbundle.plotting.quality import coverage_map as coverage_map

@@ -35,6 +35,7 @@ from .locate import locate_point as locate_point
 from .locate import locate_points as locate_points
 from .noise import Noise as Noise
 from .noise import disturbed as disturbed
+from .orbit import state_orbit as state_orbit
 from .project import Projected as Projected
 from .project import Status as Status
 from .project import make_search as make_search

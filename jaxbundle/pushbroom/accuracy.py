@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from scipy.optimize import brentq
 
 from jaxbundle.geometry.ellipsoid import geodetic
-from jaxbundle.geometry.vectors import difference
+from jaxbundle.geometry.vectors import Vector, difference
 
 from .image import PushbroomImage
 from .locate import locate_point
@@ -128,8 +128,9 @@ def _covariances(image, surface, lines, pixels, sigma):
     zero = no_errors(image)
 
     def of_place(line, pixel):
-        axes, X0 = _east_north(surface, locate_point(image, surface, line, pixel))
-        move = lambda errors: _horizontal(
+        X0 = locate_point(image, surface, line, pixel)
+        axes = east_north(surface, X0)
+        move = lambda errors: horizontal(
             axes, X0, locate_point(disturbed(image, errors), surface, line, pixel)
         )
         J = jax.jacrev(move)(zero)
@@ -151,21 +152,23 @@ def _draws(image, surface, lines, pixels, sigma, keys):
 @jax.jit
 def _differences(image, truth, surface, lines, pixels):
     def of_place(line, pixel):
-        axes, X0 = _east_north(surface, locate_point(truth, surface, line, pixel))
-        return _horizontal(axes, X0, locate_point(image, surface, line, pixel))
+        X0 = locate_point(truth, surface, line, pixel)
+        X = locate_point(image, surface, line, pixel)
+        return horizontal(east_north(surface, X0), X0, X)
 
     return jax.vmap(of_place)(lines, pixels)
 
 
-def _east_north(surface, X):
-    """The unit vectors east and north at X, and X."""
+def east_north(surface: Surface, X: Vector) -> Float[Array, "2 3"]:
+    """The unit vectors east and north at X; along X and Y of a local frame."""
     if surface.earth is None:
-        return jnp.eye(3)[:2], X
+        return jnp.eye(3)[:2]
     longitude, latitude, _ = geodetic(surface.earth, X)
     s, c, z = jnp.sin(longitude), jnp.cos(longitude), jnp.sin(latitude)
     east = jnp.stack([-s, c, 0 * s])
-    return jnp.stack([east, jnp.stack([-z * c, -z * s, jnp.cos(latitude)])]), X
+    return jnp.stack([east, jnp.stack([-z * c, -z * s, jnp.cos(latitude)])])
 
 
-def _horizontal(axes, X0, X) -> Float[Array, "2"]:
+def horizontal(axes: Float[Array, "2 3"], X0: Vector, X: Vector) -> Float[Array, "2"]:
+    """X − X0 along the axes, metres."""
     return axes @ jnp.stack(difference(X, X0))

@@ -42,7 +42,7 @@ def position_table(
     `source` names the rows in messages.
 
     **Raises:** `InputError` naming the row: times that do not increase, what is not a number, too
-    few rows.
+    few rows; a gap that is not positive.
     """
     _check_method(method, METHODS, source)
     if method == "hermite" and velocities is None:
@@ -115,19 +115,20 @@ def check_times(times: Float[np.ndarray, " rows"], source: Source) -> None:
 
 
 def check_covered(
-    table: Table, times: Sequence[float], what: str, thing: str = "line"
+    table: Table, times: Sequence[float], source: Source, thing: str = "image line"
 ) -> None:
     """Refuse a table that does not reach over the times, or has a gap among them.
 
-    `what` names the table, `thing` what the times belong to.
+    `source` names the table and its rows, `thing` what the times belong to.
     """
     rows, times = np.asarray(table.times), np.asarray(times, float)
     outside = (times < rows[0]) | (times > rows[-1])
     if outside.any():
         k = int(outside.argmax())
         raise InputError(
-            f"{what}: {thing} {k} is at {times[k]:.9g} s, outside the table, {rows[0]:.9g} to "
-            f"{rows[-1]:.9g} s; give ancillary data for the whole image, nothing is extrapolated"
+            f"{source.name}: {thing} {k} is at {times[k]:.9g} s, outside the table, "
+            f"{rows[0]:.9g} to {rows[-1]:.9g} s; give ancillary data for the whole image, nothing "
+            "is extrapolated"
         )
     i = np.clip(np.searchsorted(rows, times, side="right") - 1, 0, len(rows) - 2)
     wide = rows[i + 1] - rows[i] > table.gap
@@ -135,8 +136,9 @@ def check_covered(
         k = int(wide.argmax())
         start, end = rows[i[k]], rows[i[k] + 1]
         raise InputError(
-            f"{what}: {thing} {k} at {times[k]:.9g} s is in a gap of {end - start:.6g} s between "
-            f"rows {i[k] + 1} and {i[k] + 2}; allow it with gap = {end - start:.6g}, or give rows"
+            f"{source(i[k] + 1)}: {thing} {k} at {times[k]:.9g} s is in the gap of "
+            f"{end - start:.6g} s before this row; allow it with gap = {end - start:.6g}, or give "
+            "rows"
         )
 
 
@@ -167,6 +169,11 @@ def _table(times, values, rates, method, order, gap, what, source):
             f"{source.name}: {len(times)} rows; {method!r} needs {fewest}; give more rows{advice}"
         )
     check_times(times, source)
+    if gap is not None and not gap > 0:
+        raise InputError(
+            f"{source.name}: gap is {gap:g}; the longest step that is interpolated, in seconds, "
+            "is expected, a positive number"
+        )
     gap = GAP * float(np.median(np.diff(times))) if gap is None else float(gap)
     kind = "linear" if method == "slerp" else method
     rates = None if rates is None else jnp.asarray(rates)

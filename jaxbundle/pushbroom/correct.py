@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 from jaxbundle.geometry.ellipsoid import earth_fixed, up
 from jaxbundle.geometry.vectors import difference, dot, length
 
+from .accuracy import east_north, horizontal
 from .image import Pose, PushbroomImage
 from .locate import ground_point
 from .passages import sample
@@ -100,6 +101,37 @@ def block_places(
     return Places(np.where(inside, line, np.nan), np.where(inside, pixel, np.nan))
 
 
+def block_errors(
+    truth: PushbroomImage, search: Search, surface: Surface, nodes: Nodes, places: Places
+) -> Float[np.ndarray, "2 rows columns"]:
+    """East and north at which the pixels of a block stand wrongly on the map, metres.
+
+    A pixel shows what the image has at its place; the truth knows where on the surface that is.
+
+    **Arguments:** `truth` with the `search` made of it; `places` of the image to be judged.
+    """
+    return np.asarray(_errors(truth, search, surface, nodes, places))
+
+
+@jax.jit
+def _errors(truth, search, surface, nodes, places):
+    ground = jnp.moveaxis(_ground(surface, nodes), 0, -1)
+
+    def of_point(line, pixel, X):
+        true = _located(truth, search, surface, line, pixel)
+        return horizontal(east_north(surface, true), true, tuple(X))
+
+    of_row = lambda args: jax.vmap(of_point)(*args)
+    return jnp.moveaxis(jax.lax.map(of_row, (*places, ground)), -1, 0)
+
+
+def _located(image, search, surface, line, pixel):
+    """The point that a place shows, by the pieces of the search."""
+    numbers, _, (P, V) = sample(search.pieces, image.times.time(line))
+    pose = Pose(jnp.stack(P), numbers[:9].reshape(3, 3).T, jnp.stack(V))
+    return ground_point(pose, image.optics.slopes(pixel), surface, image.corrections)
+
+
 @jax.jit
 def _occluded(image, search, surface, line, pixel, ground):
     """Whether the rays of places end before they come to their points [3, rows, columns].
@@ -109,10 +141,8 @@ def _occluded(image, search, surface, line, pixel, ground):
     half = length(ground[:, 0, 1] - ground[:, 0, 0]) / 2
 
     def of_point(line, pixel, X):
-        numbers, _, (P, V) = sample(search.pieces, image.times.time(line))
-        pose = Pose(jnp.stack(P), numbers[:9].reshape(3, 3).T, jnp.stack(V))
-        hit = ground_point(pose, image.optics.slopes(pixel), surface, image.corrections)
-        gap = difference(X, hit)
+        _, _, (P, _) = sample(search.pieces, image.times.time(line))
+        gap = difference(X, _located(image, search, surface, line, pixel))
         return (dot(gap, difference(X, P)) > 0) & (length(gap) > half)
 
     of_row = lambda args: jax.vmap(of_point)(*args)
@@ -139,14 +169,19 @@ def _level(surface):
 
 @jax.jit
 def _places(image, search, surface, nodes, starts):
+    ground = _ground(surface, nodes)
+    return *project_from(image, search, tuple(ground), *_spread(starts)), ground
+
+
+def _ground(surface, nodes):
+    """The points of all pixels, [3, BLOCK, BLOCK]."""
     X, vertical = _spread(nodes.X), _spread(nodes.up)
     if isinstance(surface, Terrain):
         x, y, _ = surface.grid(tuple(nodes.X))
         height = bilinear(surface.heights, *_spread(jnp.stack([x, y])))
     else:
         height = _level(surface)
-    ground = X + height * vertical
-    return *project_from(image, search, tuple(ground), *_spread(starts)), ground
+    return X + height * vertical
 
 
 def _spread(nodes):

@@ -2,9 +2,11 @@
 
 | switch | what | size from 500 to 800 km |
 |---|---|---|
-| `light_time` | the Earth turns while light travels, by Ω·ρ/c | 0.8 to 1.3 m at the equator |
+| `light_time` | the Earth turns while light travels, by Ω·ρ/c | 0.8 to 1.2 m (equator) |
 | `aberration` | the moving camera sees light c·l coming along c·l + v | 13 to 20 m (v/c·ρ) |
-| `refraction` | layers of air bend the ray, n₁·sin i₁ = n₂·sin i₂ | 0.05 m at 5°, 2 m at 50° |
+| `refraction` | layers of air bend the ray, n₁·sin i₁ = n₂·sin i₂ | 0.3 m |
+
+5° off the nadir; at 50° 1.3 to 2.1 m, 21 to 34 m, 12 to 18 m.
 
 They belong to a product and cannot be guessed: the quaternions of one provider contain the
 aberration, those of another do not. All three mean Earth-fixed positions.

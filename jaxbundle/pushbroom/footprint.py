@@ -25,7 +25,8 @@ from jaxbundle.geometry.vectors import along, difference
 
 from .newton import motion
 from .passages import ahead, slopes
-from .pieces import CHUNK, Pieces, value, value_and_rate
+from .pieces import CHUNK, Pieces
+from .polynomial import value, value_and_rate
 from .surfaces import Ground, Plane
 
 HEIGHTS = -1000.0, 10_000.0

@@ -14,9 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_rotation_vector
+from jaxbundle.network.tables import Source
 
-from .ancillary import check_covered
+from .ancillary import ATTITUDE, POSITIONS, check_covered
 from .corrections import Corrections
 from .scanner import LineTimes, Optics
 from .trajectory import (
@@ -26,6 +28,9 @@ from .trajectory import (
     rotation_at,
     velocity_at,
 )
+
+LONGEST = 10_000_000
+"""More lines or pixels than any image has."""
 
 
 class Offsets(eqx.Module):
@@ -81,19 +86,33 @@ def make_image(
     pixels: int,
     mounting: Float[Array, "3"] | None = None,
     corrections: Corrections = Corrections(),  # noqa: B008
+    sources: tuple[Source, Source] = (POSITIONS, ATTITUDE),
 ) -> PushbroomImage:
     """An image whose tables reach over all its lines.
 
-    **Raises:** `InputError` that names the line at a time outside a table or in a gap.
+    **Arguments:** `sources` name the tables of positions and attitude in messages.
+
+    **Raises:** `InputError` that names the line at a time outside a table or in a gap; for a size
+    that no image has.
     """
+    check_size(lines, pixels, "image")
     mounting = jnp.zeros(3) if mounting is None else jnp.asarray(mounting, float)
     image = PushbroomImage(
         trajectory, times, optics, mounting, no_offsets(), corrections, int(lines), int(pixels)
     )
     when = np.asarray(times.time(jnp.arange(lines, dtype=float)))
-    check_covered(trajectory.position, when, "positions")
-    check_covered(trajectory.attitude.table, when, "attitude")
+    for table, source in zip((trajectory.position, trajectory.attitude.table), sources):
+        check_covered(table, when, source)
     return image
+
+
+def check_size(lines: float, pixels: float, where: str) -> None:
+    """Refuse a size of an image that is not whole, below 2, or more than any has."""
+    for size, name in ((lines, "lines"), (pixels, "pixels")):
+        if not 2 <= size <= LONGEST or size != int(size):
+            raise InputError(
+                f"{where}: {size:.15g} {name}; a whole number from 2 to {LONGEST} is expected"
+            )
 
 
 def pose_at(image: PushbroomImage, t: Float[Array, ""]) -> Pose:

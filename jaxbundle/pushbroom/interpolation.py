@@ -10,7 +10,7 @@ Between the rows i and i + 1, with τ = (t − tᵢ)/(tᵢ₊₁ − tᵢ) and �
 
 with h₀₁ = τ²(3 − 2τ), h₀₀ = 1 − h₀₁, h₁₀ = τ(1 − τ)², h₁₁ = −τ²(1 − τ). Times need not be evenly
 spaced. Nothing is extrapolated: outside the table, and in a step longer than `gap`, the value is
-NaN.
+NaN; splines end there.
 """
 
 from typing import Literal, get_args
@@ -52,7 +52,7 @@ def interpolate(table: Table, t: Float[Array, ""]) -> Float[Array, " k"]:
         case "hermite":
             value = _hermite(table, table.rates, i, t)
         case "spline":
-            value = _hermite(table, spline_rates(table.times, table.values), i, t)
+            value = _hermite(table, spline_rates(table.times, table.values, table.gap), i, t)
         case _:
             raise ValueError(f"Unknown interpolation {table.method!r}; known: {METHODS}")
     return jnp.where(covers(table, i, t), value, jnp.nan)
@@ -88,22 +88,54 @@ def breaks(table: Table) -> Float[np.ndarray, " rows"]:
 
 
 def spline_rates(
-    times: Float[Array, " rows"], values: Float[Array, "rows k"]
+    times: Float[Array, " rows"], values: Float[Array, "rows k"], gap: float = np.inf
 ) -> Float[Array, "rows k"]:
-    """The rates at the rows of the cubic spline that is not-a-knot at both ends; rows ≥ 4."""
+    """The rates at the rows of the cubic spline that is not-a-knot at both ends.
+
+    On each side of a step longer than `gap` a spline of its own ends, so that nothing beyond it has
+    a part; of three rows it is a parabola, of two a straight line.
+    """
     step = jnp.diff(times)
     slope = jnp.diff(values, axis=0) / step[:, None]
-    ends = times[2] - times[0], times[-1] - times[-3]
-    first = ((step[0] + 2 * ends[0]) * step[1] * slope[0] + step[0] ** 2 * slope[1]) / ends[0]
-    last = ((step[-1] + 2 * ends[1]) * step[-2] * slope[-1] + step[-1] ** 2 * slope[-2]) / ends[1]
-    inner = 3 * (step[1:, None] * slope[:-1] + step[:-1, None] * slope[1:])
-    zero = jnp.zeros(1)
-    return tridiagonal_solve(
-        jnp.concatenate([zero, step[1:], ends[1][None]]),
-        jnp.concatenate([step[1:2], 2 * (step[:-1] + step[1:]), step[-2:-1]]),
-        jnp.concatenate([ends[0][None], step[:-1], zero]),
-        jnp.concatenate([first[None], inner, last[None]]),
+    ends = jnp.concatenate([jnp.array([True]), step > gap, jnp.array([True])])
+    forward = _end_rows(step, slope, ends[:-1], ends[1:])
+    # seen from behind, steps and slopes keep their signs
+    back = _end_rows(step[::-1], slope[::-1], ends[:0:-1], ends[-2::-1])
+    back = tuple(v[::-1] for v in back)
+    zero, nothing = jnp.zeros(1), jnp.zeros((1, values.shape[1]))
+    before, after = jnp.concatenate([zero, step]), jnp.concatenate([step, zero])
+    inner = 3 * (
+        after[:, None] * jnp.concatenate([nothing, slope])
+        + before[:, None] * jnp.concatenate([slope, nothing])
     )
+    first, last = ends[:-1], ends[1:]
+    choose = lambda at_first, at_last, within: jnp.where(
+        first, at_first, jnp.where(last, at_last, within)
+    )
+    right = jnp.where(first[:, None], forward[2], jnp.where(last[:, None], back[2], inner))
+    return tridiagonal_solve(
+        choose(0.0, back[1], after), choose(forward[0], back[0], 2 * (before + after)),
+        choose(forward[1], 0.0, before), right,
+    )  # fmt: skip
+
+
+def _end_rows(step, slope, first, last):
+    """Diagonal, coefficient of the next rate and right side of each row, were it the first one.
+
+    `first` and `last` tell where a spline begins and ends: not-a-knot needs four rows.
+    """
+    pad = lambda v, by: jnp.concatenate([v[by:], jnp.ones((1 + by, *v.shape[1:]))])
+    h0, h1, s0, s1 = pad(step, 0), pad(step, 1), pad(slope, 0), pad(slope, 1)
+    both = h0 + h1
+    knot = (((h0 + 2 * both) * h1)[:, None] * s0 + (h0**2)[:, None] * s1) / both[:, None]
+    parabola = s0 - (h0 / both)[:, None] * (s1 - s0)
+    ending = lambda by: jnp.concatenate([last[by:], jnp.ones(by, bool)])
+    two, three = ending(1), ending(2)
+    short = last | two | three
+    right = jnp.where(last[:, None], 0.0, jnp.where(
+        two[:, None], s0, jnp.where(three[:, None], parabola, knot)
+    ))  # fmt: skip
+    return jnp.where(short, 1.0, h1), jnp.where(short, 0.0, both), right
 
 
 def _linear(table, i, t):

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxbundle.geometry.vectors import difference
 
 from .corrections import seen_point
-from .pieces import value, value_and_rate
+from .polynomial import value, value_and_rate
 
 STEPS = 2
 """Steps of a round."""

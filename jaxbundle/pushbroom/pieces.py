@@ -84,22 +84,6 @@ def make_pieces(image: PushbroomImage, earth: Ellipsoid | None) -> Pieces:
     )
 
 
-def value(coefficients, tau):
-    """A polynomial (Horner)."""
-    total = coefficients[-1]
-    for c in coefficients[-2::-1]:
-        total = total * tau + c
-    return total
-
-
-def value_and_rate(coefficients, tau):
-    """A polynomial and its derivative (Horner)."""
-    total, rate = coefficients[-1], jnp.zeros_like(tau)
-    for c in coefficients[-2::-1]:
-        total, rate = total * tau + c, rate * tau + total
-    return total, rate
-
-
 def _numbers(image, origin, left, right, span):
     """The twelve numbers at nodes and checks of many pieces: [n, 4, 12] and [n, 5, 12]."""
     places = np.r_[NODES, CHECKS]

@@ -89,7 +89,7 @@ def fit_bias(
     `ground_sigma` of the points east, north, up, metres (none if None); `source` names rows.
 
     **Raises:** `InputError` for an unknown model, too few points, points on one line, what is not a
-    number.
+    number, and points or measurements outside the domain of the coefficients.
     """
     if model not in MODELS:
         raise InputError(f"unknown bias {model!r}; 'shift' or 'affine' is expected")
@@ -109,6 +109,7 @@ def fit_bias(
             f"{source(int(bad.argmax()))}: the coefficients have no image of this point; look at "
             "longitude, latitude, height and their order"
         )
+    _check_domain(rpc, control, source)
     terms = np.asarray(_terms(rpc, computed[:, 0], computed[:, 1])).T[:, :k]
     singular = np.linalg.svd(terms, compute_uv=False)
     if singular[-1] < DETERMINED * singular[0]:
@@ -165,6 +166,30 @@ def compensated(rpc: Rpc, bias: Bias) -> tuple[Rpc, RpcCheck | None]:
     table = RpcTable(*(np.asarray(column)[inside] for column in columns))
     fitted = fit_rpc(table).rpc
     return fitted, check_rpc(fitted, table)
+
+
+def _check_domain(rpc, control, source):
+    """Refuse what the coefficients were not made for: another place, another image, swapped."""
+    longitude, latitude, height, line, sample = control
+    axes = (
+        ("longitude", np.degrees(longitude), "°", "look at coordinates and their order"),
+        ("latitude", np.degrees(latitude), "°", "look at coordinates and their order"),
+        ("height", height, " m", "heights are above the ellipsoid"),
+        ("line", line, "", "look at the measurement, and that the file is of this image"),
+        ("sample", sample, "", "look at the measurement, and that the file is of this image"),
+    )
+    for name, values, unit, remedy in axes:
+        centre, scale = (float(getattr(rpc, f"{name}_{part}")) for part in ("offset", "scale"))
+        away = values - centre
+        if name == "longitude":
+            away = away - 360 * np.round(away / 360)
+        outside = np.abs(away) > (1 + MARGIN) * abs(scale)
+        if outside.any():
+            row, reach = int(outside.argmax()), (1 + MARGIN) * abs(scale)
+            raise InputError(
+                f"{source(row)}: {name} {values[row]:.9g}{unit} is outside the domain of the "
+                f"coefficients, {centre - reach:.9g} to {centre + reach:.9g}{unit}; {remedy}"
+            )
 
 
 def _terms(rpc, line, sample):

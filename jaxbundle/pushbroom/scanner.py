@@ -19,6 +19,8 @@ from jaxtyping import Array, Float
 
 from jaxbundle.cameras import get_model, image_ray
 
+from .polynomial import value
+
 Pair = tuple[Array, Array]
 
 
@@ -93,7 +95,8 @@ class AnglePolynomial(Optics):
 
     def slopes(self, u: Float[Array, ""]) -> Pair:
         x = (u - self.middle) / self.half
-        return _polynomial(self.across, x), _polynomial(self.along, x)
+        zero = jnp.zeros_like(x)  # a constant has the shape of x too
+        return zero + value(self.across, x), zero + value(self.along, x)
 
 
 def slopes_of(optics: Optics, pixels: Float[Array, " n"]) -> tuple[Array, Array]:
@@ -106,10 +109,3 @@ def _at(values, place):
     i = jnp.clip(jnp.floor(place).astype(int), 0, len(values) - 2)
     part = place - i
     return (1 - part) * values[i] + part * values[i + 1]
-
-
-def _polynomial(coefficients, x):
-    value = jnp.zeros_like(x)
-    for c in coefficients[::-1]:
-        value = value * x + c
-    return value

@@ -22,6 +22,7 @@ from .frames import circular_orbit
 from .image import PushbroomImage, make_image
 from .locate import locate_lines
 from .noise import Noise, disturbed, draw, sigmas
+from .orbit import state_orbit
 from .resample import Resampling, resample
 from .scanner import LineTimes, Optics
 from .signals import signal
@@ -40,6 +41,7 @@ class Flight:
 
     - `lines`, `pixels`, `period`, `optics`, `mounting`: the scanner.
     - `track`: `{"height", "inclination", "node", "argument"}` of a circular orbit, or
+      `{"state", "at", "j2"}` of one Earth-fixed state vector (`orbit`), or
       `{"start", "velocity"}` of a straight line in a local frame.
     - `angles`: signals of pitch, roll, yaw, in the orbital frame or the local one.
     - `position_rate`, `attitude_rate`: of the instruments, in Hz; `noise`: their errors.
@@ -145,6 +147,9 @@ def _position(flight, rate, method):
         start, velocity = (np.asarray(track[k], float) for k in ("start", "velocity"))
         return position_table(t, start + t[:, None] * velocity, np.tile(velocity, (len(t), 1)),
                               method="linear")  # fmt: skip
+    if "state" in track:
+        state = np.asarray(track.pop("state"), float)
+        return position_table(t, *state_orbit(t, state[:3], state[3:], **track), method=method)
     if "height" not in track:
         raise InputError("track: give height, inclination, … of an orbit, or start and velocity")
     P, V = circular_orbit(t, **track)

@@ -11,6 +11,12 @@ is a parabola too, and its first root, where there is one, is the first hit: nei
 ridge nor a peak between two samples is ever taken or passed. One Newton step on the exact
 coordinates puts the point on ray and surface, and carries the derivatives.
 
+Where the model has no height, beyond its edges too, a ray goes on: the sea, or what was cut away,
+is seldom higher than what is behind it. A ray that comes out of such a place below the terrain has
+met the ground in it, and has no point. One that comes out above is taken to its hit, which unknown
+terrain could hide all the same: `over_voids=False` lets no ray pass, and the difference tells which
+points stand on that.
+
 The grid is regular in longitude and latitude (`earth` an ellipsoid of revolution, heights above
 it), or in X and Y of a local frame (`earth` None).
 """
@@ -28,6 +34,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, at_height, geodetic, ray_to_ellipsoid
 from jaxbundle.geometry.vectors import Scalar, Vector, along
 
+from .polynomial import value, value_and_rate
 from .surfaces import Surface
 
 MARGIN = 1.0
@@ -38,8 +45,8 @@ more than the 6e-6·h by which an ellipsoid with longer axes leaves the surface 
 class Terrain(Surface):
     """Heights at (x, y) = (x₀ + column·dx, y₀ + row·dy): radians, or metres in a local frame.
 
-    NaN: no height there. A ray that meets such a cell, or leaves the grid, before it hits, has no
-    point.
+    NaN: no height there. A ray that would hit in such a cell, or beyond the grid, has no point;
+    with `over_voids` false neither has one that passes over such a cell before it hits.
     """
 
     iterative: ClassVar[bool] = True
@@ -49,11 +56,12 @@ class Terrain(Surface):
     lowest: float
     highest: float
     earth: Ellipsoid | None = eqx.field(static=True, default=WGS84)
+    over_voids: bool = eqx.field(static=True, default=True)
 
     def distance(self, o: Vector, d: Vector) -> Scalar:
         top, bottom = self._slab(o, d)
         path = self._path(*stop_gradient((o, d, top, bottom)))
-        tau = _first_hit(path, self.heights)
+        tau = _first_hit(path, self.heights, self.over_voids)
         s = stop_gradient(top + tau * (bottom - top))
         x, y, h = self.grid(along(o, d, s))
         slope = _rate(path, tau, self.heights) / stop_gradient(bottom - top)
@@ -90,8 +98,12 @@ def make_terrain(
     origin: tuple[float, float],
     step: tuple[float, float],
     earth: Ellipsoid | None = WGS84,
+    over_voids: bool = True,
 ) -> Terrain:
     """A terrain model of heights in metres, the first at `origin`, columns and rows `step` apart.
+
+    **Arguments:** `over_voids`: rays pass over cells without a height, and come from beyond the
+    edges.
 
     **Raises:** `InputError` for fewer than 2 × 2 heights, or none that is a number.
     """
@@ -103,8 +115,9 @@ def make_terrain(
     low, high = float(np.nanmin(heights)), float(np.nanmax(heights))
     heights = np.where(np.isfinite(heights), heights, np.nan)
     return Terrain(
-        jnp.asarray(heights), tuple(map(float, origin)), tuple(map(float, step)), low, high, earth
-    )
+        jnp.asarray(heights), tuple(map(float, origin)), tuple(map(float, step)), low, high, earth,
+        over_voids,
+    )  # fmt: skip
 
 
 def bilinear(heights: Float[Array, "rows columns"], x: Scalar, y: Scalar) -> Scalar:
@@ -129,15 +142,9 @@ def _in_cell(cell, x, y):
     return (1 - v) * ((1 - u) * z00 + u * z01) + v * ((1 - u) * z10 + u * z11)
 
 
-def _parabola(coefficients, tau):
-    a, b, c = coefficients
-    return a + tau * (b + tau * c)
-
-
 def _rate(path, tau, heights):
     """∂(h − bilinear)/∂τ."""
-    x, y, h = (_parabola(p, tau) for p in path)
-    dx, dy, dh = (b + 2 * tau * c for _, b, c in path)
+    (x, dx), (y, dy), (h, dh) = (value_and_rate(p, tau) for p in path)
     x0, y0, (z00, z01, z10, z11) = _cell(heights, jnp.floor(x), jnp.floor(y))
     u, v = x - x0, y - y0
     along_x = (1 - v) * (z01 - z00) + v * (z11 - z10)
@@ -145,40 +152,61 @@ def _rate(path, tau, heights):
     return dh - along_x * dx - along_y * dy
 
 
-def _first_hit(path, heights):
+def _first_hit(path, heights, over_voids):
     """τ in [0, 1] of the first hit, cell by cell; NaN where there is none."""
+    rows, columns = heights.shape
     px, py, ph = path
     speed = jnp.abs(px[1]) + jnp.abs(py[1])
     least = 1e-9 / jnp.maximum(speed, 1.0)  # a billionth of a cell: the traverse never stands still
 
     def border(p, tau):
         """Where the coordinate reaches the next line of the grid."""
-        a, b, c = p
-        value, rate = a + tau * (b + tau * c), b + 2 * tau * c
-        target = jnp.where(rate > 0, jnp.floor(value) + 1, jnp.ceil(value) - 1)
-        step = (target - value) / jnp.where(rate == 0, 1, rate)
+        at, rate = value_and_rate(p, tau)
+        target = jnp.where(rate > 0, jnp.floor(at) + 1, jnp.ceil(at) - 1)
+        step = (target - at) / jnp.where(rate == 0, 1, rate)
         return jnp.where(rate == 0, jnp.inf, tau + step)
 
     def step(state):
-        tau, hit, _ = state
-        out = jnp.minimum(jnp.minimum(border(px, tau), border(py, tau)), 1.0)
-        out = jnp.maximum(out, tau + least)
+        tau, hit, void, _ = state
+        out = jnp.clip(jnp.minimum(border(px, tau), border(py, tau)), tau + least, 1.0)
         middle = (tau + out) / 2
-        cell = _cell(heights, jnp.floor(_parabola(px, middle)), jnp.floor(_parabola(py, middle)))
+        x, y = value(px, middle), value(py, middle)
+        cell = _cell(heights, jnp.floor(x), jnp.floor(y))
         f = [
-            _parabola(ph, t) - _in_cell(cell, _parabola(px, t), _parabola(py, t))
-            for t in (tau, middle, out)
+            value(ph, t) - _in_cell(cell, value(px, t), value(py, t)) for t in (tau, middle, out)
         ]
         part = _first_root(*f)
-        hit = tau + part * (out - tau)
-        # without a height (NaN) the ray ends here, and has no point
-        done = (part <= 1) | jnp.isnan(f[1]) | (out >= 1)
-        return out, jnp.where(part <= 1, hit, jnp.nan), done
+        # below the terrain where heights begin again: it was met where there are none
+        under = void & (f[0] < 0)
+        void = jnp.isnan(f[1])
+        found = (part <= 1) & ~under
+        done = found | under | (out >= 1) | _leaves(px, x, columns) | _leaves(py, y, rows)
+        if not over_voids:
+            done = done | void
+        return out, jnp.where(found, tau + part * (out - tau), jnp.nan), void, done
 
-    start = jnp.zeros_like(speed)
-    lost = jnp.isnan(speed)
-    _, hit, _ = jax.lax.while_loop(lambda s: ~s[2], step, (start, start * jnp.nan, lost))
-    return hit
+    start = jnp.maximum(_entry(px, columns), _entry(py, rows))
+    lost = jnp.isnan(speed) | ~(start < 1)
+    if not over_voids:
+        lost = lost | (start > 0)
+    state = start, jnp.full_like(speed, jnp.nan), start > 0, lost
+    return jax.lax.while_loop(lambda s: ~s[3], step, state)[1]
+
+
+def _leaves(p, x, size):
+    """Whether a coordinate is off the grid and does not come back."""
+    return jnp.where(p[1] > 0, x > size - 1, x < 0)
+
+
+def _entry(p, size):
+    """τ where a coordinate comes to the grid, 0 if it is there at first, ∞ if it never is."""
+    target = jnp.where(p[0] < 0, 0.0, size - 1.0)
+    tau = jnp.zeros_like(p[0])
+    for _ in range(3):
+        at, rate = value_and_rate(p, tau)
+        tau = tau + (target - at) / jnp.where(rate == 0, jnp.nan, rate)
+    outside = (p[0] < 0) | (p[0] > size - 1)
+    return jnp.where(outside, jnp.where(tau > 0, tau, jnp.inf), 0.0)
 
 
 def _first_root(f0, fm, f1):

@@ -30,6 +30,7 @@ from jaxbundle.refinement.equations import (
     compiled_rescaled,
 )
 from jaxbundle.refinement.freedom import Form, Name, make_form, names, of_sensor, priors
+from jaxbundle.refinement.spline import FEWEST
 from jaxbundle.refinement.tables import (
     GroundPoints,
     ScannerImage,
@@ -37,6 +38,8 @@ from jaxbundle.refinement.tables import (
     check_points_table,
 )
 
+KNOTS = 10
+"""Knots of jitter with a prior, for each measured point: what is between points only costs."""
 FAR = 2.0
 """A control point farther from its measurement than this many images is in another place."""
 
@@ -291,6 +294,24 @@ def check_input(
             raise InputError(f"image {one.id!r}: knot_spacing must be positive, in seconds")
     check_points_table(points)
     check_observations(images, points, observations)
+    for i, one in enumerate(images):
+        _check_knots(one, int((observations.image == i).sum()))
+
+
+def _check_knots(one: ScannerImage, measured: int) -> None:
+    """Refuse a jitter with more knots than its points could tell of."""
+    free = np.isinf(one.freedom.jitter).any()
+    if not any(one.freedom.jitter):
+        return
+    span = float(one.image.times.time(float(one.image.lines)) - one.image.times.time(0.0))
+    most = max(measured if free else KNOTS * measured, FEWEST)
+    knots = span / one.freedom.knot_spacing
+    if knots > most + 1:
+        raise InputError(
+            f"image {one.id!r}: knot_spacing = {one.freedom.knot_spacing:g} s makes {knots:.0f} "
+            f"knots in {span:.4g} s, with {measured} measured points; give {span / most:.3g} s at "
+            f"least{', or the jitter a prior σ' if free else ''}"
+        )
 
 
 def check_near(

@@ -124,10 +124,13 @@ def adjust(system: System, start: Unknowns, weak: Weak) -> Inspection:
     reduced, v = normal(system, unknowns)
     if not np.isfinite(np.asarray(reduced.lower)).all() or redundancy < 0:
         reasons = weak(system, found.unknowns)
+        told = reasons[0] if reasons else "more unknowns than observations"
+        if reasons[1:]:
+            told += f", and {len(reasons) - 1} more directions"
         raise NotSolvedError(
-            "the adjustment is singular: " + ("; ".join(reasons) or "more unknowns than "
-            "observations") + ". Hold some of these, give them a prior σ, or add points.", reasons,
-        )  # fmt: skip
+            f"the adjustment is singular: {told}; hold some, give them a prior σ, or add points",
+            reasons,
+        )
     if not bool(found.settled):
         raise NotSolvedError(
             f"the adjustment did not settle in {steps} steps; look at start values and "

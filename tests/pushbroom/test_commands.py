@@ -74,7 +74,6 @@ def write_scene(path):
     return path
 
 
-@pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
 def test_from_a_flight_to_a_map(tmp_path, flight, run):
     scene, out = write_scene(tmp_path / "scene.tif"), tmp_path / "out"
     status, said, _ = run("simulate", flight, "--out", out, "--scene", scene)
@@ -83,8 +82,11 @@ def test_from_a_flight_to_a_map(tmp_path, flight, run):
     assert names == {"scanner.toml", "positions.csv", "attitude.csv", "truth", "image.tif"}
     truth = out / "truth" / "scanner.toml"
     assert 'angle_unit = "deg"' in truth.read_text()
-    status, said, err = run("correct", truth, out / "image.tif", "--out", tmp_path / "map.tif",
-                            "--spacing", 0.5, "--resampling", "cubic")  # fmt: skip
+    status, said_of_map, err = run(
+        "correct", truth, out / "image.tif", "--out", tmp_path / "map.tif", "--spacing", 0.5,
+        "--resampling", "cubic", "--truth", out / "scanner.toml",
+        "--error-map", tmp_path / "errors_of_map.tif",
+    )  # fmt: skip
     assert status == 0, err
     with rasterio.open(tmp_path / "map.tif") as result:
         found, t = result.read(), result.transform
@@ -95,13 +97,31 @@ def test_from_a_flight_to_a_map(tmp_path, flight, run):
     within = binary_erosion(shown, iterations=4)
     assert shown.mean() > 0.4
     assert np.abs(found - pattern(x, y))[:, within].max() < 0.1
-    status, said, _ = run("accuracy", out / "scanner.toml", "--truth", truth, "--json", "-")
+    status, said, _ = run("accuracy", out / "scanner.toml", "--truth", truth, "--json", "-",
+                          "--map", tmp_path / "errors.tif")  # fmt: skip
     told = json.loads(said)
+    with rasterio.open(tmp_path / "errors.tif") as raster:
+        places = raster.read(3)
+        assert raster.descriptions == ("east [m]", "north [m]", "error [m]")
+        assert raster.xy(10, 0) == (0.0, 127.0)
+    np.testing.assert_allclose(places.ravel(), [r["error"] for r in told["rows"]], rtol=1e-6)
     # one draw of a bias of 0.05° about three axes, 800 m above the ground
     assert status == 0 and 0.05 < told["rms"] < 4
     assert len(told["rows"]) == 121 and {"east", "north", "error"} <= set(told["rows"][0])
+    # the truth stands in for what is judged: one image to compile
+    with rasterio.open(tmp_path / "errors_of_map.tif") as raster:
+        east, north, length = raster.read()
+        assert raster.transform == t
+    np.testing.assert_array_equal(np.isfinite(length), shown)
+    np.testing.assert_allclose(length, np.hypot(east, north), rtol=1e-5)
+    # the same errors as at the places of the image, which are spread otherwise
+    assert abs(length[shown].mean() / places.mean() - 1) < 0.02
+    assert length[shown].min() > 0.9 * places.min() and length[shown].max() < 1.1 * places.max()
+    rms = float(said_of_map.split("RMS")[1].split()[0])
+    assert rms == pytest.approx(np.sqrt(np.mean(length[shown] ** 2)), rel=1e-4)
     status, said, _ = run("accuracy", truth, "--attitude-bias", 0.05, "--draws", 900, "--json", "-",
-                          "--grid", "3x3")  # fmt: skip
+                          "--grid", "3x3", "--map", tmp_path / "rms.png")  # fmt: skip
+    assert (tmp_path / "rms.png").read_bytes()[:4] == b"\x89PNG"
     told = json.loads(said)
     assert status == 0 and abs(told["drawn_rms"] / told["rms"] - 1) < 0.08
     assert abs(told["rms"] / (800 * np.radians(0.05) * np.sqrt(2)) - 1) < 0.05
@@ -125,11 +145,16 @@ def test_what_is_refused(tmp_path, flight, run):
     scanner = tmp_path / "out" / "scanner.toml"
     for arguments, words in [
         (["accuracy", scanner], ["no σ", "--attitude-white"]),
+        (["accuracy", flight, "--table", "bias", "--draws", 1], ["--draws 1", "20 at least"]),
+        (["accuracy", scanner, "--map", "a.jpg"], ["a.jpg", ".tif or .png"]),
+        (["correct", scanner, tmp_path / "no.tif", "--out", tmp_path / "m.tif", "--truth",
+          scanner], ["--truth", "--error-map", "both"]),
         (["correct", scanner, tmp_path / "no.tif", "--out", tmp_path / "m.tif"], ["no.tif"]),
         (["correct", scanner, tmp_path / "no.tif", "--out", tmp_path / "m.tif", "--crs",
           "EPSG:4326"], ["local frame"]),
         (["correct", scanner, tmp_path / "no.tif", "--out", tmp_path / "m.tif", "--resampling",
           "best"], ["best", "bilinear"]),
+        (["correct", scanner, tmp_path / "no.tif", "--out", tmp_path], ["is a folder", "map.tif"]),
     ]:  # fmt: skip
         status, said, err = run(*arguments)
         assert status == 2 and len(err.splitlines()) == 1

@@ -207,6 +207,12 @@ BROKEN = {
     "no focal length": (
         lambda isd: isd.pop("focal_length_model"), ["focal_length is missing"],
     ),
+    "fraction": (changed("image_lines", 15.7), ["image_lines", "15.7", "whole"]),
+    "endless": (changed("image_lines", 1e15), ["image_lines", "10000000"]),
+    "focal length": (changed("focal_length_model.focal_length", 0), ["focal_length is 0"]),
+    "constant": (
+        changed("body_rotation.constant_rotation", [0.0] * 9), ["body_rotation", "no rotation"],
+    ),
     "text": (changed("image_lines", "many"), ["image_lines", "'many'", "number"]),
     "shape": (changed("focal2pixel_lines", [0.0, 1.0]), ["focal2pixel_lines", "array 3"]),
     "dependent": (changed("focal2pixel_lines", [0.0, 0.0, 1.0]), ["dependent"]),
@@ -243,7 +249,10 @@ def test_what_is_refused(tmp_path, isd, case):
 
 
 def test_what_is_no_json(tmp_path):
-    for text, word in (("{", "not valid JSON"), ("[]", "object")):
+    with pytest.raises(InputError, match="isd.json: no such file"):
+        read_csm(tmp_path / "isd.json")
+    deep = 100_000 * '{"a":'
+    for text, word in (("{", "not valid JSON"), ("[]", "object"), (deep, "isd.json: .* deeply")):
         (tmp_path / "isd.json").write_text(text)
         with pytest.raises(InputError, match=word):
             read_csm(tmp_path / "isd.json")

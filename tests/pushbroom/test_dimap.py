@@ -98,7 +98,7 @@ REFUSED = {
     "time": ("<TIME>2008-03-04T12:29", "<TIME>yesterday", ["Point 1, TIME", "yesterday"]),
     "order": ("<TIME>2008-03-04T12:29:03", "<TIME>2008-03-04T12:39:03", ["point 2", "sort"]),
     "no xml": ("</Dimap_Document>", "", ["not valid XML"]),
-    "late": ("<NROWS>600", "<NROWS>700", ["attitude: line", "outside the table"]),
+    "late": ("<NROWS>600", "<NROWS>700", ["Corrected_Attitude: image line 609", "outside"]),
 }
 
 

@@ -27,6 +27,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import ellipsoid as el
 from jaxbundle.pushbroom.corrections import (
+    BORDERS,
     INDICES,
     Corrections,
     earlier_earth,
@@ -35,8 +36,8 @@ from jaxbundle.pushbroom.corrections import (
     seen_point,
     true_direction,
 )
-from jaxbundle.pushbroom.frames import EARTH_RATE
-from jaxbundle.pushbroom.image import make_image, pose_at
+from jaxbundle.pushbroom.frames import EARTH_RATE, GM
+from jaxbundle.pushbroom.image import Pose, make_image, pose_at
 from jaxbundle.pushbroom.locate import ground_point, locate_points
 from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable, LineTimes, slopes_of
 from jaxbundle.pushbroom.surfaces import Ground, Height, Plane
@@ -136,7 +137,7 @@ def test_times_of_lines():
 
 def test_an_image_longer_than_its_tables_is_refused():
     image = satellite()
-    with pytest.raises(InputError, match="attitude: line 810 .* outside the table"):
+    with pytest.raises(InputError, match="attitude: image line 810 .* outside the table"):
         make_image(image.trajectory, image.times, image.optics, 1000, PIXELS)
 
 
@@ -178,8 +179,8 @@ def test_refraction_keeps_the_invariant_of_bouguer():
 
 
 @partial(jax.jit, static_argnums=1)
-def sight(pose, corrections):
-    return ground_point(pose, (0.3, 0.1), Ground(), corrections)
+def sight(pose, corrections, slopes=(0.3, 0.1)):
+    return ground_point(pose, slopes, Ground(), corrections)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -201,6 +202,32 @@ def test_size_and_inverse_of_corrections(name, least, most):
     sights = [np.array(X) - pose.P for X in (seen, plain)]
     a, b = (sight / np.linalg.norm(sight) for sight in sights)
     assert np.linalg.norm(np.cross(a, b)) * 6e5 < 1e-7
+
+
+@pytest.mark.parametrize("off_nadir, light, aberration, refraction", [
+    (5, (0.78, 1.25), (12.7, 20.0), (0.26, 0.27)), (30, (0.91, 1.47), (14.8, 23.5), (2.4, 2.8)),
+    (50, (1.28, 2.15), (21.0, 34.5), (12.5, 17.9)),
+])  # fmt: skip
+def test_sizes_off_the_nadir(off_nadir, light, aberration, refraction):
+    """The table of docs/pushbroom.md, from 500 and 800 km above the equator, looking east.
+
+    In layers over a plane refraction moves the ground by Σ(n − 1)·Δh·tan z/cos² z.
+    """
+    slopes = np.tan(np.radians(off_nadir)), 0.0
+    for k, h in enumerate((500e3, 800e3)):
+        P = np.array([el.WGS84.a + h, 0, 0])
+        V = np.array([0, 0, np.sqrt(GM / P[0])])
+        pose = Pose(P, np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]]), V)
+        at = lambda *c, pose=pose: np.array(sight(pose, Corrections(*map(bool, c)), slopes))
+        plain = at(0, 0, 0)
+        d = (plain - P) / np.linalg.norm(plain - P)
+        cosine = -d @ plain / np.linalg.norm(plain)
+        air = np.sum((INDICES[1:-1] - 1) * -np.diff(BORDERS))
+        expected = air * np.sqrt(1 - cosine**2) / cosine**3
+        sizes = [np.linalg.norm(at(*c) - plain) for c in np.eye(3)]
+        np.testing.assert_allclose(sizes[2], expected, rtol=0.02)
+        told = light[k], aberration[k], refraction[k]
+        np.testing.assert_allclose(sizes, told, rtol=0.08)
 
 
 def test_derivatives_by_every_parameter():

@@ -36,7 +36,12 @@ EARTH = Ellipsoid(A, A, A * (1 - F))
 PERIOD, LINES = 0.005, np.array([0.0, 100.0, 517.0, 1000.0])
 XI, ETA = np.linspace(-0.02, 0.02, 9), 0.001
 POSITIONS, TURNS = np.arange(-10.0, 16.0), np.arange(-2.0, 8.0, 0.1)
-CASES = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1)]
+NEAR, OBLIQUE = 0.05, 0.87
+"""Roll, radians: 3° and 50° off the nadir, where refraction is 60 times as large."""
+CASES = [
+    (0, 0, 0, NEAR), (1, 0, 0, NEAR), (0, 1, 0, NEAR), (0, 0, 1, NEAR), (1, 1, 1, NEAR),
+    (0, 0, 1, OBLIQUE), (1, 1, 1, OBLIQUE),
+]  # fmt: skip
 locate = jax.jit(locate_lines)
 
 
@@ -50,15 +55,15 @@ def inertial_orbit(t):
     return spin(t).apply(P), spin(t).apply(V + np.cross([0, 0, EARTH_RATE], P))
 
 
-def inertial_attitude(t):
-    wobble = np.stack([1e-4 * np.sin(t), 0.05 + 1e-4 * np.cos(0.7 * t), 0 * t + 0.2], 1)
+def inertial_attitude(t, roll):
+    wobble = np.stack([1e-4 * np.sin(t), roll + 1e-4 * np.cos(0.7 * t), 0 * t + 0.2], 1)
     frame = np.asarray(jax.vmap(orbital_frame)(*inertial_orbit(t)))
     return Rotation.from_matrix(frame) * Rotation.from_euler("XYZ", wobble)
 
 
-def our_image(corrections):
+def our_image(corrections, roll):
     P, _ = turn_positions(spin(POSITIONS).inv().as_matrix(), *inertial_orbit(POSITIONS))
-    q = np.roll(inertial_attitude(TURNS).as_quat(), 1, axis=1)
+    q = np.roll(inertial_attitude(TURNS, roll).as_quat(), 1, axis=1)
     q = turn_quaternions(spin(TURNS).inv().as_matrix(), q)
     attitude = attitude_table(TURNS, q, method="lagrange", order=5)
     optics = AnglePolynomial(
@@ -71,14 +76,14 @@ def our_image(corrections):
     )  # fmt: skip
 
 
-def ours(corrections, surface):
-    X = locate(our_image(corrections), surface, LINES, jnp.arange(len(XI)) * 1.0)
+def ours(corrections, surface, roll=NEAR):
+    X = locate(our_image(corrections, roll), surface, LINES, jnp.arange(len(XI)) * 1.0)
     return np.moveaxis(np.asarray(X), 0, -1)
 
 
 @pytest.fixture(scope="module")
 def rugged():
-    """A function of (corrections, terrain or None) that gives Rugged's points."""
+    """A function of (corrections, roll, terrain or None) that gives Rugged's points."""
     orekit_jpype.initVM()
     import jpype
     from java.util import ArrayList
@@ -125,14 +130,14 @@ def rugged():
         TimeStampedPVCoordinates(at(t), vector(p), vector(v))
         for t, p, v in zip(POSITIONS, *inertial_orbit(POSITIONS))
     )
-    turns = listed(
-        TimeStampedAngularCoordinates(
-            at(t), Turn(jpype.JArray(real, 2)(m.T.tolist()), 1e-9), Vector3D.ZERO, Vector3D.ZERO
-        )
-        for t, m in zip(TURNS, inertial_attitude(TURNS).as_matrix())
-    )
 
-    def located(corrections, terrain=None):
+    def located(corrections, roll=NEAR, terrain=None):
+        turns = listed(
+            TimeStampedAngularCoordinates(
+                at(t), Turn(jpype.JArray(real, 2)(m.T.tolist()), 1e-9), Vector3D.ZERO, Vector3D.ZERO
+            )
+            for t, m in zip(TURNS, inertial_attitude(TURNS, roll).as_matrix())
+        )
         light, aberration, refraction = map(bool, corrections)
         builder = RuggedBuilder()
         if terrain is None:
@@ -171,9 +176,11 @@ def rugged():
     return located
 
 
-@pytest.mark.parametrize("corrections", CASES)
-def test_on_the_ellipsoid(rugged, corrections):
-    np.testing.assert_allclose(ours(corrections, Ground(EARTH)), rugged(corrections), atol=1e-6)
+@pytest.mark.parametrize("case", CASES)
+def test_on_the_ellipsoid(rugged, case):
+    *corrections, roll = case
+    found, expected = ours(corrections, Ground(EARTH), roll), rugged(corrections, roll)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_on_rough_terrain(rugged):
@@ -186,5 +193,5 @@ def test_on_rough_terrain(rugged):
     shape = (int((np.ptp(latitude)) / step) + 40, int(np.ptp(longitude) / step) + 40)
     z = 500 + 200 * np.random.default_rng(4).normal(size=shape)
     terrain = make_terrain(z, (x0, y0), (step, step), EARTH)
-    expected = rugged((0, 0, 0), ((x0, y0), (step, step), z))
+    expected = rugged((0, 0, 0), NEAR, ((x0, y0), (step, step), z))
     np.testing.assert_allclose(ours((0, 0, 0), terrain), expected, atol=1e-3)

@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import sys
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -14,10 +15,12 @@ from scanner_files import TEXT, write_scanner
 from jaxbundle import cli
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import ellipsoid as el
+from jaxbundle.io.extent import Extent, image_extent
 from jaxbundle.io.rasters import read_terrain
 from jaxbundle.io.scanner import read_scanner
 from jaxbundle.pushbroom.frames import EarthOrientation, to_earth, turn_quaternions
 from jaxbundle.pushbroom.surfaces import Ground
+from jaxbundle.pushbroom.terrain import bilinear
 
 PLACES = np.linspace(0, LINES - 1, 8), np.linspace(0, PIXELS - 1, 5)
 EPOCH = "2016-06-22T04:00:12.25"
@@ -69,7 +72,10 @@ BROKEN = {
     "no principal distance": ("c = 700.0", "", ["[optics]", "c is missing"]),
     "negative period": ("period = ", "period = -", ["[times]", "positive"]),
     "not a number": ("lines = 600", 'lines = "many"', ["[scanner]", "lines is 'many'"]),
-    "too short": ("lines = 600", "lines = 900", ["attitude", "line 810", "outside the table"]),
+    "too short": ("lines = 600", "lines = 900", ["attitude.csv: image line 810", "outside"]),
+    "too long": ("lines = 600", "lines = 1000000000000000", ["[scanner]", "10000000"]),
+    "gap": ('ude.csv"', 'ude.csv"\ngap = 0.05', ["attitude.csv, line 13: image line 0", "0.1 s"]),
+    "no gap": ('ude.csv"', 'ude.csv"\ngap = -1', ["[attitude]", "gap is -1", "positive"]),
     "local frame": ('ions.csv"', 'ions.csv"\nframe = "local"', ["[position]", 'earth = "local"']),
     "interpolation": ('ude.csv"', 'ude.csv"\ninterpolation = "slurp"', ["did you mean 'slerp'"]),
     "angles": ("yaw", "jaw", ["[mounting]", "'jaw'", "'yaw'"]),
@@ -123,13 +129,19 @@ def test_there_and_back_by_the_commands(tmp_path, monkeypatch, capsys):
     rows = list(csv.DictReader(io.StringIO(ground.read_text())))
     assert [row["id"] for row in rows] == ["a", "b"]
     assert all(abs(float(row["height"]) - 200) < 1e-6 for row in rows)
-    for names in (("X", "Y", "Z"), ("longitude", "latitude", "height")):
-        text = "\n".join(",".join(row[n] for n in ("id", *names)) for row in rows)
-        (tmp_path / "points.csv").write_text(",".join(("id", *names)) + "\n" + text + "\n")
-        status, out, _ = run(
+    # the last table is what `locate` itself writes, a row without a point in it
+    whole = tuple(rows[0])
+    missed = {"id": "c", "line": "3", "pixel": "3", "status": "no terrain there"}
+    for names in (("id", "X", "Y", "Z"), ("id", "longitude", "latitude", "height"), whole):
+        lines = [",".join(row.get(n, "") for n in names) for row in rows]
+        if names is whole:
+            lines.insert(1, ",".join(missed.get(n, "") for n in names))
+        (tmp_path / "points.csv").write_text(",".join(names) + "\n" + "\n".join(lines) + "\n")
+        status, out, err = run(
             monkeypatch, capsys, "project", scanner, "--points", tmp_path / "points.csv",
             "--json", "-",
         )  # fmt: skip
+        assert ("points.csv, line 3: no point" in err) == (names is whole)
         found = json.loads(out)["rows"]
         assert status == 0 and [row["count"] for row in found] == [1, 1]
         np.testing.assert_allclose([row["line"] for row in found], [10.25, 599], atol=1e-6)
@@ -140,6 +152,9 @@ def test_what_the_commands_refuse(tmp_path, monkeypatch, capsys):
     scanner = write_scanner(tmp_path)
     off, gone = tmp_path / "off.csv", tmp_path / "gone.csv"
     off.write_text("line,pixel\n1,2\n3,400\n")
+    north, lon = tmp_path / "north.csv", tmp_path / "lon.csv"
+    north.write_text("longitude,latitude,height\n1,2,3\n1,95,3\n")
+    lon.write_text("lon,lat,height\n1,2,3\n")
     gone.write_text("X,Y,Z\n6378137,0,0\n6378137,0,1\n")  # as many as there and back
     cases = [
         (["locate", scanner, "--points", off], ["off.csv, line 3", "pixel 400", "399.5"]),
@@ -147,6 +162,9 @@ def test_what_the_commands_refuse(tmp_path, monkeypatch, capsys):
         (["locate", scanner, "--height", "7e6", "--grid", "1x2"], ["misses the surface", "2 of 2"]),
         (["project", scanner, "--points", gone], ["gone.csv, line 2", "not", "in the image"]),
         (["project", scanner, "--points", tmp_path / "none.csv"], ["none.csv", "no such file"]),
+        (["project", scanner, "--points", north], ["north.csv, line 3", "latitude 95", "90°"]),
+        (["project", scanner, "--points", lon], ["lon.csv", "X, Y, Z", "longitude"]),
+        (["locate", scanner, "--height", "nan"], ["--height nan", "finite"]),
     ]
     for arguments, words in cases:
         status, out, err = run(monkeypatch, capsys, *arguments)
@@ -183,7 +201,16 @@ def test_terrain_rasters(tmp_path, monkeypatch, capsys):
     elsewhere = write_raster(tmp_path / "far.tif", slope, "EPSG:4326", (0.01, 0, 170, 0, -0.01, 0))
     status, out, err = run(monkeypatch, capsys, "locate", scanner, "--dem", elsewhere,
                            "--grid", "3x3")  # fmt: skip
-    assert status == 2 and "no terrain" in err and "covers the image" in err
+    assert status == 2 and "far.tif" in err and "covers the image" in err
+    # only what the image can see is read, though its longitudes be a turn away
+    file = read_scanner(scanner)
+    extent = image_extent(file.image, file.earth)
+    turned = extent._replace(west=extent.west + 360, east=extent.east + 360)
+    whole, cut = (read_terrain(path, el.WGS84, part) for part in (None, turned))
+    assert cut.heights.size < 0.9 * whole.heights.size
+    np.testing.assert_allclose(
+        *(locate(file.image, t, *PLACES) for t in (whole, cut)), atol=1e-6
+    )
     bare = write_raster(tmp_path / "bare.tif", slope, None, (0.01, 0, 0, 0, -0.01, 0))
     with pytest.raises(InputError, match="no coordinate system"):
         read_terrain(bare, el.WGS84)
@@ -195,3 +222,53 @@ def test_terrain_rasters(tmp_path, monkeypatch, capsys):
     heights = np.asarray(terrain.heights)
     assert np.allclose(heights[np.isfinite(heights)], 250) and terrain.step[1] < 0
     assert abs(np.degrees(terrain.origin[1]) - 49.65) < 0.01
+
+
+def test_ground_behind_a_place_without_height(tmp_path, monkeypatch, capsys):
+    """Flat land seen obliquely over a sea without height, and a high mountain elsewhere."""
+    mounting = TEXT[TEXT.index("[mounting]") :]
+    scanner = write_scanner(tmp_path, TEXT.replace(mounting, "[mounting]\nroll = 40.0\n"))
+    file = read_scanner(scanner)
+    X = locate(file.image, Ground(), *PLACES)
+    camera = np.array(file.image.trajectory.position.values)[:1].T
+    longitude, latitude, _ = (np.degrees(v) for v in geodetic(tuple(X)))
+    beneath = float(np.degrees(geodetic(tuple(camera))[0])[0])
+    west, north = float(longitude.min()) - 0.05, float(latitude.max()) + 0.05
+    size = int((latitude.max() - latitude.min() + 0.1) / 0.01), int(np.ptp(longitude) / 0.01 + 10)
+    column = np.tile(np.arange(size[1]) + 0.5, (size[0], 1))
+    middle = (float(longitude.mean()) - west) / 0.01
+    sea = (column < middle) == (beneath < longitude.mean())
+    heights = np.where(sea, -9999, 100.0)
+    heights[0, 0 if sea[0, -1] else -1] = 4000.0
+    transform = 0.01, 0, west, 0, -0.01, north
+    path = write_raster(tmp_path / "dem.tif", heights, "EPSG:4326", transform)
+    status, out, err = run(monkeypatch, capsys, "locate", scanner, "--dem", path, "--grid", "3x31")
+    rows = list(csv.DictReader(io.StringIO(out)))
+    assert status == 0 and "dem.tif" in err
+    for row in rows:
+        if row["status"] != "no terrain there":
+            assert abs(float(row["height"]) - 100) < 1e-6
+            # rays come down from 4000 m at about 45°
+            shore = abs(float(row["longitude"]) - west - 0.01 * middle) * 111
+            assert shore < 7 if "without height" in row["status"] else shore > 2
+    counted = Counter(row["status"] for row in rows)
+    assert min(counted.values()) >= 3 and len(counted) == 3
+
+
+def test_terrain_across_180(tmp_path):
+    """The seam of a model of the whole Earth, and a projected model that lies across."""
+    row, column = np.mgrid[:180, :360]
+    heights = np.sin(np.radians(column + 0.5)) * 100 + row
+    path = write_raster(tmp_path / "all.tif", heights, "EPSG:4326", (1, 0, -180, 0, -1, 90))
+    for west in (177.0, -183.0):
+        cut = read_terrain(path, el.WGS84, Extent(west, 10.0, west + 5, 14.0))
+        assert cut.heights.shape[1] < 15
+        place = el.earth_fixed(el.WGS84, (np.radians(180.0), np.radians(12.5), 0.0))
+        x, y, _ = cut.grid(place)
+        assert float(bilinear(cut.heights, x, y)) == pytest.approx(77, abs=1e-9)
+    utm = write_raster(tmp_path / "utm.tif", np.full((60, 50), 250.0), "EPSG:32601",
+                       (800, 0, 143753, 0, -800, 66422))  # fmt: skip
+    heights = np.asarray(read_terrain(utm, el.WGS84).heights)
+    assert heights.size < 2 * 60 * 50 and np.nanmax(np.abs(heights - 250)) < 1e-6
+    with pytest.raises(InputError, match="utm.tif: the model has .* the image looks at .*covers"):
+        read_terrain(utm, el.WGS84, Extent(10.0, 10.0, 12.0, 12.0))

@@ -11,6 +11,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import binary_erosion
 
 from jaxbundle.errors import InputError
+from jaxbundle.io import correction
 from jaxbundle.io.correction import map_of, write_corrected
 from jaxbundle.io.maps import MapGrid, MapSystem
 from jaxbundle.pushbroom.correct import BLOCK, STEP, block_places
@@ -18,7 +19,7 @@ from jaxbundle.pushbroom.noise import Noise
 from jaxbundle.pushbroom.project import make_search, project_points
 from jaxbundle.pushbroom.signals import signal
 from jaxbundle.pushbroom.simulate import Flight, measured_image, taken_image, true_image
-from jaxbundle.pushbroom.surfaces import Ground
+from jaxbundle.pushbroom.surfaces import Ground, Plane
 from jaxbundle.pushbroom.terrain import make_terrain
 
 DEGREE = np.pi / 180
@@ -83,7 +84,6 @@ def write_image(path, bands, dtype="float32"):
     return path
 
 
-@pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
 def test_a_corrected_image_is_the_scene(tmp_path):
     """Of a terrain; of a plane in test_commands."""
     truth = true_image(AIRCRAFT)
@@ -150,7 +150,6 @@ def test_terrain_that_hides_terrain():
     np.testing.assert_array_equal(seen.line[places], all_.line[places])
 
 
-@pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
 def test_a_satellite_image_in_utm(tmp_path):
     """Whole numbers, georeferenced; the map shows what the truth locates."""
     flight = dataclasses.replace(
@@ -179,6 +178,29 @@ def test_a_satellite_image_in_utm(tmp_path):
         write_corrected(source, tmp_path / "x.tif", true_image(SATELLITE), None, None, None, None)
     with pytest.raises(InputError, match="EPSG:999999"):
         MapSystem(Ground().earth, "EPSG:999999")
+
+
+def test_a_coarse_map_is_made_in_parts(tmp_path, monkeypatch):
+    """No part of the image is larger than allowed; the map is the same as made at once."""
+    image, rng = true_image(AIRCRAFT), np.random.default_rng(8)
+    source = write_image(tmp_path / "image.tif", rng.uniform(0, 200, (2, 128, 128)))
+    system, search, plane = MapSystem(None, None), make_search(image, None), Plane()
+    grid, maps, windows = map_of(image, plane, system, 8.0), [], []
+    part = correction._parts
+    monkeypatch.setattr(correction, "_parts", lambda *args: [
+        windows.append([b - a for a, b in window]) or (where, window)
+        for where, window in part(*args)
+    ])  # fmt: skip
+    for most in (correction.WINDOW, 6000):
+        monkeypatch.setattr(correction, "WINDOW", most)
+        windows.clear()
+        target = tmp_path / f"{most}.tif"
+        write_corrected(source, target, image, search, plane, system, grid)
+        with rasterio.open(target) as result:
+            maps.append(result.read())
+    assert np.prod(windows, axis=1).max() <= 3000 and len(windows) > 8
+    assert np.isfinite(maps[0]).sum() > 200
+    np.testing.assert_array_equal(*maps)
 
 
 def test_a_rough_trajectory_leaves_no_holes():

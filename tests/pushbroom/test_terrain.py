@@ -79,6 +79,38 @@ def test_no_height_no_point():
     assert np.isnan(distance(terrain, o, -d)).all()
 
 
+def test_ground_is_found_over_voids():
+    """Rays from beyond the grid, over a void, into it; strict; what the void may have hidden.
+
+    Towers without height in them: the rays are those of the whole field, hits in voids and behind
+    what they hid excepted.
+    """
+    z = needles()
+    z[:, 30:] += 40
+    voids = z.copy()
+    voids[5:25, 8:20] = np.nan
+    voids[:, 30] = np.nan
+    o, d = rays()
+    o[:, ::3] -= 0.97 * 800 / d[2, ::3] * -d[:, ::3]  # these begin low, beyond the edge or inside
+    whole, passing, strict = (
+        make_terrain(heights, (0.0, 0.0), (CELL, CELL), None, over)
+        for heights, over in ((z, True), (voids, True), (voids, False))
+    )
+    s, over, ends = (np.array(distance(terrain, o, d)) for terrain in (whole, passing, strict))
+    X = o + s * d
+    cell = np.clip(np.nan_to_num(X[1::-1] // CELL).astype(int), 0, [[ROWS - 2], [COLUMNS - 2]])
+    corners = [voids[cell[0] + i, cell[1] + j] for i in (0, 1) for j in (0, 1)]
+    known = np.isfinite(s) & np.isfinite(np.sum(corners, 0))
+    np.testing.assert_allclose(over[known], s[known], atol=1e-9)
+    hidden = np.isfinite(s) & ~known & np.isfinite(over)
+    assert (over[hidden] > s[hidden]).all() and hidden.sum() < 0.2 * N
+    assert (np.isfinite(s) & ~known & np.isnan(over)).sum() > 10
+    # without a pass a ray ends at the first void: nothing is found that was not, and less
+    found = np.isfinite(ends)
+    np.testing.assert_allclose(ends[found], s[found], atol=1e-9)
+    assert (known & ~found).sum() > 10
+
+
 IMAGE = satellite()
 PLACES = np.linspace(0, LINES - 1, 4), np.linspace(0, PIXELS - 1, 4)
 SIZE = 500, 400

@@ -91,16 +91,33 @@ def test_nothing_is_extrapolated(name):
     assert np.isnan(at(table_of(name), np.r_[ends, BETWEEN][: len(BETWEEN)])[:2]).all()
 
 
+POSITIONS = Source("positions.csv", 10 + np.arange(20) + (np.arange(20) > 4) * 2, "line")
+
+
 def test_gaps_are_not_bridged():
     keep = np.r_[0:5, 11]
     table = position_table(TIMES[keep], VALUES[keep], method="linear", gap=3)
     inside, before = TIMES[8], TIMES[3] + 0.1
     found = at(table, np.r_[inside, before, BETWEEN][: len(BETWEEN)])
     assert np.isnan(found[0]).all() and np.isfinite(found[1]).all()
-    with pytest.raises(InputError, match="gap of .* between rows 5 and 6"):
-        check_covered(table, [before, inside], "positions.csv")
+    with pytest.raises(InputError, match="positions.csv, line 17: image line 1 .* in the gap"):
+        check_covered(table, [before, inside], POSITIONS)
     wide = position_table(TIMES[keep], VALUES[keep], method="linear", gap=100)
-    check_covered(wide, [before, inside], "positions.csv")
+    check_covered(wide, [before, inside], POSITIONS)
+
+
+@pytest.mark.parametrize("rows", [(0, 4, 12), (0, 5, 8, 12), (0, 2, 7, 12), (0, 1, 12)])
+def test_splines_end_at_gaps(rows):
+    """Against scipy's splines of the rows between gaps: of two a line, of three a parabola."""
+    runs = list(zip(rows, rows[1:]))
+    t = TIMES + 50.0 * np.repeat(np.arange(len(runs)), np.diff(rows))
+    table = position_table(t, VALUES, method="spline", gap=10)
+    for first, last in runs:
+        if last - first > 1:
+            inside = np.linspace(t[first], t[last - 1], len(BETWEEN), endpoint=False)
+            own = CubicSpline(t[first:last], VALUES[first:last])
+            np.testing.assert_allclose(at(table, inside), own(inside), rtol=1e-12, atol=1e-10)
+    assert np.isnan(at(table, np.full(len(BETWEEN), t[rows[1]] - 1.0))).all()
 
 
 ROTATIONS = Rotation.from_euler(
@@ -190,5 +207,5 @@ def test_bad_tables_are_refused_with_their_row(make, words):
 
 
 def test_times_outside_are_refused():
-    with pytest.raises(InputError, match="line 1 is at .* outside the table"):
-        check_covered(table_of("linear"), [TIMES[2], TIMES[-1] + 1], "positions.csv")
+    with pytest.raises(InputError, match="positions.csv: image line 1 is at .* outside the table"):
+        check_covered(table_of("linear"), [TIMES[2], TIMES[-1] + 1], POSITIONS)

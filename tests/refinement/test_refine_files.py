@@ -170,6 +170,19 @@ def test_wrong_settings_are_told_with_file_and_key(folder, old, new, message):
     assert ".toml" in str(error.value)
 
 
+@pytest.mark.parametrize("old,new,message", [
+    ("0.25", "0.001", r"'A': knot_spacing = 0.001 s makes 3000 .* 3 s, with 40 .*0.0075 s"),
+    ('0.00222222222222, "held"]\nknot_spacing = 0.25', '"free", "held"]\nknot_spacing = 0.05',
+     "60 knots .* give 0.075 s at least, or the jitter a prior"),
+])  # fmt: skip
+def test_more_knots_than_points_can_tell_of(folder, old, new, message):
+    assert old in TEXT
+    (folder / "refine.toml").write_text(TEXT.replace(old, new))
+    file = read_refinement(folder / "refine.toml")
+    with pytest.raises(InputError, match=message):
+        refine(file.images, file.points, file.observations)
+
+
 def test_a_line_outside_the_tables_is_told_with_its_time(folder):
     """The table reaches over all lines, but not to the lower edge of the last."""
     table = read_csv(folder / "A_attitude.csv")

@@ -20,12 +20,17 @@ from jaxbundle.cli.pushbroom.app import (
 )
 from jaxbundle.cli.pushbroom.locate import places
 from jaxbundle.errors import InputError
+from jaxbundle.io.error_maps import write_image_raster
 from jaxbundle.io.scanner import read_scanner
+from jaxbundle.plotting import image_map
+from jaxbundle.plotting.files import write_figures
 from jaxbundle.pushbroom.accuracy import drawn, ground_errors, propagated
 from jaxbundle.pushbroom.noise import Noise
 from jaxbundle.pushbroom.terrain import Terrain
 
 Sigma = Annotated[float, typer.Option(min=0, help="standard deviation: degrees, metres, a second")]
+
+FEWEST_DRAWS = 20
 
 
 @pushbroom.command()
@@ -45,6 +50,10 @@ def accuracy(
         str, typer.Option(help="bias or white: the table of a flight file, given as SCANNER")
     ] = "",
     levels: Annotated[str, typer.Option(help="accuracies of that table, degrees")] = "0.01,0.1",
+    map_: Annotated[
+        Path | None,
+        typer.Option("--map", help="the error over the image: .tif (all columns), .png (a figure)"),
+    ] = None,
     height: Level = None,
     dem: Dem = None,
     csv: Csv = None,
@@ -52,13 +61,20 @@ def accuracy(
 ) -> None:
     """RMS and CE90 on the ground of errors with given σ; or the errors against a known truth."""
     jaxbundle.enable_x64()
+    if 0 < draws < FEWEST_DRAWS:
+        raise InputError(
+            f"--draws {draws}: an RMS of so few says nothing; {FEWEST_DRAWS} at least, 1000 are "
+            "good to 3 %"
+        )
+    if map_ is not None:
+        _check_map(map_, table)
     if table:
         if dem is not None:
             raise InputError("--dem: with --table give --height; a terrain has no reverse mode")
         write_table(table_of(scanner, table, levels, draws, seed, height), csv, json)
         return
     file = read_scanner(scanner)
-    surface = surface_of(file.earth, height, dem)
+    surface = surface_of(file.earth, height, dem, file.image)
     _, line, pixel, _ = places(file.image, None, grid)
     columns = {"line": line, "pixel": pixel}
     if truth is not None:
@@ -86,6 +102,37 @@ def accuracy(
             head |= {
                 "drawn_rms": counted.overall, "drawn_ce90": counted.overall_ce90, "draws": draws
             }  # fmt: skip
+    if map_ is not None:
+        _write_map(map_, columns, head)
     write_rows(columns, csv, json, {"scanner": file.name, **head})
     if json != "-":
         typer.echo("; ".join(f"{k} {v:.6g}" for k, v in head.items()), err=True)
+
+
+def _check_map(path: Path, table: str) -> None:
+    if table:
+        raise InputError("--map: a map is of one image; leave --table away")
+    if path.suffix.lower() not in (".tif", ".tiff", ".png"):
+        raise InputError(f"--map {path}: a name that ends in .tif or .png is expected")
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"--map {path}: there is no folder {path.parent}")
+
+
+def _write_map(path: Path, columns: dict[str, np.ndarray], head: dict) -> None:
+    """All columns as bands; or the RMS, or the error, as a figure."""
+    lines, pixels = (np.unique(columns[name]) for name in ("line", "pixel"))
+    bands = {
+        f"{name} [m]": values.reshape(len(lines), len(pixels))
+        for name, values in columns.items() if name not in ("line", "pixel")
+    }  # fmt: skip
+    if path.suffix.lower() != ".png":
+        write_image_raster(path, lines, pixels, bands)
+        return
+    name = "error" if "error" in columns else "rms"
+    told = f"RMS {head['rms']:.3g} m, CE90 {head['ce90']:.3g} m"
+    title = "Error on the ground" if name == "error" else "RMS on the ground"
+    draw = lambda ax: image_map(lines, pixels, bands[f"{name} [m]"], title, "m", told, ax)
+    try:
+        write_figures(path.parent, {path.stem: ((7.5, 6), None, draw)})
+    except ImportError as error:
+        raise InputError(str(error)) from None

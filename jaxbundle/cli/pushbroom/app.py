@@ -12,9 +12,13 @@ from jaxbundle.cli.app import app
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.csv_tables import write_csv, write_text
+from jaxbundle.io.extent import image_extent, rpc_extent
 from jaxbundle.io.rasters import read_terrain
 from jaxbundle.io.result_json import without_nan
+from jaxbundle.network.columns import Columns
+from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.resample import RESAMPLINGS
+from jaxbundle.pushbroom.rpc import Rpc
 from jaxbundle.pushbroom.surfaces import Ground, Height, Plane, Surface
 
 pushbroom = typer.Typer(
@@ -32,13 +36,28 @@ Csv = Annotated[Path | None, typer.Option(help="file for the table; - or none: s
 Json = Annotated[str, typer.Option(help="the table as JSON instead; - for standard output")]
 
 
-def surface_of(earth: Ellipsoid | None, height: float | None, dem: Path | None) -> Surface:
-    """The surface that the options name: the ellipsoid (or Z = 0) if none."""
+def surface_of(
+    earth: Ellipsoid | None,
+    height: float | None,
+    dem: Path | None,
+    image: PushbroomImage | Rpc | None = None,
+) -> Surface:
+    """The surface that the options name: the ellipsoid (or Z = 0) if none.
+
+    Of a terrain model of an Earth what the image can see is read.
+    """
+    if height is not None and not np.isfinite(height):
+        raise InputError(f"--height {height}: a finite number is expected, in metres")
     if dem is not None:
         if height is not None:
             raise InputError("--height and --dem: give one of them")
         check_spheroid(earth)
-        return read_terrain(dem, earth)
+        extent = None
+        if isinstance(image, Rpc):
+            extent = rpc_extent(image)
+        elif image is not None and earth is not None:
+            extent = image_extent(image, earth)
+        return read_terrain(dem, earth, extent)
     if earth is None:
         return Plane(height or 0.0)
     if height is None:
@@ -60,6 +79,23 @@ def check_spheroid(earth: Ellipsoid | None) -> None:
             "heights, longitude and latitude need an ellipsoid of revolution; make the first two "
             "axes of [scanner] earth equal"
         )
+
+
+def geographic(table: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Columns longitude, latitude (degrees), height as radians and metres.
+
+    **Raises:** `InputError` with the row of an angle that is none of a place.
+    """
+    names = "longitude", "latitude", "height"
+    longitude, latitude, height = (table.numbers(name, required=True) for name in names)
+    for name, values, most in ((names[0], longitude, 360), (names[1], latitude, 90)):
+        if (beyond := ~(np.abs(values) <= most)).any():
+            row = int(beyond.argmax())
+            raise InputError(
+                f"{table.source(row)}: {name} {values[row]:g} is beyond {most}°; degrees are "
+                "expected, look at the order of columns"
+            )
+    return np.radians(longitude), np.radians(latitude), height
 
 
 def write_rows(

@@ -18,8 +18,10 @@ from jaxbundle.cli.pushbroom.app import (
 )
 from jaxbundle.errors import InputError
 from jaxbundle.io.correction import map_of, write_corrected
+from jaxbundle.io.error_maps import write_error_map
 from jaxbundle.io.maps import MapSystem
-from jaxbundle.io.scanner import read_scanner
+from jaxbundle.io.scanner import Scanner, read_scanner
+from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.project import make_search
 
 
@@ -38,6 +40,12 @@ def correct(
     occlusion: Annotated[
         bool, typer.Option("--occlusion", help="leave out what other terrain of --dem hides")
     ] = False,
+    truth: Annotated[
+        Path | None, typer.Option(help="scanner file of the truth, for --error-map")
+    ] = None,
+    error_map: Annotated[
+        Path | None, typer.Option(help="GeoTIFF of the errors of the map: east, north, length")
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Correct an image to a map, in blocks."""
@@ -45,22 +53,61 @@ def correct(
     check_resampling(resampling)
     if spacing is not None and not spacing > 0:
         raise InputError(f"--spacing {spacing:g}: a positive number is expected")
-    if not out.absolute().parent.is_dir():
-        raise InputError(f"--out {out}: there is no folder {out.parent}")
-    if out.exists() and out.samefile(image):
-        raise InputError(f"--out {out} is the image itself; give another name")
+    if (truth is None) != (error_map is None):
+        raise InputError("--truth and --error-map: give both, or none")
+    _check_target("--out", out, image)
+    if error_map is not None:
+        _check_target("--error-map", error_map, image)
+        if error_map.absolute() == out.absolute():
+            raise InputError(f"--error-map {error_map} is --out as well; give another name")
     if occlusion and dem is None:
         raise InputError("--occlusion: only terrain hides terrain; give --dem")
     file = read_scanner(scanner)
-    surface = surface_of(file.earth, height, dem)
+    surface = surface_of(file.earth, height, dem, file.image)
     system = MapSystem(file.earth, crs)
-    grid = map_of(file.image, surface, system, spacing)
+    grid = map_of(file.image, surface, system, spacing, dem)
+    search = make_search(file.image, file.earth)
+    if truth is not None:
+        true = _truth(truth, file)
     with counting(quiet) as bar:
         task = bar.add_task("blocks", total=None)
         write_corrected(
-            image, out, file.image, make_search(file.image, file.earth), surface, system, grid,
-            resampling, lambda done, total: bar.update(task, completed=done, total=total),
-            occlusion,
+            image, out, file.image, search, surface, system, grid, resampling,
+            lambda done, total: bar.update(task, completed=done, total=total), occlusion,
         )  # fmt: skip
+        if truth is not None:
+            task = bar.add_task("errors", total=None)
+            rms = write_error_map(
+                error_map, file.image, search, true, make_search(true, file.earth), surface, system,
+                grid, lambda done, total: bar.update(task, completed=done, total=total),
+            )  # fmt: skip
     if not quiet:
         print(f"{out}: {grid.rows} × {grid.columns} pixels of {grid.size:g}")
+        if truth is not None:
+            print(f"{error_map}: RMS {rms:.6g} m against {truth}")
+
+
+def _check_target(option: str, path: Path, image: Path) -> None:
+    """Refuse what cannot be written, before anything is computed."""
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"{option} {path}: there is no folder {path.parent}")
+    if path.is_dir():
+        raise InputError(
+            f"{option} {path} is a folder; name a file in it, such as {path / 'map.tif'}"
+        )
+    if path.exists() and path.samefile(image):
+        raise InputError(f"{option} {path} is the image itself; give another name")
+
+
+def _truth(path: Path, file: Scanner) -> PushbroomImage:
+    """The true image, which must be one of the same scene."""
+    truth = read_scanner(path)
+    if truth.earth != file.earth:
+        raise InputError(f"--truth {path}: its earth is not that of the scanner file")
+    size, own = ((i.lines, i.pixels) for i in (truth.image, file.image))
+    if size != own:
+        raise InputError(
+            f"--truth {path}: {size[0]} lines of {size[1]} pixels, the scanner file has {own[0]} "
+            f"of {own[1]}"
+        )
+    return truth.image

@@ -1,5 +1,6 @@
 """`jaxbundle pushbroom locate`: from the image to the ground."""
 
+import dataclasses
 from pathlib import Path
 from typing import Annotated
 
@@ -26,6 +27,11 @@ from jaxbundle.io.scanner import read_scanner
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.locate import locate_points
+from jaxbundle.pushbroom.terrain import Terrain
+
+OVER = "found beyond a place without height"
+TOLD = ("id", "X", "Y", "Z", "longitude", "latitude", "height", "count", "status")
+"""What `locate` and `project` write beside line and pixel: their tables are taken as they are."""
 
 
 @pushbroom.command()
@@ -43,15 +49,21 @@ def locate(
     """Where on the ground places of the image are; (0, 0) is the centre of the first pixel."""
     jaxbundle.enable_x64()
     file = read_scanner(scanner)
-    surface = surface_of(file.earth, height, dem)
+    surface = surface_of(file.earth, height, dem, file.image)
     ids, line, pixel, source = places(file.image, points, grid)
-    X = np.array(jax.jit(locate_points)(file.image, surface, line, pixel))
+    find = jax.jit(locate_points)
+    X = np.array(find(file.image, surface, line, pixel))
     missed = np.isnan(X).any(0)
+    over = np.zeros_like(missed)
+    if isinstance(surface, Terrain):
+        strict = dataclasses.replace(surface, over_voids=False)
+        over = ~missed & np.isnan(np.array(find(file.image, strict, line, pixel))).any(0)
     reason = "no terrain there" if dem else "misses the surface"
     if missed.any():
         row = int(missed.argmax())
         remedy = (
-            "give a model that covers the image" if dem else "look at attitude, mounting and height"
+            f"give a model that covers the image instead of {dem}" if dem
+            else "look at attitude, mounting and height"
         )
         said = (
             f"{source(row)}: the ray of line {line[row]:g}, pixel {pixel[row]:g}: {reason}; "
@@ -66,7 +78,7 @@ def locate(
         longitude, latitude, h = (np.asarray(v) for v in jax.jit(geodetic)(file.earth, tuple(X)))
         columns |= {"longitude": np.degrees(longitude), "latitude": np.degrees(latitude)}
         columns |= {"height": h}
-    columns["status"] = ["found" if not m else reason for m in missed]
+    columns["status"] = [reason if m else OVER if o else "found" for m, o in zip(missed, over)]
     write_rows(columns, csv, json, {"scanner": file.name})
 
 
@@ -83,7 +95,7 @@ def places(image: PushbroomImage, points: Path | None, grid: str):
         pixels = np.tile(np.linspace(0, image.pixels - 1, columns), rows)
         return (), lines, pixels, Source("grid", None, "place")
     table = read_csv(points)
-    table.check_names(("line", "pixel"), ("id",))
+    table.check_names(("line", "pixel"), TOLD)
     line, pixel = (table.numbers(name, required=True) for name in ("line", "pixel"))
     for name, values, size in (("line", line, image.lines), ("pixel", pixel, image.pixels)):
         outside = ~((values >= -0.5) & (values <= size - 0.5))

@@ -13,6 +13,7 @@ from jaxbundle.cli.pushbroom.app import (
     Json,
     Level,
     check_spheroid,
+    geographic,
     pushbroom,
     surface_of,
     warn,
@@ -36,6 +37,9 @@ GROUND_SIGMA = ("seast", "snorth", "sheight")
 TERMS = ("shift", "by_line", "by_sample")
 
 RpcFile = Annotated[Path, typer.Argument(help="coefficients: _RPC.TXT, .RPB, or a tagged GeoTIFF")]
+Figures = Annotated[
+    str, typer.Option(help="the figures and every point as JSON; - for standard output")
+]
 Out = Annotated[Path, typer.Option(help="file for the coefficients: .txt, .rpb, an existing .tif")]
 
 
@@ -49,7 +53,7 @@ def fit(
         str, typer.Option(help="LOW:HIGH of the ground, metres above the ellipsoid")
     ] = "0:3000",
     ridge: Annotated[float | None, typer.Option(min=0, help="ridge, chosen if not given")] = None,
-    json: Json = "",
+    json: Figures = "",
 ) -> None:
     """Fit coefficients to a scanner, or to a table; tell what they leave, in pixels."""
     jaxbundle.enable_x64()
@@ -96,16 +100,14 @@ def apply(
     if "line" in table.values:
         table.check_names(("line", "sample"), ("id",))
         place = [table.numbers(name, required=True) for name in ("line", "sample")]
-        surface = surface_of(WGS84, height, dem)
+        surface = surface_of(WGS84, height, dem, given)
         east, north, h, status = map(np.asarray, locate_points_on(given, surface, *place))
         columns = dict(zip(COLUMNS, (np.degrees(east), np.degrees(north), h, *place)))
     else:
         table.check_names(COLUMNS[:3], ("id",))
-        east, north, h = (table.numbers(name, required=True) for name in COLUMNS[:3])
-        line, sample, status = map(
-            np.asarray, project_points(given, np.radians(east), np.radians(north), h)
-        )
-        columns = dict(zip(COLUMNS, (east, north, h, line, sample)))
+        place = geographic(table)
+        line, sample, status = map(np.asarray, project_points(given, *place))
+        columns = dict(zip(COLUMNS, (*np.degrees(place[:2]), place[2], line, sample)))
     if (bad := status != RpcStatus.INSIDE).any():
         row = int(bad.argmax())
         said = (
@@ -132,7 +134,7 @@ def compensate(
     model: Annotated[str, typer.Option(help="shift or affine, in the image")] = "shift",
     sigma: Annotated[float, typer.Option(help="σ of measured lines and samples, pixels")] = 1.0,
     csv: Csv = None,
-    json: Json = "",
+    json: Figures = "",
 ) -> None:
     """Remove the bias that control points tell of; residuals, redundancy numbers and w of each."""
     jaxbundle.enable_x64()
@@ -167,8 +169,8 @@ def compensate(
 def _table(path: Path, optional: tuple[str, ...] = ()) -> tuple[RpcTable, Columns]:
     columns = read_csv(path)
     columns.check_names(COLUMNS, ("id", *optional))
-    values = [columns.numbers(name, required=True) for name in COLUMNS]
-    return RpcTable(np.radians(values[0]), np.radians(values[1]), *values[2:]), columns
+    measured = (columns.numbers(name, required=True) for name in COLUMNS[3:])
+    return RpcTable(*geographic(columns), *measured), columns
 
 
 def _heights(text: str) -> tuple[float, float]:

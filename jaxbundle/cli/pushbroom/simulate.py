@@ -32,7 +32,7 @@ def simulate(
     check_resampling(resampling)
     given = read_flight(flight)
     truth, measured = true_image(given.flight), measured_image(given.flight)
-    surface = surface_of(given.earth, height, dem)
+    surface = surface_of(given.earth, height, dem, truth)
     shown = None if scene is None else read_scene(scene, given.earth)
     unit = given.file.section("scanner").text("angle_unit", "deg")
     write = lambda folder, image: write_scanner_image(

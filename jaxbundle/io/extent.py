@@ -1,0 +1,80 @@
+"""Where a terrain model is asked for: longitudes and latitudes that an image can see.
+
+A ray is above the ground that it meets from the highest to the lowest height a terrain may have;
+the extent holds both ends of the rays of a lattice over the image.
+"""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
+from jaxbundle.pushbroom.image import PushbroomImage, pose_at
+from jaxbundle.pushbroom.locate import locate_lines
+from jaxbundle.pushbroom.rpc import Rpc
+from jaxbundle.pushbroom.surfaces import Height
+
+HEIGHTS = -12_000.0, 25_000.0
+"""Metres: of the Earth, the Moon and Mars none is outside, the sea's floor included."""
+PLACES = 17
+"""Lines and pixels of the lattice."""
+WIDER = 0.03
+"""So much of its size is added on each side."""
+POLE = 85.0
+"""Beyond this latitude, in degrees, all longitudes may be seen."""
+
+
+class Extent(NamedTuple):
+    """Degrees; `east` may be beyond 180°."""
+
+    west: float
+    south: float
+    east: float
+    north: float
+
+    def __str__(self) -> str:
+        return (
+            f"longitude {self.west:.4g}° to {self.east:.4g}°, latitude {self.south:.4g}° to "
+            f"{self.north:.4g}°"
+        )
+
+
+def image_extent(image: PushbroomImage, earth: Ellipsoid) -> Extent | None:
+    """What an image can see; None if it sees the horizon or the pole."""
+    lines, pixels = (np.linspace(0, n - 1, PLACES) for n in (image.lines, image.pixels))
+    low, high = (np.asarray(_locate(image, Height(h, earth), lines, pixels)) for h in HEIGHTS)
+    if not np.isfinite(low).all():
+        return None
+    # a camera below the highest height sees from where it is
+    P = np.asarray(_positions(image, image.times.time(lines))).T[:, :, None]
+    high = np.where(np.isfinite(high), high, P)
+    X = np.stack([low, high], axis=1)
+    longitude, latitude, _ = (np.degrees(np.asarray(v)) for v in _geodetic(earth, tuple(X)))
+    middle = longitude[0, PLACES // 2, PLACES // 2]
+    longitude = longitude - 360 * np.round((longitude - middle) / 360)
+    return _around(longitude, latitude)
+
+
+def rpc_extent(rpc: Rpc) -> Extent | None:
+    """The domain of coefficients."""
+    ends = np.array([-1.0, 1.0])
+    return _around(
+        float(rpc.longitude_offset) + abs(float(rpc.longitude_scale)) * 1.2 * ends,
+        float(rpc.latitude_offset) + abs(float(rpc.latitude_scale)) * 1.2 * ends,
+    )
+
+
+def _around(longitude, latitude):
+    if np.abs(latitude).max() > POLE or np.ptp(longitude) > 180:
+        return None
+    wider = WIDER * np.ptp(longitude), WIDER * np.ptp(latitude)
+    return Extent(
+        float(longitude.min() - wider[0]), float(latitude.min() - wider[1]),
+        float(longitude.max() + wider[0]), float(latitude.max() + wider[1]),
+    )  # fmt: skip
+
+
+_locate = jax.jit(locate_lines)
+_geodetic = jax.jit(geodetic)
+_positions = jax.jit(jax.vmap(lambda image, t: pose_at(image, t).P, (None, 0)))

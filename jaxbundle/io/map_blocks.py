@@ -1,0 +1,71 @@
+"""A map as a GeoTIFF, made and written block by block, two at a time, under a temporary name."""
+
+import os
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.io.maps import MapGrid, MapSystem
+from jaxbundle.io.rasters import as_type, rasterio, unreadable
+from jaxbundle.pushbroom.correct import BLOCK, STEP, Nodes
+from jaxbundle.pushbroom.surfaces import Surface
+
+
+def write_map(
+    target: str | Path,
+    system: MapSystem,
+    grid: MapGrid,
+    surface: Surface,
+    count: int,
+    dtype: str,
+    block: Callable[[Nodes], np.ndarray | None],
+    progress: Callable[[int, int], None] | None = None,
+    names: Sequence[str] = (),
+) -> None:
+    """Write the map of `grid`, `count` bands of the type `dtype`.
+
+    `block` makes the values [count, `BLOCK`, `BLOCK`] of a block from its nodes, NaN where there
+    are none; None if there are none at all. `names` describe the bands.
+
+    **Raises:** `InputError` if the file cannot be written.
+    """
+    package = rasterio()
+    temporary = Path(target).with_name(f".{Path(target).name}.{os.getpid()}.tif")
+    floating = np.issubdtype(dtype, np.floating)
+    writing = threading.Lock()
+    steps = np.arange(0, BLOCK + STEP, STEP)
+
+    def one(corner):
+        row, column = corner
+        values = block(system.nodes(surface, *grid.centres(row + steps, column + steps)))
+        if values is None or not np.isfinite(values).any():
+            return
+        rows, columns = min(BLOCK, grid.rows - row), min(BLOCK, grid.columns - column)
+        values = as_type(values[:, :rows, :columns], dtype)
+        with writing:
+            map_.write(values, window=((row, row + rows), (column, column + columns)))
+
+    corners = [(r, c) for r in range(0, grid.rows, BLOCK) for c in range(0, grid.columns, BLOCK)]
+    try:
+        try:
+            map_ = package.open(
+                temporary, "w", driver="GTiff", width=grid.columns, height=grid.rows, count=count,
+                dtype=dtype, crs=system.text, nodata=np.nan if floating else 0,
+                transform=package.transform.Affine(grid.size, 0, grid.x, 0, -grid.size, grid.y),
+                tiled=True, blockxsize=BLOCK, blockysize=BLOCK, BIGTIFF="IF_SAFER",
+            )  # fmt: skip
+        except package.errors.RasterioError as error:
+            raise unreadable(target, error) from None
+        with map_:
+            if names:
+                map_.descriptions = tuple(names)
+            with ThreadPoolExecutor(2) as workers:
+                for done, _ in enumerate(workers.map(one, corners), 1):
+                    if progress:
+                        progress(done, len(corners))
+        os.replace(temporary, target)
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,83 @@
+"""Whatever is in the files of a line scanner, reading ends in one line of complaint or an image."""
+
+import json
+import shutil
+from functools import cache
+from pathlib import Path
+
+import pytest
+from garbling import often, read_or_refused, what_is_done
+from rpc_scenes import made_up
+from scanner_files import write_scanner
+from test_csm import support_data
+from test_dimap import write_dimap
+
+from jaxbundle.io.csm import read_csm
+from jaxbundle.io.dimap import read_dimap
+from jaxbundle.io.flight import read_flight
+from jaxbundle.io.refinement import read_refinement
+from jaxbundle.io.rpc import read_rpc, write_rpc
+from jaxbundle.io.scanner import read_scanner
+
+FLIGHT = Path(__file__).parents[2] / "examples" / "line_scanner" / "flight.toml"
+REFINE = """
+[refine]
+points = "points.csv"
+observations = "observations.csv"
+
+[images]
+A = "scanner.toml"
+
+[unknowns]
+attitude = "free"
+"""
+POINTS = "id,role,longitude,latitude,height\nP,control,13.1,40.2,100\nQ,control,13.2,40.1,50\n"
+OBSERVATIONS = "image,point,line,pixel\nA,P,100.5,20.25\nA,Q,200,30\n"
+
+
+def made(kind: str, folder: Path) -> Path:
+    """A folder with a valid input of a kind, and nothing else."""
+    match kind:
+        case "scanner":
+            write_scanner(folder)
+        case "refinement":
+            write_scanner(folder)
+            (folder / "refine.toml").write_text(REFINE)
+            (folder / "points.csv").write_text(POINTS)
+            (folder / "observations.csv").write_text(OBSERVATIONS)
+        case "flight":
+            shutil.copy(FLIGHT, folder)
+        case "csm":
+            (folder / "isd.json").write_text(json.dumps(support_data(), indent=1))
+        case "dimap":
+            write_dimap(folder)
+        case "rpc":
+            write_rpc(folder / "image_RPC.TXT", made_up(longitude_offset=12.3))
+    return folder
+
+
+READ = {
+    "scanner": lambda folder: read_scanner(folder / "scanner.toml"),
+    "refinement": lambda folder: read_refinement(folder / "refine.toml"),
+    "flight": lambda folder: read_flight(folder / "flight.toml"),
+    "csm": lambda folder: read_csm(folder / "isd.json"),
+    "dimap": lambda folder: read_dimap(folder / "METADATA.DIM"),
+    "rpc": lambda folder: read_rpc(folder / "image_RPC.TXT"),
+}
+
+
+@pytest.fixture(scope="module")
+def valid(tmp_path_factory):
+    return cache(lambda kind: made(kind, tmp_path_factory.mktemp(kind)))
+
+
+@pytest.mark.parametrize("kind", READ)
+def test_a_valid_input_is_read(kind, valid):
+    assert READ[kind](valid(kind)) is not None
+
+
+@pytest.mark.parametrize("kind", READ)
+@often(100)
+@what_is_done
+def test_a_garbled_input_is_read_or_refused(kind, valid, **done):
+    read_or_refused(READ[kind], valid(kind), **done)

@@ -1,0 +1,54 @@
+"""Systems and grids of maps: across 180°, what is no map, what is too large."""
+
+import numpy as np
+import pytest
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import WGS84, earth_fixed
+from jaxbundle.io.maps import MapSystem, contiguous, grid_around
+
+LATTICE = np.meshgrid(179.7 + 0.02 * np.arange(33), -16 + 0.02 * np.arange(33))
+X = np.array(earth_fixed(WGS84, (*np.radians(LATTICE), np.zeros((33, 33)))))
+
+
+@pytest.mark.parametrize("crs, turn", [(None, 360), ("EPSG:4326", 360), ("EPSG:4807", 400)])
+def test_longitudes_go_on_beyond_180(crs, turn):
+    system = MapSystem(WGS84, crs)
+    x, y = system.from_ground(X)
+    # the seam of longitudes from Paris, in grads, is elsewhere
+    assert (np.ptp(x) > 0.99 * turn) == (turn == 360)
+    x = contiguous(system, x)
+    assert np.ptp(x) == pytest.approx(0.64 * turn / 360, rel=1e-3)
+    grid = grid_around(x, y, 0.01 * turn / 360)
+    assert 64 <= grid.columns <= 68 and 64 <= grid.rows <= 68
+    nodes = system.nodes(_Ground, x, y)
+    # the fourth system has its own ellipsoid: some hundred metres
+    assert np.abs(nodes.X - X).max() < (1e-6 if turn == 360 else 500)
+
+
+class _Ground:
+    earth = WGS84
+
+
+def test_a_projected_system_has_an_edge():
+    with pytest.raises(InputError, match="EPSG:3857.*both sides"):
+        system = MapSystem(WGS84, "EPSG:3857")
+        contiguous(system, system.from_ground(X)[0])
+    system = MapSystem(WGS84, "EPSG:3832")
+    x = contiguous(system, system.from_ground(X)[0])
+    assert np.ptp(x) == pytest.approx(6378137 * np.radians(0.64), rel=1e-6)
+
+
+@pytest.mark.parametrize("crs, words", [
+    ("EPSG:4978", "Geocentric"), ("EPSG:5773", "Vertical"), ("EPSG:0", "EPSG:0"),
+])  # fmt: skip
+def test_no_system_of_maps(crs, words):
+    with pytest.raises(InputError, match=words):
+        MapSystem(WGS84, crs)
+
+
+def test_a_map_that_is_too_large():
+    x, y = np.array([0.0, 1.0]), np.array([0.0, 2.0])
+    for size, most in ((1e-10, np.inf), (1e-3, 1e6)):
+        with pytest.raises(InputError, match="--spacing .* greater"):
+            grid_around(x, y, size, most)
