@@ -1,6 +1,7 @@
 """`adjust`: a network in, an `Adjustment` out."""
 
 from collections.abc import Callable
+from types import MappingProxyType
 
 import numpy as np
 
@@ -12,10 +13,17 @@ from jaxbundle.network.columns import count, some
 from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation.network import Oriented, lacks_start_values
-from jaxbundle.oriented import orient, screen
+from jaxbundle.oriented import orient, orient_again, screen
 from jaxbundle.repeated import eliminated_parameters, robustly, snooped, with_components
 from jaxbundle.result import Adjustment
-from jaxbundle.solution import minimise, names_of_defects, solved
+from jaxbundle.solution import (
+    adjusted_cameras,
+    minimise,
+    misjudged,
+    names_of_defects,
+    solved,
+    start_with,
+)
 from jaxbundle.statistics import ESTIMATORS, intersect_check_points
 from jaxbundle.statistics.snooping import check_test
 
@@ -69,17 +77,25 @@ def adjust(
     check_test(snooping, significance)
     if robust and snooping:
         raise InputError("robust estimation or data snooping, not both at once")
-    if lacks_start_values(network):
-        network = _placed(orient(network))
+    given = network
+    if lacks_start_values(given):
+        network = _placed(orient(given))
     options = {"method": method, "max_steps": max_iterations + 1, "progress": progress}
     again = lambda problem, values: minimise(problem, values, **options)
 
-    def begin(network):
+    def begin(network, cameras=MappingProxyType({})):
         network, *check = split_check_points(check_network(network))
         problem = make_problem(network, reduction)
-        return problem, again(problem, problem.data.start), check
+        return problem, again(problem, start_with(problem, cameras)), check
 
     problem, minimum, check = begin(network)
+    while len(network.observations) < len(given.observations) and misjudged(problem, minimum):
+        # What the principal distance given made impossible may agree with the one found.
+        cameras, fewer = adjusted_cameras(problem, minimum.values), network
+        network = orient_again(given, fewer, cameras)
+        if network is fewer:
+            break
+        problem, minimum, check = begin(network, cameras)
     if (robust or snooping) and not solved(with_factor(problem), minimum):
         screened = screen(network)
         if len(screened.observations) < len(network.observations):

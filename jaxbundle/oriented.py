@@ -1,6 +1,7 @@
 """`orient`: start values, with adjustments on the way; `screen`: what contradicts them."""
 
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -8,7 +9,7 @@ from jaxbundle.adjustment.problem import make_problem
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.check import check_network
 from jaxbundle.network.sightings import keep_images, keep_points
-from jaxbundle.network.tables import Distances, Network
+from jaxbundle.network.tables import Camera, Distances, Network
 from jaxbundle.orientation import many
 from jaxbundle.orientation.growth import Model, misclosures
 from jaxbundle.orientation.network import Oriented, find_start_values
@@ -32,6 +33,18 @@ def orient(network: Network) -> Oriented:
     **Raises:** `InputError` for bad tables; `NotSolvedError` where no image could be placed.
     """
     return find_start_values(network, _adjusted)
+
+
+def orient_again(given: Network, placed: Network, better: Mapping[str, Camera]) -> Network:
+    """The given network with start values found with better cameras, if that places more of its
+    image points than are in `placed`; its cameras stay the given ones."""
+    try:
+        cameras = tuple(better.get(camera.id, camera) for camera in given.cameras)
+        found = orient(given.replace(cameras=cameras)).network
+    except (InputError, NotSolvedError):
+        return placed
+    more = len(found.observations) > len(placed.observations)
+    return found.replace(cameras=given.cameras) if more else placed
 
 
 def screen(network: Network) -> Network:

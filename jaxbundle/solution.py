@@ -1,6 +1,7 @@
 """One minimum: iterate to it, and see whether it is a solution."""
 
 import dataclasses
+from collections.abc import Mapping
 
 import equinox as eqx
 import jax
@@ -17,10 +18,14 @@ from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.columns import some
 from jaxbundle.network.padding import filled, pad_values, without_filling
+from jaxbundle.network.tables import Camera
 from jaxbundle.statistics import Inspection
 
 RAYS_TO_SHARE = 10_000
 """Networks with so many rays are distributed over the devices, where there are several."""
+
+MISJUDGED = 1.03
+"""A principal distance that changed by more than this factor was too wrong for start values."""
 
 RUNAWAY = 20.0
 """A principal distance that changed by more than this factor belongs to no camera."""
@@ -75,13 +80,46 @@ def _collapsed(problem: Problem, values: Values) -> list[str]:
 
     Where c and a scale of the image are free together, c = 0 makes all corrected residuals zero.
     """
-    names = []
+    return [
+        f"{parameter} of camera {camera.id} (it ran away from its start)"
+        for camera, parameter, ratio in _principal_distances(problem, values)
+        if not 1 / RUNAWAY < ratio < RUNAWAY
+    ]
+
+
+def misjudged(problem: Problem, minimum: Minimum) -> bool:
+    """Whether a principal distance came out otherwise than it was given, though not absurdly."""
+    ratios = [ratio for *_, ratio in _principal_distances(problem, minimum.values)]
+    sane = all(1 / RUNAWAY < ratio < RUNAWAY for ratio in ratios)
+    return sane and any(not 1 / MISJUDGED < ratio < MISJUDGED for ratio in ratios)
+
+
+def adjusted_cameras(problem: Problem, values: Values) -> dict[str, Camera]:
+    """The cameras of the network by their ids, with the parameters of a solution."""
+    return {
+        camera.id: dataclasses.replace(
+            camera, parameters=dict(zip(get_model(camera.model).parameters, row))
+        )
+        for camera, row in zip(problem.network.cameras, np.asarray(values.camera).tolist())
+    }
+
+
+def start_with(problem: Problem, cameras: Mapping[str, Camera]) -> Values:
+    """The start values of a problem, the parameters of these cameras replaced by theirs."""
+    start = problem.data.start
+    rows = np.array(start.camera)
+    for row, camera in zip(rows, problem.network.cameras):
+        given = cameras.get(camera.id, camera).parameters
+        for column, name in enumerate(get_model(camera.model).parameters):
+            row[column] = given.get(name, row[column])
+    return eqx.tree_at(lambda v: v.camera, start, jax.device_put(rows))
+
+
+def _principal_distances(problem: Problem, values: Values):
+    """Camera, name and the factor by which it changed, of all principal distances."""
     now, before = np.asarray(values.camera), np.asarray(problem.data.start.camera)
     for c, camera in enumerate(problem.network.cameras):
         model = get_model(camera.model)
         for parameter in model.principal_distance:
             column = model.parameters.index(parameter)
-            ratio = now[c, column] / before[c, column]
-            if not 1 / RUNAWAY < float(ratio) < RUNAWAY:
-                names.append(f"{parameter} of camera {camera.id} (it ran away from its start)")
-    return names
+            yield camera, parameter, float(now[c, column] / before[c, column])

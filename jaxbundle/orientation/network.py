@@ -14,7 +14,7 @@ from which little grows is replaced by the next.
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -59,12 +59,14 @@ WIDE = 0.5
 @dataclasses.dataclass(frozen=True)
 class Oriented:
     """A network with start values; `images`, `points`: why those that are not in it were not
-    placed; `frame`: what the coordinates refer to."""
+    placed; `left_out`: image points that contradict the start values; `frame`: what the coordinates
+    refer to."""
 
     network: Network
     frame: str
     images: Mapping[str, str]
     points: Mapping[str, str]
+    left_out: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         placed, known = len(self.network.images), len(self.network.points)
@@ -74,6 +76,8 @@ class Oriented:
         ]
         for thing, reasons in (("image", self.images), ("point", self.points)):
             lines += [f"{thing} {id} not placed: {why}" for id, why in reasons.items()]
+        if self.left_out:
+            lines.append(_in_contradiction(self.left_out))
         return "\n".join(lines)
 
 
@@ -112,7 +116,7 @@ def _control_contradicts(network: Network, seen: Sights, model: Model) -> bool:
     control = controlled(network.points)
     placed = model.placed[seen.image]
     rays = control[seen.point] & placed
-    wrong = misclosures(seen, model) > OUT_OF_THE_QUESTION * seen.tolerance[seen.image]
+    wrong = _out_of_the_question(seen, model)
     seen_twice = np.bincount(seen.point[placed], minlength=seen.points) > 1
     unmet = seen_twice & ~model.known
     return bool(control.any()) and bool(
@@ -249,13 +253,15 @@ def _result(network: Network, seen: Sights, model: Model, frame: str) -> Oriente
     images, points = network.images, network.points
     position, angles = images.position.copy(), images.angles.copy()
     lacking = model.placed & ~np.isfinite(np.concatenate([position, angles], 1)).all(1)
+    model.placed[lacking & _disagrees(seen, model)] = False
+    lacking &= model.placed
     position[lacking] = model.X0[lacking]
     if lacking.any():
         angles[lacking] = many.angles(model.M[lacking])
     X = np.where(
         (model.known & ~np.isfinite(points.position).all(1))[:, None], model.X, points.position
     )
-    wrong = _contradicting(network, seen, model)
+    wrong = seen.row[_out_of_the_question(seen, model)]
     keep = model.placed
     known = np.isfinite(X).all(1)
     reasons = _reasons(network, seen, model, known)
@@ -271,19 +277,29 @@ def _result(network: Network, seen: Sights, model: Model, frame: str) -> Oriente
         + some((f"{id} ({why})" for id, why in found.items()), 5, str)
         for thing, found in zip(("image", "point"), reasons) if found
     ]  # fmt: skip
-    if len(wrong):
-        names = (f"{points.id[rays.point[k]]} in {images.id[rays.image[k]]}" for k in wrong)
-        said.append(
-            f"left out {count(len(wrong), 'image point')} in contradiction to the start values: "
-            f"{some(names, 5, str)}"
-        )
-    return Oriented(network.warn(f"start values found, {frame}", *said), frame, *reasons)
+    names = tuple(f"{points.id[rays.point[k]]} in {images.id[rays.image[k]]}" for k in wrong)
+    if names:
+        said.append(_in_contradiction(names))
+    return Oriented(network.warn(f"start values found, {frame}", *said), frame, *reasons, names)
 
 
-def _contradicting(network: Network, seen: Sights, model: Model):
-    """Rows of the observations of known points in placed images that are out of the question."""
-    misclosure = misclosures(seen, model) / seen.tolerance[seen.image]
-    return seen.row[np.flatnonzero(misclosure > OUT_OF_THE_QUESTION)]
+def _in_contradiction(names: Sequence[str]) -> str:
+    return (
+        f"left out {count(len(names), 'image point')} in contradiction to the start values: "
+        f"{some(names, 5, str)}"
+    )
+
+
+def _out_of_the_question(seen: Sights, model: Model) -> Bool[np.ndarray, " sights"]:
+    """Which rays of known points in placed images miss them altogether."""
+    return misclosures(seen, model) > OUT_OF_THE_QUESTION * seen.tolerance[seen.image]
+
+
+def _disagrees(seen: Sights, model: Model) -> Bool[np.ndarray, " images"]:
+    """The images of whose known points too few agree."""
+    of_image = lambda rows: np.bincount(seen.image, rows, minlength=seen.images)
+    known = of_image(model.known[seen.point])
+    return of_image(_out_of_the_question(seen, model)) > (1 - AGREE) * known
 
 
 def _reasons(network: Network, seen: Sights, model: Model, known):

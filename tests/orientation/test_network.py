@@ -194,6 +194,23 @@ def test_planes_and_solids_without_control(relief):
     assert_same_answer(network, bare(network))
 
 
+@pytest.mark.parametrize("wrong", [0.8, 1.3])
+def test_a_principal_distance_far_from_the_truth(wrong):
+    """What contradicts the one given, and is left out, comes back with the one adjusted."""
+    true = Camera("wide", "brown", {"c": 50.0, "K1": -2e-6})
+    start = Camera("wide", "brown", {"c": 50.0 * wrong}, free=("c", "x0", "y0", "K1"))
+    near = dataclasses.replace(start, parameters={"c": 50.0})
+    network, other = (
+        jaxbundle.simulate(
+            jaxbundle.ring_of_stations(10, 3.2, 2.4, roll_every=2),
+            jaxbundle.grid_of_targets(9, 9, 0.5), true, start=camera, noise=0.002,
+            image_format=FORMAT, control=(0, 8, 40, 72, 80), control_sigma=1e-4, datum="control",
+        )
+        for camera in (near, start)
+    )  # fmt: skip
+    assert_same_answer(network, bare(other))
+
+
 def test_several_cameras_of_several_models():
     """A metric camera, one in pixels and a fisheye around the same targets."""
     pixels = {"fx": 2000.0, "fy": 2000.0, "cx": 1499.5, "cy": 999.5, "k1": -0.1}
