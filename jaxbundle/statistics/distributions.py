@@ -1,23 +1,29 @@
 """Quantiles of the normal, χ², t and τ distributions, and the critical values of the tests."""
 
+import functools
+import importlib
 import math
 
-from scipy import special
+
+@functools.cache
+def _special():
+    """scipy's functions: a tenth of a second to import, spared where no quantile is asked for."""
+    return importlib.import_module("scipy.special")
 
 
 def normal_quantile(probability: float) -> float:
     """z with Φ(z) = probability."""
-    return float(special.ndtri(probability))
+    return float(_special().ndtri(probability))
 
 
 def chi2_quantile(probability: float, degrees: float) -> float:
     """x with P(χ² ≤ x) = probability."""
-    return float(special.chdtri(degrees, 1 - probability))
+    return float(_special().chdtri(degrees, 1 - probability))
 
 
 def t_quantile(probability: float, degrees: float) -> float:
     """t with P(T ≤ t) = probability, Student's distribution."""
-    return float(special.stdtrit(degrees, probability))
+    return float(_special().stdtrit(degrees, probability))
 
 
 def tau_quantile(probability: float, redundancy: float) -> float:
