@@ -38,7 +38,7 @@ from jaxbundle.io.poses import (
 from jaxbundle.io.settings import SETTINGS, apply_overrides, check_settings
 from jaxbundle.io.unpacking import most_unpacked
 from jaxbundle.network.build import make_cameras, make_network
-from jaxbundle.network.columns import Columns
+from jaxbundle.network.columns import Columns, shown
 from jaxbundle.network.tables import EXTERIOR, Network, Source
 
 OPENERS = {".gz": gzip.open, ".bz2": bz2.open}
@@ -212,7 +212,7 @@ def _not_a_number(path: Path, text: bytes) -> InputError:
                 good = False
             if not good:
                 word = word.decode(errors="replace")
-                return InputError(f"{path}, line {line}: {word!r} where a number is expected")
+                return InputError(f"{path}, line {line}: {shown(word)} where a number is expected")
     return InputError(f"{path}: there is something between the numbers that is none")
 
 
