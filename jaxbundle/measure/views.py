@@ -129,7 +129,7 @@ def measure_boards(
     if len(found) < len(names) / 2:
         failed |= _other_boards(paths, board, failed)
     if not found:
-        raise InputError(_nothing_found(failed))
+        raise InputError(_nothing_found(paths, failed))
     sizes = Counter(size for _, size, _ in found)
     size = sizes.most_common(1)[0][0]
     for name, other, _ in found:
@@ -193,10 +193,10 @@ def _look(path, board):
         return str(error).removeprefix(f"{path}: ")
 
 
-def _nothing_found(failed: Mapping[str, str]) -> str:
+def _nothing_found(paths: Mapping[str, Path], failed: Mapping[str, str]) -> str:
     """One line about photographs without a board; one that has another board speaks for all."""
     first = next((name for name in failed if HINT in failed[name]), next(iter(failed)))
-    return f"no photograph of {len(failed)} shows the board: {first}: {failed[first]}"
+    return f"no photograph of {len(failed)} shows the board: {paths[first]}: {failed[first]}"
 
 
 def _other_boards(paths: Mapping[str, Path], board: Board, failed: Mapping[str, str]):
