@@ -153,6 +153,8 @@ def board_network(
         angle_unit="deg", image_unit=model.unit, object_unit=object_unit,
         name=f"Calibration of {camera.id}",
     )  # fmt: skip
+    for warning in views.warnings:
+        network = network.warn(warning)
     if board_free and not board.unique:
         network = network.warn(
             f"a photograph does not tell the {board} from itself turned by 180°: its points are "

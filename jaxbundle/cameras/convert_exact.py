@@ -185,12 +185,6 @@ def normalised_correction(values: Values) -> dict[str, float]:
     return {**k, "p1": -c * values["P2"], "p2": c * values["P1"]}
 
 
-def brown_from_normalised(c: float, values: Values) -> dict[str, float]:
-    """The inverse of `normalised_correction`: K1, K2, K3 (mm^−2i), P1, P2 (1/mm)."""
-    K = {f"K{i}": values[f"k{i}"] / c ** (2 * i) for i in (1, 2, 3)}
-    return {**K, "P1": values["p2"] / c, "P2": -values["p1"] / c}
-
-
 def inverted_radial(q: Sequence[float]) -> tuple[float, float, float]:
     """The first terms of the inverse of r·(1 + q1·r² + q2·r⁴ + q3·r⁶): a start, never the answer.
 

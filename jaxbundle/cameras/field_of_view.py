@@ -2,6 +2,10 @@
 
     FOV = 2·atan(d/(2c))        d: width, height or diagonal of the image
 
+and where the principal distances along and across differ (fx ≠ fy), each with its own side:
+
+    d/c = w/fx,  h/fy,  √((w/fx)² + (h/fy)²)
+
 the three definitions in use. By the rays themselves, distortion and principal point included, it
 is the angle between the rays through the ends of d; the two agree for an undistorted camera with
 its principal point at the image centre.
@@ -33,10 +37,10 @@ class FieldOfView(NamedTuple):
     diagonal: float
 
 
-def field_of_view(c: float, size: Sequence[float]) -> FieldOfView:
-    """FOV = 2·atan(d/(2c)) of an image of (width, height), in the unit of c."""
-    width, height = size
-    angle = lambda d: float(2 * np.arctan(d / (2 * c)))
+def field_of_view(c: float | Sequence[float], size: Sequence[float]) -> FieldOfView:
+    """FOV = 2·atan(d/(2c)) of an image of (width, height), in the unit of c, or of (fx, fy)."""
+    width, height = np.divide(size, c)
+    angle = lambda d: float(2 * np.arctan(d / 2))
     return FieldOfView(angle(width), angle(height), angle(np.hypot(width, height)))
 
 
@@ -70,15 +74,17 @@ def angle_class(diagonal: float) -> str:
     return next(name for limit, name in CLASSES if np.degrees(diagonal) < limit)
 
 
-def equivalent_35mm(c: float, size: Sequence[float], by: str = "diagonal") -> float:
+def equivalent_35mm(
+    c: float | Sequence[float], size: Sequence[float], by: str = "diagonal"
+) -> float:
     """The principal distance, mm, that has the same field of view on 36 × 24 mm.
 
-    **Arguments:** `c` and `size` (width, height) in one unit; `by` diagonal (as CIPA has it), width
-    or height.
+    **Arguments:** `c`, or (fx, fy), and `size` (width, height) in one unit; `by` diagonal (as CIPA
+    has it), width or height.
 
     **Raises:** `ValueError` for another definition.
     """
     lengths = {"diagonal": np.hypot, "width": lambda w, h: w, "height": lambda w, h: h}
     if by not in lengths:
         raise ValueError(f"the equivalent is by diagonal, width or height, not by {by!r}")
-    return float(c * lengths[by](*SMALL_FORMAT) / lengths[by](*size))
+    return float(lengths[by](*SMALL_FORMAT) / lengths[by](*np.divide(size, c)))

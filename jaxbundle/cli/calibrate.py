@@ -178,7 +178,12 @@ def _cameras(photos, named) -> dict[str, list[str]]:
         name, equals, pattern = (part.strip() for part in item.partition("="))
         if not (name and equals and pattern):
             raise InputError(f"--camera {item}: NAME=PATTERN is expected, such as left=left/*.jpg")
-        cameras.setdefault(name, []).append(pattern)
+        if name in cameras:
+            raise InputError(
+                f"--camera {name} is given twice: {name}={cameras[name][0]}, {name}={pattern}; "
+                "give each camera a name of its own, and its photographs by one folder or pattern"
+            )
+        cameras[name] = [pattern]
     return cameras or {"cam": list(photos)}
 
 

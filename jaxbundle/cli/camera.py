@@ -93,7 +93,7 @@ def _table(given: Camera, reach: float, step: float, about_origin: bool):
 
 def _print(given: Camera, extent, size, pitch, table) -> None:
     model, p = get_model(given.model), all_parameters(given)
-    focal = float(np.mean([p[name] for name in model.principal_distance]))
+    focal = [p[name] for name in model.principal_distance]
     print(f"camera {given.id!r}, model {given.model}, {extent[0]:g} × {extent[1]:g} {model.unit}")
     for name, value in p.items():
         if value:

@@ -6,8 +6,9 @@ from pathlib import Path
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_network
 from jaxbundle.io.calibrated import is_result, read_calibrated
-from jaxbundle.io.camera_files import chosen_camera, is_camera_file, read_cameras
+from jaxbundle.io.camera_files import LOOKS, chosen_camera, is_camera_file, read_cameras
 from jaxbundle.io.csv_tables import write_bytes
+from jaxbundle.io.formats import FORMATS, recognised_format
 from jaxbundle.network.tables import Camera
 from jaxbundle.statistics.difference import Covariance
 
@@ -33,8 +34,15 @@ def calibration_given(text: str) -> tuple[Camera, Covariance | None]:
     if is_result(path):
         results = read_calibrated(path)
         cameras, found = [camera for camera, _ in results], {c.id: C for c, C in results}
+    elif is_camera_file(path):
+        cameras = read_cameras(path)
+    elif path.exists() and recognised_format(path) is None:
+        raise InputError(
+            f"{path}: not recognised; a camera stands in a camera file ({LOOKS}), the result.json "
+            f"of calibrate or adjust, or a network ({', '.join(FORMATS)})"
+        )
     else:
-        cameras = read_cameras(path) if is_camera_file(path) else read_network(path).cameras
+        cameras = read_network(path).cameras
     camera = chosen_camera(cameras, id, f"{file} (FILE#ID)")
     return camera, found.get(camera.id)
 

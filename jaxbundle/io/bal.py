@@ -36,13 +36,16 @@ from jaxbundle.io.poses import (
     rotation_vectors_of,
 )
 from jaxbundle.io.settings import SETTINGS, apply_overrides, check_settings
+from jaxbundle.io.unpacking import most_unpacked
 from jaxbundle.network.build import make_cameras, make_network
-from jaxbundle.network.columns import Columns
+from jaxbundle.network.columns import Columns, shown
 from jaxbundle.network.tables import EXTERIOR, Network, Source
 
 OPENERS = {".gz": gzip.open, ".bz2": bz2.open}
-MOST_DIGITS = 18
-"""Of a count."""
+FIRST_LINE, MOST_DIGITS = 200, 18
+"""Characters of the first line, and of a count in it."""
+NUMBER = 64
+"""Characters a number has at most, the blanks around it included."""
 UNREADABLE = (OSError, EOFError, zlib.error)
 MODEL = get_model("snavely")
 
@@ -53,7 +56,7 @@ def is_bal(path: Path) -> bool:
         return False
     try:
         with OPENERS.get(path.suffix.lower(), open)(path, "rb") as file:
-            words = file.readline(200).split()
+            words = file.readline(FIRST_LINE).split()
     except UNREADABLE:
         return False
     return _are_counts(words)
@@ -146,13 +149,8 @@ def _are_counts(words: Sequence[bytes]) -> bool:
     return len(words) == 3 and all(word.isdigit() for word in words)
 
 
-def _numbers(path: Path):
-    """The three counts of the first line, and all numbers after it."""
-    try:
-        with OPENERS.get(path.suffix.lower(), open)(path, "rb") as file:
-            first, text = file.readline().split(), file.read()
-    except UNREADABLE as error:
-        raise InputError(f"{path}: cannot be read: {error}") from None
+def _counts(path: Path, first: Sequence[bytes]) -> tuple[int, ...]:
+    """Cameras, points and observations, as the words of the first line announce them."""
     if not _are_counts(first):
         raise InputError(
             f"{path}, line 1: three whole numbers are expected: cameras, points, observations"
@@ -160,10 +158,33 @@ def _numbers(path: Path):
     if max(map(len, first)) > MOST_DIGITS:
         raise InputError(
             f"{path}, line 1: {b' '.join(first)[:60].decode()}: more cameras, points, observations "
-            f"than a file of {len(text)} characters can hold"
+            "than a file can hold"
         )
-    cameras, points, rows = counts = tuple(map(int, first))
-    expected = 4 * rows + 9 * cameras + 3 * points
+    return tuple(map(int, first))
+
+
+def _numbers(path: Path):
+    """The three counts of the first line, and all numbers after it.
+
+    No more is read than these can be, whatever a compressed file unpacks to.
+    """
+    suffix = path.suffix.lower()
+    try:
+        with OPENERS.get(suffix, open)(path, "rb") as file:
+            counts = _counts(path, file.readline(FIRST_LINE).split())
+            cameras, points, rows = counts
+            expected = 4 * rows + 9 * cameras + 3 * points
+            size = path.stat().st_size
+            held = most_unpacked(size) if suffix in OPENERS else size
+            most = min(NUMBER * (expected + 1), held)
+            text = file.read(most + 1)
+    except UNREADABLE as error:
+        raise InputError(f"{path}: cannot be read: {error}") from None
+    if len(text) > most:
+        raise InputError(
+            f"{path}: holds more than {most} characters, too many for the {expected} numbers that "
+            f"line 1 announces, in a file of {size} bytes"
+        )
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # Of text that is no number.
@@ -191,7 +212,7 @@ def _not_a_number(path: Path, text: bytes) -> InputError:
                 good = False
             if not good:
                 word = word.decode(errors="replace")
-                return InputError(f"{path}, line {line}: {word!r} where a number is expected")
+                return InputError(f"{path}, line {line}: {shown(word)} where a number is expected")
     return InputError(f"{path}: there is something between the numbers that is none")
 
 

@@ -22,6 +22,11 @@ from jaxbundle.network.columns import did_you_mean
 from jaxbundle.network.tables import Camera
 
 COLMAP_FILES = ("cameras.txt", "cameras.bin")
+LOOKS = (
+    "OpenCV's .yaml, .yml or .json; a .toml with [[camera]] entries; cameras.txt or cameras.bin of "
+    "COLMAP"
+)
+"""Camera files in words."""
 
 
 def is_camera_file(path: Path) -> bool:

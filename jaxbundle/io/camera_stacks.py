@@ -10,14 +10,17 @@
 """
 
 import dataclasses
+import os
 import zipfile
 import zlib
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
 from jaxbundle.adjustment.batch_input import check_shapes
 from jaxbundle.errors import InputError
+from jaxbundle.io.unpacking import most_unpacked
 
 UNREADABLE = (
     OSError, EOFError, ValueError, KeyError, NotImplementedError, RuntimeError, MemoryError,
@@ -26,6 +29,7 @@ UNREADABLE = (
 """What numpy and zipfile raise for an archive that is cut, garbled, or claims too much."""
 
 NEEDED = ("object_points", "image_points", "image_size")
+KNOWN = (*NEEDED, "visible", "ids")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,8 +64,9 @@ def read_camera_stack(path: str | Path) -> CameraStack:
         with open(path, "rb") as stream:
             if not zipfile.is_zipfile(stream):
                 raise zipfile.BadZipFile("it is no archive")
+            _check_size(stream)
             with np.load(stream, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in (*NEEDED, "visible", "ids") if name in file}
+                arrays = {name: file[name] for name in KNOWN if name in file}
     except UNREADABLE as error:
         why = " ".join(str(error).split())[:200]
         raise InputError(f"{path}: not a readable .npz file of plain arrays ({why})") from None
@@ -87,3 +92,16 @@ def read_camera_stack(path: str | Path) -> CameraStack:
         raise InputError(f"{path}: ids must differ, but some occur twice")
     keys = tuple(f"{path}#{id}" for id in ids.tolist())
     return CameraStack(keys, X, xy, tuple(size.tolist()), visible)
+
+
+def _check_size(stream: BinaryIO) -> None:
+    """Refuse an archive whose arrays unpack to far more than measurements do."""
+    with zipfile.ZipFile(stream) as archive:
+        unpacked = sum(
+            member.file_size for member in archive.infolist()
+            if member.filename.removesuffix(".npy") in KNOWN
+        )  # fmt: skip
+    size = stream.seek(0, os.SEEK_END)
+    stream.seek(0)
+    if unpacked > most_unpacked(size):
+        raise ValueError(f"{size} bytes that claim to unpack to {unpacked}")

@@ -55,7 +55,7 @@ def parameter_names(model: str, error: Callable[[str], InputError]) -> tuple[str
     """
     if model not in MODELS:
         known = "is not offered here" if model in OTHERS.values() else "is unknown"
-        raise error(f"the camera model {model} {known}; these are: {', '.join(MODELS)}")
+        raise error(f"the camera model {model[:40]} {known}; these are: {', '.join(MODELS)}")
     return MODELS[model][2]
 
 

@@ -27,6 +27,7 @@ from jaxbundle.io.project import FILE_NAME
 from jaxbundle.io.settings import TABLES
 from jaxbundle.network.columns import did_you_mean, some
 from jaxbundle.network.conversion import convert_cameras, convert_one
+from jaxbundle.network.outside import outside_warnings
 from jaxbundle.network.rules import check_camera
 from jaxbundle.network.tables import Camera, Network
 
@@ -94,9 +95,11 @@ def convert(
         _keep_camera_file(input, output)
         _keep_others(output, kind, force)
         cameras = _sized(read_cameras(input), image_size, pixel_size)
-        return _convert_cameras(input, cameras, output, kind, model, camera)
+        made = _convert_cameras(input, cameras, output, kind, model, camera)
+        return dataclasses.replace(made, warnings=outside_warnings(cameras))
     network = read_network(input, format, overrides)
     network = network.replace(cameras=_sized(network.cameras, image_size, pixel_size))
+    network = network.warn(*outside_warnings(network.cameras, network))
     _keep_input(input, network, output, kind)
     _keep_others(output, kind, force)
     if kind in CAMERA_KINDS:

@@ -7,11 +7,13 @@ of a large photograph (24 million pixels take 25 s, one of 1600 columns 1 s), po
 the photograph itself.
 """
 
+import dataclasses
+
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxbundle.errors import InputError
-from jaxbundle.measure.boards import MARKER, Board
+from jaxbundle.measure.boards import LEAST, MARKER, Board
 from jaxbundle.measure.opencv import need_opencv
 from jaxbundle.measure.targets import centre_by_ellipse
 
@@ -43,24 +45,46 @@ def find_board(grey: Grey, board: Board) -> Float[np.ndarray, "points 2"]:
 
 
 def other_sizes(grey: Grey, board: Board) -> Board | None:
-    """A board of another size that is in the photograph, where the one asked for is not.
+    """The largest board of another size, of the same kind, that is in the photograph.
 
-    Looked for: squares counted for corners, columns and rows changed, one more or less of either.
+    Chessboards of any size; circles with columns and rows changed, and some less or more of either.
     """
+    if board.kind == "chessboard":
+        other = largest_chessboard(grey, board)
+        return None if other == board else other
     if board.kind == "charuco":
         return None
     m, n = board.columns, board.rows
-    tried = [(n, m), (m - 1, n - 1), (n - 1, m - 1), (m + 1, n + 1)]
-    tried += [(m - 1, n), (m, n - 1), (m + 1, n), (m, n + 1)]
+    near = [(n, m)] + [(m + i, n + j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
     grey, _ = _reduced(need_opencv(), grey, QUICK)
-    for columns, rows in tried:
+    # A part of a board is a board as well: the largest is sought first.
+    for columns, rows in sorted(near, key=lambda size: -size[0] * size[1]):
         try:
-            other = Board(columns, rows, board.square, board.kind)
+            other = dataclasses.replace(board, columns=columns, rows=rows)
             find_board(grey, other)
             return other
         except InputError:
             continue
     return None
+
+
+def largest_chessboard(grey: Grey, board: Board) -> Board | None:
+    """The chessboard in the photograph with all its corners, whatever their number; sought in a
+    small copy. More columns than rows, or as `board` has them."""
+    cv2 = need_opencv()
+    grey, _ = _reduced(cv2, grey, QUICK)
+    least = LEAST["chessboard"]
+    flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
+    try:
+        found, _, grid = cv2.findChessboardCornersSBWithMeta(grey, (least, least), flags)
+    except cv2.error:
+        return None
+    if not found:
+        return None
+    rows, columns = sorted(grid.shape[:2])
+    if board.columns < board.rows:
+        rows, columns = columns, rows
+    return dataclasses.replace(board, columns=columns, rows=rows)
 
 
 def _chessboard(cv2, grey, board):

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from jaxbundle.configuration import available_cores
 from jaxbundle.errors import InputError
 from jaxbundle.measure.boards import Board
-from jaxbundle.measure.corners import find_board, other_sizes
+from jaxbundle.measure.corners import find_board, largest_chessboard, other_sizes
 from jaxbundle.measure.photographs import read_photograph
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".jp2")
@@ -24,7 +24,10 @@ SAME, ALIKE = 0.05, 0.8
 least. JPEG at quality 40 moves corners by 0.05; a second photograph of one pose, whose noise moves
 them by no more, says nothing about the camera either."""
 SEARCHED = 3
-"""In so many photographs boards of other sizes are looked for, where none has the right one."""
+"""In so many photographs boards of other sizes are looked for: in those without a board, where few
+have it, and in the others, whether the board they have is a part of a larger one."""
+
+HINT = "give --board"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +35,8 @@ class BoardViews:
     """What was measured of a board: image points of every view, and which photographs failed.
 
     **Fields:** `names` of the views; `image_size` (columns, rows); `xy` pixels, NaN where a point
-    was not found; `failed`: name and reason of every photograph that is no view.
+    was not found; `failed`: name and reason of every photograph that is no view; `warnings`: what
+    seems not to be meant.
     """
 
     board: Board
@@ -40,6 +44,7 @@ class BoardViews:
     image_size: tuple[int, int]
     xy: Float[np.ndarray, "views points 2"]
     failed: tuple[tuple[str, str], ...] = ()
+    warnings: tuple[str, ...] = ()
 
     def __post_init__(self):
         points = len(self.board.ids)
@@ -121,8 +126,10 @@ def measure_boards(
                 found.append((name, *result))
             if progress is not None:
                 progress(done, len(names))
+    if len(found) < len(names) / 2:
+        failed |= _other_boards(paths, board, failed)
     if not found:
-        raise InputError(_nothing_found(files, board, failed))
+        raise InputError(_nothing_found(paths, failed))
     sizes = Counter(size for _, size, _ in found)
     size = sizes.most_common(1)[0][0]
     for name, other, _ in found:
@@ -138,6 +145,7 @@ def measure_boards(
     return BoardViews(
         board, tuple(name for name, _ in used), size, np.array([xy for _, xy in used]),
         tuple(sorted(failed.items(), key=lambda item: order[item[0]])),
+        _part_of_a_larger(paths, [name for name, _ in used], board),
     )  # fmt: skip
 
 
@@ -185,19 +193,44 @@ def _look(path, board):
         return str(error).removeprefix(f"{path}: ")
 
 
-def _nothing_found(files, board, failed) -> str:
-    """One line about photographs without a board, with the size they have instead."""
-    first = next(iter(failed))
-    text = f"no photograph of {len(files)} shows the board: {first}: {failed[first]}"
-    for path in files[:SEARCHED]:
+def _nothing_found(paths: Mapping[str, Path], failed: Mapping[str, str]) -> str:
+    """One line about photographs without a board; one that has another board speaks for all."""
+    first = next((name for name in failed if HINT in failed[name]), next(iter(failed)))
+    return f"no photograph of {len(failed)} shows the board: {paths[first]}: {failed[first]}"
+
+
+def _other_boards(paths: Mapping[str, Path], board: Board, failed: Mapping[str, str]):
+    """Reasons of some photographs without the board, with the size of the one they have instead."""
+    sizes = {}
+    for name in list(failed)[:SEARCHED]:
         try:
-            other = other_sizes(read_photograph(path), board)
+            sizes[name] = other_sizes(read_photograph(paths[name]), board)
         except InputError:
             continue
-        if other is not None:
-            size = f"{other.columns}x{other.rows}"
-            return f"{text}. But {path} shows one of {size} inner points: give --board {size}"
-    return text
+    return {
+        name: f"{failed[name]}. But there is one of {other.columns}x{other.rows}: {HINT} "
+        f"{other.columns}x{other.rows}, if it is seen whole"
+        for name, other in sizes.items() if other is not None
+    }  # fmt: skip
+
+
+def _part_of_a_larger(paths: Mapping[str, Path], used, board: Board) -> tuple[str, ...]:
+    """A warning where most of some photographs show the same larger board; one alone may err."""
+    if board.kind != "chessboard":
+        return ()
+    few = used[:SEARCHED]
+    sizes = Counter(largest_chessboard(read_photograph(paths[name]), board) for name in few)
+    (other, times), *_ = sizes.most_common(1) or [(None, 0)]
+    if other is None or times <= len(few) / 2:
+        return ()
+    larger = other.columns >= board.columns and other.rows >= board.rows
+    if not larger or other == board:
+        return ()
+    size = f"{other.columns}x{other.rows}"
+    return (
+        f"the board of {board.columns}x{board.rows} is a part of a larger one, of {size} "
+        f"({few[0]}), and not the same part everywhere; if {size} is the board: {HINT} {size}",
+    )
 
 
 def _names(files: Sequence[Path]) -> list[str]:

@@ -10,6 +10,7 @@ The columns are those of the project format:
 | observations | image, point, x, y, and σ: sx, sy |
 | distances | from, to, value, sigma |
 
+The columns X0, Y0, Z0 of images, and omega, phi, kappa, may be left out, all three together.
 Missing values (None, NaN, empty text) mean: no start value, no σ. A σ of an image may be "fixed"
 (the value is held), a σ of a control point "free" (this axis is not controlled).
 """
@@ -45,6 +46,8 @@ from jaxbundle.network.units import ANGLE_UNITS, from_image_unit
 
 CAMERA_FIELDS = ("id", "model", "image_size", "pixel_size", "free", "sigma")
 IMAGE_COLUMNS = ("id", "camera", *EXTERIOR)
+GROUPS = EXTERIOR[:3], EXTERIOR[3:]
+"""Columns of images that may be left out, together."""
 IMAGE_SIGMAS = tuple(f"s{name}" for name in EXTERIOR)
 POINT_COLUMNS = ("id", "role", *AXES)
 POINT_SIGMAS = tuple(f"s{name}" for name in AXES)
@@ -208,7 +211,8 @@ def _matrix(table: Columns, names, **options):
 
 
 def _make_images(table: Columns, cameras: Sequence[Camera], radians: float) -> Images:
-    table.check_names(IMAGE_COLUMNS, IMAGE_SIGMAS)
+    needed = [n for group in GROUPS if {*group} & {*table.values} for n in group]
+    table.check_names(("id", "camera", *needed), (*EXTERIOR, *IMAGE_SIGMAS))
     ids = table.ids("id")
     check_unique(ids, table.source, "image")
     unit = np.array([1, 1, 1, radians, radians, radians])

@@ -83,6 +83,18 @@ def test_by_rays_it_is_the_formula_without_distortion():
     assert rays.diagonal == pytest.approx(np.arccos(a @ b / (a @ a)), rel=1e-12)
 
 
+def test_each_side_has_its_principal_distance():
+    """fx 1000, fy 500 on 2000 × 1000: 90° both, and 2·atan(√2) across the corners."""
+    view = field_of_view((1000.0, 500.0), (2000, 1000))
+    assert np.degrees(view[:2]) == pytest.approx((90, 90))
+    assert view.diagonal == pytest.approx(2 * np.arctan(np.sqrt(2)))
+    p = dict(fx=1000.0, fy=500.0, cx=999.5, cy=499.5)
+    assert view == pytest.approx(field_of_view_of_rays(get_model("opencv"), p, (2000, 1000)))
+    # tan = 1 at the edge: half of 36 mm; √2 at the corner: √(18² + 12²)/√2
+    assert equivalent_35mm((1000.0, 500.0), (2000, 1000), "width") == pytest.approx(18)
+    assert equivalent_35mm((1000.0, 500.0), (2000, 1000)) == pytest.approx(np.sqrt(468 / 2))
+
+
 def test_a_fisheye_sees_behind_itself():
     """Equidistant without coefficients: the angle is the diameter over the principal distance."""
     p = dict(fx=200.0, fy=200.0, cx=399.5, cy=399.5)

@@ -1,6 +1,8 @@
 """BAL problems: what is read is what the Snavely camera projects; damaged files are refused."""
 
+import bz2
 import gzip
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -82,8 +84,28 @@ def test_a_damaged_compressed_file(tmp_path):
 def test_a_count_of_thousands_of_digits(tmp_path):
     path = tmp_path / "problem.txt"
     path.write_text(f"{'9' * 5000} 6 12\n")
-    with pytest.raises(InputError, match="line 1: 9+: more cameras.* than a file of 0 char"):
+    with pytest.raises(InputError, match="line 1: three whole numbers are expected"):
         jaxbundle.read_network(path, format="bal")
+    path.write_text(f"{'9' * 50} 6 12\n")
+    with pytest.raises(InputError, match="line 1: 9+ 6 12: more cameras.* than a file can hold"):
+        jaxbundle.read_network(path, format="bal")
+
+
+@pytest.mark.parametrize("counts", ["2 6 12", "999999999999999999 6 12"])
+@pytest.mark.parametrize("suffix, pack", [(".gz", gzip.compress), (".bz2", bz2.compress),
+                                          ("", bytes)])  # fmt: skip
+def test_no_more_is_unpacked_than_the_counts_allow(tmp_path, counts, suffix, pack):
+    """100 MB of blanks: what is held while the file is refused stays far below."""
+    path = tmp_path / f"problem.bal{suffix}"
+    blanks = 10**8 if suffix else 10**6
+    path.write_bytes(pack(counts.encode() + b"\n" + b" " * blanks))
+    tracemalloc.start()
+    complaint = "too many for the 84 numbers" if counts == "2 6 12" else "numbers"
+    with pytest.raises(InputError, match=complaint):
+        jaxbundle.read_network(path, format="bal")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 5e7
 
 
 @pytest.mark.parametrize(

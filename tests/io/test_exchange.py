@@ -46,6 +46,16 @@ def test_kinds_of_output(opencv, tmp_path, name, to, kind):
     assert not [p for p in tmp_path.rglob("*.tmp")]
 
 
+def test_what_is_outside_the_image_is_told(opencv, tmp_path):
+    toml = opencv / "project.toml"
+    toml.write_text(toml.read_text().replace("1280, 720", "400, 300"))
+    told = convert(opencv, tmp_path / "copy").warnings
+    assert ["principal point" in line for line in told] == [True, False]
+    assert "camera '1': the principal point (641, 358.5) px is outside the image of 400" in told[0]
+    write_cameras(read_network(opencv).cameras, tmp_path / "one.toml")
+    assert convert(tmp_path / "one.toml", tmp_path / "c.yaml").warnings == told[:1]
+
+
 @pytest.mark.parametrize("name", ["p.txt", "p.bal", "p.gz", "p.out"])
 def test_a_principal_point_is_no_hindrance(tmp_path, name):
     """OpenCV with fx = fy, k1, k2 is Bundler's camera, counted from its principal point."""

@@ -15,6 +15,7 @@ import pytest
 from exchange_cases import CAMERAS, network
 from garbling import often, read_or_refused, what_is_done
 
+from jaxbundle.errors import InputError
 from jaxbundle.io import read_cameras, read_network, write_project
 from jaxbundle.io.bal import write_bal
 from jaxbundle.io.bundler import write_bundler
@@ -111,7 +112,6 @@ def read(kind: str, folder: Path):
 
 
 
-
 KINDS = ("colmap", "colmap-text", "bal", "bundler", "project", "photo-list", "opencv", "json",
          "photomodeler", "bingo", "metashape", "column-map", "camera-stack", "result")  # fmt: skip
 
@@ -127,3 +127,21 @@ def test_a_valid_input_is_read(kind, valid):
 @what_is_done
 def test_a_garbled_input_is_read_or_refused(kind, valid, **done):
     read_or_refused(partial(read, kind), valid(kind), **done)
+
+
+@pytest.mark.parametrize("kind, old, odd", [
+    ("bal", "1000.0", "z" * 9000), ("colmap-text", "OPENCV", "Z" * 9000),
+    ("colmap-text", "OPENCV", "Z/" * 4500), ("project", "opencv", "z" * 9000),
+])  # fmt: skip
+def test_a_word_without_end_is_cut(kind, old, odd, valid, tmp_path):
+    folder = shutil.copytree(valid(kind), tmp_path / "copy")
+    for file in folder.iterdir():
+        file.write_text(file.read_text().replace(old, odd, 1))
+    with pytest.raises(InputError) as found:
+        read(kind, folder)
+    assert odd[:20] in str(found.value) and len(str(found.value)) < 600
+
+
+def test_names_of_files_are_not_cut():
+    name = "/".join(["a" * 255, "b" * 255])
+    assert str(InputError(f"{name}: no such file")).startswith(name)

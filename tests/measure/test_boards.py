@@ -1,14 +1,18 @@
 """Boards in rendered photographs: where their points are, and which is which."""
 
+import dataclasses
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 import render
 
 from jaxbundle.errors import InputError
-from jaxbundle.measure import Board, find_board, read_photograph
+from jaxbundle.measure import Board, find_board, measure_boards, read_photograph
 from jaxbundle.measure.corners import other_sizes
 
+EXAMPLE = Path(__file__).parents[2] / "examples" / "board"
 MARGIN = 0.03
 CHESS = Board(9, 6, 0.03)
 CIRCLES = Board(8, 6, 0.03, "circles", diameter=0.012)
@@ -110,6 +114,30 @@ def test_what_cannot_be_found_says_so():
         find_board(picture[:5, :5], CHESS)
     assert other_sizes(picture, Board(10, 7, 0.03)) == CHESS
     assert other_sizes(np.full_like(picture, 100), CHESS) is None
+
+
+@pytest.mark.parametrize("asked", [(7, 4), (8, 5), (5, 5), (10, 7), (8, 6)])
+def test_the_board_found_instead_is_the_whole_one(asked):
+    """Not the first block of it that happens to be found."""
+    picture, _ = taken(CHESS, 20, 10, 5, 0.5)
+    assert other_sizes(picture, Board(*asked, 0.03)) == CHESS
+    assert other_sizes(picture, Board(*sorted(asked), 0.03)) in (CHESS, Board(6, 9, 0.03))
+
+
+def test_circles_of_another_number():
+    picture, _ = taken(CIRCLES, 10, 10, 0, 0.5)
+    assert other_sizes(picture, dataclasses.replace(CIRCLES, columns=7, rows=5)) == CIRCLES
+
+
+def test_a_part_of_the_board_is_said_to_be_one():
+    """Of a board of 9 × 6 the block of 5 × 5 is found in some photographs, and no 8 × 6 in most."""
+    views = measure_boards([EXAMPLE / f"photo_{i:02d}.jpg" for i in range(1, 5)], Board(5, 5, 0.03))
+    (warning,) = views.warnings
+    assert "part of a larger one, of 9x6" in warning and "give --board 9x6" in warning
+    views = measure_boards([EXAMPLE / "photo_01.jpg", EXAMPLE / "photo_13.jpg"], CHESS)
+    assert views.warnings == () and "give" not in dict(views.failed)["photo_13.jpg"]
+    with pytest.raises(InputError, match="photo_01.jpg: .* give --board 9x6, if it is seen whole$"):
+        measure_boards([EXAMPLE / "photo_01.jpg", EXAMPLE / "photo_02.jpg"], Board(10, 7, 0.03))
 
 
 def test_reading_photographs(tmp_path):

@@ -83,6 +83,19 @@ def test_a_data_frame_may_number_its_points_with_gaps():
     assert network.observations.point.tolist() == [1]
 
 
+def test_start_values_of_images_may_be_left_out():
+    """All of them, or positions or angles alone; half a position is a mistake."""
+    bare = [{"id": row["id"], "camera": row["camera"]} for row in IMAGES]
+    network = build(images=bare)
+    assert np.isnan(network.images.position).all() and np.isnan(network.images.angles).all()
+    placed = [row | {"X0": 1, "Y0": 2, "Z0": 3} for row in bare]
+    network = build(images=placed)
+    np.testing.assert_array_equal(network.images.position, [[1, 2, 3]] * len(bare))
+    assert np.isnan(network.images.angles).all()
+    with pytest.raises(InputError, match="column 'Y0' is missing; .* id, camera, X0, Y0, Z0$"):
+        build(images=[row | {"X0": 1} for row in bare])
+
+
 def test_fixed_and_prior_of_an_image():
     rows = [IMAGES[1] | {"sX0": "fixed", "sY0": 0.5, "somega": 0.1}]
     network = build(images=rows, observations=OBSERVATIONS[1:], angle_unit="deg")

@@ -161,3 +161,18 @@ def test_compare_on_the_command_line(monkeypatch, capsys, tmp_path):
     assert code == 2 and "[640, 480] and [320, 480] pixels are not of one camera" in said.err
     code, said = run(monkeypatch, capsys, "compare", tmp_path / "a.toml", tmp_path / "b.toml")
     assert code == 2 and "2 cameras (1, 2); name one of them" in said.err
+
+
+def test_camera_on_the_command_line(monkeypatch, capsys, tmp_path):
+    """90° along and across, each by its own principal distance; and what may hold a camera."""
+    (tmp_path / "a.toml").write_text(
+        '[[camera]]\nid = "1"\nmodel = "opencv"\nimage_size = [2000, 1000]\nfx = 1000.0\n'
+        "fy = 500.0\ncx = 999.5\ncy = 499.5\n"
+    )
+    code, said = run(monkeypatch, capsys, "camera", tmp_path / "a.toml")
+    assert not code and said.out.count("90.000°, 90.000°, 109.471°") == 2
+    (tmp_path / "a.foo").write_text("")
+    code, said = run(monkeypatch, capsys, "camera", tmp_path / "a.foo")
+    assert code == 2 and "not recognised; a camera stands in a camera file (OpenCV's" in said.err
+    code, said = run(monkeypatch, capsys, "camera", tmp_path / "b.foo")
+    assert code == 2 and "b.foo: no such file" in said.err

@@ -1,0 +1,53 @@
+"""What lies outside the image of its camera: coordinates that count from another origin, or a wrong
+image size, show so."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxbundle.cameras import get_model
+from jaxbundle.cameras.convert import image_area
+from jaxbundle.network.columns import count
+from jaxbundle.network.tables import Camera, Network
+
+
+def is_outside(camera: Camera, xy: Float[np.ndarray, "any 2"]) -> Bool[np.ndarray, " any"]:
+    """Whether image points, in the unit of the model, are outside the camera's image; none is where
+    its size is not known."""
+    try:
+        low, high = image_area(get_model(camera.model), camera.image_size, camera.pixel_size)
+    except ValueError:
+        return np.zeros(len(xy), bool)
+    return ((xy < low) | (xy > high)).any(1)
+
+
+def outside_warnings(cameras: Sequence[Camera], network: Network | None = None) -> tuple[str, ...]:
+    """A line for every camera whose principal point, or image points of a network, are outside."""
+    found = []
+    for c, camera in enumerate(cameras):
+        model, size = get_model(camera.model), camera.image_size
+        origin = "image centre" if model.axes != "down" else "centre of the upper-left pixel"
+        names = ("cx", "cy") if model.axes == "down" else ("x0", "y0")
+        point = np.array([[camera.parameters.get(name, 0.0) for name in names]])
+        where = f"camera {camera.id!r}: "
+        if is_outside(camera, point).any():
+            found.append(
+                f"{where}the principal point ({point[0, 0]:.6g}, {point[0, 1]:.6g}) {model.unit} "
+                f"is outside the image of {size[0]} × {size[1]} pixels; it counts from the {origin}"
+            )
+        if network is None:
+            continue
+        rays, images = network.observations, network.images
+        mine = np.flatnonzero(images.camera[rays.image] == c)
+        out = mine[is_outside(camera, rays.xy[mine])]
+        if len(out):
+            x, y = rays.xy[out[0]]
+            found.append(
+                f"{where}{len(out)} of {count(len(mine), 'image point')} outside the image of "
+                f"{size[0]} × {size[1]} pixels, such as point "
+                f"{network.points.id[rays.point[out[0]]]!r} of image "
+                f"{images.id[rays.image[out[0]]]!r} at ({x:.6g}, {y:.6g}) {model.unit} from the "
+                f"{origin}; do the coordinates count from there, and is the size right?"
+            )
+    return tuple(found)
