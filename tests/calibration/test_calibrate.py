@@ -231,7 +231,7 @@ def test_what_cannot_be_calibrated_says_why(folder, tmp_path):
     board = taken.BOARD
     good, bad = sorted(folder.glob("photo_*.png")), [folder / "text.jpg", folder / "grey.png"]
     for given, said in (
-        (bad, "no photograph of 2 shows the board: text.jpg: not an image"),
+        (bad, "no photograph of 2 shows the board: .*text.jpg: not an image"),
         ([good[0], bad[0]], r"only 1 photograph can be used \(text.jpg: not an image"),
         ([tmp_path], "no photographs in this folder"),
         ([tmp_path / "*.jpg"], "no file matches"),
