@@ -239,7 +239,7 @@ def test_what_cannot_be_calibrated_says_why(folder, tmp_path):
     ):
         with pytest.raises(InputError, match=said):
             calibrate(given, board)
-    with pytest.raises(InputError, match="shows one of 9x6 inner points: give --board 9x6"):
+    with pytest.raises(InputError, match="there is one of 9x6: give --board 9x6, if"):
         measure_boards(good[:1], Board(10, 7, 0.03))
     views = simulated()
     for options, said in (
