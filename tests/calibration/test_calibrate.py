@@ -231,7 +231,7 @@ def test_what_cannot_be_calibrated_says_why(folder, tmp_path):
     board = taken.BOARD
     good, bad = sorted(folder.glob("photo_*.png")), [folder / "text.jpg", folder / "grey.png"]
     for given, said in (
-        (bad, "no photograph of 2 shows the board: text.jpg: not an image"),
+        (bad, "no photograph of 2 shows the board: .*text.jpg: not an image"),
         ([good[0], bad[0]], r"only 1 photograph can be used \(text.jpg: not an image"),
         ([tmp_path], "no photographs in this folder"),
         ([tmp_path / "*.jpg"], "no file matches"),
@@ -239,7 +239,7 @@ def test_what_cannot_be_calibrated_says_why(folder, tmp_path):
     ):
         with pytest.raises(InputError, match=said):
             calibrate(given, board)
-    with pytest.raises(InputError, match="shows one of 9x6 inner points: give --board 9x6"):
+    with pytest.raises(InputError, match="there is one of 9x6: give --board 9x6, if"):
         measure_boards(good[:1], Board(10, 7, 0.03))
     views = simulated()
     for options, said in (
