@@ -178,6 +178,8 @@ def exterior_blocks(s: Structure, values: Values, data: Data) -> Float[Array, "e
 
 def distance_blocks(s: Structure, values: Values, data: Data) -> Float[Array, "distances 2 3"]:
     """Derivatives of the distances by their two ends."""
+    if not s.distance.shape[0]:
+        return jnp.zeros((0, 2, 3))  # Nothing to trace.
     a, b = values.point[s.distance[:, 0]], values.point[s.distance[:, 1]]
     still = jnp.zeros(3)
     ends = jax.vmap(jax.jacrev(distance_residual, (4, 5)), (0, 0, 0, 0, None, None))(

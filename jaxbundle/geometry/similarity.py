@@ -14,7 +14,7 @@ spans its null space; it is the derivative of the transformation at τ = 0,
     points  ∂X'/∂τ = [ I  −[X]×  X ],        poses  ∂(X0', δθ)/∂τ = ⎡ I  −[X0]×  X0 ⎤
                                                                     ⎣ 0    −M    0  ⎦
 
-and is obtained here by automatic differentiation (Granshaw, 1980, Photogrammetric Record 10(56)).
+(Granshaw, 1980, Photogrammetric Record 10(56)).
 """
 
 import jax
@@ -71,13 +71,18 @@ def compose(outer: Float[Array, "7"], inner: Float[Array, "7"]) -> Float[Array, 
     )
 
 
+def displacement(tau: Float[Array, "7"], X: Float[Array, "3"]) -> Float[Array, "3"]:
+    """How X moves, to first order: t + ω×X + s·X, in the object unit."""
+    return tau[:3] + jnp.cross(tau[3:6], X) + tau[6] * X
+
+
 @traced_once
 def helmert_point(X: Float[Array, "3"]) -> Float[Array, "3 7"]:
     """The rows of the Helmert matrix of a point, ∂X'/∂τ = [I, −[X]×, X] at τ = 0.
 
     Columns in the order of τ: per object unit, per radian, per unit of log scale.
     """
-    return jax.jacfwd(transform_point)(jnp.zeros(7, X.dtype), X)
+    return jax.jacfwd(displacement)(jnp.zeros(7, X.dtype), X)
 
 
 def helmert_pose(X0: Float[Array, "3"], q: Float[Array, "4"]) -> Float[Array, "6 7"]:
@@ -87,5 +92,5 @@ def helmert_pose(X0: Float[Array, "3"], q: Float[Array, "4"]) -> Float[Array, "6
     small turn r of the object is −M·r, because M·exp([r]×)ᵀ = exp([−M·r]×)·M.
     """
     M = matrix_from_quaternion(q)
-    change = lambda tau: jnp.concatenate([transform_point(tau, X0), -M @ tau[3:6]])
+    change = lambda tau: jnp.concatenate([displacement(tau, X0), -M @ tau[3:6]])
     return jax.jacfwd(change)(jnp.zeros(7, X0.dtype))

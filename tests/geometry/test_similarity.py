@@ -91,6 +91,8 @@ def test_helmert_matrix_is_the_textbook_one():
     attitudes = np.concatenate([zeros, -scipy_rotation(Q).as_matrix(), zeros[..., :1]], axis=2)
     poses = np.concatenate([centres, attitudes], axis=1)
     np.testing.assert_allclose(batch(helmert_point)(X), points, atol=1e-13)
+    slope = jax.vmap(lambda x: jax.jacfwd(transform_point)(jnp.zeros(7), x))(X)
+    np.testing.assert_allclose(slope, points, atol=1e-13)
     np.testing.assert_allclose(batch(helmert_pose)(X0, Q), poses, atol=1e-13)
 
 
