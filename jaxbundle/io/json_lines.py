@@ -30,7 +30,7 @@ class JsonLines:
         for number, line in enumerate(lines, 1):
             row = _row(line)
             if row is None:
-                if number == len(lines):
+                if number == len(lines) and not text.endswith("\n") and _is_torn(line):
                     break
                 raise InputError(
                     f"{self.path}, line {number}: not a result of jaxbundle batch; "
@@ -75,6 +75,12 @@ def _text(row: dict) -> str:
         return json.dumps(row, ensure_ascii=False, allow_nan=False)
     except ValueError:
         return json.dumps(without_nan(row), ensure_ascii=False)
+
+
+def _is_torn(line: str) -> bool:
+    """Whether a line is the beginning of a row."""
+    begin = '{"'
+    return line.startswith(begin) or begin.startswith(line)
 
 
 def _row(line: str) -> dict | None:

@@ -147,3 +147,12 @@ def test_lines_are_kept_dropped_and_tried_again(tmp_path):
     file.write_text("[1, 2]\n" + whole)
     with pytest.raises(InputError, match="line 1"):
         JsonLines(file)
+
+
+@pytest.mark.parametrize("text", ["my notes\n", "my notes", '{"key": "a", "sta\n'])
+def test_a_file_of_something_else_is_not_taken_for_a_torn_line(tmp_path, text):
+    file = tmp_path / "notes.txt"
+    file.write_text(text)
+    with pytest.raises(InputError, match="line 1: not a result"):
+        JsonLines(file)
+    assert file.read_text() == text
