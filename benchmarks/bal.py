@@ -1,286 +1,258 @@
-"""BAL problems and synthetic ones of their kind: our solver and Ceres, on one machine, in one run.
+"""BAL problems, real or synthetic: our solver and its peers, on one machine, in one run.
 
-    python benchmarks/bal.py PROBLEM ... [--ceres BINARY] [--solver NAME] [--scipy] [--repeat N]
-        [--reduction dense|banded|iterative] [--json FILE] [--baseline]
-    python benchmarks/bal.py --street IMAGES POINTS | --arc IMAGES POINTS ...
+    python benchmarks/bal.py PROBLEM ... [--street IMAGES POINTS] [--arc IMAGES POINTS]
+        [--peers NAME ...] [--ceres BINARY] [--solver NAME] [--jaxls PYTHON] [--baseline]
 
-PROBLEM is a file in the BAL format (.txt, .gz, .bz2). BINARY is Ceres' own example program
-`bundle_adjuster` (built from its sources; environment variable BUNDLE_ADJUSTER); without it our
-solver runs alone. Both use two cores: Ceres two threads, we two CPU devices of JAX. --scipy adds
-scipy's least_squares (trf, differences of grouped columns) for a few evaluations.
+PROBLEM is a file in the BAL format (.txt, .gz, .bz2); `scenes.py` writes --street and --arc. Every
+solver runs in a process of its own, in turn, twice (--rounds), on two cores: Ceres with two
+threads, we with two CPU devices of JAX, or on the GPU. The peers, all that are there unless named:
 
-Told are the final cost ½Σv², the time of an iteration (the whole solution divided by its
-iterations, compilation apart), the time from the start values to 1.0001 × the lower final cost, and
-their ratios. The exit status is 1 where our final cost is higher than Ceres' by 1e-6, and with
---baseline where it is higher than that in baseline.json by 1e-6 or an iteration takes four times as
-long as there (--write-baseline makes a new one).
+    pycolmap   Ceres as it comes with pycolmap (pip install pycolmap)
+    ceres      Ceres' own program `bundle_adjuster`: --ceres BINARY, or BUNDLE_ADJUSTER
+    scipy      least_squares with exact derivatives, for a few evaluations
+    jaxls      of github.com/brentyi/jaxls (PyPI's package of this name is another one): in this
+               environment, or in that of --jaxls PYTHON
+
+A peer that is not there is named as skipped. Told are the lowest cost ½Σv² in pixels² and whether
+the limit of evaluations ended the search, the time of an iteration (the whole solution divided by
+its iterations, compilation apart), the time from the start values to 1.0001 × the lowest cost of
+all, the same divided by a peer's (ours / peer), compilation with an empty folder of compiled
+programs and in a second process with that folder, and the peak of the memory of the process.
+--json has the cost after every evaluation and its time for all, --plot draws them.
+
+The exit status is 1 where our cost is higher than a peer's by 1e-6, and with --baseline where it
+does not agree with `baseline.json` (see `baseline.py`; --write-baseline makes a new one).
 """
 
-import argparse
 import json
 import os
-import re
-import resource
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import equinox as eqx  # noqa: E402
-import jax  # noqa: E402
-import numpy as np  # noqa: E402
-import scenes  # noqa: E402
-from jax.flatten_util import ravel_pytree  # noqa: E402
-from scipy.optimize import least_squares  # noqa: E402
-from scipy.sparse import coo_matrix  # noqa: E402
+import baseline
+import machine
 
-import jaxbundle  # noqa: E402
-from jaxbundle.adjustment.jacobian import zero_tangent  # noqa: E402
-from jaxbundle.adjustment.residuals import residuals  # noqa: E402
-from jaxbundle.adjustment.sharding import distribute, find_minimum_of_shards  # noqa: E402
-from jaxbundle.adjustment.solve import make_solver  # noqa: E402
-from jaxbundle.adjustment.solver import minimise  # noqa: E402
-from jaxbundle.network.arrays import retract  # noqa: E402
-from jaxbundle.network.reduction import REDUCTIONS  # noqa: E402
-
-CORES = 2
-SCIPY_EVALUATIONS = 5
+HERE = Path(__file__).parent
+PEERS = ("pycolmap", "ceres", "scipy", "jaxls")
+FEW = {"scipy": 20, "jaxls": 30}
+"""Evaluations of those that are slow."""
+SEED = 0
+IS_JAXLS = "import jaxls; jaxls.LeastSquaresProblem"
 
 
-BASELINE = Path(__file__).parent / "baseline.json"
-SLOWER = 4.0
-"""An iteration may take so many times as long as in the baseline, on whatever machine."""
+def commands(given) -> tuple[dict[str, list[str]], dict[str, str]]:
+    """Command of every solver without the problem, and why others are skipped."""
+    cores = ["--threads", str(given.threads), "--solver", given.solver]
+    found = {"ours": [sys.executable, "bal_ours.py", "--devices", str(given.devices)]}
+    if given.reduction:
+        found["ours"] += ["--reduction", given.reduction]
+    skipped, wanted = {}, PEERS if given.peers is None else given.peers
+    if "pycolmap" in wanted:
+        if machine.installed("pycolmap"):
+            found["pycolmap"] = [sys.executable, "bal_pycolmap.py", *cores]
+        else:
+            skipped["pycolmap"] = "not installed (pip install pycolmap)"
+    if "ceres" in wanted:
+        if given.ceres:
+            found["ceres"] = [sys.executable, "bal_ceres.py", "--binary", given.ceres, *cores]
+        else:
+            skipped["ceres"] = "no binary given (--ceres BINARY or BUNDLE_ADJUSTER)"
+    if "scipy" in wanted:
+        found["scipy"] = [sys.executable, "bal_scipy.py"]
+    if "jaxls" in wanted:
+        python = given.jaxls or sys.executable
+        if subprocess.run([python, "-c", IS_JAXLS], capture_output=True).returncode == 0:
+            found["jaxls"] = [python, "bal_jaxls.py"]
+        else:
+            skipped["jaxls"] = (
+                "that of github.com/brentyi/jaxls is not installed here (--jaxls PYTHON names an "
+                "environment that has it)"
+            )
+    return found, skipped
 
 
-def ours(path: Path, evaluations: int, repeat: int, reduction: str | None) -> dict:
-    """Our solver on all devices."""
-    begin = time.perf_counter()
-    network = jaxbundle.check_network(jaxbundle.read_network(path))
-    problem = jaxbundle.make_problem(network, reduction)
-    solver = make_solver(problem, max_steps=evaluations, atol=1e-5)
-    if len(jax.devices()) > 1:
-        shards = distribute(problem)
-        run = lambda: find_minimum_of_shards(solver, shards, problem.data.start)  # noqa: E731
-    else:
-        compiled = eqx.filter_jit(minimise)
-        run = lambda: compiled(solver, problem.data, problem.data.start)  # noqa: E731
-    prepare = time.perf_counter() - begin
-
-    def timed():
-        begin = time.perf_counter()
-        minimum = jax.block_until_ready(run())
-        return minimum, time.perf_counter() - begin
-
-    minimum, first = timed()
-    seconds = min(timed()[1] for _ in range(repeat))
-    number = int(minimum.iterations)
-    cost = np.asarray(minimum.history.cost)[:number]
-    return {
-        "reduction": problem.structure.reduction,
-        "cost": float(np.nanmin(cost)),
-        "costs": cost.tolist(),
-        "evaluations": number,
-        "seconds": seconds,
-        "iteration_s": seconds / number,
-        "compile_s": first - seconds,
-        "prepare_s": prepare,
-        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3,
-    }
-
-
-ROW = re.compile(r"^\s*(\d+)\s+([-\d.e+]+).*?([-\d.e+]+)\s+([-\d.e+]+)\s*$")
-
-
-def ceres(path: Path, binary: str, solver: str, iterations: int, repeat: int) -> dict:
-    """Ceres' bundle_adjuster: the best of some runs."""
-    command = [
-        binary, f"--input={path}", f"--num_threads={CORES}", f"--num_iterations={iterations}",
-        f"--linear_solver={solver}", "--ordering=user",
-    ]  # fmt: skip
-    if solver == "iterative_schur":
-        command.append("--preconditioner=schur_jacobi")
-    runs = []
-    for _ in range(repeat):
-        text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-        rows = [ROW.match(line) for line in text.splitlines()]
-        rows = [[float(m[i]) for i in (2, 3, 4)] for m in rows if m]
-        cost, iteration, at = np.array(rows).T
-        # From the first evaluation on, without the preprocessor before it.
-        at = at - at[0] + iteration[0]
-        runs.append((at[-1] - at[0], cost, at))
-    seconds, cost, at = min(runs, key=lambda run: run[0])
-    cost = np.minimum.accumulate(cost)
-    return {
-        "cost": float(cost[-1]), "costs": cost.tolist(), "iterations": len(cost) - 1,
-        "seconds": seconds, "iteration_s": (seconds - at[0]) / max(len(cost) - 1, 1),
-        "at_s": at.tolist(),
-    }  # fmt: skip
-
-
-def of_scipy(path: Path, evaluations: int) -> dict:
-    """scipy.optimize.least_squares, the Jacobian by differences of columns that touch no row
-    together."""
-    network = jaxbundle.check_network(jaxbundle.read_network(path))
-    problem = jaxbundle.make_problem(network, "dense")
-    s, data = problem.structure, problem.data
-    zero, unravel = ravel_pytree(zero_tangent(s))
-    image_rows = s.images * s.image_width
-    row = np.arange(2 * s.rays).reshape(-1, 2, 1)
-    image, point = np.asarray(s.image), np.asarray(s.point)
-    columns = np.concatenate([
-        image[:, None] * s.image_width + np.arange(s.image_width),
-        image_rows + point[:, None] * 3 + np.arange(3),
-    ], 1)[:, None]  # fmt: skip
-    row, columns = (x.ravel() for x in np.broadcast_arrays(row, columns))
-    touched = coo_matrix((np.ones(len(row), int), (row, columns)), (2 * s.rays, zero.size)).tocsr()
-    rows = eqx.filter_jit(lambda x: residuals(s, retract(s, data.start, unravel(x)), data).image)
-    function = lambda x: np.asarray(rows(x)).ravel()  # noqa: E731
-    function(np.asarray(zero))  # compiled
-
-    begin = time.perf_counter()
-    found = least_squares(
-        function, np.asarray(zero), jac_sparsity=touched, x_scale="jac", method="trf",
-        max_nfev=evaluations, ftol=1e-12, xtol=1e-12, gtol=1e-12,
+def run(command: list[str], problem: Path, evaluations: int, repeat: int) -> dict:
+    """Figures of one solver in a process of its own."""
+    python, program, *options = command
+    done = subprocess.run(
+        [python, str(HERE / program), str(problem), *options,
+         "--evaluations", str(evaluations), "--repeat", str(repeat)],
+        capture_output=True, text=True,
     )  # fmt: skip
-    seconds = time.perf_counter() - begin
-    return {"cost": float(found.cost), "iterations": int(found.nfev), "seconds": seconds,
-            "iteration_s": seconds / max(found.nfev, 1)}  # fmt: skip
+    if done.returncode:
+        sys.stderr.write(done.stderr)
+        raise SystemExit(f"{program} ended with status {done.returncode}")
+    return json.loads(done.stdout)
 
 
-def time_to(figures: dict, cost: float) -> float:
-    """Seconds from the start values until the cost was reached; infinite if it was not."""
-    reached = np.flatnonzero(np.asarray(figures["costs"]) <= cost)
-    if not len(reached):
-        return float("inf")
-    if "at_s" in figures:
-        return figures["at_s"][reached[0]]
-    return (reached[0] + 1) * figures["iteration_s"]
+def best_of(runs: list[dict]) -> dict:
+    """The fastest run of one solver; compilation and memory of the first."""
+    best = min(runs, key=lambda figures: figures["seconds"])
+    first, *later = runs
+    best = best | {name: first[name] for name in ("compile_s", "prepare_s", "peak_mb")
+                   if name in first}  # fmt: skip
+    if "prepare_s" in first and later:
+        best["compile_cached_s"] = later[0]["compile_s"]
+    return best
 
 
-def compare(name: str, path: Path, arguments) -> dict:
-    """Both solvers on one problem."""
-    found = {"problem": name}
-    found["ours"] = ours(path, arguments.evaluations, arguments.repeat, arguments.reduction)
-    lowest = found["ours"]["cost"]
-    if arguments.ceres:
-        found["ceres"] = ceres(
-            path, arguments.ceres, arguments.solver, arguments.evaluations, arguments.repeat
-        )
-        lowest = min(lowest, found["ceres"]["cost"])
-    if arguments.scipy:
-        found["scipy"] = of_scipy(path, SCIPY_EVALUATIONS)
-    for program in ("ours", "ceres"):
-        if program in found:
-            found[program]["to_1.0001_s"] = time_to(found[program], 1.0001 * lowest)
+def time_to(figures: dict, cost: float) -> float | None:
+    """Seconds from the start values until the cost was reached; none if it was not."""
+    return next((t for c, t in zip(figures["costs"], figures["at_s"]) if c <= cost), None)
+
+
+def compare(key: str, path: Path, todo: dict, given) -> dict:
+    """All solvers on one problem, taking turns; it begins without compiled programs."""
+    runs = {name: [] for name in todo}
+    with tempfile.TemporaryDirectory() as cache:
+        todo = todo | {"ours": [*todo["ours"], "--cache", cache]}
+        for _ in range(given.rounds):
+            for name, command in todo.items():
+                few = min(given.evaluations, FEW.get(name, given.evaluations))
+                repeat = 1 if name in FEW else given.repeat
+                runs[name].append(run(command, path, few, repeat))
+    found = {"key": key} | {name: best_of(some) for name, some in runs.items()}
+    lowest = min(found[name]["cost"] for name in todo if found[name].get("comparable", True))
+    for name in todo:
+        found[name]["to_1.0001_s"] = time_to(found[name], 1.0001 * lowest)
     return found
 
 
-def told(found: dict) -> str:
+def ratio(ours: float | None, theirs: float | None) -> str:
+    return f"{ours / theirs:.2f}" if ours and theirs else ""
+
+
+def told(found: dict, names) -> str:
     """The figures for people."""
-    o = found["ours"]
-    lines = [
-        found["problem"],
-        f"  ours   {o['reduction']}: cost {o['cost']:.4f}, {o['evaluations']} evaluations, "
-        f"{1e3 * o['iteration_s']:.1f} ms an iteration, {o['to_1.0001_s']:.3f} s to 1.0001 × "
-        f"the cost; preparation {o['prepare_s']:.1f} s, compilation {o['compile_s']:.1f} s, "
-        f"peak {o['peak_mb']:.0f} MB",
-    ]
-    if "ceres" in found:
-        c = found["ceres"]
-        lines += [
-            f"  Ceres  cost {c['cost']:.4f}, {c['iterations']} iterations, "
-            f"{1e3 * c['iteration_s']:.1f} ms an iteration, {c['to_1.0001_s']:.3f} s to 1.0001 × "
-            "the cost",
-            f"  ratio  {o['iteration_s'] / c['iteration_s']:.2f} an iteration, "
-            f"{o['to_1.0001_s'] / c['to_1.0001_s']:.2f} to 1.0001 × the cost",
-        ]
-    if "scipy" in found:
-        s = found["scipy"]
-        lines.append(
-            f"  scipy  cost {s['cost']:.4f} after {s['iterations']} evaluations, "
-            f"{1e3 * s['iteration_s']:.0f} ms each"
-        )
-    return "\n".join(lines)
-
-
-def against_baseline(all_found: list[dict]) -> list[str]:
-    """What is worse than in the committed baseline: tight on cost, loose on time."""
-    baseline, worse = json.loads(BASELINE.read_text()), []
-    for found in all_found:
-        name, now = found["problem"], found["ours"]
-        if name not in baseline:
-            continue
-        then = baseline[name]
-        if now["cost"] > (1 + 1e-6) * then["cost"]:
-            worse.append(f"{name}: cost {now['cost']:.6f}, {then['cost']:.6f} in the baseline")
-        if now["iteration_s"] > SLOWER * then["iteration_s"]:
-            worse.append(
-                f"{name}: {1e3 * now['iteration_s']:.1f} ms an iteration, "
-                f"{1e3 * then['iteration_s']:.1f} in the baseline"
+    rows = [("", "cost", "evaluations", "ms/iteration", "ratio", "s to 1.0001", "ratio",
+             "compile s, cached", "peak MB")]  # fmt: skip
+    ours, notes = found["ours"], []
+    for name in names:
+        f, peer = found[name], name != "ours"
+        to, limit = f["to_1.0001_s"], f["at_limit"]
+        compiled = [f[n] for n in ("compile_s", "compile_cached_s") if n in f]
+        comparable = f.get("comparable", True)
+        rows.append((
+            f["solver"], f"{f['cost']:.4f}" + ("" if comparable else " ≠"),
+            f"{f['evaluations']}" + (" = limit" if limit else ""),
+            f"{1e3 * f['iteration_s']:.1f}", ratio(ours["iteration_s"], f["iteration_s"]) * peer,
+            f"{to:.3f}" if to and comparable else "–",
+            ratio(ours["to_1.0001_s"], to) * (peer and comparable),
+            ", ".join(f"{s:.1f}" for s in compiled), f"{f['peak_mb']:.0f}",
+        ))  # fmt: skip
+        if limit:
+            notes.append(f"{f['solver']}: stopped at the limit of {f['evaluations']} evaluations; "
+                         "its cost is not final")  # fmt: skip
+        if not comparable:
+            said, of_all = f["costs_said"], f["costs_of_all_rays"]
+            notes.append(
+                f"{f['solver']}: leaves out rays of points behind the camera, its costs are not "
+                f"those of the problem: {said[0]:.4f} at the start, that of all rays is "
+                f"{of_all[0]:.4f}; at the end {said[1]:.4f} and {of_all[1]:.4f}"
             )
-    return worse
+    notes.append(f"jaxbundle: {ours['ended']}; importing JAX takes {ours['import_mb']:.0f} MB")
+    if ours["device_peak_mb"]:
+        notes.append(f"jaxbundle: peak of the memory of the device {ours['device_peak_mb']:.0f} MB")
+    widths = [max(map(len, column)) for column in zip(*rows)]
+    lines = [
+        "  ".join([row[0].ljust(widths[0])] + [c.rjust(w) for c, w in zip(row[1:], widths[1:])])
+        for row in rows
+    ]
+    return "\n".join([found["key"], *(f"  {line}" for line in lines + notes)])
 
 
-def write_baseline(all_found: list[dict]) -> None:
-    """Keep these figures in baseline.json, with those of other problems."""
-    baseline = json.loads(BASELINE.read_text()) if BASELINE.exists() else {}
-    for found in all_found:
-        figures = found["ours"]
-        baseline[found["problem"]] = {
-            name: figures[name] for name in ("reduction", "cost", "evaluations", "iteration_s")
-        }
-    BASELINE.write_text(json.dumps(baseline, indent=1, sort_keys=True) + "\n")
+def problems(given, folder: Path):
+    """Name and plain file of every problem, one at a time."""
+    import scenes
+
+    for path in given.problems:
+        plain = scenes.unpacked(path, folder)
+        yield baseline.name_of_file(path, plain), plain
+    for kind in ("street", "arc"):
+        for images, points in getattr(given, kind) or ():
+            plain = folder / f"{kind}.txt"
+            # In a process of its own: its memory would count as that of the solvers.
+            subprocess.run([sys.executable, str(HERE / "scenes.py"), kind, str(images), str(points),
+                            str(SEED), str(plain)], check=True)  # fmt: skip
+            yield f"{kind} of {images} images, {points} points, seed {SEED}", plain
+
+
+def arguments():
+    """Of the command line."""
+    parser = machine.parser_of(__doc__)
+    size = {"nargs": 2, "type": int, "metavar": ("IMAGES", "POINTS"), "action": "append"}
+    parser.add_argument("problems", nargs="*", type=Path)
+    parser.add_argument("--street", **size)
+    parser.add_argument("--arc", **size)
+    parser.add_argument("--peers", nargs="*", choices=PEERS, help="only these; none: --peers alone")
+    parser.add_argument("--ceres", default=os.environ.get("BUNDLE_ADJUSTER"), metavar="BINARY")
+    parser.add_argument("--solver", default="dense_schur",
+                        choices=("dense_schur", "sparse_schur", "iterative_schur"),
+                        help="of Ceres; iterative_schur with schur_jacobi")  # fmt: skip
+    parser.add_argument("--jaxls", metavar="PYTHON")
+    parser.add_argument("--reduction", choices=("dense", "banded", "iterative"),
+                        help="ours; chosen if not given")  # fmt: skip
+    parser.add_argument("--baseline", action="store_true", help="compare with baseline.json")
+    parser.add_argument("--write-baseline", action="store_true")
+    parser.add_argument("--evaluations", type=int, default=200, help="limit, of all but "
+                        + ", ".join(f"{name} ({n})" for name, n in FEW.items()))  # fmt: skip
+    parser.add_argument("--rounds", type=int, default=2, help="turns; the best counts")
+    parser.add_argument("--repeat", type=int, default=2, help="timed runs a turn")
+    parser.add_argument("--devices", type=int, default=2, help="of the processor, for JAX")
+    parser.add_argument("--threads", type=int, default=2, help="of Ceres")
+    parser.add_argument("--json", metavar="FILE", help="write the figures; - for standard output")
+    parser.add_argument("--plot", metavar="FILE", help="draw cost against iteration and time")
+    given = parser.parse_args()
+    if not (given.problems or given.street or given.arc):
+        parser.error("no problem: name a file, or --street or --arc")
+    for path in given.problems:
+        if not path.is_file():
+            parser.error(f"there is no file {path}")
+    return given
 
 
 def main() -> int:
     """Run, print, check."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("problems", nargs="*", type=Path)
-    parser.add_argument("--street", nargs=2, type=int, metavar=("IMAGES", "POINTS"))
-    parser.add_argument("--arc", nargs=2, type=int, metavar=("IMAGES", "POINTS"))
-    parser.add_argument("--ceres", default=os.environ.get("BUNDLE_ADJUSTER"))
-    parser.add_argument("--solver", default="dense_schur",
-                        help="of Ceres: dense_schur, sparse_schur, iterative_schur")  # fmt: skip
-    parser.add_argument("--scipy", action="store_true")
-    parser.add_argument("--reduction", choices=REDUCTIONS, help="chosen if not given")
-    parser.add_argument("--baseline", action="store_true", help="compare with baseline.json")
-    parser.add_argument("--write-baseline", action="store_true")
-    parser.add_argument("--evaluations", type=int, default=60)
-    parser.add_argument("--repeat", type=int, default=3, help="timed runs; the best counts")
-    parser.add_argument("--devices", type=int, default=CORES)
-    parser.add_argument("--json", metavar="FILE")
-    arguments = parser.parse_args()
-    jax.config.update("jax_num_cpu_devices", arguments.devices)
-    jaxbundle.enable_x64()
+    given = arguments()
+    show = sys.stderr if given.json == "-" else sys.stdout
+    todo, skipped = commands(given)
+    for name, why in skipped.items():
+        print(f"skipped: {name}: {why}", file=show)
+    settings = {"reduction": given.reduction or "chosen",
+                "evaluations": f"≤ {given.evaluations}", "atol": 1e-5}  # fmt: skip
     all_found = []
     with tempfile.TemporaryDirectory() as folder:
-        todo = [(path.name, path) for path in arguments.problems]
-        for kind in ("street", "arc"):
-            if size := getattr(arguments, kind):
-                path = Path(folder) / f"{kind}-{size[0]}.txt"
-                scenes.write_bal(path, *getattr(scenes, kind)(*size))
-                todo.append((path.stem, path))
-        for name, path in todo:
-            plain = scenes.unpacked(path, Path(folder))
-            all_found.append(compare(name, plain, arguments))
-            print(told(all_found[-1]), flush=True)
-    if arguments.json:
-        Path(arguments.json).write_text(json.dumps(all_found, indent=1))
-    worse = [
-        f["problem"] for f in all_found
-        if "ceres" in f and f["ours"]["cost"] > (1 + 1e-6) * f["ceres"]["cost"]
+        for problem, path in problems(given, Path(folder)):
+            found = compare(baseline.key_of(problem, settings), path, todo, given)
+            if not all_found:
+                print(machine.in_words(found["ours"]["machine"]), file=show)
+            all_found.append(found)
+            print(f"\n{told(found, todo)}", file=show, flush=True)
+    machine.write_json(all_found, given.json)
+    if given.plot:
+        import plots
+
+        plots.draw(all_found, given.plot)
+    wrong = [
+        f"{f['key']}: our cost is higher than that of {peer}"
+        for f in all_found for peer in PEERS
+        if peer in f and f[peer].get("comparable", True)
+        and f["ours"]["cost"] > (1 + 1e-6) * f[peer]["cost"]
     ]  # fmt: skip
-    worse = [f"{name}: our final cost is higher" for name in worse]
-    if arguments.write_baseline:
-        write_baseline(all_found)
-    elif arguments.baseline:
-        worse += against_baseline(all_found)
-    for line in worse:
+    if given.write_baseline:
+        baseline.write(all_found)
+    elif given.baseline:
+        more, known = baseline.compare(all_found)
+        wrong += more
+        for line in known:
+            print(f"note: {line}", file=show)
+    for line in wrong:
         print(f"WRONG: {line}", file=sys.stderr)
-    return 1 if worse else 0
+    return 1 if wrong else 0
 
 
 if __name__ == "__main__":

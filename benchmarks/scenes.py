@@ -1,7 +1,10 @@
 """Synthetic problems in the BAL format: Snavely cameras, noise of half a pixel, disturbed starts.
 
+    python benchmarks/scenes.py street|arc IMAGES POINTS SEED OUT
+
 `street`: a drive past façades, every point seen from a few places in a row (a banded system);
-`arc`: images around one scene, where almost any two have points in common (a full one).
+`arc`: images around one scene, where almost any two have points in common (a full one). The file
+is read by `bal.py` and by any program that reads BAL problems.
 """
 
 import bz2
@@ -9,6 +12,7 @@ import gzip
 import shutil
 from pathlib import Path
 
+import machine
 import numpy as np
 
 HALF_FORMAT = 700.0
@@ -50,7 +54,7 @@ def arc(images: int, points: int, seed: int = 0):
 def _problem(rng, X, centre, target, image, point, disturbance):
     """Cameras [n, 9], points, image and point of every observation, coordinates."""
     M = _looking(centre, target)
-    cameras = np.c_[_rotation_vectors(M), -np.einsum("nij,nj->ni", M, centre),
+    cameras = np.c_[rotation_vectors(M), -np.einsum("nij,nj->ni", M, centre),
                     rng.uniform(700, 1100, len(M)), 0.01 * rng.normal(size=len(M)),
                     0.005 * rng.normal(size=len(M))]  # fmt: skip
     xy, in_front = _project(cameras, M, X, image, point)
@@ -70,7 +74,7 @@ def _problem(rng, X, centre, target, image, point, disturbance):
     start = cameras[seen].copy()
     start[:, :3] += disturbance * 2e-3 * rng.normal(size=(len(seen), 3))
     moved = centre[seen] + disturbance * 0.03 * rng.normal(size=(len(seen), 3))
-    start[:, 3:6] = -np.einsum("nij,nj->ni", _matrices(start[:, :3]), moved)
+    start[:, 3:6] = -np.einsum("nij,nj->ni", matrices(start[:, :3]), moved)
     start[:, 6] *= 1 + 0.01 * rng.normal(size=len(seen))
     start[:, 7:] = 0
     noisy = xy[order] + NOISE * rng.normal(size=(len(order), 2))
@@ -87,14 +91,14 @@ def _looking(centre, target):
     return np.stack([right, np.cross(back, right), back], 1)
 
 
-def _rotation_vectors(M):
+def rotation_vectors(M):
     """Rotation vectors of rotation matrices."""
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_matrix(M).as_rotvec()
 
 
-def _matrices(vectors):
+def matrices(vectors):
     """Rotation matrices of rotation vectors."""
     from scipy.spatial.transform import Rotation
 
@@ -122,6 +126,23 @@ def write_bal(path: Path, cameras, points, image, point, xy) -> None:
         np.savetxt(file, np.concatenate([cameras.ravel(), points.ravel()]), fmt="%.16e")
 
 
+def read_bal(path: str | Path):
+    """What `write_bal` wrote, in its order."""
+    with open(path, encoding="ascii") as file:
+        images, points, rays = map(int, file.readline().split())
+        numbers = np.array(file.read().split(), float)
+    rays, cameras, X = np.split(numbers, [4 * rays, 4 * rays + 9 * images])
+    image, point, x, y = rays.reshape(-1, 4).T
+    index = image.astype(int), point.astype(int)
+    return cameras.reshape(-1, 9), X.reshape(-1, 3), *index, np.stack([x, y], 1)
+
+
+def half_square(cameras, points, image, point, xy) -> float:
+    """½Σv² of a problem, in pixels²."""
+    computed, _ = _project(cameras, matrices(cameras[:, :3]), points, image, point)
+    return 0.5 * float(np.square(computed - xy).sum())
+
+
 def unpacked(path: Path, folder: Path) -> Path:
     """The file itself, or its unpacked copy in the folder."""
     opener = {".gz": gzip.open, ".bz2": bz2.open}.get(path.suffix)
@@ -131,3 +152,19 @@ def unpacked(path: Path, folder: Path) -> Path:
     with opener(path, "rb") as packed, open(copy, "wb") as plain:
         shutil.copyfileobj(packed, plain)
     return copy
+
+
+def main() -> None:
+    parser = machine.parser_of(__doc__)
+    parser.add_argument("kind", choices=("street", "arc"))
+    parser.add_argument("images", type=int)
+    parser.add_argument("points", type=int)
+    parser.add_argument("seed", type=int)
+    parser.add_argument("out", type=Path)
+    given = parser.parse_args()
+    scene = {"street": street, "arc": arc}[given.kind]
+    write_bal(given.out, *scene(given.images, given.points, given.seed))
+
+
+if __name__ == "__main__":
+    main()

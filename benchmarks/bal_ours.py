@@ -1,0 +1,90 @@
+"""Our solver on one BAL problem, in a process of its own; prints one line of JSON for `bal.py`.
+
+    python benchmarks/bal_ours.py PROBLEM [--evaluations N] [--repeat N] [--devices N]
+        [--reduction NAME] [--cache FOLDER]
+
+The first call compiles; the difference to the best later one is told as compilation: cold with an
+empty folder of compiled programs or none, cached with a full one. Memory is read after the first
+call, and once before anything but the import of JAX.
+"""
+
+import json
+import sys
+import time
+
+import jax
+import machine
+
+memory = {"import_mb": machine.peak_mb()}
+
+import equinox as eqx  # noqa: E402
+import numpy as np  # noqa: E402
+
+import jaxbundle  # noqa: E402
+from jaxbundle.adjustment.sharding import distribute, find_minimum_of_shards  # noqa: E402
+from jaxbundle.adjustment.solve import make_solver  # noqa: E402
+from jaxbundle.adjustment.solver import LIMIT, TERMINATIONS, minimise  # noqa: E402
+from jaxbundle.network.reduction import REDUCTIONS  # noqa: E402
+
+ATOL = 1e-5
+
+
+def prepare(path: str, evaluations: int, reduction: str | None):
+    """The problem, and the function that solves it."""
+    network = jaxbundle.check_network(jaxbundle.read_network(path))
+    problem = jaxbundle.make_problem(network, reduction)
+    solver = make_solver(problem, max_steps=evaluations, atol=ATOL)
+    if len(jax.devices()) > 1:
+        shards = distribute(problem)
+        return problem, lambda: find_minimum_of_shards(solver, shards, problem.data.start)
+    compiled = eqx.filter_jit(minimise)
+    return problem, lambda: compiled(solver, problem.data, problem.data.start)
+
+
+def main() -> None:
+    parser = machine.parser_of(__doc__)
+    parser.add_argument("problem")
+    parser.add_argument("--evaluations", type=int, default=200)
+    parser.add_argument("--repeat", type=int, default=2)
+    parser.add_argument("--devices", type=int, default=2, help="of the processor")
+    parser.add_argument("--reduction", choices=REDUCTIONS)
+    parser.add_argument("--cache", help="folder of compiled programs")
+    given = parser.parse_args()
+    jax.config.update("jax_num_cpu_devices", given.devices)
+    jaxbundle.enable_x64()
+    if given.cache:
+        jaxbundle.keep_programs(given.cache)
+
+    begin = time.perf_counter()
+    problem, run = prepare(given.problem, given.evaluations, given.reduction)
+    prepare_s = time.perf_counter() - begin
+
+    def timed():
+        begin = time.perf_counter()
+        minimum = jax.block_until_ready(run())
+        return minimum, time.perf_counter() - begin
+
+    minimum, first = timed()
+    memory["peak_mb"], memory["device_peak_mb"] = machine.peak_mb(), machine.device_peak_mb()
+    seconds = min(timed()[1] for _ in range(given.repeat))
+    number, termination = int(minimum.iterations), int(minimum.termination)
+    costs = np.fmin.accumulate(np.asarray(minimum.history.cost)[:number])
+    json.dump({
+        "solver": f"jaxbundle, {problem.structure.reduction}",
+        "reduction": problem.structure.reduction,
+        "cost": float(costs[-1]),
+        "evaluations": number,
+        "ended": TERMINATIONS[termination],
+        "at_limit": termination == LIMIT,
+        "seconds": seconds,
+        "iteration_s": seconds / number,
+        "compile_s": first - seconds,
+        "prepare_s": prepare_s,
+        "costs": costs.tolist(),
+        "at_s": (seconds / number * np.arange(1, number + 1)).tolist(),
+        "machine": machine.machine(),
+    } | memory, sys.stdout)  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
