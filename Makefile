@@ -1,5 +1,6 @@
-# Two commands: `make demo` and `make test`. Both make .venv first (uv where installed, else venv
-# and pip) and install the package with what the tests need.
+# `make demo`, `make test` and `make bench` (or a part of it, below). All make .venv first (uv where
+# installed, else venv and pip) and install the package with what the tests need; `bench` also what
+# it compares with. More problems: make bench-bal BAL="problem-16-22106-pre.txt.bz2 …" PEERS="--ceres …"
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -9,7 +10,12 @@ WORKERS ?= 2
 # Many small matrices: one BLAS thread a process.
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: demo test lint bench install clean
+BENCHES = block batch bal first
+MORE_BENCHES = large pushbroom orientation measuring
+BAL ?=
+PEERS ?=
+
+.PHONY: demo test lint bench install clean $(BENCHES:%=bench-%) $(MORE_BENCHES:%=bench-%)
 
 install: $(VENV)/installed
 
@@ -29,10 +35,37 @@ test: install
 	$(BIN)/python -m ruff check jaxbundle tests benchmarks
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
-bench: install
+$(VENV)/compared: $(VENV)/installed
+	@if command -v uv >/dev/null 2>&1; then \
+	  uv pip install --quiet --python $(BIN)/python -e '.[bench]'; \
+	else \
+	  $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench]'; \
+	fi || echo "the extra 'bench' could not be installed: peers that are missing will be skipped"
+	@touch $@
+
+bench: $(BENCHES:%=bench-%)
+
+bench-block: $(VENV)/compared
 	$(BIN)/python benchmarks/big_block.py
+
+bench-batch: $(VENV)/compared
 	$(BIN)/python benchmarks/calibration.py
-	$(BIN)/python benchmarks/bal.py --street 100 10000 --arc 40 10000 --baseline
+
+bench-bal: $(VENV)/compared
+	$(BIN)/python benchmarks/bal.py $(BAL) --street 100 10000 --arc 40 10000 --baseline $(PEERS)
+
+bench-first: $(VENV)/compared
+	$(BIN)/python benchmarks/first.py
+
+# Half an hour and 6 GB.
+bench-large: ONCE = --rounds 1 --repeat 1 --evaluations 60 --peers pycolmap ceres
+bench-large: $(VENV)/compared
+	$(BIN)/python benchmarks/big_block.py --images 1000 --points 310000 --spacing 0.79 --repeat 1
+	$(BIN)/python benchmarks/bal.py --street 1723 156502 --solver sparse_schur $(ONCE) $(PEERS)
+	$(BIN)/python benchmarks/bal.py --arc 356 226730 --solver iterative_schur $(ONCE) $(PEERS)
+
+bench-pushbroom bench-orientation bench-measuring: bench-%: $(VENV)/compared
+	$(BIN)/python benchmarks/$*.py
 
 clean:
 	rm -rf $(VENV) out

@@ -14,11 +14,17 @@ from itertools import accumulate
 
 import jax
 import jax.numpy as jnp
-import jaxls
 import machine
 import numpy as np
 import scenes
 import snavely
+
+try:
+    import jaxls
+
+    jaxls.LeastSquaresProblem  # noqa: B018
+except (ImportError, AttributeError):
+    sys.exit("jaxls of github.com/brentyi/jaxls is not installed in this environment")
 
 DAMPING = 1e2
 

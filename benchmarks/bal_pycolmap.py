@@ -23,9 +23,13 @@ import tempfile
 
 import machine
 import numpy as np
-import pycolmap
 import scenes
 from bal_ceres import PRECONDITIONER, SOLVERS, figures_of
+
+try:
+    import pycolmap
+except ImportError:
+    sys.exit("pycolmap is not installed (pip install pycolmap)")
 
 TURN = np.diag([1.0, -1.0, -1.0])
 SAME = 1e-6

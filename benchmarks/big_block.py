@@ -14,14 +14,15 @@ The answer is checked too: σ0 is 1 within its own standard deviation, and every
 camera is within 4 σ of the truth. Otherwise the exit status is 1.
 """
 
-import argparse
-import json
-import resource
+import os
 import sys
 import time
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import equinox as eqx
 import jax
+import machine
 import numpy as np
 
 import jaxbundle
@@ -83,25 +84,19 @@ def best(function, repeat: int):
     return np.min([timed(function)[1] for _ in range(repeat)], 0)
 
 
-def peak_mb() -> float:
-    """Largest resident memory of this process so far, MB."""
-    size = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return size / (1e6 if sys.platform == "darwin" else 1e3)
-
-
 def run(images: int, points: int, spacing: float, repeat: int) -> dict:
     """All stages; seconds, counts, memory."""
-    memory = {"import": peak_mb()}
+    memory = {"import": machine.peak_mb()}
     simulation, simulate_s = timed(lambda: block(images, points, spacing))
-    memory["simulation"] = peak_mb()
+    memory["simulation"] = machine.peak_mb()
     problem, prepare_s = timed(
         lambda: jaxbundle.make_problem(check_network(simulation.network))
     )
-    memory["preparation"] = peak_mb()
+    memory["preparation"] = machine.peak_mb()
 
     solver = make_solver(problem)
     minimum, first_s = timed(lambda: find_minimum(solver, problem.data))
-    memory["solution"] = peak_mb()
+    memory["solution"] = machine.peak_mb()
     solve_s = best(lambda: find_minimum(solver, problem.data), repeat)
     compiled_move = eqx.filter_jit(move_to_datum)
     move = lambda: compiled_move(problem.structure, minimum.values, problem.data.start)  # noqa: E731
@@ -113,7 +108,7 @@ def run(images: int, points: int, spacing: float, repeat: int) -> dict:
         return result, result.cofactors, result.reliability, result.point_covariance
 
     (result, *_), first_statistics_s = timed(statistics)
-    memory["statistics"] = peak_mb()
+    memory["statistics"] = machine.peak_mb()
     summary = {name: getattr(result, name) for name in ("redundancy", "converged", "termination")}
     summary["sigma0"], parameters = result.sigma0, result.cameras["cam"]["parameters"]
     del result, _  # else there would be two of them at a time
@@ -121,6 +116,7 @@ def run(images: int, points: int, spacing: float, repeat: int) -> dict:
 
     evaluations = int(minimum.iterations)
     return summary | {
+        "machine": machine.machine(),
         "images": len(problem.network.images),
         "points": len(problem.network.points),
         "image_coordinates": problem.counts.observations,
@@ -137,6 +133,7 @@ def run(images: int, points: int, spacing: float, repeat: int) -> dict:
             "statistics": statistics_s.tolist(),
         },
         "peak_mb": memory,
+        "device_peak_mb": machine.device_peak_mb(),
         "errors_in_sigma": {
             name: (parameters[name]["value"] - TRUE[name]) / parameters[name]["sigma"]
             for name in FREE
@@ -185,12 +182,15 @@ def table(figures: dict) -> str:
         ("σ0", f"{f['sigma0']:.5f}, redundancy {f['redundancy']}"),
         ("errors of the camera (σ)", errors),
     ]  # fmt: skip
-    return "\n".join(f"{name:<31}{text}" for name, text in rows)
+    if f["device_peak_mb"]:
+        rows.append(("peak memory of the device", f"{f['device_peak_mb']:.0f} MB"))
+    lines = [f"{name:<31}{text}" for name, text in rows]
+    return "\n".join([machine.in_words(f["machine"]), *lines])
 
 
 def main() -> int:
     """Run, print, check."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = machine.parser_of(__doc__)
     parser.add_argument("--images", type=int, default=60)
     parser.add_argument("--points", type=int, default=26800, help="targets (some are not imaged)")
     parser.add_argument("--spacing", type=float, default=1.0, help="of the images")
@@ -199,13 +199,9 @@ def main() -> int:
     arguments = parser.parse_args()
     jaxbundle.enable_x64()
     figures = run(arguments.images, arguments.points, arguments.spacing, arguments.repeat)
-    if arguments.json == "-":
-        print(json.dumps(figures, indent=1))
-    else:
+    if arguments.json != "-":
         print(table(figures))
-        if arguments.json:
-            with open(arguments.json, "w", encoding="utf-8") as file:
-                json.dump(figures, file, indent=1)
+    machine.write_json(figures, arguments.json)
     wrong = complaints(figures)
     for line in wrong:
         print(f"WRONG: {line}", file=sys.stderr)

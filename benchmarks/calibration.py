@@ -13,8 +13,6 @@ divided by their σ have the standard deviation 1. Otherwise the exit status is 
 (`opencv-python-headless`) only our side is measured.
 """
 
-import argparse
-import json
 import multiprocessing
 import os
 import resource
@@ -23,6 +21,7 @@ import time
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import machine
 import numpy as np
 
 VIEWS, COLUMNS, ROWS, SQUARE = 20, 11, 8, 0.03
@@ -96,7 +95,7 @@ def clock(function):
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = machine.parser_of(__doc__)
     parser.add_argument("--cameras", type=int, default=1000)
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--json", help="file for the figures; - for stdout")
@@ -108,7 +107,8 @@ def main() -> int:
     try:
         import cv2 as peer
     except ImportError:
-        print("OpenCV is not installed: only our side is measured", file=sys.stderr)
+        print("skipped: OpenCV: not installed (pip install opencv-python-headless)",
+              file=sys.stderr)  # fmt: skip
     # Before JAX starts its threads: processes of their own.
     pool = multiprocessing.get_context("spawn").Pool(PROCESSES, opencv_start) if peer else None
 
@@ -134,6 +134,7 @@ def main() -> int:
     wall, cpu = (1e3 * min(column) / n for column in zip(*turns))
     error = (batch.values - truth) / batch.sigma
     figures = {
+        "machine": machine.machine(),
         "cameras": n,
         "converged": int(batch.converged.sum()),
         "iterations": float(batch.iterations.mean()),
@@ -160,15 +161,11 @@ def main() -> int:
             "opencv_not_arrived": int((difference < -1e-6).sum()),
         }
         good = good and difference.max() < 1e-6
-    text = json.dumps(figures)
-    if options.json == "-":
-        print(text)
-    else:
-        for name, value in figures.items():
+    if options.json != "-":
+        print(machine.in_words(figures["machine"]))
+        for name, value in list(figures.items())[1:]:
             print(f"{name:32s} {value}")
-        if options.json:
-            with open(options.json, "w", encoding="utf-8") as file:
-                file.write(text + "\n")
+    machine.write_json(figures, options.json)
     return 0 if good else 1
 
 

@@ -1,6 +1,6 @@
 """How well targets, circles and corners are measured in rendered photographs.
 
-    python benchmarks/measuring.py
+    python benchmarks/measuring.py [--json FILE]
 
 Photographs as in the tests (`tests/measure/render.py`): 480 × 360 pixels, grey values of noise σ 2
 with a contrast of 204, blurred by 0.7 or 1.2 pixels, the object tilted by 0° or 25°. Targets: 20
@@ -9,10 +9,14 @@ Corners: `find_board` on a chessboard of 9 × 6. RMS of a coordinate in pixels, 
 targets also the RMS of errors over the σ they state, which should be 1.
 """
 
+import os
 import sys
 from pathlib import Path
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import jax
+import machine
 import numpy as np
 
 import jaxbundle
@@ -49,21 +53,26 @@ def targets(radius, tilt, blur):
         yield np.array([t.xy for t in found]) - true, np.array([t.sigma for t in found])
 
 
-def main():
-    rms = lambda x: np.sqrt(np.mean(np.square(x)))
-    print("targets            grey values         ellipse")
-    print("radius px  blur    RMS px  error/σ     RMS px  error/σ")
+def rms(x):
+    return float(np.sqrt(np.mean(np.square(x))))
+
+
+def targets_of_all():
+    """RMS of a coordinate and of error/σ by both methods, for every radius and blur."""
     for radius in (0.002, 0.003, 0.005, 0.008):
         for blur in (0.7, 1.2):
             both = [list(targets(radius, tilt, blur)) for tilt in (0, 25)]
-            cells = []
-            for method in (0, 1):
-                errors = np.concatenate([b[method][0] for b in both])
-                sigma = np.concatenate([b[method][1] for b in both])
-                cells.append(f"{rms(errors):6.3f}  {rms(errors / sigma):7.2f}")
-            print(f"{radius * 620 / 0.55:9.1f}  {blur:4.1f}    {cells[0]}     {cells[1]}")
+            found = {"radius_px": radius * 620 / 0.55, "blur": blur}
+            for k, method in enumerate(("grey_values", "ellipse")):
+                errors = np.concatenate([b[k][0] for b in both])
+                sigma = np.concatenate([b[k][1] for b in both])
+                found[method] = {"rms_px": rms(errors), "error_over_sigma": rms(errors / sigma)}
+            yield found
+
+
+def corners_of_all():
+    """RMS of a coordinate of a chessboard's corners, for every blur."""
     board = Board(9, 6, 0.03)
-    print("\ncorners of a chessboard\nblur    RMS px")
     for blur in (0.7, 1.2):
         errors = []
         for i, tilt in enumerate((0, 15, 25, 35)):
@@ -72,7 +81,37 @@ def main():
                 render.LENS, M, X0, render.chessboard(9, 6, 0.03), blur, seed=i
             )
             errors.append(find_board(picture, board) - render.LENS.image_of(M, X0, board.points))
-        print(f"{blur:4.1f}  {rms(np.concatenate(errors)):8.3f}")
+        yield {"blur": blur, "rms_px": rms(np.concatenate(errors))}
+
+
+def show(found):
+    """The figures for people."""
+    print(machine.in_words(found["machine"]))
+    print("targets            grey values         ellipse")
+    print("radius px  blur    RMS px  error/σ     RMS px  error/σ")
+    for f in found["targets"]:
+        cells = [
+            f"{f[method]['rms_px']:6.3f}  {f[method]['error_over_sigma']:7.2f}"
+            for method in ("grey_values", "ellipse")
+        ]
+        print(f"{f['radius_px']:9.1f}  {f['blur']:4.1f}    {cells[0]}     {cells[1]}")
+    print("\ncorners of a chessboard\nblur    RMS px")
+    for f in found["corners"]:
+        print(f"{f['blur']:4.1f}  {f['rms_px']:8.3f}")
+
+
+def main():
+    parser = machine.parser_of(__doc__)
+    parser.add_argument("--json", metavar="FILE", help="write the figures; - for standard output")
+    given = parser.parse_args()
+    found = {
+        "machine": machine.machine(),
+        "targets": list(targets_of_all()),
+        "corners": list(corners_of_all()),
+    }
+    if given.json != "-":
+        show(found)
+    machine.write_json(found, given.json)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Resection and relative orientation of 10 000 random configurations: success and errors.
 
-    python benchmarks/orientation.py [--number N] [--noise SIGMA]
+    python benchmarks/orientation.py [--number N] [--noise SIGMA] [--json FILE]
 
 Cameras turned at random see points 4 to 12 units away, in images of ±0.8 principal distances;
 pairs have a base of 1 in any direction and are turned by some 0.2 rad about each axis. Every row is
@@ -16,7 +16,6 @@ quantile of χ² that their cofactors give (one in a thousand is expected outsid
     relative, n points        five or eight points, chosen, refined
 """
 
-import argparse
 import collections
 import os
 import time
@@ -25,6 +24,7 @@ from functools import partial
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax
+import machine
 import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -73,12 +73,21 @@ def run(function, data):
     return jax.tree.map(lambda *a: np.concatenate(a), *parts), seconds
 
 
-def line(name, error, success, status, seconds):
-    failed = collections.Counter(Status(int(s)).name for s in status if s)
-    quantiles = "  ".join(f"{q:8.1e}" for q in np.quantile(error, [0.5, 0.9, 0.99, 0.999, 1]))
-    names = ", ".join(f"{n} {k}" for k, n in failed.items())
-    each = 1e6 * seconds / len(error)
-    print(f"{name:34} {100 * success.mean():8.2f}  {quantiles}  {each:7.0f}  {names}")
+def row(name, error, success, status, seconds):
+    """Figures of a line of the table."""
+    return {
+        "name": name, "success": float(success.mean()),
+        "error": np.quantile(error, [0.5, 0.9, 0.99, 0.999, 1]).tolist(),
+        "us": 1e6 * seconds / len(error),
+        "named": dict(collections.Counter(Status(int(s)).name for s in status if s)),
+    }  # fmt: skip
+
+
+def show(f):
+    quantiles = "  ".join(f"{q:8.1e}" for q in f["error"])
+    names = ", ".join(f"{n} {k}" for k, n in f["named"].items())
+    line = f"{f['name']:34} {100 * f['success']:8.2f}  {quantiles}  {f['us']:7.0f}  {names}"
+    print(line, flush=True)
 
 
 def nearest(M, t, valid, truth):
@@ -102,7 +111,7 @@ def resections(rng, N, n, noise):
     error = np.maximum(np.abs(result.pose.X0 - X0).max(1), np.abs(result.pose.M - M).max((1, 2)))
     delta, Q = result.pose.X0 - X0, result.cofactor[:, :3, :3]
     success = within(delta, Q, noise) if noise else error < EXACT
-    line(f"resection, {n} points, σ = {noise:g}", error, success, result.status, seconds)
+    return row(f"resection, {n} points, σ = {noise:g}", error, success, result.status, seconds)
 
 
 def relatives(rng, N, n, noise, method):
@@ -113,24 +122,19 @@ def relatives(rng, N, n, noise, method):
     delta, Q = Rotation.from_matrix(turn).as_rotvec(), result.cofactor[:, :3, :3]
     success = within(delta, Q, noise) if noise else error < EXACT
     name = f"relative, {n} points, {method}, σ = {noise:g}"
-    line(name, error, success, result.status, seconds)
+    return row(name, error, success, result.status, seconds)
 
 
-def main():
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--number", type=int, default=10_000)
-    parser.add_argument("--noise", type=float, default=2e-4)
-    given = parser.parse_args()
-    N, rng = given.number, np.random.default_rng(0)
-    jaxbundle.enable_x64()
-    print(f"{'':34} success %       50 %      90 %      99 %    99.9 %       max       µs  named")
+def rows(N, noise):
+    """Lines of the table, one at a time."""
+    rng = np.random.default_rng(0)
     (xy, X), truth = images(rng, N, 3, 0.0)
     rays = np.concatenate([xy, -np.ones((N, 3, 1))], 2)
     (poses, valid), seconds = run(three_points, (rays, X))
     error = nearest(poses.M, poses.X0, valid, truth)
-    line("resection, 3 points, all solutions", error, error < EXACT, [], seconds)
-    for n, noise in ((4, 0.0), (10, 0.0), (10, given.noise)):
-        resections(rng, N, n, noise)
+    yield row("resection, 3 points, all solutions", error, error < EXACT, [], seconds)
+    for n, sigma in ((4, 0.0), (10, 0.0), (10, noise)):
+        yield resections(rng, N, n, sigma)
     data, truth = pairs(rng, N, 5, 0.0)
 
     def all_solutions(xy1, xy2):
@@ -140,12 +144,32 @@ def main():
 
     (M, b, valid), seconds = run(all_solutions, data)
     error = nearest(M, b, valid, truth)
-    line("relative, 5 points, all solutions", error, error < EXACT, [], seconds)
-    for n, noise, method in (
-        (6, 0.0, "five"), (10, 0.0, "five"), (10, given.noise, "five"),
-        (8, 0.0, "eight"), (10, 0.0, "eight"), (10, given.noise, "eight"),
+    yield row("relative, 5 points, all solutions", error, error < EXACT, [], seconds)
+    for n, sigma, method in (
+        (6, 0.0, "five"), (10, 0.0, "five"), (10, noise, "five"),
+        (8, 0.0, "eight"), (10, 0.0, "eight"), (10, noise, "eight"),
     ):  # fmt: skip
-        relatives(rng, N, n, noise, method)
+        yield relatives(rng, N, n, sigma, method)
+
+
+def main():
+    parser = machine.parser_of(__doc__)
+    parser.add_argument("--number", type=int, default=10_000)
+    parser.add_argument("--noise", type=float, default=2e-4)
+    parser.add_argument("--json", metavar="FILE", help="write the figures; - for standard output")
+    given = parser.parse_args()
+    jaxbundle.enable_x64()
+    found = {"machine": machine.machine(), "rows": []}
+    table = given.json != "-"
+    if table:
+        print(machine.in_words(found["machine"]))
+        print(f"{'':34} success %       50 %      90 %      99 %    99.9 %       max       µs",
+              " named")  # fmt: skip
+    for figures in rows(given.number, given.noise):
+        found["rows"].append(figures)
+        if table:
+            show(figures)
+    machine.write_json(found, given.json)
 
 
 if __name__ == "__main__":

@@ -14,8 +14,6 @@ what is computed is checked first, and a wrong answer ends with exit status 1, w
     rpc_project    ground → image by RPC              rpc_locate   the way back, heights given
 """
 
-import argparse
-import json
 import os
 import sys
 import tempfile
@@ -29,6 +27,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import machine
 import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
@@ -177,13 +176,14 @@ def map_seconds():
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = machine.parser_of(__doc__)
     parser.add_argument("--json", help="write the figures; - for standard output")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--map", action="store_true", help="also correct a whole image")
     arguments = parser.parse_args()
     rates, wrong = measure(arguments.rounds)
     if arguments.json != "-":
+        print(machine.in_words(machine.machine()))
         for name, value in rates.items():
             demand = f"demanded {DEMANDS[name]}" if DEMANDS[name] else ""
             print(f"{name:10} {value:8.2f} Mpixel/s   {demand}")
@@ -192,12 +192,7 @@ def main():
         if arguments.json != "-":
             print(f"map        {rates['map_seconds']:8.1f} s          demanded below 60 "
                   f"({grid.rows} × {grid.columns} pixels of {grid.size:g} m)")  # fmt: skip
-    if arguments.json:
-        text = json.dumps(rates) + "\n"
-        if arguments.json == "-":
-            sys.stdout.write(text)
-        else:
-            Path(arguments.json).write_text(text)
+    machine.write_json({"machine": machine.machine()} | rates, arguments.json)
     if wrong:
         sys.exit(f"wrong: {', '.join(wrong)}")
 

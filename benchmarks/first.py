@@ -1,0 +1,71 @@
+"""The first adjustment of a process: compiling everything, and with the programs of one before.
+
+    python benchmarks/first.py [--input PROJECT] [--repeat N] [--json FILE]
+
+`jaxbundle adjust PROJECT --quiet`, in processes of their own and in pairs: the first finds an empty
+folder of compiled programs (a temporary one), the second what the first left there. Told are the
+seconds from the start of a process to its end, on the clock and of the processor, the best of the
+pairs; beside them a process that only imports JAX. Demanded of a small network on two cores: below
+10 s and below 3 s.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import machine
+
+EXAMPLE = Path(__file__).parents[1] / "examples" / "convergent4" / "project.toml"
+DEMANDED = {"empty folder of programs": 10.0, "full folder of programs": 3.0}
+
+
+def seconds_of(command: list[str], folder: str) -> tuple[float, float]:
+    """Seconds of a process, on the clock and of the processor."""
+    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": folder}
+    begin = time.perf_counter()
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
+    _, status, usage = os.wait4(process.pid, 0)
+    clock = time.perf_counter() - begin
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise SystemExit(f"{' '.join(command)} ended with status {process.returncode}")
+    return clock, usage.ru_utime + usage.ru_stime
+
+
+def main() -> None:
+    parser = machine.parser_of(__doc__)
+    parser.add_argument("--input", default=str(EXAMPLE), help="anything `adjust` reads")
+    parser.add_argument("--repeat", type=int, default=3, help="pairs of processes")
+    parser.add_argument("--json", metavar="FILE", help="write the figures; - for standard output")
+    given = parser.parse_args()
+    adjust = [sys.executable, "-m", "jaxbundle", "adjust", given.input, "--quiet"]
+    runs = {"import of JAX": [], **{name: [] for name in DEMANDED}}
+    for _ in range(given.repeat):
+        with tempfile.TemporaryDirectory() as folder:
+            runs["import of JAX"].append(seconds_of([sys.executable, "-c", "import jax"], folder))
+            for name in DEMANDED:
+                runs[name].append(seconds_of(adjust, folder))
+    best = {
+        name: dict(zip(("clock_s", "processor_s"), map(min, zip(*pairs))))
+        for name, pairs in runs.items()
+    }
+    import jaxbundle
+
+    jaxbundle.enable_x64()
+    found = {"input": given.input, "machine": machine.machine()} | best
+    if given.json != "-":
+        print(machine.in_words(found["machine"]))
+        for name, seconds in best.items():
+            demand = f"   demanded {DEMANDED[name]:.0f}" if name in DEMANDED else ""
+            print(f"{name:26}{seconds['clock_s']:6.2f} s, processor "
+                  f"{seconds['processor_s']:6.2f} s{demand}")  # fmt: skip
+    machine.write_json(found, given.json)
+
+
+if __name__ == "__main__":
+    main()
