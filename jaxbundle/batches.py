@@ -99,7 +99,7 @@ def run_batch(
                 if not work.is_cameras and networks % NETWORKS_A_CACHE == 0:
                     jax.clear_caches()
     heads = (lines.heads[key] for work in works.values() for key in work.keys)
-    return Counter(head.get("status", "unknown") for head in heads) + counts
+    return Counter(str(head.get("status", "unknown")) for head in heads) + counts
 
 
 def key_of(path: str | Path, file: str | Path) -> str:

@@ -29,11 +29,16 @@ def batch(
 ) -> None:
     """Calibrate many cameras and adjust many networks; interrupted, it takes up where it was.
 
-    Lines that FILE has already are not computed again; other settings or data are refused, or
-    computed again with --renew. Exit status: 0 if every input has its line, whatever its status; 2
-    for bad input, or if another run is writing FILE; 130 or 143 if interrupted (Ctrl-C, SIGTERM).
+    Lines that are in the file already are not computed again. Those of other
+    settings or other data are refused, or computed again with --renew.
+
+    Exit status: 0 every input has its line, whatever its status; 2 bad input,
+    or another run is writing the file; 130, 143 interrupted.
     """
     jaxbundle.enable_x64()
+    if not all(path.endswith(".npz") for path in inputs):
+        # Cameras fill the cores by threads of their own, and gain nothing.
+        jaxbundle.use_cores()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     try:
         with counting(quiet) as bar:

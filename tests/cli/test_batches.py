@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -122,6 +123,18 @@ def test_a_file_of_an_earlier_version_is_understood(start):
     assert len(keys(file)) == 5 and keys(file)[0] == "elsewhere.npz#1"
 
 
+def test_lines_of_odd_content_are_no_results_of_these(start):
+    _, file, again = start
+    row = json.loads(file.read_text().splitlines()[0])
+    for odd in (dict(status=[1]), dict(settings=3), dict(settings={"free": None}), dict(data={})):
+        file.write_text(json.dumps(row | odd) + "\n")
+        if "status" in odd:
+            assert again() == {"converged": 3, "[1]": 1, "skipped": 1}
+        else:
+            with pytest.raises(InputError, match="has 1 of these"):
+                again()
+
+
 def test_a_rewritten_network_is_seen(tmp_path, monkeypatch):
     monkeypatch.setattr(batches, "network_row", lambda path, most: {"status": "converged"})
     project = shutil.copytree(EXAMPLE, tmp_path / "block") / "project.toml"
@@ -166,3 +179,16 @@ def test_inputs_are_looked_at_before_anything_is_written(tmp_path):
     with pytest.raises(InputError, match="none.toml"):
         run_batch([EXAMPLE, tmp_path / "none.toml"], file)
     assert not file.exists()
+
+
+def test_the_table_of_the_docs(start, tmp_path):
+    """docs/calibrate.md reads the file as a table."""
+    pytest.importorskip("pandas")
+    docs = (Path(__file__).parents[2] / "docs" / "calibrate.md").read_text(encoding="utf-8")
+    (code,) = (c for c in re.findall(r"```python\n(.*?)```", docs, re.S) if "pandas" in c)
+    found = {}
+    exec(code, found)
+    table = found["table"]
+    assert table.index.tolist() == keys(tmp_path / "results.jsonl")
+    assert table["status"].eq("converged").all()
+    assert table["parameters.fx.value"].between(850, 1150).all()

@@ -6,6 +6,7 @@ import stat
 from pathlib import Path
 
 import pytest
+from garbling import often, read_or_refused, what_is_done
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.json_lines import JsonLines
@@ -86,3 +87,29 @@ def test_no_lock_to_be_had_is_said(tmp_path):
             pass
     with locked("/dev/null"):
         assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
+
+
+@pytest.fixture(scope="module")
+def valid(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("valid")
+    JsonLines(folder / "results.jsonl").append(
+        {"key": f"a.npz#{i}", "status": "converged", "settings": {"free": ["fx"]}, "data": "f" * 16}
+        for i in range(5)
+    )
+    return folder
+
+
+@often(200)
+@what_is_done
+def test_a_garbled_file_is_taken_up_or_refused(valid, **done):
+    """What is taken up is whole afterwards, every key once."""
+
+    def read(folder):
+        file = folder / "results.jsonl"
+        lines = JsonLines(file)
+        lines.append([{"key": "one more", "status": "weak"}])
+        whole = file.read_bytes().removesuffix(b"\n").split(b"\n")
+        assert [json.loads(line)["key"] for line in whole] == [*lines.heads]
+        assert JsonLines(file).heads == lines.heads
+
+    read_or_refused(read, valid, **done)
