@@ -70,7 +70,7 @@ class JsonLines:
             if key in left:
                 left.discard(key)
                 kept.append(line)
-        write_bytes(self._file, b"".join(kept))
+        write_bytes(self._file, kept)
 
     def _lines(self) -> Iterator[bytes]:
         try:
