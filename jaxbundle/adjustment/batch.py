@@ -125,7 +125,8 @@ def calibrate_batch(
 
     **Arguments:**
 
-    - `object_points`: [points, 3] for all cameras, or [cameras, points, 3]; flat or solid.
+    - `object_points`: [points, 3] for all cameras, or [cameras, points, 3]; flat or solid. They may
+      be repeated for every view ([views, points, 3] or [cameras, views, points, 3]).
     - `image_points`: pixels in the axes of the model.
     - `image_size`: width and height in pixels: the principal point starts in the middle.
     - `model`: a camera model in pixels: "opencv", "kannala-brandt", "snavely".

@@ -75,6 +75,22 @@ def at_least_one(name: str, value) -> int:
     return number
 
 
+def once(X: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    """Object points listed for every view, as OpenCV takes them, but the same in all: once."""
+    if xy.ndim != 4 or X.shape in (xy.shape[2:3] + (3,), xy.shape[::2] + (3,)):
+        return X
+    cameras, views, points, _ = xy.shape
+    if X.shape in ((1, points, 3), (views, points, 3), (cameras, views, points, 3)):
+        first = X[..., :1, :, :]
+        if np.array_equal(X, np.broadcast_to(first, X.shape), equal_nan=True):
+            return first[..., 0, :, :]
+        raise InputError(
+            "object_points differ from view to view; give the points of all views as one list "
+            "[points, 3], and by visible which of them a view shows"
+        )
+    return X
+
+
 def check_shapes(X: np.ndarray, xy: np.ndarray, size: np.ndarray, visible: np.ndarray) -> None:
     """Refuse the arrays of a batch whose shapes do not fit each other.
 
@@ -130,7 +146,7 @@ class Batch:
     def of(cls, object_points, image_points, image_size, model, visible, free, start):
         model = pixel_model(model)
         xy = as_array("image_points", image_points, "numbers [cameras, views, points, 2]")
-        X = as_array("object_points", object_points, "numbers [points, 3]")
+        X = once(as_array("object_points", object_points, "numbers [points, 3]"), xy)
         size = as_array("image_size", image_size, "width and height in pixels")
         if visible is None:
             visible = np.ones(xy.shape[:3], bool)

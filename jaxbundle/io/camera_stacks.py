@@ -18,7 +18,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from jaxbundle.adjustment.batch_input import as_array, check_shapes
+from jaxbundle.adjustment.batch_input import as_array, check_shapes, once
 from jaxbundle.errors import InputError
 from jaxbundle.io.fingerprints import of_arrays
 from jaxbundle.io.unpacking import most_unpacked
@@ -90,6 +90,7 @@ def read_camera_stack(path: str | Path) -> CameraStack:
     try:
         for name in {*arrays} - {"ids"}:
             as_array(name, arrays[name], "true or false" if name == "visible" else "numbers")
+        X = once(X, xy)
         check_shapes(X, xy, size, np.ones(xy.shape[:3]) if visible is None else visible)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None

@@ -11,7 +11,7 @@ from scipy import optimize
 
 import jaxbundle
 from jaxbundle import cameras
-from jaxbundle.adjustment.batch_input import bucket
+from jaxbundle.adjustment.batch_input import bucket, once
 from jaxbundle.geometry import omega_phi_kappa_from_matrix
 
 SIZE = (1280, 960)
@@ -258,6 +258,16 @@ def test_perfect_images_give_the_camera_itself(three):
     assert_allclose(found.values[0], p, rtol=1e-7, atol=1e-9)
 
 
+def test_object_points_may_be_repeated_for_every_view(three):
+    xy, X = three[0], np.stack([BOARD, 2 * BOARD, 3 * BOARD])
+    views = xy.shape[1]
+    np.testing.assert_array_equal(once(BOARD, xy), BOARD)
+    np.testing.assert_array_equal(once(BOARD[None], xy), BOARD)
+    np.testing.assert_array_equal(once(np.tile(BOARD, (views, 1, 1)), xy), BOARD)
+    np.testing.assert_array_equal(once(X, xy), X)
+    np.testing.assert_array_equal(once(X[:, None].repeat(views, 1), xy), X)
+
+
 def test_progress_is_told_and_portions_keep_the_order(three, solved):
     told = []
     xy = np.concatenate([three[0]] * 12)
@@ -339,6 +349,9 @@ BAD = {
     "mask of numbers": (dict(visible=np.full((2, 3, 40), 0.5)), "1 or 0"),
     "mask of NaN": (dict(visible=np.full((2, 3, 40), np.nan)), "1 or 0"),
     "ragged mask": (dict(visible=[[1], [1, 0]]), "differ in length"),
+    "views of other objects": (
+        dict(object_points=np.arange(360.0).reshape(3, 40, 3)), "differ from view to view"
+    ),
     "size": (dict(image_size=(0, 960)), "image_size"),
     "size in words": (dict(image_size=("a", "b")), "width and height"),
     "size of NaN": (dict(image_size=(1280, np.nan)), "width and height"),
