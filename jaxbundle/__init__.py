@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from jaxbundle.calibration import calibrate as calibrate
     from jaxbundle.calibration import calibrate_cameras as calibrate_cameras
     from jaxbundle.configuration import enable_x64 as enable_x64
+    from jaxbundle.configuration import join_processes as join_processes
     from jaxbundle.configuration import keep_programs as keep_programs
     from jaxbundle.configuration import use_cores as use_cores
     from jaxbundle.errors import InputError as InputError
@@ -59,7 +60,7 @@ _HOME = {
     "jaxbundle.calibration": (
         "Board", "BoardViews", "Calibration", "calibrate", "calibrate_cameras",
     ),
-    "jaxbundle.configuration": ("enable_x64", "keep_programs", "use_cores"),
+    "jaxbundle.configuration": ("enable_x64", "join_processes", "keep_programs", "use_cores"),
     "jaxbundle.errors": ("InputError", "NotSolvedError"),
     "jaxbundle.gradients": ("check_gradients",),
     "jaxbundle.io": ("convert", "read_network", "write_project"),

@@ -5,17 +5,23 @@ library reads it when it is imported.
 """
 
 import os
+import sys
+
+INTERRUPTED = 130
 
 
 def main() -> None:
     """Run the command line."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from jaxbundle.configuration import keep_programs
+    try:
+        from jaxbundle.configuration import keep_programs
 
-    keep_programs()
-    from jaxbundle.cli import main
+        keep_programs()
+        from jaxbundle.cli import main
 
-    main()
+        main()
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
 
 
 if __name__ == "__main__":

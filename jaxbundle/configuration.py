@@ -1,7 +1,10 @@
 """How JAX is to work: 64-bit floats, cores, the compiler; only when it is asked for."""
 
 import os
+import re
 from importlib.metadata import version
+
+from jaxbundle.errors import InputError
 
 QUICK_LOOPS = "--xla_cpu_use_fusion_emitters=false"
 """XLA writes loops in the older of its two ways: compiled in half the time and memory, as fast."""
@@ -58,6 +61,48 @@ def keep_programs(folder: str | os.PathLike | None = None) -> bool:
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", WORTH_KEEPING)
     return True
+
+
+def join_processes(
+    address: str | None = None,
+    processes: int | None = None,
+    process: int | None = None,
+    *,
+    lost_after_seconds: int = 30,
+) -> bool:
+    """Adjust together with other processes, on this machine or others, which all run the same
+    program on the same files; call it before the first JAX computation.
+
+    **Arguments:**
+
+    - `address`: `host:port` of process 0, the same for all; `processes`: how many there are;
+      `process`: which one this is, from 0. Under SLURM or on TPUs JAX finds all three by itself:
+      give none of them.
+    - `lost_after_seconds`: a process not heard of for so long has ended, and the others end too.
+
+    **Returns:** whether this is process 0, the one that should write the results. All of them have
+    the result.
+
+    **Raises:** `InputError` if the processes cannot be told or do not find each other.
+    """
+    import jax
+
+    expected = (
+        "expected: host:port of process 0, the number of processes, and which one this is, from 0; "
+        "none of them under SLURM"
+    )
+    port = re.fullmatch(r"\S+:(\d{1,5})", address or "0:0")
+    if not port or int(port[1]) > 65535:
+        raise InputError(f"the processes cannot be joined at {address!r}; {expected}")
+    jax.config.update("jax_cpu_collectives_implementation", "gloo")
+    try:
+        jax.distributed.initialize(
+            address, processes, process, heartbeat_timeout_seconds=lost_after_seconds
+        )
+    except (ValueError, TypeError, RuntimeError) as error:
+        why = " ".join(str(error).split())[:300]
+        raise InputError(f"the processes cannot be joined: {why}; {expected}") from None
+    return jax.process_index() == 0
 
 
 def available_cores() -> int:

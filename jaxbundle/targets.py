@@ -11,7 +11,7 @@ from pathlib import Path
 
 from jaxbundle import report
 from jaxbundle.errors import InputError, NotSolvedError
-from jaxbundle.io.csv_tables import write_csv, write_text
+from jaxbundle.io.csv_tables import table_rows, write_csv, write_text
 from jaxbundle.io.project import ADJUSTED, FILE_NAME, write_project
 from jaxbundle.io.result_json import result_text, unsolved_text
 from jaxbundle.io.result_project import adjusted_network
@@ -79,17 +79,15 @@ def write_targets(
     """Write JSON (`-`: on standard output) and folder of a result, or of why there is none."""
     solved = isinstance(result, Adjustment)
     text = lambda brief: result_text(result, brief) if solved else unsolved_text(result)
-    full = "" if out is None else text(False)
-    told = full if full and not brief else text(brief) if json else ""
     if json == "-":
-        print(told, end="")
+        sys.stdout.writelines(text(brief))
     if out is not None:
         protocol = report.text(result) if solved else f"{result}\n"
         _make_empty(out)
         write_text(out / REPORT, protocol)
-        write_text(out / RESULT, full)
+        write_text(out / RESULT, text(False))
     if json not in ("", "-"):
-        write_text(Path(json), told)
+        write_text(Path(json), text(brief))
     if out is not None and solved and result.converged:
         _write_tables(result, out)
         write_project(adjusted_network(result), out / ADJUSTED)
@@ -124,5 +122,4 @@ def _write_tables(result: Adjustment, folder: Path) -> None:
     for name in TABLES:
         table = result.table(name)
         if table:
-            rows = zip(*(column.tolist() for column in table.values()))
-            write_csv(folder / f"{name}.csv", list(table), rows)
+            write_csv(folder / f"{name}.csv", list(table), table_rows(table))

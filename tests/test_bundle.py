@@ -1,6 +1,7 @@
 """`adjust` around the solver: blunders, variance components, elimination, check points, names."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from jaxbundle.adjustment.solve import find_minimum, make_solver
 from jaxbundle.adjustment.unknowns import undetermined
 from jaxbundle.bundle import adjust
 from jaxbundle.errors import NotSolvedError
-from jaxbundle.io.result_json import result_dict
+from jaxbundle.io import csv_tables
+from jaxbundle.io.result_json import result_dict, result_text, without_nan
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.statistics.distributions import tau_quantile
 
@@ -304,3 +306,12 @@ def test_angles_come_back_on_the_branch_they_were_given(simulation, result):
 def test_an_unknown_of_no_such_name(result, name, said):
     with pytest.raises(KeyError, match=said):
         result.covariance(name)
+
+
+@pytest.mark.parametrize("portion", [7, 10_000])
+@pytest.mark.parametrize("brief", [False, True])
+def test_json_text_in_pieces_is_that_of_the_whole(result, monkeypatch, portion, brief):
+    monkeypatch.setattr(csv_tables, "PORTION", portion)
+    text = "".join(result_text(result, brief))
+    assert json.loads(text) == without_nan(result_dict(result, brief))
+    assert text.endswith("}\n") and text.count("\n") == 1

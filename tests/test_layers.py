@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 LAYERS = (
-    "configuration",
     "errors",
+    "configuration",
     "geometry",
     "cameras",
     "network",

@@ -22,13 +22,17 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from jaxbundle.adjustment.batch_camera import (
     CONVERGED,
+    LIMIT,
     NOT_FINITE,
+    SINGULAR,
     STATUS,
+    WEAK,
     Solved,
     solve_camera,
 )
-from jaxbundle.adjustment.batch_input import Batch, Portion
+from jaxbundle.adjustment.batch_input import Batch, Portion, at_least_one
 from jaxbundle.adjustment.batch_start import start_values
+from jaxbundle.adjustment.batch_weakness import vague, vanishing
 from jaxbundle.adjustment.problem import require_x64
 from jaxbundle.cameras import CameraModel, get_model
 from jaxbundle.configuration import available_cores
@@ -43,12 +47,17 @@ OF_A_VIEW = ("position", "angles", "sigma_position", "sigma_angles", "rotation")
 
 @dataclasses.dataclass(frozen=True)
 class BatchCalibration:
-    """The cameras of a batch; everything of a camera that did not converge is NaN.
+    """The cameras of a batch; everything of a camera that has no solution is NaN.
 
     **Fields:**
 
     - `model`, `parameters`: the camera model and its k free parameters.
-    - `status`: "converged", "iteration limit", "singular", "not finite" or "too few points".
+    - `status`: "converged"; "weak", as that, but the views do not determine the principal distance
+      or point, whose σ is above a fiftieth of the principal distance; without a solution "iteration
+      limit", "singular", "not finite" (a number among the measurements, or the start) or "too few
+      points" (no view of use, or no redundancy).
+    - `undetermined`: the free parameters that the views do not determine, where that is why the
+      camera is weak, is singular or came to no end.
     - `values`, `sigma`, `covariance`: of the free parameters; pixels, coefficients without unit.
     - `interior`: all parameters of the model, in its order.
     - `sigma0`: √(vᵀv/redundancy), pixels; all σ and covariances are a posteriori.
@@ -63,6 +72,7 @@ class BatchCalibration:
     model: str
     parameters: tuple[str, ...]
     status: Shaped[np.ndarray, " cameras"]
+    undetermined: Bool[np.ndarray, "cameras k"]
     values: Float[np.ndarray, "cameras k"]
     sigma: Float[np.ndarray, "cameras k"]
     covariance: Float[np.ndarray, "cameras k k"]
@@ -80,7 +90,13 @@ class BatchCalibration:
 
     @property
     def converged(self) -> Bool[np.ndarray, " cameras"]:
+        """Which have a solution, and everything in it is determined."""
         return self.status == STATUS[CONVERGED]
+
+    @property
+    def solved(self) -> Bool[np.ndarray, " cameras"]:
+        """Which have values: the weak ones as well."""
+        return self.converged | (self.status == STATUS[WEAK])
 
     def __len__(self) -> int:
         return len(self.status)
@@ -88,7 +104,7 @@ class BatchCalibration:
     def __str__(self) -> str:
         names, counts = np.unique(self.status, return_counts=True)
         states = ", ".join(f"{count} {name}" for name, count in zip(names, counts))
-        rms = f"median RMS {np.nanmedian(self.rms):.4g} px" if self.converged.any() else "no result"
+        rms = f"median RMS {np.nanmedian(self.rms):.4g} px" if self.solved.any() else "no result"
         return f"{len(self)} cameras, model {self.model}: {states}; {rms}"
 
 
@@ -109,7 +125,8 @@ def calibrate_batch(
 
     **Arguments:**
 
-    - `object_points`: [points, 3] for all cameras, or [cameras, points, 3]; flat or solid.
+    - `object_points`: [points, 3] for all cameras, or [cameras, points, 3]; flat or solid. They may
+      be repeated for every view ([views, points, 3] or [cameras, views, points, 3]).
     - `image_points`: pixels in the axes of the model.
     - `image_size`: width and height in pixels: the principal point starts in the middle.
     - `model`: a camera model in pixels: "opencv", "kannala-brandt", "snavely".
@@ -128,6 +145,8 @@ def calibrate_batch(
     floats. What is wrong with the numbers of one camera stands in its status.
     """
     require_x64()
+    max_iterations = at_least_one("max_iterations", max_iterations)
+    threads = available_cores() if threads is None else at_least_one("threads", threads)
     batch = Batch.of(object_points, image_points, image_size, model, visible, free, start)
     camera_model = get_model(model)
     on_cpu = jax.default_backend() == "cpu"
@@ -136,7 +155,7 @@ def calibrate_batch(
         camera_model, batch.free, batch.known, max_iterations, batch.size, on_cpu, portion
     )
     parts = []
-    with ThreadPoolExecutor((threads or available_cores()) if on_cpu else 1) as pool:
+    with ThreadPoolExecutor(threads if on_cpu else 1) as pool:
         for portion, solved in zip(portions, pool.map(run, portions)):
             parts.append({name: rows[: len(portion.cameras)] for name, rows in solved.items()})
             if progress is not None:
@@ -150,7 +169,11 @@ def _result(model: CameraModel, batch: Batch, rows: dict) -> BatchCalibration:
     """Rows of the portions in the order of the cameras, without padding; NaN for no result."""
     rows["status"][~batch.finite] = NOT_FINITE
     rows["views"] = rows["views"][:, : batch.xy.shape[1]]
-    good = rows["status"] == CONVERGED
+    ended = rows["status"]
+    rows["undetermined"] = _undetermined(model, batch, rows)
+    weak = (ended == CONVERGED) & rows["undetermined"].any(1)
+    good = ended == CONVERGED
+    ended[weak] = WEAK
     for name, values in rows.items():
         if name in OF_A_VIEW:
             rows[name] = values = values[:, : batch.xy.shape[1]]
@@ -160,6 +183,15 @@ def _result(model: CameraModel, batch: Batch, rows: dict) -> BatchCalibration:
     rows["status"] = np.array(STATUS)[rows["status"]]
     free = tuple(model.parameters[column] for column in batch.free)
     return BatchCalibration(model=model.name, parameters=free, **rows)
+
+
+def _undetermined(model: CameraModel, batch: Batch, rows: dict) -> Bool[np.ndarray, "cameras k"]:
+    """What the views do not determine, of cameras for which that can be said."""
+    ended, sigma = rows["status"], rows["sigma"]
+    null = vanishing(rows.pop("reduced")) & np.isin(ended, (SINGULAR, LIMIT))[:, None]
+    # At the limit the last σ say why, if the equations can be solved.
+    told = (ended == LIMIT) & ~null.any(1) & np.isfinite(sigma).all(1) | (ended == CONVERGED)
+    return np.where(told[:, None], vague(model, batch.free, rows["interior"], sigma), null)
 
 
 def _solve_portion(model, free, known, max_steps, size, on_cpu, portion: Portion) -> dict:
@@ -194,6 +226,7 @@ def _portion_program(
         values=solved.at.interior[:, jnp.array(free)],
         sigma=jnp.sqrt(jnp.diagonal(covariance, axis1=1, axis2=2)),
         covariance=covariance,
+        reduced=solved.reduced,
         interior=solved.at.interior,
         sigma0=jnp.sqrt(variance),
         rms=jnp.sqrt(2 * solved.cost / points),

@@ -23,8 +23,8 @@ from jaxbundle.adjustment.batch_normal import (
     step,
 )
 
-STATUS = ("converged", "iteration limit", "singular", "not finite", "too few points")
-CONVERGED, LIMIT, SINGULAR, NOT_FINITE, TOO_FEW = range(5)
+STATUS = ("converged", "iteration limit", "singular", "not finite", "too few points", "weak")
+CONVERGED, LIMIT, SINGULAR, NOT_FINITE, TOO_FEW, WEAK = range(6)
 RUNNING = -1
 
 TOLERANCE = 1e-5
@@ -43,12 +43,14 @@ NEARER = 1e-2
 
 
 class Solved(eqx.Module):
-    """The end of the iterations: unknowns, ½vᵀv, cofactors, why it ended, steps, views used."""
+    """The end of the iterations: unknowns, ½vᵀv, cofactors, the scaled reduced normal matrix, why
+    it ended, steps, views used."""
 
     at: Calibration
     cost: Float[Array, ""]
     interior_cofactors: Float[Array, "k k"]
     pose_cofactors: Float[Array, "views 6 6"]
+    reduced: Float[Array, "k k"]
     redundancy: Int[Array, ""]
     views: Bool[Array, " views"]
     status: Int[Array, ""]
@@ -124,7 +126,7 @@ def solve_camera(model, free, max_steps, size, seen: Sightings, start: Calibrati
             refusals=refusals, status=status, steps=loop.steps + 1,
         )  # fmt: skip
 
-    few = (redundancy < 0) | ~jnp.any(views)
+    few = (redundancy < 1) | ~jnp.any(views)
     n, zero = POSE + len(free) + 1, jnp.asarray(0.0)
     loop = jax.lax.while_loop(
         lambda loop: loop.status == RUNNING,
@@ -136,7 +138,11 @@ def solve_camera(model, free, max_steps, size, seen: Sightings, start: Calibrati
             status=jnp.where(few, TOO_FEW, RUNNING), steps=jnp.asarray(0),
         ),
     )  # fmt: skip
-    Q_interior, Q_pose, weakest = cofactors(factorise(loop.N, views, 0.0))
+    factor = factorise(loop.N, views, 0.0)
+    Q_interior, Q_pose, weakest = cofactors(factor)
     lost = (loop.status == CONVERGED) & ~(weakest > INDETERMINATE)
     status = jnp.where(lost, SINGULAR, loop.status)
-    return Solved(loop.trial, loop.cost, Q_interior, Q_pose, redundancy, views, status, loop.steps)
+    return Solved(
+        loop.trial, loop.cost, Q_interior, Q_pose, factor.reduced, redundancy, views, status,
+        loop.steps,
+    )  # fmt: skip

@@ -2,7 +2,8 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator
+import operator
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
@@ -15,6 +16,9 @@ FREE = {"opencv": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")}
 
 FLAT = 0.02
 """A smaller extent across than this fraction of the second largest: the object starts as flat."""
+
+LARGEST = 1e100
+"""Larger numbers are as good as infinite: their products soon are."""
 
 ON_CPU, ON_ACCELERATOR = 32, 512
 """Cameras of a portion."""
@@ -38,6 +42,55 @@ class Portion:
     middle: np.ndarray
 
 
+def as_array(name: str, values, expected: str) -> np.ndarray:
+    """Values as an array of numbers, or of truth values.
+
+    **Raises:** `InputError` that says what is expected."""
+    try:
+        array = np.asarray(values)
+    except (ValueError, TypeError):
+        raise InputError(f"{name} must be {expected}, but its rows differ in length") from None
+    if array.dtype.kind not in "biuf" or (array.dtype.kind == "b" and name != "visible"):
+        raise InputError(f"{name} must be {expected}, but is {_kind_of(array)}")
+    return array
+
+
+def _kind_of(array: np.ndarray) -> str:
+    kinds = {"U": "text", "S": "text", "c": "complex numbers", "b": "truth values"}
+    if array.dtype.kind == "O" and array.shape == ():
+        return repr(array.item())[:80]
+    return kinds.get(array.dtype.kind, f"an array of {array.dtype}")
+
+
+def at_least_one(name: str, value) -> int:
+    """A whole number from 1 to 10⁹.
+
+    **Raises:** `InputError`."""
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = 0
+    if not 1 <= number <= 10**9 or isinstance(value, bool):
+        raise InputError(f"{name} must be a whole number from 1 to 10⁹, but is {value!r:.80}")
+    return number
+
+
+def once(X: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    """Object points listed for every view, as OpenCV takes them, but the same in all: once."""
+    if xy.ndim != 4 or X.shape in (xy.shape[2:3] + (3,), xy.shape[::2] + (3,)):
+        return X
+    cameras, views, points, _ = xy.shape
+    if X.shape in ((1, points, 3), (views, points, 3), (cameras, views, points, 3)):
+        first = X[..., :1, :, :]
+        if np.array_equal(X, np.broadcast_to(first, X.shape), equal_nan=True):
+            return first[..., 0, :, :]
+        raise InputError(
+            "object_points differ from view to view; give the points of all views as one list "
+            "[points, 3], and by visible which of them a view shows"
+        )
+    return X
+
+
 def check_shapes(X: np.ndarray, xy: np.ndarray, size: np.ndarray, visible: np.ndarray) -> None:
     """Refuse the arrays of a batch whose shapes do not fit each other.
 
@@ -56,11 +109,14 @@ def check_shapes(X: np.ndarray, xy: np.ndarray, size: np.ndarray, visible: np.nd
         raise InputError(
             f"visible must have the shape {xy.shape[:3]} of image_points, but has {visible.shape}"
         )
-    if not cameras:
-        raise InputError("image_points has no camera")
+    for number, thing in zip(xy.shape, ("camera", "view", "point")):
+        if not number:
+            raise InputError(f"image_points has no {thing}: its shape is {xy.shape}")
+    if visible.dtype.kind != "b" and not np.isin(visible, (0, 1)).all():
+        raise InputError("visible must be true or false, or 1 or 0")
     if size.shape != (2,) or not (np.isfinite(size) & (size > 0)).all():
         raise InputError(
-            f"image_size must be width and height in pixels, but is {size.tolist()!r}"
+            f"image_size must be width and height in pixels, but is {str(size.tolist())[:80]}"
         )
 
 
@@ -89,10 +145,14 @@ class Batch:
     @classmethod
     def of(cls, object_points, image_points, image_size, model, visible, free, start):
         model = pixel_model(model)
-        xy, X = np.asarray(image_points, float), np.asarray(object_points, float)
-        size = np.asarray(image_size, float)
-        visible = np.ones(xy.shape[:3], bool) if visible is None else np.asarray(visible)
+        xy = as_array("image_points", image_points, "numbers [cameras, views, points, 2]")
+        X = once(as_array("object_points", object_points, "numbers [points, 3]"), xy)
+        size = as_array("image_size", image_size, "width and height in pixels")
+        if visible is None:
+            visible = np.ones(xy.shape[:3], bool)
+        visible = as_array("visible", visible, "true or false [cameras, views, points]")
         check_shapes(X, xy, size, visible)
+        X, xy = X.astype(float), xy.astype(float)
         cameras = len(xy)
         free = free_parameters(model, free)
         interior, known = _interior(model, free, start, size, cameras)
@@ -100,8 +160,7 @@ class Batch:
         seen = visible.any(1)
         X = np.where(seen[..., None], X, 0.0)
         xy = np.where(visible[..., None], xy, 0.0)
-        finite = np.isfinite(X).all((1, 2)) & np.isfinite(xy).all((1, 2, 3))
-        finite &= np.isfinite(interior).all(1)
+        finite = _usable(X).all((1, 2)) & _usable(xy).all((1, 2, 3)) & _usable(interior).all(1)
         X[~finite], xy[~finite] = 0.0, 0.0
         return cls(
             finite, *_principal_axes(X, seen), xy=xy, visible=visible, interior=interior,
@@ -138,8 +197,16 @@ class Batch:
             wide(self.axes[cameras], size), wide(self.middle[cameras], size),
         )  # fmt: skip
 
+
+def _usable(numbers: np.ndarray) -> np.ndarray:
+    """Finite, and so are sums of their squares."""
+    return np.abs(numbers) < LARGEST
+
+
 def pixel_model(name: str) -> CameraModel:
     """The camera model of this name, if its unit is the pixel."""
+    if not isinstance(name, str):
+        raise InputError(f"model must be a name, such as 'opencv', but is {name!r}")
     try:
         model = get_model(name)
     except ValueError as error:
@@ -153,6 +220,9 @@ def free_parameters(model: CameraModel, free) -> tuple[str, ...]:
     """The parameters to estimate, checked."""
     if free is None:
         free = FREE.get(model.name) or model.parameters
+    if isinstance(free, str | bytes) or not isinstance(free, Iterable):
+        raise InputError(f"free must be a list of names, such as ['fx', 'fy'], but is {free!r}")
+    free = list(free)
     for name in free:
         if name not in model.parameters or name in model.never_free:
             raise InputError(
@@ -168,7 +238,9 @@ def _interior(model: CameraModel, free, start, size, cameras):
     """Start values [cameras, parameters]; are the focal lengths among them?"""
     values = {name: 1.0 for name in model.principal_distance} | default_parameters(model)
     values |= {name: (n - 1) / 2 for name, n in zip(("cx", "cy"), size) if name in values}
-    start = dict(start or {})
+    start = {} if start is None else start
+    if not isinstance(start, Mapping):
+        raise InputError(f"start must be like {{'fx': 900.0, 'fy': 900.0}}, but is {start!r:.80}")
     for name in start:
         if name not in values:
             raise InputError(
@@ -180,13 +252,15 @@ def _interior(model: CameraModel, free, start, size, cameras):
     held = [name for name in missing if name not in free]
     if (given and missing) or held:
         raise InputError(f"start: give {', '.join(missing)} as well")
-    try:
-        columns = [
-            np.broadcast_to(np.asarray((values | start)[name], float), (cameras,))
-            for name in model.parameters
-        ]
-    except (ValueError, TypeError) as error:
-        raise InputError(f"start: a number, or one for each of {cameras} cameras") from error
+    number = f"a number, or one for each of {cameras} cameras"
+    columns = []
+    for name in model.parameters:
+        column = as_array(f"start: {name}", {**values, **start}[name], number)
+        if column.shape not in ((), (1,), (cameras,)):
+            raise InputError(f"start: {name} must be {number}, but has the shape {column.shape}")
+        if name in model.principal_distance and (column <= 0).any():
+            raise InputError(f"start: {name} must be positive")
+        columns.append(np.broadcast_to(column.astype(float), (cameras,)))
     return np.stack(columns, 1), bool(given)
 
 

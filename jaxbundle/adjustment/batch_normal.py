@@ -96,11 +96,13 @@ def gram(x: list, y: list) -> Float[Array, "views n n"]:
 class Factor(eqx.Module):
     """The damped normal equations, factorised.
 
-    `scale` [views, 6] and `interior_scale` [k] make the diagonal 1 before the damping.
+    `scale` [views, 6] and `interior_scale` [k] make the diagonal 1 before the damping; `reduced` is
+    the matrix of the interior orientation, so scaled, after the elimination.
     """
 
     pose: list
     eliminated: list
+    reduced: Float[Array, "k k"]
     scale: Float[Array, "views 6"]
     interior: Float[Array, "k k"]
     interior_scale: Float[Array, " k"]
@@ -127,8 +129,8 @@ def factorise(N, views, damping) -> Factor:
     S = interior_scale[:, None] * reduced[:k, :k] * interior_scale + damping * jnp.eye(k)
     factor = jnp.linalg.cholesky(S)
     return Factor(
-        pose=L, eliminated=Y, scale=scale, interior=factor, interior_scale=interior_scale,
-        right=reduced[:k, k],
+        pose=L, eliminated=Y, reduced=S, scale=scale, interior=factor,
+        interior_scale=interior_scale, right=reduced[:k, k],
     )
 
 

@@ -27,6 +27,8 @@ FLAT, SOLID = 4, 6
 """A view of fewer points is left out."""
 LEAST_PIVOT = 1e-10
 """A view whose points lie on a line (a plane) has a scaled pivot below this: it is left out."""
+THIN = 1e-7
+"""An extent across below this fraction of that along is rounding: the points lie on the line."""
 ORDINARY = 1.2
 """Focal length, in lengths of the image, where the views determine none."""
 FLIP = (1.0, -1.0, -1.0)
@@ -81,6 +83,7 @@ def _ideal(model, known, seen: Sightings, interior):
 def _fit(seen, x, y, axes, least_points):
     """Columns (arrays of a view each) of H (2 axes) or P (3), w > 0 at the points; usable views."""
     X, middle, (size,) = _normalised(seen.weight, _of_views(seen, axes))
+    X = [jnp.where(jnp.max(jnp.abs(c), 1, keepdims=True) > THIN, c, 0.0) for c in X]
     (x, y), (mx, my), (k,) = _normalised(seen.weight, (x, y))
     solution, usable = _direct_linear(seen.weight, X, x, y)
     h = [*solution, jnp.ones_like(mx)]

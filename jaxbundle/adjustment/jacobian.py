@@ -191,11 +191,15 @@ def distance_blocks(s: Structure, values: Values, data: Data) -> Float[Array, "d
 def compiled_jacobian(structure: Structure, values: Values, data: Data) -> BundleJacobian:
     """`jacobian`, compiled once and shared by everything that looks at a solution, whether or not
     the datum is known yet."""
-    jac = _compiled(structure.without_datum(), values, data)
-    return dataclasses.replace(jac, structure=structure)
+    return dataclasses.replace(
+        _blocks(structure.without_datum(), values, data), structure=structure
+    )
 
 
-_compiled = eqx.filter_jit(jacobian)
+@eqx.filter_jit
+def _blocks(structure, values, data):
+    """`jacobian` without its structure, which a compiled function would return as a copy."""
+    return dataclasses.replace(jacobian(structure, values, data), structure=None)
 
 
 def _image_blocks(structure, group, values, data):

@@ -3,7 +3,7 @@
 Every device eliminates its own points; the sums over images, the reduced matrix and its right-hand
 side are added up over the devices (`Structure.total`), and every device solves the reduced system
 and moves its points. The same program runs on the cores of a processor (`jax_num_cpu_devices`), on
-several GPUs, and in several processes after `jax.distributed.initialize`.
+several GPUs, and in several processes (`jaxbundle.join_processes`).
 """
 
 import dataclasses
@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.adjustment.solver import BundleSolver, Minimum, minimise
+from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.arrays import Data, Values
 from jaxbundle.network.padding import Sizes, common_sizes, pad, pad_values, sizes_of
 from jaxbundle.network.pairs import CHUNK_LENGTHS
@@ -60,6 +61,8 @@ def find_minimum_of_shards(solver: BundleSolver, shards: Shards, start: Values) 
     """Run the solver on all parts from the start values of the whole network.
 
     The structure of the solver is replaced. The datum is not imposed: `move_to_datum` does it.
+
+    **Raises:** `NotSolvedError` where one of several processes is lost.
     """
     mesh = shards.mesh
     parts = [pad_values(_values_of(start, chosen), shards.sizes) for chosen in shards.points]
@@ -70,7 +73,16 @@ def find_minimum_of_shards(solver: BundleSolver, shards: Shards, start: Values) 
     )  # fmt: skip
     solver = dataclasses.replace(solver, structure=shards.structure)
     # What comes back is the same on all devices: every process keeps its own copy.
-    minimum = jax.tree.map(np.asarray, _run(solver, shards.data, start_parts, mesh))
+    try:
+        minimum = jax.tree.map(np.asarray, _run(solver, shards.data, start_parts, mesh))
+    except jax.errors.JaxRuntimeError as error:
+        if jax.process_count() == 1:
+            raise
+        why = " ".join(str(error).split())[:200]
+        processes = jax.process_count()
+        raise NotSolvedError(
+            f"not solved: one of {processes} processes ended, or cannot be reached ({why})"
+        ) from None
     point = np.array(start.point)
     for part, chosen in zip(minimum.values.point, shards.points):
         point[chosen] = part[: len(chosen)]

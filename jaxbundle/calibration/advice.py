@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.adjustment.batch_weakness import VAGUE
 from jaxbundle.calibration.quality import Coverage, CrossValidation
 
 FEW_VIEWS = 8
@@ -21,8 +22,7 @@ LARGE = 1.0
 CONTRADICTION = 3.0
 WEAK = 1.0
 """A distortion coefficient with |value|/σ below this says nothing."""
-DISTANCES, VAGUE = ("c", "f", "fx", "fy"), 50.0
-"""A principal distance whose σ is above a fiftieth of it is as good as unknown."""
+DISTANCES = ("c", "f", "fx", "fy")
 STRONG = ("c", "x0", "y0", "fx", "fy", "cx", "cy", "f")
 
 

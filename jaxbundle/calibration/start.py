@@ -95,7 +95,7 @@ def _why(views):
 
 
 def _solve(views: BoardViews, model: CameraModel, free) -> BatchCalibration:
-    """The first attempt that converges."""
+    """The first attempt with a solution, a weak one as well."""
     size = views.image_size
     if model.unit == "px":
         attempts = [(model.name, free, None)]
@@ -117,7 +117,7 @@ def _solve(views: BoardViews, model: CameraModel, free) -> BatchCalibration:
             views.board.points, xy[None], size, name, views.visible[None],
             free=wanted, start=start, threads=1,
         )  # fmt: skip
-        if solved.converged[0]:
+        if solved.solved[0]:
             return solved
     raise NotSolvedError(
         f"not solved: {len(views)} photographs of the board determine no camera "

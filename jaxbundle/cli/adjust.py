@@ -51,10 +51,29 @@ def adjust(
     brief: Annotated[bool, typer.Option("--brief", help="no points and residuals in JSON")] = False,
     quiet: Quiet = False,
     plots: Annotated[bool, typer.Option(help="plots in the folder of --out")] = True,
+    cores: Annotated[
+        int | None, typer.Option(min=1, help="cores that share the work; all if not given")
+    ] = None,
+    join: Annotated[
+        tuple[str, int, int] | None,
+        typer.Option(
+            metavar="HOST:PORT NUMBER INDEX",
+            help="one of NUMBER processes, which find each other at the address of the first",
+        ),
+    ] = None,
+    cluster: Annotated[
+        bool, typer.Option("--cluster", help="one of the processes started by srun (SLURM)")
+    ] = False,
 ) -> None:
     """Adjust a network and report it."""
     jaxbundle.enable_x64()
-    jaxbundle.use_cores()
+    jaxbundle.use_cores(cores)
+    if join or cluster:
+        if json == "-":
+            raise InputError("--json - with --join or --cluster: give a file; the connection of "
+                             "the processes is reported on standard output")  # fmt: skip
+        if not jaxbundle.join_processes(*(join or ())):
+            json, out, quiet = "", None, True
     network = read_network(input, format, tuple(set or ()))
     if method not in ("levenberg-marquardt", "gauss-newton"):
         raise InputError(f"--method {method!r}: levenberg-marquardt or gauss-newton")

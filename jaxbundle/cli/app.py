@@ -1,8 +1,9 @@
 """The application the commands are registered with, and how it ends."""
 
+import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 
@@ -49,19 +50,23 @@ def run() -> None:
     try:
         sys.exit(app(standalone_mode=False))
     except (InputError, NotSolvedError) as error:
-        print(f"jaxbundle: {error}", file=sys.stderr)
-        sys.exit(BAD_INPUT if isinstance(error, InputError) else NOT_SOLVED)
+        _end(error, BAD_INPUT if isinstance(error, InputError) else NOT_SOLVED)
     except MemoryError:
-        print("jaxbundle: not enough memory for this", file=sys.stderr)
-        sys.exit(NOT_SOLVED)
+        _end("not enough memory for this", NOT_SOLVED)
     except (OSError, OverflowError, RecursionError) as error:
-        print(f"jaxbundle: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(BAD_INPUT)
+        _end(" ".join(str(error).split()), BAD_INPUT)
     except typer.Abort:
         sys.exit(130)
     except Exception as error:
         # Usage errors of the command line itself (unknown option, missing argument).
         if hasattr(error, "format_message"):
-            print(f"jaxbundle: {error.format_message()}", file=sys.stderr)
-            sys.exit(BAD_INPUT)
+            _end(error.format_message(), BAD_INPUT)
         raise
+
+
+def _end(message: object, status: int) -> NoReturn:
+    print(f"jaxbundle: {message}", file=sys.stderr, flush=True)
+    jax = sys.modules.get("jax")
+    if jax and jax.distributed.is_initialized():
+        os._exit(status)  # An orderly exit would wait for the other processes.
+    sys.exit(status)

@@ -1,5 +1,7 @@
 """`jaxbundle batch`: many cameras, many networks."""
 
+import signal
+import sys
 from typing import Annotated
 
 import typer
@@ -19,18 +21,39 @@ def batch(
     max_iterations: Annotated[int, typer.Option(min=1)] = 100,
     portion: Annotated[int, typer.Option(min=1, help="cameras between two writes")] = 256,
     brief: Annotated[bool, typer.Option("--brief", help="no poses, no covariances")] = False,
-    retry: Annotated[bool, typer.Option("--retry", help="again what did not converge")] = False,
+    retry: Annotated[bool, typer.Option("--retry", help="again what has no result")] = False,
+    renew: Annotated[
+        bool, typer.Option("--renew", help="again what is from other settings or other data")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Calibrate many cameras and adjust many networks; interrupted, it takes up where it was."""
+    """Calibrate many cameras and adjust many networks; interrupted, it takes up where it was.
+
+    Lines that are in the file already are not computed again. Those of other
+    settings or other data are refused, or computed again with --renew.
+
+    Exit status: 0 every input has its line, whatever its status; 2 bad input,
+    or another run is writing the file; 130, 143 interrupted.
+    """
     jaxbundle.enable_x64()
-    with counting(quiet) as bar:
-        task = bar.add_task("batch", total=None)
-        counts = run_batch(
-            inputs, json_lines, model=model, free=free.split(",") if free else None,
-            max_iterations=max_iterations, portion=portion, brief=brief, retry=retry,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
-        )  # fmt: skip
+    if not all(path.endswith(".npz") for path in inputs):
+        # Cameras fill the cores by threads of their own, and gain nothing.
+        jaxbundle.use_cores()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    try:
+        with counting(quiet) as bar:
+            task = bar.add_task("batch", total=None)
+            counts = run_batch(
+                inputs, json_lines, model=model,
+                free=[name.strip() for name in free.split(",")] if free else None,
+                max_iterations=max_iterations, portion=portion, brief=brief, retry=retry,
+                renew=renew,
+                progress=lambda done, total: bar.update(task, completed=done, total=total),
+            )  # fmt: skip
+    except KeyboardInterrupt:
+        print("jaxbundle: interrupted; run the same command again to go on", file=sys.stderr)
+        raise
     if not quiet:
-        said = ", ".join(f"{number} {status}" for status, number in counts.items() if number)
-        print(f"{json_lines}: {said or 'nothing to do'}")
+        skipped = counts.pop("skipped", 0)
+        said = ", ".join(f"{number} {status}" for status, number in counts.most_common() if number)
+        print(f"{json_lines}: {said}" + f" ({skipped} skipped, they were there)" * bool(skipped))

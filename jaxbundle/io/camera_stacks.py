@@ -18,8 +18,9 @@ from typing import BinaryIO
 
 import numpy as np
 
-from jaxbundle.adjustment.batch_input import check_shapes
+from jaxbundle.adjustment.batch_input import as_array, check_shapes, once
 from jaxbundle.errors import InputError
+from jaxbundle.io.fingerprints import of_arrays
 from jaxbundle.io.unpacking import most_unpacked
 
 UNREADABLE = (
@@ -34,9 +35,9 @@ KNOWN = (*NEEDED, "visible", "ids")
 
 @dataclasses.dataclass(frozen=True)
 class CameraStack:
-    """The cameras of a file; `keys`: one a camera, made of the file's name and its id."""
+    """The cameras of a file."""
 
-    keys: tuple[str, ...]
+    ids: tuple[str, ...]
     object_points: np.ndarray
     image_points: np.ndarray
     image_size: tuple[float, ...]
@@ -51,6 +52,14 @@ class CameraStack:
             image_size=self.image_size,
             visible=None if self.visible is None else self.visible[chosen],
         )
+
+    def fingerprint(self, camera: int) -> str:
+        """Of what was measured of a camera; what is not visible does not count."""
+        X = self.object_points if self.object_points.ndim == 2 else self.object_points[camera]
+        xy = self.image_points[camera]
+        seen = np.ones(xy.shape[:2], bool) if self.visible is None else self.visible[camera] != 0
+        shown = np.where(seen[..., None], xy, 0)
+        return of_arrays(X, shown, seen, np.array(self.image_size))
 
 
 def read_camera_stack(path: str | Path) -> CameraStack:
@@ -76,22 +85,26 @@ def read_camera_stack(path: str | Path) -> CameraStack:
             f"{path}: no array {missing[0]!r}; expected {', '.join(NEEDED)} and, if needed, "
             "visible and ids"
         )
-    for name in NEEDED:
-        if arrays[name].dtype.kind not in "fiu":
-            raise InputError(f"{path}: {name} must be numbers, but is {arrays[name].dtype}")
     X, xy, size = (arrays[name] for name in NEEDED)
     visible = arrays.get("visible")
     try:
+        for name in {*arrays} - {"ids"}:
+            as_array(name, arrays[name], "true or false" if name == "visible" else "numbers")
+        X = once(X, xy)
         check_shapes(X, xy, size, np.ones(xy.shape[:3]) if visible is None else visible)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     ids = arrays.get("ids", np.arange(len(xy)))
     if ids.shape != (len(xy),):
         raise InputError(f"{path}: ids must have the shape ({len(xy)},), but has {ids.shape}")
-    if len({*ids.tolist()}) < len(xy):
+    if ids.dtype.kind not in "biufUS":
+        raise InputError(f"{path}: ids must be texts or numbers, but are {ids.dtype}")
+    # Bytes become the text they are in ASCII.
+    names = np.char.decode(ids, "ascii", "replace") if ids.dtype.kind == "S" else ids
+    names = tuple(map(str, names.tolist()))
+    if len({*names}) < len(xy):
         raise InputError(f"{path}: ids must differ, but some occur twice")
-    keys = tuple(f"{path}#{id}" for id in ids.tolist())
-    return CameraStack(keys, X, xy, tuple(size.tolist()), visible)
+    return CameraStack(names, X, xy, tuple(size.tolist()), visible)
 
 
 def _check_size(stream: BinaryIO) -> None:

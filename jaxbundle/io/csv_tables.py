@@ -2,10 +2,11 @@
 
 import csv
 import io
+import itertools
 import os
 import re
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,9 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import Columns
 from jaxbundle.network.tables import Source
+
+PORTION = 10_000
+"""Rows that are turned into text at a time."""
 
 
 def read_text(path: Path, fallback: str = "") -> str:
@@ -87,34 +91,56 @@ def read_csv(path: Path) -> Columns:
 
 def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     """Write a table that `read_csv` reads back; floats in full precision."""
+    write_text(path, (_csv_text(some) for some in in_portions(itertools.chain((header,), rows))))
+
+
+def _csv_text(rows: Iterable[Sequence[Any]]) -> str:
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
+    plain = csv.writer(text, lineterminator="\n")
+    quoted = csv.writer(text, lineterminator="\n", quoting=csv.QUOTE_ALL)
     for row in rows:
-        if str(row[0]).startswith("#"):
-            csv.writer(text, lineterminator="\n", quoting=csv.QUOTE_ALL).writerow(row)
-        else:
-            writer.writerow(row)
-    write_text(path, text.getvalue())
+        # Else it would be read as a comment.
+        writer = quoted if str(row[0]).startswith("#") else plain
+        writer.writerow(row)
+    return text.getvalue()
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a text in UTF-8, whole or not at all (`write_bytes`)."""
-    write_bytes(path, text.encode())
+def table_rows(table: Mapping[str, np.ndarray]) -> Iterator[tuple]:
+    """The rows of a table of columns as plain values; never all of them at a time."""
+    columns = list(table.values())
+    for first in range(0, max(map(len, columns), default=0), PORTION):
+        yield from zip(*(column[first : first + PORTION].tolist() for column in columns))
 
 
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all: under a temporary name, then renamed.
+def in_portions(rows: Iterable[Any]) -> Iterator[list]:
+    """Some rows at a time."""
+    rows = iter(rows)
+    while portion := list(itertools.islice(rows, PORTION)):
+        yield portion
+
+
+def write_text(path: Path, text: str | Iterable[str]) -> None:
+    """Write a text, or its pieces, in UTF-8, whole or not at all (`write_bytes`)."""
+    pieces = (text,) if isinstance(text, str) else text
+    write_bytes(path, (piece.encode() for piece in pieces))
+
+
+def write_bytes(path: Path, content: bytes | Iterable[bytes]) -> None:
+    """Write a file, given whole or in pieces, whole or not at all: under a temporary name, then
+    renamed.
 
     What is there and no file (a device, a pipe) is written to as it is.
     """
+    pieces = (content,) if isinstance(content, bytes) else content
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         if path.exists() and not path.is_file():
-            path.write_bytes(content)
+            with path.open("wb") as file:
+                file.writelines(pieces)
             return
         try:
-            temporary.write_bytes(content)
+            with temporary.open("wb") as file:
+                file.writelines(pieces)
             os.replace(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)

@@ -1,73 +1,102 @@
 """Results as JSON lines: one object a line, each with a `key`, appended as they come.
 
 An interrupted run leaves whole lines and at most one torn one at the end. `JsonLines` takes up
-where it stopped: it knows the keys that are there.
+where it stopped: it knows the keys that are there, and what their lines were made of.
 """
 
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.csv_tables import write_text
+from jaxbundle.io.csv_tables import write_bytes
 from jaxbundle.io.result_json import without_nan
+
+HEAD = ("status", "settings", "data")
+"""What is remembered of a line: how it ended, and what it was made of."""
 
 
 class JsonLines:
-    """A file of results, kept whole and never with a key twice.
+    """A file of results, kept whole and never with a key twice; to be used under its lock.
 
-    **Arguments:** `retry`: drop what did not converge, to be computed again.
+    `heads`: of every key the fields `HEAD` of its line, as far as it has them.
 
     **Raises:** `InputError` if the file cannot be read or written, or has other content.
     """
 
-    def __init__(self, path: str | Path, retry: bool = False):
+    def __init__(self, path: str | Path):
         self.path = Path(path)
-        self.keys: set[str] = set()
-        text = self._read()
-        kept, lines = [], text.removesuffix("\n").split("\n") if text else []
-        for number, line in enumerate(lines, 1):
-            row = _row(line)
+        # A link stays a link.
+        self._file = Path(os.path.realpath(path))
+        self.heads: dict[str, dict] = {}
+        regular = self._file.is_file() or not self._file.exists()
+        end, twice, whole = 0, False, True
+        for number, line in enumerate(self._lines() if regular else (), 1):
+            row, whole = _row(line), line.endswith(b"\n")
             if row is None:
-                if number == len(lines) and not text.endswith("\n") and _is_torn(line):
+                if not whole and _is_torn(line):
                     break
                 raise InputError(
                     f"{self.path}, line {number}: not a result of jaxbundle batch; "
                     "give another file to --json-lines"
                 )
-            if row["key"] in self.keys or (retry and row.get("status") != "converged"):
-                continue
-            self.keys.add(row["key"])
-            kept.append(line)
-        whole = "".join(line + "\n" for line in kept)
-        if whole != text or not self.path.exists():
-            write_text(self.path, whole)
+            end += len(line)
+            twice |= row["key"] in self.heads
+            self.heads.setdefault(row["key"], _head(row))
+        self._write(lambda file: None)
+        if regular and not whole:
+            self._mend(end)
+        if twice:
+            self.drop(())
 
     def __contains__(self, key: str) -> bool:
-        return key in self.keys
+        return key in self.heads
 
     def append(self, rows: Iterable[dict]) -> None:
         """Add rows; they are on the disk when this returns."""
         rows = list(rows)
-        lines = [_text(row) + "\n" for row in rows]
-        try:
-            with self.path.open("a", encoding="utf-8", newline="\n") as file:
-                file.write("".join(lines))
-                file.flush()
-                os.fsync(file.fileno())
-        except OSError as error:
-            raise InputError(f"{self.path}: cannot be written: {error.strerror}") from None
-        self.keys.update(row["key"] for row in rows)
+        # A name that is no UTF-8 is escaped, as JSON escapes it.
+        text = "".join(_text(row) + "\n" for row in rows).encode(errors="backslashreplace")
+        self._write(lambda file: file.write(text))
+        self.heads.update((row["key"], _head(row)) for row in rows)
 
-    def _read(self) -> str:
+    def drop(self, keys: Iterable[str]) -> None:
+        """Remove the lines of some keys, and every line that has a key once more."""
+        left, kept = self.heads.keys() - set(keys), []
+        self.heads = {key: head for key, head in self.heads.items() if key in left}
+        for line in self._lines():
+            key = _row(line)["key"]
+            if key in left:
+                left.discard(key)
+                kept.append(line)
+        write_bytes(self._file, kept)
+
+    def _lines(self) -> Iterator[bytes]:
         try:
-            # A torn line may end within a character.
-            return self.path.read_bytes().decode("utf-8", errors="replace")
+            with self._file.open("rb") as file:
+                yield from file
         except FileNotFoundError:
-            return ""
+            return
         except OSError as error:
             raise InputError(f"{self.path}: cannot be read: {error.strerror}") from None
+
+    def _write(self, write: Callable) -> None:
+        try:
+            with self._file.open("ab") as file:
+                write(file)
+                file.flush()
+                if self._file.is_file():
+                    os.fsync(file.fileno())
+        except OSError as error:
+            raise InputError(f"{self.path}: cannot be written: {error.strerror}") from None
+
+    def _mend(self, end: int) -> None:
+        """Cut off a torn line that begins at `end`, or give the last line its line feed."""
+        if end < self._file.stat().st_size:
+            os.truncate(self._file, end)
+        else:
+            self._write(lambda file: file.write(b"\n"))
 
 
 def _text(row: dict) -> str:
@@ -77,15 +106,19 @@ def _text(row: dict) -> str:
         return json.dumps(without_nan(row), ensure_ascii=False)
 
 
-def _is_torn(line: str) -> bool:
+def _is_torn(line: bytes) -> bool:
     """Whether a line is the beginning of a row."""
-    begin = '{"'
+    begin = b'{"'
     return line.startswith(begin) or begin.startswith(line)
 
 
-def _row(line: str) -> dict | None:
+def _row(line: bytes) -> dict | None:
     try:
         row = json.loads(line)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     return row if isinstance(row, dict) and isinstance(row.get("key"), str) else None
+
+
+def _head(row: dict) -> dict:
+    return {name: row[name] for name in HEAD if name in row}

@@ -7,9 +7,11 @@ held of an exterior orientation are 0.
 
 import json
 import math
+from collections.abc import Iterator
 
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import NotSolvedError
+from jaxbundle.io.csv_tables import in_portions, table_rows
 from jaxbundle.network.tables import EXTERIOR
 
 
@@ -53,23 +55,14 @@ def result_dict(adjustment, brief: bool = False) -> dict:
             {"camera": name.id, "parameter": name.parameter} for name in adjustment.eliminated
         ],
     }
-    if not brief:
-        head |= {
-            "points": _points(adjustment.points),
-            "residuals": _residuals(adjustment.residuals),
-            "variance_components": {
-                name: {
-                    "observations": c.observations,
-                    "redundancy": c.redundancy,
-                    "vtpv": c.vtpv,
-                    "sigma": c.sigma,
-                    "factor": c.factor,
-                    "estimated": list(c.estimated),
-                }
-                for name, c in adjustment.variance_components.items()
-            },
-        }
-    return head | {"check_points": _checks(adjustment)}
+    head |= {"check_points": _checks(adjustment)}
+    if brief:
+        return head
+    return head | {
+        "variance_components": _components(adjustment),
+        "points": dict(_points(adjustment.points)),
+        "residuals": list(_residuals(adjustment.residuals)),
+    }
 
 
 def unsolved_text(error: NotSolvedError) -> str:
@@ -78,9 +71,28 @@ def unsolved_text(error: NotSolvedError) -> str:
     return json.dumps(head, ensure_ascii=False) + "\n"
 
 
-def result_text(adjustment, brief: bool = False) -> str:
-    """The result as JSON text: one line that ends with a line feed."""
-    return json.dumps(without_nan(result_dict(adjustment, brief)), ensure_ascii=False) + "\n"
+def result_text(adjustment, brief: bool = False) -> Iterator[str]:
+    """The result as JSON text, one line that ends with a line feed, in pieces: that of 2 000 000
+    image points is of 1 GB."""
+    head = result_dict(adjustment, brief=True)
+    if brief or not adjustment.converged:
+        yield _text(head) + "\n"
+        return
+    yield _text(head | {"variance_components": _components(adjustment)})[:-1]
+    yield ', "points": {'
+    yield from _joined(_text(dict(some))[1:-1] for some in in_portions(_points(adjustment.points)))
+    yield '}, "residuals": ['
+    yield from _joined(_text(some)[1:-1] for some in in_portions(_residuals(adjustment.residuals)))
+    yield "]}\n"
+
+
+def _text(value) -> str:
+    return json.dumps(without_nan(value), ensure_ascii=False)
+
+
+def _joined(pieces: Iterator[str]) -> Iterator[str]:
+    for number, piece in enumerate(pieces):
+        yield ", " + piece if number else piece
 
 
 def without_nan(value):
@@ -119,19 +131,30 @@ def _images(adjustment) -> dict:
     }
 
 
-def _points(table) -> dict:
-    columns = {name: column.tolist() for name, column in table.items()}
+def _components(adjustment) -> dict:
     return {
-        point: {"role": columns["role"][i]}
-        | {axis: _estimate(columns[axis][i], columns[f"s{axis}"][i]) for axis in "XYZ"}
-        | {"rays": columns["rays"][i]}
-        for i, point in enumerate(columns["id"])
+        name: {
+            "observations": c.observations,
+            "redundancy": c.redundancy,
+            "vtpv": c.vtpv,
+            "sigma": c.sigma,
+            "factor": c.factor,
+            "estimated": list(c.estimated),
+        }
+        for name, c in adjustment.variance_components.items()
     }
 
 
-def _residuals(table) -> list:
-    columns = [column.tolist() for column in table.values()]
-    return [dict(zip(table, row)) for row in zip(*columns)]
+def _points(table) -> Iterator[tuple[str, dict]]:
+    for row in table_rows(table):
+        point = dict(zip(table, row))
+        estimates = {axis: _estimate(point[axis], point[f"s{axis}"]) for axis in "XYZ"}
+        yield point["id"], {"role": point["role"]} | estimates | {"rays": point["rays"]}
+
+
+def _residuals(table) -> Iterator[dict]:
+    for row in table_rows(table):
+        yield dict(zip(table, row))
 
 
 def _checks(adjustment) -> dict:

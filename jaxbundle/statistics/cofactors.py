@@ -11,6 +11,8 @@ These are marginal cofactors: the uncertainty of images and cameras is in those 
 In a free network they belong to the datum by the S-transformation Q ← S·Q·Sᵀ (`datum.py`).
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -45,12 +47,16 @@ class Cofactors(eqx.Module):
 
 def undamped_factor(structure: Structure, values: Values, data: Data) -> Factor:
     """The factor of JᵀPJ at the solution, datum directions made regular."""
-    return _factorised(compiled_jacobian(structure, values, data))
+    blocks = _factor_blocks(compiled_jacobian(structure, values, data))
+    return dataclasses.replace(blocks, structure=structure)
 
 
 @eqx.filter_jit
-def _factorised(jac):
-    return factorise(jac.structure, normal_from_jacobian(jac))
+def _factor_blocks(jac):
+    """The factor without its structure, which a compiled function would return as a copy."""
+    return dataclasses.replace(
+        factorise(jac.structure, normal_from_jacobian(jac)), structure=None
+    )
 
 
 @eqx.filter_jit

@@ -11,9 +11,10 @@ With the residuals divided by their a priori σ (v/σ) and h = diag(J·Q·Jᵀ) 
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxbundle.adjustment.jacobian import BundleJacobian, compiled_jacobian
 from jaxbundle.adjustment.residuals import Residuals, compiled_residuals
@@ -23,6 +24,7 @@ from jaxbundle.statistics.cofactors import Cofactors
 
 UNCONTROLLED = 1e-8
 """Redundancy numbers below this are rounding: the observation is not controlled at all."""
+RAYS_AT_ONCE = 1 << 16
 
 
 class Reliability(eqx.Module):
@@ -79,24 +81,9 @@ def _weights(data: Data):
 def hat_diagonal(jac: BundleJacobian, cofactors: Cofactors) -> Residuals:
     """h = diag(J·Q·Jᵀ), from the blocks of Q that each observation touches."""
     s, Q = jac.structure, cofactors.internal
-    w, k, K = s.image_width, s.camera_width, s.kept.shape[0]
-    m = s.cameras * k
+    k, K = s.camera_width, s.kept.shape[0]
     points = cofactors.internal_point
-    form = lambda a, block, b: jnp.einsum("nai,nij,naj->na", a, block, b)
-    at_images = lambda a, block, b: jnp.sum(s.table.times_matrix(a, block) * b, 2)
-    image = at_images(jac.image, Q.own, jac.image)
-    image += form(jac.point, points[s.point], jac.point)
-    image += 2 * form(jac.point, cofactors.ray, jac.image)
-    interior = Q.own
-    first = 6
-    if k:
-        at = jnp.arange(s.images)
-        with_camera = Q.border[:m].reshape(s.cameras, k, s.images, w)[s.camera_of_image, :, at, :]
-        own_camera = cofactors.camera[s.camera_of_image]
-        image += at_images(jac.camera, own_camera, jac.camera)
-        image += 2 * at_images(jac.camera, with_camera, jac.image)
-        image += 2 * form(jac.point, cofactors.incidence[s.incidence.of_ray], jac.camera)
-        interior, first = cofactors.camera, 0
+    interior, first = (cofactors.camera, 0) if k else (Q.own, 6)
     control = jac.control**2 * jnp.diagonal(points[s.control], axis1=1, axis2=2)
     exterior = jnp.einsum("eij,ejk,eik->ei", jac.exterior, Q.own[s.exterior, :6, :6], jac.exterior)
     variances = jnp.diagonal(interior, axis1=1, axis2=2)[s.interior, first:]
@@ -108,13 +95,51 @@ def hat_diagonal(jac: BundleJacobian, cofactors: Cofactors) -> Residuals:
         )
     distance = jnp.zeros(s.distance.shape[0])
     if K:
+        m = s.cameras * k
         both = Q.corner[m:, m:].reshape(K, 3, K, 3)
         place = jnp.clip(jnp.searchsorted(s.kept, s.distance), 0, K - 1)
         a, b = place[:, 0], place[:, 1]
         ja, jb = jac.distance[:, 0], jac.distance[:, 1]
         quadratic = lambda x, i, j, y: jnp.einsum("di,dij,dj->d", x, both[i, :, j, :], y)
         distance = quadratic(ja, a, a, ja) + 2 * quadratic(ja, a, b, jb) + quadratic(jb, b, b, jb)
-    return Residuals(image, control, exterior, parameters, distance)
+    return Residuals(_of_rays(jac, cofactors), control, exterior, parameters, distance)
+
+
+def _of_rays(jac: BundleJacobian, cofactors: Cofactors) -> Float[Array, "rays 2"]:
+    """h of image coordinates, some chunks of the table of rays at a time: what belongs to the rays
+    of all of it (2 000 000, say) is large."""
+    s, table = jac.structure, jac.structure.table
+    orientation = _of_orientations(s, cofactors)
+    form = lambda a, blocks, b: jnp.sum((a @ blocks) * b, 2)
+
+    def of_chunk(chunk):
+        some = lambda rows: table.in_chunks(rows)[chunk]
+        J, P, with_point = some(jac.image), some(jac.point), some(cofactors.ray)
+        if s.camera_width:
+            shared = cofactors.incidence[some(s.incidence.of_ray)]
+            with_point = jnp.concatenate([with_point, shared], 2)
+            J = jnp.concatenate([J, some(jac.camera)], 2)
+        own = form(P, cofactors.internal_point[some(s.point)], P)
+        return form(J, orientation[table.chunk_image[chunk]], J) + 2 * form(P, with_point, J) + own
+
+    chunks = jnp.arange(len(table.chunk_image))
+    at_once = max(RAYS_AT_ONCE // max(table.chunk, 1), 1)
+    if len(chunks) > at_once:
+        return jax.lax.map(of_chunk, chunks, batch_size=at_once).reshape(-1, 2)
+    return jax.vmap(of_chunk)(chunks).reshape(-1, 2)
+
+
+def _of_orientations(s: Structure, cofactors: Cofactors) -> Float[Array, "images m m"]:
+    """The block of Q of every image together with its shared camera."""
+    Q, w, k = cofactors.internal, s.image_width, s.camera_width
+    if not k:
+        return Q.own
+    border = Q.border[: s.cameras * k].reshape(s.cameras, k, s.images, w)
+    border = border[s.camera_of_image, :, jnp.arange(s.images), :]
+    return jnp.concatenate([
+        jnp.concatenate([Q.own, border.transpose(0, 2, 1)], 2),
+        jnp.concatenate([border, cofactors.camera[s.camera_of_image]], 2),
+    ], 1)  # fmt: skip
 
 
 def minimal_detectable(sigma, redundancy, delta0: float = 4.13) -> Float[np.ndarray, "..."]:

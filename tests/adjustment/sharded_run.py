@@ -16,12 +16,11 @@ os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={devices}"
 
 import jax  # noqa: E402
 
+import jaxbundle  # noqa: E402
+
 jax.config.update("jax_enable_x64", True)
 if processes > 1:
-    jax.config.update("jax_cpu_collectives_implementation", "gloo")
-    jax.distributed.initialize(
-        f"127.0.0.1:{port}", processes, rank, heartbeat_timeout_seconds=10
-    )
+    jaxbundle.join_processes(f"127.0.0.1:{port}", processes, rank, lost_after_seconds=10)
 
 import numpy as np  # noqa: E402
 from adjustment_checks import make  # noqa: E402

@@ -4,12 +4,14 @@ import cv2
 import jax
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy import optimize
 
 import jaxbundle
 from jaxbundle import cameras
-from jaxbundle.adjustment.batch_input import bucket
+from jaxbundle.adjustment.batch_input import bucket, once
 from jaxbundle.geometry import omega_phi_kappa_from_matrix
 
 SIZE = (1280, 960)
@@ -17,6 +19,11 @@ VIEWS, NOISE = 10, 0.2
 BOARD = np.c_[np.mgrid[0:8, 0:5].T.reshape(-1, 2) * 0.03, np.zeros(40)] + [0.4, -0.2, 1.5]
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 FLIP = np.diag([1.0, -1.0, -1.0])
+
+
+def often(number: int):
+    """So many examples, always the same."""
+    return settings(max_examples=number, deadline=None, derandomize=True, database=None)
 
 
 def rodrigues(v):
@@ -184,15 +191,63 @@ def test_bad_cameras_do_not_change_the_others(three, solved):
     assert str(found).startswith("6 cameras") and "1 not finite" in str(found)
 
 
+def frontal(p, views, tilt=0.0):
+    """Images of the board parallel to it, but for `tilt` (radians); [views, 40, 2]."""
+    rng = np.random.default_rng(7)
+    turns = rng.normal(0, 1, (views, 3)) * [tilt, tilt, 0.3]
+    shifts = poses(rng, views)[1]
+    return np.stack([opencv_image(p, rodrigues(v), t, BOARD) for v, t in zip(turns, shifts)])
+
+
+def test_views_parallel_to_the_board_determine_no_focal_length(three, solved):
+    """Then X/Z·fx stays the same with other fx and Z: fx and fy, and nothing but by them."""
+    p = three[1][0]
+    steps = 0.0, 0.02, 0.35
+    xy = np.stack([frontal(p, VIEWS, tilt) for tilt in steps])
+    xy[1:] += np.random.default_rng(0).normal(0, NOISE, xy[1:].shape)
+    found = jaxbundle.calibrate_batch(BOARD, xy, SIZE)
+    assert list(found.status) == ["singular", "weak", "converged"]
+    expected = [[name in ("fx", "fy") for name in NAMES]] * 2 + [[False] * len(NAMES)]
+    assert found.undetermined.tolist() == expected
+    assert list(found.solved) == [False, True, True]
+    assert np.isnan(found.values[0]).all()
+    # A weak one has values, whose σ are true.
+    assert (found.sigma[1, :2] > found.values[1, :2] / 50).all()
+    assert np.abs((found.values[1, :4] - p[:4]) / found.sigma[1, :4]).max() < 4.5
+    assert not solved.undetermined.any()
+
+
+def test_a_principal_point_is_weak_too(three):
+    """Where fx and fy are given, bad measurements of views hardly tilted leave it unknown."""
+    p = three[1][0]
+    xy = frontal(p, VIEWS, 0.02)[None] + np.random.default_rng(0).normal(0, 5, (1, VIEWS, 40, 2))
+    given = dict(zip(NAMES, p))
+    found = jaxbundle.calibrate_batch(BOARD, xy, SIZE, free=("cx", "cy", "p1", "p2"), start=given)
+    assert list(found.status) == ["weak"]
+    assert found.undetermined.tolist() == [[True, True, False, False]]
+    assert (found.sigma[0, :2] > p[:2] / 50).all() and not np.isnan(found.rms[0])
+
+
+def test_without_redundancy_there_is_no_sigma(three):
+    """2 views of 4 points: 16 coordinates for 4 + 12 unknowns."""
+    corners = [0, 7, 32, 39]
+    visible = np.zeros(three[0].shape[:3], bool)
+    visible[np.ix_(range(3), range(2), corners)] = True
+    free = ("fx", "fy", "cx", "cy")
+    found = jaxbundle.calibrate_batch(BOARD, three[0], SIZE, visible=visible, free=free)
+    assert list(found.status) == ["too few points"] * 3 and (found.redundancy == 0).all()
+
+
 def test_one_pose_over_and_over_determines_no_focal_length(three):
     p, shift = three[1][0], np.array([0.0, 0, 0.4])
     turns = [np.eye(3), rodrigues(np.array([1e-4, 0, 0])), rodrigues(np.array([0, 0, 1.0]))]
     xy = np.stack([[opencv_image(p, R, shift, BOARD)] * VIEWS for R in turns])
     noisy = xy + np.random.default_rng(0).normal(0, NOISE, xy.shape)
     found = jaxbundle.calibrate_batch(BOARD, np.concatenate([xy, noisy]), SIZE)
-    assert not found.converged[:3].any() and np.isnan(found.values[:3]).all()
+    assert not found.converged.any() and np.isnan(found.values[:3]).all()
     weak = found.sigma[3:, 0] / found.values[3:, 0]
     assert (np.isnan(weak) | (weak > 0.2)).all()
+    assert found.undetermined[3:, :2].all()
 
 
 def test_perfect_images_give_the_camera_itself(three):
@@ -201,6 +256,16 @@ def test_perfect_images_give_the_camera_itself(three):
     found = jaxbundle.calibrate_batch(BOARD, np.stack(views)[None], SIZE)
     assert found.converged.all() and found.rms[0] < 1e-9
     assert_allclose(found.values[0], p, rtol=1e-7, atol=1e-9)
+
+
+def test_object_points_may_be_repeated_for_every_view(three):
+    xy, X = three[0], np.stack([BOARD, 2 * BOARD, 3 * BOARD])
+    views = xy.shape[1]
+    np.testing.assert_array_equal(once(BOARD, xy), BOARD)
+    np.testing.assert_array_equal(once(BOARD[None], xy), BOARD)
+    np.testing.assert_array_equal(once(np.tile(BOARD, (views, 1, 1)), xy), BOARD)
+    np.testing.assert_array_equal(once(X, xy), X)
+    np.testing.assert_array_equal(once(X[:, None].repeat(views, 1), xy), X)
 
 
 def test_progress_is_told_and_portions_keep_the_order(three, solved):
@@ -270,13 +335,47 @@ GOOD = dict(
 BAD = {
     "points": (dict(object_points=BOARD[:7]), "[40, 3]"),
     "image points": (dict(image_points=np.zeros((3, 40, 2))), "[cameras, views, points, 2]"),
+    "image points in words": (dict(image_points="seen"), "numbers [cameras, views, points, 2]"),
+    "image points complex": (dict(image_points=np.zeros((2, 3, 40, 2), complex)), "complex"),
+    "image points missing": (dict(image_points=[[[[1, None]]]]), "numbers"),
+    "ragged image points": (dict(image_points=[[1, 2], [3]]), "its rows differ in length"),
+    "object points in words": (dict(object_points=BOARD.astype(str)), "numbers [points, 3]"),
+    "flat object points": (dict(object_points=BOARD[:, :2]), "[40, 3]"),
     "no camera": (dict(image_points=np.zeros((0, 3, 40, 2))), "no camera"),
+    "no view": (dict(image_points=np.zeros((2, 0, 40, 2))), "no view"),
+    "no point": (dict(image_points=np.zeros((2, 3, 0, 2)), object_points=BOARD[:0]), "no point"),
     "mask": (dict(visible=np.ones((2, 3))), "visible"),
+    "mask in words": (dict(visible=np.full((2, 3, 40), "yes")), "true or false"),
+    "mask of numbers": (dict(visible=np.full((2, 3, 40), 0.5)), "1 or 0"),
+    "mask of NaN": (dict(visible=np.full((2, 3, 40), np.nan)), "1 or 0"),
+    "ragged mask": (dict(visible=[[1], [1, 0]]), "differ in length"),
+    "views of other objects": (
+        dict(object_points=np.arange(360.0).reshape(3, 40, 3)), "differ from view to view"
+    ),
     "size": (dict(image_size=(0, 960)), "image_size"),
+    "size in words": (dict(image_size=("a", "b")), "width and height"),
+    "size of NaN": (dict(image_size=(1280, np.nan)), "width and height"),
+    "ragged size": (dict(image_size=[[1, 2], [3]]), "width and height"),
+    "one size": (dict(image_size=1280), "width and height"),
+    "no size": (dict(image_size=None), "width and height"),
     "unit": (dict(model="brown"), "pixels"),
+    "no model": (dict(model=None), "'opencv'"),
     "model": (dict(model="opencvv"), "opencv"),
     "free": (dict(free=["fx", "k9"]), "k9"),
+    "free in letters": (dict(free="fx"), "['fx', 'fy']"),
+    "free a number": (dict(free=3), "['fx', 'fy']"),
+    "free twice": (dict(free=["fx", "fy", "fx"]), "once"),
+    "nothing free": (dict(free=[]), "at least one"),
     "start": (dict(start={"k9": 1.0}), "k9"),
+    "start in words": (dict(start={"k1": "small"}), "k1 must be a number"),
+    "start complex": (dict(start={"k1": 1j}), "k1 must be a number"),
+    "start a word": (dict(start="fx"), "{'fx': 900.0"),
+    "start behind": (dict(start={"fx": 900.0, "fy": [900.0, -1]}), "fy must be positive"),
+    "no threads": (dict(threads=0), "threads must be a whole number"),
+    "fewer threads": (dict(threads=-1), "threads must be a whole number"),
+    "half a thread": (dict(threads=1.5), "threads must be a whole number"),
+    "no iteration": (dict(max_iterations=0), "max_iterations must be a whole number"),
+    "iterations without end": (dict(max_iterations=10**30), "to 10⁹"),
     "half a start": (dict(start={"fx": 900.0}), "fy"),
     "held without value": (dict(free=["cx"]), "fx"),
     "start of others": (dict(start={"k1": np.zeros(5)}), "2 cameras"),
@@ -288,7 +387,47 @@ def test_bad_input_is_refused_with_what_is_expected(case):
     changed, word = BAD[case]
     with pytest.raises(jaxbundle.InputError) as error:
         jaxbundle.calibrate_batch(**(GOOD | changed))
-    assert word in str(error.value)
+    assert word in str(error.value) and "\n" not in str(error.value)
+
+
+ODD = [np.nan, np.inf, -np.inf, 1e308, -1e200, 1e99, 1e16, 1e-308, 0.0, -1.0]
+
+
+@often(150)
+@given(
+    name=st.sampled_from(["object_points", "image_points", "visible", "image_size"]),
+    odd=st.sampled_from(ODD), part=st.integers(0, 3), seed=st.integers(0, 99),
+)  # fmt: skip
+def test_any_numbers_end_in_a_status(three, name, odd, part, seed):
+    """A number, a point, a view or everything of one camera is odd: it alone may have no result."""
+    rng = np.random.default_rng(seed)
+    given = dict(
+        object_points=np.stack([BOARD] * 3), image_points=three[0].copy(), image_size=[*SIZE],
+        visible=np.ones(three[0].shape[:3]),
+    )  # fmt: skip
+    if name == "image_size":
+        given[name][seed % 2] = odd
+    else:
+        array = given[name]
+        place = tuple(rng.integers(0, n) for n in array.shape)[: max(array.ndim - part, 1)]
+        array[(1, *place[1:])] = odd
+    try:
+        found = jaxbundle.calibrate_batch(**given)
+    except jaxbundle.InputError as error:
+        assert name in ("visible", "image_size") and name in str(error)
+        return
+    assert np.isfinite(found.sigma[found.solved]).all() and (found.sigma[found.solved] > 0).all()
+    assert np.isnan(found.values[~found.solved]).all()
+    if name != "image_size":
+        assert found.converged[[0, 2]].all()
+
+
+@pytest.mark.parametrize("X", [
+    np.zeros((40, 3)), BOARD[:, [0, 0, 0]], BOARD * 1e-200, np.tile(BOARD[:3], (14, 1))[:40],
+], ids=["one place", "a line", "nothing", "three places"])  # fmt: skip
+def test_objects_without_extent_are_too_few_points(three, X):
+    found = jaxbundle.calibrate_batch(X, three[0], SIZE)
+    assert list(found.status) == ["too few points"] * 3
 
 
 def test_buckets_are_few_and_never_smaller():

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -10,13 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from batch_cameras import images_of, write_cameras
 
+from jaxbundle.batches import run_batch
 from jaxbundle.errors import InputError
-from jaxbundle.io.json_lines import JsonLines
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "convergent4" / "project.toml"
-CAMERAS = 60
+CAMERAS = 200
 
 
 def command(*arguments):
@@ -33,67 +35,76 @@ def rows(path: Path):
 
 @pytest.fixture(scope="module")
 def cameras(tmp_path_factory):
-    """Many cameras before a board of 5 × 4 corners; the second has no measurements."""
-    rng = np.random.default_rng(0)
-    X = np.c_[np.mgrid[0:5, 0:4].T.reshape(-1, 2) * 0.1 - [0.2, 0.15], np.zeros(20)]
-    images = np.empty((CAMERAS, 6, 20, 2))
-    for views in images:
-        f = rng.uniform(900, 1100)
-        for view in views:
-            a, b = rng.uniform(-0.5, 0.5, 2)
-            ca, sa, cb, sb = np.cos(a), np.sin(a), np.cos(b), np.sin(b)
-            R = np.array([[cb, 0, sb], [sa * sb, ca, -sa * cb], [-ca * sb, sa, ca * cb]])
-            x, y, z = R @ X.T + [[0], [0], [1.2]]
-            view[:] = np.stack([f * x / z + 640, f * y / z + 480], 1)
-    images += rng.normal(0, 0.1, images.shape)
+    """Many cameras; the second has no measurements."""
+    images = images_of(CAMERAS)
     visible = np.ones(images.shape[:3], bool)
     visible[1] = False
     path = tmp_path_factory.mktemp("cameras") / "cameras.npz"
-    np.savez(
-        path, object_points=X, image_points=images, image_size=[1280, 960], visible=visible,
-        ids=[f"serial {i}" for i in range(CAMERAS)],
-    )  # fmt: skip
-    return path
+    return write_cameras(path, images, visible=visible)
 
 
-def keys_of(path: Path):
-    return [f"{path}#serial {i}" for i in range(CAMERAS)]
+def ended(process: subprocess.Popen, file: Path, lines: int, how: signal.Signals, wait: float):
+    """The run is ended by a signal, a moment after so many lines more are in the file.
+
+    Meanwhile no other run can write the file."""
+    number = lambda: file.read_bytes().count(b"\n") if file.exists() else 0
+    lines += number()
+    deadline = time.monotonic() + 120
+    while number() < lines:
+        assert process.poll() is None and time.monotonic() < deadline, "ended before its time"
+        time.sleep(0.001)
+    process.send_signal(signal.SIGSTOP)
+    with pytest.raises(InputError, match="another run is writing"):
+        run_batch([EXAMPLE], file)
+    process.send_signal(signal.SIGCONT)
+    time.sleep(wait)
+    process.send_signal(how)
+    _, told = process.communicate(timeout=60)
+    assert number() < CAMERAS, "killed too late to be a test"
+    return process.returncode, told
 
 
 @pytest.mark.slow
-def test_a_killed_run_goes_on_where_it_was(cameras, tmp_path):
+def test_ended_at_any_moment_a_run_goes_on_where_it_was(cameras, tmp_path):
     file = tmp_path / "results.jsonl"
     arguments = (cameras, "--json-lines", file, "--portion", "1", "--free", "fx,fy,k1")
-    process = subprocess.Popen(command(*arguments), stdout=subprocess.DEVNULL, cwd=ROOT)
-    deadline = time.monotonic() + 120
-    while process.poll() is None and time.monotonic() < deadline:
-        if file.exists() and file.read_bytes().count(b"\n") >= 3:
-            process.send_signal(signal.SIGKILL)
-            break
-        time.sleep(0.002)
-    process.wait()
-    before = file.read_bytes()
-    assert 3 <= before.count(b"\n") < CAMERAS, "killed too late to be a test"
-    with file.open("ab") as torn:
-        torn.write(b'{"key": "torn \xc3')
+    random = np.random.default_rng()
+    before = b""
+    for how, status in (
+        (signal.SIGKILL, -signal.SIGKILL), (signal.SIGINT, 130), (signal.SIGTERM, 143),
+        (signal.SIGKILL, -signal.SIGKILL),
+    ):  # fmt: skip
+        process = subprocess.Popen(
+            command(*arguments), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+            cwd=ROOT,
+        )  # fmt: skip
+        lines, wait = int(random.integers(1, 8)), random.uniform(0, 0.01)
+        found, told = ended(process, file, lines, how, wait)
+        assert found == status, (how, lines, wait, told)
+        assert re.fullmatch("jaxbundle: interrupted.*go on\n" if how == signal.SIGINT else "", told)
+        after = file.read_bytes()
+        whole = before[: before.rindex(b"\n") + 1] if before else b""
+        assert after.startswith(whole)
+        before = after
+        if how == signal.SIGKILL:
+            before = after[: after.rindex(b"\n") + 1] + b'{"key": "torn \xc3'
+            file.write_bytes(before)
 
-    done = run(*arguments[:-4], "--free", "fx,fy,k1")
+    done = run(*arguments[:3], "--free", "fx,fy,k1")
     assert done.returncode == 0, done.stderr
     number = before.count(b"\n")
     assert done.stderr == "" and f"{number} skipped" in done.stdout
+    assert f"{CAMERAS - 1} converged, 1 too few points" in done.stdout
     assert file.read_bytes().startswith(before[: before.rindex(b"\n") + 1])
     result = rows(file)
-    assert [row["key"] for row in result] == keys_of(cameras)
+    name = os.path.relpath(cameras, tmp_path)
+    assert [row["key"] for row in result] == [f"{name}#serial {i}" for i in range(CAMERAS)]
     assert [row["status"] for row in result].count("converged") == CAMERAS - 1
     assert result[1]["status"] == "too few points" and "parameters" not in result[1]
     assert set(result[0]["parameters"]) == {"fx", "fy", "k1"}
     assert result[0]["parameters"]["fx"]["sigma"] > 0
     assert len(result[0]["poses"]) == 6 and len(result[0]["covariance"]) == 3
     assert os.listdir(tmp_path) == ["results.jsonl"]
-
-    again = run(*arguments[:-4], "--free", "fx,fy,k1")
-    assert again.returncode == 0 and f"{CAMERAS} skipped" in again.stdout
-    assert rows(file) == result
 
 
 @pytest.mark.slow
@@ -104,8 +115,8 @@ def test_networks_and_one_that_is_bad(tmp_path):
     done = run(bad, EXAMPLE, "--json-lines", file)
     assert done.returncode == 0, done.stderr
     first, second = rows(file)
-    assert first["key"] == str(bad) and first["status"] == "bad input"
-    assert "bad.toml" in first["error"]
+    assert first["key"] == "bad.toml" and first["status"] == "bad input"
+    assert "bad.toml" in first["error"] and "1 bad input, 1 converged" in done.stdout
     assert second["status"] == "converged" and second["redundancy"] == 23
     assert "points" not in second and second["cameras"]["cam"]["parameters"]["c"]["sigma"] > 0
 
@@ -122,37 +133,9 @@ def test_bad_input_ends_with_one_line_and_writes_nothing(cameras, tmp_path):
         ((cameras, "--json-lines", file, "--model", "opencvv"), "'opencv'"),
         ((cameras, "--json-lines", file, "--free", "fx,k9"), "k9"),
         ((cameras, "--json-lines", other), "line 1"),
+        ((cameras, "--json-lines", file, "--free", "fx,,fy"), "''"),
     ):
         done = run(*arguments)
         assert done.returncode == 2, done.stderr
         assert word in done.stderr and len(done.stderr.strip().splitlines()) == 1
         assert not file.exists() and other.read_text().startswith("a diary")
-
-
-def test_lines_are_kept_dropped_and_tried_again(tmp_path):
-    file = tmp_path / "results.jsonl"
-    lines = JsonLines(file)
-    lines.append([{"key": "a", "status": "converged", "rms": float("nan")}])
-    lines.append([{"key": "b", "status": "singular"}])
-    assert file.read_text().splitlines()[0].endswith('"rms": null}')
-    whole = file.read_text()
-    file.write_text(whole + '{"key": "c", "stat')
-    assert JsonLines(file).keys == {"a", "b"} and file.read_text() == whole
-    file.write_text(whole.rstrip("\n"))  # only the line feed was lost
-    assert JsonLines(file).keys == {"a", "b"} and file.read_text() == whole
-    file.write_text(whole + whole)
-    assert "b" in JsonLines(file) and file.read_text() == whole
-    assert JsonLines(file, retry=True).keys == {"a"}
-    assert [row["key"] for row in rows(file)] == ["a"]
-    file.write_text("[1, 2]\n" + whole)
-    with pytest.raises(InputError, match="line 1"):
-        JsonLines(file)
-
-
-@pytest.mark.parametrize("text", ["my notes\n", "my notes", '{"key": "a", "sta\n'])
-def test_a_file_of_something_else_is_not_taken_for_a_torn_line(tmp_path, text):
-    file = tmp_path / "notes.txt"
-    file.write_text(text)
-    with pytest.raises(InputError, match="line 1: not a result"):
-        JsonLines(file)
-    assert file.read_text() == text

@@ -211,3 +211,20 @@ def test_orient_names_what_is_missing(project):
     done = run("orient", project / "project.toml")
     assert done.returncode == 3 and done.stdout == ""
     assert "no start values found" in done.stderr and done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "options, said",
+    [
+        (("--join", "nonsense", 2, 0), "'nonsense'"),
+        (("--join", "127.0.0.1:99999", 2, 0), "'127.0.0.1:99999'"),
+        (("--join", "127.0.0.1:9922", 2, 5), "process_id=5"),
+        (("--join", "127.0.0.1:9922", 2, 0, "--json", "-"), "give a file"),
+        (("--cluster",), "under SLURM"),
+    ],
+)
+def test_processes_that_cannot_be_joined(options, said):
+    done = run("adjust", EXAMPLE / "project.toml", "--quiet", *options)
+    assert done.returncode == 2
+    assert said in done.stderr and "Traceback" not in done.stderr
+    assert not done.stdout

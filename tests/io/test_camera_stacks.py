@@ -20,7 +20,7 @@ def test_measurements_unpack(tmp_path):
     """Corners to a tenth of a pixel, everything visible: packed as well as such arrays can be."""
     xy = np.random.default_rng(0).integers(0, 5000, (400, 20, 50, 2)) / 10
     np.savez_compressed(tmp_path / "a.npz", **arrays(400, xy))
-    assert len(read_camera_stack(tmp_path / "a.npz").keys) == 400
+    assert len(read_camera_stack(tmp_path / "a.npz").ids) == 400
 
 
 def test_zeros_without_end(tmp_path):

@@ -96,7 +96,7 @@ def read(kind: str, folder: Path):
         case "opencv" | "json":
             return read_cameras(next(folder.iterdir()))
         case "camera-stack":
-            return [Camera(key) for key in read_camera_stack(folder / "cameras.npz").keys]
+            return [Camera(key) for key in read_camera_stack(folder / "cameras.npz").ids]
         case "result":
             return [camera for camera, _ in read_calibrated(folder / "result.json")]
         case "colmap-text":

@@ -1,0 +1,45 @@
+"""What the views of a camera do not determine: parameters that a status alone does not name.
+
+A singular camera has directions of its interior orientation in which the normal equations, scaled
+by their diagonal before the elimination of the views, vanish; the parameters that have part in them
+are named. Where the equations can be solved all the same, by the noise of the measurements, what
+comes out says so by its σ: views of a board all parallel to the image determine neither principal
+distance nor distances, and the σ of fx is as large as fx.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxbundle.adjustment.batch_camera import INDETERMINATE
+from jaxbundle.cameras import CameraModel
+
+VAGUE = 50.0
+"""A principal distance whose σ is above a fiftieth of it is as good as unknown."""
+POINT = ("cx", "cy")
+PART = 0.05
+"""A parameter with this part of the square of a vanishing direction is named."""
+
+
+def vague(
+    model: CameraModel,
+    free: tuple[int, ...],
+    interior: Float[np.ndarray, "cameras parameters"],
+    sigma: Float[np.ndarray, "cameras k"],
+) -> Bool[np.ndarray, "cameras k"]:
+    """Principal distances and points with a σ above a fiftieth of the principal distance.
+
+    Distortion never is: the σ of a coefficient of no significance is larger than itself.
+    """
+    columns = [model.parameters.index(name) for name in model.principal_distance]
+    shortest = np.abs(interior[:, columns]).min(1)
+    of_these = {*columns, *(i for i, name in enumerate(model.parameters) if name in POINT)}
+    return ~(VAGUE * sigma <= shortest[:, None]) & [column in of_these for column in free]
+
+
+def vanishing(reduced: Float[np.ndarray, "cameras k k"]) -> Bool[np.ndarray, "cameras k"]:
+    """Parameters with part in the null space of the scaled reduced normal matrix."""
+    finite = np.isfinite(reduced).all((1, 2))
+    values, vectors = np.linalg.eigh(np.where(finite[:, None, None], reduced, 0.0))
+    null = values < INDETERMINATE
+    share = np.einsum("cij,cj->ci", vectors**2, null.astype(float))
+    return finite[:, None] & (share > PART)

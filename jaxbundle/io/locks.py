@@ -1,0 +1,77 @@
+"""A file that one process at a time writes.
+
+The lock is an empty file beside it, `.NAME.lock`, that the operating system keeps locked (flock; on
+Windows its first byte) until the process ends, however it ends: one left behind by a killed process
+hinders nobody. The file itself may be renamed over meanwhile.
+"""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from jaxbundle.errors import InputError
+
+
+@contextmanager
+def locked(path: str | Path) -> Iterator[None]:
+    """Hold the lock of a file, which need not exist; devices and pipes have none.
+
+    **Raises:** `InputError` if another process holds it, or no lock can be had.
+    """
+    real = Path(os.path.realpath(path))
+    if real.exists() and not real.is_file():
+        yield
+        return
+    lock = real.with_name(f".{real.name}.lock")
+    stream = None
+    while stream is None:
+        try:
+            stream = _opened(lock)
+        except BlockingIOError:
+            raise InputError(
+                f"{path}: another run is writing this file; wait for its end, or give another file"
+            ) from None
+        except OSError as error:
+            raise InputError(f"{path}: cannot be locked: {error.strerror}") from None
+    try:
+        yield
+    finally:
+        # Gone before it is let go: nobody else gets a lock on a file that is about to vanish.
+        # Windows removes no open file: there it stays.
+        with suppress(OSError):
+            lock.unlink()
+        stream.close()
+
+
+def _opened(lock: Path) -> BinaryIO | None:
+    """The file, locked; None if it vanished meanwhile.
+
+    **Raises:** `BlockingIOError` if somebody else has the lock."""
+    stream = open(lock, "ab")
+    try:
+        _lock(stream)
+        if os.path.samestat(os.fstat(stream.fileno()), os.stat(lock)):
+            return stream
+    except FileNotFoundError:
+        pass
+    except BaseException:
+        stream.close()
+        raise
+    stream.close()
+    return None
+
+
+def _lock(stream: BinaryIO) -> None:
+    try:
+        import fcntl
+    except ImportError:
+        import msvcrt
+
+        try:
+            msvcrt.locking(stream.fileno(), msvcrt.LK_NBLCK, 1)
+        except OSError as error:
+            raise BlockingIOError(error.errno, error.strerror) from None
+    else:
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)

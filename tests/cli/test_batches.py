@@ -1,0 +1,194 @@
+"""What is taken for a result of an input that is there, and what is not."""
+
+import json
+import os
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from batch_cameras import images_of, write_cameras
+
+from jaxbundle import batches
+from jaxbundle.batches import key_of, run_batch
+from jaxbundle.errors import InputError
+from jaxbundle.io.fingerprints import of_input
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "convergent4"
+FREE = ["fx", "fy", "k1"]
+"""As in `test_batch_command`: the same compiled program."""
+
+
+def keys(file: Path):
+    return [json.loads(line)["key"] for line in file.read_text().splitlines()]
+
+
+@pytest.fixture
+def images():
+    return images_of(4)
+
+
+@pytest.fixture
+def start(tmp_path, images, monkeypatch):
+    """A run in another folder: path of the cameras, file, and how to run again."""
+    monkeypatch.chdir(tmp_path)
+    path = write_cameras(tmp_path / "cameras.npz", images)
+    file = tmp_path / "results.jsonl"
+
+    def again(inputs=(path,), **options):
+        return run_batch(inputs, file, **dict(free=FREE) | options)
+
+    assert again() == {"converged": 4}
+    return path, file, again
+
+
+def test_a_key_is_the_same_however_the_path_is_written(start, tmp_path, monkeypatch):
+    path, file, again = start
+    assert keys(file) == [f"cameras.npz#serial {i}" for i in range(4)]
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "same").symlink_to(tmp_path)
+    for folder in (".", "./", "sub/..", "same", tmp_path):
+        spelling = f"{folder}/cameras.npz"
+        assert again([spelling]) == {"converged": 4, "skipped": 4}, spelling
+    assert again(["./cameras.npz", path]) == {"converged": 4, "skipped": 4}
+    monkeypatch.chdir(tmp_path / "sub")
+    assert again(["../cameras.npz"]) == {"converged": 4, "skipped": 4}
+    monkeypatch.chdir(tmp_path.parent)
+    inside = Path(tmp_path.name)
+    assert run_batch([inside / "cameras.npz"], inside / "same" / "results.jsonl", free=FREE) == {
+        "converged": 4, "skipped": 4,
+    }  # fmt: skip
+    assert key_of(tmp_path / "model" / "", file) == "model"
+    assert key_of(tmp_path / "a.toml", tmp_path / "out" / "results.jsonl") == "../a.toml"
+
+
+@pytest.mark.parametrize("options, said", [
+    (dict(model="kannala-brandt"), "model was opencv, is kannala-brandt"),
+    (dict(free=["fx", "fy"]), "free was fx,fy,k1, is fx,fy"),
+    (dict(free=None), "is fx,fy,cx,cy,k1,k2,p1,p2,k3"),
+    (dict(brief=True), "brief was False, is True"),
+])  # fmt: skip
+def test_other_settings_are_refused(start, options, said):
+    _, file, again = start
+    before = file.read_bytes()
+    with pytest.raises(InputError) as error:
+        again(**options)
+    assert said in str(error.value) and "has 4 of these" in str(error.value)
+    assert "--json-lines" in str(error.value) and "--renew" in str(error.value)
+    assert file.read_bytes() == before
+
+
+def test_renewed_are_those_of_other_settings_or_data_alone(start, images):
+    path, file, again = start
+    lines = file.read_text().splitlines()
+    images[2] += np.random.default_rng(1).normal(0, 0.1, images[2].shape)
+    # More cameras, another type, no mask: the others are what they were.
+    write_cameras(path, np.concatenate([images, images[:1]]), visible=np.ones((5, 6, 20), int))
+    with pytest.raises(InputError, match="has 1 of .*serial 2: the measurements were others"):
+        again()
+    assert again(renew=True) == {"converged": 5, "skipped": 3}
+    after = file.read_text().splitlines()
+    assert after[:3] == [lines[0], lines[1], lines[3]]
+    assert keys(file)[3:] == ["cameras.npz#serial 2", "cameras.npz#serial 4"]
+    write_cameras(path, images, object_points=images_of(1)[0, 0, :, [0, 1, 1]].T)
+    with pytest.raises(InputError, match="has 4 of .*the measurements were others"):
+        again()
+
+
+def test_the_limit_of_iterations_matters_where_it_was_reached(start):
+    _, file, again = start
+    assert again(max_iterations=50) == {"converged": 4, "skipped": 4}
+    file.unlink()
+    assert again(max_iterations=2) == {"iteration limit": 4}
+    with pytest.raises(InputError, match="max_iterations was 2, is 100"):
+        again()
+    assert again(max_iterations=2) == {"iteration limit": 4, "skipped": 4}
+    assert again(retry=True) == {"converged": 4}
+    assert again(retry=True) == {"converged": 4, "skipped": 4}
+
+
+def test_a_file_of_an_earlier_version_is_understood(start):
+    _, file, again = start
+    old = [json.loads(line) for line in file.read_text().splitlines()]
+    for row in old:
+        del row["settings"], row["data"]
+    file.write_text("".join(json.dumps(row) + "\n" for row in old))
+    with pytest.raises(InputError, match="does not say what it was made of"):
+        again()
+    # What is not asked for is left alone.
+    elsewhere = old[0] | {"key": "elsewhere.npz#1"}
+    file.write_text(json.dumps(elsewhere) + "\n" + json.dumps(old[0]) + "\n")
+    assert again(renew=True) == {"converged": 4}
+    assert len(keys(file)) == 5 and keys(file)[0] == "elsewhere.npz#1"
+
+
+def test_lines_of_odd_content_are_no_results_of_these(start):
+    _, file, again = start
+    row = json.loads(file.read_text().splitlines()[0])
+    for odd in (dict(status=[1]), dict(settings=3), dict(settings={"free": None}), dict(data={})):
+        file.write_text(json.dumps(row | odd) + "\n")
+        if "status" in odd:
+            assert again() == {"converged": 3, "[1]": 1, "skipped": 1}
+        else:
+            with pytest.raises(InputError, match="has 1 of these"):
+                again()
+
+
+def test_a_rewritten_network_is_seen(tmp_path, monkeypatch):
+    monkeypatch.setattr(batches, "network_row", lambda path, most: {"status": "converged"})
+    project = shutil.copytree(EXAMPLE, tmp_path / "block") / "project.toml"
+    file = tmp_path / "results.jsonl"
+    assert run_batch([project, project.parent], file) == {"converged": 2}
+    assert keys(file) == ["block/project.toml", "block"]
+    for path in (project, project.parent / "observations.csv"):
+        assert run_batch([project, project.parent], file)["skipped"] == 2
+        path.write_text(path.read_text() + "# looked through\n")
+        with pytest.raises(InputError, match="block/project.toml: the measurements were others"):
+            run_batch([project, project.parent], file)
+        assert run_batch([project, project.parent], file, renew=True) == {"converged": 2}
+
+
+def test_the_fingerprint_of_a_network_is_of_its_files(tmp_path):
+    model = tmp_path / "sparse"
+    model.mkdir()
+    for name in ("cameras.bin", "images.bin", "points3D.bin", "photo.jpg"):
+        (model / name).write_bytes(name.encode())
+    first = of_input(model)
+    (model / "photo.jpg").write_bytes(b"another")
+    os.utime(model / "cameras.bin", (0, 0))
+    assert of_input(model) == of_input(shutil.copytree(model, tmp_path / "copy")) == first
+    (model / "points3D.bin").write_bytes(b"another")
+    assert of_input(model) != first
+    bad = tmp_path / "bad.toml"
+    found = set()
+    for text in (b"", b"[project", b"\xff", b'a = "\\u0000"', b'a = ["bad.toml", "..", "no.csv"]'):
+        bad.write_bytes(text)
+        found.add(of_input(bad))
+    assert len(found) == 5
+
+
+@pytest.mark.parametrize("options", [dict(portion=0), dict(max_iterations=0), dict(free="fx")])
+def test_bad_options_are_refused(start, options):
+    with pytest.raises(InputError, match=next(iter(options))):
+        start[2](**options)
+
+
+def test_inputs_are_looked_at_before_anything_is_written(tmp_path):
+    file = tmp_path / "results.jsonl"
+    with pytest.raises(InputError, match="none.toml"):
+        run_batch([EXAMPLE, tmp_path / "none.toml"], file)
+    assert not file.exists()
+
+
+def test_the_table_of_the_docs(start, tmp_path):
+    """docs/calibrate.md reads the file as a table."""
+    pytest.importorskip("pandas")
+    docs = (Path(__file__).parents[2] / "docs" / "calibrate.md").read_text(encoding="utf-8")
+    (code,) = (c for c in re.findall(r"```python\n(.*?)```", docs, re.S) if "pandas" in c)
+    found = {}
+    exec(code, found)
+    table = found["table"]
+    assert table.index.tolist() == keys(tmp_path / "results.jsonl")
+    assert table["status"].eq("converged").all()
+    assert table["parameters.fx.value"].between(850, 1150).all()

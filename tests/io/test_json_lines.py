@@ -1,0 +1,115 @@
+"""A file of results is kept whole, every key once, and written by one run at a time."""
+
+import json
+import os
+import stat
+from pathlib import Path
+
+import pytest
+from garbling import often, read_or_refused, what_is_done
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.json_lines import JsonLines
+from jaxbundle.io.locks import locked
+
+
+def rows(path: Path):
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_lines_are_kept_and_dropped(tmp_path):
+    file = tmp_path / "results.jsonl"
+    lines = JsonLines(file)
+    lines.append([{"key": "a", "status": "converged", "rms": float("nan")}])
+    lines.append([{"key": "b", "status": "singular"}])
+    assert file.read_text().splitlines()[0].endswith('"rms": null}')
+    whole = file.read_text()
+    file.write_text(whole + '{"key": "c", "stat')
+    assert JsonLines(file).heads.keys() == {"a", "b"} and file.read_text() == whole
+    file.write_text(whole.rstrip("\n"))  # only the line feed was lost
+    assert JsonLines(file).heads.keys() == {"a", "b"} and file.read_text() == whole
+    file.write_text(whole + whole)
+    assert "b" in JsonLines(file) and file.read_text() == whole
+    JsonLines(file).drop(["b"])
+    assert JsonLines(file).heads == {"a": {"status": "converged"}}
+    assert [row["key"] for row in rows(file)] == ["a"]
+    file.write_text("[1, 2]\n" + whole)
+    with pytest.raises(InputError, match="line 1"):
+        JsonLines(file)
+
+
+@pytest.mark.parametrize("text", ["my notes\n", "my notes", '{"key": "a", "sta\n'])
+def test_a_file_of_something_else_is_not_taken_for_a_torn_line(tmp_path, text):
+    file = tmp_path / "notes.txt"
+    file.write_text(text)
+    with pytest.raises(InputError, match="line 1: not a result"):
+        JsonLines(file)
+    assert file.read_text() == text
+
+
+def test_a_file_that_is_a_link_stays_one(tmp_path):
+    file, link = tmp_path / "results.jsonl", tmp_path / "link.jsonl"
+    link.symlink_to(file)
+    lines = JsonLines(link)
+    lines.append([{"key": key, "status": "converged"} for key in "ab"])
+    lines.drop("a")
+    assert link.is_symlink() and [row["key"] for row in rows(file)] == ["b"]
+
+
+def test_a_name_of_other_bytes_than_text_is_found_again(tmp_path):
+    file, key = tmp_path / "results.jsonl", os.fsdecode(b"camera \xe9")
+    JsonLines(file).append([{"key": key, "status": "converged"}])
+    assert key in JsonLines(file)
+
+
+def test_one_at_a_time(tmp_path):
+    file, link = tmp_path / "results.jsonl", tmp_path / "link.jsonl"
+    link.symlink_to(file)
+    for _ in range(2):
+        with locked(file):
+            JsonLines(file).append([{"key": "a", "status": "converged"}])
+            JsonLines(file).drop("a")  # another file of the same name
+            for same in (file, link):
+                with pytest.raises(InputError, match="another run is writing"), locked(same):
+                    pass
+            with locked(tmp_path / "other.jsonl"):
+                pass
+        assert sorted(os.listdir(tmp_path)) == ["link.jsonl", "results.jsonl"]
+    (tmp_path / ".results.jsonl.lock").write_text("")  # of a killed run
+    with locked(link):
+        pass
+    assert sorted(os.listdir(tmp_path)) == ["link.jsonl", "results.jsonl"]
+
+
+def test_no_lock_to_be_had_is_said(tmp_path):
+    with pytest.raises(InputError, match="cannot be locked: No such file"):
+        with locked(tmp_path / "nowhere" / "results.jsonl"):
+            pass
+    with locked("/dev/null"):
+        assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
+
+
+@pytest.fixture(scope="module")
+def valid(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("valid")
+    JsonLines(folder / "results.jsonl").append(
+        {"key": f"a.npz#{i}", "status": "converged", "settings": {"free": ["fx"]}, "data": "f" * 16}
+        for i in range(5)
+    )
+    return folder
+
+
+@often(200)
+@what_is_done
+def test_a_garbled_file_is_taken_up_or_refused(valid, **done):
+    """What is taken up is whole afterwards, every key once."""
+
+    def read(folder):
+        file = folder / "results.jsonl"
+        lines = JsonLines(file)
+        lines.append([{"key": "one more", "status": "weak"}])
+        whole = file.read_bytes().removesuffix(b"\n").split(b"\n")
+        assert [json.loads(line)["key"] for line in whole] == [*lines.heads]
+        assert JsonLines(file).heads == lines.heads
+
+    read_or_refused(read, valid, **done)
