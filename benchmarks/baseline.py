@@ -3,7 +3,7 @@
 An entry is found by all that fixes its cost: the problem (kind, images, points and seed of a
 synthetic one; name, sizes and digest of a file) and the settings of the solver. Costs agree to
 1e-6: a higher one is wrong, a lower one says that the baseline is stale. An iteration may take
-twice as long beside pycolmap's as it did there; where pycolmap is missing on either side, four
+three times as long beside pycolmap's as it did there; where pycolmap is missing on either side, four
 times as long on the clock.
 """
 
@@ -13,7 +13,8 @@ from pathlib import Path
 
 FILE = Path(__file__).parent / "baseline.json"
 TIGHT = 1e-6
-SLOWER, SLOWER_BESIDE = 4.0, 2.0
+SLOWER, SLOWER_BESIDE = 4.0, 3.0
+"""Beside pycolmap 1.9 was seen between a quiet and a loaded hour: two devices wait for each other."""
 PEER = "pycolmap"
 KEPT = ("cost", "at_limit", "evaluations", "reduction", "iteration_s")
 
