@@ -1,10 +1,10 @@
 """Figures of `bal.py` against those committed in `baseline.json`: tight on cost, loose on time.
 
 An entry is found by all that fixes its cost: the problem (kind, images, points and seed of a
-synthetic one; name, sizes and digest of a file) and the settings of the solver. Costs agree to
-1e-6: a higher one is wrong, a lower one says that the baseline is stale. An iteration may take
-three times as long beside pycolmap's as it did there; where pycolmap is missing on either side, four
-times as long on the clock.
+synthetic one; name and digest of a file) and the settings of the solver. Costs agree to 1e-6: a
+higher one is wrong, a lower one says that the baseline is stale. An iteration may take three times
+as long beside pycolmap's as it did there; where pycolmap is missing on either side, four times as
+long on the clock.
 """
 
 import hashlib
@@ -14,7 +14,7 @@ from pathlib import Path
 FILE = Path(__file__).parent / "baseline.json"
 TIGHT = 1e-6
 SLOWER, SLOWER_BESIDE = 4.0, 3.0
-"""Beside pycolmap 1.9 was seen between a quiet and a loaded hour: two devices wait for each other."""
+"""Beside pycolmap, a factor of 1.9 was seen between two hours of one shared machine."""
 PEER = "pycolmap"
 KEPT = ("cost", "at_limit", "evaluations", "reduction", "iteration_s")
 
