@@ -57,7 +57,7 @@ bench-bal: $(VENV)/compared
 bench-first: $(VENV)/compared
 	$(BIN)/python benchmarks/first.py
 
-# Large problems, once each; the block with its statistics needs 4.5 GB.
+# Large problems, once each; the block with its statistics needs 3.5 GB.
 bench-large: ONCE = --rounds 1 --repeat 1 --evaluations 60 --peers pycolmap ceres
 bench-large: $(VENV)/compared
 	$(BIN)/python benchmarks/big_block.py --images 1000 --points 310000 --spacing 0.79 --repeat 1
