@@ -22,7 +22,7 @@ from jaxbundle.adjustment.batch_input import at_least_one, free_parameters, pixe
 from jaxbundle.bundle import adjust
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io import read_network
-from jaxbundle.io.camera_stacks import read_camera_stack
+from jaxbundle.io.camera_stacks import is_camera_stack, read_camera_stack
 from jaxbundle.io.fingerprints import of_input
 from jaxbundle.io.json_lines import JsonLines
 from jaxbundle.io.locks import locked
@@ -76,8 +76,9 @@ def run_batch(
     works = {}
     for path in map(str, inputs):
         name = key_of(path, file)
-        of_its_kind = _cameras if path.endswith(".npz") else _network
-        works.setdefault(name, of_its_kind(path, name, options, brief))
+        if name not in works:
+            of_its_kind = _cameras if is_camera_stack(path) else _network
+            works[name] = of_its_kind(path, name, options, brief)
     total = sum(len(work.keys) for work in works.values())
     with locked(file):
         lines = JsonLines(file)
@@ -137,7 +138,7 @@ def _cameras(path: str, name: str, options: dict, brief: bool) -> _Work:
         return [camera_row(batch, i, brief) for i in range(len(chosen))]
 
     settings = options | {"free": list(free), "brief": brief}
-    keys = tuple(f"{name}#{id}" for id in stack.ids)
+    keys = tuple(f"{name}#{camera}" for camera in stack.ids)
     return _Work(keys, settings, stack.fingerprint, solve, True)
 
 
@@ -189,7 +190,8 @@ def _difference(head: dict, work: _Work, i: int) -> str:
         matters = name != "max_iterations" or head.get("status") == STATUS[LIMIT]
         if matters and old.get(name) != value:
             return f"{name} was {_shown(old.get(name))}, is {_shown(value)}"
-    return "" if head["data"] == work.data(i) else "the measurements were others"
+    others = "the measurements were others" if work.is_cameras else "its files were others"
+    return "" if head["data"] == work.data(i) else others
 
 
 def _shown(value) -> str:

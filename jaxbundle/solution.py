@@ -33,17 +33,19 @@ RUNAWAY = 20.0
 
 def minimise(problem: Problem, start: Values, **options) -> Minimum:
     """Iterate from `start`; the datum and what is held stay those of the problem's own start."""
-    solver, data = make_solver(problem, **options), problem.data
+    solver = make_solver(problem, **options)
+    structure, data, sizes = filled(problem.structure, problem.data)
     if len(jax.devices()) > 1 and problem.structure.rays >= RAYS_TO_SHARE:
         minimum = find_minimum_of_shards(solver, distribute(problem), start)
-        values = move_to_datum(problem.structure, minimum.values, data.start)
-        return eqx.tree_at(lambda m: m.values, minimum, values)
-    structure, data, sizes = filled(problem.structure, problem.data)
-    solver = dataclasses.replace(solver, structure=structure)
-    minimum = find_minimum(solver, data, pad_values(start, sizes))
-    return eqx.tree_at(
-        lambda m: m.values, minimum, without_filling(minimum.values, problem.data.start)
-    )
+        values = _move_to_datum(structure, pad_values(minimum.values, sizes), data.start)
+    else:
+        solver = dataclasses.replace(solver, structure=structure)
+        minimum = find_minimum(solver, data, pad_values(start, sizes))
+        values = minimum.values
+    return eqx.tree_at(lambda m: m.values, minimum, without_filling(values, problem.data.start))
+
+
+_move_to_datum = eqx.filter_jit(move_to_datum)
 
 
 def solved(problem: Problem, minimum: Minimum) -> Inspection | None:

@@ -1,7 +1,8 @@
 """`calibrate_batch`: many cameras, each calibrated by itself from views of known points.
 
 Cameras are solved in portions of one compiled shape: views and points are padded to the next size
-of a short list (`bucket`), padding being points that are not seen.
+of a short list (`bucket`), padding being points that are not seen. Where many cameras have far
+fewer views than others, they have a shape of their own.
 
 On a CPU a portion is a loop over its cameras (`lax.map`), and as many portions as there are cores
 run at the same time, each in a thread. Milliseconds of one core for a camera of 20 views × 88
@@ -31,6 +32,7 @@ from jaxbundle.adjustment.batch_camera import (
     solve_camera,
 )
 from jaxbundle.adjustment.batch_input import Batch, Portion, at_least_one
+from jaxbundle.adjustment.batch_normal import POSE
 from jaxbundle.adjustment.batch_start import start_values
 from jaxbundle.adjustment.batch_weakness import vague, vanishing
 from jaxbundle.adjustment.problem import require_x64
@@ -53,7 +55,8 @@ class BatchCalibration:
 
     - `model`, `parameters`: the camera model and its k free parameters.
     - `status`: "converged"; "weak", as that, but the views do not determine the principal distance
-      or point, whose σ is above a fiftieth of the principal distance; without a solution "iteration
+      or point, whose σ is above a fiftieth of the principal distance (or its `rms` is so large,
+      with wrong points, that they do not); without a solution "iteration
       limit", "singular", "not finite" (a number among the measurements, or the start) or "too few
       points" (no view of use, or no redundancy).
     - `undetermined`: the free parameters that the views do not determine, where that is why the
@@ -150,45 +153,55 @@ def calibrate_batch(
     batch = Batch.of(object_points, image_points, image_size, model, visible, free, start)
     camera_model = get_model(model)
     on_cpu = jax.default_backend() == "cpu"
+    views = batch.xy.shape[1]
     portions = list(batch.portions(on_cpu))
     run = lambda portion: _solve_portion(
         camera_model, batch.free, batch.known, max_iterations, batch.size, on_cpu, portion
     )
-    parts = []
+    parts, done = [], 0
     with ThreadPoolExecutor(threads if on_cpu else 1) as pool:
         for portion, solved in zip(portions, pool.map(run, portions)):
-            parts.append({name: rows[: len(portion.cameras)] for name, rows in solved.items()})
+            parts.append(_without_padding(portion, views, solved))
+            done += len(portion.cameras)
             if progress is not None:
-                progress(sum(len(part["status"]) for part in parts), len(batch))
+                progress(done, len(batch))
     order = np.argsort(np.concatenate([portion.cameras for portion in portions]))
     rows = {name: np.concatenate([p[name] for p in parts])[order] for name in parts[0]}
     return _result(camera_model, batch, rows)
 
 
+def _without_padding(portion: Portion, views: int, solved: dict) -> dict:
+    """The rows of the cameras of a portion, views at their places among all."""
+    rows = {name: values[: len(portion.cameras)] for name, values in solved.items()}
+    camera = np.arange(len(portion.cameras))[:, None]
+    for name in ("views", *OF_A_VIEW):
+        values = rows[name]
+        rows[name] = np.zeros((len(values), views, *values.shape[2:]), values.dtype)
+        rows[name][camera, portion.views] = values[:, : portion.views.shape[1]]
+    return rows
+
+
 def _result(model: CameraModel, batch: Batch, rows: dict) -> BatchCalibration:
-    """Rows of the portions in the order of the cameras, without padding; NaN for no result."""
-    rows["status"][~batch.finite] = NOT_FINITE
-    rows["views"] = rows["views"][:, : batch.xy.shape[1]]
-    ended = rows["status"]
-    rows["undetermined"] = _undetermined(model, batch, rows)
-    weak = (ended == CONVERGED) & rows["undetermined"].any(1)
-    good = ended == CONVERGED
-    ended[weak] = WEAK
-    for name, values in rows.items():
-        if name in OF_A_VIEW:
-            rows[name] = values = values[:, : batch.xy.shape[1]]
-            values[~rows["views"]] = np.nan
+    """Rows in the order of the cameras; NaN for no result."""
+    ended = np.where(batch.finite, rows["status"], NOT_FINITE)
+    solved = ended == CONVERGED
+    undetermined = _undetermined(model, batch, ended, rows)
+    for name in OF_A_VIEW:
+        rows[name][~rows["views"]] = np.nan
+    for values in rows.values():
         if np.issubdtype(values.dtype, np.floating):
-            values[~good] = np.nan
-    rows["status"] = np.array(STATUS)[rows["status"]]
+            values[~solved] = np.nan
+    del rows["reduced"]
+    rows["undetermined"] = undetermined
+    rows["status"] = np.array(STATUS)[np.where(solved & undetermined.any(1), WEAK, ended)]
     free = tuple(model.parameters[column] for column in batch.free)
     return BatchCalibration(model=model.name, parameters=free, **rows)
 
 
-def _undetermined(model: CameraModel, batch: Batch, rows: dict) -> Bool[np.ndarray, "cameras k"]:
+def _undetermined(model: CameraModel, batch: Batch, ended, rows) -> Bool[np.ndarray, "cameras k"]:
     """What the views do not determine, of cameras for which that can be said."""
-    ended, sigma = rows["status"], rows["sigma"]
-    null = vanishing(rows.pop("reduced")) & np.isin(ended, (SINGULAR, LIMIT))[:, None]
+    sigma = rows["sigma"]
+    null = vanishing(rows["reduced"]) & np.isin(ended, (SINGULAR, LIMIT))[:, None]
     # At the limit the last σ say why, if the equations can be solved.
     told = (ended == LIMIT) & ~null.any(1) & np.isfinite(sigma).all(1) | (ended == CONVERGED)
     return np.where(told[:, None], vague(model, batch.free, rows["interior"], sigma), null)
@@ -216,7 +229,7 @@ def _portion_program(
     solved: Solved = every((seen, interior))
     variance = 2 * solved.cost / solved.redundancy
     covariance = variance[:, None, None] * solved.interior_cofactors
-    points = 0.5 * (solved.redundancy + len(free) + 6 * solved.views.sum(1))
+    points = 0.5 * (solved.redundancy + len(free) + POSE * solved.views.sum(1))
     rotation, position, angles, pose_sigma = jax.vmap(
         jax.vmap(_exterior_orientation, (0, 0, 0, None, None))
     )(solved.at.rotation, solved.at.shift, solved.pose_cofactors, axes, middle)

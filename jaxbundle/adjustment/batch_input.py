@@ -23,6 +23,9 @@ LARGEST = 1e100
 ON_CPU, ON_ACCELERATOR = 32, 512
 """Cameras of a portion."""
 
+WORTH_COMPILING = 4_000_000
+"""So many points of views take as long as compiling for another number of views: 2 to 3 s."""
+
 
 def bucket(n: int) -> int:
     """The next size to pad to: 4, 5, 6, 7, 8, 10, 12, 14, 16, 20, 24, 28, 32, …"""
@@ -32,9 +35,13 @@ def bucket(n: int) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class Portion:
-    """Padded arrays of some cameras, for one call of the compiled program."""
+    """Padded arrays of some cameras, for one call of the compiled program.
+
+    `views` [cameras, n]: the numbers of the views that are there, all that show anything.
+    """
 
     cameras: np.ndarray
+    views: np.ndarray
     flat: bool
     seen: Sightings
     interior: np.ndarray
@@ -169,31 +176,49 @@ class Batch:
         )  # fmt: skip
 
     def portions(self, on_cpu: bool) -> Iterator[Portion]:
-        """Cameras in portions, flat and solid objects apart."""
-        _, views, points, _ = self.xy.shape
-        shape = (bucket(views), bucket(points) if points > 128 else -(-points // 8) * 8)
+        """Cameras in portions; flat and solid objects apart, and few views from many."""
+        points = self.xy.shape[2]
+        points = bucket(points) if points > 128 else -(-points // 8) * 8
+        shown = self.visible.any(2) & self.finite[:, None]
+        widths = self._widths(shown.sum(1), points)
         size = ON_CPU
         if not on_cpu:
             size = min(ON_ACCELERATOR, 2 ** math.ceil(math.log2(max(len(self), 1))))
         for flat in (True, False):
-            cameras = np.flatnonzero(self.flat == flat)
-            for first in range(0, len(cameras), size):
-                yield self._portion(cameras[first : first + size], flat, size, shape)
+            for width in np.unique(widths):
+                cameras = np.flatnonzero((self.flat == flat) & (widths == width))
+                for first in range(0, len(cameras), size):
+                    some = cameras[first : first + size]
+                    views = np.argsort(~shown[some], axis=1, kind="stable")[:, :width]
+                    yield self._portion(some, np.sort(views), flat, size, (width, points))
 
-    def _portion(self, cameras, flat, size, shape) -> Portion:
+    def _widths(self, views: np.ndarray, points: int) -> np.ndarray:
+        """To how many views each camera is filled up: cameras with fewer go by themselves where
+        they save more than the compilation of another program costs."""
+        need = np.array([bucket(number) for number in views])
+        width = bucket(self.xy.shape[1])
+        widths = np.full(len(need), width)
+        for fewer in np.unique(need)[::-1]:
+            if (need <= fewer).sum() * (width - fewer) * points > WORTH_COMPILING:
+                width = fewer
+            widths[need <= fewer] = width
+        return widths
+
+    def _portion(self, cameras, views, flat, size, shape) -> Portion:
         def wide(rows, *axes):
             missing = [n - old for n, old in zip(axes, rows.shape)]
             return np.pad(rows, [(0, n) for n in missing] + [(0, 0)] * (rows.ndim - len(axes)))
 
-        visible = self.visible[cameras] & self.finite[cameras, None, None]
+        of_views = lambda rows: rows[cameras[:, None], views]
+        visible = of_views(self.visible) & self.finite[cameras, None, None]
         seen = Sightings(
             point=wide(self.point[cameras], size, shape[1]),
-            xy=wide(self.xy[cameras], size, *shape),
+            xy=wide(of_views(self.xy), size, *shape),
             weight=wide(visible.astype(float), size, *shape),
         )
         interior = np.pad(self.interior[cameras], [(0, size - len(cameras)), (0, 0)], mode="edge")
         return Portion(
-            cameras, flat, seen, interior,
+            cameras, views, flat, seen, interior,
             wide(self.axes[cameras], size), wide(self.middle[cameras], size),
         )  # fmt: skip
 

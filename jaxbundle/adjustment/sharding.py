@@ -10,7 +10,6 @@ import dataclasses
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
@@ -19,7 +18,16 @@ from jaxbundle.adjustment.problem import Problem
 from jaxbundle.adjustment.solver import BundleSolver, Minimum, minimise
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.arrays import Data, Values
-from jaxbundle.network.padding import Sizes, common_sizes, pad, pad_values, sizes_of
+from jaxbundle.network.padding import (
+    LARGE,
+    Sizes,
+    common_sizes,
+    pad,
+    pad_values,
+    round_sizes,
+    sizes_of,
+    without_filling,
+)
 from jaxbundle.network.pairs import CHUNK_LENGTHS
 from jaxbundle.network.structure import Structure, make_structure
 from jaxbundle.network.tables import Distances
@@ -48,7 +56,11 @@ def distribute(problem: Problem, devices=None) -> Shards:
     devices = jax.devices() if devices is None else devices
     points = _cut(problem, len(devices))
     parts = [_part(problem, chosen, first=d == 0) for d, chosen in enumerate(points)]
-    sizes = common_sizes([sizes_of(structure) for structure, _ in parts])
+    structures = [structure for structure, _ in parts]
+    if problem.structure.rays > LARGE:
+        sizes = common_sizes([*map(sizes_of, structures)])
+    else:
+        sizes = round_sizes(structures)
     parts = [pad(structure, data, sizes) for structure, data in parts]
     mesh = Mesh(np.array(devices), (AXIS,))
     arrays, static = zip(*(eqx.partition(part, eqx.is_array) for part in parts))
@@ -68,7 +80,7 @@ def find_minimum_of_shards(solver: BundleSolver, shards: Shards, start: Values) 
     parts = [pad_values(_values_of(start, chosen), shards.sizes) for chosen in shards.points]
     start_parts = Values(
         *(_placed(mesh, np.asarray(x), PartitionSpec())
-          for x in (start.camera, start.position, start.rotation)),
+          for x in (parts[0].camera, parts[0].position, parts[0].rotation)),
         point=_placed(mesh, np.stack([p.point for p in parts]), PartitionSpec(AXIS)),
     )  # fmt: skip
     solver = dataclasses.replace(solver, structure=shards.structure)
@@ -86,8 +98,8 @@ def find_minimum_of_shards(solver: BundleSolver, shards: Shards, start: Values) 
     point = np.array(start.point)
     for part, chosen in zip(minimum.values.point, shards.points):
         point[chosen] = part[: len(chosen)]
-    minimum = eqx.tree_at(lambda m: m.values.point, minimum, point)
-    return jax.tree.map(jnp.asarray, minimum)
+    values = eqx.tree_at(lambda v: v.point, minimum.values, point)
+    return jax.device_put(eqx.tree_at(lambda m: m.values, minimum, without_filling(values, start)))
 
 
 @eqx.filter_jit

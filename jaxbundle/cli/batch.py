@@ -10,6 +10,7 @@ import jaxbundle
 from jaxbundle.batches import run_batch
 from jaxbundle.cli.app import Quiet, app
 from jaxbundle.cli.progress import counting
+from jaxbundle.io.camera_stacks import is_camera_stack
 
 
 @app.command()
@@ -36,7 +37,7 @@ def batch(
     or another run is writing the file; 130, 143 interrupted.
     """
     jaxbundle.enable_x64()
-    if not all(path.endswith(".npz") for path in inputs):
+    if not all(map(is_camera_stack, inputs)):
         # Cameras fill the cores by threads of their own, and gain nothing.
         jaxbundle.use_cores()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))

@@ -54,12 +54,19 @@ class CameraStack:
         )
 
     def fingerprint(self, camera: int) -> str:
-        """Of what was measured of a camera; what is not visible does not count."""
+        """Of what was measured of a camera; what is not visible does not count, nor how much room
+        there is for it."""
         X = self.object_points if self.object_points.ndim == 2 else self.object_points[camera]
         xy = self.image_points[camera]
         seen = np.ones(xy.shape[:2], bool) if self.visible is None else self.visible[camera] != 0
-        shown = np.where(seen[..., None], xy, 0)
-        return of_arrays(X, shown, seen, np.array(self.image_size))
+        return of_arrays(
+            np.argwhere(seen), xy[seen], X[seen.any(0)], np.array(self.image_size)
+        )
+
+
+def is_camera_stack(path: str | Path) -> bool:
+    """Whether the name is that of a file of many cameras."""
+    return Path(path).suffix.lower() == ".npz"
 
 
 def read_camera_stack(path: str | Path) -> CameraStack:

@@ -16,6 +16,8 @@ from jaxbundle.errors import InputError
 from jaxbundle.network.columns import Columns
 from jaxbundle.network.tables import Source
 
+DESCRIPTORS = (Path("/dev"), Path("/dev/fd"), Path("/proc/self/fd"))
+"""Where open files of the process have names."""
 PORTION = 10_000
 """Rows that are turned into text at a time."""
 
@@ -129,19 +131,21 @@ def write_bytes(path: Path, content: bytes | Iterable[bytes]) -> None:
     """Write a file, given whole or in pieces, whole or not at all: under a temporary name, then
     renamed.
 
-    What is there and no file (a device, a pipe) is written to as it is.
+    What is there and no file (a device, a pipe) is written to as it is, and so is what an open
+    descriptor leads to (/dev/stdout); a link stays a link.
     """
     pieces = (content,) if isinstance(content, bytes) else content
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    real = Path(os.path.realpath(path))
+    temporary = real.with_name(f".{real.name}.{os.getpid()}.tmp")
     try:
-        if path.exists() and not path.is_file():
+        if path.exists() and (not path.is_file() or path.parent in DESCRIPTORS):
             with path.open("wb") as file:
                 file.writelines(pieces)
             return
         try:
             with temporary.open("wb") as file:
                 file.writelines(pieces)
-            os.replace(temporary, path)
+            os.replace(temporary, real)
         finally:
             temporary.unlink(missing_ok=True)
     except OSError as error:

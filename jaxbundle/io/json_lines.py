@@ -27,15 +27,15 @@ class JsonLines:
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
-        # A link stays a link.
-        self._file = Path(os.path.realpath(path))
+        regular = self.path.is_file() or not self.path.exists()
+        # A link stays a link; a pipe of a process has no other name.
+        self._file = Path(os.path.realpath(path)) if regular else self.path
         self.heads: dict[str, dict] = {}
-        regular = self._file.is_file() or not self._file.exists()
         end, twice, whole = 0, False, True
         for number, line in enumerate(self._lines() if regular else (), 1):
             row, whole = _row(line), line.endswith(b"\n")
             if row is None:
-                if not whole and _is_torn(line):
+                if not whole and _is_torn(line.rstrip(b"\0")):
                     break
                 raise InputError(
                     f"{self.path}, line {number}: not a result of jaxbundle batch; "
@@ -48,7 +48,7 @@ class JsonLines:
         if regular and not whole:
             self._mend(end)
         if twice:
-            self.drop(())
+            self._keep(self.heads)
 
     def __contains__(self, key: str) -> bool:
         return key in self.heads
@@ -62,9 +62,14 @@ class JsonLines:
         self.heads.update((row["key"], _head(row)) for row in rows)
 
     def drop(self, keys: Iterable[str]) -> None:
-        """Remove the lines of some keys, and every line that has a key once more."""
-        left, kept = self.heads.keys() - set(keys), []
-        self.heads = {key: head for key, head in self.heads.items() if key in left}
+        """Remove the lines of some keys."""
+        gone = set(keys)
+        self.heads = {key: head for key, head in self.heads.items() if key not in gone}
+        self._keep(self.heads)
+
+    def _keep(self, keys: Iterable[str]) -> None:
+        """Rewrite the file with the first line of each of these keys alone."""
+        left, kept = set(keys), []
         for line in self._lines():
             key = _row(line)["key"]
             if key in left:
@@ -107,17 +112,21 @@ def _text(row: dict) -> str:
 
 
 def _is_torn(line: bytes) -> bool:
-    """Whether a line is the beginning of a row."""
-    begin = b'{"'
-    return line.startswith(begin) or begin.startswith(line)
+    """Whether a line is the beginning of a row, and not the whole of something else."""
+    begin = b'{"key": "'
+    return begin.startswith(line[: len(begin)]) and _parsed(line) is None
 
 
 def _row(line: bytes) -> dict | None:
+    row = _parsed(line)
+    return row if isinstance(row, dict) and isinstance(row.get("key"), str) else None
+
+
+def _parsed(line: bytes):
     try:
-        row = json.loads(line)
+        return json.loads(line)
     except (ValueError, RecursionError):
         return None
-    return row if isinstance(row, dict) and isinstance(row.get("key"), str) else None
 
 
 def _head(row: dict) -> dict:

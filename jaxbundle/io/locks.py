@@ -20,10 +20,12 @@ def locked(path: str | Path) -> Iterator[None]:
 
     **Raises:** `InputError` if another process holds it, or no lock can be had.
     """
-    real = Path(os.path.realpath(path))
-    if real.exists() and not real.is_file():
+    if os.path.exists(path) and not os.path.isfile(path):
         yield
         return
+    real = Path(os.path.realpath(path))
+    if not real.parent.is_dir():
+        raise InputError(f"{path}: there is no folder {real.parent}")
     lock = real.with_name(f".{real.name}.lock")
     stream = None
     while stream is None:
@@ -34,7 +36,10 @@ def locked(path: str | Path) -> Iterator[None]:
                 f"{path}: another run is writing this file; wait for its end, or give another file"
             ) from None
         except OSError as error:
-            raise InputError(f"{path}: cannot be locked: {error.strerror}") from None
+            raise InputError(
+                f"{path}: its lock {lock} cannot be made: {error.strerror}; the folder must take "
+                "files"
+            ) from None
     try:
         yield
     finally:

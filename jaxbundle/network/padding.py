@@ -7,6 +7,7 @@ and one filled incidence to which filled rows can refer.
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -91,21 +92,22 @@ def common_sizes(all_sizes) -> Sizes:
     return Sizes(**found)
 
 
-def bucket_of(structure: Structure) -> Sizes:
-    """Round sizes that hold this structure, the same for all of nearly its size.
+def round_sizes(structures: Sequence[Structure]) -> Sizes:
+    """Round sizes that hold each of these parts of a network, the same for all networks of nearly
+    its size.
 
     A table without rows stays one. The images of a band keep their number, on which it depends."""
-    exact = sizes_of(structure)
-    least = common_sizes([exact])
+    exact = [sizes_of(structure) for structure in structures]
+    least = common_sizes(exact)
     chunks = _rounded(least.chunks)
-    filled = np.add(exact.groups, chunks - exact.chunks)
+    filled = np.max([np.add(sizes.groups, chunks - sizes.chunks) for sizes in exact], 0)
     found = {
         field.name: jax.tree.map(_rounded, getattr(least, field.name))
         for field in dataclasses.fields(Sizes)
     }
     found |= {"chunks": chunks, "groups": tuple(_rounded(int(n)) for n in filled)}
-    if structure.band is not None:
-        found["images"] = exact.images
+    if structures[0].band is not None:
+        found["images"] = least.images
     return Sizes(**found)
 
 
@@ -175,7 +177,7 @@ def filled(structure: Structure, data: Data) -> tuple[Structure, Data, Sizes]:
     """The network in tables of round sizes; large ones, that would feel it, as they are."""
     if structure.rays > LARGE:
         return structure, data, sizes_of(structure)
-    sizes = bucket_of(structure)
+    sizes = round_sizes([structure])
     return *pad(structure, data, sizes), sizes
 
 

@@ -11,6 +11,7 @@ from scipy import optimize
 
 import jaxbundle
 from jaxbundle import cameras
+from jaxbundle.adjustment import batch_input
 from jaxbundle.adjustment.batch_input import bucket, once
 from jaxbundle.geometry import omega_phi_kappa_from_matrix
 
@@ -266,6 +267,22 @@ def test_object_points_may_be_repeated_for_every_view(three):
     np.testing.assert_array_equal(once(np.tile(BOARD, (views, 1, 1)), xy), BOARD)
     np.testing.assert_array_equal(once(X, xy), X)
     np.testing.assert_array_equal(once(X[:, None].repeat(views, 1), xy), X)
+
+
+def test_few_views_are_not_filled_up_to_many(three, solved, monkeypatch):
+    """The first camera keeps every other view, the last all: each by itself or together."""
+    monkeypatch.setattr(batch_input, "ON_CPU", 2)
+    visible = np.ones(three[0].shape[:3], bool)
+    visible[0, ::2] = False
+    together = jaxbundle.calibrate_batch(BOARD, three[0], SIZE, visible=visible)
+    monkeypatch.setattr(batch_input, "WORTH_COMPILING", 0)
+    apart = jaxbundle.calibrate_batch(BOARD, three[0], SIZE, visible=visible)
+    np.testing.assert_array_equal(apart.views, visible.any(2))
+    np.testing.assert_array_equal(apart.views, together.views)
+    for name in ("values", "sigma", "position", "sigma_angles", "rms"):
+        np.testing.assert_allclose(getattr(apart, name), getattr(together, name), rtol=1e-7)
+    assert np.isnan(apart.position[0, ::2]).all() and np.isfinite(apart.position[0, 1::2]).all()
+    np.testing.assert_allclose(apart.values[1:], solved.values[1:], rtol=1e-9)
 
 
 def test_progress_is_told_and_portions_keep_the_order(three, solved):

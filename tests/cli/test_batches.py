@@ -144,7 +144,7 @@ def test_a_rewritten_network_is_seen(tmp_path, monkeypatch):
     for path in (project, project.parent / "observations.csv"):
         assert run_batch([project, project.parent], file)["skipped"] == 2
         path.write_text(path.read_text() + "# looked through\n")
-        with pytest.raises(InputError, match="block/project.toml: the measurements were others"):
+        with pytest.raises(InputError, match="block/project.toml: its files were others"):
             run_batch([project, project.parent], file)
         assert run_batch([project, project.parent], file, renew=True) == {"converged": 2}
 

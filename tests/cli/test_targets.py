@@ -1,12 +1,14 @@
 """What the command line writes is checked before the adjustment, and replaces what was there."""
 
 import json
+import os
 from pathlib import Path
 
 import pytest
 
 import jaxbundle
 from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.io.csv_tables import write_text
 from jaxbundle.targets import FILES, check_targets, write_targets
 
 pytestmark = pytest.mark.xdist_group("convergent4")
@@ -79,3 +81,21 @@ def test_why_there_is_no_result_is_told_as_json(tmp_path, capsys):
 def test_a_device_is_written_to_and_stays_one():
     write_targets(REASON, "/dev/null", None, brief=True, plots=False)
     assert Path("/dev/null").is_char_device()
+
+
+def test_a_link_stays_a_link(tmp_path):
+    (tmp_path / "target.json").write_text("old")
+    (tmp_path / "link.json").symlink_to("target.json")
+    write_text(tmp_path / "link.json", "new")
+    assert (tmp_path / "link.json").is_symlink()
+    assert (tmp_path / "target.json").read_text() == "new"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["link.json", "target.json"]
+
+
+def test_what_a_descriptor_leads_to_is_written_and_not_replaced(tmp_path):
+    path = tmp_path / "result.json"
+    with path.open("w") as file:
+        before = os.fstat(file.fileno()).st_ino
+        write_text(Path(f"/dev/fd/{file.fileno()}"), "new")
+        assert path.stat().st_ino == before
+    assert path.read_text() == "new" and os.path.isdir("/dev/fd")

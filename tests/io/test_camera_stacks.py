@@ -1,4 +1,4 @@
-"""An archive of cameras that unpacks to far more than it holds is refused before it is unpacked."""
+"""Archives of cameras: those that unpack to far more than they hold; what a camera is known by."""
 
 import tracemalloc
 
@@ -31,3 +31,25 @@ def test_zeros_without_end(tmp_path):
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 1e7
+
+
+def test_what_is_not_visible_does_not_count(tmp_path):
+    """A camera with more views beside it, or another number where nothing is seen: the same."""
+    rng = np.random.default_rng(1)
+    X, xy = rng.normal(size=(50, 3)), rng.uniform(0, 400, (1, 6, 50, 2))
+    seen = rng.uniform(size=(1, 6, 50)) < 0.8
+    seen[..., 7] = False
+    wide = np.zeros((2, 9, 50, 2))
+    wide[:1, :6], wide[1] = xy, rng.uniform(0, 400, (9, 50, 2))
+    seen_wide = np.ones((2, 9, 50), bool)
+    seen_wide[0] = False
+    seen_wide[:1, :6] = seen
+    other = X.copy()
+    other[7] = np.nan
+    found = []
+    for object_points, image_points, visible in ((X, xy, seen), (other, wide, seen_wide)):
+        np.savez(tmp_path / "a.npz", object_points=object_points, image_points=image_points,
+                 image_size=(640, 480), visible=visible)  # fmt: skip
+        stack = read_camera_stack(tmp_path / "a.npz")
+        found.append([stack.fingerprint(i) for i in range(len(stack.ids))])
+    assert found[0][0] == found[1][0] != found[1][1]

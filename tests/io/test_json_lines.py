@@ -82,11 +82,36 @@ def test_one_at_a_time(tmp_path):
 
 
 def test_no_lock_to_be_had_is_said(tmp_path):
-    with pytest.raises(InputError, match="cannot be locked: No such file"):
+    with pytest.raises(InputError, match="there is no folder .*nowhere"):
         with locked(tmp_path / "nowhere" / "results.jsonl"):
             pass
     with locked("/dev/null"):
         assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
+
+
+def test_a_pipe_takes_lines():
+    read, write = os.pipe()
+    with open(read, "rb") as end:
+        with locked(f"/dev/fd/{write}"):
+            JsonLines(f"/dev/fd/{write}").append([{"key": "a"}])
+        os.close(write)
+        assert json.loads(end.read()) == {"key": "a"}
+
+
+@pytest.mark.parametrize("text", ['{"a": 1}', '{"precious": [1, 2', '{"key": 1}'])
+def test_a_file_of_somebody_else_stays_as_it_is(tmp_path, text):
+    """Also where it does not end with a line feed, as a torn line of results does."""
+    path = tmp_path / "mine.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match="not a result"):
+        JsonLines(path)
+    assert path.read_text() == text
+
+
+def test_a_tail_of_zeros_is_cut(tmp_path):
+    path = tmp_path / "results.jsonl"
+    path.write_bytes(b'{"key": "a"}\n' + bytes(50))
+    assert [*JsonLines(path).heads] == ["a"] and path.read_bytes() == b'{"key": "a"}\n'
 
 
 @pytest.fixture(scope="module")

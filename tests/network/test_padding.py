@@ -6,7 +6,7 @@ import pytest
 from adjustment_checks import NETWORKS, synthetic
 
 from jaxbundle.adjustment.problem import make_problem
-from jaxbundle.network.padding import _rounded, bucket_of, filled, sizes_of
+from jaxbundle.network.padding import _rounded, filled, round_sizes, sizes_of
 from jaxbundle.statistics import Inspection, cofactors, reliability, undamped_factor
 
 OWN_CAMERAS = "own cameras of two models"
@@ -30,7 +30,7 @@ def test_a_few_rays_less_are_the_same_program(name):
     smaller = network.replace(observations=network.observations.take(rows))
     a, b = (make_problem(n) for n in (network, smaller))
     assert sizes_of(a.structure) != sizes_of(b.structure)
-    if bucket_of(a.structure) == bucket_of(b.structure):
+    if round_sizes([a.structure]) == round_sizes([b.structure]):
         tables = (filled(p.structure, p.data)[:2] for p in (a, b))
         assert shapes(next(tables)) == shapes(next(tables))
 
@@ -38,9 +38,9 @@ def test_a_few_rays_less_are_the_same_program(name):
 def test_networks_at_both_ends_of_a_bucket():
     network, _ = synthetic(**NETWORKS["free"])
     sizes = [
-        bucket_of(make_problem(network.replace(
+        round_sizes([make_problem(network.replace(
             observations=network.observations.take(np.arange(len(network.observations) - n))
-        )).structure)
+        )).structure])
         for n in range(12)
     ]  # fmt: skip
     # Of twelve networks with one ray less each, most share their sizes with another.
