@@ -20,12 +20,15 @@ all, the same divided by a peer's (ours / peer), compilation with an empty folde
 programs and in a second process with that folder, and the peak of the memory of the process.
 --json has the cost after every evaluation and its time for all, --plot draws them.
 
-The exit status is 1 where our cost is higher than a peer's by 1e-6, and with --baseline where it
-does not agree with `baseline.json` (see `baseline.py`; --write-baseline makes a new one).
+The exit status is 1 where our cost is higher than a peer's by 1e-6; where our search has not
+settled, unless a peer that came to its end, or Ceres within the same limit, has no lower cost, or
+`baseline.json` has no lower one; and with --baseline where it does not agree with `baseline.json`
+(see `baseline.py`; --write-baseline makes a new one). A peer that fails is noted.
 """
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -41,6 +44,14 @@ PEERS = ("pycolmap", "ceres", "scipy", "jaxls")
 FEW = {"scipy": 20, "jaxls": 30}
 """Evaluations of those that are slow."""
 SEED = 0
+CERES = ("pycolmap", "ceres")
+READ = """
+import sys, jaxbundle
+try:
+    jaxbundle.read_network(sys.argv[1], "bal")
+except jaxbundle.InputError as error:
+    sys.exit(str(error))
+"""
 IS_JAXLS = "import jaxls; jaxls.LeastSquaresProblem"
 
 
@@ -57,7 +68,9 @@ def commands(given) -> tuple[dict[str, list[str]], dict[str, str]]:
         else:
             skipped["pycolmap"] = "not installed (pip install pycolmap)"
     if "ceres" in wanted:
-        if given.ceres:
+        if given.ceres and not shutil.which(given.ceres):
+            skipped["ceres"] = f"{given.ceres} is no program"
+        elif given.ceres:
             found["ceres"] = [sys.executable, "bal_ceres.py", "--binary", given.ceres, *cores]
         else:
             skipped["ceres"] = "no binary given (--ceres BINARY or BUNDLE_ADJUSTER)"
@@ -65,7 +78,9 @@ def commands(given) -> tuple[dict[str, list[str]], dict[str, str]]:
         found["scipy"] = [sys.executable, "bal_scipy.py"]
     if "jaxls" in wanted:
         python = given.jaxls or sys.executable
-        if subprocess.run([python, "-c", IS_JAXLS], capture_output=True).returncode == 0:
+        if not shutil.which(python):
+            skipped["jaxls"] = f"{python} is no program"
+        elif subprocess.run([python, "-c", IS_JAXLS], capture_output=True).returncode == 0:
             found["jaxls"] = [python, "bal_jaxls.py"]
         else:
             skipped["jaxls"] = (
@@ -73,6 +88,10 @@ def commands(given) -> tuple[dict[str, list[str]], dict[str, str]]:
                 "environment that has it)"
             )
     return found, skipped
+
+
+class Failed(Exception):
+    """A solver that gave no figures, and its last words."""
 
 
 def run(command: list[str], problem: Path, evaluations: int, repeat: int) -> dict:
@@ -84,8 +103,8 @@ def run(command: list[str], problem: Path, evaluations: int, repeat: int) -> dic
         capture_output=True, text=True,
     )  # fmt: skip
     if done.returncode:
-        sys.stderr.write(done.stderr)
-        raise SystemExit(f"{program} ended with status {done.returncode}")
+        words = (done.stderr.strip() or "no message").splitlines()[-1]
+        raise Failed(f"{program} ended with status {done.returncode}: {words}")
     return json.loads(done.stdout)
 
 
@@ -107,31 +126,51 @@ def time_to(figures: dict, cost: float) -> float | None:
 
 def compare(key: str, path: Path, todo: dict, given) -> dict:
     """All solvers on one problem, taking turns; it begins without compiled programs."""
-    runs = {name: [] for name in todo}
+    runs, failed = {name: [] for name in todo}, {}
     with tempfile.TemporaryDirectory() as cache:
         todo = todo | {"ours": [*todo["ours"], "--cache", cache]}
         for _ in range(given.rounds):
             for name, command in todo.items():
+                if name in failed:
+                    continue
                 few = min(given.evaluations, FEW.get(name, given.evaluations))
                 repeat = 1 if name in FEW else given.repeat
-                runs[name].append(run(command, path, few, repeat))
-    found = {"key": key} | {name: best_of(some) for name, some in runs.items()}
-    lowest = min(found[name]["cost"] for name in todo if found[name].get("comparable", True))
-    for name in todo:
-        found[name]["to_1.0001_s"] = time_to(found[name], 1.0001 * lowest)
-    return found
+                try:
+                    runs[name].append(run(command, path, few, repeat))
+                except Failed as error:
+                    failed[name] = str(error)
+    solvers = {name: best_of(some) for name, some in runs.items() if name not in failed}
+    lowest = min((f["cost"] for f in solvers.values() if f.get("comparable", True)), default=0.0)
+    for figures in solvers.values():
+        figures["to_1.0001_s"] = time_to(figures, 1.0001 * lowest)
+    return {"key": key, "failed": failed} | solvers
+
+
+def complaints(found: dict) -> list[str]:
+    """What is wrong with our answer."""
+    if "ours" not in found:
+        return [f"{found['key']}: {found['failed']['ours']}"]
+    ours, key = found["ours"], found["key"]
+    peers = {name: found[name] for name in PEERS
+             if name in found and found[name].get("comparable", True)}  # fmt: skip
+    wrong = [f"{key}: our cost is higher than that of {name}" for name, peer in peers.items()
+             if not ours["cost"] <= (1 + 1e-6) * peer["cost"]]  # fmt: skip
+    vouched = any(name in CERES or not peer["at_limit"] for name, peer in peers.items())
+    if not (wrong or ours["settled"] or vouched or baseline.agrees(found)):
+        wrong = [f"{key}: not settled ({ours['ended']}), and nothing to compare with"]
+    return wrong
 
 
 def ratio(ours: float | None, theirs: float | None) -> str:
     return f"{ours / theirs:.2f}" if ours and theirs else ""
 
 
-def told(found: dict, names) -> str:
+def told(found: dict) -> str:
     """The figures for people."""
     rows = [("", "cost", "evaluations", "ms/iteration", "ratio", "s to 1.0001", "ratio",
              "compile s, cached", "peak MB")]  # fmt: skip
-    ours, notes = found["ours"], []
-    for name in names:
+    ours, notes = found["ours"], [f"failed: {text}" for text in found["failed"].values()]
+    for name in ("ours", *(name for name in PEERS if name in found)):
         f, peer = found[name], name != "ours"
         to, limit = f["to_1.0001_s"], f["at_limit"]
         compiled = [f[n] for n in ("compile_s", "compile_cached_s") if n in f]
@@ -154,7 +193,9 @@ def told(found: dict, names) -> str:
                 f"those of the problem: {said[0]:.4f} at the start, that of all rays is "
                 f"{of_all[0]:.4f}; at the end {said[1]:.4f} and {of_all[1]:.4f}"
             )
-    notes.append(f"jaxbundle: {ours['ended']}; importing JAX takes {ours['import_mb']:.0f} MB")
+    above = ours["peak_mb"] - ours["import_mb"]
+    notes.append(f"jaxbundle: {ours['ended']}; peak {ours['peak_mb']:.0f} MB, "
+                 f"{above:.0f} MB above importing JAX ({ours['import_mb']:.0f} MB)")  # fmt: skip
     if ours["device_peak_mb"]:
         notes.append(f"jaxbundle: peak of the memory of the device {ours['device_peak_mb']:.0f} MB")
     widths = [max(map(len, column)) for column in zip(*rows)]
@@ -176,15 +217,20 @@ def problems(given, folder: Path):
         for images, points in getattr(given, kind) or ():
             plain = folder / f"{kind}.txt"
             # In a process of its own: its memory would count as that of the solvers.
-            subprocess.run([sys.executable, str(HERE / "scenes.py"), kind, str(images), str(points),
-                            str(SEED), str(plain)], check=True)  # fmt: skip
-            yield f"{kind} of {images} images, {points} points, seed {SEED}", plain
+            name = f"{kind} of {images} images, {points} points, seed {SEED}"
+            made = subprocess.run([sys.executable, str(HERE / "scenes.py"), kind, str(images),
+                                   str(points), str(SEED), str(plain)],
+                                  capture_output=True, text=True)  # fmt: skip
+            if made.returncode:
+                sys.exit(f"{name}: cannot be made: {made.stderr.strip().splitlines()[-1]}")
+            yield name, plain
 
 
 def arguments():
     """Of the command line."""
     parser = machine.parser_of(__doc__)
-    size = {"nargs": 2, "type": int, "metavar": ("IMAGES", "POINTS"), "action": "append"}
+    number = {"type": machine.positive}
+    size = number | {"nargs": 2, "metavar": ("IMAGES", "POINTS"), "action": "append"}
     parser.add_argument("problems", nargs="*", type=Path)
     parser.add_argument("--street", **size)
     parser.add_argument("--arc", **size)
@@ -198,20 +244,29 @@ def arguments():
                         help="ours; chosen if not given")  # fmt: skip
     parser.add_argument("--baseline", action="store_true", help="compare with baseline.json")
     parser.add_argument("--write-baseline", action="store_true")
-    parser.add_argument("--evaluations", type=int, default=200, help="limit, of all but "
+    parser.add_argument("--evaluations", **number, default=200, help="limit, of all but "
                         + ", ".join(f"{name} ({n})" for name, n in FEW.items()))  # fmt: skip
-    parser.add_argument("--rounds", type=int, default=2, help="turns; the best counts")
-    parser.add_argument("--repeat", type=int, default=2, help="timed runs a turn")
-    parser.add_argument("--devices", type=int, default=2, help="of the processor, for JAX")
-    parser.add_argument("--threads", type=int, default=2, help="of Ceres")
-    parser.add_argument("--json", metavar="FILE", help="write the figures; - for standard output")
-    parser.add_argument("--plot", metavar="FILE", help="draw cost against iteration and time")
+    parser.add_argument("--rounds", **number, default=2, help="turns; the best counts")
+    parser.add_argument("--repeat", **number, default=2, help="timed runs a turn")
+    parser.add_argument("--devices", **number, default=2, help="of the processor, for JAX")
+    parser.add_argument("--threads", **number, default=2, help="of Ceres")
+    parser.add_argument("--json", type=machine.target, metavar="FILE",
+                        help="write the figures; - for standard output")  # fmt: skip
+    parser.add_argument("--plot", type=machine.target, metavar="FILE",
+                        help="draw cost against iteration and time")  # fmt: skip
     given = parser.parse_args()
     if not (given.problems or given.street or given.arc):
         parser.error("no problem: name a file, or --street or --arc")
     for path in given.problems:
         if not path.is_file():
             parser.error(f"there is no file {path}")
+        # In a process of its own: reading begins to use the device.
+        read = subprocess.run([sys.executable, "-c", READ, str(path)], capture_output=True,
+                              text=True)  # fmt: skip
+        if read.returncode:
+            parser.error((read.stderr.strip() or f"{path} cannot be read").splitlines()[-1])
+    if given.plot and not machine.installed("matplotlib"):
+        parser.error("--plot needs matplotlib (pip install matplotlib)")
     return given
 
 
@@ -224,35 +279,33 @@ def main() -> int:
         print(f"skipped: {name}: {why}", file=show)
     settings = {"reduction": given.reduction or "chosen",
                 "evaluations": f"≤ {given.evaluations}", "atol": 1e-5}  # fmt: skip
-    all_found = []
+    all_found, solved, wrong = [], [], []
     with tempfile.TemporaryDirectory() as folder:
         for problem, path in problems(given, Path(folder)):
             found = compare(baseline.key_of(problem, settings), path, todo, given)
-            if not all_found:
-                print(machine.in_words(found["ours"]["machine"]), file=show)
             all_found.append(found)
-            print(f"\n{told(found, todo)}", file=show, flush=True)
-    machine.write_json(all_found, given.json)
+            wrong += complaints(found)
+            if given.json != "-":
+                machine.write_json(all_found, given.json)
+            if "ours" in found:
+                if not solved:
+                    print(machine.in_words(found["ours"]["machine"]), file=show)
+                solved.append(found)
+                print(f"\n{told(found)}", file=show, flush=True)
+    if given.json == "-":
+        machine.write_json(all_found, "-")
+    if given.write_baseline:
+        baseline.write(solved)
+    elif given.baseline:
+        more, known = baseline.compare(solved)
+        wrong += more
+        for line in known:
+            print(f"note: {line}", file=show)
     if given.plot:
         import plots
 
         plots.draw(all_found, given.plot)
-    wrong = [
-        f"{f['key']}: our cost is higher than that of {peer}"
-        for f in all_found for peer in PEERS
-        if peer in f and f[peer].get("comparable", True)
-        and f["ours"]["cost"] > (1 + 1e-6) * f[peer]["cost"]
-    ]  # fmt: skip
-    if given.write_baseline:
-        baseline.write(all_found)
-    elif given.baseline:
-        more, known = baseline.compare(all_found)
-        wrong += more
-        for line in known:
-            print(f"note: {line}", file=show)
-    for line in wrong:
-        print(f"WRONG: {line}", file=sys.stderr)
-    return 1 if wrong else 0
+    return machine.verdict(wrong)
 
 
 if __name__ == "__main__":

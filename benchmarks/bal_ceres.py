@@ -40,9 +40,9 @@ def main() -> None:
     parser.add_argument("problem")
     parser.add_argument("--binary", required=True)
     parser.add_argument("--solver", choices=SOLVERS, default=SOLVERS[0])
-    parser.add_argument("--evaluations", type=int, default=200)
-    parser.add_argument("--repeat", type=int, default=2)
-    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--evaluations", type=machine.positive, default=200)
+    parser.add_argument("--repeat", type=machine.positive, default=2)
+    parser.add_argument("--threads", type=machine.positive, default=2)
     given = parser.parse_args()
     command = [
         given.binary, f"--input={given.problem}", f"--num_threads={given.threads}",
@@ -53,9 +53,13 @@ def main() -> None:
         command.append(f"--preconditioner={PRECONDITIONER}")
     runs = []
     for _ in range(given.repeat):
-        text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-        ended = re.search(r"Termination:\s+(.*)", text)[1]
-        runs.append(figures_of(text) | {"ended": ended, "at_limit": "NO_CONVERGENCE" in ended})
+        done = subprocess.run(command, capture_output=True, text=True)
+        text, ended = done.stdout, re.search(r"Termination:\s+(.*)", done.stdout)
+        if done.returncode or not ended:
+            sys.exit(f"{given.binary} ended with status {done.returncode}, "
+                     f"{'with' if ended else 'without'} the summary of Ceres")  # fmt: skip
+        runs.append(figures_of(text) | {"ended": ended[1],
+                                        "at_limit": "NO_CONVERGENCE" in ended[1]})  # fmt: skip
     best = min(runs, key=lambda run: run["seconds"])
     name = f"Ceres {re.search(r'Solver Summary .v ([0-9.]+)', text)[1]}, {given.solver}"
     peak = {"peak_mb": machine.peak_mb(resource.RUSAGE_CHILDREN)}

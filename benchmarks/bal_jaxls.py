@@ -19,22 +19,7 @@ import numpy as np
 import scenes
 import snavely
 
-try:
-    import jaxls
-
-    jaxls.LeastSquaresProblem  # noqa: B018
-except (ImportError, AttributeError):
-    sys.exit("jaxls of github.com/brentyi/jaxls is not installed in this environment")
-
 DAMPING = 1e2
-
-
-class CameraVar(jaxls.Var[jax.Array], default_factory=lambda: jnp.zeros(9)):
-    """Nine parameters of an image."""
-
-
-class PointVar(jaxls.Var[jax.Array], default_factory=lambda: jnp.zeros(3)):
-    """An object point."""
 
 
 def cost(values, camera, point, xy):
@@ -42,8 +27,15 @@ def cost(values, camera, point, xy):
     return snavely.residual(values[camera], values[point], xy)
 
 
-def problem_of(cameras, points, image, point, xy):
+def problem_of(jaxls, cameras, points, image, point, xy):
     """The problem, analysed, and its start values."""
+
+    class CameraVar(jaxls.Var[jax.Array], default_factory=lambda: jnp.zeros(9)):
+        """Nine parameters of an image."""
+
+    class PointVar(jaxls.Var[jax.Array], default_factory=lambda: jnp.zeros(3)):
+        """An object point."""
+
     every_camera, every_point = CameraVar(jnp.arange(len(cameras))), PointVar(
         jnp.arange(len(points))
     )
@@ -58,11 +50,17 @@ def problem_of(cameras, points, image, point, xy):
 def main() -> None:
     parser = machine.parser_of(__doc__)
     parser.add_argument("problem")
-    parser.add_argument("--evaluations", type=int, default=30)
-    parser.add_argument("--repeat", type=int, default=2)
+    parser.add_argument("--evaluations", type=machine.positive, default=30)
+    parser.add_argument("--repeat", type=machine.positive, default=2)
     given = parser.parse_args()
+    try:
+        import jaxls
+
+        jaxls.LeastSquaresProblem  # noqa: B018
+    except (ImportError, AttributeError):
+        sys.exit("jaxls of github.com/brentyi/jaxls is not installed in this environment")
     jax.config.update("jax_enable_x64", True)
-    problem, start = problem_of(*scenes.read_bal(given.problem))
+    problem, start = problem_of(jaxls, *scenes.read_bal(given.problem))
 
     def timed():
         begin = time.perf_counter()

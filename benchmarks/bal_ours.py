@@ -23,7 +23,7 @@ import numpy as np  # noqa: E402
 import jaxbundle  # noqa: E402
 from jaxbundle.adjustment.sharding import distribute, find_minimum_of_shards  # noqa: E402
 from jaxbundle.adjustment.solve import make_solver  # noqa: E402
-from jaxbundle.adjustment.solver import LIMIT, TERMINATIONS, minimise  # noqa: E402
+from jaxbundle.adjustment.solver import LIMIT, RELATIVE_COST, SETTLED, TERMINATIONS, minimise  # noqa: E402
 from jaxbundle.network.reduction import REDUCTIONS  # noqa: E402
 
 ATOL = 1e-5
@@ -44,9 +44,9 @@ def prepare(path: str, evaluations: int, reduction: str | None):
 def main() -> None:
     parser = machine.parser_of(__doc__)
     parser.add_argument("problem")
-    parser.add_argument("--evaluations", type=int, default=200)
-    parser.add_argument("--repeat", type=int, default=2)
-    parser.add_argument("--devices", type=int, default=2, help="of the processor")
+    parser.add_argument("--evaluations", type=machine.positive, default=200)
+    parser.add_argument("--repeat", type=machine.positive, default=2)
+    parser.add_argument("--devices", type=machine.positive, default=2, help="of the processor")
     parser.add_argument("--reduction", choices=REDUCTIONS)
     parser.add_argument("--cache", help="folder of compiled programs")
     given = parser.parse_args()
@@ -76,6 +76,7 @@ def main() -> None:
         "evaluations": number,
         "ended": TERMINATIONS[termination],
         "at_limit": termination == LIMIT,
+        "settled": termination in (SETTLED, RELATIVE_COST),
         "seconds": seconds,
         "iteration_s": seconds / number,
         "compile_s": first - seconds,

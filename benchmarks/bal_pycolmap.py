@@ -16,6 +16,8 @@ interior orientation are two blocks of parameters of an image for COLMAP, one bl
 Ceres' own `bundle_adjuster`, whose compiled sizes 2, 3, 9 Ceres therefore cannot use here.
 """
 
+from __future__ import annotations
+
 import json
 import os
 import sys
@@ -29,7 +31,7 @@ from bal_ceres import PRECONDITIONER, SOLVERS, figures_of
 try:
     import pycolmap
 except ImportError:
-    sys.exit("pycolmap is not installed (pip install pycolmap)")
+    pycolmap = None
 
 TURN = np.diag([1.0, -1.0, -1.0])
 SAME = 1e-6
@@ -113,10 +115,12 @@ def main() -> None:
     parser = machine.parser_of(__doc__)
     parser.add_argument("problem")
     parser.add_argument("--solver", choices=SOLVERS, default=SOLVERS[0])
-    parser.add_argument("--evaluations", type=int, default=200)
-    parser.add_argument("--repeat", type=int, default=2)
-    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--evaluations", type=machine.positive, default=200)
+    parser.add_argument("--repeat", type=machine.positive, default=2)
+    parser.add_argument("--threads", type=machine.positive, default=2)
     given = parser.parse_args()
+    if pycolmap is None:
+        sys.exit("pycolmap is not installed (pip install pycolmap)")
     cameras, points, *rays = scenes.read_bal(given.problem)
     config = pycolmap.BundleAdjustmentConfig()
     for i in range(len(cameras)):

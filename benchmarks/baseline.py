@@ -35,9 +35,16 @@ def _entry(found: dict) -> dict:
     machine = figures["machine"]
     entry = {name: figures[name] for name in KEPT}
     entry |= {"devices": machine["devices"], "device_kind": machine["device_kind"]}
-    if PEER in found:
+    if found.get(PEER, {}).get("iteration_s"):
         entry["beside_pycolmap"] = figures["iteration_s"] / found[PEER]["iteration_s"]
     return entry
+
+
+def agrees(found: dict) -> bool:
+    """Whether there is an entry, and the cost is no higher than there."""
+    baseline = json.loads(FILE.read_text()) if FILE.exists() else {}
+    then = baseline.get(found["key"])
+    return bool(then) and found["ours"]["cost"] <= (1 + TIGHT) * then["cost"]
 
 
 def compare(all_found: list[dict]) -> tuple[list[str], list[str]]:
@@ -55,14 +62,23 @@ def compare(all_found: list[dict]) -> tuple[list[str], list[str]]:
             wrong.append(costs)
         elif now["cost"] < (1 - TIGHT) * then["cost"]:
             known.append(f"{costs}: the baseline is stale (--write-baseline)")
+        if now["at_limit"] and not then["at_limit"]:
+            wrong.append(f"{key}: stopped at the limit of evaluations, not so in the baseline")
+        if now["reduction"] != then["reduction"]:
+            wrong.append(f"{key}: reduction {now['reduction']}, "
+                         f"{then['reduction']} in the baseline")  # fmt: skip
+        if now["device_kind"] != then["device_kind"]:
+            known.append(f"{key}: times not compared: {now['device_kind']}, "
+                         f"{then['device_kind']} in the baseline")  # fmt: skip
+            continue
         beside = "beside_pycolmap"
         if beside in now and beside in then:
-            if now[beside] > SLOWER_BESIDE * then[beside]:
+            if not now[beside] <= SLOWER_BESIDE * then[beside]:
                 wrong.append(
                     f"{key}: an iteration takes {now[beside]:.2f} of pycolmap's, "
                     f"{then[beside]:.2f} in the baseline"
                 )
-        elif now["iteration_s"] > SLOWER * then["iteration_s"]:
+        elif not now["iteration_s"] <= SLOWER * then["iteration_s"]:
             wrong.append(
                 f"{key}: {1e3 * now['iteration_s']:.1f} ms an iteration, "
                 f"{1e3 * then['iteration_s']:.1f} in the baseline"

@@ -96,9 +96,9 @@ def clock(function):
 
 def main() -> int:
     parser = machine.parser_of(__doc__)
-    parser.add_argument("--cameras", type=int, default=1000)
-    parser.add_argument("--repeat", type=int, default=3)
-    parser.add_argument("--json", help="file for the figures; - for stdout")
+    parser.add_argument("--cameras", type=machine.positive, default=1000)
+    parser.add_argument("--repeat", type=machine.positive, default=3)
+    parser.add_argument("--json", type=machine.target, help="file for the figures; - for stdout")
     options = parser.parse_args()
     n = options.cameras
 
@@ -144,7 +144,9 @@ def main() -> int:
         "error_over_sigma": [round(float(s), 3) for s in error.std(0)],
         "median_rms": float(np.median(batch.rms)),
     }
-    good = batch.converged.all() and (np.abs(error.std(0) - 1) < 5 / np.sqrt(2 * n)).all()
+    wrong = [] if batch.converged.all() else ["not every camera has converged"]
+    if not (np.abs(error.std(0) - 1) < 5 / np.sqrt(2 * n)).all():
+        wrong.append("errors of the parameters are not as large as their σ say")
     if pool:
         spent = resource.getrusage(resource.RUSAGE_CHILDREN)
         difference = batch.rms - np.array(theirs)
@@ -160,13 +162,14 @@ def main() -> int:
             "rms_above_opencv_largest": float(difference.max()),
             "opencv_not_arrived": int((difference < -1e-6).sum()),
         }
-        good = good and difference.max() < 1e-6
+        if not difference.max() < 1e-6:
+            wrong.append("an RMS is above that of OpenCV")
     if options.json != "-":
         print(machine.in_words(figures["machine"]))
         for name, value in list(figures.items())[1:]:
             print(f"{name:32s} {value}")
     machine.write_json(figures, options.json)
-    return 0 if good else 1
+    return machine.verdict(wrong)
 
 
 if __name__ == "__main__":

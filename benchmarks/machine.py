@@ -20,6 +20,27 @@ def parser_of(description: str) -> argparse.ArgumentParser:
     )
 
 
+def positive(text: str) -> int:
+    """A whole number from 1 on, of the command line."""
+    if not (text.isdecimal() and int(text) > 0):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 on")
+    return int(text)
+
+
+def target(text: str) -> str:
+    """A file to be written, of the command line; refused before anything is measured."""
+    if text != "-" and (Path(text).is_dir() or not Path(text).absolute().parent.is_dir()):
+        raise argparse.ArgumentTypeError(f"{text} is a folder, or its folder does not exist")
+    return text
+
+
+def verdict(wrong: list[str]) -> int:
+    """Exit status; what is wrong is told."""
+    for line in wrong:
+        print(f"WRONG: {line}", file=sys.stderr)
+    return 1 if wrong else 0
+
+
 def machine() -> dict:
     """Devices of JAX, precision, versions, threads; JAX must have been set up before."""
     import jax

@@ -6,7 +6,8 @@ Photographs as in the tests (`tests/measure/render.py`): 480 × 360 pixels, grey
 with a contrast of 204, blurred by 0.7 or 1.2 pixels, the object tilted by 0° or 25°. Targets: 20
 discs each, their true centres those of the images of the circles (eccentricity taken into account).
 Corners: `find_board` on a chessboard of 9 × 6. RMS of a coordinate in pixels, against truth; for
-targets also the RMS of errors over the σ they state, which should be 1.
+targets also the RMS of errors over the σ they state, which should be 1. The exit status is 1 where
+an RMS is above 0.05 pixels, or errors are more than twice their σ.
 """
 
 import os
@@ -36,6 +37,7 @@ from jaxbundle.measure import (  # noqa: E402
 )
 from jaxbundle.orientation import Pose  # noqa: E402
 
+LIMIT_PX, LIMIT_IN_SIGMA = 0.05, 2.0
 PLACES = np.array([[0.06 * i, 0.06 * j, 0.0] for i in range(5) for j in range(4)])
 MODEL, P, UP = get_model("opencv"), render.LENS.parameters, np.array([0.0, 0.0, 1.0])
 shifts = jax.jit(jax.vmap(lambda pose, X, r: circle_centre_shift(MODEL, P, pose, X, UP, r),
@@ -100,9 +102,24 @@ def show(found):
         print(f"{f['blur']:4.1f}  {f['rms_px']:8.3f}")
 
 
+def complaints(found):
+    """What is not as near to the truth as it should be, or said to be."""
+    of_targets = [
+        (f"targets of {f['radius_px']:.1f} pixels by {method}, blur {f['blur']}", f[method])
+        for f in found["targets"] for method in ("grey_values", "ellipse")
+    ]  # fmt: skip
+    of_corners = [(f"corners, blur {f['blur']}", f) for f in found["corners"]]
+    return [
+        f"{name}: RMS {f['rms_px']:.3f} pixels, error/σ {f.get('error_over_sigma', 1):.2f}"
+        for name, f in of_targets + of_corners
+        if not (f["rms_px"] <= LIMIT_PX and f.get("error_over_sigma", 1) <= LIMIT_IN_SIGMA)
+    ]
+
+
 def main():
     parser = machine.parser_of(__doc__)
-    parser.add_argument("--json", metavar="FILE", help="write the figures; - for standard output")
+    parser.add_argument("--json", type=machine.target, metavar="FILE",
+                        help="write the figures; - for standard output")  # fmt: skip
     given = parser.parse_args()
     found = {
         "machine": machine.machine(),
@@ -112,7 +129,8 @@ def main():
     if given.json != "-":
         show(found)
     machine.write_json(found, given.json)
+    return machine.verdict(complaints(found))
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -7,7 +7,8 @@ pairs have a base of 1 in any direction and are turned by some 0.2 rad about eac
 a table line of: successes, quantiles of the error, names of what failed, microseconds an item
 without compilation. The error is the greatest of a component of X0 (unit: the object's) or of b,
 and of an element of M. It is a success below 1e-6; with noise, if the errors are within the 0.999
-quantile of χ² that their cofactors give (one in a thousand is expected outside).
+quantile of χ² that their cofactors give (one in a thousand is expected outside). The exit status is
+1 where a row has fewer successes than 0.997 of its number, by more than chance.
 
     resection, 3 points       all solutions; one of them is the truth
     resection, 3 + 1 points   the solution chosen by a fourth point, refined
@@ -18,6 +19,7 @@ quantile of χ² that their cofactors give (one in a thousand is expected outsid
 
 import collections
 import os
+import sys
 import time
 from functools import partial
 
@@ -40,6 +42,7 @@ from jaxbundle.orientation import (
 )
 
 EXACT, CONFIDENCE, BATCH = 1e-6, 0.999, 1000
+LEAST = 0.997
 
 
 def images(rng, N, n, noise):
@@ -152,11 +155,21 @@ def rows(N, noise):
         yield relatives(rng, N, n, sigma, method)
 
 
+def complaints(rows, number):
+    """Rows with too few successes; four standard deviations of their number are chance."""
+    least = LEAST - 4 * np.sqrt(LEAST * (1 - LEAST) / number)
+    return [
+        f"{f['name']}: {100 * f['success']:.2f} % successes, at least {100 * least:.2f} expected"
+        for f in rows if not f["success"] >= least
+    ]  # fmt: skip
+
+
 def main():
     parser = machine.parser_of(__doc__)
-    parser.add_argument("--number", type=int, default=10_000)
+    parser.add_argument("--number", type=machine.positive, default=10_000)
     parser.add_argument("--noise", type=float, default=2e-4)
-    parser.add_argument("--json", metavar="FILE", help="write the figures; - for standard output")
+    parser.add_argument("--json", type=machine.target, metavar="FILE",
+                        help="write the figures; - for standard output")  # fmt: skip
     given = parser.parse_args()
     jaxbundle.enable_x64()
     found = {"machine": machine.machine(), "rows": []}
@@ -170,7 +183,8 @@ def main():
         if table:
             show(figures)
     machine.write_json(found, given.json)
+    return machine.verdict(complaints(found["rows"], given.number))
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -21,7 +21,7 @@ def draw(all_found: list[dict], path: str) -> None:
             f for f in found.values()
             if isinstance(f, dict) and "costs" in f and f.get("comparable", True)
         ]  # fmt: skip
-        lowest = min(f["cost"] for f in solvers)
+        lowest = min((f["cost"] for f in solvers), default=1.0)
         for f in solvers:
             excess = np.maximum(np.array(f["costs"]) / lowest - 1, ROUNDING)
             left.loglog(np.arange(1, len(excess) + 1), excess, label=f["solver"])

@@ -177,8 +177,9 @@ def map_seconds():
 
 def main():
     parser = machine.parser_of(__doc__)
-    parser.add_argument("--json", help="write the figures; - for standard output")
-    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--json", type=machine.target, metavar="FILE",
+                        help="write the figures; - for standard output")  # fmt: skip
+    parser.add_argument("--rounds", type=machine.positive, default=5)
     parser.add_argument("--map", action="store_true", help="also correct a whole image")
     arguments = parser.parse_args()
     rates, wrong = measure(arguments.rounds)
@@ -193,9 +194,8 @@ def main():
             print(f"map        {rates['map_seconds']:8.1f} s          demanded below 60 "
                   f"({grid.rows} × {grid.columns} pixels of {grid.size:g} m)")  # fmt: skip
     machine.write_json({"machine": machine.machine()} | rates, arguments.json)
-    if wrong:
-        sys.exit(f"wrong: {', '.join(wrong)}")
+    return machine.verdict([f"{name} misses its limit" for name in wrong])
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -10,6 +10,7 @@ is read by `bal.py` and by any program that reads BAL problems.
 import bz2
 import gzip
 import shutil
+import sys
 from pathlib import Path
 
 import machine
@@ -145,7 +146,7 @@ def half_square(cameras, points, image, point, xy) -> float:
 
 def unpacked(path: Path, folder: Path) -> Path:
     """The file itself, or its unpacked copy in the folder."""
-    opener = {".gz": gzip.open, ".bz2": bz2.open}.get(path.suffix)
+    opener = {".gz": gzip.open, ".bz2": bz2.open}.get(path.suffix.lower())
     if opener is None:
         return path
     copy = folder / path.stem
@@ -157,13 +158,19 @@ def unpacked(path: Path, folder: Path) -> Path:
 def main() -> None:
     parser = machine.parser_of(__doc__)
     parser.add_argument("kind", choices=("street", "arc"))
-    parser.add_argument("images", type=int)
-    parser.add_argument("points", type=int)
+    parser.add_argument("images", type=machine.positive)
+    parser.add_argument("points", type=machine.positive)
     parser.add_argument("seed", type=int)
     parser.add_argument("out", type=Path)
     given = parser.parse_args()
     scene = {"street": street, "arc": arc}[given.kind]
-    write_bal(given.out, *scene(given.images, given.points, given.seed))
+    try:
+        whole = scene(given.images, given.points, given.seed)
+    except (ValueError, IndexError):  # Of empty arrays.
+        whole = ((),)
+    if not len(whole[0]):
+        sys.exit("so few images and points have no rays")
+    write_bal(given.out, *whole)
 
 
 if __name__ == "__main__":
