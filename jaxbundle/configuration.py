@@ -133,7 +133,7 @@ def _check_address(host: str, port: int, process: int | None, wait_seconds: int)
         try:
             socket.create_server(("", port)).close()
         except OSError as error:
-            raise InputError(f"port {port}: {error.strerror}; take another") from None
+            raise InputError(f"port {port}: {os.strerror(error.errno)}; take another") from None
         return
     end = time.monotonic() + wait_seconds
     while process:
