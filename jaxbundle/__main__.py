@@ -6,6 +6,7 @@ library reads it when it is imported.
 
 import os
 import sys
+import warnings
 
 INTERRUPTED = 130
 
@@ -17,11 +18,30 @@ def main() -> None:
         from jaxbundle.configuration import keep_programs
 
         keep_programs()
+        _tell_once_of_damage()
         from jaxbundle.cli import main
 
         main()
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
+
+
+def _tell_once_of_damage() -> None:
+    """JAX warns of every kept program it cannot read, at every run, for it does not replace it."""
+    show, told = warnings.showwarning, []
+
+    def tell(message, *where):
+        if "persistent compilation cache entry" not in str(message):
+            return show(message, *where)
+        if not told and "--quiet" not in sys.argv:
+            print(
+                "jaxbundle: kept programs cannot be read or written; to mend it, delete the folder"
+                f" {sys.modules['jax'].config.jax_compilation_cache_dir}",
+                file=sys.stderr,
+            )
+        told.append(message)
+
+    warnings.showwarning = tell
 
 
 if __name__ == "__main__":

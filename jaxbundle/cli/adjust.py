@@ -1,8 +1,12 @@
 """`jaxbundle adjust`: adjust a network and report it."""
 
+import hashlib
+import signal
+import sys
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 import jaxbundle
@@ -11,6 +15,7 @@ from jaxbundle.cli.app import Format, Input, Quiet, Settings, app
 from jaxbundle.cli.progress import iterating
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io import read_network
+from jaxbundle.io.fingerprints import of_input
 from jaxbundle.network.columns import some
 from jaxbundle.network.reduction import REDUCTIONS
 from jaxbundle.result import Adjustment
@@ -69,10 +74,17 @@ def adjust(
     jaxbundle.enable_x64()
     jaxbundle.use_cores(cores)
     if join or cluster:
-        if json == "-":
-            raise InputError("--json - with --join or --cluster: give a file; the connection of "
-                             "the processes is reported on standard output")  # fmt: skip
-        if not jaxbundle.join_processes(*(join or ())):
+        if join and cluster:
+            raise InputError("--join with --cluster: give one of them")
+        if json in ("-", "/dev/stdout", "/dev/fd/1"):
+            raise InputError(f"--json {json} with --join or --cluster: give a file; the connection "
+                             "of the processes is reported on standard output")  # fmt: skip
+        first = _join(join, quiet)
+        _check_sameness(
+            of_input(input), set, format, max_iterations, method, reduction, robust, snooping,
+            significance, eliminate, components,
+        )  # fmt: skip
+        if not first:
             json, out, quiet = "", None, True
     network = read_network(input, format, tuple(set or ()))
     if method not in ("levenberg-marquardt", "gauss-newton"):
@@ -103,6 +115,30 @@ def adjust(
         print(report.text(result))
     if not result.converged:
         raise NotSolvedError(_why_not(result))
+
+
+def _join(join: tuple[str, int, int] | None, quiet: bool) -> bool:
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        # Python would wait for the end of a program that may itself wait for other processes.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    if join and not quiet:
+        print(f"jaxbundle: waiting for {join[1]} processes at {join[0]}", file=sys.stderr)
+    return jaxbundle.join_processes(*(join or ()))
+
+
+def _check_sameness(*given: object) -> None:
+    import jax
+    from jax.experimental.multihost_utils import process_allgather
+
+    digest = hashlib.blake2b(repr(given).encode(errors="replace"), digest_size=8).digest()
+    mine = np.frombuffer(digest, np.uint32)
+    try:
+        same = np.all(process_allgather(mine) == mine)
+    except jax.errors.JaxRuntimeError:
+        raise NotSolvedError("one of the processes is lost; start all of them again") from None
+    if not same:
+        jax.distributed.shutdown()  # All are here: none ends before the others have heard of it.
+        raise InputError("the processes were given different files or options")
 
 
 def _why_not(result: Adjustment) -> str:

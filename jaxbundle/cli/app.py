@@ -1,16 +1,17 @@
 """The application the commands are registered with, and how it ends."""
 
-import os
 import sys
+import traceback
 from pathlib import Path
 from typing import Annotated, NoReturn
 
 import typer
 
 import jaxbundle
+from jaxbundle.configuration import leave
 from jaxbundle.errors import InputError, NotSolvedError
 
-BAD_INPUT, NOT_SOLVED = 2, 3
+BAD_INPUT, NOT_SOLVED, INTERRUPTED = 2, 3, 130
 
 app = typer.Typer(
     name="jaxbundle",
@@ -56,17 +57,15 @@ def run() -> None:
     except (OSError, OverflowError, RecursionError) as error:
         _end(" ".join(str(error).split()), BAD_INPUT)
     except typer.Abort:
-        sys.exit(130)
+        leave(INTERRUPTED)
     except Exception as error:
         # Usage errors of the command line itself (unknown option, missing argument).
         if hasattr(error, "format_message"):
             _end(error.format_message(), BAD_INPUT)
-        raise
+        traceback.print_exc()
+        leave(1)
 
 
 def _end(message: object, status: int) -> NoReturn:
     print(f"jaxbundle: {message}", file=sys.stderr, flush=True)
-    jax = sys.modules.get("jax")
-    if jax and jax.distributed.is_initialized():
-        os._exit(status)  # An orderly exit would wait for the other processes.
-    sys.exit(status)
+    leave(status)

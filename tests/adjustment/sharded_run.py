@@ -1,17 +1,18 @@
 """Adjusts networks on several devices and processes, and prints what it found as JSON.
 
-    python sharded_run.py DEVICES [PROCESSES ID PORT [ABANDON]]
+    python sharded_run.py DEVICES [PROCESSES ID PORT [SIGNAL]]
 
-DEVICES are those of this process; with PROCESSES, it is number ID of so many. ABANDON: this process
-leaves without a word when the others rely on it.
+DEVICES are those of this process; with PROCESSES, it is number ID of so many. SIGNAL: this process
+gets it when the others rely on it.
 """
 
 import json
 import os
 import sys
+import time
 
 devices, *rest = map(int, sys.argv[1:])
-processes, rank, port, abandon = (*rest, *(1, 0, 0, 0)[len(rest) :])
+processes, rank, port, signal = (*rest, *(1, 0, 0, 0)[len(rest) :])
 os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={devices}"
 
 import jax  # noqa: E402
@@ -41,8 +42,9 @@ for name, counts in COUNTS.items() if processes == 1 else [("free with distances
     solver = make_solver(problem, atol=1e-9)
     for count in counts or (jax.device_count(),):
         shards = distribute(problem, jax.devices()[:count])
-        if abandon:
-            os._exit(1)
+        if signal:
+            os.kill(os.getpid(), signal)
+            time.sleep(10)
         minimum = find_minimum_of_shards(solver, shards, problem.data.start)
         cost = np.asarray(minimum.history.cost)[: int(minimum.iterations)]
         found[f"{name}, {count}{reduction}"] = {

@@ -2,6 +2,8 @@
 
 import json
 import os
+import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -12,13 +14,14 @@ import numpy as np
 import pytest
 from adjustment_checks import make, solved
 
+EXAMPLE = Path(__file__).parents[2] / "examples" / "convergent4"
 SCRIPT = Path(__file__).with_name("sharded_run.py")
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("sharding")]  # one worker, one cache
 
 
-def start(*arguments):
+def start(*arguments, program=(SCRIPT,)):
     return subprocess.Popen(
-        [sys.executable, SCRIPT, *map(str, arguments)],
+        [sys.executable, *program, *map(str, arguments)],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=dict(os.environ),
     )  # fmt: skip
 
@@ -76,10 +79,31 @@ def test_in_several_processes(processes):
         assert one[name]["cost"][-1] == pytest.approx(expected[-1], rel=1e-9)
 
 
-def test_a_lost_process_ends_the_others():
+@pytest.mark.parametrize("by", [signal.SIGKILL, signal.SIGTERM])
+def test_a_lost_process_ends_the_others(by):
     port = free_port()
-    running = [start(1, 2, k, port, int(k == 1)) for k in range(2)]
+    running = [start(1, 2, k, port, int(k and by)) for k in range(2)]
     running[1].communicate(timeout=300)
+    assert running[1].returncode == -by
     out, error = running[0].communicate(timeout=300)
     assert running[0].returncode != 0
     assert error and not out
+
+
+@pytest.mark.parametrize("other", ["file", "option"])
+def test_different_files_or_options_end_all(tmp_path, other):
+    folders = [shutil.copytree(EXAMPLE, tmp_path / name) for name in "ab"]
+    if other == "file":
+        with (folders[1] / "points.csv").open("a") as file:
+            file.write("\n")
+    join = ("--join", f"127.0.0.1:{free_port()}", 2)
+    running = [
+        start("adjust", folder / "project.toml", "--quiet", *join, k,
+              *(("--robust", "huber") if k and other == "option" else ()),
+              program=("-m", "jaxbundle"))
+        for k, folder in enumerate(folders)
+    ]  # fmt: skip
+    for process in running:
+        out, error = process.communicate(timeout=300)
+        assert process.returncode == 2 and "different files or options" in error
+        assert error.count("\n") == 1

@@ -173,6 +173,29 @@ def test_compiled_programs_are_kept_where_they_can_be(tmp_path):
     assert any((tmp_path / "new").iterdir())
 
 
+def test_damaged_or_refused_programs_are_told_at_most_once(tmp_path, monkeypatch):
+    code = (
+        "import contextlib, jax; from jaxbundle.__main__ import main\n"
+        "with contextlib.suppress(SystemExit): main()\n"
+        "jax.jit(lambda x: x + 1)(1.0); jax.jit(lambda x: x + 2)(1.0)"
+    )
+
+    def told(*arguments):
+        command = [sys.executable, "-W", "default", "-c", code, "convert", "--help", *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stderr
+
+    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "programs"))
+    assert told() == ""
+    for file in (tmp_path / "programs").glob("*-cache"):
+        file.write_bytes(b"damaged")
+    assert told().count("\n") == 1 and f"delete the folder {tmp_path / 'programs'}" in told()
+    assert told("--quiet") == ""
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "file"))
+    assert told() == ""
+
+
 def test_a_level_of_significance_is_between_0_and_1():
     done = run("adjust", EXAMPLE / "project.toml", "--snooping", "pope", "--significance", "1")
     assert done.returncode == 2 and "--significance 1: a number between 0 and 1" in done.stderr
@@ -218,9 +241,14 @@ def test_orient_names_what_is_missing(project):
     [
         (("--join", "nonsense", 2, 0), "'nonsense'"),
         (("--join", "127.0.0.1:99999", 2, 0), "'127.0.0.1:99999'"),
-        (("--join", "127.0.0.1:9922", 2, 5), "process_id=5"),
+        (("--join", "127.0.0.1:0", 2, 0), "'127.0.0.1:0'"),
+        (("--join", "127.0.0.1:9922", 2, 5), "process 5 of 2"),
+        (("--join", "127.0.0.1:9922", 2, -1), "process -1 of 2"),
+        (("--join", "no.machine.invalid:9922", 2, 1), "no machine 'no.machine.invalid'"),
+        (("--join", "127.0.0.1:9922", 2, 0, "--cluster"), "give one of them"),
         (("--join", "127.0.0.1:9922", 2, 0, "--json", "-"), "give a file"),
-        (("--cluster",), "under SLURM"),
+        (("--join", "127.0.0.1:9922", 2, 0, "--json", "/dev/stdout"), "give a file"),
+        (("--cluster",), "no SLURM variables"),
     ],
 )
 def test_processes_that_cannot_be_joined(options, said):
