@@ -26,9 +26,26 @@ if processes > 1:
 import numpy as np  # noqa: E402
 from adjustment_checks import make  # noqa: E402
 
+from jaxbundle import solution  # noqa: E402
 from jaxbundle.adjustment.sharding import distribute, find_minimum_of_shards  # noqa: E402
 from jaxbundle.adjustment.solve import make_solver  # noqa: E402
 
+
+def compiled_twice(problem):
+    """How many programs an adjustment compiles, and the same once more."""
+    compiled = []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, *_, **__: compiled.append(event) if "backend_compile" in event else None
+    )
+    numbers = []
+    for _ in range(2):
+        before = len(compiled)
+        solution.minimise(problem, problem.data.start, atol=1e-9)
+        numbers.append(len(compiled) - before)
+    return numbers
+
+
+solution.RAYS_TO_SHARE = 0
 COUNTS = {
     "shared cameras of two models": (2,),
     "free with distances": (1, 2, 4),
@@ -52,4 +69,6 @@ for name, counts in COUNTS.items() if processes == 1 else [("free with distances
             "cost": cost.tolist(),
             "camera": np.asarray(minimum.values.camera).tolist(),
         }
+if processes == 1:
+    found["compiled"] = compiled_twice(make("free with distances"))
 print(json.dumps(found))

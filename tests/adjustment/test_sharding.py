@@ -67,6 +67,11 @@ def test_conjugate_gradients_on_two_devices():
     np.testing.assert_allclose(found["camera"], expected.values.camera, rtol=1e-6, atol=1e-9)
 
 
+def test_a_network_adjusted_again_compiles_nothing():
+    first, again = on_one_processor()["compiled"]
+    assert first > 0 and again == 0
+
+
 @pytest.mark.parametrize("processes", [2, 4])
 def test_in_several_processes(processes):
     port = free_port()
