@@ -36,12 +36,9 @@ def figures_of(text: str) -> dict:
 
 
 def main() -> None:
-    parser = machine.parser_of(__doc__)
-    parser.add_argument("problem")
+    parser = machine.solver_parser(__doc__)
     parser.add_argument("--binary", required=True)
     parser.add_argument("--solver", choices=SOLVERS, default=SOLVERS[0])
-    parser.add_argument("--evaluations", type=machine.positive, default=200)
-    parser.add_argument("--repeat", type=machine.positive, default=2)
     parser.add_argument("--threads", type=machine.positive, default=2)
     given = parser.parse_args()
     command = [

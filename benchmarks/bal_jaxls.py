@@ -48,11 +48,7 @@ def problem_of(jaxls, cameras, points, image, point, xy):
 
 
 def main() -> None:
-    parser = machine.parser_of(__doc__)
-    parser.add_argument("problem")
-    parser.add_argument("--evaluations", type=machine.positive, default=30)
-    parser.add_argument("--repeat", type=machine.positive, default=2)
-    given = parser.parse_args()
+    given = machine.solver_parser(__doc__, evaluations=30).parse_args()
     try:
         import jaxls
 

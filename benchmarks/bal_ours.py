@@ -42,10 +42,7 @@ def prepare(path: str, evaluations: int, reduction: str | None):
 
 
 def main() -> None:
-    parser = machine.parser_of(__doc__)
-    parser.add_argument("problem")
-    parser.add_argument("--evaluations", type=machine.positive, default=200)
-    parser.add_argument("--repeat", type=machine.positive, default=2)
+    parser = machine.solver_parser(__doc__)
     parser.add_argument("--devices", type=machine.positive, default=2, help="of the processor")
     parser.add_argument("--reduction", choices=REDUCTIONS)
     parser.add_argument("--cache", help="folder of compiled programs")

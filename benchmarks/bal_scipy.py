@@ -46,11 +46,7 @@ def functions(cameras, points, image, point, xy):
 
 
 def main() -> None:
-    parser = machine.parser_of(__doc__)
-    parser.add_argument("problem")
-    parser.add_argument("--evaluations", type=machine.positive, default=20)
-    parser.add_argument("--repeat", type=machine.positive, default=1)
-    given = parser.parse_args()
+    given = machine.solver_parser(__doc__, evaluations=20, repeat=1).parse_args()
     jax.config.update("jax_enable_x64", True)
     cameras, points, *rays = scenes.read_bal(given.problem)
     start = np.concatenate([cameras.ravel(), points.ravel()])

@@ -199,8 +199,13 @@ def main() -> int:
                         help="timed calls; the best counts")  # fmt: skip
     parser.add_argument("--json", type=machine.target, metavar="FILE",
                         help="write the figures; - for standard output")  # fmt: skip
+    parser.add_argument("--write", metavar="FOLDER", help="only write the block as a project")
     arguments = parser.parse_args()
     jaxbundle.enable_x64()
+    if arguments.write:
+        simulation = block(arguments.images, arguments.points, arguments.spacing)
+        print(jaxbundle.write_project(simulation.network, arguments.write))
+        return 0
     figures = run(arguments.images, arguments.points, arguments.spacing, arguments.repeat)
     if arguments.json != "-":
         print(table(figures))

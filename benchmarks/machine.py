@@ -20,6 +20,15 @@ def parser_of(description: str) -> argparse.ArgumentParser:
     )
 
 
+def solver_parser(description: str, evaluations: int = 200, repeat: int = 2):
+    """For a program that runs one solver on one BAL problem."""
+    parser = parser_of(description)
+    parser.add_argument("problem")
+    parser.add_argument("--evaluations", type=positive, default=evaluations)
+    parser.add_argument("--repeat", type=positive, default=repeat)
+    return parser
+
+
 def positive(text: str) -> int:
     """A whole number from 1 on, of the command line."""
     if not (text.isdecimal() and int(text) > 0):

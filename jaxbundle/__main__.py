@@ -5,10 +5,9 @@ library reads it when it is imported.
 """
 
 import os
+import signal
 import sys
 import warnings
-
-INTERRUPTED = 130
 
 
 def main() -> None:
@@ -23,7 +22,7 @@ def main() -> None:
 
         main()
     except KeyboardInterrupt:
-        sys.exit(INTERRUPTED)
+        sys.exit(128 + signal.SIGINT)
 
 
 def _tell_once_of_damage() -> None:

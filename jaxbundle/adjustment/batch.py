@@ -55,10 +55,10 @@ class BatchCalibration:
 
     - `model`, `parameters`: the camera model and its k free parameters.
     - `status`: "converged"; "weak", as that, but the views do not determine the principal distance
-      or point, whose σ is above a fiftieth of the principal distance (or its `rms` is so large,
-      with wrong points, that they do not); without a solution "iteration
-      limit", "singular", "not finite" (a number among the measurements, or the start) or "too few
-      points" (no view of use, or no redundancy).
+      or point, whose σ is above a fiftieth of the principal distance (where `rms` is large, wrong
+      points are the reason); without a solution "iteration limit", "singular", "not finite" (a
+      number among the measurements, or the start) or "too few points" (no view of use, or no
+      redundancy).
     - `undetermined`: the free parameters that the views do not determine, where that is why the
       camera is weak, is singular or came to no end.
     - `values`, `sigma`, `covariance`: of the free parameters; pixels, coefficients without unit.
@@ -138,7 +138,8 @@ def calibrate_batch(
     - `free`: the parameters to estimate; if not given, for "opencv" those of OpenCV's model of 5
       coefficients, otherwise all.
     - `start`: start values of parameters, for all cameras or [cameras]; without focal lengths these
-      are found by themselves. What is neither free nor given is 0, or the middle of the image.
+      are found by themselves. What is neither free nor given is 0, or the middle of the image. A
+      view is left out whose points no ray reaches with a given distortion that folds over.
     - `threads`: portions solved at the same time on a CPU; the number of cores if not given.
     - `progress(done, total)`: called after every portion.
 

@@ -18,16 +18,7 @@ from jaxbundle.adjustment.problem import Problem
 from jaxbundle.adjustment.solver import BundleSolver, Minimum, minimise
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.arrays import Data, Values
-from jaxbundle.network.padding import (
-    LARGE,
-    Sizes,
-    common_sizes,
-    pad,
-    pad_values,
-    round_sizes,
-    sizes_of,
-    without_filling,
-)
+from jaxbundle.network.padding import Sizes, pad, pad_values, round_sizes, without_filling
 from jaxbundle.network.pairs import CHUNK_LENGTHS
 from jaxbundle.network.structure import Structure, make_structure
 from jaxbundle.network.tables import Distances
@@ -56,11 +47,7 @@ def distribute(problem: Problem, devices=None) -> Shards:
     devices = jax.devices() if devices is None else devices
     points = _cut(problem, len(devices))
     parts = [_part(problem, chosen, first=d == 0) for d, chosen in enumerate(points)]
-    structures = [structure for structure, _ in parts]
-    if problem.structure.rays > LARGE:
-        sizes = common_sizes([*map(sizes_of, structures)])
-    else:
-        sizes = round_sizes(structures)
+    sizes = round_sizes([structure for structure, _ in parts])
     parts = [pad(structure, data, sizes) for structure, data in parts]
     mesh = Mesh(np.array(devices), (AXIS,))
     arrays, static = zip(*(eqx.partition(part, eqx.is_array) for part in parts))

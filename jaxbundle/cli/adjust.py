@@ -1,17 +1,14 @@
 """`jaxbundle adjust`: adjust a network and report it."""
 
-import hashlib
-import signal
-import sys
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
 import jaxbundle
 from jaxbundle import report
 from jaxbundle.cli.app import Format, Input, Quiet, Settings, app
+from jaxbundle.cli.processes import check_sameness, join_processes
 from jaxbundle.cli.progress import iterating
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io import read_network
@@ -79,8 +76,8 @@ def adjust(
         if json in ("-", "/dev/stdout", "/dev/fd/1"):
             raise InputError(f"--json {json} with --join or --cluster: give a file; the connection "
                              "of the processes is reported on standard output")  # fmt: skip
-        first = _join(join, quiet)
-        _check_sameness(
+        first = join_processes(join, quiet)
+        check_sameness(
             of_input(input), set, format, max_iterations, method, reduction, robust, snooping,
             significance, eliminate, components,
         )  # fmt: skip
@@ -115,30 +112,6 @@ def adjust(
         print(report.text(result))
     if not result.converged:
         raise NotSolvedError(_why_not(result))
-
-
-def _join(join: tuple[str, int, int] | None, quiet: bool) -> bool:
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        # Python would wait for the end of a program that may itself wait for other processes.
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-    if join and not quiet:
-        print(f"jaxbundle: waiting for {join[1]} processes at {join[0]}", file=sys.stderr)
-    return jaxbundle.join_processes(*(join or ()))
-
-
-def _check_sameness(*given: object) -> None:
-    import jax
-    from jax.experimental.multihost_utils import process_allgather
-
-    digest = hashlib.blake2b(repr(given).encode(errors="replace"), digest_size=8).digest()
-    mine = np.frombuffer(digest, np.uint32)
-    try:
-        same = np.all(process_allgather(mine) == mine)
-    except jax.errors.JaxRuntimeError:
-        raise NotSolvedError("one of the processes is lost; start all of them again") from None
-    if not same:
-        jax.distributed.shutdown()  # All are here: none ends before the others have heard of it.
-        raise InputError("the processes were given different files or options")
 
 
 def _why_not(result: Adjustment) -> str:

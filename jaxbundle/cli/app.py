@@ -1,5 +1,6 @@
 """The application the commands are registered with, and how it ends."""
 
+import signal
 import sys
 import traceback
 from pathlib import Path
@@ -11,7 +12,7 @@ import jaxbundle
 from jaxbundle.configuration import leave
 from jaxbundle.errors import InputError, NotSolvedError
 
-BAD_INPUT, NOT_SOLVED, INTERRUPTED = 2, 3, 130
+BAD_INPUT, NOT_SOLVED = 2, 3
 
 app = typer.Typer(
     name="jaxbundle",
@@ -57,7 +58,7 @@ def run() -> None:
     except (OSError, OverflowError, RecursionError) as error:
         _end(" ".join(str(error).split()), BAD_INPUT)
     except typer.Abort:
-        leave(INTERRUPTED)
+        leave(128 + signal.SIGINT)
     except Exception as error:
         # Usage errors of the command line itself (unknown option, missing argument).
         if hasattr(error, "format_message"):

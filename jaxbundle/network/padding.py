@@ -94,11 +94,13 @@ def common_sizes(all_sizes) -> Sizes:
 
 def round_sizes(structures: Sequence[Structure]) -> Sizes:
     """Round sizes that hold each of these parts of a network, the same for all networks of nearly
-    its size.
+    its size; of a large one, that would feel it, the least.
 
     A table without rows stays one. The images of a band keep their number, on which it depends."""
     exact = [sizes_of(structure) for structure in structures]
     least = common_sizes(exact)
+    if sum(structure.rays for structure in structures) > LARGE:
+        return least
     chunks = _rounded(least.chunks)
     filled = np.max([np.add(sizes.groups, chunks - sizes.chunks) for sizes in exact], 0)
     found = {
@@ -174,7 +176,7 @@ def pad(structure: Structure, data: Data, sizes: Sizes) -> tuple[Structure, Data
 
 
 def filled(structure: Structure, data: Data) -> tuple[Structure, Data, Sizes]:
-    """The network in tables of round sizes; large ones, that would feel it, as they are."""
+    """The network in tables of round sizes; a large one as it is."""
     if structure.rays > LARGE:
         return structure, data, sizes_of(structure)
     sizes = round_sizes([structure])

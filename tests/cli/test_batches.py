@@ -183,7 +183,6 @@ def test_inputs_are_looked_at_before_anything_is_written(tmp_path):
 
 def test_the_table_of_the_docs(start, tmp_path):
     """docs/calibrate.md reads the file as a table."""
-    pytest.importorskip("pandas")
     docs = (Path(__file__).parents[2] / "docs" / "calibrate.md").read_text(encoding="utf-8")
     (code,) = (c for c in re.findall(r"```python\n(.*?)```", docs, re.S) if "pandas" in c)
     found = {}

@@ -1,0 +1,36 @@
+"""Several processes with one task: they find each other, and agree on what it is."""
+
+import hashlib
+import signal
+import sys
+
+import numpy as np
+
+import jaxbundle
+from jaxbundle.errors import InputError, NotSolvedError
+
+
+def join_processes(join: tuple[str, int, int] | None, quiet: bool) -> bool:
+    """Join, and say whether this is the process that writes."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        # Python would wait for the end of a program that may itself wait for other processes.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    if join and not quiet:
+        print(f"jaxbundle: waiting for {join[1]} processes at {join[0]}", file=sys.stderr)
+    return jaxbundle.join_processes(*(join or ()))
+
+
+def check_sameness(*given: object) -> None:
+    """Refuse, in all processes, what is not the same in all of them."""
+    import jax
+    from jax.experimental.multihost_utils import process_allgather
+
+    digest = hashlib.blake2b(repr(given).encode(errors="replace"), digest_size=8).digest()
+    mine = np.frombuffer(digest, np.uint32)
+    try:
+        same = np.all(process_allgather(mine) == mine)
+    except jax.errors.JaxRuntimeError:
+        raise NotSolvedError("one of the processes is lost; start all of them again") from None
+    if not same:
+        jax.distributed.shutdown()  # All are here: none ends before the others have heard of it.
+        raise InputError("the processes were given different files or options")
