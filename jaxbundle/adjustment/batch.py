@@ -139,7 +139,7 @@ def calibrate_batch(
       coefficients, otherwise all.
     - `start`: start values of parameters, for all cameras or [cameras]; without focal lengths these
       are found by themselves. What is neither free nor given is 0, or the middle of the image. A
-      view is left out whose points no ray reaches with a given distortion that folds over.
+      view is left out if the given camera turns too few of its points into rays.
     - `threads`: portions solved at the same time on a CPU; the number of cores if not given.
     - `progress(done, total)`: called after every portion.
 
