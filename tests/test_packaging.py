@@ -1,0 +1,36 @@
+"""What the distribution tells and carries: licence, metadata, types, and extras that are used."""
+
+import hashlib
+import re
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+APACHE = "cfc7749b96f63bd31c3c42b5c471bf756814053e847c10f3eb003417bc523d30"
+"""SHA-256 of LICENSE-2.0.txt as the Apache Software Foundation publishes it."""
+MODULES = {"opencv-python-headless": "cv2", "pyerfa": "erfa"}
+"""Distributions whose module has another name."""
+
+
+def test_licence_authors_and_addresses_are_told():
+    assert PROJECT["license"] == "Apache-2.0"
+    (name,) = PROJECT["license-files"]
+    assert hashlib.sha256((ROOT / name).read_bytes()).hexdigest() == APACHE
+    assert all(author["name"] for author in PROJECT["authors"])
+    assert {"Source", "Issues"} <= {*PROJECT["urls"]}
+    assert all(url.startswith("https://") for url in PROJECT["urls"].values())
+
+
+def test_type_checkers_are_told_of_the_annotations():
+    assert (ROOT / "jaxbundle" / "py.typed").is_file()
+
+
+def test_packages_of_extras_are_imported():
+    used = set()
+    for path in (ROOT / "jaxbundle").rglob("*.py"):
+        used |= {*re.findall(r"^\s*(?:import|from) (\w+)", path.read_text(), re.MULTILINE)}
+    for extra in ("plots", "tables", "images", "geo", "files"):
+        for requirement in PROJECT["optional-dependencies"][extra]:
+            package = re.match(r"[\w-]+", requirement)[0]
+            assert MODULES.get(package, package) in used, f"{package} is imported nowhere"
