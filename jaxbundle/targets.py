@@ -28,16 +28,21 @@ NETWORK_FILES = (FILE_NAME, *(f"{name}.csv" for name in NETWORK_TABLES))
 """In the folder of the adjusted network."""
 
 
-def check_targets(input: Path, network: Network, json: str, out: Path | None) -> None:
+def check_targets(
+    input: Path, network: Network, json: str, out: Path | None, control: Path | None = None
+) -> None:
     """Refuse a JSON file or a folder that cannot be written, or that would replace the input."""
     names = (*FILES, *(Path(ADJUSTED) / name for name in NETWORK_FILES))
-    check_writable(json, out, names, network_files(input, network))
+    check_writable(json, out, names, network_files(input, network, control))
 
 
-def network_files(input: Path, network: Network) -> tuple[str | Path, ...]:
+def network_files(
+    input: Path, network: Network, control: Path | None = None
+) -> tuple[str | Path, ...]:
     """The files a network was read from."""
     tables = (network.images, network.points, network.observations, network.distances)
-    return (input, input / FILE_NAME, *(table.source.name for table in tables))
+    files = (input, input / FILE_NAME, *(table.source.name for table in tables))
+    return files if control is None else (*files, control)
 
 
 def check_writable(

@@ -7,7 +7,7 @@ import typer
 
 import jaxbundle
 from jaxbundle import report
-from jaxbundle.cli.app import Format, Input, Quiet, Settings, app
+from jaxbundle.cli.app import Control, Format, Input, Quiet, Settings, app
 from jaxbundle.cli.processes import check_sameness, join_processes
 from jaxbundle.cli.progress import iterating
 from jaxbundle.errors import InputError, NotSolvedError
@@ -27,6 +27,7 @@ def adjust(
     out: Annotated[Path | None, typer.Option(help="folder for report, JSON, tables, plots")] = None,
     set: Settings = None,
     format: Format = None,
+    control: Control = None,
     max_iterations: Annotated[int, typer.Option(min=1)] = 100,
     method: Annotated[
         str, typer.Option(help="levenberg-marquardt or gauss-newton")
@@ -78,18 +79,18 @@ def adjust(
                              "of the processes is reported on standard output")  # fmt: skip
         first = join_processes(join, quiet)
         check_sameness(
-            of_input(input), set, format, max_iterations, method, reduction, robust, snooping,
-            significance, eliminate, components,
+            of_input(input), control and of_input(control), set, format, max_iterations, method,
+            reduction, robust, snooping, significance, eliminate, components,
         )  # fmt: skip
         if not first:
             json, out, quiet = "", None, True
-    network = read_network(input, format, tuple(set or ()))
+    network = read_network(input, format, tuple(set or ()), control)
     if method not in ("levenberg-marquardt", "gauss-newton"):
         raise InputError(f"--method {method!r}: levenberg-marquardt or gauss-newton")
     if reduction not in (None, *REDUCTIONS):
         raise InputError(f"--reduction {reduction!r}: {', '.join(REDUCTIONS)}")
     check_test(snooping, significance, "--")
-    check_targets(input, network, json, out)
+    check_targets(input, network, json, out, control)
     try:
         with iterating(quiet or json == "-") as tell:
             result = jaxbundle.adjust(

@@ -25,6 +25,10 @@ app = typer.Typer(
 Input = Annotated[Path, typer.Argument(help="project .toml, text list of photographs, …")]
 Settings = Annotated[list[str] | None, typer.Option(help="KEY=VALUE replaces a setting")]
 Format = Annotated[str | None, typer.Option(help="kind of input, if not recognised")]
+Control = Annotated[
+    Path | None,
+    typer.Option(help="table id,X,Y,Z[,sX,sY,sZ] whose control replaces that of the input"),
+]
 Quiet = Annotated[bool, typer.Option("--quiet", help="print nothing but errors")]
 
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from jaxbundle.cli.app import Format, Input, Quiet, Settings, app
+from jaxbundle.cli.app import Control, Format, Input, Quiet, Settings, app
 from jaxbundle.cli.cameras_given import pair
 from jaxbundle.errors import InputError
 from jaxbundle.io.exchange import convert as convert_file
@@ -31,6 +31,7 @@ def convert(
     ] = False,
     set: Settings = None,
     format: Format = None,
+    control: Control = None,
     quiet: Quiet = False,
 ) -> None:
     """Write any input in another format: project, COLMAP, BAL, Bundler, OpenCV, PLY, DXF, CSV."""
@@ -40,7 +41,7 @@ def convert(
         raise InputError(f"--image-size {image_size}: whole numbers of pixels are expected")
     done = convert_file(
         input, output, to, model, camera, format, overrides, measured,
-        size and tuple(map(int, size)), pair("--pixel-size", pixel_size), force,
+        size and tuple(map(int, size)), pair("--pixel-size", pixel_size), force, control,
     )  # fmt: skip
     if not quiet:
         print(str(done).split("\n", 1)[0])

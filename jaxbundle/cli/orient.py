@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 import jaxbundle
-from jaxbundle.cli.app import Format, Input, Quiet, Settings, app
+from jaxbundle.cli.app import Control, Format, Input, Quiet, Settings, app
 from jaxbundle.io import read_network, write_project
 from jaxbundle.targets import NETWORK_FILES, check_writable, network_files
 
@@ -19,13 +19,14 @@ def orient(
     ] = None,
     set: Settings = None,
     format: Format = None,
+    control: Control = None,
     quiet: Quiet = False,
 ) -> None:
     """Find the start values of images and points; what cannot be placed is named, with why."""
     jaxbundle.enable_x64()
-    network = read_network(input, format, tuple(set or ()))
+    network = read_network(input, format, tuple(set or ()), control)
     if out is not None:
-        check_writable("", out, NETWORK_FILES, network_files(input, network))
+        check_writable("", out, NETWORK_FILES, network_files(input, network, control))
     found = jaxbundle.orient(network)
     path = None if out is None else write_project(found.network, out)
     if not quiet:

@@ -35,7 +35,7 @@ from jaxbundle.io.poses import (
     matrices_of_rotation_vectors,
     rotation_vectors_of,
 )
-from jaxbundle.io.settings import SETTINGS, apply_overrides, check_settings
+from jaxbundle.io.settings import apply_overrides, check_settings
 from jaxbundle.io.unpacking import most_unpacked
 from jaxbundle.network.build import make_cameras, make_network
 from jaxbundle.network.columns import Columns, shown
@@ -90,11 +90,8 @@ def read_bal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             for c, row in enumerate(given[:, 6:])
         ],
     }  # fmt: skip
-    document = apply_overrides(document, overrides, (*SETTINGS, "free"))
+    document = apply_overrides(document, overrides)
     project = document["project"]
-    free = project.pop("free", None)
-    for camera in document["camera"] if free is not None else ():
-        camera["free"] = free
     check_settings(project, f"{path}: ")
     angle_unit = project.pop("angle_unit", "rad")
     return make_network(

@@ -71,6 +71,7 @@ def convert(
     image_size: Sequence[float] | None = None,
     pixel_size: Sequence[float] | None = None,
     force: bool = False,
+    control: str | Path | None = None,
 ) -> Converted:
     """Write an input in another format.
 
@@ -81,7 +82,7 @@ def convert(
     - `model`: camera model to convert to. Without it cameras are converted only where the output
       has not their model and the conversion is exact.
     - `camera`: which camera, where the output holds one.
-    - `format`, `overrides`: of the input, as in `read_network`.
+    - `format`, `overrides`, `control`: of the input, as in `read_network`.
     - `measured`: what is fitted is fitted over the area of the measurements, not the whole image.
     - `image_size` (pixels), `pixel_size` (mm): of all cameras that have none.
     - `force`: files that are there, the output and those written beside it, are replaced.
@@ -97,10 +98,10 @@ def convert(
         cameras = _sized(read_cameras(input), image_size, pixel_size)
         made = _convert_cameras(input, cameras, output, kind, model, camera)
         return dataclasses.replace(made, warnings=outside_warnings(cameras))
-    network = read_network(input, format, overrides)
+    network = read_network(input, format, overrides, control)
     network = network.replace(cameras=_sized(network.cameras, image_size, pixel_size))
     network = network.warn(*outside_warnings(network.cameras, network))
-    _keep_input(input, network, output, kind)
+    _keep_input(input, network, output, kind, control)
     _keep_others(output, kind, force)
     if kind in CAMERA_KINDS:
         if model is not None and measured:
@@ -162,7 +163,7 @@ def _check_output(output: Path, kind: str) -> None:
         raise InputError(f"{output}: there is no folder {output.parent}")
 
 
-def _keep_input(input: Path, network: Network, output: Path, kind: str) -> None:
+def _keep_input(input: Path, network: Network, output: Path, kind: str, control=None) -> None:
     """Refuse to replace what is read."""
     tables = (network.images, network.points, network.observations, network.distances)
     read = {os.path.realpath(p) for p in (input, *(table.source.name for table in tables))}
@@ -173,6 +174,8 @@ def _keep_input(input: Path, network: Network, output: Path, kind: str) -> None:
     inside = kind in ("project", "colmap", "colmap-text") and os.path.realpath(
         output.parent if output.name == FILE_NAME else output
     ) in folders
+    if control is not None:
+        read.add(os.path.realpath(control))
     if read & written or inside:
         raise InputError(f"{output} is the input and would be overwritten; give another place")
 

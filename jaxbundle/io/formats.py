@@ -13,6 +13,7 @@ from jaxbundle.io.bundler import is_bundler, read_bundler, write_bundler
 from jaxbundle.io.camera_files import is_camera_file
 from jaxbundle.io.colmap import is_colmap, read_colmap, write_colmap
 from jaxbundle.io.column_map import is_column_map, read_column_map
+from jaxbundle.io.control import read_control, with_control
 from jaxbundle.io.coordinates import write_coordinates
 from jaxbundle.io.dxf import write_dxf
 from jaxbundle.io.metashape import is_metashape, read_metashape
@@ -20,17 +21,19 @@ from jaxbundle.io.photo_list import read_photo_list
 from jaxbundle.io.photomodeler import is_photomodeler, read_photomodeler
 from jaxbundle.io.ply import write_ply
 from jaxbundle.io.project import FILE_NAME, project_file, read_project, write_project
-from jaxbundle.network.columns import did_you_mean
+from jaxbundle.network.columns import count, did_you_mean, some
 from jaxbundle.network.tables import Network
 
 
 @dataclasses.dataclass(frozen=True)
 class Format:
-    """A kind of input: how it is recognised, how it is read, and what it looks like in words."""
+    """A kind of input: how it is recognised, how it is read, and what it looks like in words;
+    `adjusted` where its control points have adjusted coordinates and a posteriori σ."""
 
     recognises: Callable[[Path], bool]
     read: Callable[[Path, Sequence[str]], Network]
     looks: str
+    adjusted: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +79,8 @@ FORMATS: dict[str, Format] = {
     "bingo": Format(is_bingo, read_bingo, "a folder with image.dat and geoin.dat"),
     "metashape": Format(is_metashape, read_metashape, "an .xml file of Metashape's cameras"),
     "photomodeler": Format(
-        is_photomodeler, read_photomodeler, 'a .txt file that begins with "Bundle Soln"'
+        is_photomodeler, read_photomodeler, 'a .txt file that begins with "Bundle Soln"',
+        adjusted=True,
     ),
     "bundler": Format(is_bundler, read_bundler, 'a file that begins with "# Bundle file"'),
 }
@@ -128,7 +132,10 @@ def recognised_format(path: Path) -> str | None:
 
 
 def read_network(
-    path: str | Path, format: str | None = None, overrides: Sequence[str] = ()
+    path: str | Path,
+    format: str | None = None,
+    overrides: Sequence[str] = (),
+    control: str | Path | None = None,
 ) -> Network:
     """The network of an input in any known format.
 
@@ -137,6 +144,7 @@ def read_network(
     - `path`: a file or folder.
     - `format`: a name in `FORMATS`; recognised from the path and its content if not given.
     - `overrides`: settings `KEY=VALUE` that replace those of the input.
+    - `control`: a table whose control points replace those of the input (`jaxbundle.io.control`).
 
     **Raises:** `InputError`.
     """
@@ -159,4 +167,24 @@ def read_network(
     if format is None:
         known = "; ".join(f"{name}: {kind.looks}" for name, kind in FORMATS.items())
         raise InputError(f"{path}: the kind of input is not recognised; known formats: {known}")
-    return FORMATS[format].read(path, overrides)
+    given = None if control is None else read_control(control)
+    network = FORMATS[format].read(path, overrides)
+    if given is not None:
+        datum = any(text.partition("=")[0].strip() == "datum" for text in overrides)
+        return with_control(network, given, datum=not datum)
+    return network.warn(*_of_adjusted_control(network)) if FORMATS[format].adjusted else network
+
+
+def _of_adjusted_control(network: Network):
+    """What is to be said of control that an adjustment has already moved, and of what is held."""
+    points = network.points
+    held = [id for id, role in zip(points.id, points.role) if role == "fixed"]
+    weighted = points.role.count("control")
+    if held:
+        yield f"{count(len(held), 'control point')} without positive σ held as fixed: {some(held)}"
+    if weighted:
+        yield (
+            f"the file gives {count(weighted, 'control point')} with adjusted coordinates and a "
+            "posteriori σ; adjusted again, control counts twice and σ0 is too small. Give the "
+            "control as it was measured: --control FILE (id,X,Y,Z,sX,sY,sZ)"
+        )

@@ -10,7 +10,7 @@ from typing import Any
 
 from jaxbundle.errors import InputError
 from jaxbundle.network.build import CAMERA_FIELDS, make_cameras, make_network
-from jaxbundle.network.columns import Columns, did_you_mean, shown
+from jaxbundle.network.columns import Columns, did_you_mean, shown, some
 from jaxbundle.network.rules import CHOICES, check_choice, check_sigma_image
 from jaxbundle.network.tables import Network
 
@@ -20,6 +20,8 @@ SETTINGS = (*TEXT, "sigma_image", "datum_points")
 CAMERA_KEYS = ("camera.ID.PARAMETER", "camera.ID.sigma.PARAMETER") + tuple(
     f"camera.ID.{field}" for field in CAMERA_FIELDS if field not in ("id", "sigma")
 )
+ALL = "*"
+"""Stands for all cameras, where none has this id."""
 
 Document = dict[str, Any]
 
@@ -29,22 +31,22 @@ def apply_overrides(
 ) -> Document:
     """The document with `KEY=VALUE` settings of the command line put in.
 
-    Keys are those of `[project]` in `keys`, `camera.ID.…` of a camera, and `free` where there
-    is one camera only.
+    Keys are those of `[project]` in `keys`, `camera.ID.…` of a camera, `camera.*.…` of all
+    cameras, and `free`, which is `camera.*.free`.
     """
     document = copy.deepcopy(document)
     for override in overrides:
         key, equals, text = (part.strip() for part in override.partition("="))
         if not equals:
             raise InputError(f"--set {override}: expected KEY=VALUE")
-        if key == "free" and len(document["camera"]) == 1:
-            document["camera"][0]["free"] = _words(text)
+        if key == "free":
+            _override_cameras(document["camera"], f"camera.{ALL}.free", text)
         elif key.startswith("camera."):
-            _override_camera(document["camera"], key, text)
+            _override_cameras(document["camera"], key, text)
         elif key in keys:
             document["project"][key] = _project_value(key, text)
         else:
-            known = (*keys, *CAMERA_KEYS)
+            known = (*keys, "free", *CAMERA_KEYS)
             raise InputError(f"--set {key}: unknown key; known: {', '.join(known)}")
     return document
 
@@ -52,21 +54,27 @@ def apply_overrides(
 def _project_value(key: str, text: str):
     if key == "sigma_image":
         return _number(key, text)
-    return _words(text) if key in ("datum_points", "free") else text
+    return _words(text) if key == "datum_points" else text
 
 
-def _override_camera(cameras: list[dict], key: str, text: str) -> None:
+def _override_cameras(cameras: list[dict], key: str, text: str) -> None:
+    """Put a setting into the camera the key names, or into all of them."""
     rest = key.removeprefix("camera.")
     ids = [str(camera.get("id", "")).strip() for camera in cameras]
     for c in sorted(range(len(ids)), key=lambda c: -len(ids[c])):
-        field, camera = rest.removeprefix(f"{ids[c]}."), cameras[c]
-        if field != rest:
-            break
-    else:
+        if rest.startswith(f"{ids[c]}."):
+            _override_camera(cameras[c], key, rest.removeprefix(f"{ids[c]}."), text)
+            return
+    if not rest.startswith(f"{ALL}."):
         raise InputError(
             f"--set {key}: no such camera; known: "
-            f"{', '.join(f'camera.{id}.PARAMETER' for id in ids)}"
+            f"{some((f'camera.{id}.PARAMETER' for id in (*ids, ALL)), 12, str)}"
         )
+    for camera in cameras:
+        _override_camera(camera, key, rest.removeprefix(f"{ALL}."), text)
+
+
+def _override_camera(camera: dict, key: str, field: str, text: str) -> None:
     if field == "free":
         camera["free"] = _words(text)
     elif field in ("image_size", "pixel_size"):

@@ -10,7 +10,7 @@ import pytest
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_network, read_project, write_opencv, write_project
 from jaxbundle.io.formats import FORMATS
-from jaxbundle.io.settings import CAMERA_KEYS, SETTINGS, TABLES
+from jaxbundle.io.settings import CAMERA_KEYS, SETTINGS, TABLES, apply_overrides
 from jaxbundle.network.build import (
     CAMERA_FIELDS,
     DISTANCE_COLUMNS,
@@ -20,6 +20,7 @@ from jaxbundle.network.build import (
     OBSERVATION_SIGMAS,
     POINT_COLUMNS,
     POINT_SIGMAS,
+    make_cameras,
     make_network,
 )
 from jaxbundle.network.check import check_network
@@ -144,6 +145,25 @@ def test_overrides(folder):
     assert (camera.sigma, camera.image_size) == ({"c": 0.1, "x0": 0.2}, (100, 200))
     assert read_project(folder / "project.toml", ["free=c,K2", "camera.cam.1.sigma.c=1"]).cameras[
         0].free == ("c", "K2")
+
+
+def test_settings_of_all_cameras():
+    cameras = [{"id": "a", "c": 5.0, "free": ["K1"]}, {"id": "b", "c": 6.0}]
+    opencv = {"id": "c", "model": "opencv", "fx": 1.0, "fy": 1.0}
+    document = {"project": {}, "camera": [*cameras, opencv]}
+    of = lambda *overrides: apply_overrides(document, overrides)["camera"]
+    assert [c["free"] for c in of("free=c,K1")] == [["c", "K1"]] * 3
+    assert [c["free"] for c in of("camera.*.free=c", "camera.b.free=K2")] == [["c"], ["K2"], ["c"]]
+    made = of("camera.*.image_size=100,200", "camera.*.sigma.K1=0.1", "camera.*.c=7")
+    assert all(c["image_size"] == [100, 200] and c["sigma"] == {"K1": 0.1} for c in made)
+    assert [c["c"] for c in made] == [7.0] * 3
+    assert document["camera"][:2] == cameras
+    star = {"project": {}, "camera": [{"id": "*"}, {"id": "b"}]}
+    assert apply_overrides(star, ["camera.*.c=1"])["camera"] == [{"id": "*", "c": 1.0}, {"id": "b"}]
+    with pytest.raises(InputError, match="camera 'c': free names the unknown parameter 'c'"):
+        make_cameras(of("free=c,K1"))
+    with pytest.raises(InputError, match=r"no such camera; known: .*camera.\*.PARAMETER"):
+        of("camera.d.c=1")
 
 
 @pytest.mark.parametrize("override, said", [
