@@ -18,7 +18,8 @@ import numpy as np
 
 from jaxbundle.adjustment.batch import BatchCalibration, calibrate_batch
 from jaxbundle.adjustment.batch_camera import CONVERGED, LIMIT, STATUS, WEAK
-from jaxbundle.adjustment.batch_input import at_least_one, free_parameters, pixel_model
+from jaxbundle.adjustment.batch_input import free_parameters, pixel_model
+from jaxbundle.arguments import whole
 from jaxbundle.bundle import adjust
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io import read_network
@@ -67,8 +68,8 @@ def run_batch(
     results of other settings or data in the file without `renew`, and for a file another run is
     writing; a network that cannot be read or solved gets a line that says so, and the others go on.
     """
-    portion = at_least_one("portion", portion)
-    max_iterations = at_least_one("max_iterations", max_iterations)
+    portion = whole("portion", portion)
+    max_iterations = whole("max_iterations", max_iterations)
     for path in inputs:
         if not os.path.exists(path):
             raise InputError(f"{path}: no such file or folder")

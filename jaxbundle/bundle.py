@@ -6,12 +6,14 @@ from types import MappingProxyType
 import numpy as np
 
 from jaxbundle.adjustment.problem import make_problem, with_factor
-from jaxbundle.adjustment.solve import converged
+from jaxbundle.adjustment.solve import METHODS, converged
+from jaxbundle.arguments import at_least_zero, one_of, shown, truth, whole
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.check import check_network
 from jaxbundle.network.columns import count, some
+from jaxbundle.network.reduction import REDUCTIONS
 from jaxbundle.network.sightings import split_check_points
-from jaxbundle.network.tables import Network
+from jaxbundle.network.tables import Network, require_network
 from jaxbundle.orientation.network import Oriented, lacks_start_values
 from jaxbundle.oriented import orient, orient_again, screen
 from jaxbundle.repeated import eliminated_parameters, robustly, snooped, with_components
@@ -72,11 +74,12 @@ def adjust(
     where it, or what data snooping, elimination or variance components leave of it, determines no
     answer.
     """
-    if robust not in (None, *ESTIMATORS):
-        raise InputError(f"robust must be one of {', '.join(ESTIMATORS)}, not {robust!r}")
-    check_test(snooping, significance)
-    if robust and snooping:
-        raise InputError("robust estimation or data snooping, not both at once")
+    require_network(network)
+    check_options(
+        method=method, reduction=reduction, max_iterations=max_iterations, robust=robust,
+        snooping=snooping, significance=significance, eliminate=eliminate, critical_t=critical_t,
+        estimate_components=estimate_components, progress=progress,
+    )  # fmt: skip
     given = network
     if lacks_start_values(given):
         network = _placed(orient(given))
@@ -132,6 +135,36 @@ def adjust(
         sigma_factors=factors, inspection=inspection, robust=robust,
         weights=None if weights is None else np.asarray(weights)[problem.rays],
     )  # fmt: skip
+
+
+def check_options(
+    *,
+    method="levenberg-marquardt",
+    reduction=None,
+    max_iterations=100,
+    robust=None,
+    snooping=None,
+    significance=0.001,
+    eliminate=False,
+    critical_t=2.0,
+    estimate_components=False,
+    progress=None,
+) -> None:
+    """Refuse options of `adjust` that cannot be.
+
+    **Raises:** `InputError`, naming the option and what is expected."""
+    one_of("method", method, tuple(METHODS))
+    one_of("reduction", reduction, REDUCTIONS, none=True)
+    whole("max_iterations", max_iterations)
+    one_of("robust", robust, ESTIMATORS, none=True)
+    check_test(snooping, significance)
+    if robust and snooping:
+        raise InputError("robust estimation or data snooping, not both at once")
+    truth("eliminate", eliminate)
+    at_least_zero("critical_t", critical_t)
+    truth("estimate_components", estimate_components)
+    if progress is not None and not callable(progress):
+        raise InputError(f"progress must be a function, but is {shown(progress)}")
 
 
 def _placed(found: Oriented) -> Network:

@@ -36,7 +36,10 @@ def use_cores(number: int | None = None) -> None:
     of JAX; call it before the first JAX computation."""
     import jax
 
-    jax.config.update("jax_num_cpu_devices", number or available_cores())
+    from jaxbundle.arguments import whole
+
+    cores = available_cores() if number is None else whole("number", number)
+    jax.config.update("jax_num_cpu_devices", cores)
 
 
 def keep_programs(folder: str | os.PathLike | None = None) -> bool:
@@ -50,6 +53,9 @@ def keep_programs(folder: str | os.PathLike | None = None) -> bool:
     """
     import jax
 
+    from jaxbundle.arguments import path
+
+    folder = None if folder is None else path("folder", folder)
     variable = "JAX_COMPILATION_CACHE_DIR"
     if folder is None:
         home = os.path.join(os.path.expanduser("~"), ".cache")
@@ -96,12 +102,19 @@ def join_processes(
     """
     import jax
 
+    from jaxbundle.arguments import whole
+
     expected = (
         "expected: host:port of process 0, the number of processes, and which one this is, from 0; "
         "none of them under SLURM"
     )
+    for name, value in (("processes", processes), ("process", process)):
+        if value is not None:
+            whole(name, value, least=0)
+    whole("lost_after_seconds", lost_after_seconds)
+    whole("wait_seconds", wait_seconds)
     if address is not None:
-        parts = re.fullmatch(r"(\S+):(\d{1,5})", address)
+        parts = re.fullmatch(r"(\S+):(\d{1,5})", str(address))
         if not parts or not 0 < int(parts[2]) < 65536:
             raise InputError(f"the processes cannot be joined at {address!r}; {expected}")
         if None not in (processes, process) and not 0 <= process < processes:

@@ -10,7 +10,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from jaxbundle.adjustment import Problem, solve
+from jaxbundle.arguments import positive, shown, whole
 from jaxbundle.cameras import CameraModel, project
+from jaxbundle.errors import InputError
 from jaxbundle.network.arrays import Data
 
 
@@ -58,6 +60,12 @@ def check_gradients(
     - `step`: of the differences, relative to the size of each leaf of the arguments; extrapolated
       from h and h/2 (Richardson), so the error is O(h⁴).
     """
+    if not callable(function) and not isinstance(function, CameraModel | Problem):
+        raise InputError(
+            f"function must be a function, a CameraModel or a Problem, but is {shown(function)}"
+        )
+    directions = whole("directions", directions)
+    step, tolerance = positive("step", step), positive("tolerance", tolerance)
     if isinstance(function, CameraModel):
         model = function
         function = lambda p, ray: jnp.stack(project(model, tuple(p), *ray))

@@ -19,8 +19,9 @@ from jaxbundle.adjustment.problem import Problem
 from jaxbundle.adjustment.solve import converged
 from jaxbundle.adjustment.solver import TERMINATIONS, Minimum
 from jaxbundle.adjustment.unknowns import Name, interior_names
+from jaxbundle.arguments import at_least_zero, shown
 from jaxbundle.cameras import get_model
-from jaxbundle.errors import NotSolvedError
+from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.geometry import (
     matrix_from_quaternion,
     omega_phi_kappa_near,
@@ -273,7 +274,10 @@ class Adjustment:
         return _place(camera, [given.id for given in self.problem.network.cameras], "camera")
 
     def insignificant(self, critical: float = 2.0) -> list[tuple[float, Name]]:
-        """Free interior parameters with t = |value|/σ below `critical`, the least first."""
+        """Free interior parameters with t = |value|/σ below `critical`, the least first.
+
+        **Raises:** `InputError` for a critical value that is negative or no number."""
+        critical = at_least_zero("critical", critical)
         found = [
             (entry["t"], Name("camera", camera, parameter))
             for camera, table in self.cameras.items()
@@ -286,7 +290,15 @@ class Adjustment:
         """Covariance of any unknowns by name, e.g. `("camera", "cam", "c")`,
         `("image", "12", "kappa")` (radians), `("point", "7", "Z")`.
 
-        **Raises:** `KeyError` for a name that is not there."""
+        **Raises:** `InputError` where nothing is named, or a name has other than three parts;
+        `KeyError` for a name that is not there."""
+        for name in names or (None,):
+            if isinstance(name, str) or np.shape(name) != (3,):
+                given = "none is given" if name is None else f"one is {shown(name)}"
+                raise InputError(
+                    'covariance: names of unknowns are expected, such as ("camera", "cam", "c") or '
+                    f'("point", "7", "Z"), but {given}'
+                )
         wanted = [Name(*map(str, name)) for name in names]
         for name in wanted:
             self._value_of(name, self.values)  # refuses what is not there
@@ -370,6 +382,7 @@ class Adjustment:
 
     def report(self, residual_limit: float = 3.0, **options) -> str:
         """The whole protocol as text (options: see `jaxbundle.report.text`)."""
+        residual_limit = at_least_zero("residual_limit", residual_limit)
         return report.text(self, residual_limit, **options)
 
     def __str__(self) -> str:

@@ -7,6 +7,7 @@ import pytest
 
 LAYERS = (
     "errors",
+    "arguments",
     "configuration",
     "geometry",
     "cameras",

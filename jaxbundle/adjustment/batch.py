@@ -31,11 +31,12 @@ from jaxbundle.adjustment.batch_camera import (
     Solved,
     solve_camera,
 )
-from jaxbundle.adjustment.batch_input import Batch, Portion, at_least_one
+from jaxbundle.adjustment.batch_input import Batch, Portion
 from jaxbundle.adjustment.batch_normal import POSE
 from jaxbundle.adjustment.batch_start import start_values
 from jaxbundle.adjustment.batch_weakness import vague, vanishing
 from jaxbundle.adjustment.problem import require_x64
+from jaxbundle.arguments import whole
 from jaxbundle.cameras import CameraModel, get_model
 from jaxbundle.configuration import available_cores
 from jaxbundle.geometry import (
@@ -56,9 +57,9 @@ class BatchCalibration:
     - `model`, `parameters`: the camera model and its k free parameters.
     - `status`: "converged"; "weak", as that, but the views do not determine the principal distance
       or point, whose σ is above a fiftieth of the principal distance (where `rms` is large, wrong
-      points are the reason); without a solution "iteration limit", "singular", "not finite" (a
-      number among the measurements, or the start) or "too few points" (no view of use, or no
-      redundancy).
+      points are the reason); without a solution "iteration limit", "singular", "not finite" (an
+      infinite number among the measurements, or the start) or "too few points" (no view of use, or
+      no redundancy).
     - `undetermined`: the free parameters that the views do not determine, where that is why the
       camera is weak, is singular or came to no end.
     - `values`, `sigma`, `covariance`: of the free parameters; pixels, coefficients without unit.
@@ -134,7 +135,8 @@ def calibrate_batch(
     - `image_size`: width and height in pixels: the principal point starts in the middle.
     - `model`: a camera model in pixels: "opencv", "kannala-brandt", "snavely".
     - `visible`: which points were measured where; all, if not given. What is not visible may have
-      any coordinates, NaN as well.
+      any coordinates. A point that is NaN or masked is not visible: in an image, where it was not
+      measured, or in the object.
     - `free`: the parameters to estimate; if not given, for "opencv" those of OpenCV's model of 5
       coefficients, otherwise all.
     - `start`: start values of parameters, for all cameras or [cameras]; without focal lengths these
@@ -145,12 +147,13 @@ def calibrate_batch(
 
     **Returns:** a `BatchCalibration`; look at `status` before anything else.
 
-    **Raises:** `InputError` for shapes and names that do not fit; `RuntimeError` without 64-bit
-    floats. What is wrong with the numbers of one camera stands in its status.
+    **Raises:** `InputError` for shapes and names that do not fit, and under `jax.jit`, `jax.vmap`
+    or `jax.grad`; `RuntimeError` without 64-bit floats. What is wrong with the numbers of one
+    camera stands in its status.
     """
     require_x64()
-    max_iterations = at_least_one("max_iterations", max_iterations)
-    threads = available_cores() if threads is None else at_least_one("threads", threads)
+    max_iterations = whole("max_iterations", max_iterations)
+    threads = available_cores() if threads is None else whole("threads", threads)
     batch = Batch.of(object_points, image_points, image_size, model, visible, free, start)
     camera_model = get_model(model)
     on_cpu = jax.default_backend() == "cpu"

@@ -2,12 +2,12 @@
 
 import dataclasses
 import math
-import operator
 from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
 from jaxbundle.adjustment.batch_normal import Sightings
+from jaxbundle.arguments import numeric_array
 from jaxbundle.cameras import CameraModel, default_parameters, get_model
 from jaxbundle.errors import InputError
 
@@ -47,39 +47,6 @@ class Portion:
     interior: np.ndarray
     axes: np.ndarray
     middle: np.ndarray
-
-
-def as_array(name: str, values, expected: str) -> np.ndarray:
-    """Values as an array of numbers, or of truth values.
-
-    **Raises:** `InputError` that says what is expected."""
-    try:
-        array = np.asarray(values)
-    except (ValueError, TypeError):
-        raise InputError(f"{name} must be {expected}, but its rows differ in length") from None
-    if array.dtype.kind not in "biuf" or (array.dtype.kind == "b" and name != "visible"):
-        raise InputError(f"{name} must be {expected}, but is {_kind_of(array)}")
-    return array
-
-
-def _kind_of(array: np.ndarray) -> str:
-    kinds = {"U": "text", "S": "text", "c": "complex numbers", "b": "truth values"}
-    if array.dtype.kind == "O" and array.shape == ():
-        return repr(array.item())[:80]
-    return kinds.get(array.dtype.kind, f"an array of {array.dtype}")
-
-
-def at_least_one(name: str, value) -> int:
-    """A whole number from 1 to 10⁹.
-
-    **Raises:** `InputError`."""
-    try:
-        number = operator.index(value)
-    except TypeError:
-        number = 0
-    if not 1 <= number <= 10**9 or isinstance(value, bool):
-        raise InputError(f"{name} must be a whole number from 1 to 10⁹, but is {value!r:.80}")
-    return number
 
 
 def once(X: np.ndarray, xy: np.ndarray) -> np.ndarray:
@@ -152,18 +119,21 @@ class Batch:
     @classmethod
     def of(cls, object_points, image_points, image_size, model, visible, free, start):
         model = pixel_model(model)
-        xy = as_array("image_points", image_points, "numbers [cameras, views, points, 2]")
-        X = once(as_array("object_points", object_points, "numbers [points, 3]"), xy)
-        size = as_array("image_size", image_size, "width and height in pixels")
+        xy = numeric_array("image_points", image_points, "numbers [cameras, views, points, 2]")
+        X = once(numeric_array("object_points", object_points, "numbers [points, 3]"), xy)
+        size = numeric_array("image_size", image_size, "width and height in pixels")
         if visible is None:
             visible = np.ones(xy.shape[:3], bool)
-        visible = as_array("visible", visible, "true or false [cameras, views, points]")
+        visible = numeric_array(
+            "visible", visible, "true or false [cameras, views, points]", truths=True
+        )
         check_shapes(X, xy, size, visible)
         X, xy = X.astype(float), xy.astype(float)
         cameras = len(xy)
         free = free_parameters(model, free)
         interior, known = _interior(model, free, start, size, cameras)
-        visible = visible.astype(bool)
+        there = ~np.isnan(X).any(-1)
+        visible = visible.astype(bool) & ~np.isnan(xy).any(-1) & there[..., None, :]
         seen = visible.any(1)
         X = np.where(seen[..., None], X, 0.0)
         xy = np.where(visible[..., None], xy, 0.0)
@@ -280,7 +250,7 @@ def _interior(model: CameraModel, free, start, size, cameras):
     number = f"a number, or one for each of {cameras} cameras"
     columns = []
     for name in model.parameters:
-        column = as_array(f"start: {name}", {**values, **start}[name], number)
+        column = numeric_array(f"start: {name}", {**values, **start}[name], number)
         if column.shape not in ((), (1,), (cameras,)):
             raise InputError(f"start: {name} must be {number}, but has the shape {column.shape}")
         if name in model.principal_distance and (column <= 0).any():

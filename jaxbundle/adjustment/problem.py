@@ -14,12 +14,13 @@ from jaxbundle.adjustment.datum import (
     open_directions_in_words,
     open_similarities,
 )
+from jaxbundle.arguments import one_of
 from jaxbundle.errors import InputError
 from jaxbundle.network.arrays import Data
 from jaxbundle.network.reduction import FACTORS, REDUCTIONS
 from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.structure import Structure, make_structure, order_cameras
-from jaxbundle.network.tables import Network
+from jaxbundle.network.tables import Network, require_network
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,6 +73,8 @@ def make_problem(network: Network, reduction: str | None = None) -> Problem:
     64-bit floats.
     """
     require_x64()
+    one_of("reduction", reduction, REDUCTIONS, none=True)
+    require_network(network)
     network = order_cameras(split_check_points(network)[0])
     ways = REDUCTIONS if reduction is None else (reduction,)
     structure, data, origin, rays = make_structure(network, ways=ways)

@@ -1,5 +1,7 @@
 """`solve`: arrays in, adjusted arrays out, differentiable, under jit and vmap."""
 
+from typing import get_args
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,6 +11,8 @@ from jaxbundle.adjustment.datum import move_to_datum
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.adjustment.sensitivity import Sensitivity, attach_derivatives
 from jaxbundle.adjustment.solver import BundleSolver, FullStep, Minimum, TrustRegion, minimise
+from jaxbundle.arguments import one_of, positive, shown, whole
+from jaxbundle.errors import InputError
 from jaxbundle.network.arrays import Data, Values
 
 METHODS = {"levenberg-marquardt": TrustRegion(), "gauss-newton": FullStep()}
@@ -16,8 +20,7 @@ METHODS = {"levenberg-marquardt": TrustRegion(), "gauss-newton": FullStep()}
 
 def make_solver(problem: Problem, method: str = "levenberg-marquardt", **options) -> BundleSolver:
     """The solver of a problem; `options` are those of `BundleSolver`."""
-    if method not in METHODS:
-        raise ValueError(f"method must be one of {', '.join(METHODS)}, not {method!r}")
+    one_of("method", method, tuple(METHODS))
     redundancy = jax.device_put(np.float64(problem.counts.redundancy))
     return BundleSolver(problem.structure, redundancy, METHODS[method], **options)
 
@@ -59,6 +62,14 @@ def solve(
     **Returns:** `Values`; NaN throughout where the solver did not converge, so that a failure can
     never be taken for an answer.
     """
+    if not isinstance(problem, Problem):
+        raise InputError(
+            f"problem must be what jaxbundle.make_problem gives, but is {shown(problem)}"
+        )
+    if data is not None and not isinstance(data, Data):
+        raise InputError(f"data must be a Data, as problem.data is one, but is {shown(data)}")
+    one_of("sensitivity", sensitivity, get_args(Sensitivity))
+    max_iterations, atol = whole("max_iterations", max_iterations), positive("atol", atol)
     data = problem.data if data is None else data
     solver = make_solver(problem, method, atol=atol, max_steps=max_iterations)
     minimum = find_minimum(solver, jax.lax.stop_gradient(data))

@@ -14,7 +14,7 @@
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -23,14 +23,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.adjustment.problem import require_x64
-from jaxbundle.bundle import adjust
+from jaxbundle.arguments import number, positive, shown, text, vector
+from jaxbundle.bundle import adjust, check_options
 from jaxbundle.calibration.frames import in_model_units, in_pixels, unit_size
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.start import Start, default_free, start_values
 from jaxbundle.cameras import CameraModel, get_model
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_quaternion
-from jaxbundle.measure.boards import Board
+from jaxbundle.measure.boards import Board, require_board
 from jaxbundle.measure.ellipses import rim_centre_shift
 from jaxbundle.measure.views import BoardViews, measure_boards
 from jaxbundle.network.build import make_network
@@ -90,11 +91,23 @@ def calibrate(
     pixel_size = _pair(pixel_size)
     unit_size(camera_model, pixel_size)
     _check(sigma_image, board_sigma, board_free)
+    _check_given(camera_model, given)
+    text("camera", camera), text("object_unit", object_unit)
+    options |= {"robust": robust, "snooping": None if robust else snooping}
+    check_options(**options)
     check_test(snooping, options.get("significance", 0.001))
     views = photographs
     if not isinstance(views, BoardViews):
         if board is None:
             raise InputError("calibrate: give the board that is in the photographs")
+        require_board(board)
+        if isinstance(views, str | Path):
+            views = photographs = [views]
+        if not isinstance(views, Sequence):
+            raise InputError(
+                "photographs must be a list of files, patterns or folders, or BoardViews, but is "
+                f"{shown(views)}"
+            )
         views = measure_boards(photographs, board, progress)
     board = views.board
     start = start_values(views, camera_model, free, pixel_size, given)
@@ -106,7 +119,6 @@ def calibrate(
         start, made, sigma_image, board_sigma=board_sigma, board_free=board_free,
         object_unit=object_unit,
     )  # fmt: skip
-    options |= {"robust": robust, "snooping": None if robust else snooping}
     result = adjust(network, **options)
     if board.diameter is not None and board.kind != "chessboard" and result.converged:
         for _ in range(ECCENTRICITY_ROUNDS):
@@ -189,7 +201,11 @@ def _model(name: str, free) -> tuple[CameraModel, tuple[str, ...]]:
         model = get_model(name)
     except ValueError as error:
         raise InputError(str(error)) from None
+    if isinstance(free, str) or not (free is None or isinstance(free, Iterable)):
+        raise InputError(f"free must be a list of names, such as ['fx', 'fy'], but is {free!r:.60}")
     free = default_free(model) if free is None else tuple(free)
+    if not free or len({*free}) < len(free):
+        raise InputError("free: name at least one parameter, and each once")
     for parameter in free:
         if parameter not in model.parameters or parameter in model.never_free:
             known = [p for p in model.parameters if p not in model.never_free]
@@ -203,17 +219,30 @@ def _model(name: str, free) -> tuple[CameraModel, tuple[str, ...]]:
 def _pair(pixel_size) -> tuple[float, float] | None:
     if pixel_size is None:
         return None
-    pair = np.broadcast_to(np.asarray(pixel_size, float), 2)
-    if not (np.isfinite(pair) & (pair > 0)).all():
+    pair = vector("pixel_size", pixel_size, 2, "a positive length in mm, or two")
+    if not (pair > 0).all():
         raise InputError(f"pixel size {pixel_size}: a positive length in mm is expected")
     return float(pair[0]), float(pair[1])
 
 
+def _check_given(model: CameraModel, given) -> None:
+    if given is None:
+        return
+    if not isinstance(given, Mapping):
+        raise InputError(f"given must be like {{'fx': 900.0}}, but is {shown(given)}")
+    for name, value in given.items():
+        if name not in model.parameters:
+            raise InputError(
+                f"given: camera model {model.name!r} has no parameter {name!r}; its parameters "
+                f"are {', '.join(model.parameters)}"
+            )
+        check = positive if name in model.principal_distance else number
+        check(f"given: {name}", value)
+
+
 def _check(sigma_image, board_sigma, board_free) -> None:
-    for name, value in (("sigma of the image", sigma_image), ("sigma of the board", board_sigma)):
-        if value is not None and not (np.isfinite(value) and value > 0):
-            raise InputError(f"{name} is {value}; a positive number is expected")
+    positive("sigma_image", sigma_image)
+    if board_sigma is not None:
+        positive("board_sigma", board_sigma)
     if board_free and board_sigma is not None:
         raise InputError("the board is either free or has a σ (--board-free, --board-sigma)")
-
-

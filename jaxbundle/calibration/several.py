@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from jaxbundle.arguments import shown
 from jaxbundle.calibration.calibrate import calibrate
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.rig import calibrate_rig
@@ -50,6 +51,11 @@ def calibrate_cameras(
 
     **Raises:** `InputError`, `NotSolvedError`, naming the camera where there are several.
     """
+    if not isinstance(photographs, Mapping) or not photographs:
+        raise InputError(
+            "photographs must be by the name of the camera, such as {'left': ['left/*.jpg']}, but "
+            f"is {shown(photographs)}"
+        )
     if rig and len(photographs) < 2:
         raise InputError("a rig has two cameras or more: give --camera NAME=PATTERN for each")
     found = {}

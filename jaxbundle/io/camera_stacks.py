@@ -5,7 +5,7 @@
 | `object_points` | [points, 3] or [cameras, points, 3] | known coordinates |
 | `image_points` | [cameras, views, points, 2] | pixels |
 | `image_size` | [2] | width, height |
-| `visible` | [cameras, views, points] | optional: what was measured |
+| `visible` | [cameras, views, points] | optional: what was measured; NaN is not visible either |
 | `ids` | [cameras] | optional: names; otherwise 0, 1, 2, … |
 """
 
@@ -18,7 +18,8 @@ from typing import BinaryIO
 
 import numpy as np
 
-from jaxbundle.adjustment.batch_input import as_array, check_shapes, once
+from jaxbundle.adjustment.batch_input import check_shapes, once
+from jaxbundle.arguments import numeric_array
 from jaxbundle.errors import InputError
 from jaxbundle.io.fingerprints import of_arrays
 from jaxbundle.io.unpacking import most_unpacked
@@ -58,7 +59,8 @@ class CameraStack:
         there is for it."""
         X = self.object_points if self.object_points.ndim == 2 else self.object_points[camera]
         xy = self.image_points[camera]
-        seen = np.ones(xy.shape[:2], bool) if self.visible is None else self.visible[camera] != 0
+        seen = ~np.isnan(xy).any(-1) & ~np.isnan(X).any(-1)
+        seen = seen if self.visible is None else seen & (self.visible[camera] != 0)
         return of_arrays(
             np.argwhere(seen), xy[seen], X[seen.any(0)], np.array(self.image_size)
         )
@@ -96,7 +98,8 @@ def read_camera_stack(path: str | Path) -> CameraStack:
     visible = arrays.get("visible")
     try:
         for name in {*arrays} - {"ids"}:
-            as_array(name, arrays[name], "true or false" if name == "visible" else "numbers")
+            mask = name == "visible"
+            numeric_array(name, arrays[name], "true or false" if mask else "numbers", truths=mask)
         X = once(X, xy)
         check_shapes(X, xy, size, np.ones(xy.shape[:3]) if visible is None else visible)
     except InputError as error:

@@ -9,6 +9,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+from jaxbundle.arguments import path as given_path
 from jaxbundle.cameras import Conversion
 from jaxbundle.errors import InputError
 from jaxbundle.io.bundler import LIST
@@ -89,7 +90,7 @@ def convert(
 
     **Raises:** `InputError`; nothing is written then.
     """
-    input, output = Path(input), Path(output)
+    input, output = Path(given_path("input", input)), Path(given_path("output", output))
     kind = _kind(output, to)
     _check_output(output, kind)
     if format in (None, *CAMERA_KINDS) and is_camera_file(input):

@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
+from jaxbundle.arguments import path as given_path
+from jaxbundle.arguments import shown
 from jaxbundle.errors import InputError
 from jaxbundle.io.bal import OPENERS, is_bal, read_bal, write_bal
 from jaxbundle.io.bingo import is_bingo, read_bingo
@@ -148,7 +150,13 @@ def read_network(
 
     **Raises:** `InputError`.
     """
-    path = Path(path)
+    path = Path(given_path("path", path))
+    if isinstance(overrides, str) or not (
+        isinstance(overrides, Sequence) and all(isinstance(text, str) for text in overrides)
+    ):
+        raise InputError(
+            f"overrides must be a list of texts, such as ['datum=inner'], but is {shown(overrides)}"
+        )
     if format is not None and format not in FORMATS:
         if format in TARGETS or format == "opencv":
             what = "holds a camera alone" if format == "opencv" else "is written only"

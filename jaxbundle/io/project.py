@@ -36,6 +36,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from jaxbundle.arguments import path as given_path
 from jaxbundle.errors import InputError
 from jaxbundle.io.csv_tables import read_csv, read_toml, write_csv, write_text
 from jaxbundle.io.settings import SETTINGS, TABLES, Document, apply_overrides, network_of
@@ -50,7 +51,7 @@ from jaxbundle.network.build import (
     POINT_SIGMAS,
 )
 from jaxbundle.network.columns import Columns, as_columns, did_you_mean
-from jaxbundle.network.tables import Camera, Network, Source
+from jaxbundle.network.tables import Camera, Network, Source, require_network
 from jaxbundle.network.units import ANGLE_UNITS, to_image_unit
 
 FILE_NAME = "project.toml"
@@ -131,7 +132,7 @@ def write_project(network: Network, folder: str | Path) -> Path:
     Reading it again gives the same network (its warnings stand in the file as comments). Every
     file is written under a temporary name and renamed, `project.toml` last.
     """
-    folder = Path(folder)
+    network, folder = require_network(network), Path(given_path("folder", folder))
     images, points, rays = network.images, network.points, network.observations
     xy, sigma = to_image_unit(
         network.cameras, images.camera[rays.image], rays.xy, rays.sigma, network.image_unit

@@ -23,6 +23,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.arguments import number, shown, whole
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import did_you_mean
 
@@ -30,6 +31,10 @@ KINDS = ("chessboard", "circles", "asymmetric-circles", "charuco")
 LEAST = {"chessboard": 3, "circles": 2, "asymmetric-circles": 2, "charuco": 3}
 MARKER = 0.75
 """Side of a marker, in sides of a square, if it is not given."""
+
+
+def _is_length(x: float) -> bool:
+    return 0 < x < np.inf
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,18 +62,21 @@ class Board:
     dictionary: str = "DICT_4X4_50"
 
     def __post_init__(self):
-        if self.kind not in KINDS:
+        if not isinstance(self.kind, str) or self.kind not in KINDS:
             raise InputError(f"kind of board {self.kind!r}{did_you_mean(self.kind, KINDS)}")
         least = LEAST[self.kind]
+        for name in ("columns", "rows"):
+            whole(f"board: {name}", getattr(self, name), least=0)
         if min(self.columns, self.rows) < least or self.columns * self.rows > 100_000:
             raise InputError(
                 f"board {self.columns}x{self.rows}: a {self.kind} board needs at least "
                 f"{least} columns and rows"
             )
-        for name, value in (("square", self.square), ("diameter", self.diameter),
-                            ("marker", self.marker)):  # fmt: skip
-            if value is not None and not (np.isfinite(value) and value > 0):
-                raise InputError(f"board: {name} is {value}; a positive length is expected")
+        for name in ("square", "diameter", "marker"):
+            value = getattr(self, name)
+            if value is not None or name == "square":
+                length = number(f"board: {name}", value, "a positive length", _is_length)
+                object.__setattr__(self, name, length)
         if self.marker is not None and self.marker >= self.square:
             raise InputError(
                 f"board: a marker of {self.marker:g} does not fit into a square of {self.square:g}"
@@ -105,3 +113,14 @@ class Board:
 
     def __str__(self) -> str:
         return f"{self.kind} {self.columns}x{self.rows}, square {self.square:g}"
+
+
+def require_board(board: Board) -> Board:
+    """The board, or a complaint about what was given instead.
+
+    **Raises:** `InputError`."""
+    if not isinstance(board, Board):
+        raise InputError(
+            f"board must be a Board, such as Board(9, 6, 0.03), but is {shown(board)}"
+        )
+    return board

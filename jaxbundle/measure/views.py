@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxbundle.arguments import numeric_array
 from jaxbundle.configuration import available_cores
 from jaxbundle.errors import InputError
-from jaxbundle.measure.boards import Board
+from jaxbundle.measure.boards import Board, require_board
 from jaxbundle.measure.corners import find_board, largest_chessboard, other_sizes
 from jaxbundle.measure.photographs import read_photograph
 
@@ -47,6 +48,14 @@ class BoardViews:
     warnings: tuple[str, ...] = ()
 
     def __post_init__(self):
+        require_board(self.board)
+        if isinstance(self.names, str) or not isinstance(self.names, Sequence | np.ndarray):
+            raise InputError(f"names must be a list, one for each view, but is {self.names!r:.60}")
+        object.__setattr__(self, "names", tuple(map(str, self.names)))
+        if len({*self.names}) < len(self.names):
+            raise InputError("names of the views must differ, but some occur twice")
+        xy = numeric_array("xy", self.xy, "pixels [views, points, 2]").astype(float)
+        object.__setattr__(self, "xy", xy)
         points = len(self.board.ids)
         if np.shape(self.xy) != (len(self.names), points, 2):
             raise InputError(
@@ -54,8 +63,12 @@ class BoardViews:
                 f"the shape [{len(self.names)}, {points}, 2], but have {np.shape(self.xy)}"
             )
         size = self.image_size
-        if np.shape(size) != (2,) or not all(np.isfinite(n) and n > 0 for n in size):
-            raise InputError(f"image_size must be columns and rows, but is {size!r}")
+        try:
+            good = np.shape(size) == (2,) and all(0 < n < np.inf for n in size)
+        except (TypeError, ValueError):
+            good = False
+        if not good:
+            raise InputError(f"image_size must be columns and rows, but is {size!r:.60}")
 
     def __len__(self) -> int:
         return len(self.names)

@@ -16,14 +16,22 @@ Missing values (None, NaN, empty text) mean: no start value, no σ. A σ of an i
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from jaxbundle.arguments import text
 from jaxbundle.cameras import MODEL_NAMES, get_model
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import Columns, as_columns, did_you_mean, shown
+from jaxbundle.network.columns import (
+    NO_NUMBERS,
+    Columns,
+    as_columns,
+    did_you_mean,
+    is_missing,
+    shown,
+)
 from jaxbundle.network.rules import (
     AXES,
     CHOICES,
@@ -91,6 +99,10 @@ def make_network(
         check_choice(key, given[key], choices)
     if sigma_image is not None:
         check_sigma_image(sigma_image)
+    for key, value in (("object_unit", object_unit), ("name", name)):
+        text(key, value)
+    if isinstance(datum_points, str) or not isinstance(datum_points, Iterable):
+        raise InputError(f"datum_points must be a list of ids, not {shown(datum_points)}")
 
     cameras = make_cameras(cameras)
     images = _make_images(as_columns(images, "images"), cameras, ANGLE_UNITS[angle_unit])
@@ -132,7 +144,12 @@ def make_cameras(cameras: Any, where: str = "") -> tuple[Camera, ...]:
     elif isinstance(cameras, Mapping) or hasattr(cameras, "columns"):
         table = as_columns(cameras, "cameras")
         rows = ({k: v[row] for k, v in table.values.items()} for row in range(len(table)))
-        cameras = [{k: v for k, v in row.items() if not _missing(v)} for row in rows]
+        cameras = [{k: v for k, v in row.items() if not is_missing(v)} for row in rows]
+    if isinstance(cameras, str) or not isinstance(cameras, Iterable):
+        raise InputError(
+            f"{where}cameras: expected Camera objects, dict rows or a data frame of pandas, not "
+            f"{shown(cameras)}"
+        )
     made = tuple(
         camera if isinstance(camera, Camera) else _camera(camera, number, where)
         for number, camera in enumerate(cameras, 1)
@@ -143,10 +160,6 @@ def make_cameras(cameras: Any, where: str = "") -> tuple[Camera, ...]:
     for camera in made:
         check_camera(camera, where)
     return made
-
-
-def _missing(value) -> bool:
-    return value is None or (isinstance(value, float) and math.isnan(value))
 
 
 def _camera(row: Mapping[str, Any], number: int, where: str) -> Camera:
@@ -183,7 +196,7 @@ def _camera(row: Mapping[str, Any], number: int, where: str) -> Camera:
 
 
 def _number(where: str, key: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+    if isinstance(value, NO_NUMBERS) or not isinstance(value, int | float | np.number):
         raise InputError(f"{where}{key} is {shown(value)}; a number is expected")
     try:
         return float(value)

@@ -22,7 +22,15 @@ from jaxbundle.network.sightings import (
 )
 from jaxbundle.network.sightings import split_check_points as split_check_points
 from jaxbundle.network.single_strip import check_single_strip
-from jaxbundle.network.tables import EXTERIOR, ROLES, Images, Network, Points, Source
+from jaxbundle.network.tables import (
+    EXTERIOR,
+    ROLES,
+    Images,
+    Network,
+    Points,
+    Source,
+    require_network,
+)
 from jaxbundle.network.units import ANGLE_UNITS
 
 
@@ -49,6 +57,7 @@ def check_network(network: Network) -> Network:
 def check_tables(network: Network) -> Network:
     """The network with every value looked at, whatever can be determined from them; start values
     may be missing. As in `check_network`."""
+    require_network(network)
     for key, choices in CHOICES.items():
         check_choice(key, getattr(network, key), choices)
     _check_sizes(network)

@@ -13,12 +13,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxbundle.arguments import refuse_traced
+from jaxbundle.arguments import shown as shown
 from jaxbundle.cameras.names import closest_name
 from jaxbundle.errors import InputError
 from jaxbundle.network.tables import Source
 
-BOOLEAN = (bool, np.bool_)
-"""No numbers, although Python converts them."""
+NO_NUMBERS = (bool, np.bool_, complex, np.complexfloating, type(np.ma.masked))
+"""Python or numpy converts them: truth values to 0 and 1, complex numbers to their real parts."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,14 +84,14 @@ class Columns:
             value = value.strip()
             if value in words:
                 return words[value]
-        if value is None or value == "":
+        if is_missing(value):
             return math.nan
         try:
-            number = float(value)
+            number = math.nan if isinstance(value, NO_NUMBERS) else float(value)
             good = not isinstance(value, str) or (math.isfinite(number) and "_" not in value)
         except (TypeError, ValueError, OverflowError):
             good = False
-        if not good or isinstance(value, BOOLEAN):
+        if not good or isinstance(value, NO_NUMBERS):
             or_word = "".join(f" or {word!r}" for word in words)
             raise InputError(
                 f"{self.source(row)}: {name} is {shown(value)}; a number{or_word} is expected"
@@ -116,31 +118,61 @@ def as_columns(table: Any, name: str) -> Columns:
     if isinstance(table, Columns):
         return table
     source = Source(name)
-    if hasattr(table, "columns"):
-        present = table.notna()
-        return Columns({
-            str(c): table[c].astype(object).where(present[c], None).to_list()
-            for c in table.columns
-        }, source)
+    if hasattr(table, "columns") and hasattr(table, "notna"):
+        return _of_frame(table, source)
     if isinstance(table, Mapping):
         columns = {str(c): _column(values, c, name) for c, values in table.items()}
         lengths = {c: len(values) for c, values in columns.items()}
         if len(set(lengths.values())) > 1:
             raise InputError(f"{name}: the columns differ in length: {lengths}")
         return Columns(columns, source)
-    rows = list(table)
+    rows = list(table) if isinstance(table, Iterable) else [table]
     if not all(isinstance(row, Mapping) for row in rows):
         raise InputError(
-            f"{name}: expected a data frame, a dict of columns, or a list of dict rows"
+            f"{name}: expected a data frame of pandas, a dict of columns, or a list of dict rows, "
+            f"not {shown(table)}"
         )
+    refuse_traced(name, rows)
     keys = dict.fromkeys(str(key) for row in rows for key in row)
     return Columns({key: [row.get(key) for row in rows] for key in keys}, source)
 
 
+def _of_frame(table: Any, source: Source) -> Columns:
+    names = [str(column) for column in table.columns]
+    if len({*names}) < len(names):
+        twice = next(column for column in names if names.count(column) > 1)
+        raise InputError(f"{source.name}: two columns are called {twice!r}; expected one of each")
+    present = table.notna()
+    return Columns({
+        name: table[c].astype(object).where(present[c], None).to_list()
+        for name, c in zip(names, table.columns)
+    }, source)
+
+
 def _column(values: Any, column: str, name: str) -> Sequence[Any]:
+    """Values of a column; None where an array is masked."""
+    refuse_traced(f"{name}: column {column!r}", values)
     if isinstance(values, str) or not isinstance(values, Iterable):
-        raise InputError(f"{name}: column {column!r} must be a sequence, not {values!r}")
+        raise InputError(f"{name}: column {column!r} must be a sequence, not {shown(values)}")
+    shape = np.shape(values) if hasattr(values, "shape") else (0,)
+    if len(shape) != 1:
+        raise InputError(
+            f"{name}: column {column!r} must have one dimension, a value for each row, but has "
+            f"the shape {shape}"
+        )
+    if isinstance(values, np.ma.MaskedArray):
+        return values.tolist()
     return values if isinstance(values, np.ndarray) else list(values)
+
+
+def is_missing(value: Any) -> bool:
+    """None, NaN, empty text, what is masked, and the missing values of pandas."""
+    if value is None or value is np.ma.masked:
+        return True
+    if isinstance(value, str):
+        return not value.strip()
+    number = isinstance(value, float | np.floating)
+    return bool(np.isnan(value)) if number else type(value).__name__ in ("NAType", "NaTType")
 
 
 def did_you_mean(name: str, known: Iterable[str], *, listing: bool = True) -> str:
@@ -150,12 +182,6 @@ def did_you_mean(name: str, known: Iterable[str], *, listing: bool = True) -> st
     if close is not None:
         return f"; did you mean {close!r}?"
     return f"; known: {', '.join(known)}" if listing and known else ""
-
-
-def shown(value: Any) -> str:
-    """A value as a message shows it: what is long is cut."""
-    text = repr(value.item() if isinstance(value, np.generic) else value)
-    return text if len(text) <= 60 else f"{text[:58]}…"
 
 
 def quoted(name: Any) -> str:
@@ -178,7 +204,7 @@ def count(number: int, thing: str, rest: str = "") -> str:
 def _id(value: Any) -> str:
     if isinstance(value, str):
         return value.strip()
-    if value is None or value != value:
+    if is_missing(value):
         return ""
     if isinstance(value, float | np.floating) and float(value).is_integer():
         value = int(value)
@@ -189,10 +215,12 @@ def _plain_numbers(values: Sequence[Any]) -> np.ndarray | None:
     """The fast way, for columns without a missing or odd cell; else None."""
     if isinstance(values, np.ndarray) and values.dtype.kind in "iuf":
         return values.astype(float)
+    if any(isinstance(value, NO_NUMBERS) for value in values):
+        return None
     try:
         numbers = np.fromiter(map(float, values), float, len(values))
     except (TypeError, ValueError, OverflowError):
         return None
     texts = [value for value in values if isinstance(value, str)]
     odd = texts and (not np.isfinite(numbers).all() or any("_" in text for text in texts))
-    return None if odd or any(isinstance(value, BOOLEAN) for value in values) else numbers
+    return None if odd else numbers

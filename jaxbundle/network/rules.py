@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxbundle.arguments import one_of
 from jaxbundle.cameras import MODEL_NAMES, check_parameters, default_parameters, get_model
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import did_you_mean, shown
@@ -23,8 +24,7 @@ CHOICES = {
 
 def check_choice(key: str, value: str, choices: Sequence[str], where: str = "") -> None:
     """Refuse a setting that is not one of its choices."""
-    if value not in choices:
-        raise InputError(f"{where}{key} must be one of {', '.join(choices)}, not {value!r}")
+    one_of(f"{where}{key}", value, choices)
 
 
 def check_unique(ids: Sequence[str], source: Source, thing: str) -> None:

@@ -22,12 +22,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxbundle.arguments import numeric_array, positive, shown, text, whole
 from jaxbundle.cameras import default_parameters, get_model, image_ray, project
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.network.build import make_cameras
 from jaxbundle.network.rules import CHOICES, check_choice
-from jaxbundle.network.stations import Stations, rows_of_three
+from jaxbundle.network.stations import LARGEST_SEED, Stations, rows_of_three
 from jaxbundle.network.tables import (
     Camera,
     Distances,
@@ -140,10 +141,25 @@ def simulate_with_truth(
         )
     check_choice("datum", datum, CHOICES["datum"])
     check_choice("residuals", residuals, CHOICES["residuals"])
+    if not isinstance(stations, Stations):
+        raise InputError(
+            f"stations must be Stations, but is {shown(stations)}: ring_of_stations, aerial_block "
+            "or stations_looking_at give them"
+        )
     targets = rows_of_three(targets, "targets")
+    seed = whole("seed", seed, least=0, most=LARGEST_SEED)
+    min_rays = whole("min_rays", min_rays, least=0)
+    max_rays = None if max_rays is None else whole("max_rays", max_rays)
+    if max_incidence is not None:
+        max_incidence = positive("max_incidence", max_incidence)
+    distance_sigma = positive("distance_sigma", distance_sigma)
+    if normals is not None:
+        normals = _normals(normals, targets)
+    for key, value in (("name", name), ("object_unit", object_unit)):
+        text(key, value)
     cameras = make_cameras(camera)
     of_station = _camera_of_station(cameras, camera_of_station, len(stations))
-    begin = cameras if start is None else make_cameras(start)
+    begin = cameras if start is None else make_cameras(start, "start: ")
     if len(begin) != len(cameras):
         raise InputError(f"start has {len(begin)} cameras, camera {len(cameras)}; give as many")
     role = _roles(len(targets), control, control_sigma, check)
@@ -234,7 +250,7 @@ def _camera_of_station(cameras, given, stations: int) -> Int[np.ndarray, " image
                 "index of the camera of every station"
             )
         return np.arange(stations) % len(cameras)
-    given = np.asarray(given)
+    given = numeric_array("camera_of_station", given, "indices of cameras")
     if given.shape != (stations,) or not np.isin(given, np.arange(len(cameras))).all():
         raise InputError(
             f"camera_of_station must be {stations} indices below {len(cameras)}, one a station"
@@ -251,7 +267,9 @@ def _roles(points: int, control, control_sigma, check):
         ("control", control, "fixed" if (sigma == 0).all() else "control"),
         ("check", check, "check"),
     ):
-        chosen = np.asarray(chosen, int).reshape(-1)
+        chosen = _indices(name, chosen)
+        if chosen.ndim != 1:
+            raise InputError(f"{name} must be a list of indices, but is {shown(chosen.tolist())}")
         if not np.isin(chosen, np.arange(points)).all():
             raise InputError(f"{name} holds an index that is not among the {points} targets")
         if (role[chosen] != "tie").any():
@@ -260,8 +278,17 @@ def _roles(points: int, control, control_sigma, check):
     return role
 
 
+def _indices(name: str, values):
+    """Indices of targets; none may be given as []."""
+    array = numeric_array(name, values, "indices of targets")
+    if array.size and array.dtype.kind not in "iu":
+        raise InputError(f"{name} must be indices of targets, whole numbers, but is "
+                         f"{shown(array.tolist())}")  # fmt: skip
+    return array.astype(int)
+
+
 def _not_negative(value, size: int, name: str):
-    value = np.asarray(value, float)
+    value = numeric_array(name, value, f"0 or positive, one number or {size}").astype(float)
     if value.shape not in ((), (size,)) or not (np.isfinite(value) & (value >= 0)).all():
         raise InputError(f"{name} is {value}; it must be 0 or positive, one number or {size}")
     return np.broadcast_to(value, size)
@@ -269,7 +296,7 @@ def _not_negative(value, size: int, name: str):
 
 def _disturbance(disturb, rays):
     """σ of the start values of positions, angles and points."""
-    if np.ndim(disturb) == 0:
+    if numeric_array("disturb", disturb, "a fraction, or three σ").ndim == 0:
         length = float(np.linalg.norm(rays, axis=1).mean())
         disturb = (disturb * length, disturb, disturb * length)
     return _not_negative(disturb, 3, "disturb")
@@ -277,7 +304,14 @@ def _disturbance(disturb, rays):
 
 def _ends(distances, targets: int, used, row):
     """The ends of the distances as rows of the points used."""
-    ends = np.asarray(distances, int).reshape(-1, 2)
+    ends = _indices("distances", distances)
+    if ends.shape != (0,) and (ends.ndim != 2 or ends.shape[1] != 2 or (ends[:, 0] == ends[:, 1])
+                               .any()):  # fmt: skip
+        raise InputError(
+            "distances must be pairs of indices of two different targets, but is "
+            f"{shown(ends.tolist())}"
+        )
+    ends = ends.reshape(-1, 2)
     if not np.isin(ends, np.arange(targets)).all():
         raise InputError(f"distances name an index that is not among the {targets} targets")
     for a, b in ends[~used[ends].all(1)][:1]:
@@ -289,10 +323,21 @@ def _facing(stations, targets, normals, image, point):
     """Cosine of the angle between a target's normal and the direction to the camera."""
     if normals is None:
         raise InputError("max_incidence needs the normals of the targets; give normals [P, 3]")
-    normals = np.broadcast_to(np.asarray(normals, float), targets.shape)
-    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     ray = stations.position[image] - targets[point]
     return (ray * normals[point]).sum(1) / np.linalg.norm(ray, axis=1)
+
+
+def _normals(normals, targets):
+    """Unit vectors [P, 3]."""
+    normals = numeric_array("normals", normals, "directions X, Y, Z").astype(float)
+    if normals.shape not in ((3,), targets.shape):
+        raise InputError(
+            f"normals must have the shape [3] or {list(targets.shape)}, but has {normals.shape}"
+        )
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    if not (np.isfinite(length) & (length > 0)).all():
+        raise InputError("normals must be finite directions, none of them 0, 0, 0")
+    return np.broadcast_to(normals / length, targets.shape)
 
 
 def _at_most(point, max_rays: int, rng):
@@ -359,7 +404,7 @@ def _format(camera: Camera, image_format):
             size = np.array(camera.image_size) * camera.pixel_size
     if size is None:
         return np.full(2, -np.inf), np.full(2, np.inf)
-    size = np.asarray(size, float)
+    size = numeric_array("image_format", size, "(width, height)").astype(float)
     if size.shape != (2,) or not (np.isfinite(size) & (size > 0)).all():
         raise InputError(f"image_format is {size}; expected (width, height), both positive")
     if model.axes == "down":

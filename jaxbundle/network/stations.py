@@ -12,8 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.arguments import number, numeric_array, positive, shown, vector, whole
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import omega_phi_kappa_from_matrix
+
+COORDINATES = "finite coordinates X, Y, Z"
+LARGEST_SEED = 2**128
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +51,7 @@ class Stations:
 
 def rows_of_three(values, name: str) -> Float[np.ndarray, "rows 3"]:
     """Finite numbers [rows, 3], or a complaint that names them."""
-    values = np.asarray(values, float)
+    values = numeric_array(name, values, "numbers [rows, 3]").astype(float)
     if values.ndim != 2 or values.shape[1] != 3 or not len(values):
         raise InputError(f"{name} has the shape {values.shape}; expected [rows, 3]")
     for row, k in np.argwhere(~np.isfinite(values))[:1]:
@@ -73,9 +77,19 @@ def stations_looking_at(
       looks along `up` has its x axis along X of the object space.
     """
     position = rows_of_three(position, "stations: position")
-    up = np.asarray(up, float)
+    look_at = numeric_array("look_at", look_at, "coordinates X, Y, Z").astype(float)
+    if look_at.shape not in ((3,), position.shape) or not np.isfinite(look_at).all():
+        raise InputError(
+            f"look_at must be finite coordinates [3], or {list(position.shape)}, one point for "
+            f"each station, but is {shown(look_at.tolist())}"
+        )
+    up = vector("up", up, 3, "a direction X, Y, Z")
+    if not up.any():
+        raise InputError("up must be a direction X, Y, Z, but is 0, 0, 0")
+    roll = vector("roll", roll, len(position), f"an angle, or one for each of {len(position)} "
+                  "stations")  # fmt: skip
     # The camera looks along −z, so z points from the object back to the camera.
-    z = position - np.asarray(look_at, float)
+    z = position - look_at
     length = np.linalg.norm(z, axis=1, keepdims=True)
     for row in np.flatnonzero(length[:, 0] == 0)[:1]:
         raise InputError(f"stations: station {row + 1} stands on the point it looks at")
@@ -106,14 +120,16 @@ def ring_of_stations(
     many-th camera is turned by 90° about its axis (2: every other one; 0: none). Without turned
     cameras, or an object with depth, the principal point is poorly determined.
     """
+    stations = whole("stations", stations)
+    radius, height = positive("radius", radius), number("height", height)
+    roll_every = whole("roll_every", roll_every, least=0)
+    look_at = vector("look_at", look_at, 3, COORDINATES)
     azimuth = 2 * np.pi * np.arange(stations) / stations
     offset = np.stack(
         [radius * np.cos(azimuth), radius * np.sin(azimuth), np.full(stations, height)], 1
     )
     turned = np.arange(1, stations + 1) % roll_every == 0 if roll_every else np.zeros(stations)
-    return stations_looking_at(
-        np.asarray(look_at, float) + offset, look_at, roll=np.pi / 2 * turned
-    )
+    return stations_looking_at(look_at + offset, look_at, roll=np.pi / 2 * turned)
 
 
 def aerial_block(
@@ -143,13 +159,23 @@ def aerial_block(
 
     **Returns:** strips × images_per_strip stations, centred above `centre`.
     """
-    for name, overlap in (("forward_overlap", forward_overlap), ("side_overlap", side_overlap)):
-        if not overlap < 1:
-            raise InputError(f"{name} is {overlap}; it must be a fraction below 1")
+    strips = whole("strips", strips)
+    images_per_strip = whole("images_per_strip", images_per_strip)
+    footprint = vector("footprint", footprint, 2, "two lengths, along and across the flight")
+    if not (footprint > 0).all():
+        raise InputError(f"footprint must be two positive lengths, but is {footprint.tolist()}")
+    centre = vector("centre", centre, 3, COORDINATES)
+    height, heading, tilt = (
+        number(name, value)
+        for name, value in (("height", height), ("heading", heading), ("tilt", tilt))
+    )
+    below_one = lambda x: -np.inf < x < 1
+    forward_overlap = number("forward_overlap", forward_overlap, "a fraction below 1", below_one)
+    side_overlap = number("side_overlap", side_overlap, "a fraction below 1", below_one)
     base, spacing = footprint[0] * (1 - forward_overlap), footprint[1] * (1 - side_overlap)
-    strip, number = np.divmod(np.arange(strips * images_per_strip), images_per_strip)
+    strip, place = np.divmod(np.arange(strips * images_per_strip), images_per_strip)
     back = strip % 2 == 1
-    along = base * (number - (images_per_strip - 1) / 2) * np.where(back, -1, 1)
+    along = base * (place - (images_per_strip - 1) / 2) * np.where(back, -1, 1)
     across = spacing * (strip - (strips - 1) / 2)
     c, s = np.cos(heading), np.sin(heading)
     offset = np.stack(
@@ -160,8 +186,12 @@ def aerial_block(
     x = np.cos(tilt) * direction + np.sin(tilt) * up
     z = np.cos(tilt) * up - np.sin(tilt) * direction
     return Stations(
-        np.asarray(centre, float) + offset, _angles(np.stack([x, np.cross(z, x), z], 1))
+        centre + offset, _angles(np.stack([x, np.cross(z, x), z], 1))
     )
+
+
+def _a_length(x: float) -> bool:
+    return 0 <= x < np.inf
 
 
 def _angles(matrices: Float[np.ndarray, "images 3 3"]) -> Float[np.ndarray, "images 3"]:
@@ -183,12 +213,18 @@ def grid_of_targets(
     **Arguments:** `spacing` along X and Y; `relief`: heights vary at random (by `seed`) within
     ± relief; 0 gives a plane.
     """
-    dx, dy = np.broadcast_to(spacing, 2)
+    columns, rows = whole("columns", columns), whole("rows", rows)
+    dx, dy = vector("spacing", spacing, 2, "one positive length, or two along X and Y")
+    if not min(dx, dy) > 0:
+        raise InputError(f"spacing must be positive, but is {shown(spacing)}")
+    relief = number("relief", relief, "0 or a positive length", _a_length)
+    centre = vector("centre", centre, 3, COORDINATES)
+    seed = whole("seed", seed, least=0, most=LARGEST_SEED)
     x = dx * (np.arange(columns) - (columns - 1) / 2)
     y = dy * (np.arange(rows) - (rows - 1) / 2)
     xy = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     z = np.random.default_rng(seed).uniform(-relief, relief, len(xy))
-    return np.asarray(centre, float) + np.concatenate([xy, z[:, None]], 1)
+    return centre + np.concatenate([xy, z[:, None]], 1)
 
 
 def cloud_of_targets(
@@ -199,6 +235,10 @@ def cloud_of_targets(
     centre: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> Float[np.ndarray, "points 3"]:
     """Targets at random in a box of the given `size` (one edge, or three): [points, 3]."""
-    half = np.broadcast_to(size, 3) / 2
-    rng = np.random.default_rng(seed)
-    return np.asarray(centre, float) + rng.uniform(-half, half, (points, 3))
+    points = whole("points", points)
+    half = vector("size", size, 3, "one length of an edge, or three") / 2
+    if (half < 0).any():
+        raise InputError(f"size must be 0 or positive lengths, but is {shown((2 * half).tolist())}")
+    centre = vector("centre", centre, 3, COORDINATES)
+    rng = np.random.default_rng(whole("seed", seed, least=0, most=LARGEST_SEED))
+    return centre + rng.uniform(-half, half, (points, 3))

@@ -13,10 +13,14 @@ are kept beside them for people.
 """
 
 import dataclasses
+import os
 from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+
+from jaxbundle.arguments import shown
+from jaxbundle.errors import InputError
 
 ROLES = ("tie", "control", "fixed", "check")
 DATUMS = ("control", "inner", "minimal")
@@ -189,3 +193,17 @@ class Network:
             f"{len(self.points)} points, {len(self.observations)} image points, "
             f"{len(self.distances)} distances, datum {self.datum}"
         )
+
+
+def require_network(network: Network, name: str = "network") -> Network:
+    """The network, or a complaint about what was given instead.
+
+    **Raises:** `InputError`."""
+    if isinstance(network, Network):
+        return network
+    is_path = isinstance(network, str | os.PathLike)
+    remedy = f"jaxbundle.read_network({os.fspath(network)!r})" if is_path else (
+        "jaxbundle.read_network(path), make_network or simulate give one"
+    )
+    raise InputError(f"{name} must be a Network, but is {shown(network)}: {remedy}"
+                     + " reads it" * is_path)  # fmt: skip

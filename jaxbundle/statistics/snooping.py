@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.adjustment.problem import Problem, count_rows
+from jaxbundle.arguments import number
 from jaxbundle.errors import InputError
 from jaxbundle.network.arrays import Values
 from jaxbundle.statistics.distributions import critical_w
@@ -47,10 +48,9 @@ def check_test(test: str | None, significance: float, option: str = "") -> None:
 
     **Raises:** `InputError`.
     """
-    if test not in (None, *TESTS):
+    if test is not None and (not isinstance(test, str) or test not in TESTS):
         raise InputError(f"{option}snooping {test!r}: {' or '.join(TESTS)}")
-    if not 0 < significance < 1:
-        raise InputError(f"{option}significance {significance:g}: a number between 0 and 1")
+    number(f"{option}significance", significance, "a number between 0 and 1", lambda a: 0 < a < 1)
 
 
 def snoop(

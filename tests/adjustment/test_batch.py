@@ -159,6 +159,28 @@ def test_what_is_not_visible_counts_as_removed(three):
     assert_allclose(masked.position[:, views], removed.position, atol=1e-8)
 
 
+def test_masked_or_nan_is_not_visible(three):
+    """As in `BoardViews`: measurements that are NaN or masked, and points without coordinates."""
+    xy, visible = three[0].copy(), np.random.default_rng(3).uniform(size=three[0].shape[:3]) > 0.2
+    expected = jaxbundle.calibrate_batch(BOARD, xy, SIZE, visible=visible)
+    assert expected.converged.all() and (expected.redundancy != expected.redundancy[0]).any()
+    xy[~visible, 0] = np.nan
+    hidden = np.ma.masked_array(np.nan_to_num(xy, nan=77.0), np.isnan(xy))
+    mask = np.ma.masked_array(np.ones(visible.shape, bool), ~visible)
+    for image_points, seen in ((xy, None), (hidden, None), (list(hidden), None), (three[0], mask)):
+        found = jaxbundle.calibrate_batch(BOARD, image_points, SIZE, visible=seen)
+        for camera in range(3):
+            same(found, expected, camera, camera)
+    without = visible.copy()
+    without[:, :, 7] = False
+    expected = jaxbundle.calibrate_batch(BOARD, three[0], SIZE, visible=without)
+    unknown = np.ma.masked_array(BOARD, np.arange(40)[:, None] == [7] * 3)
+    for X in (unknown, unknown.filled(np.nan), np.ma.stack([unknown] * 3)):
+        found = jaxbundle.calibrate_batch(X, three[0], SIZE, visible=visible)
+        for camera in range(3):
+            same(found, expected, camera, camera)
+
+
 def test_a_view_of_three_points_or_of_a_line_is_left_out(three):
     visible = np.ones(three[0].shape[:3], bool)
     visible[0, 2, 3:] = False
@@ -178,7 +200,7 @@ def test_bad_cameras_do_not_change_the_others(three, solved):
     visible = np.ones(xy.shape[:3], bool)
     order = [5, 0, 6, 1, 7, 2]  # good cameras at 1, 3, 5
     xy, visible = xy[order], visible[order]
-    xy[0, 0, 0, 0] = np.nan
+    xy[0, 0, 0, 0] = np.inf
     visible[2, :, 2:] = False
     xy[4] = xy[4, :1] * [1e-3, 0] + [100, 100]  # the same line in every view
     found = jaxbundle.calibrate_batch(BOARD, xy, SIZE, visible=visible)

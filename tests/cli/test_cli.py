@@ -198,7 +198,7 @@ def test_damaged_or_refused_programs_are_told_at_most_once(tmp_path, monkeypatch
 
 def test_a_level_of_significance_is_between_0_and_1():
     done = run("adjust", EXAMPLE / "project.toml", "--snooping", "pope", "--significance", "1")
-    assert done.returncode == 2 and "--significance 1: a number between 0 and 1" in done.stderr
+    assert done.returncode == 2 and "--significance must be a number between 0 and 1" in done.stderr
 
 
 def test_not_converged_says_so(tmp_path):

@@ -46,10 +46,12 @@ def test_what_is_not_visible_does_not_count(tmp_path):
     seen_wide[:1, :6] = seen
     other = X.copy()
     other[7] = np.nan
-    found = []
-    for object_points, image_points, visible in ((X, xy, seen), (other, wide, seen_wide)):
+    found, missing = [], np.where(seen[..., None], xy, np.nan)
+    for object_points, image_points, visible in (
+        (X, xy, seen), (other, wide, seen_wide), (X, missing, np.ones(seen.shape, bool)),
+    ):  # fmt: skip
         np.savez(tmp_path / "a.npz", object_points=object_points, image_points=image_points,
                  image_size=(640, 480), visible=visible)  # fmt: skip
         stack = read_camera_stack(tmp_path / "a.npz")
         found.append([stack.fingerprint(i) for i in range(len(stack.ids))])
-    assert found[0][0] == found[1][0] != found[1][1]
+    assert found[0][0] == found[1][0] == found[2][0] != found[1][1]

@@ -90,8 +90,8 @@ def test_coordinates_and_names():
 
 @pytest.mark.parametrize("given, said", [
     ((1, 6, 0.03), "board 1x6: a chessboard board needs at least 3"),
-    ((9, 6, -1.0), "square is -1.0; a positive length"),
-    ((9, 6, float("nan")), "square is nan"),
+    ((9, 6, -1.0), "square must be a positive length, but is -1.0"),
+    ((9, 6, float("nan")), "square must be a positive length, but is nan"),
     ((9, 6, 1.0, "chessbord"), "did you mean 'chessboard'"),
     ((9, 6, 1.0, "charuco", None, 1.5), "a marker of 1.5 does not fit into a square of 1"),
 ])  # fmt: skip

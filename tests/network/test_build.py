@@ -156,7 +156,7 @@ def test_a_bad_camera_is_refused(camera, said):
     ({"images": []}, "images: column 'id' is missing"),
     ({"images": {"id": []}}, "column 'camera' is missing"),
     ({"images": {"id": ["1"], "camera": []}}, "differ in length"),
-    ({"points": [1, 2]}, "points: expected a data frame, a dict of columns, or a list of dict"),
+    ({"points": [1, 2]}, "points: expected a data frame of pandas, a dict of columns, or a list"),
     ({"points": {"id": "p"}}, "points: column 'id' must be a sequence"),
     ({"cameras": []}, "no camera is given"),
     ({"cameras": [CAMERAS[0]] * 2}, "camera 'a' stands already"),

@@ -1,0 +1,170 @@
+"""Arguments checked before they are used: one line names the argument and what is expected.
+
+Masked arrays keep their mask: what is masked comes back as NaN. Complex numbers are refused, as are
+arrays that JAX traces (under `jax.jit`, `jax.vmap` or `jax.grad`), where numbers are needed.
+"""
+
+import math
+import numbers
+import operator
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxbundle.errors import InputError
+
+MOST = 10**9
+"""Whole numbers go so far."""
+
+
+def shown(value: Any) -> str:
+    """A value as a message shows it: what is long is cut."""
+    text = " ".join(repr(value.item() if isinstance(value, np.generic) else value).split())
+    return text if len(text) <= 60 else f"{text[:58]}…"
+
+
+def whole(name: str, value: Any, least: int = 1, most: int = MOST) -> int:
+    """A whole number from `least` to `most`.
+
+    **Raises:** `InputError`."""
+    refuse_traced(name, value)
+    try:
+        number = least - 1 if isinstance(value, bool | np.bool_) else operator.index(value)
+    except TypeError:
+        number = least - 1
+    if not least <= number <= most:
+        last = "10⁹" if most == MOST else most
+        raise InputError(f"{name} must be a whole number from {least} to {last}, but is "
+                         f"{shown(value)}")  # fmt: skip
+    return number
+
+
+def number(name: str, value: Any, expected: str = "a number", good=math.isfinite) -> float:
+    """A number for which `good` holds, by default a finite one.
+
+    **Raises:** `InputError`."""
+    refuse_traced(name, value)
+    value = value.item() if isinstance(value, np.ndarray | jax.Array) and not value.ndim else value
+    real = isinstance(value, numbers.Real) and not isinstance(value, bool | np.bool_)
+    try:
+        if real and good(float(value)):
+            return float(value)
+    except OverflowError:
+        pass
+    raise InputError(f"{name} must be {expected}, but is {shown(value)}")
+
+
+def positive(name: str, value: Any) -> float:
+    """A finite number above 0.
+
+    **Raises:** `InputError`."""
+    return number(name, value, "a positive number", lambda x: 0 < x < math.inf)
+
+
+def at_least_zero(name: str, value: Any) -> float:
+    """A number that is 0 or above, infinity as well.
+
+    **Raises:** `InputError`."""
+    return number(name, value, "0 or a positive number", lambda x: x >= 0)
+
+
+def one_of(name: str, value: Any, choices: Sequence[str], none: bool = False) -> str | None:
+    """One of some words, or None where there may be none.
+
+    **Raises:** `InputError`."""
+    if (value is None and none) or (isinstance(value, str) and value in choices):
+        return value
+    raise InputError(f"{name} must be one of {', '.join(choices)}, not {shown(value)}")
+
+
+def truth(name: str, value: Any) -> bool:
+    """True or False.
+
+    **Raises:** `InputError`."""
+    if not isinstance(value, bool | np.bool_):
+        raise InputError(f"{name} must be True or False, but is {shown(value)}")
+    return bool(value)
+
+
+def text(name: str, value: Any) -> str:
+    """A text that is not empty.
+
+    **Raises:** `InputError`."""
+    if not isinstance(value, str) or not value.strip():
+        raise InputError(f"{name} must be a text, but is {shown(value)}")
+    return value
+
+
+def path(name: str, value: Any) -> str:
+    """The path of a file or folder.
+
+    **Raises:** `InputError`."""
+    if not isinstance(value, str | os.PathLike):
+        raise InputError(f"{name} must be the path of a file or folder, but is {shown(value)}")
+    return os.fspath(value)
+
+
+def numeric_array(name: str, values: Any, expected: str, truths: bool = False) -> np.ndarray:
+    """Values as an array of real numbers, or also of truth values; a masked number is NaN, a masked
+    truth False.
+
+    **Raises:** `InputError` that says what is expected."""
+    refuse_traced(name, values)
+    masked = _stacked_masks(values)
+    if masked is not None:
+        values = masked
+    try:
+        array = np.asanyarray(values) if masked is not None else np.asarray(values)
+    except (ValueError, TypeError):
+        raise InputError(f"{name} must be {expected}, but its rows differ in length") from None
+    if array.dtype.kind not in "biuf" or (array.dtype.kind == "b" and not truths):
+        raise InputError(f"{name} must be {expected}, but is {_kind_of(array)}")
+    if isinstance(array, np.ma.MaskedArray):
+        array = array.filled(False) if array.dtype.kind == "b" else array.astype(float).filled(
+            np.nan)  # fmt: skip
+    return array
+
+
+def vector(name: str, value: Any, size: int, expected: str) -> np.ndarray:
+    """Finite numbers [size]; one number stands for all of them.
+
+    **Raises:** `InputError`."""
+    array = numeric_array(name, value, expected).astype(float)
+    if array.shape not in ((), (size,)) or not np.isfinite(array).all():
+        raise InputError(f"{name} must be {expected}, but is {shown(array.tolist())}")
+    return np.broadcast_to(array, size)
+
+
+def refuse_traced(name: str, *values: Any) -> None:
+    """Refuse what JAX traces, wherever it is among the values.
+
+    **Raises:** `InputError`."""
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values)):
+        raise InputError(
+            f"{name} must be numbers, but is traced by JAX: this function does not work under "
+            "jax.jit, jax.vmap or jax.grad; jaxbundle.solve does"
+        )
+
+
+def _stacked_masks(values: Any) -> np.ma.MaskedArray | None:
+    """A masked array, or one of a list of masked arrays, whose masks `np.asarray` would lose."""
+    if isinstance(values, np.ma.MaskedArray):
+        return values
+    if isinstance(values, list | tuple) and any(
+        isinstance(part, np.ma.MaskedArray) for part in values
+    ):
+        try:
+            return np.ma.stack([np.ma.asanyarray(part) for part in values])
+        except ValueError:
+            return None
+    return None
+
+
+def _kind_of(array: np.ndarray) -> str:
+    kinds = {"U": "text", "S": "text", "c": "complex numbers", "b": "truth values"}
+    if array.dtype.kind == "O" and array.shape == ():
+        return shown(array.item())
+    return kinds.get(array.dtype.kind, f"an array of {array.dtype}")
