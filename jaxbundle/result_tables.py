@@ -61,32 +61,36 @@ def images(adjustment) -> dict[str, np.ndarray]:
     sigma = np.sqrt(np.clip(np.diagonal(adjustment.image_covariance, axis1=1, axis2=2), 0, None))
     sigma = sigma * scale
     image = np.asarray(s.image)
-    weight = np.asarray(adjustment.problem.data.image_weight)
-    used = weight > 0
-    v = np.asarray(adjustment.reliability.residual.image) / np.where(used, weight, 1.0)
-    squares = np.bincount(image, (v**2 * used).sum(1), minlength=s.images)
-    number = np.bincount(image, used.sum(1), minlength=s.images)
     table = {"id": np.array(adjustment.problem.network.images.id, dtype=object)}
     table |= {name: values[:, i] for i, name in enumerate(EXTERIOR)}
     table |= {f"s{name}": sigma[:, i] for i, name in enumerate(EXTERIOR)}
-    table["rays"] = np.bincount(image, used.any(1), minlength=s.images).astype(int)
-    table["rms"] = np.sqrt(squares / np.maximum(number, 1))
-    return table
+    return table | _rays_and_rms(adjustment, image, s.images)
 
 
 def points(adjustment) -> dict[str, np.ndarray]:
-    """Columns id, role, X, Y, Z, sX, sY, sZ, rays."""
+    """Columns id, role, X, Y, Z, sX, sY, sZ, rays, rms (of v of its image points, image unit)."""
     network, s = adjustment.problem.network, adjustment.problem.structure
     sigma = np.sqrt(np.clip(np.diagonal(adjustment.point_covariance, axis1=1, axis2=2), 0, None))
-    used = (np.asarray(adjustment.problem.data.image_weight) > 0).any(1)
     table = {
         "id": np.array(network.points.id, dtype=object),
         "role": np.array(network.points.role, dtype=object),
     }
     table |= {axis: adjustment.point_values[:, i] for i, axis in enumerate("XYZ")}
     table |= {f"s{axis}": sigma[:, i] for i, axis in enumerate("XYZ")}
-    table["rays"] = np.bincount(np.asarray(s.point), used, minlength=s.points).astype(int)
-    return table
+    return table | _rays_and_rms(adjustment, np.asarray(s.point), s.points)
+
+
+def _rays_and_rms(adjustment, of_ray, n: int) -> dict[str, np.ndarray]:
+    """Columns rays and rms (of v, image unit) of what `of_ray` gives for every ray."""
+    weight = np.asarray(adjustment.problem.data.image_weight)
+    used = weight > 0
+    v = np.asarray(adjustment.inspection.residuals.image) / np.where(used, weight, 1.0)
+    squares = np.bincount(of_ray, (v**2 * used).sum(1), minlength=n)
+    number = np.bincount(of_ray, used.sum(1), minlength=n)
+    return {
+        "rays": np.bincount(of_ray, used.any(1), minlength=n).astype(int),
+        "rms": np.sqrt(squares / np.maximum(number, 1)),
+    }
 
 
 def residuals(adjustment) -> dict[str, np.ndarray]:

@@ -132,6 +132,14 @@ def test_camera_table_and_correlations(convergent4, text):
         )
 
 
+def test_rms_of_points_and_images_is_that_of_their_residuals(convergent4):
+    rows = convergent4.residuals
+    for thing, table in (("point", convergent4.points), ("image", convergent4.images)):
+        for id, rms in zip(table["id"], table["rms"]):
+            v = rows["v"][(rows["kind"] == "image") & (rows[thing] == id)]
+            assert rms == pytest.approx(np.sqrt(np.mean(v**2)), rel=1e-12)
+
+
 def test_points_and_images_are_those_of_the_tables(convergent4, text):
     table = convergent4.points
     found = rows(section(text, "Points: coordinates in model"), "point")

@@ -168,8 +168,9 @@ def binary_files(model: ColmapModel) -> dict[str, bytes]:
         ]  # fmt: skip
     points = [struct.pack("<Q", len(model.points))]
     of_point = tracks(model)
-    for id, position in zip(model.point_ids.tolist(), model.points):
+    for id, position, error in zip(model.point_ids.tolist(), model.points, model.errors.tolist()):
         track = np.array(of_point[id], "<u4")
-        points += [struct.pack("<Q3d3BdQ", id, *position, *GREY, 0.0, len(track)), track.tobytes()]
+        head = struct.pack("<Q3d3BdQ", id, *position, *GREY, error, len(track))
+        points += [head, track.tobytes()]
     parts = {"cameras.bin": cameras, "images.bin": images, "points3D.bin": points}
     return {name: b"".join(part) for name, part in parts.items()}

@@ -20,9 +20,11 @@ from jaxbundle.io.colmap_models import HALF, to_colmap
 from jaxbundle.io.losses import need_values, what_is_lost
 from jaxbundle.io.poses import matrices_of, matrices_of_quaternions, quaternions_of
 from jaxbundle.network.columns import Columns, count, some
+from jaxbundle.network.reprojection import point_errors
 from jaxbundle.network.tables import Camera, Network, Source
 
 NO_POINT = -1
+NO_ERROR = -1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,13 +44,14 @@ class ColmapImage:
 
 @dataclasses.dataclass(frozen=True)
 class ColmapModel:
-    """The contents of `cameras`, `images` and `points3D`."""
+    """The contents of `cameras`, `images` and `points3D`; `errors` of points: only written."""
 
     cameras: dict[int, Camera]
     images: Sequence[ColmapImage]
     point_ids: Int[np.ndarray, " points"]
     points: Float[np.ndarray, "points 3"]
     points_source: Source
+    errors: Float[np.ndarray, " points"] | None = None
 
 
 def check_unique(ids: Sequence[int], place, thing: str) -> None:
@@ -160,7 +163,10 @@ def from_network(network: Network) -> tuple[ColmapModel, tuple[str, ...]]:
     lost = what_is_lost(network)
     if list(point_numbers.astype(str)) != list(points.id):
         lost = (*lost, "names of points, which are numbered from 1")
-    return ColmapModel(cameras, made, point_numbers, points.position, points.source), lost
+    return ColmapModel(
+        cameras, made, point_numbers, points.position, points.source,
+        np.nan_to_num(point_errors(network)[0], nan=NO_ERROR),
+    ), lost  # fmt: skip
 
 
 def numbers_of(ids: Sequence[str]) -> list[int]:

@@ -107,10 +107,10 @@ def text_files(model: ColmapModel) -> dict[str, bytes]:
         ))  # fmt: skip
     points = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"]
     of_point = tracks(model)
-    for id, position in zip(model.point_ids.tolist(), model.points):
+    for id, position, error in zip(model.point_ids.tolist(), model.points, model.errors.tolist()):
         track = " ".join(f"{image} {k}" for image, k in of_point[id])
         colour = " ".join(map(str, GREY))
-        points.append(f"{id} {_join(position)} {colour} 0 {track}".rstrip())
+        points.append(f"{id} {_join(position)} {colour} {error!r} {track}".rstrip())
     texts = {"cameras.txt": camera_lines(model.cameras), "images.txt": images,
              "points3D.txt": points}  # fmt: skip
     return {name: ("\n".join(lines) + "\n").encode() for name, lines in texts.items()}

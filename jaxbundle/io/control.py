@@ -22,7 +22,7 @@ import numpy as np
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.csv_tables import read_text
 from jaxbundle.io.poses import angles_of, matrices_of
-from jaxbundle.network.build import POINT_SIGMAS
+from jaxbundle.network.build import POINT_ERRORS, POINT_SIGMAS
 from jaxbundle.network.columns import Columns, count, did_you_mean, shown, some
 from jaxbundle.network.rules import AXES, check_choice, check_unique
 from jaxbundle.network.tables import ROLES, Images, Network, Points, Source
@@ -31,7 +31,7 @@ from jaxbundle.orientation.network import find_start_values
 
 PLAIN = ("id", *AXES, *POINT_SIGMAS)
 """The columns of a table without a header, the last three only together."""
-NAMES = {name.lower(): name for name in (*PLAIN, "role", "name")}
+NAMES = {name.lower(): name for name in (*PLAIN, "role", "name", *POINT_ERRORS)}
 ELSEWHERE = 0.01
 """Control this far from where the input has it, as a part of its extent, is in another frame."""
 

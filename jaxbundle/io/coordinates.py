@@ -1,7 +1,8 @@
 """Points and orientations as tables of comma-separated values.
 
 `NAME.csv` has the points, `NAME_images.csv` the exterior orientations, angles in the network's
-unit; the columns are those of a project's tables, without σ where there are none.
+unit; the columns are those of a project's tables, without σ where there are none, and of points the
+mean reprojection error, `error_px` or `error_mm`, which is not read again.
 """
 
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 
 from jaxbundle.io.csv_tables import write_csv
 from jaxbundle.network.build import IMAGE_COLUMNS, POINT_COLUMNS, POINT_SIGMAS
+from jaxbundle.network.reprojection import point_errors
 from jaxbundle.network.tables import Network
 from jaxbundle.network.units import ANGLE_UNITS
 
@@ -34,8 +36,10 @@ def write_coordinates(network: Network, path: str | Path) -> tuple[str, ...]:
          zip(images.id, camera, np.concatenate([images.position, angles], 1).tolist())),
     )  # fmt: skip
     sigma = np.isfinite(points.sigma).any()
-    numbers = np.concatenate([points.position, points.sigma], 1) if sigma else points.position
-    header = (*POINT_COLUMNS, *POINT_SIGMAS) if sigma else POINT_COLUMNS
+    errors, unit = point_errors(network)
+    numbers = np.concatenate([points.position, *([points.sigma] if sigma else []),
+                              errors[:, None]], 1)  # fmt: skip
+    header = (*POINT_COLUMNS, *(POINT_SIGMAS if sigma else ()), f"error_{unit}")
     rows = zip(points.id, points.role, numbers.tolist())
     write_csv(path, header, ((id, role, *_cells(row)) for id, role, row in rows))
     return ("interior orientations", "image points")

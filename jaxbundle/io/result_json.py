@@ -149,7 +149,9 @@ def _points(table) -> Iterator[tuple[str, dict]]:
     for row in table_rows(table):
         point = dict(zip(table, row))
         estimates = {axis: _estimate(point[axis], point[f"s{axis}"]) for axis in "XYZ"}
-        yield point["id"], {"role": point["role"]} | estimates | {"rays": point["rays"]}
+        yield point["id"], {"role": point["role"]} | estimates | {
+            "rays": point["rays"], "rms": point["rms"]
+        }  # fmt: skip
 
 
 def _residuals(table) -> Iterator[dict]:

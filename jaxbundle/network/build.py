@@ -59,6 +59,8 @@ GROUPS = EXTERIOR[:3], EXTERIOR[3:]
 IMAGE_SIGMAS = tuple(f"s{name}" for name in EXTERIOR)
 POINT_COLUMNS = ("id", "role", *AXES)
 POINT_SIGMAS = tuple(f"s{name}" for name in AXES)
+POINT_ERRORS = ("error_px", "error_mm")
+"""Reprojection errors, as tables of points are written with them; not used."""
 OBSERVATION_COLUMNS = ("image", "point", "x", "y")
 OBSERVATION_SIGMAS = ("sx", "sy")
 DISTANCE_COLUMNS = ("from", "to", "value", "sigma")
@@ -241,7 +243,7 @@ def _make_images(table: Columns, cameras: Sequence[Camera], radians: float) -> I
 
 
 def _make_points(table: Columns) -> Points:
-    table.check_names(POINT_COLUMNS, POINT_SIGMAS)
+    table.check_names(POINT_COLUMNS, (*POINT_SIGMAS, *POINT_ERRORS))
     ids = table.ids("id")
     check_unique(ids, table.source, "point")
     return Points(

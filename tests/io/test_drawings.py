@@ -1,6 +1,8 @@
 """PLY, DXF and CSV of points and cameras, read back by other means."""
 
 import csv
+import dataclasses
+import struct
 import sys
 
 import ezdxf
@@ -10,10 +12,14 @@ from exchange_cases import ANGLES, POINTS, POSITION, matrix, network
 from numpy.testing import assert_allclose
 
 from jaxbundle.errors import InputError
+from jaxbundle.io import read_network
+from jaxbundle.io.colmap import write_colmap
 from jaxbundle.io.coordinates import images_path, write_coordinates
 from jaxbundle.io.dxf import write_dxf
 from jaxbundle.io.ply import write_ply
+from jaxbundle.io.project import write_project
 from jaxbundle.io.pyramids import pyramids
+from jaxbundle.network.reprojection import point_errors
 from jaxbundle.network.tables import Points
 
 
@@ -47,10 +53,10 @@ def test_ply(tmp_path):
     lines = head.decode().splitlines()
     assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
     assert "element vertex 26" in lines and "element edge 24" in lines
-    vertex = np.frombuffer(body[: 26 * 27], "<f8,<f8,<f8,u1,u1,u1")
+    vertex = np.frombuffer(body[: 26 * 31], "<f8,<f8,<f8,u1,u1,u1,<f4")
     assert_allclose(np.stack([vertex[f"f{k}"][:11] for k in range(3)], 1), np.delete(POINTS, 4, 0))
     assert vertex["f3"][2] != vertex["f3"][0]
-    edges = np.frombuffer(body[26 * 27 :], "<i4").reshape(-1, 2)
+    edges = np.frombuffer(body[26 * 31 :], "<i4").reshape(-1, 2)
     assert len(edges) == 24 and edges.min() == 11 and edges.max() == 25
 
 
@@ -97,3 +103,66 @@ def test_dxf_says_what_to_install(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"DXF needs ezdxf: pip install 'jaxbundle\[files\]'"):
         write_dxf(case(), tmp_path / "net.dxf")
     assert not list(tmp_path.iterdir())
+
+
+def disturbed(model):
+    """One image point of point 2 displaced by 5 px, which is seen in three images, and one of point
+    4 by 1 px, seen in two; the others are where they belong."""
+    net = network(model)
+    camera, rays = net.cameras[0], net.observations
+    step = np.array(camera.pixel_size) if model == "brown" else np.ones(2)
+    xy = rays.xy.copy()
+    for point, by in ((1, (3, -4)), (3, (1, 0))):
+        xy[np.flatnonzero(rays.point == point)[0]] += np.array(by) * step
+    return net.replace(observations=dataclasses.replace(rays, xy=xy))
+
+
+WANTED = np.array([0, 5 / 3, 0, 1 / 2, *[0] * 8])
+
+
+@pytest.mark.parametrize("model", ["opencv", "brown"])
+def test_points_carry_their_reprojection_error(tmp_path, model):
+    net = disturbed(model)
+    errors, unit = point_errors(net)
+    assert unit == "px"
+    assert_allclose(errors, WANTED, atol=1e-9)
+    write_coordinates(net, tmp_path / "net.csv")
+    with (tmp_path / "net.csv").open() as file:
+        assert_allclose([float(row["error_px"]) for row in csv.DictReader(file)], errors)
+    write_ply(net, tmp_path / "net.ply")
+    head, body = (tmp_path / "net.ply").read_bytes().split(b"end_header\n", 1)
+    vertex = np.frombuffer(body[: 27 * 31], "<f8,<f8,<f8,u1,u1,u1,<f4")
+    assert b"in px" in head and np.isnan(vertex["f6"][12:]).all()
+    assert_allclose(vertex["f6"][:12], WANTED, atol=1e-6)
+
+
+def test_reprojection_errors_in_colmap(tmp_path):
+    net = disturbed("opencv")
+    write_colmap(net, tmp_path / "text", text=True)
+    lines = (tmp_path / "text" / "points3D.txt").read_text().splitlines()[1:]
+    assert_allclose([float(line.split()[7]) for line in lines], WANTED, atol=1e-9)
+    write_colmap(net, tmp_path / "binary")
+    data = (tmp_path / "binary" / "points3D.bin").read_bytes()[8:]
+    for wanted in WANTED:
+        (error, rays), data = struct.unpack("<dQ", data[35:51]), data[51:]
+        assert error == pytest.approx(wanted, abs=1e-9)
+        data = data[8 * rays :]
+    assert not data
+
+
+def test_reprojection_errors_where_there_is_nothing():
+    """A point without coordinates, one without image points, cameras without a pixel size."""
+    net = case()
+    rays = net.observations
+    net = net.replace(observations=rays.take(rays.point != 7))
+    assert np.isnan(point_errors(net)[0][[4, 7]]).all()
+    brown = network("brown")
+    camera = dataclasses.replace(brown.cameras[0], pixel_size=None)
+    assert point_errors(brown.replace(cameras=(camera,)))[1] == "mm"
+
+
+def test_a_table_of_points_with_errors_is_read(tmp_path):
+    net = network()
+    write_project(net, tmp_path)
+    write_coordinates(net, tmp_path / "points.csv")
+    assert_allclose(read_network(tmp_path).points.position, POINTS)

@@ -1,0 +1,75 @@
+"""How far the image points of an object point are from where the network projects it.
+
+    e = |x(X; X0, M, camera) − x measured|        in the measured image; of a point: the mean over
+                                                  its image points
+
+as COLMAP's `ERROR` has it. In pixels where the cameras have them or their pixel size is known, else
+in mm.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.cameras import default_parameters, get_model
+from jaxbundle.cameras.model import project
+from jaxbundle.geometry import matrix_from_omega_phi_kappa
+from jaxbundle.network.tables import Network
+
+AT_ONCE = 4096
+"""Image points of a portion: all networks share a program for each camera model."""
+
+
+def point_errors(network: Network) -> tuple[Float[np.ndarray, " points"], str]:
+    """The mean reprojection error of every point, and its unit ("px" or "mm"); NaN without image
+    points, coordinates or orientations."""
+    rays, cameras = network.observations, network.cameras
+    of_ray = network.images.camera[rays.image]
+    in_pixels = all(get_model(c.model).unit == "px" or c.pixel_size for c in cameras)
+    length = np.full(len(rays), np.nan)
+    for name in {camera.model for camera in cameras}:
+        model = get_model(name)
+        values, pitch = np.zeros((len(cameras), len(model.parameters))), np.ones((len(cameras), 2))
+        for c, camera in enumerate(cameras):
+            if camera.model == name:
+                values[c] = [{**default_parameters(model), **camera.parameters}[p]
+                             for p in model.parameters]  # fmt: skip
+                if in_pixels and model.unit == "mm":
+                    pitch[c] = camera.pixel_size
+        rows = np.flatnonzero(np.array([camera.model == name for camera in cameras])[of_ray])
+        off = (_projected(model, network, rows, values) - rays.xy[rows]) / pitch[of_ray[rows]]
+        length[rows] = np.linalg.norm(off, axis=1)
+    good = np.isfinite(length)
+    number = np.bincount(rays.point[good], minlength=len(network.points))
+    total = np.bincount(rays.point[good], length[good], minlength=len(network.points))
+    with np.errstate(invalid="ignore"):
+        return total / number, "px" if in_pixels else "mm"
+
+
+def _projected(model, network: Network, rows, values) -> Float[np.ndarray, "n 2"]:
+    """The images of the points of some rays, a portion at a time."""
+    images, rays = network.images, network.observations
+    found = np.zeros((len(rows), 2))
+    with jax.enable_x64(True):
+        for first in range(0, len(rows), AT_ONCE):
+            mine = rows[first : first + AT_ONCE]
+            all = np.pad(mine, (0, AT_ONCE - len(mine)), mode="edge")
+            image = rays.image[all]
+            part = _portion(
+                model, values[images.camera[image]], images.position[image], images.angles[image],
+                network.points.position[rays.point[all]],
+            )  # fmt: skip
+            found[first : first + AT_ONCE] = np.asarray(part)[: len(mine)]
+    return found
+
+
+@partial(jax.jit, static_argnums=0)
+def _portion(model, values, position, angles, points):
+    def one(p, X0, angles, X):
+        ray = matrix_from_omega_phi_kappa(angles) @ (X - X0)
+        return jnp.stack(project(model, tuple(p), *ray))
+
+    return jax.vmap(one)(values, position, angles, points)
