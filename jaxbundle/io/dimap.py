@@ -9,8 +9,8 @@ By the SPOT 123-4-5 Geometry Handbook (GAEL-P135-DOC-001), with angles in radian
 
 Its camera frame and its orbital frame are ours; its pitch and roll have the other sign. Lines count
 from 1 there, from 0 here. Positions and velocities by Lagrange's polynomial through eight rows; the
-attitudes, turned into Earth-fixed quaternions at their own times, by slerp. They may begin and end
-up to one of their steps inside the image: they go on linearly so far, no further.
+attitudes, turned into Earth-fixed quaternions at their own times, by slerp. Where they end a little
+before the image does (`ancillary.extrapolation_limit`), the angles go on linearly.
 """
 
 import xml.etree.ElementTree as ET
@@ -32,6 +32,7 @@ from jaxbundle.pushbroom.ancillary import (
     check_covered,
     check_times,
     position_table,
+    told_extrapolation,
 )
 from jaxbundle.pushbroom.image import check_size, make_image
 from jaxbundle.pushbroom.interpolation import interpolate
@@ -74,8 +75,9 @@ def read_dimap(path: str | Path) -> Scanner:
     )  # fmt: skip
     source = Source(f"{path}, Corrected_Attitude", None, "row")
     check_times(rows, source)
-    ends = [float(times.time(line)) for line in (0.0, lines - 1.0)]
-    rows, angles = _continued(rows, angles, *ends)
+    when = np.asarray(times.time(jnp.arange(lines, dtype=float)))
+    warnings = told_extrapolation(rows, when, source)
+    rows, angles = _continued(rows, angles, when[0], when[-1])
     check_covered(position, rows, points, "attitude row")
     state = np.asarray(jax.vmap(lambda at: interpolate(both, at))(rows))
     frame = np.asarray(jax.vmap(orbital_frame)(state[:, :3], state[:, 3:]))
@@ -92,7 +94,8 @@ def read_dimap(path: str | Path) -> Scanner:
     image = make_image(
         Trajectory(position, attitude), times, optics, lines, pixels, sources=(points, source)
     )
-    return Scanner(file.text("Dataset_Id/DATASET_NAME", Path(path).stem), image, WGS84)
+    name = file.text("Dataset_Id/DATASET_NAME", Path(path).stem)
+    return Scanner(name, image, WGS84, warnings)
 
 
 class _Dimap:
@@ -162,11 +165,16 @@ def _time(text, where):
 
 
 def _continued(t, angles, first, last):
-    """The rows with one before and one after them where these are needed, on a straight line."""
+    """The rows with more before and after them where these are needed, on straight lines."""
     if len(t) < 2:
         return t, angles
-    if t[0] - (t[1] - t[0]) <= first < t[0]:
-        t, angles = np.r_[2 * t[0] - t[1], t], np.vstack([2 * angles[0] - angles[1], angles])
-    if t[-1] < last <= t[-1] + (t[-1] - t[-2]):
-        t, angles = np.r_[t, 2 * t[-1] - t[-2]], np.vstack([angles, 2 * angles[-1] - angles[-2]])
+    end = (t[-1], t[-1] - t[-2], angles[-1], angles[-1] - angles[-2], last)
+    start = (t[0], t[0] - t[1], angles[0], angles[0] - angles[1], first)
+    for k, (at, step, value, change, reached) in enumerate((end, start)):
+        steps = 1 + np.arange(max(np.ceil((reached - at) / step), 0))
+        more = at + steps * step, value + steps[:, None] * change
+        if k:
+            t, angles = np.r_[more[0][::-1], t], np.vstack([more[1][::-1], angles])
+        else:
+            t, angles = np.r_[t, more[0]], np.vstack([angles, more[1]])
     return t, angles

@@ -77,6 +77,7 @@ class RefineFile(NamedTuple):
     frames: Network | None
     snooping: str
     significance: float
+    warnings: tuple[str, ...] = ()
 
 
 def read_refinement(path: str | Path) -> RefineFile:
@@ -103,9 +104,10 @@ def read_refinement(path: str | Path) -> RefineFile:
             raise InputError(
                 f"{path}, [unknowns.{id}]: no such image{did_you_mean(id, scanners.values)}"
             )
-    images = []
+    images, warnings = [], []
     for id in scanners.values:
         scanner = read_scanner(path.parent / scanners.text(id))
+        warnings += scanner.warnings
         where = f"{path}, [unknowns{'.' + id if id in own else ''}]: "
         freedom = _freedom(Section(file, where, common | own.get(id, {})), radians)
         images.append(ScannerImage(id, scanner.image, scanner.earth, freedom, sensors.text(id, id)))
@@ -137,7 +139,9 @@ def read_refinement(path: str | Path) -> RefineFile:
     significance = section.number("significance", 0.001)
     if not 0 < significance < 1:
         raise InputError(f"{section.where}significance is {significance}; between 0 and 1, please")
-    return RefineFile(images, points, observations, frames, snooping, significance)
+    return RefineFile(
+        images, points, observations, frames, snooping, significance, tuple(warnings)
+    )
 
 
 def _freedom(section: Section, radians: float) -> Freedom:

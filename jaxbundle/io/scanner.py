@@ -15,13 +15,14 @@ period = 0.00066
 [position]                          # table, or tle, or circle, or state
 table = "positions.csv"             # t,X,Y,Z[,VX,VY,VZ]
 frame = "ITRF"                      # ITRF | GCRF | J2000 | TEME, or "local"
-interpolation = "lagrange"          # linear | lagrange | hermite | spline
+interpolation = "lagrange"          # linear | lagrange | usgscsm | hermite | spline
 order = 7
+extrapolate = 0.0                   # seconds beyond the ends of the table
 
 [attitude]
 table = "attitude.csv"              # t,q0,q1,q2,q3 (scalar first) or t,pitch,roll,yaw
 frame = "ITRF"                      # as of positions, or "orbit"
-interpolation = "slerp"             # slerp | linear | lagrange | spline
+interpolation = "slerp"             # slerp | linear | lagrange | usgscsm | spline
 
 [optics]                            # a camera model's parameters, or table, or across and along
 model = "brown"
@@ -38,6 +39,17 @@ aberration = true                   # light_time, aberration, refraction: false 
 
 [earth_orientation]
 ut1_utc = -0.12                     # seconds; x_pole, y_pole in arcseconds
+```
+
+Or the file of a product, with what is to be different from it:
+
+```toml
+[scanner]
+source = "image.json"
+interpolation = "lagrange"          # CSM files: usgscsm | lagrange
+
+[corrections]
+refraction = true
 ```
 """
 
@@ -67,10 +79,12 @@ from jaxbundle.pushbroom.trajectory import Attitude, Trajectory
 FRAMES = (*frames.FRAMES, "local")
 ANGLES = ("pitch", "roll", "yaw")
 MOST_ROWS = 1_000_000
-INTERPOLATION = ("interpolation", "order", "gap")
+INTERPOLATION = ("interpolation", "order", "gap", "extrapolate")
 KINDS = ("table", "tle", "circle", "state")
 SECTIONS = {
-    "scanner": ("name", "lines", "pixels", "epoch", "earth", "angle_unit"),
+    "scanner": (
+        "name", "lines", "pixels", "epoch", "earth", "angle_unit", "source", "interpolation",
+    ),
     "times": ("first", "period", "table"),
     "position": (*KINDS, "at", "j2", "frame", "span", "step", *INTERPOLATION),
     "attitude": ("table", "frame", *INTERPOLATION),
@@ -78,35 +92,37 @@ SECTIONS = {
     "mounting": ANGLES,
     "corrections": Corrections._fields,
     "earth_orientation": frames.EarthOrientation._fields,
-}
+}  # fmt: skip
 NEEDED = ("scanner", "times", "position", "attitude", "optics")
+PRODUCTS = (".json", ".dim")
+"""Suffixes of `io.scanner_products`."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Scanner:
-    """A scanner file: the image, and the ellipsoid of its Earth (None: a local frame)."""
+    """A scanner file: the image, the ellipsoid of its Earth (None: a local frame), warnings."""
 
     name: str
     image: PushbroomImage
     earth: Ellipsoid | None
+    warnings: tuple[str, ...] = ()
 
 
 def read_scanner(path: str | Path) -> Scanner:
-    """The pushbroom image of a scanner file; `.json` is read by `io.csm`, `.dim` by `io.dimap`.
+    """The pushbroom image of a scanner file, `.toml`, or of a product (`io.scanner_products`).
 
     **Raises:** `InputError` naming file, section and key, or table and line.
     """
     path = Path(path)
-    if path.suffix.lower() == ".json":
-        from jaxbundle.io.csm import read_csm  # which makes a `Scanner` too
+    if path.suffix.lower() in PRODUCTS:
+        from jaxbundle.io.scanner_products import read_product  # which makes a `Scanner` too
 
-        return read_csm(path)
-    if path.suffix.lower() == ".dim":
-        from jaxbundle.io.dimap import read_dimap
-
-        return read_dimap(path)
-    file = read_sections(path, SECTIONS, NEEDED)
+        return read_product(path)
+    file = read_sections(path, SECTIONS, NEEDED[:1])
     scanner = file.section("scanner")
+    if "source" in scanner:
+        return _of_product(file, scanner)
+    file.require(NEEDED)
     lines, pixels = (scanner.whole(key) for key in ("lines", "pixels"))
     check_size(lines, pixels, scanner.where.removesuffix(": "))
     earth = earth_of(scanner)
@@ -122,6 +138,28 @@ def read_scanner(path: str | Path) -> Scanner:
         mounting, corrections, (positions, attitudes),
     )  # fmt: skip
     return Scanner(scanner.text("name", path.stem), image, earth)
+
+
+def _of_product(file: TomlFile, scanner: Section) -> Scanner:
+    """The image of the source, with the name, interpolation and corrections of the file."""
+    from jaxbundle.io.scanner_products import read_product
+
+    scanner.check_keys(("source", "name", "interpolation"))
+    for name in file.document:
+        if name not in ("scanner", "corrections"):
+            raise InputError(
+                f"{file.path}, [{name}]: this is read from the source; only [scanner] and "
+                "[corrections] can stand beside it"
+            )
+    choice = scanner.text("interpolation") if "interpolation" in scanner else None
+    found = read_product(file.path.parent / scanner.text("source"), choice)
+    switches = file.section("corrections")
+    corrections = {name: switches.switch(name) for name in switches.values}
+    corrections = found.image.corrections._replace(**corrections)
+    return dataclasses.replace(
+        found, name=scanner.text("name", found.name),
+        image=dataclasses.replace(found.image, corrections=corrections),
+    )  # fmt: skip
 
 
 def _orientation(file: TomlFile) -> frames.EarthOrientation:
@@ -141,7 +179,7 @@ def _epoch(file: TomlFile) -> str:
 
 
 def _options(section: Section, method: str) -> dict[str, Any]:
-    """Interpolation, order, gap."""
+    """Interpolation, order, gap, extrapolation."""
     options = {"method": section.text("interpolation", method)}
     if "order" in section:
         options["order"] = int(section.number("order"))
@@ -152,6 +190,8 @@ def _options(section: Section, method: str) -> dict[str, Any]:
                 f"{section.where}gap is {options['gap']:g}; the longest step that is "
                 "interpolated, in seconds, is expected, a positive number"
             )
+    if "extrapolate" in section:
+        options["extrapolate"] = section.number("extrapolate")
     return options
 
 
@@ -187,6 +227,8 @@ def _times(file: TomlFile, lines: int) -> LineTimes:
     columns.check_names(("t",), ("line",))
     t = columns.numbers("t", required=True)
     check_times(t, columns.source)
+    if lines == 1:
+        raise InputError(f"{section.where}table: one line has no period; give first and period")
     if len(t) != lines:
         raise InputError(
             f"{columns.source.name}: {len(t)} times for {lines} lines; one row a line is expected"

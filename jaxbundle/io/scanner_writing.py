@@ -67,10 +67,12 @@ def write_scanner_image(
 
 def _options(table, method=None):
     options = {"interpolation": method or table.method}
-    if options["interpolation"] == "lagrange":
+    if options["interpolation"] in ("lagrange", "usgscsm"):
         options["order"] = table.order
     if np.isfinite(table.gap):
         options["gap"] = table.gap
+    if table.extrapolate:
+        options["extrapolate"] = table.extrapolate
     return options
 
 

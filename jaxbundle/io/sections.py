@@ -26,6 +26,12 @@ class TomlFile:
         """A section, empty if it is not there."""
         return Section(self, f"{self.path}, [{name}]: ", self.document.get(name, {}))
 
+    def require(self, names: Sequence[str]) -> None:
+        """Refuse a file that lacks one of these sections."""
+        for name in names:
+            if name not in self.document:
+                raise InputError(f"{self.path}: the section [{name}] is missing")
+
     @property
     def radians(self) -> float:
         """Radians in one unit of the file's angles."""
@@ -50,10 +56,9 @@ def read_sections(
             raise InputError(f"{path}: {key} must be a section, [{key}]")
         if sections[key]:
             Section(None, f"{path}, [{key}]: ", value).check_keys(sections[key])
-    for key in needed:
-        if key not in document:
-            raise InputError(f"{path}: the section [{key}] is missing")
-    return TomlFile(path, document)
+    file = TomlFile(path, document)
+    file.require(needed)
+    return file
 
 
 @dataclasses.dataclass(frozen=True)

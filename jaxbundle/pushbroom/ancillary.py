@@ -22,7 +22,15 @@ UNIT = 1e-4
 GAP = 5.0
 """A step longer than this many median steps is a gap."""
 
-FEWEST = {"linear": 2, "hermite": 2, "slerp": 2, "spline": 4}
+FEWEST = {"linear": 2, "hermite": 2, "slerp": 2, "spline": 4, "usgscsm": 2}
+
+STEPS, SHORTEST, LONGEST = 2.0, 0.05, 0.5
+"""Tables of products may end this many steps before the image does, no less than the shortest and
+no more than the longest of these times, in seconds: turns and falls of a satellite that linear
+extrapolation ignores come to centimetres or decimetres on the ground in this time."""
+
+ROUNDING = 1e-6
+"""Times of products are rounded: seconds since J2000 to 6e-8 s, dates to microseconds."""
 
 
 def position_table(
@@ -33,13 +41,15 @@ def position_table(
     method: str = "lagrange",
     order: int = 7,
     gap: float | None = None,
+    extrapolate: float = 0.0,
     source: Source = POSITIONS,
 ) -> Table:
     """Positions (metres) against time (seconds).
 
     **Arguments:** `velocities` in metres a second, needed by `"hermite"`; `order` of Lagrange's
     polynomial; `gap` the longest step that is interpolated, in seconds (five median steps);
-    `source` names the rows in messages.
+    `extrapolate` the seconds beyond the ends that are extrapolated (none); `source` names the rows
+    in messages.
 
     **Raises:** `InputError` naming the row: times that do not increase, what is not a number, too
     few rows; a gap that is not positive.
@@ -49,7 +59,9 @@ def position_table(
         raise InputError(
             f"{source.name}: 'hermite' needs velocities; give VX, VY, VZ or another interpolation"
         )
-    return _table(times, positions, velocities, method, order, gap, "position", source)
+    return _table(
+        times, positions, velocities, method, order, gap, extrapolate, "position", source
+    )  # fmt: skip
 
 
 def attitude_table(
@@ -59,6 +71,7 @@ def attitude_table(
     method: str = "slerp",
     order: int = 7,
     gap: float | None = None,
+    extrapolate: float = 0.0,
     reference: Literal["earth", "orbit"] = "earth",
     source: Source = ATTITUDE,
 ) -> Attitude:
@@ -90,7 +103,7 @@ def attitude_table(
         values = continuous(values / length[:, None])
     else:
         values = np.unwrap(values, axis=0)
-    table = _table(times, values, None, method, order, gap, "attitude", source)
+    table = _table(times, values, None, method, order, gap, extrapolate, "attitude", source)
     return Attitude(table, method == "slerp", reference)
 
 
@@ -114,6 +127,49 @@ def check_times(times: Float[np.ndarray, " rows"], source: Source) -> None:
         )
 
 
+def extrapolation_limit(rows: Float[np.ndarray, " rows"]) -> float:
+    """The seconds that the table of a product, with rows at these times, is extrapolated at most:
+    two of its steps, but 0.05 s at least and 0.5 s at most."""
+    step = float(np.median(np.diff(rows))) if len(rows) > 1 else 0.0
+    return min(max(STEPS * step, SHORTEST), LONGEST)
+
+
+def told_extrapolation(
+    rows: Float[np.ndarray, " rows"], times: Float[np.ndarray, " lines"], source: Source
+) -> tuple[str, ...]:
+    """A warning if the rows of a product begin after, or end before, the times of the lines.
+
+    **Raises:** `InputError` if they do so by more than `extrapolation_limit`.
+    """
+    limit = extrapolation_limit(rows)
+    check_span(rows, limit, times, source)
+    before, after = rows[0] - times.min(), times.max() - rows[-1]
+    if max(before, after) <= ROUNDING:
+        return ()
+    number = int(((times < rows[0] - ROUNDING) | (times > rows[-1] + ROUNDING)).sum())
+    where = " and ".join(
+        f"{value:.6g} s {text}" for value, text in ((before, "at its start"), (after, "at its end"))
+        if value > ROUNDING
+    )  # fmt: skip
+    return (
+        f"{source.name}: the table does not cover the whole image: extrapolated by {where} "
+        f"({number} of {len(times)} lines; up to {limit:.6g} s are allowed)",
+    )
+
+
+def check_span(rows, extrapolate, times, source, thing="image line") -> None:
+    """Refuse times outside the rows of a table by more than is extrapolated."""
+    outside = (times < rows[0] - extrapolate) | (times > rows[-1] + extrapolate)
+    if outside.any():
+        k = int(outside.argmax())
+        beyond = f"at most {extrapolate:.6g} s are" if extrapolate else "nothing is"
+        raise InputError(
+            f"{source.name}: {thing} {k} is at {times[k]:.9g} s, outside the table, "
+            f"{rows[0]:.9g} to {rows[-1]:.9g} s; give ancillary data for the whole image, {beyond} "
+            "extrapolated"
+        )
+
+
 def check_covered(
     table: Table, times: Sequence[float], source: Source, thing: str = "image line"
 ) -> None:
@@ -122,14 +178,7 @@ def check_covered(
     `source` names the table and its rows, `thing` what the times belong to.
     """
     rows, times = np.asarray(table.times), np.asarray(times, float)
-    outside = (times < rows[0]) | (times > rows[-1])
-    if outside.any():
-        k = int(outside.argmax())
-        raise InputError(
-            f"{source.name}: {thing} {k} is at {times[k]:.9g} s, outside the table, "
-            f"{rows[0]:.9g} to {rows[-1]:.9g} s; give ancillary data for the whole image, nothing "
-            "is extrapolated"
-        )
+    check_span(rows, table.extrapolate, times, source, thing)
     i = np.clip(np.searchsorted(rows, times, side="right") - 1, 0, len(rows) - 2)
     wide = rows[i + 1] - rows[i] > table.gap
     if wide.any():
@@ -149,7 +198,7 @@ def _check_method(method, known, source):
         )
 
 
-def _table(times, values, rates, method, order, gap, what, source):
+def _table(times, values, rates, method, order, gap, extrapolate, what, source):
     times, values = np.asarray(times, float), np.asarray(values, float)
     if values.ndim != 2 or times.shape != values.shape[:1]:
         raise InputError(
@@ -160,8 +209,8 @@ def _table(times, values, rates, method, order, gap, what, source):
     for name, array in ((what, values), ("velocity", rates)):
         if array is not None and (bad := ~np.isfinite(array).all(1)).any():
             raise InputError(f"{source(int(bad.argmax()))}: the {name} is not a finite number")
-    if method == "lagrange" and order < 1:
-        raise InputError(f"{source.name}: the order of 'lagrange' is {order}; at least 1, please")
+    if method in ("lagrange", "usgscsm") and order < 1:
+        raise InputError(f"{source.name}: the order of {method!r} is {order}; at least 1, please")
     fewest = FEWEST.get(method, order + 1)
     if len(times) < fewest:
         advice = " or a lower order" if method == "lagrange" else ""
@@ -174,7 +223,14 @@ def _table(times, values, rates, method, order, gap, what, source):
             f"{source.name}: gap is {gap:g}; the longest step that is interpolated, in seconds, "
             "is expected, a positive number"
         )
+    if not 0 <= extrapolate < np.inf:
+        raise InputError(
+            f"{source.name}: extrapolate is {extrapolate:g}; seconds beyond the ends of the table "
+            "are expected, 0 or more"
+        )
     gap = GAP * float(np.median(np.diff(times))) if gap is None else float(gap)
     kind = "linear" if method == "slerp" else method
     rates = None if rates is None else jnp.asarray(rates)
-    return Table(jnp.asarray(times), jnp.asarray(values), rates, gap, kind, order)
+    return Table(
+        jnp.asarray(times), jnp.asarray(values), rates, gap, kind, order, float(extrapolate)
+    )

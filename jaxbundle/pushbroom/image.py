@@ -107,11 +107,12 @@ def make_image(
 
 
 def check_size(lines: float, pixels: float, where: str) -> None:
-    """Refuse a size of an image that is not whole, below 2, or more than any has."""
-    for size, name in ((lines, "lines"), (pixels, "pixels")):
-        if not 2 <= size <= LONGEST or size != int(size):
+    """Refuse a size of an image that is not whole, of no line, of less than 2 pixels, or more than
+    any has."""
+    for size, name, least in ((lines, "lines", 1), (pixels, "pixels", 2)):
+        if not least <= size <= LONGEST or size != int(size):
             raise InputError(
-                f"{where}: {size:.15g} {name}; a whole number from 2 to {LONGEST} is expected"
+                f"{where}: {size:.15g} {name}; a whole number from {least} to {LONGEST} is expected"
             )
 
 

@@ -4,13 +4,16 @@ Between the rows i and i + 1, with τ = (t − tᵢ)/(tᵢ₊₁ − tᵢ) and �
 
     linear      y = (1 − τ)·yᵢ + τ·yᵢ₊₁
     lagrange    y = Σ Lⱼ(t)·yⱼ,  Lⱼ = Π (t − tₖ)/(tⱼ − tₖ),  the order + 1 rows about t
+    usgscsm     the same with as many rows before t as after it, so fewer near the ends of the
+                table: order + 1 at most, 6, 4, 2 in the last intervals (usgscsm, lagrangeInterp)
     hermite     y = h₀₀·yᵢ + h₀₁·yᵢ₊₁ + Δ·(h₁₀·ẏᵢ + h₁₁·ẏᵢ₊₁)      with the rates ẏ of the table
     spline      the same with the rates that make ÿ continuous, not-a-knot at both ends
                 (de Boor, 1978, A Practical Guide to Splines, chapter IV)
 
 with h₀₁ = τ²(3 − 2τ), h₀₀ = 1 − h₀₁, h₁₀ = τ(1 − τ)², h₁₁ = −τ²(1 − τ). Times need not be evenly
-spaced. Nothing is extrapolated: outside the table, and in a step longer than `gap`, the value is
-NaN; splines end there.
+spaced. In a step longer than `gap`, and outside the table by more than `extrapolate` seconds (none
+unless it is given), the value is NaN; splines end there. Up to there the first and last interval
+continue, which is a straight line for `usgscsm`.
 """
 
 from typing import Literal, get_args
@@ -22,7 +25,7 @@ import numpy as np
 from jax.lax.linalg import tridiagonal_solve
 from jaxtyping import Array, Float, Int
 
-Method = Literal["linear", "lagrange", "hermite", "spline"]
+Method = Literal["linear", "lagrange", "usgscsm", "hermite", "spline"]
 METHODS: tuple[str, ...] = get_args(Method)
 
 
@@ -30,7 +33,8 @@ class Table(eqx.Module):
     """Values against time, differentiable in all of them.
 
     `times` in seconds; `gap` the longest step between two rows that is interpolated, in seconds;
-    `order` the degree of Lagrange's polynomial.
+    `order` the degree of Lagrange's polynomial, the highest one of `usgscsm`; `extrapolate` the
+    seconds beyond its ends that the table still covers.
     """
 
     times: Float[Array, " rows"]
@@ -39,6 +43,7 @@ class Table(eqx.Module):
     gap: float = eqx.field(static=True, default=np.inf)
     method: Method = eqx.field(static=True, default="lagrange")
     order: int = eqx.field(static=True, default=7)
+    extrapolate: float = eqx.field(static=True, default=0.0)
 
 
 def interpolate(table: Table, t: Float[Array, ""]) -> Float[Array, " k"]:
@@ -49,6 +54,8 @@ def interpolate(table: Table, t: Float[Array, ""]) -> Float[Array, " k"]:
             value = _linear(table, i, t)
         case "lagrange":
             value = _lagrange(table, i, t)
+        case "usgscsm":
+            value = _usgscsm(table, i, t)
         case "hermite":
             value = _hermite(table, table.rates, i, t)
         case "spline":
@@ -70,16 +77,22 @@ def interval(table: Table, t: Float[Array, ""]) -> Int[Array, ""]:
 
 
 def fraction(table: Table, i: Int[Array, ""], t: Float[Array, ""]) -> Float[Array, ""]:
-    """τ, the part of the interval i that has passed at t."""
+    """τ, the part of the interval i that has passed at t; beyond 0 and 1 outside the table."""
     start, end = table.times[i], table.times[i + 1]
     return (t - start) / (end - start)
 
 
 def covers(table: Table, i: Int[Array, ""], t: Float[Array, ""]) -> Array:
-    """Whether the table tells about t: between its ends and not in a gap."""
+    """Whether the table covers t: between its ends, or near enough to them, and not in a gap."""
     times = table.times
-    inside = (t >= times[0]) & (t <= times[-1])
+    inside = (t >= times[0] - table.extrapolate) & (t <= times[-1] + table.extrapolate)
     return inside & (times[i + 1] - times[i] <= table.gap)
+
+
+def span(table: Table) -> tuple[float, float]:
+    """The first and the last time that the table covers."""
+    times = np.asarray(table.times)
+    return float(times[0]) - table.extrapolate, float(times[-1]) + table.extrapolate
 
 
 def breaks(table: Table) -> Float[np.ndarray, " rows"]:
@@ -151,6 +164,19 @@ def _lagrange(table, i, t):
     same = jnp.eye(rows, dtype=bool)
     spans = times[:, None] - times + same
     return jnp.prod(jnp.where(same, 1.0, (t - times) / spans), axis=1) @ values
+
+
+def _usgscsm(table, i, t):
+    most = (table.order + 1) // 2
+    half = jnp.minimum(jnp.minimum(i + 1, len(table.times) - 1 - i), most)
+    offset = jnp.arange(-most, most) + 1
+    used = (offset > -half) & (offset <= half)
+    row = jnp.clip(i + offset, 0, len(table.times) - 1)
+    times, values = table.times[row], table.values[row]
+    factor = ~jnp.eye(2 * most, dtype=bool) & used & used[:, None]
+    spans = jnp.where(factor, times[:, None] - times, 1.0)
+    weights = jnp.prod(jnp.where(factor, (t - times) / spans, 1.0), axis=1)
+    return jnp.where(used, weights, 0.0) @ values
 
 
 def _hermite(table, rates, i, t):

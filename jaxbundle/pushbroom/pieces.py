@@ -19,7 +19,7 @@ from jaxbundle.geometry.ellipsoid import Ellipsoid, ray_to_ellipsoid
 from jaxbundle.geometry.vectors import turned
 
 from .image import PushbroomImage, pose_at
-from .interpolation import breaks
+from .interpolation import breaks, span
 
 DEGREE = 3
 TOLERANCE = 1e-7
@@ -54,10 +54,10 @@ def make_pieces(image: PushbroomImage, earth: Ellipsoid | None) -> Pieces:
     """
     first, last = (float(image.times.time(line)) for line in (-0.5, image.lines - 0.5))
     line = (last - first) / image.lines
-    tables = [breaks(image.trajectory.position), breaks(image.trajectory.attitude.table)]
-    first = max(first, *(table[0] for table in tables))
-    last = min(last, *(table[-1] for table in tables))
-    nodes = np.unique(np.concatenate(tables))
+    tables = image.trajectory.position, image.trajectory.attitude.table
+    starts, ends = zip(*(span(table) for table in tables))
+    first, last = max(first, *starts), min(last, *ends)
+    nodes = np.unique(np.concatenate([breaks(table) for table in tables]))
     nodes = nodes[(nodes > first + SAME * line) & (nodes < last - SAME * line)]
     ends = np.r_[first, nodes[np.diff(nodes, prepend=-np.inf) > SAME * line], last]
     origin, reach, per_radian = _sight(image, earth)

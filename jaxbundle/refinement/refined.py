@@ -20,7 +20,7 @@ from jaxbundle.geometry import (
 )
 from jaxbundle.pushbroom.ancillary import attitude_table
 from jaxbundle.pushbroom.image import PushbroomImage, no_offsets
-from jaxbundle.pushbroom.interpolation import Table
+from jaxbundle.pushbroom.interpolation import Table, span
 from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable, FocalLine, Optics
 from jaxbundle.pushbroom.trajectory import Attitude, Trajectory, attitude_at
 from jaxbundle.refinement.freedom import Change, Form, changed, changed_optics
@@ -74,7 +74,9 @@ def _attitude(image, form, change) -> Attitude:
     first, last = (float(image.times.time(line)) for line in (-0.5, image.lines - 0.5))
     start = max(np.searchsorted(rows, first, side="right") - 1 - MARGIN, 0)
     end = min(np.searchsorted(rows, last) + MARGIN, len(rows) - 1)
-    times = rows[start : end + 1]
+    covered = np.clip([first, last], *span(old.table))
+    # an extrapolated end becomes a row
+    times = np.union1d(rows[start : end + 1], covered[(covered < rows[0]) | (covered > rows[-1])])
     centres = form.spline.centres
     times = np.union1d(times, centres[(centres > first) & (centres < last)])
     gaps = rows[1:][np.diff(rows) > old.table.gap]

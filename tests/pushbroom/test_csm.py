@@ -137,7 +137,9 @@ PLACES = np.linspace(0, LINES - 1, 8), np.linspace(0, PIXELS - 1, 5)
 
 @pytest.mark.parametrize("older", [False, True])
 def test_an_image_written_as_support_data_is_read_as_itself(tmp_path, older):
-    scanner = read_csm(write(tmp_path, support_data(older)))
+    # merged times of pointing and body would be too far apart for this restless satellite
+    scanner = read_csm(write(tmp_path, support_data(older)), "usgscsm" if older else "lagrange")
+    assert not scanner.warnings
     assert scanner.name == "test" and scanner.earth.a == WGS84.a
     expected = locate(expected_image(), Ground(), *PLACES)
     found = locate(scanner.image, Ground(), *PLACES)
@@ -219,6 +221,8 @@ BROKEN = {
     "period": (changed("line_scan_rate", [[0.5, 0.0, 0.0]]), ["line_scan_rate", "positive"]),
     "unit": (changed("radii.unit", "miles"), ["radii.unit", "'miles'"]),
     "distortion": (changed("optical_distortion", {"fisheye": {}}), ["'fisheye'", "radial"]),
+    "legendre": (changed("optical_distortion", {"legendre": {}}), ["'legendre' is not supported"]),
+    "themisir": (changed("optical_distortion", {"themisir": {}}), ["'themisir' is not supported"]),
     "quaternion": (
         changed("body_rotation.quaternions", [[1, 0, 0, 0], [1, 1, 0, 0]]),
         ["body_rotation", "unit"],

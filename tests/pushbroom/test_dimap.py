@@ -1,5 +1,7 @@
 """DIMAP of SPOT 5: an image written by the handbook's formulas is read as itself; refusals."""
 
+import re
+
 import numpy as np
 import pytest
 from pushbroom_scenes import LINES, PERIOD, PIXELS, locate, orbit
@@ -78,15 +80,24 @@ def by_the_handbook(line, pixel):
 
 
 def test_an_image_by_the_handbook(tmp_path):
-    """First, middle and last line and column; the attitudes begin 0.056 s after the first line."""
+    """First, middle and last line and column; the attitudes begin 0.056 s after the first line, and
+    then, with two rows less, end 1.5 steps before the last."""
     scanner = read_scanner(write_dimap(tmp_path))
     assert scanner.name == "scene" and scanner.earth == WGS84
+    assert "extrapolated by 0.0558" in scanner.warnings[0]
     lines, pixels = np.array([0, 299, 300, 599]), np.array([0, 150, 399])
     found = locate(scanner.image, Ground(), lines.astype(float), pixels.astype(float))
     for i, line in enumerate(lines):
         for k, pixel in enumerate(pixels):
             expected = by_the_handbook(line, pixel)
             np.testing.assert_allclose(found[:, i, k], expected, atol=2e-3)
+    fewer = lambda text: re.sub(r"(<Angles>((?!</Angles>).)*</Angles>){2}(?=</Corr)", "", text)
+    scanner = read_scanner(write_dimap(tmp_path, fewer))
+    assert len(scanner.image.trajectory.attitude.table.times) == 34
+    assert "and 0.1875 s at its end" in scanner.warnings[0]
+    found = locate(scanner.image, Ground(), lines.astype(float), pixels.astype(float))
+    for k, pixel in enumerate(pixels):
+        np.testing.assert_allclose(found[:, 3, k], by_the_handbook(599, pixel), atol=2e-3)
 
 
 REFUSED = {
@@ -98,7 +109,7 @@ REFUSED = {
     "time": ("<TIME>2008-03-04T12:29", "<TIME>yesterday", ["Point 1, TIME", "yesterday"]),
     "order": ("<TIME>2008-03-04T12:29:03", "<TIME>2008-03-04T12:39:03", ["point 2", "sort"]),
     "no xml": ("</Dimap_Document>", "", ["not valid XML"]),
-    "late": ("<NROWS>600", "<NROWS>700", ["Corrected_Attitude: image line 609", "outside"]),
+    "late": ("<NROWS>600", "<NROWS>700", ["Corrected_Attitude: image line 646", "0.25 s are"]),
 }
 
 

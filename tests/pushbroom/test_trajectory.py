@@ -49,12 +49,26 @@ def lagrange(order):
     return lambda times: np.array([value(t) for t in times])
 
 
+def as_usgscsm(order):
+    """As many rows before t as after it, (order + 1)/2 at most on each side."""
+
+    def value(t):
+        i = np.clip(np.searchsorted(TIMES, t, side="right") - 1, 0, len(TIMES) - 2)
+        half = min(i + 1, len(TIMES) - 1 - i, (order + 1) // 2)
+        rows = slice(i + 1 - half, i + 1 + half)
+        return KroghInterpolator(TIMES[rows], VALUES[rows])(t)
+
+    return lambda times: np.array([value(t) for t in times])
+
+
 ORACLES = {
     "linear": interp1d(TIMES, VALUES, axis=0),
     "hermite": CubicHermiteSpline(TIMES, VALUES, RATES),
     "spline": CubicSpline(TIMES, VALUES),
     "lagrange 3": lagrange(3),
     "lagrange 7": lagrange(7),
+    "usgscsm 3": as_usgscsm(3),
+    "usgscsm 7": as_usgscsm(7),
 }
 
 

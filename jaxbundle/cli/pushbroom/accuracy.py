@@ -14,6 +14,7 @@ from jaxbundle.cli.pushbroom.app import (
     Json,
     Level,
     ScannerFile,
+    open_scanner,
     pushbroom,
     surface_of,
     write_rows,
@@ -21,7 +22,6 @@ from jaxbundle.cli.pushbroom.app import (
 from jaxbundle.cli.pushbroom.locate import places
 from jaxbundle.errors import InputError
 from jaxbundle.io.error_maps import write_image_raster
-from jaxbundle.io.scanner import read_scanner
 from jaxbundle.plotting import image_map
 from jaxbundle.plotting.files import write_figures
 from jaxbundle.pushbroom.accuracy import drawn, ground_errors, propagated
@@ -73,12 +73,12 @@ def accuracy(
             raise InputError("--dem: with --table give --height; a terrain has no reverse mode")
         write_table(table_of(scanner, table, levels, draws, seed, height), csv, json)
         return
-    file = read_scanner(scanner)
+    file = open_scanner(scanner)
     surface = surface_of(file.earth, height, dem, file.image)
     _, line, pixel, _ = places(file.image, None, grid)
     columns = {"line": line, "pixel": pixel}
     if truth is not None:
-        errors = ground_errors(file.image, read_scanner(truth).image, surface, line, pixel)
+        errors = ground_errors(file.image, open_scanner(truth).image, surface, line, pixel)
         length = np.hypot(*errors.T)
         columns |= {"east": errors[:, 0], "north": errors[:, 1], "error": length}
         head = {"rms": float(np.sqrt(np.nanmean(length**2))),

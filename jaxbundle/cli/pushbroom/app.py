@@ -15,6 +15,7 @@ from jaxbundle.io.csv_tables import write_csv, write_text
 from jaxbundle.io.extent import image_extent, rpc_extent
 from jaxbundle.io.rasters import read_terrain
 from jaxbundle.io.result_json import without_nan
+from jaxbundle.io.scanner import Scanner, read_scanner
 from jaxbundle.network.columns import Columns
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.resample import RESAMPLINGS
@@ -27,7 +28,9 @@ pushbroom = typer.Typer(
 )
 app.add_typer(pushbroom, name="pushbroom")
 
-ScannerFile = Annotated[Path, typer.Argument(help="scanner file, .toml (docs/pushbroom.md)")]
+ScannerFile = Annotated[
+    Path, typer.Argument(help="scanner file .toml, or of a product (docs/pushbroom.md)")
+]
 Level = Annotated[
     float | None, typer.Option("--height", help="metres above the ellipsoid; Z in a local frame")
 ]
@@ -64,6 +67,14 @@ def surface_of(
         return Ground(earth)
     check_spheroid(earth)
     return Height(height, earth)
+
+
+def open_scanner(path: Path) -> Scanner:
+    """A scanner file; its warnings go to standard error."""
+    file = read_scanner(path)
+    for warning in file.warnings:
+        warn(warning)
+    return file
 
 
 def check_resampling(kind: str) -> None:

@@ -13,6 +13,7 @@ from jaxbundle.cli.pushbroom.app import (
     Level,
     ScannerFile,
     check_resampling,
+    open_scanner,
     pushbroom,
     surface_of,
 )
@@ -20,7 +21,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.correction import map_of, write_corrected
 from jaxbundle.io.error_maps import write_error_map
 from jaxbundle.io.maps import MapSystem
-from jaxbundle.io.scanner import Scanner, read_scanner
+from jaxbundle.io.scanner import Scanner
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.project import make_search
 
@@ -62,7 +63,7 @@ def correct(
             raise InputError(f"--error-map {error_map} is --out as well; give another name")
     if occlusion and dem is None:
         raise InputError("--occlusion: only terrain hides terrain; give --dem")
-    file = read_scanner(scanner)
+    file = open_scanner(scanner)
     surface = surface_of(file.earth, height, dem, file.image)
     system = MapSystem(file.earth, crs)
     grid = map_of(file.image, surface, system, spacing, dem)
@@ -101,7 +102,7 @@ def _check_target(option: str, path: Path, image: Path) -> None:
 
 def _truth(path: Path, file: Scanner) -> PushbroomImage:
     """The true image, which must be one of the same scene."""
-    truth = read_scanner(path)
+    truth = open_scanner(path)
     if truth.earth != file.earth:
         raise InputError(f"--truth {path}: its earth is not that of the scanner file")
     size, own = ((i.lines, i.pixels) for i in (truth.image, file.image))

@@ -15,6 +15,7 @@ from jaxbundle.cli.pushbroom.app import (
     Json,
     Level,
     ScannerFile,
+    open_scanner,
     pushbroom,
     surface_of,
     warn,
@@ -23,7 +24,6 @@ from jaxbundle.cli.pushbroom.app import (
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import geodetic
 from jaxbundle.io.csv_tables import read_csv
-from jaxbundle.io.scanner import read_scanner
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.locate import locate_points
@@ -48,7 +48,7 @@ def locate(
 ) -> None:
     """Where on the ground places of the image are; (0, 0) is the centre of the first pixel."""
     jaxbundle.enable_x64()
-    file = read_scanner(scanner)
+    file = open_scanner(scanner)
     surface = surface_of(file.earth, height, dem, file.image)
     ids, line, pixel, source = places(file.image, points, grid)
     find = jax.jit(locate_points)

@@ -13,6 +13,7 @@ from jaxbundle.cli.pushbroom.app import (
     ScannerFile,
     check_spheroid,
     geographic,
+    open_scanner,
     pushbroom,
     warn,
     write_rows,
@@ -20,7 +21,6 @@ from jaxbundle.cli.pushbroom.app import (
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed
 from jaxbundle.io.csv_tables import read_csv
-from jaxbundle.io.scanner import read_scanner
 from jaxbundle.network.columns import Columns, did_you_mean
 from jaxbundle.pushbroom.project import Status, make_search, project_points
 
@@ -42,7 +42,7 @@ def project(
 ) -> None:
     """Where in the image points of the ground are: a row for every line that sees one."""
     jaxbundle.enable_x64()
-    file = read_scanner(scanner)
+    file = open_scanner(scanner)
     table = _with_points(read_csv(points))
     X = _points(table, file.earth)
     found = project_points(file.image, make_search(file.image, file.earth), X, most=MOST)

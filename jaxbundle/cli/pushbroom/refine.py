@@ -1,5 +1,6 @@
 """`jaxbundle pushbroom refine`: least squares on control and tie points."""
 
+import dataclasses
 import json as json_
 from pathlib import Path
 from typing import Annotated
@@ -32,6 +33,7 @@ def refine(
         file.images, file.points, file.observations, file.frames,
         snooping=file.snooping, significance=file.significance,
     )  # fmt: skip
+    result = dataclasses.replace(result, warnings=(*file.warnings, *result.warnings))
     text, document = report(result), without_nan(to_json(result))
     as_json = json_.dumps(document, ensure_ascii=False) + "\n"
     if out is not None:

@@ -14,6 +14,7 @@ from jaxbundle.cli.pushbroom.app import (
     Level,
     check_spheroid,
     geographic,
+    open_scanner,
     pushbroom,
     surface_of,
     warn,
@@ -23,7 +24,6 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.io.csv_tables import read_csv
 from jaxbundle.io.rpc import read_rpc, write_rpc
-from jaxbundle.io.scanner import read_scanner
 from jaxbundle.network.columns import Columns
 from jaxbundle.pushbroom.rpc import RpcStatus, locate_points_on, project_points
 from jaxbundle.pushbroom.rpc_bias import compensated, fit_bias
@@ -62,7 +62,7 @@ def fit(
         table, columns = _table(source)
         found = fit_rpc(table, ridge=ridge, source=columns.source)
     else:
-        file = read_scanner(source)
+        file = open_scanner(source)
         if file.earth is None:
             raise InputError(f"{source}: a local frame has no longitudes; RPCs need an Earth")
         check_spheroid(file.earth)
