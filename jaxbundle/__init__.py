@@ -12,7 +12,8 @@ Importing configures nothing; `enable_x64` switches JAX to the 64-bit floats adj
 """
 
 import importlib
-from typing import TYPE_CHECKING
+
+TYPE_CHECKING = False  # typing would be imported for nothing else
 
 if TYPE_CHECKING:
     from jaxbundle.adjustment import Problem as Problem

@@ -5,24 +5,28 @@ library reads it when it is imported.
 """
 
 import os
-import signal
 import sys
 import warnings
 
+from jaxbundle.interrupts import handle_interrupts, set_status
+
 
 def main() -> None:
-    """Run the command line."""
+    """Run the command line, as the whole of this process."""
+    handle_interrupts()
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from jaxbundle.configuration import keep_programs
+
+    keep_programs()
+    _tell_once_of_damage()
+    from jaxbundle.cli import main
+
     try:
-        from jaxbundle.configuration import keep_programs
-
-        keep_programs()
-        _tell_once_of_damage()
-        from jaxbundle.cli import main
-
         main()
-    except KeyboardInterrupt:
-        sys.exit(128 + signal.SIGINT)
+    except SystemExit as ended:
+        set_status(ended.code or 0)
+        raise
+    set_status(0)
 
 
 def _tell_once_of_damage() -> None:

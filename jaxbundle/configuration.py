@@ -9,6 +9,7 @@ from importlib.metadata import version
 from typing import NoReturn
 
 from jaxbundle.errors import InputError
+from jaxbundle.temporaries import watch_cache
 
 QUICK_LOOPS = "--xla_cpu_use_fusion_emitters=false"
 """XLA writes loops in the older of its two ways: compiled in half the time and memory, as fast."""
@@ -70,6 +71,7 @@ def keep_programs(folder: str | os.PathLike | None = None) -> bool:
     jax.config.update("jax_compilation_cache_dir", os.fspath(folder) if usable else None)
     if not usable:
         return False
+    watch_cache(folder)
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", WORTH_KEEPING)
     return True

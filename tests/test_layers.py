@@ -8,6 +8,8 @@ import pytest
 LAYERS = (
     "errors",
     "arguments",
+    "temporaries",
+    "interrupts",
     "configuration",
     "geometry",
     "cameras",

@@ -1,6 +1,6 @@
 """The application the commands are registered with, and how it ends."""
 
-import signal
+import os
 import sys
 import traceback
 from pathlib import Path
@@ -13,6 +13,8 @@ from jaxbundle.configuration import leave
 from jaxbundle.errors import InputError, NotSolvedError
 
 BAD_INPUT, NOT_SOLVED = 2, 3
+NO_READER = 128 + 13
+"""As of a Unix tool whose reader has gone: ended by SIGPIPE, number 13."""
 
 app = typer.Typer(
     name="jaxbundle",
@@ -54,21 +56,26 @@ def _main(
 def run() -> None:
     """Run the application; errors of the input, the solution, the machine end in one line."""
     try:
-        sys.exit(app(standalone_mode=False))
+        status = app(standalone_mode=False)
+        sys.stdout.flush()
     except (InputError, NotSolvedError) as error:
         _end(error, BAD_INPUT if isinstance(error, InputError) else NOT_SOLVED)
     except MemoryError:
         _end("not enough memory for this", NOT_SOLVED)
+    except (BrokenPipeError, SystemExit):  # typer ends a command that meets a broken pipe
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        leave(NO_READER)
+    except typer.Abort as error:  # typer's word for EOFError
+        _end(f"a file ends too early: {error.__cause__}", BAD_INPUT)
     except (OSError, OverflowError, RecursionError) as error:
         _end(" ".join(str(error).split()), BAD_INPUT)
-    except typer.Abort:
-        leave(128 + signal.SIGINT)
     except Exception as error:
         # Usage errors of the command line itself (unknown option, missing argument).
         if hasattr(error, "format_message"):
             _end(error.format_message(), BAD_INPUT)
         traceback.print_exc()
         leave(1)
+    sys.exit(status)
 
 
 def _end(message: object, status: int) -> NoReturn:

@@ -1,7 +1,5 @@
 """`jaxbundle batch`: many cameras, many networks."""
 
-import signal
-import sys
 from typing import Annotated
 
 import typer
@@ -10,6 +8,7 @@ import jaxbundle
 from jaxbundle.batches import run_batch
 from jaxbundle.cli.app import Quiet, app
 from jaxbundle.cli.progress import counting
+from jaxbundle.interrupts import advise
 from jaxbundle.io.camera_stacks import is_camera_stack
 
 
@@ -40,20 +39,16 @@ def batch(
     if not all(map(is_camera_stack, inputs)):
         # Cameras fill the cores by threads of their own, and gain nothing.
         jaxbundle.use_cores()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    try:
-        with counting(quiet) as bar:
-            task = bar.add_task("batch", total=None)
-            counts = run_batch(
-                inputs, json_lines, model=model,
-                free=[name.strip() for name in free.split(",")] if free else None,
-                max_iterations=max_iterations, portion=portion, brief=brief, retry=retry,
-                renew=renew,
-                progress=lambda done, total: bar.update(task, completed=done, total=total),
-            )  # fmt: skip
-    except KeyboardInterrupt:
-        print("jaxbundle: interrupted; run the same command again to go on", file=sys.stderr)
-        raise
+    advise("run the same command again to go on")
+    with counting(quiet) as bar:
+        task = bar.add_task("batch", total=None)
+        counts = run_batch(
+            inputs, json_lines, model=model,
+            free=[name.strip() for name in free.split(",")] if free else None,
+            max_iterations=max_iterations, portion=portion, brief=brief, retry=retry,
+            renew=renew,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )  # fmt: skip
     if not quiet:
         skipped = counts.pop("skipped", 0)
         said = ", ".join(f"{number} {status}" for status, number in counts.most_common() if number)

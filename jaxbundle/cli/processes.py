@@ -1,7 +1,6 @@
 """Several processes with one task: they find each other, and agree on what it is."""
 
 import hashlib
-import signal
 import sys
 
 import numpy as np
@@ -12,9 +11,6 @@ from jaxbundle.errors import InputError, NotSolvedError
 
 def join_processes(join: tuple[str, int, int] | None, quiet: bool) -> bool:
     """Join, and say whether this is the process that writes."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        # Python would wait for the end of a program that may itself wait for other processes.
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
     if join and not quiet:
         print(f"jaxbundle: waiting for {join[1]} processes at {join[0]}", file=sys.stderr)
     return jaxbundle.join_processes(*(join or ()))

@@ -3,7 +3,6 @@
 import csv
 import io
 import itertools
-import os
 import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -15,6 +14,7 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import Columns
 from jaxbundle.network.tables import Source
+from jaxbundle.temporaries import replacing
 
 DESCRIPTORS = (Path("/dev"), Path("/dev/fd"), Path("/proc/self/fd"))
 """Where open files of the process have names."""
@@ -135,18 +135,12 @@ def write_bytes(path: Path, content: bytes | Iterable[bytes]) -> None:
     descriptor leads to (/dev/stdout); a link stays a link.
     """
     pieces = (content,) if isinstance(content, bytes) else content
-    real = Path(os.path.realpath(path))
-    temporary = real.with_name(f".{real.name}.{os.getpid()}.tmp")
     try:
         if path.exists() and (not path.is_file() or path.parent in DESCRIPTORS):
             with path.open("wb") as file:
                 file.writelines(pieces)
             return
-        try:
-            with temporary.open("wb") as file:
-                file.writelines(pieces)
-            os.replace(temporary, real)
-        finally:
-            temporary.unlink(missing_ok=True)
+        with replacing(path) as whole, whole.open("wb") as file:
+            file.writelines(pieces)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None

@@ -1,6 +1,5 @@
 """Errors as rasters: of a map against a known truth, and of places over an image."""
 
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from jaxbundle.pushbroom.correct import block_errors, block_places
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.project import Search
 from jaxbundle.pushbroom.surfaces import Surface
+from jaxbundle.temporaries import replacing
 
 BANDS = "east [m]", "north [m]", "error [m]"
 
@@ -61,18 +61,12 @@ def write_image_raster(
     Its coordinates are those of the image: x the pixel, y the line, downwards.
     """
     package = rasterio()
-    target = Path(target)
     steps = [v[1] - v[0] if len(v) > 1 else 1.0 for v in (pixels, lines)]
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.tif")
-    try:
-        with open_plain(
-            temporary, "w", driver="GTiff", width=len(pixels), height=len(lines), count=len(bands),
-            dtype="float32", nodata=np.nan, transform=package.transform.Affine(
-                steps[0], 0, pixels[0] - steps[0] / 2, 0, steps[1], lines[0] - steps[1] / 2
-            ),
-        ) as raster:  # fmt: skip
-            raster.write(np.stack(list(bands.values())).astype("float32"))
-            raster.descriptions = tuple(bands)
-        os.replace(temporary, target)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(target, ".tif") as temporary, open_plain(
+        temporary, "w", driver="GTiff", width=len(pixels), height=len(lines), count=len(bands),
+        dtype="float32", nodata=np.nan, transform=package.transform.Affine(
+            steps[0], 0, pixels[0] - steps[0] / 2, 0, steps[1], lines[0] - steps[1] / 2
+        ),
+    ) as raster:  # fmt: skip
+        raster.write(np.stack(list(bands.values())).astype("float32"))
+        raster.descriptions = tuple(bands)

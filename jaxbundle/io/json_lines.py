@@ -7,11 +7,13 @@ where it stopped: it knows the keys that are there, and what their lines were ma
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.csv_tables import write_bytes
 from jaxbundle.io.result_json import without_nan
+from jaxbundle.temporaries import unbroken
 
 HEAD = ("status", "settings", "data")
 """What is remembered of a line: how it ended, and what it was made of."""
@@ -27,7 +29,7 @@ class JsonLines:
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
-        regular = self.path.is_file() or not self.path.exists()
+        self._regular = regular = self.path.is_file() or not self.path.exists()
         # A link stays a link; a pipe of a process has no other name.
         self._file = Path(os.path.realpath(path)) if regular else self.path
         self.heads: dict[str, dict] = {}
@@ -88,10 +90,11 @@ class JsonLines:
 
     def _write(self, write: Callable) -> None:
         try:
-            with self._file.open("ab") as file:
+            # A pipe may take its time: nothing waits for it.
+            with unbroken() if self._regular else nullcontext(), self._file.open("ab") as file:
                 write(file)
                 file.flush()
-                if self._file.is_file():
+                if self._regular:
                     os.fsync(file.fileno())
         except OSError as error:
             raise InputError(f"{self.path}: cannot be written: {error.strerror}") from None

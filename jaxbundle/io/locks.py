@@ -7,11 +7,12 @@ hinders nobody. The file itself may be renamed over meanwhile.
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
 from jaxbundle.errors import InputError
+from jaxbundle.temporaries import temporary, unbroken
 
 
 @contextmanager
@@ -27,27 +28,31 @@ def locked(path: str | Path) -> Iterator[None]:
     if not real.parent.is_dir():
         raise InputError(f"{path}: there is no folder {real.parent}")
     lock = real.with_name(f".{real.name}.lock")
-    stream = None
-    while stream is None:
-        try:
-            stream = _opened(lock)
-        except BlockingIOError:
-            raise InputError(
-                f"{path}: another run is writing this file; wait for its end, or give another file"
-            ) from None
-        except OSError as error:
-            raise InputError(
-                f"{path}: its lock {lock} cannot be made: {error.strerror}; the folder must take "
-                "files"
-            ) from None
-    try:
+    with ExitStack() as held:
+        with unbroken():  # A lock is removed by the process that has it, and by no other.
+            held.enter_context(_taken(path, lock))
+            # Gone before it is let go: nobody else gets a lock on a file that is about to vanish.
+            # Windows removes no open file: there it stays.
+            held.enter_context(temporary(lock))
         yield
-    finally:
-        # Gone before it is let go: nobody else gets a lock on a file that is about to vanish.
-        # Windows removes no open file: there it stays.
-        with suppress(OSError):
-            lock.unlink()
-        stream.close()
+
+
+def _taken(path: str | Path, lock: Path) -> BinaryIO:
+    """The locked file.
+
+    **Raises:** `InputError` as `locked`."""
+    try:
+        while (stream := _opened(lock)) is None:
+            pass
+    except BlockingIOError:
+        raise InputError(
+            f"{path}: another run is writing this file; wait for its end, or give another file"
+        ) from None
+    except OSError as error:
+        raise InputError(
+            f"{path}: its lock {lock} cannot be made: {error.strerror}; the folder must take files"
+        ) from None
+    return stream
 
 
 def _opened(lock: Path) -> BinaryIO | None:

@@ -1,6 +1,5 @@
 """A map as a GeoTIFF, made and written block by block, two at a time, under a temporary name."""
 
-import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -12,6 +11,7 @@ from jaxbundle.io.maps import MapGrid, MapSystem
 from jaxbundle.io.rasters import as_type, rasterio, unreadable
 from jaxbundle.pushbroom.correct import BLOCK, STEP, Nodes
 from jaxbundle.pushbroom.surfaces import Surface
+from jaxbundle.temporaries import replacing
 
 
 def write_map(
@@ -33,7 +33,6 @@ def write_map(
     **Raises:** `InputError` if the file cannot be written.
     """
     package = rasterio()
-    temporary = Path(target).with_name(f".{Path(target).name}.{os.getpid()}.tif")
     floating = np.issubdtype(dtype, np.floating)
     writing = threading.Lock()
     steps = np.arange(0, BLOCK + STEP, STEP)
@@ -49,7 +48,7 @@ def write_map(
             map_.write(values, window=((row, row + rows), (column, column + columns)))
 
     corners = [(r, c) for r in range(0, grid.rows, BLOCK) for c in range(0, grid.columns, BLOCK)]
-    try:
+    with replacing(target, ".tif") as temporary:
         try:
             map_ = package.open(
                 temporary, "w", driver="GTiff", width=grid.columns, height=grid.rows, count=count,
@@ -66,6 +65,3 @@ def write_map(
                 for done, _ in enumerate(workers.map(one, corners), 1):
                     if progress:
                         progress(done, len(corners))
-        os.replace(temporary, target)
-    finally:
-        temporary.unlink(missing_ok=True)

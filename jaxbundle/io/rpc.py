@@ -11,7 +11,6 @@ In all of them line 0, sample 0 is the centre of the first pixel, degrees and me
 besides (ERR_BIAS, ERR_RAND, MIN_LONG, …) are passed over, and none are written.
 """
 
-import os
 import re
 import shutil
 from pathlib import Path
@@ -24,6 +23,7 @@ from jaxbundle.io.csv_tables import read_text, write_text
 from jaxbundle.io.rasters import rasterio
 from jaxbundle.network.columns import shown
 from jaxbundle.pushbroom.rpc import TERMS, Rpc
+from jaxbundle.temporaries import replacing
 
 OFFSETS = {
     "line": ("LINE", "line"), "sample": ("SAMP", "samp"), "longitude": ("LONG", "long"),
@@ -203,16 +203,13 @@ def _to_raster(path, rpc):
         given[name.lower()] = np.asarray(getattr(rpc, field)).tolist()
     if not path.is_file():
         raise InputError(f"{path}: no such file; RPC tags are written into a raster that exists")
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
-        shutil.copyfile(path, temporary)
-        with package.open(temporary, "r+") as target:
-            target.rpcs = RPC(**given)
-        os.replace(temporary, path)
+        with replacing(path, path.suffix) as temporary:
+            shutil.copyfile(path, temporary)
+            with package.open(temporary, "r+") as target:
+                target.rpcs = RPC(**given)
     except (OSError, package.errors.RasterioError) as error:
         raise InputError(f"{path}: cannot be written: {' '.join(str(error).split())}") from None
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _plain_text(rpc):

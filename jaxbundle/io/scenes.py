@@ -1,6 +1,5 @@
 """Scenes for simulation: a raster with map coordinates, and the image that is taken of it."""
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -16,6 +15,7 @@ from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.resample import Resampling
 from jaxbundle.pushbroom.simulate import taken_image
 from jaxbundle.pushbroom.surfaces import Surface
+from jaxbundle.temporaries import replacing
 
 PORTION = 64
 """Lines that are taken together."""
@@ -68,9 +68,8 @@ def write_taken(
 
     **Raises:** `InputError` if the scene is nowhere in the image.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tif")
     seen = False
-    try:
+    with replacing(path, ".tif") as temporary:
         with open_plain(
             temporary, "w", driver="GTiff", width=image.pixels, height=image.lines,
             count=len(bands), dtype=dtype, BIGTIFF="IF_SAFER",
@@ -89,6 +88,3 @@ def write_taken(
                     progress(first + values.shape[1], image.lines)
         if not seen:
             raise InputError("the image shows nothing of the scene: look at track and coordinates")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)

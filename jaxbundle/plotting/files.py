@@ -1,9 +1,7 @@
 """All figures of a result as PNG files, without a display and without pyplot."""
 
 import io
-import os
 import re
-import tempfile
 import warnings
 from collections.abc import Mapping
 from functools import partial
@@ -12,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxbundle.errors import InputError
+from jaxbundle.io.csv_tables import write_bytes
 from jaxbundle.plotting.cameras import correlation_matrix, distortion_curve
 from jaxbundle.plotting.images import residual_histogram, residual_vectors
 from jaxbundle.plotting.style import need_matplotlib
@@ -80,7 +79,7 @@ def write_figures(folder: str | Path, drawings: Mapping[str, tuple]) -> list[Pat
     written = []
     for name, (size, projection, draw) in drawings.items():
         path = folder / f"{name}.png"
-        _write(path, png(size, projection, draw))
+        write_bytes(path, png(size, projection, draw))
         written.append(path)
     return written
 
@@ -99,22 +98,6 @@ def png(size, projection, draw) -> bytes:
         warnings.filterwarnings("ignore", message="Glyph .* missing")
         figure.savefig(data, format="png", bbox_inches="tight", pad_inches=0.15)
     return data.getvalue()
-
-
-def _write(path: Path, content: bytes) -> None:
-    try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
-    finally:
-        Path(temporary).unlink(missing_ok=True)
 
 
 class _Names:

@@ -1,0 +1,125 @@
+"""Ctrl-C and SIGTERM on the command line: one line, status 130 or 143, nothing half-written.
+
+Python's own handler raises an exception in the main thread. That is not enough. In a destructor, a
+callback of the garbage collector or of C++ the exception is swallowed, and the run goes on; in the
+middle of an import it turns into another error; and while the main thread compiles or computes in
+C++, which takes minutes for a large network, it is not raised at all.
+
+So nothing is raised. The handler removes what is temporary and ends the process. Python calls it
+between two steps of the main thread, wherever that is. Where it is not called within `GRACE`, for
+the main thread is in C++, a thread that the signal wakes does the same.
+
+Nothing of this is set up by importing jaxbundle: only the command line calls `handle_interrupts`.
+"""
+
+import atexit
+import os
+import signal
+import sys
+import threading
+import time
+from contextlib import suppress
+
+from jaxbundle.temporaries import put_off, remove_temporaries
+
+GRACE = 0.3
+"""Seconds the main thread has to take notice of a signal."""
+
+PATIENCE = 10.0
+"""Seconds for what must not be cut in two; a disk that does not answer holds nobody longer."""
+
+WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
+if os.name == "posix":
+    WORDS[signal.SIGHUP] = "the terminal is gone"
+
+_advice = ""
+_status = 1
+_heard = False
+_ending = threading.RLock()
+
+
+def handle_interrupts() -> None:
+    """End this process by the rules above, from now on; what is ignored stays ignored (nohup).
+
+    At its end the process leaves without taking the interpreter apart, which takes JAX up to a
+    second in which a signal would end it in other ways.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return
+    for number in WORDS:
+        if signal.getsignal(number) in (signal.default_int_handler, signal.SIG_DFL):
+            signal.signal(number, _handle)
+    _open_standard_streams()
+    atexit.register(_leave)  # the first to be registered is the last to be called
+    if os.name == "posix":
+        reader, writer = os.pipe()
+        os.set_blocking(writer, False)
+        signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+        threading.Thread(target=_watch, args=(reader,), daemon=True).start()
+
+
+def advise(words: str) -> None:
+    """Say at an interrupt what to do to go on."""
+    global _advice
+    _advice = words
+
+
+def set_status(status: int) -> None:
+    """The exit status of the process, if nothing interrupts it any more."""
+    global _status
+    _status = status
+
+
+def _handle(number: int, frame: object) -> None:
+    global _heard
+    _heard = True
+    if not put_off(lambda: _end(number)):
+        _end(number)
+
+
+def _watch(reader: int) -> None:
+    """Wait for the byte that Python writes for a signal, whatever the main thread does."""
+    number = 0
+    while number not in WORDS:
+        number = os.read(reader, 1)[0]
+    time.sleep(GRACE)
+    if not _heard:
+        _end(number)
+    time.sleep(2 * PATIENCE)
+    os._exit(128 + number)
+
+
+def _end(number: int) -> None:
+    """Tidy up, say so, and end; a thread that comes second waits here for the end."""
+    _ending.acquire()
+    if threading.current_thread() is threading.main_thread():
+        # Not "ignore": Python tells of a signal that it had taken note of, and that is now ignored.
+        for one in WORDS:
+            if signal.getsignal(one) is _handle:
+                signal.signal(one, lambda *_: None)
+    remove_temporaries(PATIENCE)
+    line = f"jaxbundle: {WORDS[number]}" + (_advice and f"; {_advice}") + "\n"
+    with suppress(OSError):
+        if os.isatty(2):  # There may be a bar of progress, which hides the cursor.
+            line = "\r\x1b[2K\x1b[?25h" + line
+        os.write(2, line.encode())
+    os._exit(128 + number)
+
+
+def _leave() -> None:
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(_status)
+
+
+def _open_standard_streams() -> None:
+    """Give a closed standard stream (`>&-`) the null device: the next file that is opened would
+    have its number, and get what is said to the user."""
+    for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))
