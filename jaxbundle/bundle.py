@@ -15,6 +15,7 @@ from jaxbundle.network.reduction import REDUCTIONS
 from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.tables import Network, require_network
 from jaxbundle.orientation.network import Oriented, lacks_start_values
+from jaxbundle.orientation.one_place import name_one_place
 from jaxbundle.oriented import orient, orient_again, screen
 from jaxbundle.repeated import eliminated_parameters, robustly, snooped, with_components
 from jaxbundle.result import Adjustment
@@ -25,6 +26,7 @@ from jaxbundle.solution import (
     names_of_defects,
     solved,
     start_with,
+    weakness_without_solution,
 )
 from jaxbundle.statistics import ESTIMATORS, intersect_check_points
 from jaxbundle.statistics.snooping import check_test
@@ -124,6 +126,10 @@ def adjust(
     names = () if inspection else names_of_defects(problem, minimum)
     if not inspection and converged(int(minimum.termination)):
         names = names or UNNAMED
+    weak, findings = None, ()
+    if not inspection:
+        findings = tuple(filter(None, [name_one_place(problem.network)]))
+        weak = None if names else weakness_without_solution(problem, minimum)
     intersected = None
     if len(check[0]):
         intersected = lambda result: intersect_check_points(
@@ -132,8 +138,8 @@ def adjust(
     return Adjustment(
         network, problem, minimum, removed=tuple(removed), eliminated=tuple(eliminated),
         undetermined=tuple(names), check=intersected, method=method, reduction=used,
-        sigma_factors=factors, inspection=inspection, robust=robust,
-        weights=None if weights is None else np.asarray(weights)[problem.rays],
+        sigma_factors=factors, inspection=inspection, robust=robust, weakness=weak,
+        findings=findings, weights=None if weights is None else np.asarray(weights)[problem.rays],
     )  # fmt: skip
 
 

@@ -43,6 +43,7 @@ from jaxbundle.statistics import (
     distortion_reach,
     variance_components,
 )
+from jaxbundle.statistics.weakness import Weakness, weakness
 
 
 class Adjustment:
@@ -55,10 +56,13 @@ class Adjustment:
     - `cameras`, `images`, `points`, `residuals`: tables (dicts of numpy columns)
     - `method`, `reduction`: of the solution; the latter of the reduced system of images and cameras
     - `warnings`, `removed` (data snooping), `eliminated` (insignificant parameters),
-      `undetermined` (names, where the network is singular)
+      `undetermined` (names, where the network is singular), `weakness` (what is determined in name
+      only)
     - `sigma_factors`: where variance components were estimated, by group of observations, what its
       a priori σ have been multiplied by; empty otherwise. Everything called a priori then means
       the estimated σ, except in `variance_components`.
+    - `findings`: likely causes where there is no solution, or one that fits badly; in words, among
+      the `warnings`.
     - `robust`, `weights`: the estimator, and the factors of the weights it gave the image points
       in the order of the observations; None otherwise. A priori σ are then those after weighting.
     """
@@ -79,6 +83,8 @@ class Adjustment:
         inspection: Inspection | None = None,
         robust: str | None = None,
         weights: Float[np.ndarray, " observations"] | None = None,
+        weakness: Weakness | None = None,
+        findings: tuple[str, ...] = (),
     ):
         self.network = network
         self.problem = problem
@@ -91,6 +97,8 @@ class Adjustment:
         self.sigma_factors = dict(sigma_factors or {})
         self.robust = robust
         self.weights = weights
+        self.findings = findings
+        self._weakness = weakness
         self._inspection = inspection
         self._check = check
 
@@ -115,10 +123,21 @@ class Adjustment:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What was left out or looked strange, in words; also distortions that turn back."""
+        """What was left out or looked strange, in words; also what is poorly determined, and
+        distortions that turn back."""
         found = self.distortion_reach.values() if self.converged else ()
         turns = (reach.message for reach in found if reach.message is not None)
-        return (*self.problem.network.warnings, *turns)
+        return (
+            *self.problem.network.warnings, *self.findings, *self.weakness.lines, *turns
+        )  # fmt: skip
+
+    @functools.cached_property
+    def weakness(self) -> Weakness:
+        """What is determined in name only: unknowns with a σ above a fiftieth of their extent, or,
+        without a solution, with such a σ a priori where the iterations ended."""
+        if self._weakness is not None or not self.converged:
+            return self._weakness or Weakness()
+        return weakness(self.inspection, self.sigma0)
 
     @functools.cached_property
     def distortion_reach(self) -> dict[str, Reach]:
@@ -145,6 +164,7 @@ class Adjustment:
         if not self.converged:
             names = some(self.undetermined, 8, str)
             what = f"; not determined: {names}" if names else ""
+            what += "".join(f"; {line}" for line in (*self.findings, *self.weakness.lines))
             raise NotSolvedError(
                 f"the adjustment did not converge ({self.termination}){what}; it has no result"
             )

@@ -20,12 +20,16 @@ from jaxbundle.network.columns import some
 from jaxbundle.network.padding import filled, pad_values, without_filling
 from jaxbundle.network.tables import Camera
 from jaxbundle.statistics import Inspection
+from jaxbundle.statistics.weakness import Weakness, weakness_of_unsolved
 
 RAYS_TO_SHARE = 10_000
 """Networks with so many rays are distributed over the devices, where there are several."""
 
 MISJUDGED = 1.03
 """A principal distance that changed by more than this factor was too wrong for start values."""
+
+EIGENVECTORS = 3000
+"""Reduced systems with more unknowns are not searched for null vectors: that takes minutes."""
 
 RUNAWAY = 20.0
 """A principal distance that changed by more than this factor belongs to no camera."""
@@ -58,12 +62,27 @@ def solved(problem: Problem, minimum: Minimum) -> Inspection | None:
 
 
 def names_of_defects(problem: Problem, minimum: Minimum) -> list[str]:
+    """What nothing determines where the iterations ended; of a large network, whose eigenvectors
+    nobody can wait for, what is weak where it is singular."""
     values = minimum.values
     if bool(converged(int(minimum.termination))) and _collapsed(problem, values):
         return _collapsed(problem, values)
-    if not all(np.isfinite(np.asarray(x)).all() for x in (values.camera, values.position)):
-        values = problem.data.start
-    return undetermined(problem, values, problem.data)
+    if problem.structure.reduction == "dense" and problem.structure.reduced_size <= EIGENVECTORS:
+        return undetermined(problem, _last(problem, minimum), problem.data)
+    singular = bool(converged(int(minimum.termination))) or int(minimum.termination) == SINGULAR
+    return list(weakness_without_solution(problem, minimum).unknowns) if singular else []
+
+
+def weakness_without_solution(problem: Problem, minimum: Minimum) -> Weakness:
+    """What is poorly determined where the iterations ended."""
+    return weakness_of_unsolved(problem, _last(problem, minimum))
+
+
+def _last(problem: Problem, minimum: Minimum) -> Values:
+    """Where the iterations ended; the start where that is nowhere."""
+    values = minimum.values
+    finite = all(np.isfinite(np.asarray(x)).all() for x in (values.camera, values.position))
+    return values if finite else problem.data.start
 
 
 def require_solved(problem: Problem, minimum: Minimum, when: str) -> None:

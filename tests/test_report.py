@@ -322,10 +322,11 @@ def test_a_distortion_that_turns_back_is_warned_of(convergent4):
     changed = again(convergent4, minimum=eqx.tree_at(
         lambda m: m.values, convergent4.minimum, turned
     ))  # fmt: skip
-    (warning,) = changed.warnings
+    # These residuals are so large that the camera is poorly determined too.
+    (warning,) = (line for line in changed.warnings if not line.startswith("poorly determined"))
     assert "'cam'" in warning and "turns back" in warning and "a radius of 4 mm" in warning
-    assert result_dict(changed, brief=True)["warnings"] == [warning]
-    assert "1 warning" in str(changed)
+    assert result_dict(changed, brief=True)["warnings"][-1] == warning
+    assert f"{len(changed.warnings)} warning" in str(changed)
     assert convergent4.warnings == ()
 
 

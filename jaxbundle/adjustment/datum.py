@@ -120,6 +120,19 @@ def s_transform(structure: Structure, values: Values, change: Tangent) -> Tangen
     return jax.tree.map(lambda d, g: d - g @ along, change, G)
 
 
+def s_transform_transposed(structure: Structure, values: Values, row: Tangent) -> Tangent:
+    """A linear function of the unknowns as one of those before the datum: f − B(GᵀB)⁻¹Gᵀf."""
+    if not structure.defect:
+        return row
+    G = gauge_directions(structure, values)
+    B = G.point * structure.datum_weight[..., None]
+    gram = jnp.einsum("pik,pil->kl", G.point, B)
+    total = sum(
+        jnp.einsum("...k,...->k", g, f) for g, f in zip(jax.tree.leaves(G), jax.tree.leaves(row))
+    )
+    return Tangent(row.image, row.camera, row.point - B @ jnp.linalg.solve(gram, total))
+
+
 def move_to_datum(
     structure: Structure, values: Values, start: Values, *, derivatives: bool = False
 ) -> Values:

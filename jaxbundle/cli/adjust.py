@@ -120,6 +120,8 @@ def _why_not(result: Adjustment) -> str:
     if result.undetermined:
         parts.append(f"not determined: {some(result.undetermined, 12, str)}")
         parts.append("fix them, give them a prior σ, or measure what determines them")
+    elif result.findings or result.weakness.lines:
+        parts += [*result.findings, *result.weakness.lines]
     elif "limit" in result.termination:
         parts.append("raise --max-iterations or give better start values")
     else:

@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import count, did_you_mean, some
+from jaxbundle.network.repetitions import warn_of_repetitions
 from jaxbundle.network.rules import AXES, CHOICES, check_camera, check_choice, check_unique
 from jaxbundle.network.sightings import (
     check_images,
@@ -50,6 +51,7 @@ def check_network(network: Network) -> Network:
     check_parts(network)
     check_redundancy(network)
     network = check_single_strip(network)
+    network = warn_of_repetitions(network)
     network = _warn_of_points_behind(network)
     return network.replace(warnings=tuple(dict.fromkeys(network.warnings)))
 

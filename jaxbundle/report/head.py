@@ -22,6 +22,7 @@ from jaxbundle.report.layout import (
     significant,
     table,
 )
+from jaxbundle.statistics.weakness import ADVICE_FOR
 
 METHODS = {
     "levenberg-marquardt": "least squares by Levenberg–Marquardt steps, points eliminated (Schur)",
@@ -42,12 +43,6 @@ ADVICE = {
     STUCK: "Give better start values, and look for gross errors in observations and point names.",
     NOT_FINITE: "Give better start values: some points lie behind their cameras or in their "
     "plane, or outside the range of the distortion.",
-}
-ADVICE_FOR = {
-    "camera": "Free fewer camera parameters, or give them a prior σ; c needs depth or convergent "
-    "images, x0 and y0 need images turned about their axis.",
-    "image": "An image needs three or more well spread points whose coordinates are determined.",
-    "point": "A point needs rays from two directions or more.",
 }
 
 
@@ -301,6 +296,8 @@ def why_not_solved(adjustment) -> list[str]:
     ]
     if names:
         rows.append(("Not determined", some(names, 40, clean)))
+    elif adjustment.weakness.unknowns:
+        rows.append(("Hardly determined", some(adjustment.weakness.unknowns, 40, clean)))
     advice = [ADVICE.get(reason, ADVICE[STUCK])]
     if reason == LIMIT and taken < tried / 2:
         advice.append("Most steps were rejected: hold parameters that the images hardly determine.")

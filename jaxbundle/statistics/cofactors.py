@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbundle.adjustment.datum import gauge_directions
+from jaxbundle.adjustment.datum import gauge_directions, s_transform_transposed
 from jaxbundle.adjustment.jacobian import compiled_jacobian
 from jaxbundle.adjustment.normal import normal_from_jacobian
 from jaxbundle.adjustment.parts import Parts
@@ -163,20 +163,7 @@ def propagate(structure: Structure, values: Values, factor: Factor, rows: Tangen
 
     One structured solve for each function; covariances of anything, never conditional ones.
     """
-    from_datum = jax.vmap(lambda r: _datum_transposed(structure, values, r))(rows)
+    from_datum = jax.vmap(lambda r: s_transform_transposed(structure, values, r))(rows)
     solved = jax.vmap(lambda r: solve(factor, r))(from_datum)
     flat = lambda t: jnp.concatenate([x.reshape(x.shape[0], -1) for x in jax.tree.leaves(t)], 1)
     return flat(from_datum) @ flat(solved).T
-
-
-def _datum_transposed(s, values, row):
-    """Sᵀ·f: f − B(GᵀB)⁻¹Gᵀf."""
-    if not s.defect:
-        return row
-    G = gauge_directions(s, values)
-    B = G.point * s.datum_weight[..., None]
-    gram = jnp.einsum("pik,pil->kl", G.point, B)
-    total = sum(
-        jnp.einsum("...k,...->k", g, f) for g, f in zip(jax.tree.leaves(G), jax.tree.leaves(row))
-    )
-    return Tangent(row.image, row.camera, row.point - B @ jnp.linalg.solve(gram, total))

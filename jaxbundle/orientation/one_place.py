@@ -1,0 +1,58 @@
+"""Images taken from one place: a rotation alone takes the rays of one to those of the other.
+
+Seen from one place, points have directions and no depth, whatever their start values say. With the
+unit rays u of points that two images share, R·u₁ = u₂ to the precision of the measurements; R by
+Horn (1987), as in `absolute.py`.
+"""
+
+import numpy as np
+
+from jaxbundle.cameras import get_model
+from jaxbundle.network.columns import some
+from jaxbundle.network.tables import Network
+from jaxbundle.orientation.sights import sights
+
+IN_COMMON = 5
+"""Points two images must share: a rotation has 3 parameters, the points 10 coordinates."""
+MOST = 200
+"""Images that are compared with the one that has the most image points."""
+NOISE = 3.0
+"""A misclosure of so many σ is that of the measurements."""
+
+
+def name_one_place(network: Network) -> str:
+    """Which images were taken from one place, in words; empty where they were not, or where images
+    from other places are there too."""
+    seen = sights(network)
+    number = np.bincount(seen.image, minlength=seen.images)
+    base = int(number.argmax())
+    others = [image for image in np.flatnonzero(number) if image != base][:MOST]
+    c = np.array([camera.parameters[get_model(camera.model).principal_distance[0]]
+                  for camera in network.cameras])  # fmt: skip
+    of_camera = network.images.camera[seen.image]
+    sigma = network.observations.sigma[seen.row] / c[of_camera, None]
+    if not others or not all(_turned_only(seen, sigma, base, image) for image in others):
+        return ""
+    names = [network.images.id[image] for image in sorted([base, *others])]
+    return (
+        f"images {some(names)} were taken from one place, as far as their measurements tell: a "
+        "rotation alone takes one to the other, and points have no depth; add images from other "
+        "places"
+    )
+
+
+def _turned_only(seen, sigma, one: int, other: int) -> bool:
+    """Whether a rotation takes the rays of an image to those of another."""
+    a, b = seen.of(one), seen.of(other)
+    _, k, l = np.intersect1d(seen.point[a], seen.point[b], return_indices=True)
+    if len(k) < IN_COMMON:
+        return False
+    rays = []
+    for rows, at in ((a, k), (b, l)):
+        ray = np.pad(seen.xy[rows][at], ((0, 0), (0, 1)), constant_values=-1.0)
+        rays.append(ray / np.linalg.norm(ray, axis=1, keepdims=True))
+    U, _, V = np.linalg.svd(rays[0].T @ rays[1])
+    turn = U @ np.diag([1, 1, np.linalg.det(U @ V)]) @ V
+    off = np.linalg.norm(rays[0] @ turn - rays[1], axis=1)
+    noise = np.sqrt((sigma[a][k] ** 2).sum(1) + (sigma[b][l] ** 2).sum(1))
+    return bool(np.median(off / noise) < NOISE)

@@ -1,0 +1,141 @@
+"""Networks that determine something in name only say so: what is weak, and how to mend it.
+
+Four images of 25 targets; of the first two shapes (with and without control) all share one solver.
+"""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import jaxbundle
+from jaxbundle import Camera, grid_of_targets, ring_of_stations, simulate, stations_looking_at
+from jaxbundle.adjustment.problem import make_problem
+from jaxbundle.network.repetitions import warn_of_repetitions
+from jaxbundle.network.stations import Stations
+from jaxbundle.orientation.one_place import name_one_place
+from jaxbundle.statistics import Inspection
+from jaxbundle.statistics.weakness import VAGUE, weakness, weakness_of_unsolved
+
+TARGETS = grid_of_targets(5, 5, 0.5, relief=0.2, seed=1)
+RING = ring_of_stations(4, 3.0, 2.5, roll_every=2)
+ONE_PLACE = stations_looking_at(
+    np.repeat(RING.position[:1], 4, 0),
+    np.array([[0, 0, 0], [3, 1, 0], [-2, 2, 0], [2, -3, 0]]) / 10,
+)
+NADIR = Stations(
+    np.array([[-4, -4, 30], [4, -4, 30], [-4, 4, 30], [4, 4, 30]]) / 10, np.zeros((4, 3))
+)
+CONTROL = {"control": (0, 4, 20, 24), "control_sigma": 0.002, "datum": "control"}
+
+
+def camera(id="cam", **options):
+    return Camera(id, "brown", {"c": 24.0}, free=("c",), **options)
+
+
+def network(stations, cameras=None, targets=TARGETS, **options):
+    cameras = cameras or camera()
+    return simulate(stations, targets, cameras, noise=0.002, seed=3, disturb=0.005, **options)
+
+
+def without_start_values(network):
+    images, points = network.images, network.points
+    tie = points.has_role("tie")[:, None]
+    return network.replace(
+        images=dataclasses.replace(
+            images, position=images.position * np.nan, angles=images.angles * np.nan
+        ),
+        points=dataclasses.replace(points, position=np.where(tie, np.nan, points.position)),
+    )
+
+
+def said(result):
+    return " | ".join(result.warnings)
+
+
+@pytest.fixture(scope="module")
+def sound():
+    return jaxbundle.adjust(network(RING, **CONTROL))
+
+
+def test_a_sound_network_says_nothing(sound):
+    assert sound.converged and sound.warnings == ()
+    assert sound.weakness.worst < 0.002
+
+
+def test_images_from_one_place_are_named_where_there_is_no_solution():
+    result = jaxbundle.adjust(network(ONE_PLACE))
+    assert not result.converged
+    assert "images '1', '2', '3', '4' were taken from one place" in said(result)
+    assert " of image " in " ".join(result.weakness.unknowns)
+    with pytest.raises(jaxbundle.NotSolvedError, match="one place"):
+        assert result.cameras
+    assert "one place" in result.report().replace("\n  ", " ")
+
+
+def test_images_from_one_place_solved_by_control_have_no_depth():
+    result = jaxbundle.adjust(network(ONE_PLACE, **CONTROL))
+    assert result.converged
+    assert "the images stand at one place, or nearly" in said(result)
+    sigma = np.stack([result.points[f"s{axis}"] for axis in "XYZ"], 1)
+    rows = [result.points["id"].tolist().index(id) for id in result.weakness.points]
+    assert (np.linalg.norm(sigma[rows], axis=1) > 0.3).all()  # of about 3.9 m
+    assert len(rows) > 12
+
+
+def test_two_images_from_one_place_are_told_from_two_that_are_not():
+    two = lambda stations: network(Stations(stations.position[:2], stations.angles[:2]), camera())
+    assert "'1', '2'" in name_one_place(two(ONE_PLACE))
+    assert name_one_place(two(RING)) == ""
+
+
+@pytest.mark.parametrize("control", [CONTROL, {}])
+def test_vertical_images_name_the_principal_distance(control, monkeypatch):
+    result = jaxbundle.adjust(network(NADIR, **control))
+    first, *others = result.weakness.unknowns
+    assert first == "c of camera cam" and others and all("Z0 of image" in n for n in others)
+    assert "c needs depth or convergent images" in said(result)
+    assert result.converged == bool(control)
+    if result.converged:
+        c = result.cameras["cam"]["parameters"]["c"]
+        assert VAGUE * c["sigma"] > c["value"]
+        # The directions of a factor give what the cofactors give.
+        given = result.weakness
+        monkeypatch.setattr("jaxbundle.statistics.weakness.SMALL", 0)
+        found = weakness(Inspection(result.problem, result.values), result.sigma0)
+        assert found.unknowns == given.unknowns
+        assert found.worst == pytest.approx(c["sigma"] / c["value"], rel=1e-3)
+        assert given.worst == pytest.approx(c["sigma"] / c["value"], rel=1e-9)
+
+
+def test_a_camera_for_every_image_with_a_wide_prior_is_named():
+    cameras = [camera(f"c{i}", sigma={"c": 24.0}) for i in range(4)]
+    flat = TARGETS * [1, 1, 0]
+    problem = make_problem(network(NADIR, cameras, flat, **CONTROL))
+    found = weakness_of_unsolved(problem, problem.data.start)
+    assert {f"c of camera c{i}" for i in range(4)} <= set(found.unknowns)
+
+
+def test_what_repeats_another_is_named():
+    given = network(RING)
+    images, rays = given.images, given.observations
+    again = np.flatnonzero(rays.image == 0)
+    rows = np.concatenate([np.arange(len(rays)), again])
+    image = np.concatenate([rays.image, np.full(len(again), 4)])
+    repeated = given.replace(
+        images=dataclasses.replace(images.take(np.array([0, 1, 2, 3, 0])), id=(*images.id, "copy")),
+        observations=dataclasses.replace(rays.take(rows), image=image),
+    )
+    (line,) = warn_of_repetitions(repeated).warnings
+    assert "'copy' repeats '1'" in line and "remove one" in line
+    assert warn_of_repetitions(given).warnings == ()
+    # One coordinate in the last digit, and it is another measurement.
+    xy = repeated.observations.xy.copy()
+    xy[-1, 0] = np.nextafter(xy[-1, 0], 99)
+    other = repeated.replace(observations=dataclasses.replace(repeated.observations, xy=xy))
+    assert warn_of_repetitions(other).warnings == ()
+    twin = rays.xy.copy()
+    twin[rays.point == 7] = twin[rays.point == 3]
+    other = given.replace(observations=dataclasses.replace(rays, xy=twin))
+    (line,) = warn_of_repetitions(other).warnings
+    assert "'8' repeats '4'" in line
