@@ -13,7 +13,6 @@ attitudes, turned into Earth-fixed quaternions at their own times, by slerp. Whe
 before the image does (`ancillary.extrapolation_limit`), the angles go on linearly.
 """
 
-import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import jax
@@ -23,9 +22,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
-from jaxbundle.io.csv_tables import read_text
 from jaxbundle.io.scanner import Scanner
-from jaxbundle.network.columns import shown
+from jaxbundle.io.xml_fields import XmlFields, read_xml
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.ancillary import (
     attitude_table,
@@ -48,7 +46,7 @@ def read_dimap(path: str | Path) -> Scanner:
     **Raises:** `InputError` naming file, element and its number: what is missing, no number, no
     time, not as many look angles as pixels, times that do not increase.
     """
-    file = _Dimap(Path(path))
+    file = XmlFields(path, read_xml(path), "DIMAP of SPOT 5")
     lines, pixels = (file.number(f"Raster_Dimensions/{n}") for n in ("NROWS", "NCOLS"))
     check_size(lines, pixels, f"{path}: Raster_Dimensions")
     lines, pixels = int(lines), int(pixels)
@@ -60,19 +58,16 @@ def read_dimap(path: str | Path) -> Scanner:
         raise InputError(f"{path}: LINE_PERIOD is {period:g} s; a positive number is expected")
     times = LineTimes(jnp.asarray(-period * centre), jnp.asarray(period))
 
-    t, orbit = file.rows(
-        "Ephemeris/Points/Point", [f"{a}/{b}" for a in ("Location", "Velocity") for b in "XYZ"],
-        epoch,
-    )  # fmt: skip
+    points = "Ephemeris/Points/Point"
+    t = file.times(points, epoch)
+    orbit = file.columns(points, [f"{a}/{b}" for a in ("Location", "Velocity") for b in "XYZ"])
     source = points = Source(f"{path}, Ephemeris", None, "point")
     options = {"method": "lagrange", "order": min(ORDER, len(t) - 1), "gap": np.inf}
     both = position_table(t, orbit, **options, source=source)
     position = position_table(t, orbit[:, :3], **options, source=source)
 
-    rows, angles = file.rows(
-        "Corrected_Attitudes/Corrected_Attitude/Angles",
-        ["PITCH", "ROLL", "YAW"], epoch,
-    )  # fmt: skip
+    attitudes = "Corrected_Attitudes/Corrected_Attitude/Angles"
+    rows, angles = file.times(attitudes, epoch), file.columns(attitudes, ["PITCH", "ROLL", "YAW"])
     source = Source(f"{path}, Corrected_Attitude", None, "row")
     check_times(rows, source)
     when = np.asarray(times.time(jnp.arange(lines, dtype=float)))
@@ -84,7 +79,7 @@ def read_dimap(path: str | Path) -> Scanner:
     turn = Rotation.from_matrix(frame) * Rotation.from_euler("XYZ", angles * [-1, -1, 1])
     attitude = attitude_table(rows, np.roll(turn.as_quat(), 1, axis=1), source=source)
 
-    psi = file.numbers(
+    psi = file.columns(
         "Instrument_Look_Angles_List/Instrument_Look_Angles/Look_Angles_List/Look_Angles",
         ["PSI_X", "PSI_Y"],
     )  # fmt: skip
@@ -96,72 +91,6 @@ def read_dimap(path: str | Path) -> Scanner:
     )
     name = file.text("Dataset_Id/DATASET_NAME", Path(path).stem)
     return Scanner(name, image, WGS84, warnings)
-
-
-class _Dimap:
-    """An XML document whose elements are asked for by their path, anywhere in it."""
-
-    def __init__(self, path):
-        self.path = path
-        try:
-            self.root = ET.fromstring(read_text(path))
-        except ET.ParseError as error:
-            raise InputError(f"{path}: not valid XML: {error}") from None
-
-    def text(self, key, default=None):
-        found = self.root.findtext(f".//{key}", default)
-        if found is None:
-            raise InputError(f"{self.path}: {key} is missing; DIMAP of SPOT 5 is expected")
-        return found.strip()
-
-    def number(self, key):
-        return _number(self.text(key), f"{self.path}: {key}")
-
-    def time(self, key):
-        return _time(self.text(key), f"{self.path}: {key}")
-
-    def numbers(self, key, names):
-        """The columns of elements that stand there again and again; of the first list of them."""
-        *parents, last = key.split("/")
-        parent = self.root.find(f".//{'/'.join(parents)}")
-        elements = [] if parent is None else parent.findall(last)
-        if not elements:
-            raise InputError(f"{self.path}: {key} is missing; DIMAP of SPOT 5 is expected")
-        return np.array([
-            [_number(e.findtext(name, ""), f"{self.path}: {last} {k}, {name}") for name in names]
-            for k, e in enumerate(elements, 1)
-        ])
-
-    def rows(self, key, names, epoch):
-        """Seconds since the epoch, and the columns."""
-        values = self.numbers(key, names)
-        last = key.split("/")[-1]
-        elements = self.root.findall(f".//{key}")[: len(values)]
-        times = [
-            _time(e.findtext("TIME", ""), f"{self.path}: {last} {k}, TIME")
-            for k, e in enumerate(elements, 1)
-        ]
-        return np.array([(t - epoch) / np.timedelta64(1, "ns") * 1e-9 for t in times]), values
-
-
-def _number(text, where):
-    try:
-        value = float(text)
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        raise InputError(f"{where} is {shown(text)}; a finite number is expected")
-    return value
-
-
-def _time(text, where):
-    try:
-        time = np.datetime64(text.strip().removesuffix("Z"), "ns")
-    except ValueError:
-        time = np.datetime64("NaT")
-    if np.isnat(time):
-        raise InputError(f"{where} is {shown(text)}; a time such as 2008-03-04T12:31:03.081912")
-    return time
 
 
 def _continued(t, angles, first, last):

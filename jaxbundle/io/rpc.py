@@ -1,4 +1,5 @@
-"""Files of rational polynomial coefficients (RPC00B): text, RPB, tags of a GeoTIFF.
+"""Files of rational polynomial coefficients (RPC00B): text, RPB, tags of a GeoTIFF, and those of
+products (`io.rpc_products`).
 
     LINE_OFF: +003000.50 pixels          text, `…_RPC.TXT`: one value a line, a unit may follow
     LINE_NUM_COEFF_1: -1.2E-03
@@ -7,8 +8,8 @@
     lineNumCoef = ( -1.2E-03, …);
 
 In all of them line 0, sample 0 is the centre of the first pixel, degrees and metres, as in `Rpc`.
-(The RPC files of DIMAP count from 1 and are not read here.) Errors and limits that a file may tell
-besides (ERR_BIAS, ERR_RAND, MIN_LONG, …) are passed over, and none are written.
+Errors and limits that a file may tell besides (ERR_BIAS, ERR_RAND, MIN_LONG, …) are passed over,
+and none are written. Scales may be negative, as some providers have them.
 """
 
 import re
@@ -21,6 +22,8 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.io.csv_tables import read_text, write_text
 from jaxbundle.io.rasters import rasterio
+from jaxbundle.io.rpc_products import from_geom, from_xml
+from jaxbundle.io.xml_fields import number_in
 from jaxbundle.network.columns import shown
 from jaxbundle.pushbroom.rpc import TERMS, Rpc
 from jaxbundle.temporaries import replacing
@@ -47,7 +50,7 @@ RPB = re.compile(r"\s*(\w+)\s*=\s*(.*?)\s*;?\s*$")
 
 
 def read_rpc(path: str | Path) -> Rpc:
-    """The coefficients of a text file, an RPB file, or a raster with RPC tags.
+    """The coefficients of a text file, an RPB file, a raster with RPC tags, or of a product.
 
     **Raises:** `InputError` naming file and line: what is missing, there twice, no number, in
     another unit, not RPC00B.
@@ -56,13 +59,16 @@ def read_rpc(path: str | Path) -> Rpc:
     if path.suffix.lower() in RASTERS:
         values = _from_raster(path)
     else:
-        text = read_text(path)
-        values = _from_rpb(path, text) if "lineOffset" in text else _from_text(path, text)
+        text = read_text(path, fallback="latin-1")
+        if text.lstrip().startswith("<"):
+            values = from_xml(path)
+        elif "line_num_coeff_00" in text or path.suffix.lower() == ".geom":
+            values = from_geom(path, text)
+        else:
+            values = _from_rpb(path, text) if "lineOffset" in text else _from_text(path, text)
     for axis in OFFSETS:
-        if not values[f"{axis}_scale"] > 0:
-            raise InputError(
-                f"{path}: the scale of {axis} is {values[f'{axis}_scale']:g}; it must be positive"
-            )
+        if values[f"{axis}_scale"] == 0:
+            raise InputError(f"{path}: the scale of {axis} is 0; another number is expected")
     for name in ("line_denominator", "sample_denominator"):
         if values[name][0] == 0:
             raise InputError(f"{path}: the {name.replace('_', ' ')} begins with 0; 1 is usual")
@@ -104,7 +110,7 @@ def _from_text(path, text):
         if name not in found:
             raise InputError(f"{path}: {name} is missing; an RPC00B text file is expected")
         words, line = found[name]
-        value = _number(words[0] if words else "", f"{path}, line {line}: {name}")
+        value = number_in(words[0] if words else "", f"{path}, line {line}: {name}")
         if unit and len(words) > 1 and words[1].lower() not in ACCEPTED[unit]:
             raise InputError(f"{path}, line {line}: {name} is in {words[1]}; {unit} are expected")
         return value
@@ -147,26 +153,15 @@ def _from_rpb(path, text):
 
     values = {}
     for axis, (_, key) in OFFSETS.items():
-        values[f"{axis}_offset"] = _number(*value_of(f"{key}Offset"))
-        values[f"{axis}_scale"] = _number(*value_of(f"{key}Scale"))
+        values[f"{axis}_offset"] = number_in(*value_of(f"{key}Offset"))
+        values[f"{axis}_scale"] = number_in(*value_of(f"{key}Scale"))
     for field, (_, key) in FIELDS.items():
         value, where = value_of(key)
         numbers = [part for part in value.strip("() \t").split(",") if part.strip()]
         if len(numbers) != TERMS:
             raise InputError(f"{where} has {len(numbers)} coefficients; {TERMS} are expected")
-        values[field] = [_number(part, where) for part in numbers]
+        values[field] = [number_in(part, where) for part in numbers]
     return values
-
-
-def _number(text, where):
-    try:
-        value = float(text)
-        good = np.isfinite(value) and "_" not in text
-    except ValueError:
-        good = False
-    if not good:
-        raise InputError(f"{where} is {shown(text)}; a finite number is expected")
-    return value
 
 
 def _from_raster(path):

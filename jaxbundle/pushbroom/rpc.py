@@ -173,7 +173,7 @@ def sight(
         longitude, latitude, _ = locate(rpc, line, sample, height)
         return jnp.stack(earth_fixed(earth, (longitude, latitude, height)))
 
-    ends = rpc.height_offset + rpc.height_scale * jnp.array([1.0, -1.0])
+    ends = rpc.height_offset + jnp.abs(rpc.height_scale) * jnp.array([1.0, -1.0])
     top, bottom = jax.vmap(point)(ends)
     return tuple(top), unit(difference(bottom, top))
 

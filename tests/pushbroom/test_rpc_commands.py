@@ -38,9 +38,9 @@ def write_table(path, table):
 
 def test_a_table_is_fitted(tmp_path, run):
     table = write_table(tmp_path / "table.csv", table_of(RPC))
-    status, out, _ = run("fit", table, "--out", tmp_path / "fit_RPC.TXT", "--json", "-")
+    status, out, err = run("fit", table, "--out", tmp_path / "fit_RPC.TXT", "--json", "-")
     told = json.loads(out)
-    assert status == 0 and told["points"] == 196 and told["fit_largest_line"] < 1e-3
+    assert err == "" and status == 0 and told["points"] == 196 and told["fit_largest_line"] < 1e-3
     largest = max(abs(row["v_line"]) for row in told["rows"])
     assert len(told["rows"]) == 196 and largest == told["fit_largest_line"]
     given = table_of(RPC)
@@ -52,10 +52,12 @@ def test_a_table_is_fitted(tmp_path, run):
 def test_a_scanner_is_fitted_as_well_as_its_wobble_allows(tmp_path, run):
     """Its attitude sways by 1e-4 at 0.7 Hz: more than a pixel that no cubic follows; it is told."""
     scanner = write_scanner(tmp_path)
-    status, out, _ = run(
+    status, out, err = run(
         "fit", scanner, "--heights", "0:1000", "--out", tmp_path / "a.RPB", "--json", "-"
     )
     told = json.loads(out)
+    largest = max(v for k, v in told.items() if "largest" in k)
+    assert largest > 0.5 and f"leave up to {largest:.3g} pixel" in err
     assert status == 0 and 0.05 < told["check_largest_line"] < 5
     assert float(read_rpc(tmp_path / "a.RPB").height_scale) == pytest.approx(500, abs=1e-6)
 

@@ -69,7 +69,7 @@ BROKEN = {
     "feet": ("_RPC.TXT", "600.0 meters", "600.0 feet", ["line 10", "feet", "meters"]),
     "twice": ("_RPC.TXT", "SAMP_OFF", "LINE_OFF", ["line 2", "LINE_OFF", "twice"]),
     "no name": ("_RPC.TXT", "SAMP_OFF: ", "SAMP_OFF ", ["line 2", "NAME: value"]),
-    "scale": ("_RPC.TXT", "HEIGHT_SCALE: 600", "HEIGHT_SCALE: 0", ["height", "positive"]),
+    "scale": ("_RPC.TXT", "HEIGHT_SCALE: 600", "HEIGHT_SCALE: 0", ["height is 0"]),
     "RPC00A": (".RPB", "RPC00B", "RPC00A", ["line 3", "RPC00A", "order"]),
     "coefficients": (".RPB", "lineNumCoef = (", "lineNumCoef = (1.0,", ["21 coef", "20"]),
     "bracket": (".RPB", "lineDenCoef = (\n\t\t\t1.0", "lineDenCoef = (\n\t\t\tone", ["'one'"]),

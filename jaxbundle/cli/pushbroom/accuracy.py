@@ -11,6 +11,7 @@ from jaxbundle.cli.pushbroom.accuracy_table import table_of, write_table
 from jaxbundle.cli.pushbroom.app import (
     Csv,
     Dem,
+    Geoid,
     Json,
     Level,
     ScannerFile,
@@ -56,6 +57,7 @@ def accuracy(
     ] = None,
     height: Level = None,
     dem: Dem = None,
+    geoid: Geoid = None,
     csv: Csv = None,
     json: Json = "",
 ) -> None:
@@ -74,7 +76,7 @@ def accuracy(
         write_table(table_of(scanner, table, levels, draws, seed, height), csv, json)
         return
     file = open_scanner(scanner)
-    surface = surface_of(file.earth, height, dem, file.image)
+    surface = surface_of(file.earth, height, dem, file.image, geoid)
     _, line, pixel, _ = places(file.image, None, grid)
     columns = {"line": line, "pixel": pixel}
     if truth is not None:

@@ -13,6 +13,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.csv_tables import write_csv, write_text
 from jaxbundle.io.extent import image_extent, rpc_extent
+from jaxbundle.io.geoid import add_geoid
 from jaxbundle.io.rasters import read_terrain
 from jaxbundle.io.result_json import without_nan
 from jaxbundle.io.scanner import Scanner, read_scanner
@@ -35,6 +36,11 @@ Level = Annotated[
     float | None, typer.Option("--height", help="metres above the ellipsoid; Z in a local frame")
 ]
 Dem = Annotated[Path | None, typer.Option(help="raster of the terrain, heights as --height")]
+Geoid = Annotated[
+    Path | None,
+    typer.Option(help="grid of the geoid above the ellipsoid, for a --dem of orthometric heights: "
+                 "a raster, or the name of one of PROJ's grids"),
+]  # fmt: skip
 Csv = Annotated[Path | None, typer.Option(help="file for the table; - or none: standard output")]
 Json = Annotated[str, typer.Option(help="the table as JSON instead; - for standard output")]
 
@@ -44,11 +50,14 @@ def surface_of(
     height: float | None,
     dem: Path | None,
     image: PushbroomImage | Rpc | None = None,
+    geoid: Path | None = None,
 ) -> Surface:
     """The surface that the options name: the ellipsoid (or Z = 0) if none.
 
     Of a terrain model of an Earth what the image can see is read.
     """
+    if geoid is not None and dem is None:
+        raise InputError("--geoid: it is added to a terrain model; give --dem")
     if height is not None and not np.isfinite(height):
         raise InputError(f"--height {height}: a finite number is expected, in metres")
     if dem is not None:
@@ -60,7 +69,8 @@ def surface_of(
             extent = rpc_extent(image)
         elif image is not None and earth is not None:
             extent = image_extent(image, earth)
-        return read_terrain(dem, earth, extent)
+        terrain = read_terrain(dem, earth, extent)
+        return terrain if geoid is None else add_geoid(terrain, geoid)
     if earth is None:
         return Plane(height or 0.0)
     if height is None:

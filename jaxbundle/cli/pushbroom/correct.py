@@ -10,6 +10,7 @@ from jaxbundle.cli.app import Quiet
 from jaxbundle.cli.progress import counting
 from jaxbundle.cli.pushbroom.app import (
     Dem,
+    Geoid,
     Level,
     ScannerFile,
     check_resampling,
@@ -37,6 +38,7 @@ def correct(
     ] = None,
     height: Level = None,
     dem: Dem = None,
+    geoid: Geoid = None,
     resampling: Annotated[str, typer.Option(help="nearest, bilinear, cubic")] = "bilinear",
     occlusion: Annotated[
         bool, typer.Option("--occlusion", help="leave out what other terrain of --dem hides")
@@ -64,7 +66,7 @@ def correct(
     if occlusion and dem is None:
         raise InputError("--occlusion: only terrain hides terrain; give --dem")
     file = open_scanner(scanner)
-    surface = surface_of(file.earth, height, dem, file.image)
+    surface = surface_of(file.earth, height, dem, file.image, geoid)
     system = MapSystem(file.earth, crs)
     grid = map_of(file.image, surface, system, spacing, dem)
     search = make_search(file.image, file.earth)

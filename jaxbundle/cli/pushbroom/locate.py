@@ -12,6 +12,7 @@ import jaxbundle
 from jaxbundle.cli.pushbroom.app import (
     Csv,
     Dem,
+    Geoid,
     Json,
     Level,
     ScannerFile,
@@ -29,6 +30,7 @@ from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.locate import locate_points
 from jaxbundle.pushbroom.terrain import Terrain
 
+OFF = "off the image"
 OVER = "found beyond a place without height"
 TOLD = ("id", "X", "Y", "Z", "longitude", "latitude", "height", "count", "status")
 """What `locate` and `project` write beside line and pixel: their tables are taken as they are."""
@@ -43,21 +45,24 @@ def locate(
     ] = "11x11",
     height: Level = None,
     dem: Dem = None,
+    geoid: Geoid = None,
     csv: Csv = None,
     json: Json = "",
 ) -> None:
     """Where on the ground places of the image are; (0, 0) is the centre of the first pixel."""
     jaxbundle.enable_x64()
     file = open_scanner(scanner)
-    surface = surface_of(file.earth, height, dem, file.image)
+    surface = surface_of(file.earth, height, dem, file.image, geoid)
     ids, line, pixel, source = places(file.image, points, grid)
+    off = _off(file.image, line, pixel, source)
     find = jax.jit(locate_points)
     X = np.array(find(file.image, surface, line, pixel))
-    missed = np.isnan(X).any(0)
+    X[:, off] = np.nan
+    missed = np.isnan(X).any(0) & ~off
     over = np.zeros_like(missed)
     if isinstance(surface, Terrain):
         strict = dataclasses.replace(surface, over_voids=False)
-        over = ~missed & np.isnan(np.array(find(file.image, strict, line, pixel))).any(0)
+        over = ~(missed | off) & np.isnan(np.array(find(file.image, strict, line, pixel))).any(0)
     reason = "no terrain there" if dem else "misses the surface"
     if missed.any():
         row = int(missed.argmax())
@@ -69,7 +74,7 @@ def locate(
             f"{source(row)}: the ray of line {line[row]:g}, pixel {pixel[row]:g}: {reason}; "
             f"{remedy} ({missed.sum()} of {len(line)} points)"
         )
-        if missed.all():
+        if (missed | off).all():
             raise InputError(said)
         warn(said)
     columns = {"id": ids} if ids else {}
@@ -78,7 +83,7 @@ def locate(
         longitude, latitude, h = (np.asarray(v) for v in jax.jit(geodetic)(file.earth, tuple(X)))
         columns |= {"longitude": np.degrees(longitude), "latitude": np.degrees(latitude)}
         columns |= {"height": h}
-    columns["status"] = [reason if m else OVER if o else "found" for m, o in zip(missed, over)]
+    columns["status"] = np.select([off, missed, over], [OFF, reason, OVER], "found").tolist()
     write_rows(columns, csv, json, {"scanner": file.name})
 
 
@@ -97,13 +102,26 @@ def places(image: PushbroomImage, points: Path | None, grid: str):
     table = read_csv(points)
     table.check_names(("line", "pixel"), TOLD)
     line, pixel = (table.numbers(name, required=True) for name in ("line", "pixel"))
-    for name, values, size in (("line", line, image.lines), ("pixel", pixel, image.pixels)):
-        outside = ~((values >= -0.5) & (values <= size - 0.5))
-        if outside.any():
-            row = int(outside.argmax())
-            raise InputError(
-                f"{table.source(row)}: {name} {values[row]:g} is off the image, which has {size}; "
-                f"-0.5 to {size - 0.5:g} is expected"
-            )
     ids = table.ids("id") if "id" in table.values else ()
     return ids, line, pixel, table.source
+
+
+def _off(image: PushbroomImage, line: np.ndarray, pixel: np.ndarray, source: Source) -> np.ndarray:
+    """Which places are off the image; told, and refused if all are."""
+    off = np.zeros(len(line), bool)
+    said = None
+    for name, values, size in (("line", line, image.lines), ("pixel", pixel, image.pixels)):
+        outside = ~((values >= -0.5) & (values <= size - 0.5))
+        if outside.any() and said is None:
+            row = int(outside.argmax())
+            said = (
+                f"{source(row)}: {name} {values[row]:g} is {OFF}, which has {size}; -0.5 to "
+                f"{size - 0.5:g} is expected"
+            )
+        off |= outside
+    if said is not None:
+        said += f" ({off.sum()} of {len(off)} points)"
+        if off.all():
+            raise InputError(said)
+        warn(said)
+    return off

@@ -10,6 +10,7 @@ import jaxbundle
 from jaxbundle.cli.pushbroom.app import (
     Csv,
     Dem,
+    Geoid,
     Json,
     Level,
     check_spheroid,
@@ -32,11 +33,18 @@ from jaxbundle.pushbroom.rpc_fit import RpcCheck, RpcTable, fit_image, fit_rpc
 rpc = typer.Typer(help="Rational polynomial coefficients (RPC00B).", no_args_is_help=True)
 pushbroom.add_typer(rpc, name="rpc")
 
+ENOUGH = 0.5
+"""A fit that leaves more than this, in pixels, is not one to work with in silence."""
 COLUMNS = ("longitude", "latitude", "height", "line", "sample")
 GROUND_SIGMA = ("seast", "snorth", "sheight")
 TERMS = ("shift", "by_line", "by_sample")
 
-RpcFile = Annotated[Path, typer.Argument(help="coefficients: _RPC.TXT, .RPB, or a tagged GeoTIFF")]
+RpcFile = Annotated[
+    Path,
+    typer.Argument(
+        help="coefficients: _RPC.TXT, .RPB, a tagged GeoTIFF, XML of DIMAP or DigitalGlobe, .geom"
+    ),
+]
 Figures = Annotated[
     str, typer.Option(help="the figures and every point as JSON; - for standard output")
 ]
@@ -76,6 +84,13 @@ def fit(
             f"{found.ridge.max():.3g}, or points over more heights"
         )
     write_rpc(out, found.rpc)
+    largest = max(found.check.largest.max(), *(v for k, v in head.items() if "largest" in k), 0.0)
+    if largest > ENOUGH:
+        warn(
+            f"{source}: the coefficients leave up to {largest:.3g} pixel: they do not follow what "
+            "jitters faster than a cubic over the image; cut it into shorter pieces, or use the "
+            "rigorous model"
+        )
     head = {"points": len(found.check.residuals), **_told("fit", found.check), **head}
     head |= {"ridge_line": found.ridge[0], "ridge_sample": found.ridge[1]}
     _tell(head, json, found.check)
@@ -90,6 +105,7 @@ def apply(
     ],
     height: Level = None,
     dem: Dem = None,
+    geoid: Geoid = None,
     csv: Csv = None,
     json: Json = "",
 ) -> None:
@@ -100,7 +116,7 @@ def apply(
     if "line" in table.values:
         table.check_names(("line", "sample"), ("id",))
         place = [table.numbers(name, required=True) for name in ("line", "sample")]
-        surface = surface_of(WGS84, height, dem, given)
+        surface = surface_of(WGS84, height, dem, given, geoid)
         east, north, h, status = map(np.asarray, locate_points_on(given, surface, *place))
         columns = dict(zip(COLUMNS, (np.degrees(east), np.degrees(north), h, *place)))
     else:

@@ -10,7 +10,14 @@ import typer
 import jaxbundle
 from jaxbundle.cli.app import Quiet
 from jaxbundle.cli.progress import counting
-from jaxbundle.cli.pushbroom.app import Dem, Level, check_resampling, pushbroom, surface_of
+from jaxbundle.cli.pushbroom.app import (
+    Dem,
+    Geoid,
+    Level,
+    check_resampling,
+    pushbroom,
+    surface_of,
+)
 from jaxbundle.io.flight import read_flight
 from jaxbundle.io.scanner_writing import write_scanner_image
 from jaxbundle.io.scenes import read_scene, write_taken
@@ -24,6 +31,7 @@ def simulate(
     scene: Annotated[Path | None, typer.Option(help="raster with map coordinates to see")] = None,
     height: Level = None,
     dem: Dem = None,
+    geoid: Geoid = None,
     resampling: Annotated[str, typer.Option(help="nearest, bilinear, cubic")] = "cubic",
     quiet: Quiet = False,
 ) -> None:
@@ -32,7 +40,7 @@ def simulate(
     check_resampling(resampling)
     given = read_flight(flight)
     truth, measured = true_image(given.flight), measured_image(given.flight)
-    surface = surface_of(given.earth, height, dem, truth)
+    surface = surface_of(given.earth, height, dem, truth, geoid)
     shown = None if scene is None else read_scene(scene, given.earth)
     unit = given.file.section("scanner").text("angle_unit", "deg")
     write = lambda folder, image: write_scanner_image(
