@@ -6,34 +6,30 @@ adjusted network as a project.
 
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from jaxbundle import report
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.csv_tables import table_rows, write_csv, write_text
-from jaxbundle.io.project import ADJUSTED, FILE_NAME, write_project
+from jaxbundle.io.folders import check_folder, replaced_folder
+from jaxbundle.io.project import ADJUSTED, FILE_NAME, fill_project
+from jaxbundle.io.project import FILES as NETWORK_FILES
 from jaxbundle.io.result_json import result_text, unsolved_text
 from jaxbundle.io.result_project import adjusted_network
-from jaxbundle.io.settings import TABLES as NETWORK_TABLES
 from jaxbundle.network.tables import Network
-from jaxbundle.plotting import save_figures
-from jaxbundle.plotting.files import FIGURES
+from jaxbundle.plotting.files import FIGURES, draw_figures
+from jaxbundle.plotting.style import need_matplotlib
 from jaxbundle.result import Adjustment
 
 REPORT, RESULT = "report.txt", "result.json"
 TABLES = ("cameras", "images", "points", "residuals", "checks")
-FILES = (REPORT, RESULT, *(f"{name}.csv" for name in TABLES))
-NETWORK_FILES = (FILE_NAME, *(f"{name}.csv" for name in NETWORK_TABLES))
-"""In the folder of the adjusted network."""
-
-
-def check_targets(
-    input: Path, network: Network, json: str, out: Path | None, control: Path | None = None
-) -> None:
-    """Refuse a JSON file or a folder that cannot be written, or that would replace the input."""
-    names = (*FILES, *(Path(ADJUSTED) / name for name in NETWORK_FILES))
-    check_writable(json, out, names, network_files(input, network, control))
+FILES = (
+    REPORT, RESULT, *(f"{name}.csv" for name in TABLES),
+    *(f"{ADJUSTED}/{name}" for name in NETWORK_FILES), *FIGURES,
+)  # fmt: skip
+"""What is written into a folder, figures as patterns."""
 
 
 def network_files(
@@ -46,81 +42,103 @@ def network_files(
 
 
 def check_writable(
-    json: str, out: Path | None, names: Iterable[str | Path], inputs: Iterable[str | Path]
+    json: str,
+    out: Path | None,
+    by: str,
+    names: Iterable[str],
+    inputs: Iterable[str | Path],
+    force: bool = False,
 ) -> None:
-    """Refuse a JSON file, or a folder for files of these names, that cannot be written, or that
-    would replace one of the inputs."""
-    written = []
+    """Refuse a JSON file, or a folder for files of these names, that the command `by` cannot or may
+    not write (`jaxbundle.io.folders`), or that would replace one of the inputs."""
+    inputs = tuple(inputs)
     if out is not None:
-        _check_folder(f"--out {out}", out)
-        written += [out / name for name in names]
+        check_folder(out, by, names, inputs, force)
+    if json in ("", "-"):
+        return
+    path = Path(json)
+    real = Path(os.path.realpath(path))
+    if path.is_dir():
+        raise InputError(f"--json {json}: is a folder; give the name of a file")
+    if out is not None and Path(os.path.realpath(out)).is_relative_to(real):
+        raise InputError(f"--json {json}: is to be the folder of --out; give the name of a file")
+    if name_inside(json, out) is None:
+        if not os.path.isdir(path.parent):
+            raise InputError(f"--json {json}: there is no folder {path.parent}")
+        if not os.access(path.parent, os.W_OK | os.X_OK):
+            raise InputError(f"--json {json}: cannot be written: no permission in {path.parent}")
+    if str(real) in map(os.path.realpath, inputs):
+        raise InputError(f"{path} is part of the input and would be overwritten; give another")
+
+
+def check_targets(
+    input: Path, network: Network, json: str, out: Path | None, control: Path | None = None,
+    force: bool = False,
+) -> None:  # fmt: skip
+    """Check what `adjust` is to write, before it is computed (`check_writable`)."""
+    check_writable(json, out, "adjust", FILES, network_files(input, network, control), force)
+
+
+def name_inside(json: str, out: Path | None) -> str | None:
+    """The name of a JSON file directly in the folder of --out, which it then belongs to."""
+    if json in ("", "-") or out is None:
+        return None
+    path = Path(json)
+    return path.name if os.path.realpath(path.parent) == os.path.realpath(out) else None
+
+
+@contextmanager
+def written(
+    json: str, text: str | Iterable[str], out: Path | None, by: str, names: Iterable[str],
+    force: bool,
+) -> Iterator[Path | None]:  # fmt: skip
+    """Write the JSON of a result (`-`: on standard output), and give the folder to fill that
+    becomes --out, None if there is none.
+
+    A JSON file is written when the folder is in place; one in the folder belongs to it.
+    """
+    if json == "-":
+        sys.stdout.writelines((text,) if isinstance(text, str) else text)
+    if out is None:
+        yield None
+    else:
+        with replaced_folder(out, by, names, force) as new:
+            yield new
+            if (name := name_inside(json, out)) is not None:
+                write_text(new / name, text)
+                json = ""
     if json not in ("", "-"):
-        path = Path(json)
-        if path.is_dir():
-            raise InputError(f"--json {json}: is a folder; give the name of a file")
-        if out is None or os.path.abspath(path.parent) != os.path.abspath(out):
-            if not os.path.isdir(path.parent):
-                raise InputError(f"--json {json}: there is no folder {path.parent}")
-            _check_folder(f"--json {json}", path.parent)
-        written.append(path)
-    read = {os.path.realpath(path) for path in inputs}
-    for path in written:
-        if os.path.realpath(path) in read:
-            raise InputError(f"{path} is part of the input and would be overwritten; give another")
-
-
-def _check_folder(option: str, folder: Path) -> None:
-    """Refuse what is no folder, or where none can be made, or nothing written."""
-    there = next((p for p in (folder, *folder.absolute().parents) if os.path.exists(p)), folder)
-    if not os.path.isdir(there):
-        raise InputError(f"{option}: cannot be made: {there} is not a folder")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise InputError(f"{option}: cannot be written: no permission in {there}")
+        write_text(Path(json), text)
 
 
 def write_targets(
-    result: Adjustment | NotSolvedError, json: str, out: Path | None, brief: bool, plots: bool
-) -> None:
+    result: Adjustment | NotSolvedError, json: str, out: Path | None, brief: bool, plots: bool,
+    force: bool = False,
+) -> None:  # fmt: skip
     """Write JSON (`-`: on standard output) and folder of a result, or of why there is none."""
     solved = isinstance(result, Adjustment)
     text = lambda brief: result_text(result, brief) if solved else unsolved_text(result)
-    if json == "-":
-        sys.stdout.writelines(text(brief))
-    if out is not None:
-        protocol = report.text(result) if solved else f"{result}\n"
-        _make_empty(out)
-        write_text(out / REPORT, protocol)
-        write_text(out / RESULT, text(False))
-    if json not in ("", "-"):
-        write_text(Path(json), text(brief))
-    if out is not None and solved and result.converged:
-        _write_tables(result, out)
-        write_project(adjusted_network(result), out / ADJUSTED)
+    plots = plots and out is not None and solved and result.converged and can_plot()
+    with written(json, text(brief), out, "adjust", FILES, force) as new:
+        if new is None:
+            return
+        write_text(new / REPORT, report.text(result) if solved else f"{result}\n")
+        write_text(new / RESULT, text(False))
+        if solved and result.converged:
+            _write_tables(result, new)
+            fill_project(adjusted_network(result), new / ADJUSTED)
         if plots:
-            try:
-                save_figures(result, out)
-            except ImportError as error:
-                print(f"no plots: {error}", file=sys.stderr)
+            draw_figures(result, new)
 
 
-def _make_empty(folder: Path) -> None:
-    """Make the folder, and remove what an earlier run has written into it."""
+def can_plot() -> bool:
+    """Whether there is matplotlib; where not, that is said on standard error."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for path in _own_files(folder):
-            path.unlink(missing_ok=True)
-        network = folder / ADJUSTED
-        if network.is_dir() and not any(network.iterdir()):
-            network.rmdir()
-    except OSError as error:
-        raise InputError(f"--out {folder}: cannot be written: {error.strerror}") from None
-
-
-def _own_files(folder: Path) -> Iterable[Path]:
-    yield from (folder / name for name in FILES)
-    yield from (folder / ADJUSTED / name for name in NETWORK_FILES)
-    for pattern in FIGURES:
-        yield from folder.glob(pattern)
+        need_matplotlib()
+    except ImportError as error:
+        print(f"no plots: {error}", file=sys.stderr)
+        return False
+    return True
 
 
 def _write_tables(result: Adjustment, folder: Path) -> None:

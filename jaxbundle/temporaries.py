@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-_temporaries: dict[str, None] = {}
+_temporaries: dict[str, bool] = {}
+"""By name, whether its content goes with it."""
 _caches: set[str] = set()
 _lock = threading.RLock()
 _inside: list[int] = []
@@ -19,30 +20,19 @@ _put_off: list[Callable[[], None]] = []
 
 
 @contextmanager
-def temporary(path: str | os.PathLike) -> Iterator[Path]:
-    """A file or folder, not made yet, that is removed at the end of the block if it is there."""
+def temporary(path: str | os.PathLike, content: bool = True) -> Iterator[Path]:
+    """A file or folder, not made yet, that is removed at the end of the block if it is there.
+
+    `content`: a folder goes with what is in it; else it goes if it is empty.
+    """
     name = os.path.abspath(path)
     with _lock:
-        _temporaries[name] = None
+        _temporaries[name] = content
     try:
         yield Path(path)
     finally:
-        _remove(name)
+        _remove(name, content)
         _temporaries.pop(name, None)
-
-
-@contextmanager
-def replacing(target: str | os.PathLike, suffix: str = ".tmp") -> Iterator[Path]:
-    """A temporary name beside `target`: the file written there becomes `target` at the end of the
-    block, and is removed if the block fails. A link stays a link.
-
-    `suffix`: the end of the name, for programs that go by it.
-    """
-    real = Path(os.path.realpath(target))
-    with temporary(real.with_name(f".{real.name}.{os.getpid()}{suffix}")) as path:
-        yield path
-        with unbroken():
-            os.replace(path, real)
 
 
 @contextmanager
@@ -78,17 +68,17 @@ def remove_temporaries(patience: float) -> None:
     """Remove what is temporary; the process must end at once, for no block `unbroken` begins after
     this. A thread in such a block may finish it, for so many seconds."""
     _lock.acquire(timeout=patience)
-    for name in list(_temporaries):
-        _remove(name)
+    for name, content in reversed(list(_temporaries.items())):
+        _remove(name, content)
     _remove_open_files(_caches)
 
 
-def _remove(name: str) -> None:
+def _remove(name: str, content: bool) -> None:
     with suppress(OSError):
         if os.path.islink(name) or not os.path.isdir(name):
             os.unlink(name)
             return
-        for folder, folders, files in os.walk(name, topdown=False):
+        for folder, folders, files in os.walk(name, topdown=False) if content else ():
             for one in (*files, *folders):
                 path = os.path.join(folder, one)
                 with suppress(OSError):

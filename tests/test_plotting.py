@@ -305,7 +305,7 @@ def test_save_figures(convergent4, tmp_path):
     names += [f"residuals_{image}" for image in convergent4.images["id"]]
     names += ["distortion_cam", "correlations_cam"]
     assert [path.name for path in written] == [f"{name}.png" for name in names]
-    assert sorted(written) == sorted((tmp_path / "new" / "folder").iterdir())
+    assert sorted(written) == sorted((tmp_path / "new" / "folder").glob("*.png"))
     for path in written:
         content = path.read_bytes()
         assert content.startswith(b"\x89PNG") and b"IEND" in content[-12:]

@@ -15,7 +15,7 @@ as a comment in the TOML.
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -23,15 +23,20 @@ import numpy as np
 
 from jaxbundle.calibration.report import rig_dict
 from jaxbundle.errors import InputError
-from jaxbundle.io import adjusted_network, write_colmap, write_opencv, write_project
-from jaxbundle.io.colmap import PARTS
+from jaxbundle.io import adjusted_network, write_opencv
+from jaxbundle.io.colmap import FILES as COLMAP_FILES
+from jaxbundle.io.colmap import fill_colmap
 from jaxbundle.io.csv_tables import write_text
-from jaxbundle.io.project import ADJUSTED, cameras_text
+from jaxbundle.io.folders import replaced_folder
+from jaxbundle.io.project import ADJUSTED, cameras_text, fill_project
+from jaxbundle.io.project import FILES as NETWORK_FILES
 from jaxbundle.network.conversion import convert_cameras
 from jaxbundle.network.tables import Camera, Network
-from jaxbundle.plotting import save_figures, write_figures
-from jaxbundle.plotting.files import FIGURES
+from jaxbundle.plotting import write_figures
+from jaxbundle.plotting.files import FIGURES, draw_figures
+from jaxbundle.plotting.style import need_matplotlib
 
+COMMAND = "calibrate"
 REPORT, RESULT = "report.txt", "result.json"
 COLMAP = "colmap"
 OWN_FIGURES = ("coverage.png", "uncertainty*.png", "halves.png")
@@ -51,36 +56,50 @@ def file_name(name: str) -> str:
     return re.sub(r"[^\w.-]+", "_", name, flags=re.ASCII).strip("._")[:60] or "camera"
 
 
-def write_calibration(calibration, folder: str | Path, plots: bool = True) -> None:
+def files_of(names: Sequence[str]) -> list[str]:
+    """What a calibration of these cameras may write into its folder, figures as patterns."""
+    found = [REPORT, RESULT]
+    for name in map(file_name, names):
+        place = "" if len(names) == 1 else f"{name}/"
+        found += [f"{place}{file}" for file in (
+            REPORT, RESULT, f"{name}.toml", f"{name}.yaml", *OWN_FIGURES, *FIGURES,
+            *(f"{ADJUSTED}/{file}" for file in NETWORK_FILES),
+            *(f"{COLMAP}/{file}" for file in COLMAP_FILES),
+        )]  # fmt: skip
+        found += [f"rig_{name}.toml", f"rig_{name}_*.png"] if place else []
+    return found
+
+
+def write_calibration(
+    calibration, folder: str | Path, plots: bool = True, force: bool = False
+) -> None:
     """Write everything about a calibration into a folder (see the module's docstring).
 
-    **Raises:** `InputError` where that cannot be done; `ImportError` for plots without matplotlib.
+    **Arguments:** `force`: replace what no calibration has written.
+
+    **Raises:** `InputError` where the folder may not or cannot be written
+    (`jaxbundle.io.folders`); `ImportError` for plots without matplotlib.
     """
-    folder, name = Path(folder), file_name(calibration.name)
-    _make_empty(folder, name)
+    if plots:
+        need_matplotlib()
+    with replaced_folder(folder, COMMAND, files_of([calibration.name]), force) as new:
+        _fill(calibration, new, plots)
+
+
+def _fill(calibration, folder: Path, plots: bool) -> None:
+    name = file_name(calibration.name)
+    folder.mkdir(exist_ok=True)
     write_text(folder / REPORT, calibration.report())
     write_text(folder / RESULT, json_text(calibration.to_dict()))
     if not calibration.converged:
         return
     network = adjusted_network(calibration.adjustment)
-    write_project(network, folder / ADJUSTED)
+    fill_project(network, folder / ADJUSTED)
     remark = _write_foreign(network, folder, name)
     text = camera_text(calibration.camera, calibration.sigma, *remark)
     write_text(folder / f"{name}.toml", text)
     if plots:
         save_plots(calibration, folder)
-
-
-def _make_empty(folder: Path, name: str) -> None:
-    """Make the folder, and remove what an earlier calibration has written into it."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for pattern in (REPORT, RESULT, f"{name}.toml", f"{name}.yaml", *OWN_FIGURES, *FIGURES,
-                        *(f"{COLMAP}/{part}.txt" for part in PARTS)):  # fmt: skip
-            for path in folder.glob(pattern):
-                path.unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
 
 
 def _write_foreign(network: Network, folder: Path, name: str) -> list[str]:
@@ -93,21 +112,30 @@ def _write_foreign(network: Network, folder: Path, name: str) -> list[str]:
             return [f"not written for OpenCV and COLMAP: {error}"]
         remark = [f"{name}.yaml and {COLMAP}: {conversion}" for conversion in cost.values()]
     write_opencv(network.cameras[0], folder / f"{name}.yaml")
-    write_colmap(network, folder / COLMAP, text=True)
+    fill_colmap(network, folder / COLMAP, text=True)
     return remark
 
 
-def write_calibrations(found, folder: str | Path, plots: bool = True) -> None:
+def write_calibrations(
+    found, folder: str | Path, plots: bool = True, force: bool = False
+) -> None:
     """Write one calibration into a folder, several into folders of their own, and the rig beside.
 
     A rig adds report.txt and result.json of the whole, its cameras as rig_CAMERA.toml, and figures
-    of their coverage and uncertainty in it.
+    of their coverage and uncertainty in it. Arguments and errors as of `write_calibration`.
     """
-    folder = Path(folder)
+    if plots:
+        need_matplotlib()
+    with replaced_folder(folder, COMMAND, files_of([*found.cameras]), force) as new:
+        fill_calibrations(found, new, plots)
+
+
+def fill_calibrations(found, folder: Path, plots: bool) -> None:
+    """Write the same beside what is in a folder."""
     if len(found.cameras) == 1:
-        return write_calibration(next(iter(found.cameras.values())), folder, plots)
+        return _fill(next(iter(found.cameras.values())), folder, plots)
     for name, one in found.cameras.items():
-        write_calibration(one, folder / file_name(name), plots)
+        _fill(one, folder / file_name(name), plots)
     write_text(folder / REPORT, found.report())
     write_text(folder / RESULT, json_text(calibrations_dict(found)))
     if found.rig is not None:
@@ -142,7 +170,7 @@ def save_plots(calibration, folder: Path) -> None:
     if halves is not None and halves.comparison is not None:
         drawings["halves"] = ((7.5, 6), None, calibration.plot_halves)
     write_figures(folder, drawings)
-    save_figures(calibration.adjustment, folder)
+    draw_figures(calibration.adjustment, folder)
 
 
 def save_rig_plots(rig, folder: Path) -> None:

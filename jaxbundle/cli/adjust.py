@@ -7,7 +7,7 @@ import typer
 
 import jaxbundle
 from jaxbundle import report
-from jaxbundle.cli.app import Control, Format, Input, Quiet, Settings, app
+from jaxbundle.cli.app import Control, Force, Format, Input, Quiet, Settings, app
 from jaxbundle.cli.processes import check_sameness, join_processes
 from jaxbundle.cli.progress import iterating
 from jaxbundle.errors import InputError, NotSolvedError
@@ -25,6 +25,7 @@ def adjust(
     input: Input,
     json: Annotated[str, typer.Option(help="write the result as JSON; - for stdout alone")] = "",
     out: Annotated[Path | None, typer.Option(help="folder for report, JSON, tables, plots")] = None,
+    force: Force = False,
     set: Settings = None,
     format: Format = None,
     control: Control = None,
@@ -90,7 +91,7 @@ def adjust(
     if reduction not in (None, *REDUCTIONS):
         raise InputError(f"--reduction {reduction!r}: {', '.join(REDUCTIONS)}")
     check_test(snooping, significance, "--")
-    check_targets(input, network, json, out, control)
+    check_targets(input, network, json, out, control, force)
     try:
         with iterating(quiet or json == "-") as tell:
             result = jaxbundle.adjust(
@@ -106,9 +107,9 @@ def adjust(
                 progress=tell,
             )
     except NotSolvedError as error:
-        write_targets(error, json, out, brief, plots)
+        write_targets(error, json, out, brief, plots, force)
         raise
-    write_targets(result, json, out, brief, plots)
+    write_targets(result, json, out, brief, plots, force)
     if json != "-" and not quiet and result.converged:
         print(report.text(result))
     if not result.converged:

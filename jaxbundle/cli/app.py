@@ -31,6 +31,9 @@ Control = Annotated[
     Path | None,
     typer.Option(help="table id,X,Y,Z[,sX,sY,sZ] whose control replaces that of the input"),
 ]
+Force = Annotated[
+    bool, typer.Option("--force", help="replace files in the folder of --out of other origin")
+]
 Quiet = Annotated[bool, typer.Option("--quiet", help="print nothing but errors")]
 
 

@@ -1,23 +1,28 @@
 """`jaxbundle calibrate`: photographs of a board in, calibrated cameras out."""
 
 import re
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 import jaxbundle
-from jaxbundle.calibration import Board, calibrate_cameras, write_calibrations
-from jaxbundle.calibration.files import REPORT, RESULT, calibrations_dict, file_name, json_text
-from jaxbundle.cli.app import Quiet, app
+from jaxbundle.calibration import Board, calibrate_cameras
+from jaxbundle.calibration.files import (
+    COMMAND,
+    calibrations_dict,
+    file_name,
+    files_of,
+    fill_calibrations,
+    json_text,
+)
+from jaxbundle.cli.app import Force, Quiet, app
 from jaxbundle.cli.progress import counting
 from jaxbundle.errors import InputError, NotSolvedError
-from jaxbundle.io.csv_tables import write_text
 from jaxbundle.io.result_json import unsolved_text
 from jaxbundle.measure.views import photographs
 from jaxbundle.statistics.snooping import check_test
-from jaxbundle.targets import check_writable
+from jaxbundle.targets import can_plot, check_writable, name_inside, written
 
 
 @app.command()
@@ -75,6 +80,7 @@ def calibrate(
     out: Annotated[
         Path | None, typer.Option(help="folder for report, JSON, cameras, network, plots")
     ] = None,
+    force: Force = False,
     brief: Annotated[bool, typer.Option("--brief", help="no points and residuals in JSON")] = False,
     quiet: Quiet = False,
     plots: Annotated[bool, typer.Option(help="plots in the folder of --out")] = True,
@@ -89,8 +95,9 @@ def calibrate(
     known = Board(columns, rows, square, kind, diameter, marker, dictionary)
     cameras = _cameras(photos, camera)
     files = [path for paths in cameras.values() for path in photographs(paths)]
-    check_writable(json, out, (REPORT, RESULT), files)
-    _check_folders(out, files, cameras)
+    _check_names(cameras)
+    names = files_of([*cameras])
+    check_writable(json, out, COMMAND, names, files, force)
     with counting(quiet or json == "-") as bar:
         task = bar.add_task("searching the board", total=len(files))
 
@@ -109,18 +116,17 @@ def calibrate(
                 progress=tell,
             )  # fmt: skip
         except NotSolvedError as error:
-            _write_json(json, unsolved_text(error))
+            place = out if name_inside(json, out) else None
+            with written(json, unsolved_text(error), place, COMMAND, names, force):
+                pass
             raise
         bar.update(task, description="how good it is")
         text = json_text(calibrations_dict(found, brief)) if json else ""
         report = "" if quiet or json == "-" else found.report()
         bar.update(task, description="writing")
-        if out is not None:
-            try:
-                write_calibrations(found, out, plots)
-            except ImportError as error:
-                print(f"no plots: {error}", file=sys.stderr)
-    _write_json(json, text)
+        with written(json, text, out, COMMAND, names, force) as new:
+            if new is not None:
+                fill_calibrations(found, new, plots and can_plot())
     if report:
         print(report)
     failed = [name for name, one in found.cameras.items() if not one.converged]
@@ -133,14 +139,8 @@ def calibrate(
         )
 
 
-def _check_folders(out: Path | None, files, cameras) -> None:
-    """Refuse a folder with the photographs in it, from which earlier results are removed, and
-    cameras whose results would have one folder."""
-    if out is not None:
-        target = out.resolve()
-        for file in files:
-            if target in Path(file).resolve().parents:
-                raise InputError(f"--out {out}: {file} is in it; give a folder of its own")
+def _check_names(cameras) -> None:
+    """Refuse cameras whose results would have one folder."""
     folders: dict[str, str] = {}
     for name in cameras:
         other = folders.setdefault(file_name(name).casefold(), name)
@@ -149,13 +149,6 @@ def _check_folders(out: Path | None, files, cameras) -> None:
                 f"--camera: {other!r} and {name!r} would have the same folder {file_name(name)!r}; "
                 "choose other names"
             )
-
-
-def _write_json(json: str, text: str) -> None:
-    if json == "-":
-        print(text, end="")
-    elif json:
-        write_text(Path(json), text)
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -27,7 +27,7 @@ def convert(
     image_size: Annotated[str, typer.Option(help="W,H in pixels, of cameras without")] = "",
     pixel_size: Annotated[str, typer.Option(help="W,H in mm, of cameras without")] = "",
     force: Annotated[
-        bool, typer.Option("--force", help="replace files that are there")
+        bool, typer.Option("--force", help="replace files that are there, of other origin")
     ] = False,
     set: Settings = None,
     format: Format = None,

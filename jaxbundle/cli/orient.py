@@ -6,9 +6,11 @@ from typing import Annotated
 import typer
 
 import jaxbundle
-from jaxbundle.cli.app import Control, Format, Input, Quiet, Settings, app
+from jaxbundle.cli.app import Control, Force, Format, Input, Quiet, Settings, app
 from jaxbundle.io import read_network, write_project
-from jaxbundle.targets import NETWORK_FILES, check_writable, network_files
+from jaxbundle.io.folders import check_folder
+from jaxbundle.io.project import FILES
+from jaxbundle.targets import network_files
 
 
 @app.command()
@@ -17,6 +19,7 @@ def orient(
     out: Annotated[
         Path | None, typer.Option(help="folder for the project with start values")
     ] = None,
+    force: Force = False,
     set: Settings = None,
     format: Format = None,
     control: Control = None,
@@ -26,9 +29,9 @@ def orient(
     jaxbundle.enable_x64()
     network = read_network(input, format, tuple(set or ()), control)
     if out is not None:
-        check_writable("", out, NETWORK_FILES, network_files(input, network, control))
+        check_folder(out, "orient", FILES, network_files(input, network, control), force)
     found = jaxbundle.orient(network)
-    path = None if out is None else write_project(found.network, out)
+    path = None if out is None else write_project(found.network, out, force, "orient")
     if not quiet:
         print(found)
         if path is not None:

@@ -8,10 +8,12 @@ import typer
 
 import jaxbundle
 from jaxbundle.cameras.field_of_view import angle_class, equivalent_35mm, field_of_view
-from jaxbundle.cli.app import app
+from jaxbundle.cli.app import Force, app
 from jaxbundle.cli.cameras_given import pair
 from jaxbundle.errors import InputError
 from jaxbundle.io import write_project
+from jaxbundle.io.folders import check_folder
+from jaxbundle.io.project import FILES
 from jaxbundle.network.planned_block import planned_network
 from jaxbundle.network.planning import design_block, relief_displacement
 from jaxbundle.network.tables import Camera
@@ -38,9 +40,12 @@ def plan(
     ] = None,
     network: Annotated[bool, typer.Option(help="σ by the covariance of a simulated block")] = True,
     out: Annotated[Path | None, typer.Option(help="folder for the block as a project")] = None,
+    force: Force = False,
 ) -> None:
     """Design a block of vertical photographs: strips, photographs, and expected precision."""
     jaxbundle.enable_x64()
+    if out is not None:
+        check_folder(out, "plan", FILES, force=force)
     image_format, extent = _needed("--image", image), _needed("--area", area)
     design = design_block(
         c, image_format, extent, sigma_image, height=height, scale_number=scale,
@@ -80,7 +85,7 @@ def plan(
             for axis, (mean, low, high) in found.summary().items():
                 lines.append((f"σ{axis} of tie points", f"{mean:.4g} m ({low:.4g} to {high:.4g})"))
         if out is not None:
-            lines.append(("written", str(write_project(block, out))))
+            lines.append(("written", str(write_project(block, out, force, "plan"))))
     for name, value in lines:
         print(f"{name:22}{value}")
 

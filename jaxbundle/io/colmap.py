@@ -13,11 +13,14 @@ from jaxbundle.io.colmap_text import (
     text_files,
 )
 from jaxbundle.io.csv_tables import write_bytes
+from jaxbundle.io.folders import replaced_folder
 from jaxbundle.network.tables import Camera, Network
 
 PARTS = ("cameras", "images", "points3D")
 RIGS = ("rigs", "frames")
 SUFFIXES = (".bin", ".txt")
+FILES = tuple(f"{part}{suffix}" for part in (*PARTS, *RIGS) for suffix in SUFFIXES)
+"""What a model may consist of, in either form."""
 
 
 def is_colmap(path: Path) -> bool:
@@ -60,24 +63,29 @@ def write_colmap_cameras(cameras: Sequence[Camera], path: str | Path) -> None:
     write_bytes(Path(path), ("\n".join(lines) + "\n").encode())
 
 
-def write_colmap(network: Network, folder: str | Path, text: bool = False) -> tuple[str, ...]:
-    """Write a sparse model into a folder; `cameras` comes last, with it the model is complete.
+def write_colmap(
+    network: Network, folder: str | Path, text: bool = False, force: bool = False
+) -> tuple[str, ...]:
+    """Write a sparse model into a folder.
 
-    Cameras must be of model `opencv` or `kannala-brandt` and have an image size. The files of a
-    model that was there in the other form are removed: they would be read first.
+    Cameras must be of model `opencv` or `kannala-brandt` and have an image size.
+
+    **Arguments:** `force`: replace a model that this function has not written, in either form.
 
     **Returns:** what COLMAP has no place for, in words.
+
+    **Raises:** `InputError` where the folder may not or cannot be written
+    (`jaxbundle.io.folders`).
     """
-    folder = Path(folder)
+    with replaced_folder(folder, "write_colmap", FILES, force) as new:
+        return fill_colmap(network, new, text)
+
+
+def fill_colmap(network: Network, folder: Path, text: bool) -> tuple[str, ...]:
+    """Write a sparse model beside what is in a folder, or a new one; as `write_colmap`."""
     model, lost = from_network(network)
     files = text_files(model) if text else binary_files(model)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, content in reversed(files.items()):
-            write_bytes(folder / name, content)
-        for name in {f"{part}{suffix}" for part in (*PARTS, *RIGS) for suffix in SUFFIXES}:
-            if name not in files:
-                (folder / name).unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
+    folder.mkdir(exist_ok=True)
+    for name, content in files.items():
+        write_bytes(folder / name, content)
     return lost

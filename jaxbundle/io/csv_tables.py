@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from jaxbundle.errors import InputError
+from jaxbundle.io.replacing import replaced_file, unwritable
 from jaxbundle.network.columns import Columns
 from jaxbundle.network.tables import Source
-from jaxbundle.temporaries import replacing
 
 DESCRIPTORS = (Path("/dev"), Path("/dev/fd"), Path("/proc/self/fd"))
 """Where open files of the process have names."""
@@ -135,12 +135,12 @@ def write_bytes(path: Path, content: bytes | Iterable[bytes]) -> None:
     descriptor leads to (/dev/stdout); a link stays a link.
     """
     pieces = (content,) if isinstance(content, bytes) else content
-    try:
-        if path.exists() and (not path.is_file() or path.parent in DESCRIPTORS):
+    if path.exists() and (not path.is_file() or path.parent in DESCRIPTORS):
+        try:
             with path.open("wb") as file:
                 file.writelines(pieces)
-            return
-        with replacing(path) as whole, whole.open("wb") as file:
-            file.writelines(pieces)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+        except OSError as error:
+            raise unwritable(path, error) from None
+        return
+    with replaced_file(path) as temporary, temporary.open("wb") as file:
+        file.writelines(pieces)

@@ -9,11 +9,11 @@ from jaxtyping import Float
 from jaxbundle.io.map_blocks import write_map
 from jaxbundle.io.maps import MapGrid, MapSystem
 from jaxbundle.io.rasters import open_plain, rasterio
+from jaxbundle.io.replacing import replaced_file
 from jaxbundle.pushbroom.correct import block_errors, block_places
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.project import Search
 from jaxbundle.pushbroom.surfaces import Surface
-from jaxbundle.temporaries import replacing
 
 BANDS = "east [m]", "north [m]", "error [m]"
 
@@ -62,7 +62,7 @@ def write_image_raster(
     """
     package = rasterio()
     steps = [v[1] - v[0] if len(v) > 1 else 1.0 for v in (pixels, lines)]
-    with replacing(target, ".tif") as temporary, open_plain(
+    with replaced_file(target) as temporary, open_plain(
         temporary, "w", driver="GTiff", width=len(pixels), height=len(lines), count=len(bands),
         dtype="float32", nodata=np.nan, transform=package.transform.Affine(
             steps[0], 0, pixels[0] - steps[0] / 2, 0, steps[1], lines[0] - steps[1] / 2

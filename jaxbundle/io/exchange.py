@@ -19,13 +19,12 @@ from jaxbundle.io.camera_files import (
     read_cameras,
     write_cameras,
 )
-from jaxbundle.io.colmap import PARTS, RIGS, write_colmap_cameras
-from jaxbundle.io.colmap import SUFFIXES as MODEL_SUFFIXES
+from jaxbundle.io.colmap import write_colmap_cameras
 from jaxbundle.io.coordinates import images_path
+from jaxbundle.io.folders import check_folder, replaced_folder
 from jaxbundle.io.formats import PIXEL_MODELS, TARGETS, read_network
 from jaxbundle.io.opencv_file import SUFFIXES, write_opencv
 from jaxbundle.io.project import FILE_NAME
-from jaxbundle.io.settings import TABLES
 from jaxbundle.network.columns import did_you_mean, some
 from jaxbundle.network.conversion import convert_cameras, convert_one
 from jaxbundle.network.outside import outside_warnings
@@ -86,7 +85,8 @@ def convert(
     - `format`, `overrides`, `control`: of the input, as in `read_network`.
     - `measured`: what is fitted is fitted over the area of the measurements, not the whole image.
     - `image_size` (pixels), `pixel_size` (mm): of all cameras that have none.
-    - `force`: files that are there, the output and those written beside it, are replaced.
+    - `force`: files that are there, the output and those written beside it, are replaced. Without
+      it a folder is replaced that `convert` has written, no file.
 
     **Raises:** `InputError`; nothing is written then.
     """
@@ -115,7 +115,12 @@ def convert(
     if camera is not None:
         raise InputError(f"--camera {camera}: {kind} holds all cameras; leave it out")
     network, costs = _with_model(network, kind, model, measured)
-    lost = TARGETS[kind].write(network, output)
+    folder, files = _folder(output, kind), TARGETS[kind].files
+    if folder is None:
+        lost = TARGETS[kind].write(network, output)
+    else:
+        with replaced_folder(folder, "convert", files, force) as new:
+            lost = TARGETS[kind].write(network, new)
     return Converted(kind, output, costs, tuple(lost), network.warnings)
 
 
@@ -155,12 +160,12 @@ def _sized(cameras: Sequence[Camera], image_size, pixel_size) -> tuple[Camera, .
 
 def _check_output(output: Path, kind: str) -> None:
     """Refuse a place where nothing can be written."""
-    folder = kind in ("project", "colmap", "colmap-text") and output.name != FILE_NAME
-    if folder and output.exists() and not output.is_dir():
-        raise InputError(f"{output}: is a file; {kind} is written into a folder")
-    if not folder and output.is_dir():
+    folder = _folder(output, kind)
+    if folder is not None and folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file; {kind} is written into a folder")
+    if folder != output and output.is_dir():
         raise InputError(f"{output}: is a folder; give the name of a file for {kind}")
-    if not folder and kind != "project" and not output.absolute().parent.is_dir():
+    if folder is None and not output.absolute().parent.is_dir():
         raise InputError(f"{output}: there is no folder {output.parent}")
 
 
@@ -172,9 +177,8 @@ def _keep_input(input: Path, network: Network, output: Path, kind: str, control=
     written = {os.path.realpath(p) for p in (output, output / FILE_NAME)}
     if kind == "csv":
         written.add(os.path.realpath(images_path(output)))
-    inside = kind in ("project", "colmap", "colmap-text") and os.path.realpath(
-        output.parent if output.name == FILE_NAME else output
-    ) in folders
+    folder = _folder(output, kind)
+    inside = folder is not None and os.path.realpath(folder) in folders
     if control is not None:
         read.add(os.path.realpath(control))
     if read & written or inside:
@@ -186,20 +190,21 @@ def _keep_camera_file(input: Path, output: Path) -> None:
         raise InputError(f"{output} is the input and would be overwritten; give another place")
 
 
-def files_of(output: Path, kind: str) -> list[Path]:
-    """The files an output of a kind may consist of."""
-    if kind == "project":
-        folder = output.parent if output.name == FILE_NAME else output
-        return [folder / name for name in (FILE_NAME, *(f"{table}.csv" for table in TABLES))]
-    if kind in ("colmap", "colmap-text"):
-        return [output / f"{part}{suffix}" for part in (*PARTS, *RIGS) for suffix in MODEL_SUFFIXES]
-    beside = {"csv": [images_path(output)], "bundler": [output.parent / LIST]}
-    return [output, *beside.get(kind, [])]
+def _folder(output: Path, kind: str) -> Path | None:
+    """The folder that is written; None where it is a file, with others beside it or not."""
+    if kind not in TARGETS or not TARGETS[kind].files:
+        return None
+    return output.parent if kind == "project" and output.name == FILE_NAME else output
 
 
 def _keep_others(output: Path, kind: str, force: bool) -> None:
-    """Refuse to replace files that are there."""
-    there = [path for path in files_of(output, kind) if os.path.lexists(path)]
+    """Refuse to replace files that are there, and folders that are not of `convert`."""
+    folder = _folder(output, kind)
+    if folder is not None:
+        names = TARGETS[kind].files
+        return check_folder(folder, "convert", names, force=force, option="")
+    beside = {"csv": [images_path(output)], "bundler": [output.parent / LIST]}
+    there = [path for path in (output, *beside.get(kind, [])) if os.path.lexists(path)]
     if there and not force:
         raise InputError(
             f"{some([str(path) for path in there], 3, str)}: already there and would be replaced; "

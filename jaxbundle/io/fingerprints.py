@@ -44,6 +44,17 @@ def of_input(path: str | Path) -> str:
     return found.hexdigest()
 
 
+def files_read(path: str | Path) -> list[Path]:
+    """An input in TOML, the files it names, and those that these name."""
+    found, left = {}, [Path(path)]
+    while left:
+        file = left.pop()
+        if (real := os.path.realpath(file)) not in found:
+            found[real] = file
+            left += _files(file)
+    return [*found.values()]
+
+
 def _files(path: Path) -> Iterator[Path]:
     """A file and those it names, or the files of a folder."""
     if path.is_dir():

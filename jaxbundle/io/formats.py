@@ -13,7 +13,8 @@ from jaxbundle.io.bal import OPENERS, is_bal, read_bal, write_bal
 from jaxbundle.io.bingo import is_bingo, read_bingo
 from jaxbundle.io.bundler import is_bundler, read_bundler, write_bundler
 from jaxbundle.io.camera_files import is_camera_file
-from jaxbundle.io.colmap import is_colmap, read_colmap, write_colmap
+from jaxbundle.io.colmap import FILES as COLMAP_FILES
+from jaxbundle.io.colmap import fill_colmap, is_colmap, read_colmap
 from jaxbundle.io.column_map import is_column_map, read_column_map
 from jaxbundle.io.control import read_control, with_control
 from jaxbundle.io.coordinates import write_coordinates
@@ -22,7 +23,8 @@ from jaxbundle.io.metashape import is_metashape, read_metashape
 from jaxbundle.io.photo_list import read_photo_list
 from jaxbundle.io.photomodeler import is_photomodeler, read_photomodeler
 from jaxbundle.io.ply import write_ply
-from jaxbundle.io.project import FILE_NAME, project_file, read_project, write_project
+from jaxbundle.io.project import FILE_NAME, fill_project, project_file, read_project
+from jaxbundle.io.project import FILES as PROJECT_FILES
 from jaxbundle.network.columns import count, did_you_mean, some
 from jaxbundle.network.tables import Network
 
@@ -42,13 +44,15 @@ class Format:
 class Target:
     """A kind of output: names it is recognised by, who writes it, and the camera models it has.
 
-    `write` returns what is not kept, in words; no `models`: all.
+    `write` returns what is not kept, in words; no `models`: all. `files`: names of what is written
+    into a folder; none: a file is written.
     """
 
     recognises: Callable[[Path], bool]
     write: Callable[[Network, Path], Sequence[str]]
     looks: str
     models: tuple[str, ...] = ()
+    files: tuple[str, ...] = ()
 
 
 def _is_project(path: Path) -> bool:
@@ -89,7 +93,7 @@ FORMATS: dict[str, Format] = {
 
 
 def _write_project(network: Network, path: Path) -> Sequence[str]:
-    write_project(network, path.parent if path.name == FILE_NAME else path)
+    fill_project(network, path)
     return ()
 
 
@@ -115,15 +119,16 @@ TARGETS: dict[str, Target] = {
     "bundler": Target(_ends(".out"), write_bundler, "NAME.out", ("snavely",)),
     "bal": Target(_is_bal_name, write_bal, "NAME.txt, .bal, .gz, .bz2", ("snavely",)),
     "colmap": Target(
-        _is_colmap_name, partial(write_colmap, text=False), "a folder with colmap or sparse in its "
-        "name", PIXEL_MODELS,
+        _is_colmap_name, partial(fill_colmap, text=False), "a folder with colmap or sparse in its "
+        "name", PIXEL_MODELS, COLMAP_FILES,
     ),
     "colmap-text": Target(
-        lambda path: False, partial(write_colmap, text=True), "by --to only", PIXEL_MODELS
+        lambda path: False, partial(fill_colmap, text=True), "by --to only", PIXEL_MODELS,
+        COLMAP_FILES,
     ),
     "project": Target(
         lambda path: not path.suffix or path.is_dir() or path.name == FILE_NAME, _write_project,
-        "another folder",
+        "another folder", files=PROJECT_FILES,
     ),
 }  # fmt: skip
 

@@ -5,6 +5,7 @@ Windows its first byte) until the process ends, however it ends: one left behind
 hinders nobody. The file itself may be renamed over meanwhile.
 """
 
+import errno
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -14,54 +15,66 @@ from typing import BinaryIO
 from jaxbundle.errors import InputError
 from jaxbundle.temporaries import temporary, unbroken
 
+NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
+"""Errors of a file system that has no locks."""
+
 
 @contextmanager
-def locked(path: str | Path) -> Iterator[None]:
+def locked(
+    path: str | Path, named: str | Path | None = None, needed: bool = True
+) -> Iterator[None]:
     """Hold the lock of a file, which need not exist; devices and pipes have none.
+
+    **Arguments:** `named`: what messages say is being written, the file by default; `needed`:
+    whether a file system without locks is an error.
 
     **Raises:** `InputError` if another process holds it, or no lock can be had.
     """
     if os.path.exists(path) and not os.path.isfile(path):
         yield
         return
-    real = Path(os.path.realpath(path))
+    real, told = Path(os.path.realpath(path)), path if named is None else named
     if not real.parent.is_dir():
-        raise InputError(f"{path}: there is no folder {real.parent}")
+        raise InputError(f"{told}: there is no folder {real.parent}")
     lock = real.with_name(f".{real.name}.lock")
     with ExitStack() as held:
         with unbroken():  # A lock is removed by the process that has it, and by no other.
-            held.enter_context(_taken(path, lock))
+            held.enter_context(_taken(lock, told, needed))
             # Gone before it is let go: nobody else gets a lock on a file that is about to vanish.
             # Windows removes no open file: there it stays.
             held.enter_context(temporary(lock))
         yield
 
 
-def _taken(path: str | Path, lock: Path) -> BinaryIO:
+def _taken(lock: Path, told: str | Path, needed: bool) -> BinaryIO:
     """The locked file.
 
     **Raises:** `InputError` as `locked`."""
     try:
-        while (stream := _opened(lock)) is None:
+        while (stream := _opened(lock, needed)) is None:
             pass
     except BlockingIOError:
         raise InputError(
-            f"{path}: another run is writing this file; wait for its end, or give another file"
+            f"{told}: another run is writing it; wait for its end, or give another name"
         ) from None
     except OSError as error:
         raise InputError(
-            f"{path}: its lock {lock} cannot be made: {error.strerror}; the folder must take files"
+            f"{told}: its lock {lock} cannot be made: {error.strerror}; the folder must take files"
         ) from None
     return stream
 
 
-def _opened(lock: Path) -> BinaryIO | None:
+def _opened(lock: Path, needed: bool) -> BinaryIO | None:
     """The file, locked; None if it vanished meanwhile.
 
     **Raises:** `BlockingIOError` if somebody else has the lock."""
     stream = open(lock, "ab")
     try:
-        _lock(stream)
+        try:
+            _lock(stream)
+        except OSError as error:
+            if needed or error.errno not in NO_LOCKS:
+                raise
         if os.path.samestat(os.fstat(stream.fileno()), os.stat(lock)):
             return stream
     except FileNotFoundError:

@@ -9,9 +9,9 @@ import numpy as np
 
 from jaxbundle.io.maps import MapGrid, MapSystem
 from jaxbundle.io.rasters import as_type, rasterio, unreadable
+from jaxbundle.io.replacing import replaced_file
 from jaxbundle.pushbroom.correct import BLOCK, STEP, Nodes
 from jaxbundle.pushbroom.surfaces import Surface
-from jaxbundle.temporaries import replacing
 
 
 def write_map(
@@ -48,7 +48,7 @@ def write_map(
             map_.write(values, window=((row, row + rows), (column, column + columns)))
 
     corners = [(r, c) for r in range(0, grid.rows, BLOCK) for c in range(0, grid.columns, BLOCK)]
-    with replacing(target, ".tif") as temporary:
+    with replaced_file(target) as temporary:
         try:
             map_ = package.open(
                 temporary, "w", driver="GTiff", width=grid.columns, height=grid.rows, count=count,

@@ -39,6 +39,7 @@ import numpy as np
 from jaxbundle.arguments import path as given_path
 from jaxbundle.errors import InputError
 from jaxbundle.io.csv_tables import read_csv, read_toml, write_csv, write_text
+from jaxbundle.io.folders import replaced_folder
 from jaxbundle.io.settings import SETTINGS, TABLES, Document, apply_overrides, network_of
 from jaxbundle.io.toml_text import assignments
 from jaxbundle.network.build import (
@@ -57,6 +58,8 @@ from jaxbundle.network.units import ANGLE_UNITS, to_image_unit
 FILE_NAME = "project.toml"
 ADJUSTED = "network"
 """The folder of the adjusted network beside the tables of a result."""
+FILES = (FILE_NAME, *(f"{table}.csv" for table in TABLES))
+"""What a project consists of."""
 INLINE = {table: table.removesuffix("s") for table in TABLES}
 """The tables and the name of one of their rows in the TOML file."""
 
@@ -126,21 +129,31 @@ def _read_table(document: Document, table: str, path: Path) -> Columns | None:
     return read_csv(path.parent / file)
 
 
-def write_project(network: Network, folder: str | Path) -> Path:
+def write_project(
+    network: Network, folder: str | Path, force: bool = False, by: str = "write_project"
+) -> Path:
     """Write `project.toml` and its tables into a folder; returns the path of the former.
 
-    Reading it again gives the same network (its warnings stand in the file as comments). Every
-    file is written under a temporary name and renamed, `project.toml` last.
+    Reading it again gives the same network (its warnings stand in the file as comments).
+
+    **Arguments:** `force`: replace what `by`, the command or function, has not written.
+
+    **Raises:** `InputError` where the folder may not or cannot be written
+    (`jaxbundle.io.folders`).
     """
     network, folder = require_network(network), Path(given_path("folder", folder))
+    with replaced_folder(folder, by, FILES, force) as new:
+        fill_project(network, new)
+    return folder / FILE_NAME
+
+
+def fill_project(network: Network, folder: Path) -> None:
+    """Write `project.toml` and its tables beside what is in a folder, or a new one."""
     images, points, rays = network.images, network.points, network.observations
     xy, sigma = to_image_unit(
         network.cameras, images.camera[rays.image], rays.xy, rays.sigma, network.image_unit
     )
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made: {error.strerror}") from None
+    folder.mkdir(exist_ok=True)
     radians = ANGLE_UNITS[network.angle_unit]
     unit = np.array([1, 1, 1, radians, radians, radians])
     exterior = np.concatenate([images.position, images.angles], 1) / unit
@@ -164,7 +177,6 @@ def write_project(network: Network, folder: str | Path) -> Path:
         values = np.stack([distances.value, distances.sigma], 1)
         _write_table(folder / "distances.csv", DISTANCE_COLUMNS, ends, values, (), values, {})
     write_text(folder / FILE_NAME, _document_text(network))
-    return folder / FILE_NAME
 
 
 def _write_table(path, header, ids, values, sigma_header, sigma, words):

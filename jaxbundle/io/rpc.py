@@ -22,11 +22,11 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.io.csv_tables import read_text, write_text
 from jaxbundle.io.rasters import rasterio
+from jaxbundle.io.replacing import replaced_file
 from jaxbundle.io.rpc_products import from_geom, from_xml
 from jaxbundle.io.xml_fields import number_in
 from jaxbundle.network.columns import shown
 from jaxbundle.pushbroom.rpc import TERMS, Rpc
-from jaxbundle.temporaries import replacing
 
 OFFSETS = {
     "line": ("LINE", "line"), "sample": ("SAMP", "samp"), "longitude": ("LONG", "long"),
@@ -199,7 +199,7 @@ def _to_raster(path, rpc):
     if not path.is_file():
         raise InputError(f"{path}: no such file; RPC tags are written into a raster that exists")
     try:
-        with replacing(path, path.suffix) as temporary:
+        with replaced_file(path) as temporary:
             shutil.copyfile(path, temporary)
             with package.open(temporary, "r+") as target:
                 target.rpcs = RPC(**given)

@@ -15,6 +15,14 @@ from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable, FocalLine, Optics
 
+TABLES = ("positions", "attitude", "times", "angles")
+
+
+def names_of(name: str, prefix: str | None = None) -> list[str]:
+    """The files an image may consist of; arguments as of `write_scanner_image`."""
+    prefix = f"{name}_" if prefix is None else prefix
+    return [f"{name}.toml", *(f"{prefix}{table}.csv" for table in TABLES)]
+
 
 def write_scanner_image(
     folder: str | Path,
@@ -24,7 +32,7 @@ def write_scanner_image(
     prefix: str | None = None,
     angle_unit: str = "rad",
 ) -> Path:
-    """Write an image without offsets as `NAME.toml` with its tables beside it.
+    """Write an image without offsets as `NAME.toml` with its tables, beside what is in a folder.
 
     `read_scanner` reads the same image. The names of the tables begin with `prefix`, by default
     `NAME_`; angles are in `angle_unit`.

@@ -11,11 +11,11 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.maps import MapSystem
 from jaxbundle.io.rasters import as_type, open_plain, rasterio, unreadable
+from jaxbundle.io.replacing import replaced_file
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.resample import Resampling
 from jaxbundle.pushbroom.simulate import taken_image
 from jaxbundle.pushbroom.surfaces import Surface
-from jaxbundle.temporaries import replacing
 
 PORTION = 64
 """Lines that are taken together."""
@@ -69,7 +69,7 @@ def write_taken(
     **Raises:** `InputError` if the scene is nowhere in the image.
     """
     seen = False
-    with replacing(path, ".tif") as temporary:
+    with replaced_file(path) as temporary:
         with open_plain(
             temporary, "w", driver="GTiff", width=image.pixels, height=image.lines,
             count=len(bands), dtype=dtype, BIGTIFF="IF_SAFER",

@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.csv_tables import write_bytes
+from jaxbundle.io.folders import replaced_folder
 from jaxbundle.plotting.cameras import correlation_matrix, distortion_curve
 from jaxbundle.plotting.images import residual_histogram, residual_vectors
 from jaxbundle.plotting.style import need_matplotlib
@@ -24,20 +25,28 @@ FIGURES = ("plan.png", "perspective.png", "histogram.png",
 """Patterns of the names of all files written here."""
 
 
-def save_figures(adjustment, folder: str | Path) -> list[Path]:
-    """Write the figures of a result into a folder, each file whole or not at all.
+def save_figures(adjustment, folder: str | Path, force: bool = False) -> list[Path]:
+    """Write the figures of a result into a folder, all of them or none.
 
     plan.png, perspective.png, histogram.png, residuals_IMAGE.png of at most 12 images (those with
     the largest RMS), distortion_CAMERA.png and correlations_CAMERA.png of at most 6 cameras;
     correlations only where two parameters are free. Ids are made safe for file names.
 
+    **Arguments:** `force`: replace figures that are there and were not written by this function.
+
     **Returns:** the paths written.
 
-    **Raises:** `ImportError` without matplotlib, `InputError` where the folder cannot be written,
-    `NotSolvedError` where there is no result.
+    **Raises:** `ImportError` without matplotlib, `InputError` where the folder cannot or may not be
+    written (`jaxbundle.io.folders`), `NotSolvedError` where there is no result.
     """
     need_matplotlib()
-    folder = Path(folder)
+    with replaced_folder(folder, "save_figures", FIGURES, force) as new:
+        written = draw_figures(adjustment, new)
+    return [Path(folder) / path.name for path in written]
+
+
+def draw_figures(adjustment, folder: Path) -> list[Path]:
+    """Write the figures of a result beside what is in a folder; as `save_figures`."""
     table = adjustment.images
     worst = np.argsort(-np.nan_to_num(table["rms"]), kind="stable")[:MOST_IMAGES]
     drawings = {

@@ -188,8 +188,10 @@ def test_report_and_json_and_files(calibration, folder, tmp_path):
     assert max(map(len, report.splitlines())) <= 100
     (tmp_path / "out").mkdir()
     for old in ("uncertainty_far.png", "residuals_3.png", "mine.png"):
-        (tmp_path / "out" / old).write_bytes(b"from an earlier run")
-    write_calibration(calibration, tmp_path / "out", plots=False)
+        (tmp_path / "out" / old).write_bytes(b"from somewhere else")
+    with pytest.raises(InputError, match="uncertainty_far.png.*residuals_3.png: already there"):
+        write_calibration(calibration, tmp_path / "out", plots=False)
+    write_calibration(calibration, tmp_path / "out", plots=False, force=True)
     assert [path.name for path in (tmp_path / "out").glob("*.png")] == ["mine.png"]
     document = json.loads((tmp_path / "out" / "result.json").read_text())
     assert document["converged"] and document["redundancy"] == calibration.adjustment.redundancy

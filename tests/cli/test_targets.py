@@ -9,7 +9,8 @@ import pytest
 import jaxbundle
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.csv_tables import write_text
-from jaxbundle.targets import FILES, check_targets, write_targets
+from jaxbundle.io.folders import MARKER
+from jaxbundle.targets import check_targets, write_targets
 
 pytestmark = pytest.mark.xdist_group("convergent4")
 
@@ -23,7 +24,7 @@ def network():
 
 
 def names(folder):
-    return {path.name for path in folder.iterdir()}
+    return {path.name for path in folder.iterdir()} - {MARKER}
 
 
 @pytest.mark.parametrize("json, out, said", [
@@ -60,14 +61,16 @@ def test_folders_to_be_made_are_fine(network, tmp_path):
 
 
 def test_no_file_of_an_earlier_result_stays(convergent4, tmp_path):
-    (tmp_path / "notes.txt").write_text("mine")
-    (tmp_path / "residuals.txt").write_text("mine")
-    write_targets(convergent4, "", tmp_path, brief=False, plots=False)
-    assert set(FILES) - {"checks.csv"} < names(tmp_path)
-    (tmp_path / "residuals_DSC_037.png").write_bytes(b"")
-    write_targets(REASON, "", tmp_path, brief=False, plots=False)
-    assert names(tmp_path) == {"report.txt", "result.json", "notes.txt", "residuals.txt"}
-    assert (tmp_path / "report.txt").read_text() == "not solved: too few images\n"
+    out = tmp_path / "out"
+    write_targets(convergent4, str(out / "r.json"), out, brief=False, plots=False)
+    first = names(out)
+    assert {"report.txt", "result.json", "r.json", "points.csv", "network"} < first
+    for mine in ("notes.txt", "network/residuals.txt"):
+        (out / mine).write_text("mine")
+    write_targets(REASON, "", out, brief=False, plots=False)
+    assert names(out) == {"report.txt", "result.json", "notes.txt", "network"}
+    assert names(out / "network") == {"residuals.txt"}
+    assert (out / "report.txt").read_text() == "not solved: too few images\n"
 
 
 def test_why_there_is_no_result_is_told_as_json(tmp_path, capsys):

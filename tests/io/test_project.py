@@ -9,6 +9,7 @@ import pytest
 
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_network, read_project, write_opencv, write_project
+from jaxbundle.io.folders import MARKER
 from jaxbundle.io.formats import FORMATS
 from jaxbundle.io.settings import CAMERA_KEYS, SETTINGS, TABLES, apply_overrides
 from jaxbundle.network.build import (
@@ -342,7 +343,7 @@ def test_writing_and_reading_gives_the_same_network(folder, tmp_path):
     assert path == tmp_path / "new" / "copy" / "project.toml"
     assert_same(read_project(path), network)
     assert path.read_text().startswith("# look here\n[project]\n")
-    assert {p.name for p in path.parent.iterdir()} == set(FILES)
+    assert {p.name for p in path.parent.iterdir()} == {*FILES, MARKER}
 
 
 @pytest.mark.parametrize("unit", ["deg", "gon"])

@@ -8,14 +8,19 @@ from typing import Annotated
 import typer
 
 import jaxbundle
+from jaxbundle.cli.app import Force
 from jaxbundle.cli.pushbroom.app import pushbroom, warn
 from jaxbundle.io.csv_tables import write_csv, write_text
-from jaxbundle.io.project import write_project
+from jaxbundle.io.fingerprints import files_read
+from jaxbundle.io.project import FILES, fill_project
 from jaxbundle.io.refinement import read_refinement
 from jaxbundle.io.result_json import without_nan
-from jaxbundle.io.scanner_writing import write_scanner_image
+from jaxbundle.io.scanner_writing import names_of, write_scanner_image
 from jaxbundle.refinement import adjusted_photographs, point_rows, report, to_json
 from jaxbundle.refinement import refine as refine_images
+from jaxbundle.targets import REPORT, RESULT, check_writable, written
+
+PHOTOGRAPHS = "photographs"
 
 
 @pushbroom.command()
@@ -24,11 +29,15 @@ def refine(
     out: Annotated[
         Path | None, typer.Option(help="folder for report, JSON, refined files")
     ] = None,
+    force: Force = False,
     json: Annotated[str, typer.Option(help="write the result as JSON; - for stdout alone")] = "",
 ) -> None:
     """Refine attitude, position and optics of scanner images by points; report what they tell."""
     jaxbundle.enable_x64()
     file = read_refinement(input)
+    names = [REPORT, RESULT, "points.csv", *(f"{PHOTOGRAPHS}/{name}" for name in FILES)]
+    names += [name for one in file.images for name in names_of(one.id)]
+    check_writable(json, out, "pushbroom refine", names, files_read(input), force)
     result = refine_images(
         file.images, file.points, file.observations, file.frames,
         snooping=file.snooping, significance=file.significance,
@@ -36,23 +45,19 @@ def refine(
     result = dataclasses.replace(result, warnings=(*file.warnings, *result.warnings))
     text, document = report(result), without_nan(to_json(result))
     as_json = json_.dumps(document, ensure_ascii=False) + "\n"
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        for one in file.images:
-            write_scanner_image(out, one.id, result.image(one.id), one.earth)
-        rows = point_rows(result)
-        write_csv(out / "points.csv", list(rows[0]), [list(row.values()) for row in rows])
-        photographs = adjusted_photographs(result)
-        if photographs is not None:
-            write_project(photographs, out / "photographs")
-        write_text(out / "report.txt", text)
-        write_text(out / "result.json", as_json)
-    if json == "-":
-        print(as_json, end="")
-    else:
-        if json:
-            write_text(Path(json), as_json)
+    with written(json, as_json, out, "pushbroom refine", names, force) as new:
+        if new is not None:
+            for one in file.images:
+                write_scanner_image(new, one.id, result.image(one.id), one.earth)
+            rows = point_rows(result)
+            write_csv(new / "points.csv", list(rows[0]), [list(row.values()) for row in rows])
+            photographs = adjusted_photographs(result)
+            if photographs is not None:
+                fill_project(photographs, new / PHOTOGRAPHS)
+            write_text(new / REPORT, text)
+            write_text(new / RESULT, as_json)
+    if json != "-":
         print(text, end="")
-    if json == "-":
+    else:
         for warning in result.warnings:
             warn(warning)

@@ -8,7 +8,7 @@ import numpy as np
 import typer
 
 import jaxbundle
-from jaxbundle.cli.app import Quiet
+from jaxbundle.cli.app import Force, Quiet
 from jaxbundle.cli.progress import counting
 from jaxbundle.cli.pushbroom.app import (
     Dem,
@@ -18,16 +18,21 @@ from jaxbundle.cli.pushbroom.app import (
     pushbroom,
     surface_of,
 )
+from jaxbundle.io.fingerprints import files_read
 from jaxbundle.io.flight import read_flight
-from jaxbundle.io.scanner_writing import write_scanner_image
+from jaxbundle.io.folders import check_folder, replaced_folder
+from jaxbundle.io.scanner_writing import names_of, write_scanner_image
 from jaxbundle.io.scenes import read_scene, write_taken
 from jaxbundle.pushbroom.simulate import measured_image, true_image
+
+COMMAND, NAME, IMAGE, TRUTH = "pushbroom simulate", "scanner", "image.tif", "truth"
 
 
 @pushbroom.command()
 def simulate(
     flight: Annotated[Path, typer.Argument(help="flight file, .toml (docs/pushbroom.md)")],
     out: Annotated[Path, typer.Option(help="folder for scanner.toml, tables, truth/, image.tif")],
+    force: Force = False,
     scene: Annotated[Path | None, typer.Option(help="raster with map coordinates to see")] = None,
     height: Level = None,
     dem: Dem = None,
@@ -39,22 +44,26 @@ def simulate(
     jaxbundle.enable_x64()
     check_resampling(resampling)
     given = read_flight(flight)
+    names = [IMAGE, *(f"{place}{n}" for place in ("", f"{TRUTH}/") for n in names_of(NAME, ""))]
+    inputs = [path for path in (scene, dem, geoid) if path is not None]
+    check_folder(out, COMMAND, names, [*files_read(flight), *inputs], force)
     truth, measured = true_image(given.flight), measured_image(given.flight)
     surface = surface_of(given.earth, height, dem, truth, geoid)
     shown = None if scene is None else read_scene(scene, given.earth)
     unit = given.file.section("scanner").text("angle_unit", "deg")
     write = lambda folder, image: write_scanner_image(
-        folder, "scanner", image, given.earth, prefix="", angle_unit=unit
+        folder, NAME, image, given.earth, prefix="", angle_unit=unit
     )
-    path = write(out, measured)
-    write(out / "truth", truth)
-    if shown is not None:
-        with counting(quiet) as bar:
-            task = bar.add_task("lines", total=None)
-            write_taken(
-                out / "image.tif", truth, surface, jnp.asarray(shown.bands), shown.place,
-                np.dtype(shown.dtype), resampling,
-                lambda done, total: bar.update(task, completed=done, total=total),
-            )  # fmt: skip
+    with replaced_folder(out, COMMAND, names, force) as new:
+        path = write(new, measured)
+        write(new / TRUTH, truth)
+        if shown is not None:
+            with counting(quiet) as bar:
+                task = bar.add_task("lines", total=None)
+                write_taken(
+                    new / IMAGE, truth, surface, jnp.asarray(shown.bands), shown.place,
+                    np.dtype(shown.dtype), resampling,
+                    lambda done, total: bar.update(task, completed=done, total=total),
+                )  # fmt: skip
     if not quiet:
-        print(path)
+        print(out / path.name)
