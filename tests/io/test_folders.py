@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from jaxbundle.errors import InputError
 from jaxbundle.io import folders
 from jaxbundle.io.folders import INSIDE, MARKER, check_folder, read_marker, replaced_folder
+from jaxbundle.temporaries import remove_temporaries
 
 OLD = {"report.txt": "old", "network/points.csv": "1", "histogram.png": "h"}
 NEWER = {"report.txt": "newer", "network/points.csv": "2", "network/deep/x": "3", "plan.png": "p"}
@@ -251,14 +252,28 @@ def test_a_kill_at_any_rename_leaves_old_or_new(tmp_path, inside):
     assert ended == 0 and len(outcomes) > len(OLD) + len(NEWER) and outcomes.count(False) > 5
 
 
+@pytest.mark.parametrize("place", ["out", "a/b"])
+def test_an_interrupt_of_the_command_line_leaves_no_trace(out, place):
+    """It ends the process without an exception, and removes what is temporary."""
+
+    def action():
+        with replaced_folder(out.parent / place, "adjust", NEWER) as new:
+            (new / "report.txt").write_text("half")
+            remove_temporaries(1)
+            os._exit(7)
+
+    assert in_child(action) == 7
+    assert content(out) == OLD and {*os.listdir(out.parent)} == {"out"}
+
+
 def test_two_runs_do_not_write_one_folder(out):
     with replaced_folder(out, "adjust", NEWER):
-        with pytest.raises(InputError, match=f"^{out}: another run is writing this folder"):
+        with pytest.raises(InputError, match=f"^{out}: another run is writing it"):
             write(out, NEWER)
     assert content(out) == {}
 
 
-def test_every_command_with_a_folder_refuses_a_foreign_one(tmp_path):
+def test_every_command_with_a_folder_refuses_a_foreign_one(tmp_path, monkeypatch):
     """One implementation: the same refusal, before anything is read or computed."""
     import jaxbundle.cli.adjust  # noqa: F401
     import jaxbundle.cli.orient  # noqa: F401
@@ -267,6 +282,7 @@ def test_every_command_with_a_folder_refuses_a_foreign_one(tmp_path):
     import jaxbundle.cli.pushbroom.simulate  # noqa: F401
     from jaxbundle.cli.app import app
 
+    monkeypatch.setattr(jaxbundle, "use_cores", lambda *_: None)  # JAX runs in this process
     examples = Path(__file__).parents[2] / "examples"
     project = examples / "convergent4" / "project.toml"
     out = tmp_path / "other"
