@@ -1,0 +1,177 @@
+"""An interrupt of the command line: one line, its status, nothing half-written, at any moment.
+
+The processes here import no JAX: what they do stands for what it does at such a moment.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from jaxbundle import cli
+
+BEGIN = """
+import gc, hashlib, os, signal, sys, threading
+from jaxbundle.interrupts import advise, handle_interrupts, set_status
+from jaxbundle.temporaries import replacing, temporary, unbroken, watch_cache
+interrupt = lambda number=signal.SIGINT: signal.raise_signal(number)
+"""
+STARTED = BEGIN + "handle_interrupts()\n"
+
+# What swallows the exception that Python's own handler raises there, and goes on.
+SWALLOWED = {
+    "a callback of the garbage collector": """
+gc.callbacks.append(lambda *_: interrupt())
+gc.collect()
+""",
+    "a destructor": """
+class Held:
+    def __del__(self):
+        interrupt()
+Held()
+""",
+    "an import that something else can stand in for": """
+open("numbers_.py", "w").write("import signal; signal.raise_signal(signal.SIGINT)")
+sys.path.insert(0, ".")
+try:
+    import numbers_
+except BaseException:
+    numbers_ = None
+""",
+    "the last moments of a program": """
+import atexit
+atexit.register(print, "it goes on")
+atexit.register(interrupt)
+sys.exit()
+""",
+}
+
+
+def run(code: str, folder: Path, **options):
+    return subprocess.run(
+        [sys.executable, "-B", "-c", code], cwd=folder, capture_output=True, text=True, timeout=60,
+        **options,
+    )  # fmt: skip
+
+
+def check(done, status=130, line="jaxbundle: interrupted\n", said=""):
+    assert (done.returncode, done.stderr, done.stdout) == (status, line, said)
+
+
+@pytest.mark.parametrize("code", SWALLOWED.values(), ids=SWALLOWED)
+def test_it_is_not_swallowed(code, tmp_path):
+    check(run(STARTED + code + "\nprint('it goes on')", tmp_path))
+
+
+@pytest.mark.parametrize("number, status, word", [
+    (signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated"),
+    (signal.SIGHUP, 129, "the terminal is gone"),
+])  # fmt: skip
+def test_each_signal_has_its_status_and_its_word_once(number, status, word, tmp_path):
+    code = f"advise('go on')\n[interrupt({int(number)}) for _ in range(3)]"
+    check(run(STARTED + code, tmp_path), status, f"jaxbundle: {word}; go on\n")
+
+
+def test_what_is_half_written_goes_and_what_was_there_stays(tmp_path):
+    (tmp_path / "result.json").write_text("old")
+    code = """
+os.makedirs("out/within")
+with temporary("new"), replacing("result.json") as path:
+    os.makedirs("new/within")
+    open("new/within/table.csv", "w").write("half")
+    os.symlink(os.path.abspath("out"), "new/link")
+    path.write_text("half")
+    assert len(os.listdir()) == 4
+    interrupt()
+"""
+    check(run(STARTED + code, tmp_path))
+    assert sorted(os.listdir(tmp_path)) == ["out", "result.json"]
+    assert (tmp_path / "result.json").read_text() == "old"
+    assert os.listdir(tmp_path / "out") == ["within"]
+
+
+def test_what_belongs_together_is_done_whole(tmp_path):
+    code = """
+with unbroken():
+    with unbroken():
+        open("first", "w").close()
+        interrupt()
+    open("second", "w").close()
+open("third", "w").close()
+"""
+    check(run(STARTED + code, tmp_path))
+    assert sorted(os.listdir(tmp_path)) == ["first", "second"]
+
+
+def test_work_in_c_does_not_hold_it_up(tmp_path):
+    """A hash that takes minutes and knows no interrupts, as a compilation of XLA."""
+    code = """
+threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start()
+with temporary("half"):
+    open("half", "w").close()
+    hashlib.pbkdf2_hmac("sha512", b"", b"", 1_000_000_000)
+"""
+    check(run(STARTED + code, tmp_path))
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="no /proc/self/fd")
+def test_a_program_kept_in_part_is_removed(tmp_path):
+    code = """
+os.mkdir("cache")
+watch_cache("cache")
+whole, half, other = (open(name, "w") for name in ("cache/whole", "cache/half", "other"))
+whole.close()
+interrupt()
+"""
+    check(run(STARTED + code, tmp_path))
+    assert os.listdir(tmp_path / "cache") == ["whole"] and (tmp_path / "other").exists()
+
+
+def test_in_a_program_it_is_pythons_own(tmp_path):
+    code = """
+import jaxbundle
+assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+try:
+    with unbroken(), replacing("result.json") as path:
+        path.write_text("half")
+        interrupt()
+except KeyboardInterrupt:
+    assert os.listdir() == []
+    print("caught")
+"""
+    check(run(BEGIN + code, tmp_path), 0, "", "caught\n")
+
+
+def test_what_is_ignored_stays_ignored(tmp_path):
+    code = """
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+handle_interrupts()
+interrupt()
+set_status(3)
+print("to the end")
+"""
+    check(run(BEGIN + code, tmp_path), 3, "", "to the end\n")
+
+
+def test_closed_streams_are_not_taken_for_files(tmp_path):
+    code = STARTED + "file = open('result', 'w'); print('said'); file.flush(); interrupt()"
+    command = ["sh", "-c", 'exec "$@" <&- >&- 2>&-', "-", sys.executable, "-c", code]
+    assert subprocess.run(command, cwd=tmp_path, timeout=60).returncode == 130
+    assert (tmp_path / "result").read_text() == ""
+
+
+def test_a_reader_that_has_gone_ends_it_quietly(monkeypatch, capfd):
+    reader, writer = os.pipe()
+    os.close(reader)
+    monkeypatch.setattr(sys, "argv", ["jaxbundle", "camera", "--help"])
+    with open(writer, "w") as stream, monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", stream)
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+    assert ended.value.code == 141
+    assert capfd.readouterr().err == ""
