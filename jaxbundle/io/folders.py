@@ -98,7 +98,8 @@ def replaced_folder(
         try:
             for parent in [p for p in real.parents if not p.exists()][::-1]:
                 until.enter_context(temporary(parent, content=False)).mkdir()
-            work = until.enter_context(temporary(_make_work(real), content=False))
+            with unbroken():
+                work = until.enter_context(temporary(_make_work(real), content=False))
             new = work / NEW
             until.enter_context(_held(folder, work))
             until.enter_context(temporary(new)).mkdir()

@@ -16,7 +16,7 @@ from jaxbundle import cli
 BEGIN = """
 import gc, hashlib, os, signal, sys, threading
 from jaxbundle.interrupts import advise, handle_interrupts, set_status
-from jaxbundle.temporaries import replacing, temporary, unbroken, watch_cache
+from jaxbundle.temporaries import temporary, unbroken, watch_cache
 interrupt = lambda number=signal.SIGINT: signal.raise_signal(number)
 """
 STARTED = BEGIN + "handle_interrupts()\n"
@@ -79,12 +79,13 @@ def test_what_is_half_written_goes_and_what_was_there_stays(tmp_path):
     (tmp_path / "result.json").write_text("old")
     code = """
 os.makedirs("out/within")
-with temporary("new"), replacing("result.json") as path:
+with temporary("new"), temporary("empty", content=False), temporary(".result.json") as path:
+    os.mkdir("empty")
     os.makedirs("new/within")
     open("new/within/table.csv", "w").write("half")
     os.symlink(os.path.abspath("out"), "new/link")
     path.write_text("half")
-    assert len(os.listdir()) == 4
+    assert len(os.listdir()) == 5
     interrupt()
 """
     check(run(STARTED + code, tmp_path))
@@ -137,7 +138,7 @@ import jaxbundle
 assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 try:
-    with unbroken(), replacing("result.json") as path:
+    with unbroken(), temporary(".result.json") as path:
         path.write_text("half")
         interrupt()
 except KeyboardInterrupt:
