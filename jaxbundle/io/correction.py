@@ -105,7 +105,10 @@ def write_corrected(
                 places = block_places(image, search, surface, nodes, occlusion)
                 if places is None:
                     return None
-                return _values(bands, reading, image, places, resampling)
+                try:
+                    return _values(bands, reading, image, places, resampling)
+                except package.errors.RasterioError as error:
+                    raise unreadable(source, error) from None
 
             write_map(
                 target, system, grid, surface, bands.count, bands.dtypes[0], block, progress

@@ -8,8 +8,8 @@ from jaxtyping import Float
 
 from jaxbundle.io.map_blocks import write_map
 from jaxbundle.io.maps import MapGrid, MapSystem
-from jaxbundle.io.rasters import open_plain, rasterio
-from jaxbundle.io.replacing import replaced_file
+from jaxbundle.io.raster_writing import written_raster
+from jaxbundle.io.rasters import rasterio
 from jaxbundle.pushbroom.correct import block_errors, block_places
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.project import Search
@@ -60,13 +60,12 @@ def write_image_raster(
 
     Its coordinates are those of the image: x the pixel, y the line, downwards.
     """
-    package = rasterio()
     steps = [v[1] - v[0] if len(v) > 1 else 1.0 for v in (pixels, lines)]
-    with replaced_file(target) as temporary, open_plain(
-        temporary, "w", driver="GTiff", width=len(pixels), height=len(lines), count=len(bands),
-        dtype="float32", nodata=np.nan, transform=package.transform.Affine(
-            steps[0], 0, pixels[0] - steps[0] / 2, 0, steps[1], lines[0] - steps[1] / 2
-        ),
-    ) as raster:  # fmt: skip
+    transform = rasterio().transform.Affine(
+        steps[0], 0, pixels[0] - steps[0] / 2, 0, steps[1], lines[0] - steps[1] / 2
+    )
+    with written_raster(
+        target, len(pixels), len(lines), len(bands), "float32", nodata=np.nan, transform=transform
+    ) as raster:
         raster.write(np.stack(list(bands.values())).astype("float32"))
-        raster.descriptions = tuple(bands)
+        raster.describe(tuple(bands))

@@ -1,6 +1,5 @@
 """A map as a GeoTIFF, made and written block by block, two at a time, under a temporary name."""
 
-import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -8,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from jaxbundle.io.maps import MapGrid, MapSystem
-from jaxbundle.io.rasters import as_type, rasterio, unreadable
-from jaxbundle.io.replacing import replaced_file
+from jaxbundle.io.raster_writing import written_raster
+from jaxbundle.io.rasters import as_type, rasterio
 from jaxbundle.pushbroom.correct import BLOCK, STEP, Nodes
 from jaxbundle.pushbroom.surfaces import Surface
 
@@ -32,9 +31,7 @@ def write_map(
 
     **Raises:** `InputError` if the file cannot be written.
     """
-    package = rasterio()
     floating = np.issubdtype(dtype, np.floating)
-    writing = threading.Lock()
     steps = np.arange(0, BLOCK + STEP, STEP)
 
     def one(corner):
@@ -44,24 +41,17 @@ def write_map(
             return
         rows, columns = min(BLOCK, grid.rows - row), min(BLOCK, grid.columns - column)
         values = as_type(values[:, :rows, :columns], dtype)
-        with writing:
-            map_.write(values, window=((row, row + rows), (column, column + columns)))
+        map_.write(values, row, column)
 
     corners = [(r, c) for r in range(0, grid.rows, BLOCK) for c in range(0, grid.columns, BLOCK)]
-    with replaced_file(target) as temporary:
-        try:
-            map_ = package.open(
-                temporary, "w", driver="GTiff", width=grid.columns, height=grid.rows, count=count,
-                dtype=dtype, crs=system.text, nodata=np.nan if floating else 0,
-                transform=package.transform.Affine(grid.size, 0, grid.x, 0, -grid.size, grid.y),
-                tiled=True, blockxsize=BLOCK, blockysize=BLOCK, BIGTIFF="IF_SAFER",
-            )  # fmt: skip
-        except package.errors.RasterioError as error:
-            raise unreadable(target, error) from None
-        with map_:
-            if names:
-                map_.descriptions = tuple(names)
-            with ThreadPoolExecutor(2) as workers:
-                for done, _ in enumerate(workers.map(one, corners), 1):
-                    if progress:
-                        progress(done, len(corners))
+    with written_raster(
+        target, grid.columns, grid.rows, count, dtype, crs=system.text,
+        nodata=np.nan if floating else 0, tiled=True, blockxsize=BLOCK, blockysize=BLOCK,
+        transform=rasterio().transform.Affine(grid.size, 0, grid.x, 0, -grid.size, grid.y),
+    ) as map_:  # fmt: skip
+        if names:
+            map_.describe(names)
+        with ThreadPoolExecutor(2) as workers:
+            for done, _ in enumerate(workers.map(one, corners), 1):
+                if progress:
+                    progress(done, len(corners))

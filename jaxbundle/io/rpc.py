@@ -22,7 +22,7 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.io.csv_tables import read_text, write_text
 from jaxbundle.io.rasters import rasterio
-from jaxbundle.io.replacing import replaced_file
+from jaxbundle.io.replacing import disk_of, replaced_file
 from jaxbundle.io.rpc_products import from_geom, from_xml
 from jaxbundle.io.xml_fields import number_in
 from jaxbundle.network.columns import shown
@@ -203,6 +203,9 @@ def _to_raster(path, rpc):
             shutil.copyfile(path, temporary)
             with package.open(temporary, "r+") as target:
                 target.rpcs = RPC(**given)
+            with package.open(temporary) as target:  # what fails at closing is told to nobody
+                if target.rpcs is None:
+                    raise InputError(f"{path}: cannot be written: no tags arrived{disk_of(path)}")
     except (OSError, package.errors.RasterioError) as error:
         raise InputError(f"{path}: cannot be written: {' '.join(str(error).split())}") from None
 

@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.maps import MapSystem
+from jaxbundle.io.raster_writing import written_raster
 from jaxbundle.io.rasters import as_type, open_plain, rasterio, unreadable
-from jaxbundle.io.replacing import replaced_file
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.resample import Resampling
 from jaxbundle.pushbroom.simulate import taken_image
@@ -69,22 +69,15 @@ def write_taken(
     **Raises:** `InputError` if the scene is nowhere in the image.
     """
     seen = False
-    with replaced_file(path) as temporary:
-        with open_plain(
-            temporary, "w", driver="GTiff", width=image.pixels, height=image.lines,
-            count=len(bands), dtype=dtype, BIGTIFF="IF_SAFER",
-        ) as target:  # fmt: skip
-            for first in range(0, image.lines, PORTION):
-                lines = np.arange(first, first + PORTION, dtype=float)
-                inside = np.minimum(lines, image.lines - 1)
-                values = taken_image(image, surface, bands, place, inside, resampling)
-                values = values[:, : image.lines - first]
-                seen |= bool(np.isfinite(values).any())
-                target.write(
-                    as_type(values, dtype),
-                    window=((first, first + values.shape[1]), (0, image.pixels)),
-                )
-                if progress:
-                    progress(first + values.shape[1], image.lines)
+    with written_raster(path, image.pixels, image.lines, len(bands), dtype) as target:
+        for first in range(0, image.lines, PORTION):
+            lines = np.arange(first, first + PORTION, dtype=float)
+            inside = np.minimum(lines, image.lines - 1)
+            values = taken_image(image, surface, bands, place, inside, resampling)
+            values = values[:, : image.lines - first]
+            seen |= bool(np.isfinite(values).any())
+            target.write(as_type(values, dtype), first)
+            if progress:
+                progress(first + values.shape[1], image.lines)
         if not seen:
             raise InputError("the image shows nothing of the scene: look at track and coordinates")

@@ -10,6 +10,7 @@ from scipy.ndimage import binary_erosion
 from test_simulate_correct import pattern
 
 from jaxbundle import cli
+from jaxbundle.io.folders import MARKER
 
 FLIGHT = """
 [scanner]
@@ -79,7 +80,7 @@ def test_from_a_flight_to_a_map(tmp_path, flight, run):
     status, said, _ = run("simulate", flight, "--out", out, "--scene", scene)
     assert status == 0 and said.strip() == str(out / "scanner.toml")
     names = {p.name for p in out.iterdir()}
-    assert names == {"scanner.toml", "positions.csv", "attitude.csv", "truth", "image.tif"}
+    assert names == {"scanner.toml", "positions.csv", "attitude.csv", "truth", "image.tif", MARKER}
     truth = out / "truth" / "scanner.toml"
     assert 'angle_unit = "deg"' in truth.read_text()
     status, said_of_map, err = run(

@@ -1,0 +1,95 @@
+"""A disk that is full: the raster that is written is named with its disk, and nothing is left."""
+
+import os
+import resource
+import signal
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from jaxbundle.errors import InputError
+from jaxbundle.io import correction, error_maps, raster_writing
+from jaxbundle.io.map_blocks import write_map
+from jaxbundle.io.maps import MapGrid, MapSystem
+from jaxbundle.pushbroom.surfaces import Plane
+
+rasterio = pytest.importorskip("rasterio")
+
+
+@contextmanager
+def files_end_at(size: int):
+    """No file grows beyond so many bytes: the system refuses the write, as a full disk does."""
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, before)
+
+
+def write(target):
+    values = np.random.default_rng(1).integers(0, 255, (1, 256, 256), dtype=np.uint8)
+    write_map(target, MapSystem(None, None), MapGrid(0.0, 0.0, 1.0, 600, 600), Plane(0.0), 1,
+              "uint8", lambda nodes: values.astype(float))  # fmt: skip
+
+
+@pytest.mark.parametrize("cache", [64, 2**20], ids=["at closing", "at a block"])
+def test_a_full_disk_names_the_map_and_its_disk(tmp_path, capfd, cache):
+    """GDAL with a large cache writes when the file is closed, and swallows what fails then."""
+    target = tmp_path / "map.tif"
+    target.write_text("the old one")
+    with rasterio.Env(GDAL_CACHEMAX=cache), files_end_at(100_000):
+        with pytest.raises(InputError) as found:
+            write(target)
+    said = str(found.value)
+    assert said.startswith(f"{target}: cannot be written: ")
+    assert " are free on the disk at /" in said
+    assert "\n" not in said and capfd.readouterr().err == ""
+    assert target.read_text() == "the old one" and os.listdir(tmp_path) == ["map.tif"]
+    write(target)
+    with rasterio.open(target) as raster:
+        assert raster.read(1)[300:].any()
+
+
+def test_a_disk_too_small_is_found_before_anything_is_made(tmp_path, monkeypatch):
+    usage = lambda path: type("", (), {"free": 300_000})
+    monkeypatch.setattr(raster_writing.shutil, "disk_usage", usage)
+    with pytest.raises(InputError, match="map.tif: cannot be written: 0.36 MB are needed; 0.3 MB"):
+        write(tmp_path / "map.tif")
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_raster_of_errors_on_a_full_disk(tmp_path):
+    bands = {"east [m]": np.random.default_rng(1).normal(size=(200, 200))}
+    with files_end_at(50_000), pytest.raises(InputError, match="e.tif: cannot be written: .*disk"):
+        error_maps.write_image_raster(tmp_path / "e.tif", np.arange(200.0), np.arange(200.0), bands)
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_source_that_cannot_be_read_is_named_itself(tmp_path, monkeypatch):
+    source = tmp_path / "source.tif"
+    with rasterio.open(source, "w", driver="GTiff", width=4, height=4, count=1, dtype="uint8",
+                       transform=rasterio.transform.Affine(1, 0, 5, 0, -1, 5)):  # fmt: skip
+        pass
+
+    def fail(*_):
+        raise rasterio.errors.RasterioIOError("Read failed.")
+
+    monkeypatch.setattr(correction, "block_places", lambda *_: ())
+    monkeypatch.setattr(correction, "_values", fail)
+    image = type("", (), {"lines": 4, "pixels": 4})
+    with pytest.raises(InputError, match=f"^{source}: Read failed.$"):
+        correction.write_corrected(
+            source, tmp_path / "map.tif", image, None, Plane(0.0), MapSystem(None, None),
+            MapGrid(5.0, 5.0, 1.0, 4, 4),
+        )  # fmt: skip
+    assert os.listdir(tmp_path) == ["source.tif"]
+
+
+def test_a_device_is_not_replaced_by_a_map(tmp_path):
+    (tmp_path / "null.tif").symlink_to("/dev/null")
+    with pytest.raises(InputError, match="null.tif: cannot be written: it is not a file"):
+        write(tmp_path / "null.tif")
