@@ -19,14 +19,14 @@ if TYPE_CHECKING:
     from jaxbundle.adjustment import Problem as Problem
     from jaxbundle.adjustment import make_problem as make_problem
     from jaxbundle.adjustment import solve as solve
-    from jaxbundle.adjustment.batch import BatchCalibration as BatchCalibration
-    from jaxbundle.adjustment.batch import calibrate_batch as calibrate_batch
     from jaxbundle.bundle import adjust as adjust
     from jaxbundle.calibration import Board as Board
     from jaxbundle.calibration import BoardViews as BoardViews
     from jaxbundle.calibration import Calibration as Calibration
     from jaxbundle.calibration import calibrate as calibrate
     from jaxbundle.calibration import calibrate_cameras as calibrate_cameras
+    from jaxbundle.calibration.batch import BatchCalibration as BatchCalibration
+    from jaxbundle.calibration.batch import calibrate_batch as calibrate_batch
     from jaxbundle.configuration import enable_x64 as enable_x64
     from jaxbundle.configuration import join_processes as join_processes
     from jaxbundle.configuration import keep_programs as keep_programs
@@ -56,7 +56,7 @@ if TYPE_CHECKING:
 
 _HOME = {
     "jaxbundle.adjustment": ("Problem", "make_problem", "solve"),
-    "jaxbundle.adjustment.batch": ("BatchCalibration", "calibrate_batch"),
+    "jaxbundle.calibration.batch": ("BatchCalibration", "calibrate_batch"),
     "jaxbundle.bundle": ("adjust",),
     "jaxbundle.calibration": (
         "Board", "BoardViews", "Calibration", "calibrate", "calibrate_cameras",

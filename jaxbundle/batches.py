@@ -16,11 +16,13 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxbundle.adjustment.batch import BatchCalibration, calibrate_batch
-from jaxbundle.adjustment.batch_camera import CONVERGED, LIMIT, STATUS, WEAK
+from jaxbundle.adjustment.batch_camera import LIMIT, STATUS
 from jaxbundle.adjustment.batch_input import free_parameters, pixel_model
-from jaxbundle.arguments import whole
+from jaxbundle.arguments import one_of, whole
 from jaxbundle.bundle import adjust
+from jaxbundle.calibration.batch import BatchCalibration, calibrate_batch
+from jaxbundle.calibration.batch_result import SOLVED
+from jaxbundle.calibration.batch_snooping import TESTS
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io import read_network
 from jaxbundle.io.camera_stacks import is_camera_stack, read_camera_stack
@@ -28,8 +30,10 @@ from jaxbundle.io.fingerprints import of_input
 from jaxbundle.io.json_lines import JsonLines
 from jaxbundle.io.locks import locked
 from jaxbundle.io.result_json import result_dict
+from jaxbundle.statistics.snooping import check_test
 
-SOLVED = (STATUS[CONVERGED], STATUS[WEAK])
+SNOOPING = ("snooping", "significance")
+"""Settings that only a line has whose measurements were searched for blunders."""
 CAMERAS_A_WRITE = 256
 NETWORKS_A_CACHE = 50
 """After so many networks compiled programs are dropped: each holds memory."""
@@ -42,6 +46,8 @@ def run_batch(
     model: str = "opencv",
     free: Sequence[str] | None = None,
     max_iterations: int = 100,
+    snooping: str | None = None,
+    significance: float = 0.001,
     brief: bool = False,
     retry: bool = False,
     renew: bool = False,
@@ -55,6 +61,7 @@ def run_batch(
     - `file`: JSON lines; what it already has is skipped.
     - `model`, `free`: as of `calibrate_batch`, for the cameras.
     - `max_iterations`: for each camera and each network.
+    - `snooping`, `significance`: data snooping, `"pope"`, of every camera and every network.
     - `brief`: no poses and covariances of cameras.
     - `retry`: compute again what has no result in the file.
     - `renew`: compute again what the file has from other settings or other data.
@@ -70,10 +77,14 @@ def run_batch(
     """
     portion = whole("portion", portion)
     max_iterations = whole("max_iterations", max_iterations)
+    one_of("snooping", snooping, TESTS, none=True)
+    check_test(snooping, significance)
     for path in inputs:
         if not os.path.exists(path):
             raise InputError(f"{path}: no such file or folder")
     options = dict(model=model, free=free, max_iterations=max_iterations)
+    if snooping is not None:
+        options |= dict(snooping=snooping, significance=significance)
     works = {}
     for path in map(str, inputs):
         name = key_of(path, file)
@@ -144,9 +155,9 @@ def _cameras(path: str, name: str, options: dict, brief: bool) -> _Work:
 
 
 def _network(path: str, name: str, options: dict, brief: bool) -> _Work:
-    most = options["max_iterations"]
-    solve = lambda chosen: [network_row(path, most)]
-    return _Work((name,), {"max_iterations": most}, lambda i: of_input(path), solve, False)
+    options = {key: value for key, value in options.items() if key not in ("model", "free")}
+    solve = lambda chosen: [network_row(path, **options)]
+    return _Work((name,), options, lambda i: of_input(path), solve, False)
 
 
 def _rows(work: _Work, chosen: Sequence[int]) -> list[dict]:
@@ -186,7 +197,8 @@ def _difference(head: dict, work: _Work, i: int) -> str:
     old = head.get("settings")
     if not isinstance(old, dict) or "data" not in head:
         return "its line does not say what it was made of (an earlier version wrote it)"
-    for name, value in work.settings.items():
+    for name in {**work.settings, **dict.fromkeys(SNOOPING)}:
+        value = work.settings.get(name)
         # A minimum is the same after however many iterations were allowed.
         matters = name != "max_iterations" or head.get("status") == STATUS[LIMIT]
         if matters and old.get(name) != value:
@@ -199,10 +211,10 @@ def _shown(value) -> str:
     return ",".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
-def network_row(path: str, max_iterations: int = 100) -> dict:
-    """The status and brief result of one network, or why there is none."""
+def network_row(path: str, **options) -> dict:
+    """The status and brief result of one network (`options` of `adjust`), or why there is none."""
     try:
-        result = adjust(read_network(path), max_iterations=max_iterations)
+        result = adjust(read_network(path), **options)
         status = "converged" if result.converged else result.termination
         return {"status": status} | result_dict(result, brief=True)
     except (InputError, NotSolvedError) as error:
@@ -222,6 +234,11 @@ def camera_row(batch: BatchCalibration, i: int, brief: bool = False) -> dict:
         "views": int(batch.views[i].sum()),
         "views_left_out": np.flatnonzero(~batch.views[i]).tolist(),
     }
+    if batch.remark[i]:
+        row["remark"] = str(batch.remark[i])
+    if batch.removed is not None:
+        removed = np.argwhere(batch.removed[i])
+        row["removed"] = len(removed) if brief else removed.tolist()
     if batch.undetermined[i].any():
         row["undetermined"] = np.array(batch.parameters)[batch.undetermined[i]].tolist()
     if not batch.solved[i]:

@@ -76,13 +76,12 @@ def adjust(
     where it, or what data snooping, elimination or variance components leave of it, determines no
     answer.
     """
-    require_network(network)
     check_options(
         method=method, reduction=reduction, max_iterations=max_iterations, robust=robust,
         snooping=snooping, significance=significance, eliminate=eliminate, critical_t=critical_t,
         estimate_components=estimate_components, progress=progress,
     )  # fmt: skip
-    given = network
+    given = require_network(network)
     if lacks_start_values(given):
         network = _placed(orient(given))
     options = {"method": method, "max_steps": max_iterations + 1, "progress": progress}

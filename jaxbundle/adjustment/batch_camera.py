@@ -23,8 +23,10 @@ from jaxbundle.adjustment.batch_normal import (
     step,
 )
 
-STATUS = ("converged", "iteration limit", "singular", "not finite", "too few points", "weak")
-CONVERGED, LIMIT, SINGULAR, NOT_FINITE, TOO_FEW, WEAK = range(6)
+STATUS = (
+    "converged", "iteration limit", "singular", "not finite", "too few points", "weak", "misfit"
+)  # fmt: skip
+CONVERGED, LIMIT, SINGULAR, NOT_FINITE, TOO_FEW, WEAK, MISFIT = range(7)
 RUNNING = -1
 
 TOLERANCE = 1e-5

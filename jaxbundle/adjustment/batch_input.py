@@ -111,7 +111,12 @@ class Batch:
     interior: np.ndarray
     free: tuple[int, ...]
     known: bool
-    size: float
+    image_size: np.ndarray
+
+    @property
+    def size(self) -> float:
+        """A length of the image, pixels."""
+        return float(self.image_size.max())
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -142,7 +147,7 @@ class Batch:
         return cls(
             finite, *_principal_axes(X, seen), xy=xy, visible=visible, interior=interior,
             free=tuple(model.parameters.index(name) for name in free), known=known,
-            size=float(size.max()),
+            image_size=size.astype(float),
         )  # fmt: skip
 
     def portions(self, on_cpu: bool) -> Iterator[Portion]:

@@ -61,6 +61,11 @@ def normal_equations(model, free, seen: Sightings, at: Calibration):
 
     **Arguments:** `free`: the columns of the k free parameters.
     """
+    return gram(*design(model, free, seen, at))
+
+
+def design(model, free, seen: Sightings, at: Calibration) -> tuple[list, list]:
+    """The columns of [Jₑ Jᵢ v], each [views, points]: the rows of x, and those of y."""
     M = jax.vmap(matrix_from_quaternion)(at.rotation)
     of_view = lambda column: column[:, None]
     # What is not seen stands at the middle of the object, whose image always exists.
@@ -84,7 +89,19 @@ def normal_equations(model, free, seen: Sightings, at: Calibration):
     still = ((nil,) * 3, (nil,) * 3, (nil,) * len(free))
     (vx, vy), pull = jax.vjp(weighted_residual, still)
     flat = lambda rows: [column for group in rows for column in group]
-    return gram([*flat(pull((one, nil))[0]), vx], [*flat(pull((nil, one))[0]), vy])
+    return [*flat(pull((one, nil))[0]), vx], [*flat(pull((nil, one))[0]), vy]
+
+
+def residual_lengths(model, seen: Sightings, at: Calibration) -> Float[Array, "views points"]:
+    """√(vx² + vy²) of all points, 0 where none is seen."""
+    M = jax.vmap(matrix_from_quaternion)(at.rotation)
+    X = [jnp.where(seen.weight > 0, seen.point[:, i], 0.0) for i in range(3)]
+    ray = tuple(
+        sum(M[:, i, j, None] * X[j] for j in range(3)) + at.shift[:, i, None] for i in range(3)
+    )
+    xy = (seen.xy[..., 0], seen.xy[..., 1])
+    vx, vy = cameras.residual(model, "measured", tuple(at.interior), ray, xy)
+    return seen.weight * jnp.sqrt(vx * vx + vy * vy)
 
 
 def gram(x: list, y: list) -> Float[Array, "views n n"]:

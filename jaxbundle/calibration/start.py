@@ -15,8 +15,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.adjustment.batch import BatchCalibration, calibrate_batch
 from jaxbundle.adjustment.batch_input import FREE
+from jaxbundle.calibration.batch import BatchCalibration, calibrate_batch
 from jaxbundle.calibration.frames import images_of_board, in_model_units
 from jaxbundle.cameras import CameraModel, get_model
 from jaxbundle.errors import InputError, NotSolvedError

@@ -5,7 +5,9 @@ from typing import Annotated
 import typer
 
 import jaxbundle
+from jaxbundle.arguments import one_of
 from jaxbundle.batches import run_batch
+from jaxbundle.calibration.batch_snooping import TESTS
 from jaxbundle.cli.app import Quiet, app
 from jaxbundle.cli.progress import counting
 from jaxbundle.interrupts import advise
@@ -19,6 +21,10 @@ def batch(
     model: Annotated[str, typer.Option(help="camera model of the .npz files")] = "opencv",
     free: Annotated[str, typer.Option(help="parameters to estimate: fx,fy,…")] = "",
     max_iterations: Annotated[int, typer.Option(min=1)] = 100,
+    snooping: Annotated[
+        str, typer.Option(help="removal of gross errors: pope, or none")
+    ] = "none",
+    significance: Annotated[float, typer.Option(help="level of the test")] = 0.001,
     portion: Annotated[int, typer.Option(min=1, help="cameras between two writes")] = 256,
     brief: Annotated[bool, typer.Option("--brief", help="no poses, no covariances")] = False,
     retry: Annotated[bool, typer.Option("--retry", help="again what has no result")] = False,
@@ -36,6 +42,7 @@ def batch(
     or another run is writing the file; 130, 143 interrupted.
     """
     jaxbundle.enable_x64()
+    one_of("--snooping", snooping, ("none", *TESTS))
     if not all(map(is_camera_stack, inputs)):
         # Cameras fill the cores by threads of their own, and gain nothing.
         jaxbundle.use_cores()
@@ -45,7 +52,9 @@ def batch(
         counts = run_batch(
             inputs, json_lines, model=model,
             free=[name.strip() for name in free.split(",")] if free else None,
-            max_iterations=max_iterations, portion=portion, brief=brief, retry=retry,
+            max_iterations=max_iterations,
+            snooping=None if snooping == "none" else snooping, significance=significance,
+            portion=portion, brief=brief, retry=retry,
             renew=renew,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )  # fmt: skip

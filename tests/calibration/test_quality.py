@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from test_calibrate import NOISE, simulated
 
 from jaxbundle import cli
-from jaxbundle.adjustment.batch import calibrate_batch
 from jaxbundle.calibration import calibrate
 from jaxbundle.calibration.advice import advice
+from jaxbundle.calibration.batch import calibrate_batch
 from jaxbundle.calibration.files import json_text, write_calibration
 from jaxbundle.calibration.quality import coverage, grid_of, uncertainty_map
 from jaxbundle.cameras import compare_cameras, get_model

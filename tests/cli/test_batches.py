@@ -96,6 +96,24 @@ def test_renewed_are_those_of_other_settings_or_data_alone(start, images):
         again()
 
 
+def test_snooping_is_a_setting_of_its_lines(start, images):
+    path, file, again = start
+    with pytest.raises(InputError, match="snooping was None, is pope"):
+        again(snooping="pope")
+    images[1, :, 7] += 30
+    write_cameras(path, images)
+    file.unlink()
+    assert again() == {"converged": 3, "misfit": 1}
+    # A misfit has its values: it is not computed again.
+    assert again(retry=True) == {"converged": 3, "misfit": 1, "skipped": 4}
+    assert again(snooping="pope", renew=True) == {"converged": 4}
+    row = [json.loads(line) for line in file.read_text().splitlines()][1]
+    assert row["removed"] == [[view, 7] for view in range(6)]
+    assert row["settings"]["snooping"] == "pope" and "remark" not in row
+    with pytest.raises(InputError, match="snooping was pope, is None"):
+        again()
+
+
 def test_the_limit_of_iterations_matters_where_it_was_reached(start):
     _, file, again = start
     assert again(max_iterations=50) == {"converged": 4, "skipped": 4}
@@ -136,7 +154,7 @@ def test_lines_of_odd_content_are_no_results_of_these(start):
 
 
 def test_a_rewritten_network_is_seen(tmp_path, monkeypatch):
-    monkeypatch.setattr(batches, "network_row", lambda path, most: {"status": "converged"})
+    monkeypatch.setattr(batches, "network_row", lambda path, **options: {"status": "converged"})
     project = shutil.copytree(EXAMPLE, tmp_path / "block") / "project.toml"
     file = tmp_path / "results.jsonl"
     assert run_batch([project, project.parent], file) == {"converged": 2}

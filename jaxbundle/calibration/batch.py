@@ -19,24 +19,28 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float
 
 from jaxbundle.adjustment.batch_camera import (
     CONVERGED,
     LIMIT,
+    MISFIT,
     NOT_FINITE,
     SINGULAR,
     STATUS,
     WEAK,
-    Solved,
     solve_camera,
 )
 from jaxbundle.adjustment.batch_input import Batch, Portion
-from jaxbundle.adjustment.batch_normal import POSE
+from jaxbundle.adjustment.batch_normal import POSE, Calibration, Sightings, residual_lengths
 from jaxbundle.adjustment.batch_start import start_values
+from jaxbundle.adjustment.batch_tests import point_tests
 from jaxbundle.adjustment.batch_weakness import vague, vanishing
 from jaxbundle.adjustment.problem import require_x64
-from jaxbundle.arguments import whole
+from jaxbundle.arguments import one_of, whole
+from jaxbundle.calibration.batch_misfit import axes_remark, misfits
+from jaxbundle.calibration.batch_result import BatchCalibration as BatchCalibration
+from jaxbundle.calibration.batch_snooping import ROUNDS, TESTS, Snooping
 from jaxbundle.cameras import CameraModel, get_model
 from jaxbundle.configuration import available_cores
 from jaxbundle.geometry import (
@@ -44,72 +48,9 @@ from jaxbundle.geometry import (
     matrix_from_rotation_vector,
     omega_phi_kappa_from_matrix,
 )
+from jaxbundle.statistics.snooping import check_test
 
 OF_A_VIEW = ("position", "angles", "sigma_position", "sigma_angles", "rotation")
-
-
-@dataclasses.dataclass(frozen=True)
-class BatchCalibration:
-    """The cameras of a batch; everything of a camera that has no solution is NaN.
-
-    **Fields:**
-
-    - `model`, `parameters`: the camera model and its k free parameters.
-    - `status`: "converged"; "weak", as that, but the views do not determine the principal distance
-      or point, whose σ is above a fiftieth of the principal distance (where `rms` is large, wrong
-      points are the reason); without a solution "iteration limit", "singular", "not finite" (an
-      infinite number among the measurements, or the start) or "too few points" (no view of use, or
-      no redundancy).
-    - `undetermined`: the free parameters that the views do not determine, where that is why the
-      camera is weak, is singular or came to no end.
-    - `values`, `sigma`, `covariance`: of the free parameters; pixels, coefficients without unit.
-    - `interior`: all parameters of the model, in its order.
-    - `sigma0`: √(vᵀv/redundancy), pixels; all σ and covariances are a posteriori.
-    - `rms`: √(Σ(vx² + vy²)/points), pixels, as OpenCV defines it.
-    - `redundancy`, `iterations` (evaluations of the normal equations).
-    - `views`: the views that took part. One with fewer than 4 points of a flat object (6 of a solid
-      one), or with all of them on a line (in a plane), is left out.
-    - `position`, `angles`: X0, Y0, Z0 in the unit of the object; ω, φ, κ in radians, with
-      `sigma_position`, `sigma_angles`; `rotation`: the matrices M.
-    """
-
-    model: str
-    parameters: tuple[str, ...]
-    status: Shaped[np.ndarray, " cameras"]
-    undetermined: Bool[np.ndarray, "cameras k"]
-    values: Float[np.ndarray, "cameras k"]
-    sigma: Float[np.ndarray, "cameras k"]
-    covariance: Float[np.ndarray, "cameras k k"]
-    interior: Float[np.ndarray, "cameras parameters"]
-    sigma0: Float[np.ndarray, " cameras"]
-    rms: Float[np.ndarray, " cameras"]
-    redundancy: Int[np.ndarray, " cameras"]
-    iterations: Int[np.ndarray, " cameras"]
-    views: Bool[np.ndarray, "cameras views"]
-    position: Float[np.ndarray, "cameras views 3"]
-    angles: Float[np.ndarray, "cameras views 3"]
-    sigma_position: Float[np.ndarray, "cameras views 3"]
-    sigma_angles: Float[np.ndarray, "cameras views 3"]
-    rotation: Float[np.ndarray, "cameras views 3 3"]
-
-    @property
-    def converged(self) -> Bool[np.ndarray, " cameras"]:
-        """Which have a solution, and everything in it is determined."""
-        return self.status == STATUS[CONVERGED]
-
-    @property
-    def solved(self) -> Bool[np.ndarray, " cameras"]:
-        """Which have values: the weak ones as well."""
-        return self.converged | (self.status == STATUS[WEAK])
-
-    def __len__(self) -> int:
-        return len(self.status)
-
-    def __str__(self) -> str:
-        names, counts = np.unique(self.status, return_counts=True)
-        states = ", ".join(f"{count} {name}" for name, count in zip(names, counts))
-        rms = f"median RMS {np.nanmedian(self.rms):.4g} px" if self.solved.any() else "no result"
-        return f"{len(self)} cameras, model {self.model}: {states}; {rms}"
 
 
 def calibrate_batch(
@@ -122,6 +63,8 @@ def calibrate_batch(
     free: Sequence[str] | None = None,
     start: Mapping[str, float | Float[np.ndarray, " cameras"]] | None = None,
     max_iterations: int = 100,
+    snooping: str | None = None,
+    significance: float = 0.001,
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> BatchCalibration:
@@ -142,6 +85,8 @@ def calibrate_batch(
     - `start`: start values of parameters, for all cameras or [cameras]; without focal lengths these
       are found by themselves. What is neither free nor given is 0, or the middle of the image. A
       view is left out if the given camera turns too few of its points into rays.
+    - `snooping`: `"pope"`: image points that are blunders at the level `significance`, the
+      probability to lose anything of a camera without blunders, are removed, camera by camera.
     - `threads`: portions solved at the same time on a CPU; the number of cores if not given.
     - `progress(done, total)`: called after every portion.
 
@@ -153,19 +98,23 @@ def calibrate_batch(
     """
     require_x64()
     max_iterations = whole("max_iterations", max_iterations)
+    one_of("snooping", snooping, TESTS, none=True)
+    check_test(snooping, significance)
     threads = available_cores() if threads is None else whole("threads", threads)
     batch = Batch.of(object_points, image_points, image_size, model, visible, free, start)
     camera_model = get_model(model)
     on_cpu = jax.default_backend() == "cpu"
-    views = batch.xy.shape[1]
     portions = list(batch.portions(on_cpu))
-    run = lambda portion: _solve_portion(
-        camera_model, batch.free, batch.known, max_iterations, batch.size, on_cpu, portion
-    )
+    fixed = camera_model, batch.free, batch.known, max_iterations, batch.size, on_cpu
+
+    def run(portion):
+        rows = _solve_portion(*fixed, portion)
+        return rows if snooping is None else _snooped(*fixed, portion, rows, snooping, significance)
+
     parts, done = [], 0
     with ThreadPoolExecutor(threads if on_cpu else 1) as pool:
         for portion, solved in zip(portions, pool.map(run, portions)):
-            parts.append(_without_padding(portion, views, solved))
+            parts.append(_without_padding(portion, batch.xy.shape[1:3], solved))
             done += len(portion.cameras)
             if progress is not None:
                 progress(done, len(batch))
@@ -174,12 +123,13 @@ def calibrate_batch(
     return _result(camera_model, batch, rows)
 
 
-def _without_padding(portion: Portion, views: int, solved: dict) -> dict:
+def _without_padding(portion: Portion, shape: tuple[int, int], solved: dict) -> dict:
     """The rows of the cameras of a portion, views at their places among all."""
+    views, points = shape
     rows = {name: values[: len(portion.cameras)] for name, values in solved.items()}
     camera = np.arange(len(portion.cameras))[:, None]
-    for name in ("views", *OF_A_VIEW):
-        values = rows[name]
+    for name in ({"views", "removed", *OF_A_VIEW} & {*rows}):
+        values = rows[name] if name != "removed" else rows[name][:, :, :points]
         rows[name] = np.zeros((len(values), views, *values.shape[2:]), values.dtype)
         rows[name][camera, portion.views] = values[:, : portion.views.shape[1]]
     return rows
@@ -195,11 +145,28 @@ def _result(model: CameraModel, batch: Batch, rows: dict) -> BatchCalibration:
     for values in rows.values():
         if np.issubdtype(values.dtype, np.floating):
             values[~solved] = np.nan
-    del rows["reduced"]
-    rows["undetermined"] = undetermined
-    rows["status"] = np.array(STATUS)[np.where(solved & undetermined.any(1), WEAK, ended)]
+    ended = np.where(solved & undetermined.any(1), WEAK, ended)
+    ended = np.where(misfits(rows["rms"], rows["mean_length"], solved), MISFIT, ended)
+    for name in ("reduced", "mean_length", "quaternion", "shift"):
+        del rows[name]
+    rows["undetermined"], rows["status"] = undetermined, np.array(STATUS)[ended]
+    rows["remark"] = _remarks(model, batch, rows["interior"], solved & (ended == CONVERGED))
     free = tuple(model.parameters[column] for column in batch.free)
     return BatchCalibration(model=model.name, parameters=free, **rows)
+
+
+def _remarks(model: CameraModel, batch: Batch, interior, good) -> np.ndarray:
+    """What is odd about the axes of the image points: looked for where the principal point is
+    outside the image, or there is no good result."""
+    frame = batch.image_size
+    if "cx" in model.parameters:
+        middle = interior[:, [model.parameters.index(name) for name in ("cx", "cy")]]
+        good = good & ((middle > -0.5) & (middle < frame - 0.5)).all(1)
+    remark = [""] * len(batch)
+    for camera in np.flatnonzero(~good & batch.finite):
+        xy = batch.xy[camera][batch.visible[camera]]
+        remark[camera] = axes_remark(xy, frame, model.axes == "down")
+    return np.array(remark)
 
 
 def _undetermined(model: CameraModel, batch: Batch, ended, rows) -> Bool[np.ndarray, "cameras k"]:
@@ -209,6 +176,48 @@ def _undetermined(model: CameraModel, batch: Batch, ended, rows) -> Bool[np.ndar
     # At the limit the last σ say why, if the equations can be solved.
     told = (ended == LIMIT) & ~null.any(1) & np.isfinite(sigma).all(1) | (ended == CONVERGED)
     return np.where(told[:, None], vague(model, batch.free, rows["interior"], sigma), null)
+
+
+def _snooped(
+    model, free, known, max_steps, size, on_cpu, portion: Portion, rows, test, significance
+) -> dict:
+    """The rows of a portion without blunders; only cameras that lose any are solved again."""
+    weight = np.asarray(portion.seen.weight)
+    found = [Snooping(seen > 0, test, significance) for seen in weight]
+    open_ones = np.arange(len(portion.cameras))
+    for _ in range(ROUNDS):
+        used = np.stack([camera.used for camera in found]).astype(float)
+        tests = np.asarray(_tests_program(
+            model, free, on_cpu, portion.seen, used, rows["interior"], rows["quaternion"],
+            rows["shift"], rows["views"],
+        ))  # fmt: skip
+        open_ones = np.array([
+            i for i in open_ones
+            if rows["status"][i] == CONVERGED
+            and found[i].next(tests[i], rows["sigma0"][i], rows["redundancy"][i])
+        ], int)  # fmt: skip
+        if not len(open_ones):
+            break
+        left = np.zeros_like(weight)
+        left[open_ones] = [found[i].used for i in open_ones]
+        seen = dataclasses.replace(portion.seen, weight=left)
+        again = dataclasses.replace(portion, seen=seen)
+        again = _solve_portion(model, free, known, max_steps, size, on_cpu, again)
+        for name, values in rows.items():
+            values[open_ones] = again[name][open_ones]
+    rows["removed"] = np.stack([camera.seen & ~camera.used for camera in found])
+    return rows
+
+
+@partial(jax.jit, static_argnums=range(3))
+def _tests_program(model, free, on_cpu, seen, used, interior, quaternion, shift, views):
+    def one(arguments):
+        seen, used, at, views = arguments
+        seen = Sightings(seen.point, seen.xy, seen.weight * views[:, None])
+        return point_tests(model, free, seen, seen.weight * used, at)
+
+    every = partial(jax.lax.map, one) if on_cpu else jax.vmap(one)
+    return every((seen, used, Calibration(interior, quaternion, shift), views))
 
 
 def _solve_portion(model, free, known, max_steps, size, on_cpu, portion: Portion) -> dict:
@@ -227,10 +236,11 @@ def _portion_program(
     def one(arguments):
         seen, interior = arguments
         usable, start = start_values(model, flat, known, seen, interior, size)
-        return solve_camera(model, free, max_steps, size, usable, start)
+        solved = solve_camera(model, free, max_steps, size, usable, start)
+        return solved, jnp.sum(residual_lengths(model, usable, solved.at))
 
     every = partial(jax.lax.map, one) if on_cpu else jax.vmap(one)
-    solved: Solved = every((seen, interior))
+    solved, lengths = every((seen, interior))
     variance = 2 * solved.cost / solved.redundancy
     covariance = variance[:, None, None] * solved.interior_cofactors
     points = 0.5 * (solved.redundancy + len(free) + POSE * solved.views.sum(1))
@@ -247,6 +257,9 @@ def _portion_program(
         interior=solved.at.interior,
         sigma0=jnp.sqrt(variance),
         rms=jnp.sqrt(2 * solved.cost / points),
+        mean_length=lengths / points,
+        quaternion=solved.at.rotation,
+        shift=solved.at.shift,
         redundancy=solved.redundancy,
         iterations=solved.steps,
         views=solved.views,
