@@ -4,7 +4,8 @@ Of every view only the worst point goes at a time, and only points at least half
 of all, for a blunder spoils the residuals of its view. In the end whatever was removed is held
 against the calibration it took no part in: what passes comes back. A camera without blunders keeps
 its first solution. The test is Pope's (`jaxbundle.statistics.distributions`), for a batch knows no
-σ a priori.
+σ a priori. Its σ0 is that of the residuals, or that of their median where this is smaller: many
+blunders make σ0 so large that each of them hides behind the others.
 """
 
 import numpy as np
@@ -15,6 +16,10 @@ from jaxbundle.statistics.distributions import critical_w
 TESTS = ("pope",)
 TOGETHER = 0.5
 """Points are removed together with the worst one if their test is at least this part of its."""
+MEDIAN = 1.0518
+"""Median of the larger of two normal |w|: (2Φ(m) − 1)² = ½."""
+ROUNDING = 1e-6
+"""A smaller σ0 is noise of the arithmetic, pixels."""
 ROUNDS = 200
 
 
@@ -35,8 +40,11 @@ class Snooping:
 
         **Returns:** whether anything has changed.
         """
-        observations = 2 * int((self.used & np.isfinite(tests)).sum())
-        critical = critical_w(self.test, self.significance, observations, redundancy, sigma0)
+        fitting = tests[self.used & np.isfinite(tests)]
+        if not len(fitting):
+            return False
+        sigma0 = max(min(sigma0, float(np.median(fitting)) / MEDIAN), ROUNDING)
+        critical = critical_w(self.test, self.significance, 2 * len(fitting), redundancy, sigma0)
         tests = np.nan_to_num(tests, nan=0.0)
         own = np.where(self.used, tests, 0.0)
         if own.max(initial=0.0) > critical:

@@ -171,7 +171,8 @@ def rig_text(rig) -> str:
         ("Board", "exact" if rig.known.known else "its points estimated, inner constraints"
          if rig.known.free else f"known with σ {rig.known.sigma:g} {unit}"),
     ])  # fmt: skip
-    lines += facts((clean(epoch), clean(why)) for epoch, why in rig.left_out)
+    odd = (*rig.left_out, *rig.contradicting)
+    lines += facts((clean(epoch), clean(why)) for epoch, why in odd)
     for name, m in rig.mountings.items():
         lines += heading(f"Mounting of {clean(name)} in the frame of {clean(rig.names[0])}")
         values = [*m.base, *m.angles]
@@ -205,6 +206,7 @@ def rig_dict(rig) -> dict:
         "reference": rig.names[0],
         "epochs": list(rig.epochs),
         "left_out": dict(rig.left_out),
+        "contradicting": dict(rig.contradicting),
         "sigma0": rig.sigma0,
         "redundancy": rig.redundancy,
         "rms": rig.rms,

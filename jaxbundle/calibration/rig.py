@@ -6,7 +6,7 @@ Photographs taken at the same moment are an epoch; they are found by name: equal
 else equal last numbers in them (left_017.jpg, right_017.jpg). Start values of the mounting come
 from the epochs two cameras share: M_k·Mᵣᵀ and Mᵣ·(X0_k − X0_r) should be the same in all of them,
 and the one nearest to all others is taken. Epochs that contradict the mounting (the board moved in
-between) are left out. The board is known, weighted or free, as in the calibration of one camera;
+between) are left out, or named where nothing is to be left out. The board is known, weighted or free, as in the calibration of one camera;
 gross errors were removed camera by camera.
 """
 
@@ -39,12 +39,14 @@ def calibrate_rig(
     *,
     board_sigma: float | None = None,
     board_free: bool = False,
+    snooping: bool = True,
     max_iterations: int = 50,
 ) -> RigCalibration:
     """The common calibration of cameras that were calibrated by themselves, from photographs of one
     board taken in step; the first is the reference.
 
-    **Arguments:** `board_sigma` (object unit), `board_free`: as in `calibrate`.
+    **Arguments:** `board_sigma` (object unit), `board_free`: as in `calibrate`; `snooping`: False:
+    epochs that contradict the mounting stay, and are named in `contradicting`.
 
     **Raises:** `InputError` where the photographs of two cameras cannot be paired;
     `NotSolvedError` where an adjustment does not settle.
@@ -68,7 +70,7 @@ def calibrate_rig(
         start = _start(calibrations, poses, base, turn, epochs, points)
         solution = adjust_rig(rig, known, start, max_iterations)
         bad = _contradictions(calibrations, rig, solution) if solution.converged else []
-        if not bad:
+        if not bad or not snooping:
             break
         left_out += [(epochs[e], f"does not fit the mounting (RMS {rms:.1f} px): photographs not "
                       "of the same moment?") for e, rms in bad]  # fmt: skip
@@ -80,8 +82,10 @@ def calibrate_rig(
             "photographs that are not of the same moment"
         )
     return RigCalibration(
-        dict(calibrations), rig, known, tuple(epochs), tuple(left_out), solution
-    )
+        dict(calibrations), rig, known, tuple(epochs), tuple(left_out), solution,
+        tuple((epochs[e], f"kept, but does not fit the mounting (RMS {rms:.1f} px)")
+              for e, rms in bad),
+    )  # fmt: skip
 
 
 def epoch_keys(names: Mapping[str, tuple[str, ...]]) -> dict[str, list[str]]:

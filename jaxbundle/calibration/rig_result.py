@@ -53,17 +53,22 @@ class RigCalibration:
 
     **Attributes:** `cameras`: the calibrations of each by itself; `mountings`, `parameters`,
     `sigma` of the common adjustment, by camera; `board`: its points [points, 3]; `epochs`;
-    `measured`: the image points used; `left_out`: epoch and reason; `rms` (pixels) by camera;
+    `measured`: the image points used; `left_out`, and `contradicting` that were kept
+    all the same: epoch and reason; `rms` (pixels) by camera;
     `sigma0`, `redundancy`, `converged`.
     """
 
-    def __init__(self, cameras, rig, known: RigObject, epochs, left_out, solution: RigSolution):
+    def __init__(
+        self, cameras, rig, known: RigObject, epochs, left_out, solution: RigSolution,
+        contradicting=(),
+    ):  # fmt: skip
         self.cameras: dict[str, Calibration] = cameras
         self.measured: list[RigCamera] = rig
         self._maps: dict[tuple, UncertaintyMap] = {}
         self.known = known
         self.epochs: tuple[str, ...] = epochs
         self.left_out: tuple[tuple[str, str], ...] = left_out
+        self.contradicting: tuple[tuple[str, str], ...] = contradicting
         self.solution = solution
 
     @property

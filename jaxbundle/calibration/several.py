@@ -46,7 +46,8 @@ def calibrate_cameras(
     """Calibrate several cameras from photographs of one board.
 
     **Arguments:** `photographs` by the name of the camera; `rig`: the cameras are mounted rigidly
-    and photographed in step (`jaxbundle.calibration.rig`), the first is the reference;
+    and photographed in step (`jaxbundle.calibration.rig`), the first is the reference; epochs that
+    contradict the mounting are left out, but with `snooping=None` only named;
     `progress()`: after every photograph; `options`: those of `calibrate`.
 
     **Raises:** `InputError`, `NotSolvedError`, naming the camera where there are several.
@@ -70,5 +71,6 @@ def calibrate_cameras(
     together = None
     if rig and all(one.converged for one in found.values()):
         known = {name: options[name] for name in ("board_sigma", "board_free") if name in options}
-        together = calibrate_rig(found, **known)
+        keep = options.get("snooping", "pope") is None and options.get("robust") is None
+        together = calibrate_rig(found, snooping=not keep, **known)
     return Calibrations(found, together)
