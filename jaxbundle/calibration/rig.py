@@ -6,8 +6,8 @@ Photographs taken at the same moment are an epoch; they are found by name: equal
 else equal last numbers in them (left_017.jpg, right_017.jpg). Start values of the mounting come
 from the epochs two cameras share: M_k·Mᵣᵀ and Mᵣ·(X0_k − X0_r) should be the same in all of them,
 and the one nearest to all others is taken. Epochs that contradict the mounting (the board moved in
-between) are left out, or named where nothing is to be left out. The board is known, weighted or free, as in the calibration of one camera;
-gross errors were removed camera by camera.
+between) are left out, or named where nothing is to be left out. The board is known, weighted or
+free, as in the calibration of one camera; gross errors were removed camera by camera.
 """
 
 import re

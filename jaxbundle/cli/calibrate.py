@@ -66,7 +66,7 @@ def calibrate(
         float, typer.Option(help="a priori σ of an image coordinate, pixels")
     ] = 0.1,
     snooping: Annotated[
-        str, typer.Option(help="removal of gross errors, of epochs of a rig too: pope, baarda, none")
+        str, typer.Option(help="removal of gross errors, and epochs of a rig: pope, baarda, none")
     ] = "pope",
     significance: Annotated[float, typer.Option(help="level of the test")] = 0.001,
     robust: Annotated[

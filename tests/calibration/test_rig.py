@@ -200,11 +200,20 @@ def test_exact_rays_from_poor_start_values():
 
 def test_an_epoch_that_is_not_of_one_moment_is_left_out():
     views = pair(moved=(3, 8))
-    found = calibrate_cameras(views, rig=True, snooping=None).rig
+    found = calibrate_cameras(views, rig=True).rig
     assert {epoch for epoch, _ in found.left_out} == {"3", "8"}
     assert "photographs not of the same moment" in found.left_out[0][1]
     mounting = found.mountings["right"]
     assert (np.abs(mounting.base - BASE) < 3.5 * mounting.sigma[:3]).all()
+
+
+def test_without_snooping_every_epoch_stays_and_is_named():
+    """`--snooping none`: nothing is removed by the program."""
+    found = calibrate_cameras(pair(moved=(3, 8)), rig=True, snooping=None).rig
+    assert found.left_out == () and {"3", "8"} <= {*found.epochs} and len(found.epochs) == VIEWS
+    assert {epoch for epoch, _ in found.contradicting} >= {"3", "8"}
+    assert "kept, but does not fit the mounting" in rig_text(found)
+    assert {*rig_dict(found)["contradicting"]} >= {"3", "8"}
 
 
 def test_a_bent_board_is_estimated_with_the_rig():
