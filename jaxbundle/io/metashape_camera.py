@@ -2,19 +2,24 @@
 
 [X, Y, Z] of a camera are right, down, forward. Its image of X, with x = X/Z, y = Y/Z, r² = x² + y²:
 
-    x' = x·(1 + k1·r² + k2·r⁴ + k3·r⁶ + k4·r⁸) + p1·(r² + 2x²) + 2·p2·x·y
-    y' = y·(1 + …)                             + p2·(r² + 2y²) + 2·p1·x·y
+    x' = x·(1 + k1·r² + k2·r⁴ + k3·r⁶ + k4·r⁸) + (p1·(r² + 2x²) + 2·p2·x·y)·(1 + p3·r² + p4·r⁴)
+    y' = y·(1 + …)                             + (p2·(r² + 2y²) + 2·p1·x·y)·(1 + p3·r² + p4·r⁴)
     u = w/2 + cx + x'·f + x'·b1 + y'·b2        v = h/2 + cy + y'·f
 
-from the corner of the first pixel, hence in `opencv`, exactly if k4 = b2 = 0,
+from the corner of the first pixel, hence in `opencv`, exactly if k4 = p3 = p4 = b2 = 0 (where p1
+and p2 are 0, p3 and p4 have no effect),
 
     fx = f + b1   fy = f   cx_cv = w/2 + cx − ½   cy_cv = h/2 + cy − ½   p1_cv = p2   p2_cv = p1
 
-With a skew b2 or with k4 it is fitted as `brown-projected`, which has the affine terms, if the file
-tells the pixel size; refused if that leaves more than 0.05 px somewhere. p3, p4 and sensors that
-are no frame cameras have no place in our models and are refused by name.
+A fisheye has (x, y) = (X, Y)/√(X² + Y²)·θ, θ the angle to the axis, in the same formula, or
+2·sin(θ/2) for θ (equisolid); the first is exactly `kannala-brandt` if p1 = p2 = b2 = 0. Everything
+else is fitted by the nearest model, with a warning that gives the largest difference.
 
-Source: Agisoft Metashape user manual, appendix "Camera models".
+Old exports (PhotoScan to 1.2) have fx, fy, skew for f, b1, b2, cx and cy from the corner of the
+image, and p1 and p2 exchanged.
+
+Source: Agisoft Metashape user manual, appendix "Camera models"; PhotoScan user manual 1.2, the same
+appendix.
 """
 
 import xml.etree.ElementTree as ET
@@ -22,116 +27,112 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxbundle.cameras import get_model
-from jaxbundle.cameras.convert import MEASURABLE
-from jaxbundle.cameras.convert_fit import (
-    fit_parameters,
-    image_grid,
-    images_of,
-    rays_of,
-    start_values,
-)
-from jaxbundle.cameras.frames import pixel_frame
 from jaxbundle.errors import InputError
+from jaxbundle.io.nearest_camera import Foreign, nearest_camera
 from jaxbundle.network.columns import shown
 
 COEFFICIENTS = ("f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
-GOOD = 0.05
-"""Pixels a fit may leave."""
+OLD = ("fx", "fy", "skew")
+FISHEYE = ("fisheye", "equidistant", "equidistant_fisheye", "equisolid", "equisolid_fisheye")
+TYPES = ("frame", *FISHEYE)
+PIXEL = ("pixel_width", "pixel_height")
+
+
+class NoPlaceError(InputError):
+    """A sensor that none of our models comes near: its photographs can be left out."""
 
 
 def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict, tuple[str, ...]]:
     """The entry of a sensor in a document, and a warning where it is fitted.
 
-    **Raises:** `InputError` naming file, sensor and element.
+    **Raises:** `InputError` naming file, sensor and element; `NoPlaceError` for a sensor of
+    another kind.
     """
     label = label_of(sensor)
     where = f"{path}, sensor {label!r}"
     kinds = sensor.findall("calibration")
     if not kinds:
-        raise InputError(f"{where}: there is no <calibration>")
+        raise NoPlaceError(f"{where}: there is no <calibration>")
     calibration = next((c for c in kinds if c.get("class") == "adjusted"), kinds[0])
-    for element in (sensor, calibration):
-        if element.get("type", "frame") != "frame":
-            raise InputError(
-                f"{where}: sensors of type {shown(element.get('type'))} are not offered; frame is"
+    kind = calibration.get("type", sensor.get("type", "frame"))
+    for name in (sensor.get("type", "frame"), kind):
+        if name not in TYPES:
+            raise NoPlaceError(
+                f"{where}: sensors of type {shown(name)} are not offered; these are: "
+                f"{', '.join(TYPES)}"
             )
     size = calibration.find("resolution")
     size = sensor.find("resolution") if size is None else size
     if size is None:
         raise InputError(f"{where}: there is no <resolution>")
     w, h = (number_of(f"{where}, resolution, {k}", size.get(k)) for k in ("width", "height"))
-    p = dict.fromkeys(COEFFICIENTS, 0.0)
-    for element in calibration:
-        if element.tag in ("fx", "fy", "skew"):
-            raise InputError(f"{where}: <{element.tag}> is of an old version; f, b1, b2 are known")
-        if element.tag in p:
-            p[element.tag] = number_of(f"{where}, {element.tag}", element.text)
-    for name in ("p3", "p4"):
-        if p[name] != 0:
-            raise InputError(
-                f"{where}: {name} is {p[name]:g} and has no place in our models; optimise the "
-                f"cameras without {name} and export again"
-            )
+    p = _coefficients(where, calibration, w, h)
     values = {
         "fx": p["f"] + p["b1"], "fy": p["f"],
         "cx": w / 2 + p["cx"] - 0.5, "cy": h / 2 + p["cy"] - 0.5,
-        "k1": p["k1"], "k2": p["k2"], "k3": p["k3"], "p1": p["p2"], "p2": p["p1"],
+        "k1": p["k1"], "k2": p["k2"], "k3": p["k3"],
     }  # fmt: skip
-    entry = {"id": label, "image_size": [w, h]}
-    if p["b2"] == p["k4"] == 0:
-        return entry | {"model": "opencv", **values}, ()
-    return _fitted(where, sensor, entry, p, values)
-
-
-def _fitted(where: str, sensor: ET.Element, entry: dict, p: dict, values: dict):
-    """The sensor as `brown-projected`, and what that costs."""
-    pitch = {e.get("name"): e.get("value") for e in sensor.iterfind("property")}
-    names = ("pixel_width", "pixel_height")
-    if not all(name in pitch for name in names):
-        raise InputError(
-            f"{where}: b2 or k4 is not 0, and without the pixel size (property pixel_width, "
-            "pixel_height) there is no model for it; optimise the cameras without it"
-        )
-    pixel = [number_of(f"{where}, {name}", pitch[name]) for name in names]
-    size, sizes = entry["image_size"], (entry["image_size"], pixel)
-    if not (np.array([*size, *pixel, values["fx"], values["fy"]]) > 0).all():
+    if not (np.array([w, h, values["fx"], values["fy"]]) > 0).all():
         raise InputError(f"{where}: sizes and f must be positive")
-    source, target = get_model("opencv"), get_model("brown-projected")
-    full = dict.fromkeys(source.parameters, 0.0) | values
-    rays = rays_of(source, full, image_grid([-0.5, -0.5], np.array(size) - 0.5))
-    there = np.isfinite(rays).all(1)
-    if there.mean() < MEASURABLE:
-        raise InputError(f"{where}: its distortion turns back inside the image")
-    rays = rays[there]
-    with np.errstate(all="ignore"):
-        uv = _published(p, size, *(rays * [1, -1, -1]).T)
-    origin, step = pixel_frame(target, *sizes)
-    xy = (uv - origin) / step
-    try:
-        found = fit_parameters(target, rays, xy, start_values(source, full, target, sizes))
-    except ValueError as error:
-        raise InputError(f"{where}: {error}") from None
-    left = np.linalg.norm((images_of(target, found, rays) - xy) * step, axis=1).max()
-    if not left <= GOOD:  # also where it is NaN
-        raise InputError(
-            f"{where}: b2 {p['b2']:g} and k4 {p['k4']:g} have no place in our models; the nearest, "
-            f"brown-projected, differs by {left:.3g} px; optimise the cameras without them"
-        )
-    warning = (
-        f"sensor {entry['id']!r} has b2 or k4: fitted as brown-projected, largest difference "
-        f"{left:.2g} px"
-    )
-    return entry | {"model": target.name, "pixel_size": pixel, **found}, (warning,)
+    entry = {"id": label, "image_size": [w, h]}
+    decentred = p["p1"] != 0 or p["p2"] != 0
+    if kind == "frame":
+        values |= {"p1": p["p2"], "p2": p["p1"]}
+        rest = {name: p[name] for name in ("k4", "b2", *(("p3", "p4") if decentred else ()))}
+    else:
+        values |= {"k4": p["k4"]}
+        rest = {name: p[name] for name in ("p1", "p2", "b2")}
+    rest = {name: value for name, value in rest.items() if value != 0}
+    if not rest and "equisolid" not in kind:
+        return entry | {"model": "opencv" if kind == "frame" else "kannala-brandt", **values}, ()
+    foreign = Foreign(
+        lambda X, Y, Z: _published(kind, p, (w, h), X, Y, Z), values, (w, h),
+        _pixel_size(where, sensor), kind != "frame",
+    )  # fmt: skip
+    found, told = nearest_camera(foreign, where)
+    has = "".join(f"{name} {value:g}, " for name, value in rest.items()).rstrip(", ")
+    why = f"has {has}" if has else "is equisolid"
+    return entry | found, (f"sensor {label!r} {why}: {told}",)
 
 
-def _published(p: dict, size, X, Y, Z):
+def _coefficients(where: str, calibration: ET.Element, w: float, h: float) -> dict[str, float]:
+    """All coefficients in the form of today."""
+    given = {
+        element.tag: number_of(f"{where}, {element.tag}", element.text)
+        for element in calibration if element.tag in (*COEFFICIENTS, *OLD)
+    }  # fmt: skip
+    p = dict.fromkeys(COEFFICIENTS, 0.0) | given
+    if "f" in given or "fy" not in given:
+        return p
+    p |= {"f": p["fy"], "b1": p.get("fx", p["fy"]) - p["fy"], "b2": p.get("skew", 0.0),
+          "cx": given.get("cx", w / 2) - w / 2, "cy": given.get("cy", h / 2) - h / 2,
+          "p1": p["p2"], "p2": p["p1"]}  # fmt: skip
+    return p
+
+
+def _pixel_size(where: str, sensor: ET.Element) -> list[float] | None:
+    properties = {e.get("name"): e.get("value") for e in sensor.iterfind("property")}
+    if not all(name in properties for name in PIXEL):
+        return None
+    pixel = [number_of(f"{where}, {name}", properties[name]) for name in PIXEL]
+    return pixel if min(pixel) > 0 else None
+
+
+def _published(kind: str, p: dict, size, X, Y, Z):
     """The manual's formula, from the centre of the first pixel."""
-    x, y = X / Z, Y / Z
+    if kind == "frame":
+        x, y = X / Z, Y / Z
+    else:
+        off = np.hypot(X, Y)
+        angle = np.arctan2(off, Z)
+        length = 2 * np.sin(angle / 2) if "equisolid" in kind else angle
+        scale = np.where(off > 0, length / np.where(off > 0, off, 1), 1.0)
+        x, y = X * scale, Y * scale
     r2 = x * x + y * y
     radial = 1 + r2 * (p["k1"] + r2 * (p["k2"] + r2 * (p["k3"] + r2 * p["k4"])))
-    xd = x * radial + p["p1"] * (r2 + 2 * x * x) + 2 * p["p2"] * x * y
-    yd = y * radial + p["p2"] * (r2 + 2 * y * y) + 2 * p["p1"] * x * y
+    more = 1 + r2 * (p["p3"] + r2 * p["p4"])
+    xd = x * radial + (p["p1"] * (r2 + 2 * x * x) + 2 * p["p2"] * x * y) * more
+    yd = y * radial + (p["p2"] * (r2 + 2 * y * y) + 2 * p["p1"] * x * y) * more
     u = size[0] / 2 + p["cx"] + xd * (p["f"] + p["b1"]) + yd * p["b2"]
     return np.stack([u, size[1] / 2 + p["cy"] + yd * p["f"]], 1) - 0.5
 

@@ -19,14 +19,16 @@ SCALE, SHIFT = 2.5, np.array([100.0, 200.0, 300.0])
 TURN = Rotation.from_euler("xyz", [0.3, -0.2, 0.7]).as_matrix()
 
 
-def published(X, Y, Z):
+def published(X, Y, Z, **more):
     """u, v from the corner of the first pixel, as the manual has it."""
+    p = dict(k4=0, p3=0, p4=0, b2=0) | P | more
     x, y = X / Z, Y / Z
     r2 = x * x + y * y
-    radial = 1 + P["k1"] * r2 + P["k2"] * r2**2 + P["k3"] * r2**3
-    xd = x * radial + P["p1"] * (r2 + 2 * x * x) + 2 * P["p2"] * x * y
-    yd = y * radial + P["p2"] * (r2 + 2 * y * y) + 2 * P["p1"] * x * y
-    return 640 + P["cx"] + xd * (P["f"] + P["b1"]), 360 + P["cy"] + yd * P["f"]
+    radial = 1 + p["k1"] * r2 + p["k2"] * r2**2 + p["k3"] * r2**3 + p["k4"] * r2**4
+    more = 1 + p["p3"] * r2 + p["p4"] * r2**2
+    xd = x * radial + (p["p1"] * (r2 + 2 * x * x) + 2 * p["p2"] * x * y) * more
+    yd = y * radial + (p["p2"] * (r2 + 2 * y * y) + 2 * p["p1"] * x * y) * more
+    return 640 + p["cx"] + xd * (p["f"] + p["b1"]) + yd * p["b2"], 360 + p["cy"] + yd * p["f"]
 
 
 def xml(transform=False, more="", sensor='type="frame"', extra_calibration="") -> str:
@@ -94,39 +96,144 @@ PIXEL = ('<property name="pixel_width" value="0.005"/><property name="pixel_heig
          "<calibration")  # fmt: skip
 
 
-def test_a_skew_is_fitted(tmp_path):
-    text = xml().replace("<b1>", "<b2>2.5</b2><b1>").replace("<calibration", PIXEL, 1)
+def over_the_image(**more):
+    """Rays (right, down, forward) whose images fill the image, and these, by the formula above."""
+    x, y = np.meshgrid(np.linspace(-0.9, 0.9, 61), np.linspace(-0.6, 0.6, 41))
+    rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], 1)
+    uv = np.stack(published(*rays.T, **more), 1) - 0.5
+    inside = ((uv >= -0.5) & (uv <= [1279.5, 719.5])).all(1)
+    assert np.ptp(uv[inside], axis=0).min() > 700
+    return rays[inside], uv[inside]
+
+
+def largest_difference(camera, **more):
+    rays, uv = over_the_image(**more)
+    xy = images_of(get_model(camera.model), all_parameters(camera), rays * [1, -1, -1])
+    if camera.model == "brown-projected":
+        xy = np.stack([xy[:, 0] / 0.005 + 639.5, 359.5 - xy[:, 1] / 0.005], 1)
+    return np.linalg.norm(xy - uv, axis=1).max()
+
+
+FITS = {
+    "skew": (dict(b2=2.5), True, "brown-projected", 0.05),
+    "skew without a pixel size": (dict(b2=0.5), False, "opencv", 0.5),
+    "k4": (dict(k4=0.05), False, "opencv", 0.05),
+    "p3": (dict(p3=0.2), False, "opencv", 0.05),
+}
+
+
+@pytest.mark.parametrize("name", FITS)
+def test_what_has_no_place_is_fitted_and_the_difference_told(tmp_path, name):
+    more, pixel, model, limit = FITS[name]
+    text = xml(extra_calibration="".join(f"<{k}>{v!r}</{k}>" for k, v in more.items()))
+    net = read(tmp_path, text.replace("<calibration", PIXEL, 1) if pixel else text)
+    (camera,), (key,) = net.cameras, more
+    (warning,) = [w for w in net.warnings if "fitted" in w]
+    assert camera.model == model and f"sensor 'cam' has {key} {more[key]:g}: fitted as" in warning
+    told = float(re.search(r"largest difference (\S+) px", warning)[1])
+    assert largest_difference(camera, **more) <= 1.05 * told <= limit
+
+
+@pytest.mark.parametrize("extra", [
+    "<k4>0</k4><p3>0</p3><p4>0.0</p4><b2>0</b2>",
+    "<k4>0</k4><p3>0.2</p3><p1>0</p1><p2>0</p2>",
+])  # fmt: skip
+def test_parameters_that_are_0_have_no_effect(tmp_path, extra):
+    """p3 and p4 are factors of p1 and p2."""
+    net = read(tmp_path, xml(extra_calibration=extra))
+    more = dict(p1=0, p2=0, p3=0.2) if "<p1>" in extra else {}
+    assert net.cameras[0].model == "opencv" and not [w for w in net.warnings if "fitted" in w]
+    assert largest_difference(net.cameras[0], **more) < 1e-9
+
+
+def test_a_fisheye_is_exact(tmp_path):
+    text = xml(extra_calibration="<p1>0</p1><p2>0</p2><k4>-0.0004</k4>")
+    (camera,) = read(tmp_path, text.replace('type="frame"', 'type="fisheye"')).cameras
+    assert camera.model == "kannala-brandt"
+    theta, around = np.meshgrid([0.01, 0.5, 1.2], np.linspace(0, 6, 7))
+    d = theta * (1 + sum(P.get(f"k{i}", -0.0004) * theta ** (2 * i) for i in (1, 2, 3, 4)))
+    u = 640 + P["cx"] - 0.5 + d * np.cos(around) * (P["f"] + P["b1"])
+    v = 360 + P["cy"] - 0.5 + d * np.sin(around) * P["f"]
+    rays = np.stack([np.sin(theta) * np.cos(around), -np.sin(theta) * np.sin(around),
+                     -np.cos(theta)], -1).reshape(-1, 3)  # fmt: skip
+    found = images_of(get_model(camera.model), all_parameters(camera), rays)
+    assert_allclose(found, np.stack([u.ravel(), v.ravel()], 1), atol=1e-9)
+
+
+def test_an_old_export_is_the_same_camera(tmp_path):
+    """fx, fy, skew; cx, cy from the corner; p1 and p2 exchanged."""
+    old = dict(fx=1001.5, fy=1000.0, cx=643.5, cy=357.75, p1=P["p2"], p2=P["p1"], skew=0.0)
+    text = re.sub(r"<(f|b1|cx|cy|p1|p2)>[^<]*</\1>", "", xml())
+    text = text.replace("<k1>", "".join(f"<{k}>{v!r}</{k}>" for k, v in old.items()) + "<k1>")
+    (camera,) = read(tmp_path, text).cameras
+    assert largest_difference(camera) < 1e-9
+
+
+def test_photographs_of_a_sensor_that_none_comes_near_are_left_out(tmp_path):
+    spherical = """<sensor id="7" label="ball" type="spherical"><resolution width="10" height="5"/>
+    <calibration type="spherical"><resolution width="10" height="5"/></calibration></sensor>
+    <sensor id="8" label="raw" type="frame"/></sensors>"""
+    text = xml().replace("</sensors>", spherical)
+    text = text.replace('id="1" sensor_id="0"', 'id="1" sensor_id="7"')
     net = read(tmp_path, text)
-    (camera,) = net.cameras
-    assert camera.model == "brown-projected" and camera.pixel_size == (0.005, 0.005)
-    told = float(re.search(r"brown-projected, largest difference (\S+) px", net.warnings[-2])[1])
-    assert told <= 0.05
-    rays = (POINTS - POSITION[0]) @ matrix(ANGLES[0]).T
-    X, Y, Z = (rays * [1, -1, -1]).T
-    u, v = published(X, Y, Z)
-    u = u + 2.5 * (v - 360 - P["cy"]) / P["f"]
-    x, y = images_of(get_model(camera.model), all_parameters(camera), rays).T
-    mine = np.stack([x / 0.005 + 640, 360 - y / 0.005], 1)
-    assert np.linalg.norm(mine - np.stack([u, v], 1), axis=1).max() <= 1.05 * told
+    assert net.images.id == ("a#0", "a#2") and [c.id for c in net.cameras] == ["cam"]
+    (told,) = [w for w in net.warnings if "spherical" in w]
+    assert "sensor 'ball'" in told and "left out 1 camera: 'b'" in told
+    with pytest.raises(InputError, match="sensor 'ball': sensors of type 'spherical'"):
+        read(tmp_path, text.replace('sensor_id="0"', 'sensor_id="7"'))
+
+
+def with_markers(system="", enabled=("true", "1", "true", "true", "false"), transform=True):
+    """Five points of `exchange_cases` as markers with references in the frame of the chunk's
+    transform; a location that is not valid has no coordinates."""
+    world = POINTS if transform else SCALE * POINTS @ TURN.T + SHIFT
+    markers, locations = "", ""
+    for k in range(5):
+        x, y, z = world[k]
+        sigma = 'sx="0.01" sy="0.01" sz="0.02" ' if k == 0 else ""
+        markers += (f'<marker id="{k}" label="M{k}"><reference x="{x}" y="{y}" z="{z}" {sigma}'
+                    f'enabled="{enabled[k]}"/></marker>')  # fmt: skip
+        locations += f'<marker marker_id="{k}"><location camera_id="1" pinned="0" valid="0"/>'
+        for i in (0, 2):
+            ray = matrix(ANGLES[i]) @ (POINTS[k] - POSITION[i]) * [1, -1, -1]
+            u, v = map(float, published(*ray))
+            locations += f'<location camera_id="{i}" pinned="true" x="{u!r}" y="{v!r}"/>'
+        locations += "</marker>"
+    more = (f"{system}<markers>{markers}</markers><frames><frame id='0'><markers>{locations}"
+            "</markers></frame></frames>")  # fmt: skip
+    return xml(transform, more)
+
+
+@pytest.mark.parametrize("transform", [True, False])
+def test_references_of_markers_are_control(tmp_path, transform):
+    """In the frame of the chunk's transform; without one a similarity takes the images there."""
+    local = '<reference>LOCAL_CS["Local Coordinates (m)",UNIT["metre",1]]</reference>'
+    net = read(tmp_path, with_markers(local, transform=transform))
+    world = (lambda X: X) if transform else lambda X: SCALE * X @ TURN.T + SHIFT
+    assert net.datum == "control" and net.points.role == ("control",) * 4 + ("check",)
+    assert_allclose(net.points.position, world(POINTS[:5]), atol=1e-9)
+    assert_allclose(net.points.sigma[:2], [[0.01, 0.01, 0.02], [0.005] * 3])
+    assert_allclose(net.images.position, world(POSITION), rtol=1e-7)
+    assert len(net.observations) == 10
+
+
+def test_references_that_are_no_control(tmp_path):
+    geographic = '<reference>GEOGCS["WGS 84"]</reference>'
+    few = ("true", "true", "false", "false", "false")
+    for text in (with_markers(geographic), with_markers(enabled=few)):
+        net = read(tmp_path, text)
+        assert net.datum == "inner" and set(net.points.role) == {"tie"}
+        assert ("not in a local system" in " ".join(net.warnings)) == ("GEOGCS" in text)
 
 
 BROKEN = {
     "not XML": (lambda t: t[: len(t) // 2], "not valid XML"),
     "entities": (lambda t: t.replace("<document", "<!DOCTYPE x><document", 1), "document type"),
     "no chunk": (lambda t: "<document></document>", "one <chunk>"),
-    "skew": (lambda t: t.replace("<b1>", "<b2>0.1</b2><b1>"), "without the pixel size"),
-    "k4": (
-        lambda t: t.replace("<b1>", "<k4>-3</k4><b1>").replace("<calibration", PIXEL, 1),
-        r"k4 -3 have no place.*brown-projected, differs by \d",
+    "folded": (lambda t: t.replace("<k1>-0.1", "<k4>1</k4><k1>-9"), "turns back inside the image"),
+    "spherical": (
+        lambda t: t.replace('"cam" type="frame"', '"cam" type="spherical"'), "type 'spherical'"
     ),
-    "pixel": (
-        lambda t: t.replace("<b1>", "<b2>1</b2><b1>").replace(
-            "<calibration", PIXEL.replace("0.005", "-1"), 1
-        ), "must be positive",
-    ),
-    "p3": (lambda t: t.replace("<b1>", "<p3>0.1</p3><b1>"), "p3 is 0.1"),
-    "old": (lambda t: t.replace("<b1>", "<skew>0.1</skew><b1>"), "<skew> is of an old version"),
-    "fisheye": (lambda t: t.replace('"cam" type="frame"', '"cam" type="fisheye"'), "type 'fisheye"),
     "NaN": (lambda t: t.replace("<k2>0.02", "<k2>nan"), "sensor 'cam', k2: 'nan'"),
     "focal": (lambda t: t.replace("<f>1000.0", "<f>-1000.0"), "must be positive"),
     "size": (lambda t: t.replace('width="1280"', ""), "resolution, width"),

@@ -1,0 +1,136 @@
+"""Cameras of other programs that are none of our models: fitted by the nearest, with what it costs.
+
+A reader gives the camera's own formula, from rays to pixels. Points of a grid over the image get
+their rays by Newton's method; the parameters of each candidate are those that bring the images of
+these rays nearest to the points (`cameras.convert_fit`). The first candidate that leaves less than
+`GOOD` is taken, else the nearest.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.cameras import get_model
+from jaxbundle.cameras.convert import MEASURABLE
+from jaxbundle.cameras.convert_fit import (
+    FITTED,
+    fit_parameters,
+    image_grid,
+    images_of,
+    start_values,
+)
+from jaxbundle.cameras.frames import pixel_frame
+from jaxbundle.errors import InputError
+
+Formula = Callable[..., Float[np.ndarray, "n 2"]]
+"""(X, Y, Z), right, down and forward, to pixels from the centre of the first one."""
+
+GOOD = 0.05
+"""Pixels: a candidate that is as near is taken without a look at the next."""
+ON_THE_POINT = 1e-7
+"""Pixels by which a ray may miss its point."""
+ROUNDS, STEP, LONGEST = 60, 1e-6, 0.2
+"""Newton's method for rays: rounds, radians of its differences, and of its steps."""
+RATIONAL = (*FITTED["opencv"], "k4", "k5", "k6")
+PRISM = (*FITTED["opencv"], "s1", "s2", "s3", "s4")
+PERSPECTIVE = (("opencv", FITTED["opencv"]), ("opencv", RATIONAL), ("opencv", PRISM),
+               ("opencv", (*RATIONAL, *PRISM[-4:])),
+               ("brown-projected", FITTED["brown-projected"]))  # fmt: skip
+FISHEYE = (("kannala-brandt", FITTED["kannala-brandt"]),)
+NARROW = np.cos(np.radians(75))
+"""Rays within this angle of the axis may have a perspective model."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Foreign:
+    """A camera of another program.
+
+    `start`: the parameters of `opencv`, or of `kannala-brandt` if it is a `fisheye`, that come
+    nearest to its formula; `image_size` in pixels, `pixel_size` in mm where it is known.
+    """
+
+    formula: Formula
+    start: Mapping[str, float]
+    image_size: Sequence[float]
+    pixel_size: Sequence[float] | None = None
+    fisheye: bool = False
+
+
+def nearest_camera(camera: Foreign, where: str) -> tuple[dict, str]:
+    """The model and parameters of the nearest of our cameras as an entry of a document, and in
+    words how near it is.
+
+    **Raises:** `InputError` beginning with `where` if less than half of the image has rays, or
+    nothing could be fitted.
+    """
+    sizes = (camera.image_size, camera.pixel_size)
+    uv = image_grid([-0.5, -0.5], np.array(camera.image_size, float) - 0.5)
+    rays, there = _rays(camera, uv)
+    if there.mean() < MEASURABLE:
+        raise InputError(
+            f"{where}: only {100 * there.mean():.0f} % of the image has rays: its distortion turns "
+            "back inside the image"
+        )
+    uv, rays = uv[there], rays[there] * [1, -1, -1]
+    source = get_model("kannala-brandt" if camera.fisheye else "opencv")
+    narrow = (-rays[:, 2] > NARROW).all()
+    found, problem = [], ""
+    for name, free in (*(FISHEYE if camera.fisheye else ()), *(PERSPECTIVE if narrow else ())):
+        target = get_model(name)
+        if target.unit == "mm" and camera.pixel_size is None:
+            continue
+        origin, step = pixel_frame(target, *sizes)
+        xy = (uv - origin) / step
+        starts = start_values(source, camera.start, target, sizes)
+        try:
+            values = fit_parameters(target, rays, xy, starts, free)
+        except ValueError as error:
+            problem = str(error)
+            continue
+        off = np.linalg.norm((images_of(target, values, rays) - xy) * step, axis=1)
+        largest = float(off.max()) if np.isfinite(off).all() else np.inf
+        found.append((largest, float(np.sqrt(np.mean(off**2))), target, values))
+        if largest <= GOOD:
+            break
+    if not found or not np.isfinite(min(found, key=lambda one: one[0])[0]):
+        raise InputError(f"{where}: none of our models comes near it; {problem}")
+    largest, rms, target, values = min(found, key=lambda one: one[0])
+    entry = {"model": target.name, **values}
+    told = f"fitted as {target.name}, largest difference {largest:.2g} px, RMS {rms:.2g} px"
+    if there.mean() < 1:
+        told += f"; {100 * (1 - there.mean()):.1f} % of the image has no ray"
+    return entry | ({"pixel_size": list(camera.pixel_size)} if target.unit == "mm" else {}), told
+
+
+def _rays(camera: Foreign, uv) -> tuple[Float[np.ndarray, "n 3"], np.ndarray]:
+    """Unit vectors (right, down, forward) of image points, and which of them there are: beyond a
+    radius where the image turns back there are none."""
+    p = camera.start
+    at = (uv - [p["cx"], p["cy"]]) / [p["fx"], p["fy"]]
+    r = np.linalg.norm(at, axis=1, keepdims=True)
+    m = at if camera.fisheye else at * np.arctan(r) / np.where(r > 0, r, 1)
+    image = lambda m: camera.formula(*_direction(m).T)
+    with np.errstate(all="ignore"):
+        for _ in range(ROUNDS):
+            J = np.stack(
+                [(image(m + h) - image(m - h)) / (2 * STEP) for h in STEP * np.eye(2)], -1
+            )
+            det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
+            off = uv - image(m)
+            step = np.stack([J[:, 1, 1] * off[:, 0] - J[:, 0, 1] * off[:, 1],
+                             J[:, 0, 0] * off[:, 1] - J[:, 1, 0] * off[:, 0]], 1)  # fmt: skip
+            step /= det[:, None]
+            length = np.linalg.norm(step, axis=1, keepdims=True)
+            step = np.nan_to_num(step * np.minimum(1, LONGEST / np.maximum(length, LONGEST)))
+            m = m + step
+            if np.abs(step).max() < 1e-14:
+                break
+        there = (np.linalg.norm(uv - image(m), axis=1) < ON_THE_POINT) & (det > 0)
+    return _direction(m), there
+
+
+def _direction(m):
+    angle = np.linalg.norm(m, axis=1)
+    return np.concatenate([m * np.sinc(angle / np.pi)[:, None], np.cos(angle)[:, None]], 1)
