@@ -1,5 +1,6 @@
 """What the commands about cameras share: FILE or FILE#ID, pairs of numbers, figures."""
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from jaxbundle.io.calibrated import is_result, read_calibrated
 from jaxbundle.io.camera_files import LOOKS, chosen_camera, is_camera_file, read_cameras
 from jaxbundle.io.csv_tables import write_bytes
 from jaxbundle.io.formats import FORMATS, recognised_format
+from jaxbundle.io.nearest_camera import fits_told
 from jaxbundle.network.tables import Camera
 from jaxbundle.statistics.difference import Covariance
 
@@ -44,6 +46,8 @@ def calibration_given(text: str) -> tuple[Camera, Covariance | None]:
     else:
         cameras = read_network(path).cameras
     camera = chosen_camera(cameras, id, f"{file} (FILE#ID)")
+    for told in fits_told([camera]):
+        print(f"warning: {told}", file=sys.stderr)
     return camera, found.get(camera.id)
 
 

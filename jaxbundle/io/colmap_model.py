@@ -18,6 +18,7 @@ from jaxbundle.geometry.pose_conventions import cv_pose, exterior_from_cv
 from jaxbundle.io.assemble import assemble, foreign_document, image_columns
 from jaxbundle.io.colmap_models import HALF, to_colmap
 from jaxbundle.io.losses import need_values, what_is_lost
+from jaxbundle.io.nearest_camera import fits_told
 from jaxbundle.io.poses import matrices_of, matrices_of_quaternions, quaternions_of
 from jaxbundle.network.columns import Columns, count, some
 from jaxbundle.network.reprojection import point_errors
@@ -99,13 +100,13 @@ def to_network(path: Path, model: ColmapModel, overrides: Sequence[str]) -> Netw
             {"id": model.point_ids, "role": ["tie"] * len(model.points),
              **dict(zip("XYZ", model.points.T))}, model.points_source,
         ),
-        observed, warnings,
+        observed, (*warnings, *fits_told(model.cameras.values())),
     )  # fmt: skip
 
 
 def _entry(camera: Camera) -> dict:
-    return {"id": camera.id, "model": camera.model, "image_size": camera.image_size,
-            **camera.parameters}  # fmt: skip
+    sizes = {"image_size": camera.image_size, "pixel_size": camera.pixel_size}
+    return {"id": camera.id, "model": camera.model, **sizes, **camera.parameters}
 
 
 def _observations(path: Path, model: ColmapModel):

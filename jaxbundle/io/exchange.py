@@ -23,6 +23,7 @@ from jaxbundle.io.colmap import write_colmap_cameras
 from jaxbundle.io.coordinates import images_path
 from jaxbundle.io.folders import check_folder, replaced_folder
 from jaxbundle.io.formats import PIXEL_MODELS, TARGETS, read_network
+from jaxbundle.io.nearest_camera import fits_told
 from jaxbundle.io.opencv_file import SUFFIXES, write_opencv
 from jaxbundle.io.project import FILE_NAME
 from jaxbundle.network.columns import did_you_mean, some
@@ -98,7 +99,9 @@ def convert(
         _keep_others(output, kind, force)
         cameras = _sized(read_cameras(input), image_size, pixel_size)
         made = _convert_cameras(input, cameras, output, kind, model, camera)
-        return dataclasses.replace(made, warnings=outside_warnings(cameras))
+        return dataclasses.replace(
+            made, warnings=(*fits_told(cameras), *outside_warnings(cameras))
+        )
     network = read_network(input, format, overrides, control)
     network = network.replace(cameras=_sized(network.cameras, image_size, pixel_size))
     network = network.warn(*outside_warnings(network.cameras, network))

@@ -7,7 +7,7 @@ these rays nearest to the points (`cameras.convert_fit`). The first candidate th
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -23,6 +23,7 @@ from jaxbundle.cameras.convert_fit import (
 )
 from jaxbundle.cameras.frames import pixel_frame
 from jaxbundle.errors import InputError
+from jaxbundle.network.tables import Camera
 
 Formula = Callable[..., Float[np.ndarray, "n 2"]]
 """(X, Y, Z), right, down and forward, to pixels from the centre of the first one."""
@@ -102,6 +103,29 @@ def nearest_camera(camera: Foreign, where: str) -> tuple[dict, str]:
     if there.mean() < 1:
         told += f"; {100 * (1 - there.mean()):.1f} % of the image has no ray"
     return entry | ({"pixel_size": list(camera.pixel_size)} if target.unit == "mm" else {}), told
+
+
+@dataclasses.dataclass(frozen=True)
+class FittedCamera(Camera):
+    """A camera that stands for one of another program, and in words how near it is."""
+
+    told: str = ""
+
+
+def fitted_camera(id: str, camera: Foreign, where: str, why: str) -> FittedCamera:
+    """The nearest of our cameras; `why` its own model has no place here. Raises `InputError`."""
+    entry, told = nearest_camera(camera, where)
+    pixel = entry.pop("pixel_size", None)
+    model, size = entry.pop("model"), camera.image_size
+    return FittedCamera(
+        id, model, entry, image_size=(int(size[0]), int(size[1])),
+        pixel_size=pixel and tuple(pixel), told=f"camera {id!r} {why}: {told}",
+    )  # fmt: skip
+
+
+def fits_told(cameras: Iterable[Camera]) -> tuple[str, ...]:
+    """What is to be told of the cameras that were fitted."""
+    return tuple(camera.told for camera in cameras if isinstance(camera, FittedCamera))
 
 
 def _rays(camera: Foreign, uv) -> tuple[Float[np.ndarray, "n 3"], np.ndarray]:

@@ -15,8 +15,14 @@
 
 The files of ROS, which look alike, are read as well: with `distortion_model` "equidistant" or
 "fisheye" the four coefficients are those of `kannala-brandt`. Pixels have their origin at the
-centre of the first pixel, as ours. A skew in the camera matrix and a tilted sensor (τx, τy) have no
-place in our models and are refused.
+centre of the first pixel, as ours. A skew and a tilted sensor (τx, τy),
+
+    s·[x'', y'', 1] = [R33, 0, −R13; 0, R33, −R23; 0, 0, 1]·R·[x', y', 1]
+    R = [cos τy, 0, −sin τy; 0, 1, 0; sin τy, 0, cos τy]
+        ·[1, 0, 0; 0, cos τx, sin τx; 0, −sin τx, cos τx]
+    u = fx·x'' + skew·y'' + cx
+
+have no place in our models: where they are not 0 the nearest is fitted, which needs the image size.
 
 The reader knows what cameras need of YAML, and nothing else of it; other entries are skipped.
 
@@ -25,15 +31,18 @@ Source: OpenCV 4 documentation, XML/YAML/JSON file storages; ROS wiki, camera_ca
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from jaxbundle.cameras import get_model
+from jaxbundle.cameras.convert_fit import images_of
 from jaxbundle.errors import InputError
 from jaxbundle.io.assemble import all_parameters
 from jaxbundle.io.csv_tables import read_text, write_text
+from jaxbundle.io.nearest_camera import FittedCamera, Foreign, fitted_camera
 from jaxbundle.network.columns import shown
 from jaxbundle.network.rules import check_camera
 from jaxbundle.network.tables import Camera
@@ -67,19 +76,17 @@ def read_opencv(path: str | Path) -> Camera:
     is_json = path.suffix.lower() == ".json" or text.lstrip().startswith("{")
     entries = _from_json(path, text) if is_json else _from_yaml(path, text)
     name, K = _matrix(path, entries, MATRIX, (3, 3))
-    for row, column in ((0, 1), (1, 0), (2, 0), (2, 1)):
-        if K[row, column] != 0:
+    for row, column, wanted in ((1, 0, 0), (2, 0, 0), (2, 1, 0), (2, 2, 1)):
+        if K[row, column] != wanted:
             raise InputError(
-                f"{path}: {name}[{row}][{column}] is {K[row, column]:g}; a skew has no place in "
-                "our models, 0 is expected"
+                f"{path}: {name}[{row}][{column}] is {K[row, column]:g}; {wanted} is expected"
             )
-    if K[2, 2] != 1:
-        raise InputError(f"{path}: {name}[2][2] is {K[2, 2]:g}; 1 is expected")
     coefficients = _coefficients(path, entries)
+    coefficients, tilt = coefficients[: len(ORDER)], coefficients[len(ORDER) :]
     parameters = dict(zip(("fx", "fy", "cx", "cy"), (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
     fisheye = entries.get("distortion_model") in FISHEYE or _is_one(entries.get("fisheye_model"))
     if fisheye:
-        if len(coefficients) != 4:
+        if any(coefficients[4:]) or any(tilt):
             raise InputError(
                 f"{path}: {len(coefficients)} distortion coefficients; a fisheye has 4"
             )
@@ -93,7 +100,37 @@ def read_opencv(path: str | Path) -> Camera:
         image_size=_image_size(path, entries),
     )
     check_camera(camera, f"{path}, ")
-    return camera
+    return camera if K[0, 1] == 0 and not any(tilt) else _fitted(path, camera, K[0, 1], tilt)
+
+
+def _fitted(path: Path, camera: Camera, skew: float, tilt: Sequence[float]) -> FittedCamera:
+    """The nearest of our cameras to one with a skew or a tilted sensor."""
+    if camera.image_size is None:
+        raise InputError(
+            f"{path}: a skew or a tilted sensor has no place in our models; to fit the nearest one "
+            "the image size is needed: give image_width and image_height"
+        )
+    model, p = get_model(camera.model), all_parameters(camera)
+    one = p | {"fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0}
+    homography = _tilted(*tilt) if tilt else np.eye(3)
+
+    def formula(X, Y, Z):
+        xy = images_of(model, one, np.stack([X, -Y, -Z], 1))
+        x, y, s = (np.concatenate([xy, np.ones((len(xy), 1))], 1) @ homography.T).T
+        u = p["fx"] * x / s + skew * y / s + p["cx"]
+        return np.stack([u, p["fy"] * y / s + p["cy"]], 1)
+
+    has = [f"skew {skew:g}"] if skew else []
+    has += [f"tilt τx {tilt[0]:g}, τy {tilt[1]:g}"] if any(tilt) else []
+    foreign = Foreign(formula, p, camera.image_size, fisheye=camera.model == "kannala-brandt")
+    return fitted_camera(camera.id, foreign, str(path), f"has {' and '.join(has)}")
+
+
+def _tilted(tx: float, ty: float) -> np.ndarray:
+    cx, sx, cy, sy = np.cos(tx), np.sin(tx), np.cos(ty), np.sin(ty)
+    about_y = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])
+    R = about_y @ np.array([[1, 0, 0], [0, cx, sx], [0, -sx, cx]])
+    return np.array([[R[2, 2], 0, -R[0, 2]], [0, R[2, 2], -R[1, 2]], [0, 0, 1]]) @ R
 
 
 def opencv_text(camera: Camera, as_json: bool = False) -> str:
@@ -233,14 +270,10 @@ def _coefficients(path: Path, entries: Mapping) -> list[float]:
         return [0.0] * 4
     name, values = _matrix(path, entries, COEFFICIENTS, None)
     values = values.tolist()
-    if len(values) == 14 and values[12:] == [0, 0]:
-        values = values[:12]
-    if len(values) == 14:
-        raise InputError(
-            f"{path}: {name}: a tilted sensor (τx {values[12]:g}, τy {values[13]:g}) has no place "
-            "in our models"
-        )
-    if len(values) not in LENGTHS:
+    while values and len(values) not in (*LENGTHS, 14) and values[-1] == 0:
+        values = values[:-1]
+    values = values or [0.0] * 4
+    if len(values) not in (*LENGTHS, 14):
         raise InputError(f"{path}: {name} has {len(values)} values; 4, 5, 8, 12 or 14 are known")
     return values
 

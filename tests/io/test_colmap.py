@@ -1,5 +1,6 @@
 """COLMAP's sparse models: round trips, an independent reading, and broken files."""
 
+import re
 import struct
 
 import numpy as np
@@ -8,7 +9,10 @@ from exchange_cases import POINTS, assert_same, network
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
+from jaxbundle.cameras import get_model
+from jaxbundle.cameras.convert_fit import images_of
 from jaxbundle.errors import InputError
+from jaxbundle.io.assemble import all_parameters
 from jaxbundle.io.colmap import (
     is_colmap,
     read_colmap,
@@ -147,9 +151,87 @@ def test_what_is_lost_is_told(tmp_path):
     assert "roles" in lost[0] and "numbered from 1" in lost[1]
 
 
+def of_fov(x, y, w):
+    r = np.hypot(x, y)
+    return [v * np.arctan(2 * r * np.tan(w / 2)) / w / r for v in (x, y)]
+
+
+def of_eucm(x, y, alpha, beta):
+    d = alpha * np.sqrt(beta * (x**2 + y**2) + 1) + 1 - alpha
+    return x / d, y / d
+
+
+def of_division(x, y, k):
+    """The distorted point whose undistorted one, x_d/(1 + k·r_d²), is given (Fitzgibbon 2001)."""
+    r = np.hypot(x, y)
+    rd = np.array([min(np.roots([k * a, -1, a]), key=abs) for a in r]).real
+    return x * rd / r, y * rd / r
+
+
+def of_aria(x, y, k0, k1, k2, k3, k4, k5, p0, p1, s0, s1, s2, s3):
+    t = np.arctan(np.hypot(x, y))
+    t = t * (1 + k0 * t**2 + k1 * t**4 + k2 * t**6 + k3 * t**8 + k4 * t**10 + k5 * t**12)
+    x, y = t * x / np.hypot(x, y), t * y / np.hypot(x, y)
+    r2, p = x**2 + y**2, np.array([p0, p1])
+    along = 2 * (p[0] * x + p[1] * y)
+    return (x + along * x + p0 * r2 + s0 * r2 + s1 * r2**2,
+            y + along * y + p1 * r2 + s2 * r2 + s3 * r2**2)  # fmt: skip
+
+
+FITS = {
+    "FOV": ((500, 505, 320, 240, 0.9), of_fov, 0.05),
+    "SIMPLE_DIVISION": ((500, 320, 240, -0.2), of_division, 0.05),
+    "EUCM": ((400, 402, 321, 239, 0.6, 1.1), of_eucm, 0.05),
+    "RAD_TAN_THIN_PRISM_FISHEYE": ((300, 301, 320, 240, 0.1, 0.01, -0.02, 0, 1e-3, 0, 1e-3, -5e-4,
+                                    2e-4, 0, -3e-4, 1e-4), of_aria, 2.0),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("model", FITS)
+def test_models_of_its_own_are_fitted_and_the_difference_told(folder, model):
+    """Rays over the image, by formulas of the models' papers; the told difference is theirs."""
+    values, formula, limit = FITS[model]
+    line = f"{model} 640 480 {' '.join(map(str, values))}"
+    text = FILES["cameras.txt"].replace("SIMPLE_RADIAL 640 480 500 320 240 -0.1", line)
+    (folder / "cameras.txt").write_text(text)
+    net = read_colmap(folder)
+    camera = next(c for c in net.cameras if c.id == "1")
+    (told,) = [w for w in net.warnings if f"camera '1' is of COLMAP's model {model}: fitted" in w]
+    largest = float(re.search(r"largest difference (\S+) px", told)[1])
+    n = 1 if model == "SIMPLE_DIVISION" else 2
+    f, c, own = values[:n], values[n : n + 2], values[n + 2 :]
+    x, y = (g.ravel() for g in np.meshgrid(np.linspace(-1.4, 1.4, 60), np.linspace(-1, 1, 60)))
+    xd, yd = formula(x, y, *own)
+    uv = np.stack([xd * f[0] + c[0], yd * f[-1] + c[1]], 1) - 0.5
+    inside = ((uv > -0.5) & (uv < [639.5, 479.5])).all(1)
+    assert np.ptp(uv[inside], axis=0).min() > 440
+    rays = np.stack([x, -y, -np.ones_like(x)], 1)[inside]
+    off = np.linalg.norm(images_of(get_model(camera.model), all_parameters(camera), rays)
+                         - uv[inside], axis=1)  # fmt: skip
+    assert off.max() <= 1.05 * largest <= limit
+    assert read_colmap_cameras(folder / "cameras.txt")[0].told == told
+
+
+@pytest.mark.parametrize("line, model, values", [
+    ("FOV 640 480 500 505 320 240 0", "opencv", dict(fx=500, fy=505, cx=319.5, cy=239.5)),
+    ("DIVISION 640 480 500 505 320 240 0", "opencv", dict(fx=500, fy=505, cx=319.5, cy=239.5)),
+    ("EUCM 640 480 500 505 320 240 0 1", "opencv", dict(fx=500, fy=505, cx=319.5, cy=239.5)),
+    ("THIN_PRISM_FISHEYE 640 480 500 505 320 240 0.1 0.2 0 0 0.3 0.4 0 0", "kannala-brandt",
+     dict(fx=500, fy=505, cx=319.5, cy=239.5, k1=0.1, k2=0.2, k3=0.3, k4=0.4)),
+    ("RAD_TAN_THIN_PRISM_FISHEYE 640 480 500 505 320 240 0.1 0.2 0.3 0.4 0 0 0 0 0 0 0 0",
+     "kannala-brandt", dict(fx=500, fy=505, cx=319.5, cy=239.5, k1=0.1, k2=0.2, k3=0.3, k4=0.4)),
+])  # fmt: skip
+def test_terms_that_are_0_need_no_place(tmp_path, line, model, values):
+    (tmp_path / "cameras.txt").write_text(f"1 {line}\n")
+    (camera,) = read_colmap_cameras(tmp_path / "cameras.txt")
+    assert (camera.model, camera.parameters) == (model, values)
+
+
 BROKEN = {
     "unknown model": ("cameras.txt", "SIMPLE_RADIAL", "FISHY", "line 2: the camera model FISHY is"),
-    "no such model here": ("cameras.txt", "SIMPLE_RADIAL", "FOV", "FOV is not offered"),
+    "no such model here": ("cameras.txt", "SIMPLE_RADIAL", "EQUIRECTANGULAR", "AR is not offered"),
+    "folded": ("cameras.txt", "SIMPLE_RADIAL 640 480 500 320 240 -0.1",
+               "SIMPLE_DIVISION 640 480 500 320 240 30", "camera '1': only .* % of the image has rays"),
     "too few parameters": ("cameras.txt", " -0.1\n", "\n", "3 values where 4 are expected"),
     "too many": ("cameras.txt", "-0.1\n", "-0.1 7\n", "5 values where 4"),
     "focal": ("cameras.txt", " 500 ", " -500 ", "fx must be positive"),
@@ -205,7 +287,7 @@ def test_a_binary_file_cut_anywhere(tmp_path, part):
         ("images", 8 + 64 + 2, struct.pack("<Q", 10**18), f"image 1: {10**18} image points"),
         ("images", 12, struct.pack("<d", np.nan), "image 1: pose: nan"),
         ("images", 8 + 64, b"\xff", "not UTF-8"),
-        ("cameras", 12, struct.pack("<i", 10), "THIN_PRISM_FISHEYE is not offered"),
+        ("cameras", 12, struct.pack("<i", 17), "EQUIRECTANGULAR is not offered"),
         ("cameras", 12, struct.pack("<i", 99), "number 99 is unknown"),
         ("cameras", 16, struct.pack("<Q", 2**60), "image size"),
         ("points3D", 8, struct.pack("<Q", 2**64 - 5), "point 1: its number"),

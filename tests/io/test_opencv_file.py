@@ -1,13 +1,17 @@
 """OpenCV's camera files: what we write cv2 reads, what cv2 writes we read."""
 
 import json
+import re
 
 import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from jaxbundle.cameras import get_model
+from jaxbundle.cameras.convert_fit import images_of
 from jaxbundle.errors import InputError
+from jaxbundle.io.assemble import all_parameters
 from jaxbundle.io.opencv_file import is_opencv, read_opencv, write_opencv
 from jaxbundle.network import Camera
 
@@ -90,9 +94,44 @@ def _matrix(rows, columns, data):
     return {"rows": rows, "cols": columns, "dt": "d", "data": data}
 
 
+def test_coefficients_that_are_0_do_not_count(tmp_path):
+    path = tmp_path / "cam.json"
+    for n, model in ((5, "fisheye"), (6, "plumb_bob"), (14, "rational"), (3, "plumb_bob")):
+        values = [0.1 if k == 0 and n > 4 else 0 for k in range(n)]
+        path.write_text(json.dumps(_with(distortion_coefficients=_matrix(n, 1, values),
+                                         distortion_model=model)))  # fmt: skip
+        camera = read_opencv(path)
+        assert camera.parameters["k1"] == values[0] * (n > 4)
+        assert camera.model == ("kannala-brandt" if model == "fisheye" else "opencv")
+
+
+@pytest.mark.parametrize("skew, tilt", [(0.4, (0.0, 0.0)), (0.0, (0.01, -0.02))])
+def test_a_skew_and_a_tilt_are_fitted_and_the_difference_told(tmp_path, skew, tilt):
+    """Against cv2's own projection, to which the skew adds skew·y''."""
+    d = np.array([-0.1, 0.02, 1e-4, -2e-4, 0.003, 0, 0, 0, 0, 0, 0, 0, *tilt])
+    path = tmp_path / "cam.json"
+    path.write_text(json.dumps(_with(
+        camera_matrix=_matrix(3, 3, [500, skew, 320, 0, 505, 240, 0, 0, 1]),
+        distortion_coefficients=_matrix(14, 1, d.tolist()),
+    )))  # fmt: skip
+    camera = read_opencv(path)
+    X = np.stack([g.ravel() for g in np.meshgrid(np.linspace(-0.7, 0.7, 40),
+                                                 np.linspace(-0.5, 0.5, 40), 1.0)], 1)  # fmt: skip
+    K = np.array([[500, 0, 320], [0, 505, 240], [0, 0, 1.0]])
+    uv = cv2.projectPoints(X, np.zeros(3), np.zeros(3), K, d)[0][:, 0]
+    uv[:, 0] += skew * (uv[:, 1] - 240) / 505
+    inside = ((uv > -0.5) & (uv < [639.5, 479.5])).all(1)
+    assert np.ptp(uv[inside], axis=0).min() > 450
+    off = images_of(get_model(camera.model), all_parameters(camera), X[inside] * [1, -1, -1])
+    off = np.linalg.norm(off - uv[inside], axis=1).max()
+    told = float(re.search(r"largest difference (\S+) px", camera.told)[1])
+    assert off <= 1.05 * told <= 0.5 and ("skew 0.4" in camera.told) == (skew > 0)
+
+
 BROKEN = {
     "no matrix": (_with(camera_matrix=None), "camera_matrix is missing"),
-    "skew": (_with(camera_matrix=_matrix(3, 3, [5, 0.1, 3, 0, 5, 2, 0, 0, 1])), "skew"),
+    "skew": (_with(camera_matrix=_matrix(3, 3, [5, 0.1, 3, 0, 5, 2, 0, 0, 1]), image_width=None,
+                   image_height=None), "skew or a tilted sensor .* image size is needed"),
     "not a camera": (_with(camera_matrix=_matrix(3, 3, [5, 0, 3, 0, 5, 2, 0, 0, 2])), r"\[2\]"),
     "too few": (_with(camera_matrix=_matrix(3, 3, [5, 0, 3])), "3 numbers for 3 rows"),
     "wrong shape": (_with(camera_matrix=_matrix(1, 9, [5, 0, 3, 0, 5, 2, 0, 0, 1])), "3 rows"),
@@ -101,9 +140,9 @@ BROKEN = {
     "text": (_with(camera_matrix=_matrix(3, 3, ["5"] * 9)), "finite numbers"),
     "focal": (_with(camera_matrix=_matrix(3, 3, [0, 0, 3, 0, 5, 2, 0, 0, 1])), "fx must be posi"),
     "coefficients": (_with(distortion_coefficients=_matrix(6, 1, [0.1] * 6)), "has 6 values"),
-    "tilted": (_with(distortion_coefficients=_matrix(14, 1, [0.1] * 14)), "tilted sensor"),
     "size": (_with(image_width=640.5), "image size"),
-    "fisheye": (_with(distortion_model="fisheye"), "a fisheye has 4"),
+    "fisheye": (_with(distortion_model="fisheye",
+                      distortion_coefficients=_matrix(5, 1, [0.1] * 5)), "a fisheye has 4"),
     "list": ([1, 2], "an object"),
     "huge": (_with(camera_matrix=_matrix(3, 3, [10**400] * 9)), "finite numbers"),
 }
