@@ -101,7 +101,7 @@ def read_binary_cameras(path: Path) -> dict[int, Camera]:
         values = file.numbers(len(parameter_names(name, file.error)), "parameters")
         if not (0 < width < 10**9 and 0 < height < 10**9):
             raise file.error(f"the image size {width} × {height} is impossible")
-        cameras[id] = from_colmap(str(id), name, (width, height), values)
+        cameras[id] = from_colmap(str(id), name, (width, height), values, f"{path}, ")
     file.end()
     return cameras
 

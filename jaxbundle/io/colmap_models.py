@@ -84,8 +84,13 @@ def parameter_names(model: str, error: Callable[[str], InputError]) -> tuple[str
     return MODELS[model][2]
 
 
-def from_colmap(id: str, model: str, size: Sequence[int], values: Sequence[float]) -> Camera:
-    """A camera of ours from one of COLMAP's, a `FittedCamera` where it is none of ours."""
+def from_colmap(
+    id: str, model: str, size: Sequence[int], values: Sequence[float], where: str = ""
+) -> Camera:
+    """A camera of ours from one of COLMAP's, a `FittedCamera` where it is none of ours.
+
+    **Raises:** `InputError` that begins with `where`, if none of ours comes near it.
+    """
     names = FITTED[model][1] if model in FITTED else MODELS[model][2]
     p = dict(zip(names, map(float, values)))
     f = p.pop("f", None)
@@ -99,7 +104,7 @@ def from_colmap(id: str, model: str, size: Sequence[int], values: Sequence[float
             wide = 2 * np.tan(p["omega"] / 2) / p["omega"]
             start |= {"fx": p["fx"] * wide, "fy": p["fy"] * wide}
         foreign = Foreign(lambda X, Y, Z: _image(model, p, X, Y, Z), start, size, fisheye=True)
-        return fitted_camera(id, foreign, f"camera {id!r}", f"is of COLMAP's model {model}")
+        return fitted_camera(id, foreign, f"{where}camera {id!r}", f"is of COLMAP's model {model}")
     return Camera(id, ours, exact, image_size=(int(size[0]), int(size[1])))
 
 

@@ -41,7 +41,8 @@ def read_text_cameras(path: Path) -> dict[int, Camera]:
         model = row.words[1] if len(row) > 1 else ""
         names = parameter_names(model, row.error)
         size = [row.whole(k, what, 1) for k, what in ((2, "WIDTH"), (3, "HEIGHT"))]
-        cameras[number] = from_colmap(str(number), model, size, row.numbers(names, 4))
+        values, where = row.numbers(names, 4), f"{path}, line {row.number}: "
+        cameras[number] = from_colmap(str(number), model, size, values, where)
     return cameras
 
 
