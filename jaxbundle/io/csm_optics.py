@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.io.json_fields import JsonFields
+from jaxbundle.io.sight_frames import sight_frame
 from jaxbundle.network.columns import shown
 from jaxbundle.pushbroom.scanner import AngleTable, FocalLine, Optics
 
@@ -33,19 +34,8 @@ def optics_of(
     x, y = _focal_plane(isd, np.arange(pixels))
     kind, undistorted = _distortion(isd, x, y)
     sights = np.stack([x / f, y / f])
-    look = np.array([*sights[:, pixels // 2], 1.0])
-    # the camera frame here looks along −z: turned about x, or as it is and seen from behind
-    ahead = look @ down > 0
-    turn = Rotation.from_matrix(np.diag([1.0, -1, -1]) if ahead else np.eye(3))
-    signs = np.array([1.0, -1.0]) if ahead else np.array([-1.0, -1.0])
-    along = signs * (sights[:, -1] - sights[:, 0])
-    angle = np.arctan2(along[1], along[0])
-    about = lambda angle: turn * Rotation.from_rotvec([0, 0, angle])
-    if about(angle).inv().apply(forward)[1] < 0:
-        angle += np.pi
-    c, s = np.cos(angle), np.sin(angle)
-    plane = lambda x, y: np.array([[c, s], [-s, c]]) @ (signs[:, None] * [x, y])
-    X, Y = plane(x, y)
+    frame = sight_frame(sights, down, forward)
+    X, Y = f * frame.slopes(*sights)
     pitch = (X[-1] - X[0]) / (pixels - 1)
     straight = np.abs(Y - Y[0]).max() < ALIGNED * max(np.abs(X).max(), abs(f))
     if kind == "radial" and f > 0 and straight:
@@ -54,9 +44,9 @@ def optics_of(
         given = {"c": f, **{f"K{k}": value for k, value in enumerate(K)}}
         parameters = jnp.asarray([given.get(name, 0.0) for name in model.parameters])
         place = (jnp.asarray(v) for v in (pitch, -X[0] / pitch, Y[0]))
-        return FocalLine(parameters, *place, "usgs"), about(angle)
-    psi = np.arctan(plane(*undistorted) / f)
-    return AngleTable(*map(jnp.asarray, psi)), about(angle)
+        return FocalLine(parameters, *place, "usgs"), frame.turn
+    psi = np.arctan(frame.slopes(*undistorted) / f)
+    return AngleTable(*map(jnp.asarray, psi)), frame.turn
 
 
 def _focal_plane(isd, u):

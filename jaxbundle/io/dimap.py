@@ -13,8 +13,6 @@ attitudes, turned into Earth-fixed quaternions at their own times, by slerp. Whe
 before the image does (`ancillary.extrapolation_limit`), the angles go on linearly.
 """
 
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.io.scanner import Scanner
-from jaxbundle.io.xml_fields import XmlFields, read_xml
+from jaxbundle.io.xml_fields import XmlFields
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.ancillary import (
     attitude_table,
@@ -40,13 +38,13 @@ from jaxbundle.pushbroom.trajectory import Trajectory, orbital_frame
 ORDER = 7
 
 
-def read_dimap(path: str | Path) -> Scanner:
+def read_dimap(file: XmlFields) -> Scanner:
     """The pushbroom image of a SPOT 5 scene, `METADATA.DIM`.
 
     **Raises:** `InputError` naming file, element and its number: what is missing, no number, no
     time, not as many look angles as pixels, times that do not increase.
     """
-    file = XmlFields(path, read_xml(path), "DIMAP of SPOT 5")
+    path = file.path
     lines, pixels = (file.number(f"Raster_Dimensions/{n}") for n in ("NROWS", "NCOLS"))
     check_size(lines, pixels, f"{path}: Raster_Dimensions")
     lines, pixels = int(lines), int(pixels)
@@ -58,16 +56,16 @@ def read_dimap(path: str | Path) -> Scanner:
         raise InputError(f"{path}: LINE_PERIOD is {period:g} s; a positive number is expected")
     times = LineTimes(jnp.asarray(-period * centre), jnp.asarray(period))
 
-    points = "Ephemeris/Points/Point"
-    t = file.times(points, epoch)
-    orbit = file.columns(points, [f"{a}/{b}" for a in ("Location", "Velocity") for b in "XYZ"])
+    key = "Ephemeris/Points/Point"
+    t = file.times(key, epoch)
+    orbit = file.columns(key, [f"{a}/{b}" for a in ("Location", "Velocity") for b in "XYZ"])
     source = points = Source(f"{path}, Ephemeris", None, "point")
     options = {"method": "lagrange", "order": min(ORDER, len(t) - 1), "gap": np.inf}
     both = position_table(t, orbit, **options, source=source)
     position = position_table(t, orbit[:, :3], **options, source=source)
 
-    attitudes = "Corrected_Attitudes/Corrected_Attitude/Angles"
-    rows, angles = file.times(attitudes, epoch), file.columns(attitudes, ["PITCH", "ROLL", "YAW"])
+    key = "Corrected_Attitudes/Corrected_Attitude/Angles"
+    rows, angles = file.times(key, epoch), file.columns(key, ["PITCH", "ROLL", "YAW"])
     source = Source(f"{path}, Corrected_Attitude", None, "row")
     check_times(rows, source)
     when = np.asarray(times.time(jnp.arange(lines, dtype=float)))
@@ -89,7 +87,7 @@ def read_dimap(path: str | Path) -> Scanner:
     image = make_image(
         Trajectory(position, attitude), times, optics, lines, pixels, sources=(points, source)
     )
-    name = file.text("Dataset_Id/DATASET_NAME", Path(path).stem)
+    name = file.text("Dataset_Id/DATASET_NAME", path.stem)
     return Scanner(name, image, WGS84, warnings)
 
 

@@ -94,7 +94,7 @@ SECTIONS = {
     "earth_orientation": frames.EarthOrientation._fields,
 }  # fmt: skip
 NEEDED = ("scanner", "times", "position", "attitude", "optics")
-PRODUCTS = (".json", ".dim")
+PRODUCTS = (".json", ".dim", ".xml", ".imd")
 """Suffixes of `io.scanner_products`."""
 
 

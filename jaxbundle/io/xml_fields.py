@@ -1,5 +1,6 @@
 """Elements of an XML document, asked for by their path; what is wrong is said with its place."""
 
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,6 +10,9 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.io.csv_tables import read_text
 from jaxbundle.network.columns import shown
+
+TIME = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d(?:\.\d{1,9})?)\d*Z?")
+"""UTC; digits below a nanosecond are dropped."""
 
 
 class XmlFields:
@@ -115,13 +119,13 @@ def number_in(text: str, where: str) -> float:
 
 def time_in(text: str, where: str) -> np.datetime64:
     """A time of a text, to the nanosecond."""
+    match = TIME.fullmatch(text.strip())
     try:
-        time = np.datetime64(text.strip().removesuffix("Z").replace(" ", "T"), "ns")
-    except ValueError:
-        time = np.datetime64("NaT")
-    if np.isnat(time):
-        raise InputError(f"{where} is {shown(text)}; a time such as 2008-03-04T12:31:03.081912")
-    return time
+        return np.datetime64("T".join(match.groups()), "ns")
+    except (ValueError, AttributeError):
+        raise InputError(
+            f"{where} is {shown(text)}; a time such as 2008-03-04T12:31:03.081912 is expected"
+        ) from None
 
 
 def seconds(time: np.datetime64, epoch: np.datetime64) -> float:

@@ -11,9 +11,9 @@ from rpc_scenes import made_up
 from scanner_files import write_scanner
 from test_csm import support_data
 from test_dimap import write_dimap
+from test_xml_products import dimap, worldview
 
 from jaxbundle.io.csm import read_csm
-from jaxbundle.io.dimap import read_dimap
 from jaxbundle.io.flight import read_flight
 from jaxbundle.io.refinement import read_refinement
 from jaxbundle.io.rpc import read_rpc, write_rpc
@@ -49,6 +49,10 @@ def made(kind: str, folder: Path) -> Path:
             shutil.copy(FLIGHT, folder)
         case "csm":
             (folder / "isd.json").write_text(json.dumps(support_data(), indent=1))
+        case "worldview":
+            (folder / "image.xml").write_text(worldview())
+        case "dimap2":
+            (folder / "DIM.XML").write_text(dimap())
         case "dimap":
             write_dimap(folder)
         case "rpc":
@@ -61,7 +65,9 @@ READ = {
     "refinement": lambda folder: read_refinement(folder / "refine.toml"),
     "flight": lambda folder: read_flight(folder / "flight.toml"),
     "csm": lambda folder: read_csm(folder / "isd.json"),
-    "dimap": lambda folder: read_dimap(folder / "METADATA.DIM"),
+    "worldview": lambda folder: read_scanner(folder / "image.xml"),
+    "dimap2": lambda folder: read_scanner(folder / "DIM.XML"),
+    "dimap": lambda folder: read_scanner(folder / "METADATA.DIM"),
     "rpc": lambda folder: read_rpc(folder / "image_RPC.TXT"),
 }
 

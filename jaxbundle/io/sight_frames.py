@@ -1,0 +1,53 @@
+"""From a product's camera frame to ours: x along the detectors, y forward, looking along −z."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from jaxbundle.pushbroom.scanner import AnglePolynomial
+
+
+class SightFrame(NamedTuple):
+    """`turn` leads from our camera frame into that of the product, `slopes` from its x/z, y/z to
+    (ξ, η)."""
+
+    turn: Rotation
+    slopes: Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def sight_frame(
+    sights: Float[np.ndarray, "2 pixels"], down: Float[np.ndarray, "3"],
+    forward: Float[np.ndarray, "3"],
+) -> SightFrame:  # fmt: skip
+    """The frame of a camera that looks along ±(x, y, 1): the side of the planet.
+
+    **Arguments:** `sights` x and y of all pixels; `down` and `forward`, the directions to the
+    planet and of flight, in the frame of the product.
+    """
+    look = np.array([*sights[:, sights.shape[1] // 2], 1.0])
+    # the camera frame here looks along −z: turned about x, or as it is and seen from behind
+    ahead = look @ down > 0
+    turn = Rotation.from_matrix(np.diag([1.0, -1, -1]) if ahead else np.eye(3))
+    signs = np.array([1.0, -1.0]) if ahead else np.array([-1.0, -1.0])
+    along = signs * (sights[:, -1] - sights[:, 0])
+    angle = np.arctan2(along[1], along[0])
+    about = lambda angle: turn * Rotation.from_rotvec([0, 0, angle])
+    if about(angle).inv().apply(forward)[1] < 0:
+        angle += np.pi
+    c, s = np.cos(angle), np.sin(angle)
+    slopes = lambda x, y: np.array([[c, s], [-s, c]]) @ (signs[:, None] * [x, y])
+    return SightFrame(about(angle), slopes)
+
+
+def polynomial_optics(
+    frame: SightFrame, x: Float[np.ndarray, " k"], y: Float[np.ndarray, " k"]
+) -> AnglePolynomial:
+    """The optics of x/z and y/z that are polynomials of the pixel, constants first."""
+    across, along = frame.slopes(np.asarray(x, float), np.asarray(y, float))
+    return AnglePolynomial(
+        jnp.asarray(across), jnp.asarray(along), jnp.asarray(0.0), jnp.asarray(1.0)
+    )
