@@ -12,15 +12,10 @@ the main thread is in C++, a thread that the signal wakes does the same.
 Nothing of this is set up by importing jaxbundle: only the command line calls `handle_interrupts`.
 """
 
-import atexit
 import os
 import signal
 import sys
-import threading
 import time
-from contextlib import suppress
-
-from jaxbundle.temporaries import put_off, remove_temporaries
 
 GRACE = 0.3
 """Seconds the main thread has to take notice of a signal."""
@@ -35,7 +30,8 @@ if os.name == "posix":
 _advice = ""
 _status = 1
 _heard = False
-_ending = threading.RLock()
+_ending = _temporaries = None
+"""A lock, and the module that knows what is temporary: once they are imported."""
 
 
 def handle_interrupts() -> None:
@@ -44,11 +40,21 @@ def handle_interrupts() -> None:
     At its end the process leaves without taking the interpreter apart, which takes JAX up to a
     second in which a signal would end it in other ways.
     """
-    if threading.current_thread() is not threading.main_thread():
-        return
+    global _ending, _temporaries
     for number in WORDS:
         if signal.getsignal(number) in (signal.default_int_handler, signal.SIG_DFL):
-            signal.signal(number, _handle)
+            try:
+                signal.signal(number, _handle)
+            except ValueError:  # Only the main thread may.
+                return
+    # After that and not before: these imports take as long as the start of Python.
+    import atexit
+    import threading
+
+    from jaxbundle import temporaries
+
+    _ending = threading.RLock()
+    _temporaries = temporaries
     _open_standard_streams()
     atexit.register(_leave)  # the first to be registered is the last to be called
     if os.name == "posix":
@@ -73,7 +79,9 @@ def set_status(status: int) -> None:
 def _handle(number: int, frame: object) -> None:
     global _heard
     _heard = True
-    if not put_off(lambda: _end(number)):
+    if _temporaries is None:  # Then nothing is.
+        _say_and_exit(number)
+    if not _temporaries.put_off(lambda: _end(number)):
         _end(number)
 
 
@@ -92,24 +100,41 @@ def _watch(reader: int) -> None:
 def _end(number: int) -> None:
     """Tidy up, say so, and end; a thread that comes second waits here for the end."""
     _ending.acquire()
-    if threading.current_thread() is threading.main_thread():
-        # Not "ignore": Python tells of a signal that it had taken note of, and that is now ignored.
-        for one in WORDS:
-            if signal.getsignal(one) is _handle:
-                signal.signal(one, lambda *_: None)
-    remove_temporaries(PATIENCE)
+    _become_deaf()
+    _temporaries.remove_temporaries(PATIENCE)
+    _say_and_exit(number)
+
+
+def _become_deaf() -> None:
+    """In the main thread, which runs the handlers: a second signal changes nothing.
+
+    Not "ignore": Python tells of a signal that it had taken note of, and that is now ignored.
+    """
+    try:
+        for number in WORDS:
+            if signal.getsignal(number) is _handle:
+                signal.signal(number, lambda *_: None)
+    except ValueError:
+        pass  # another thread; the main thread would come to wait in `_end`
+
+
+def _say_and_exit(number: int) -> None:
     line = f"jaxbundle: {WORDS[number]}" + (_advice and f"; {_advice}") + "\n"
-    with suppress(OSError):
+    try:
         if os.isatty(2):  # There may be a bar of progress, which hides the cursor.
             line = "\r\x1b[2K\x1b[?25h" + line
         os.write(2, line.encode())
+    except OSError:
+        pass  # Nobody listens.
     os._exit(128 + number)
 
 
 def _leave() -> None:
     for stream in (sys.stdout, sys.stderr):
-        with suppress(OSError, ValueError):
+        try:
             stream.flush()
+        except (OSError, ValueError):
+            pass  # Nobody reads.
     os._exit(_status)
 
 

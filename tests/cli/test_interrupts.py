@@ -66,6 +66,20 @@ def test_it_is_not_swallowed(code, tmp_path):
     check(run(STARTED + code + "\nprint('it goes on')", tmp_path))
 
 
+def test_it_is_handled_before_anything_else_is_imported(tmp_path):
+    code = """
+import signal, sys
+class Interrupting:
+    def find_spec(self, name, *_):
+        if name.partition(".")[2] not in ("", "__main__", "interrupts"):
+            signal.raise_signal(signal.SIGINT)
+sys.meta_path.insert(0, Interrupting())
+from jaxbundle.__main__ import main
+main()
+"""
+    check(run(code, tmp_path))
+
+
 @pytest.mark.parametrize("number, status, word", [
     (signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated"),
     (signal.SIGHUP, 129, "the terminal is gone"),
