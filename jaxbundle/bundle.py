@@ -3,8 +3,6 @@
 from collections.abc import Callable
 from types import MappingProxyType
 
-import numpy as np
-
 from jaxbundle.adjustment.problem import make_problem, with_factor
 from jaxbundle.adjustment.solve import METHODS, converged
 from jaxbundle.arguments import at_least_zero, one_of, shown, truth, whole
@@ -28,7 +26,7 @@ from jaxbundle.solution import (
     start_with,
     weakness_without_solution,
 )
-from jaxbundle.statistics import ESTIMATORS, intersect_check_points
+from jaxbundle.statistics import ESTIMATORS, doubt_of_robust, intersect_check_points
 from jaxbundle.statistics.snooping import check_test
 
 UNNAMED = ("a combination of unknowns that spreads over many of them",)
@@ -58,12 +56,14 @@ def adjust(
     - `method`: `"levenberg-marquardt"` or `"gauss-newton"`.
     - `reduction`: how the reduced system of images and cameras is solved: `"dense"`, `"banded"` or
       `"iterative"`; chosen by its size and fill if not given.
-    - `robust`: `"huber"`, `"cauchy"` or `"tukey"`: image points that fit badly count less. Their
-      last weights are those of the result, its σ by some per cent too small.
+    - `robust`: `"huber"`, `"cauchy"` or `"tukey"`: image points that fit badly count less, by the
+      a posteriori scale of their residuals (`jaxbundle.statistics.robust_scale`, a MAD). Their last
+      weights are those of the result, its σ by some per cent too small.
     - `snooping`: `"pope"` or `"baarda"`: remove blunders at the level `significance`: with
       `"pope"` the probability to lose anything of a network without blunders, with `"baarda"`
-      that of a single observation. Where blunders leave no solution to begin with, image points
-      that contradict the start values altogether are left out first (also of `robust`).
+      that of a single observation; also the probability that `robust` suspects anything. Where
+      blunders leave no solution to begin with, image points that contradict the start values
+      altogether are left out first (also of `robust`).
     - `eliminate`: fix additional parameters with t < `critical_t` at 0, the least significant
       first, adjusting again each time.
     - `estimate_components`: scale the σ of each group of observations until its variance
@@ -107,13 +107,17 @@ def adjust(
     network, used = problem.network, problem.structure.reduction
     problem = with_factor(problem)
 
-    removed, eliminated, factors, weights = [], [], {}, None
+    removed, eliminated, factors, reweighted, suspects, doubt = [], [], {}, None, [], None
     if robust:
-        problem, minimum, weights = robustly(problem, minimum, again, robust)
+        reweighted, minimum = robustly(problem, minimum, again, robust)
+        problem, suspects = reweighted.found.problem, reweighted.suspects(significance)
+        doubt = doubt_of_robust(reweighted.scale, problem.counts.redundancy)
     inspection = solved(problem, minimum)
     if inspection and (snooping or estimate_components or eliminate):
         if snooping:
-            problem, minimum, removed = snooped(problem, minimum, again, snooping, significance)
+            problem, minimum, removed, doubt = snooped(
+                inspection, minimum, again, snooping, significance
+            )
         if estimate_components:
             problem, minimum, factors = with_components(problem, minimum, again)
         if eliminate:
@@ -138,7 +142,8 @@ def adjust(
         network, problem, minimum, removed=tuple(removed), eliminated=tuple(eliminated),
         undetermined=tuple(names), check=intersected, method=method, reduction=used,
         sigma_factors=factors, inspection=inspection, robust=robust, weakness=weak,
-        findings=findings, weights=None if weights is None else np.asarray(weights)[problem.rays],
+        findings=findings, reweighted=reweighted, suspects=tuple(suspects),
+        doubts=(doubt,) if doubt else (),
     )  # fmt: skip
 
 

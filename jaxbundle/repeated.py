@@ -15,8 +15,10 @@ from jaxbundle.solution import require_solved, solved
 from jaxbundle.statistics import (
     Component,
     Inspection,
+    doubt_of_baarda,
     rescale,
     reweight,
+    robust_scale,
     snoop,
     variance_components,
 )
@@ -28,41 +30,42 @@ ROUNDS = 20
 """Variance components are estimated at most so many times."""
 
 
-def snooped(problem: Problem, minimum, again, test: str, significance: float):
-    """The problem and its minimum without blunders, and what was removed."""
-    repeat = _Repeat(again, "after data snooping")
-    problem, _, removed = snoop(
-        problem, minimum.values, repeat, test=test, significance=significance
-    )
-    return problem, repeat.minimum, removed
+def snooped(found: Inspection, minimum, again, test: str, significance: float):
+    """The problem and its minimum without blunders, what was removed, and what is to be said of σ
+    that the test trusts though the data contradict them."""
+    whole, doubt = found.problem, None
+    repeat = _Repeat(again, "after data snooping", minimum)
+    found, removed = snoop(found, repeat, test=test, significance=significance)
+    if test == "baarda" and whole.counts.redundancy > 0:
+        scale, counts = robust_scale(whole, Inspection(whole, found.adjusted).lengths), whole.counts
+        rays = sum(len(r.rows) for r in removed if r.kind == "image")
+        doubt = doubt_of_baarda(scale, rays, counts.observations // 2, counts.redundancy)
+    return found.problem, repeat.minimum, removed, doubt
 
 
 def robustly(problem: Problem, minimum, again, estimator: str):
-    """The problem with the weights of a robust estimator, its minimum, the factors of the image
-    points. The first weights come from the minimum, or from the start values if it is no solution.
-    """
-    repeat = _Repeat(again, "by robust estimation")
-    repeat.minimum = minimum
+    """The solution with the weights of a robust estimator, and its minimum. The first weights come
+    from the minimum, or from the start values if it is no solution."""
+    repeat = _Repeat(again, "by robust estimation", minimum)
     first = minimum.values if solved(problem, minimum) else problem.data.start
-    problem, _, factors, rests = reweight(problem, first, repeat, estimator)
-    if not rests:
+    reweighted = reweight(problem, first, repeat, estimator)
+    if not reweighted.rests:
         raise NotSolvedError(
             f"not solved by robust estimation: the weights of {estimator} do not come to rest; use "
             f"{'' if estimator == 'huber' else 'huber, or '}data snooping"
         )
-    return problem, repeat.minimum, factors
+    return reweighted, repeat.minimum
 
 
 class _Repeat:
     """Adjusts a changed problem, and keeps the minimum."""
 
-    def __init__(self, again, when: str):
-        self.again, self.when = again, when
+    def __init__(self, again, when: str, minimum):
+        self.again, self.when, self.minimum = again, when, minimum
 
-    def __call__(self, problem: Problem, values: Values) -> Values:
+    def __call__(self, problem: Problem, values: Values) -> Inspection:
         self.minimum = self.again(problem, values)
-        require_solved(problem, self.minimum, self.when)
-        return self.minimum.values
+        return require_solved(problem, self.minimum, self.when)
 
 
 def with_components(problem, minimum, again, tolerance: float = 1e-3):

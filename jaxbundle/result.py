@@ -39,8 +39,12 @@ from jaxbundle.statistics import (
     Reach,
     Reliability,
     Removed,
+    Reweighted,
+    Suspect,
     chi2_quantile,
     distortion_reach,
+    doubt_of_fit,
+    robust_scale,
     variance_components,
 )
 from jaxbundle.statistics.weakness import Weakness, weakness
@@ -65,6 +69,9 @@ class Adjustment:
       the `warnings`.
     - `robust`, `weights`: the estimator, and the factors of the weights it gave the image points
       in the order of the observations; None otherwise. A priori σ are then those after weighting.
+      `robust_scale`: of the residuals, a posteriori (MAD), in a priori σ; `suspects`: image points
+      whose residuals are too long for good ones.
+    - `doubts`: those of the warnings that the a priori σ, σ0 and blunders are about
     """
 
     def __init__(
@@ -82,7 +89,9 @@ class Adjustment:
         sigma_factors: Mapping[str, float] | None = None,
         inspection: Inspection | None = None,
         robust: str | None = None,
-        weights: Float[np.ndarray, " observations"] | None = None,
+        reweighted: Reweighted | None = None,
+        suspects: tuple[Suspect, ...] = (),
+        doubts: tuple[str, ...] = (),
         weakness: Weakness | None = None,
         findings: tuple[str, ...] = (),
     ):
@@ -96,7 +105,10 @@ class Adjustment:
         self.reduction = reduction or problem.structure.reduction
         self.sigma_factors = dict(sigma_factors or {})
         self.robust = robust
-        self.weights = weights
+        self.weights = None if reweighted is None else reweighted.weights[problem.rays]
+        self.robust_scale = None if reweighted is None else reweighted.scale
+        self.suspects = suspects
+        self._doubts = doubts
         self.findings = findings
         self._weakness = weakness
         self._inspection = inspection
@@ -123,12 +135,13 @@ class Adjustment:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What was left out or looked strange, in words; also what is poorly determined, and
-        distortions that turn back."""
+        """What was left out or looked strange, in words; also what is poorly determined,
+        distortions that turn back, and a σ0 far from 1."""
         found = self.distortion_reach.values() if self.converged else ()
         turns = (reach.message for reach in found if reach.message is not None)
         return (
-            *self.problem.network.warnings, *self.findings, *self.weakness.lines, *turns
+            *self.problem.network.warnings, *self.findings, *self.weakness.lines, *turns,
+            *self.doubts,
         )  # fmt: skip
 
     @functools.cached_property
@@ -138,6 +151,18 @@ class Adjustment:
         if self._weakness is not None or not self.converged:
             return self._weakness or Weakness()
         return weakness(self.inspection, self.sigma0)
+
+    @functools.cached_property
+    def doubts(self) -> tuple[str, ...]:
+        """The warnings that are about a priori σ, σ0 and blunders, with the remedy; the last one of
+        a global test that is far from passed."""
+        if not self.converged:
+            return self._doubts
+        doubt, downweighted = None, self.robust and self.sigma0 < 1
+        if not (self.sigma_factors or downweighted or report.unit_weights(self)):
+            scale = robust_scale(self.problem, self.inspection.lengths)
+            doubt = doubt_of_fit(self.sigma0, scale, self.redundancy)
+        return self._doubts if doubt is None else (*self._doubts, doubt)
 
     @functools.cached_property
     def distortion_reach(self) -> dict[str, Reach]:

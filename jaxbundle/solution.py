@@ -85,15 +85,19 @@ def _last(problem: Problem, minimum: Minimum) -> Values:
     return values if finite else problem.data.start
 
 
-def require_solved(problem: Problem, minimum: Minimum, when: str) -> None:
-    """Refuse to go on from an adjustment repeated that was not solved."""
-    if not solved(problem, minimum):
+def require_solved(problem: Problem, minimum: Minimum, when: str) -> Inspection:
+    """The solution of an adjustment repeated; one that was not solved is refused.
+
+    **Raises:** `NotSolvedError`."""
+    found = solved(problem, minimum)
+    if not found:
         names = names_of_defects(problem, minimum)
         reason = int(minimum.termination)
         why = TERMINATIONS[SINGULAR if bool(converged(reason)) else reason]
         if names:
             why = f"the network is no longer determined: {some(names, 8, str)}"
         raise NotSolvedError(f"not solved {when}: {why}", names)
+    return found
 
 
 def _collapsed(problem: Problem, values: Values) -> list[str]:

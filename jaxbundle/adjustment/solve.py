@@ -7,13 +7,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbundle.adjustment import schur
 from jaxbundle.adjustment.datum import move_to_datum
+from jaxbundle.adjustment.jacobian import jacobian
+from jaxbundle.adjustment.normal import gradient, normal_from_jacobian
 from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.residuals import residuals
 from jaxbundle.adjustment.sensitivity import Sensitivity, attach_derivatives
-from jaxbundle.adjustment.solver import BundleSolver, FullStep, Minimum, TrustRegion, minimise
+from jaxbundle.adjustment.solver import (
+    INEXACT,
+    BundleSolver,
+    FullStep,
+    Minimum,
+    TrustRegion,
+    minimise,
+)
 from jaxbundle.arguments import one_of, positive, shown, whole
 from jaxbundle.errors import InputError
-from jaxbundle.network.arrays import Data, Values
+from jaxbundle.network.arrays import Data, Values, retract_about
+from jaxbundle.network.structure import Structure
 
 METHODS = {"levenberg-marquardt": TrustRegion(), "gauss-newton": FullStep()}
 
@@ -34,6 +46,16 @@ def find_minimum(solver: BundleSolver, data: Data, start: Values | None = None) 
     minimum = minimise(solver, data, data.start if start is None else start)
     values = move_to_datum(solver.structure, minimum.values, data.start)
     return eqx.tree_at(lambda m: m.values, minimum, values)
+
+
+@eqx.filter_jit
+def take_step(structure: Structure, values: Values, data: Data) -> Values:
+    """The unknowns after one undamped Gauss–Newton step, near a solution; NaN if singular."""
+    jac = jacobian(structure, values, data)
+    g = gradient(jac, residuals(structure, values, data))
+    factor = schur.factorise(structure, normal_from_jacobian(jac), tolerance=INEXACT)
+    change = schur.solve(factor, jax.tree.map(jnp.negative, g))
+    return retract_about(structure, values, change)
 
 
 def solve(

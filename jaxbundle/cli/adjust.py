@@ -44,7 +44,10 @@ def adjust(
         str | None, typer.Option(help="remove blunders by the test of pope or baarda")
     ] = None,
     significance: Annotated[
-        float, typer.Option(help="level of data snooping: of the largest (pope), of one (baarda)")
+        float, typer.Option(
+            help="level of data snooping: of the largest (pope), of one (baarda); and of the "
+            "suspects of --robust (the largest)"
+        ),
     ] = 0.001,
     eliminate: Annotated[
         bool, typer.Option("--eliminate", help="fix insignificant additional parameters (t < 2)")
@@ -112,6 +115,8 @@ def adjust(
     write_targets(result, json, out, brief, plots, force)
     if json != "-" and not quiet and result.converged:
         print(report.text(result))
+        for doubt in result.doubts:
+            print(f"warning: {doubt}")
     if not result.converged:
         raise NotSolvedError(_why_not(result))
 

@@ -45,11 +45,16 @@ def result_dict(adjustment, brief: bool = False) -> dict:
         return head | {"undetermined": list(adjustment.undetermined)}
     head |= {"sigma0": adjustment.sigma0, "vtpv": adjustment.vtpv, "sigma": "a posteriori"}
     head |= {"sigma_factors": adjustment.sigma_factors, "robust": adjustment.robust}
+    head |= {"robust_scale": adjustment.robust_scale}
     head |= {
         "cameras": {name: _camera(table) for name, table in adjustment.cameras.items()},
         "images": _images(adjustment),
         "removed": [
             {"kind": r.kind, "name": r.name, "test": r.test} for r in adjustment.removed
+        ],
+        "suspects": [
+            {"kind": s.kind, "name": s.name, "test": s.test, "weight": s.weight}
+            for s in adjustment.suspects
         ],
         "eliminated": [
             {"camera": name.id, "parameter": name.parameter} for name in adjustment.eliminated

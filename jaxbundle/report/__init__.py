@@ -9,6 +9,7 @@ report that says why and what to do, without any number of a solution.
 """
 
 from jaxbundle.report import head, observations, unknowns
+from jaxbundle.report.head import unit_weights as unit_weights
 from jaxbundle.report.summary import html as html
 from jaxbundle.report.summary import one_line as one_line
 from jaxbundle.report.summary import short as short

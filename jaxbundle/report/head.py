@@ -253,7 +253,7 @@ def chi_squared(adjustment, level: float = 0.05) -> str:
         return f"not passed: {numbers}; the observations are better than their a priori σ"
     return (
         f"not passed: {numbers}; the a priori σ are too small, blunders are left, or the cameras "
-        "lack parameters"
+        f"lack parameters{', see Warnings' if adjustment.doubts else ''}"
     )
 
 

@@ -160,10 +160,6 @@ def components(adjustment) -> list[str]:
     return lines
 
 
-HALF = 0.5
-"""Image points with less of their weight are named."""
-
-
 def removals(adjustment) -> list[str]:
     """What data snooping took away, in that order, and the parameters fixed for lack of t."""
     lines = []
@@ -175,6 +171,11 @@ def removals(adjustment) -> list[str]:
         lines += heading("Data snooping: removed observations")
         lines += table(("", "kind", "observation", "test"), rows, "rllr")
         lines += ["", "They take no part in what is reported here."]
+        if any(item.others for item in adjustment.removed):
+            lines += paragraph(
+                "Either of: one of these rays is wrong and the point does not tell which, so that "
+                "none of them is used; a tie point left with fewer than two rays is not used."
+            )
     if adjustment.eliminated:
         names = ", ".join(clean(name) for name in adjustment.eliminated)
         lines += heading("Eliminated parameters")
@@ -183,22 +184,27 @@ def removals(adjustment) -> list[str]:
 
 
 def downweighted(adjustment, most: int) -> list[str]:
-    """The image points that robust estimation gave the least weight."""
+    """The scale of a robust estimate, and the image points it suspects."""
     if adjustment.robust is None:
         return []
-    found, total = adjustment.residuals, len(adjustment.weights)
-    order = np.argsort(adjustment.weights, kind="stable")
-    least = order[adjustment.weights[order] < HALF]
+    suspects = adjustment.suspects
     rows = [
-        (found["image"][2 * i], found["point"][2 * i], significant(adjustment.weights[i], 2))
-        for i in least[:most]
+        (str(i), item.kind, item.name, significant(item.test, 3), significant(item.weight, 2))
+        for i, item in enumerate(suspects[:most], 1)
     ]
     lines = heading(f"Robust estimation ({adjustment.robust})")
     lines += paragraph(
-        f"{len(least)} of {total} image points have less than half their weight"
-        f"{', the least of them:' if rows else '.'}"
+        f"Scale: {significant(adjustment.robust_scale, 4)} times the a priori σ, a posteriori from "
+        "the median of the residuals (MAD). "
+        f"{len(suspects)} of {count(len(adjustment.weights), 'image point')} have residuals too "
+        f"long for good ones{', in σ times the scale (test):' if rows else '.'}"
     )
-    return lines + (["", *table(("image", "point", "weight"), rows, "llr")] if rows else [])
+    if rows:
+        header = ("", "kind", "observation", "test", "weight")
+        lines += ["", *table(header, rows, "rllrr")]
+    if len(suspects) > most:
+        lines.append(f"… and {len(suspects) - most} more: all are in result.json.")
+    return lines
 
 
 # --- comparisons ----------------------------------------------------------------------------

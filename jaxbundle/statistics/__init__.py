@@ -16,11 +16,17 @@ from jaxbundle.statistics.distributions import normal_quantile as normal_quantil
 from jaxbundle.statistics.distributions import t_quantile as t_quantile
 from jaxbundle.statistics.distributions import tau_quantile as tau_quantile
 from jaxbundle.statistics.inspection import Inspection as Inspection
+from jaxbundle.statistics.misfit import doubt_of_baarda as doubt_of_baarda
+from jaxbundle.statistics.misfit import doubt_of_fit as doubt_of_fit
+from jaxbundle.statistics.misfit import doubt_of_robust as doubt_of_robust
+from jaxbundle.statistics.misfit import robust_scale as robust_scale
 from jaxbundle.statistics.reliability import Reliability as Reliability
 from jaxbundle.statistics.reliability import external_reliability as external_reliability
 from jaxbundle.statistics.reliability import minimal_detectable as minimal_detectable
 from jaxbundle.statistics.reliability import reliability as reliability
 from jaxbundle.statistics.robust import ESTIMATORS as ESTIMATORS
+from jaxbundle.statistics.robust import Reweighted as Reweighted
+from jaxbundle.statistics.robust import Suspect as Suspect
 from jaxbundle.statistics.robust import reweight as reweight
 from jaxbundle.statistics.snooping import Removed as Removed
 from jaxbundle.statistics.snooping import snoop as snoop

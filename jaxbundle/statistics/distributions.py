@@ -45,5 +45,14 @@ def critical_w(
     """
     if test == "baarda":
         return normal_quantile(1 - significance / 2)
-    of_one = -math.expm1(math.log1p(-significance) / max(observations, 1))
-    return sigma0 * tau_quantile(1 - of_one / 2, redundancy)
+    return sigma0 * tau_quantile(1 - _of_one(significance, observations) / 2, redundancy)
+
+
+def critical_length(significance: float, residuals: int) -> float:
+    """The greatest length of the longest of n residuals in the plane, in σ: t² ~ χ²₂."""
+    return math.sqrt(-2 * math.log(_of_one(significance, residuals)))
+
+
+def _of_one(significance: float, observations: int) -> float:
+    """The level of each of n tests of which all together have the given one."""
+    return -math.expm1(math.log1p(-significance) / max(observations, 1))

@@ -25,11 +25,12 @@ DETERMINED = 1e-13
 class Inspection:
     """What statistics need of a problem at its adjusted `values`.
 
-    `factor` and the internal blocks of `cofactors` are those of the filled arrays.
+    `factor` and the internal blocks of `cofactors` are those of the filled arrays, as `structure`,
+    `data` and `values` are; `adjusted` are the values as given.
     """
 
     def __init__(self, problem: Problem, values: Values):
-        self.problem = problem
+        self.problem, self.adjusted = problem, values
         self.structure, self.data, self.sizes = filled(problem.structure, problem.data)
         self.values = pad_values(values, self.sizes)
 
@@ -37,6 +38,11 @@ class Inspection:
     def residuals(self) -> Residuals:
         """All residuals divided by their σ, in the order of the problem's arrays."""
         return self._rows(compiled_residuals(self.structure, self.values, self.data))
+
+    @property
+    def lengths(self) -> Float[np.ndarray, " rays"]:
+        """|v/σ| of every image point."""
+        return np.hypot(*np.asarray(self.residuals.image).T)
 
     @functools.cached_property
     def vtpv(self) -> float:

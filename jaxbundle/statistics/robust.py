@@ -8,8 +8,8 @@ gives it the weight
     Tukey    w = (1 − (t/k)²)², t < k      k = 5.1230      Beaton and Tukey (1974)
 
 and the network is adjusted again with p = w/σ² until the weights rest (Krarup, Juhl and Kubik,
-1980). s = median(t)/√(2·ln 2)·√(n/r): the median length of normal residuals is 1.1774 σ, smaller
-by the redundancy r of n coordinates.
+1980). The scale s is a posteriori, from the median of the residuals (`misfit.py`), so the σ given
+matter only in proportion to each other.
 
 With ψ(t) = w·t the efficiency for normal errors in the plane is E[ψ' + ψ/t]²/(2·E[ψ²]), t² ~ χ²₂
 (Maronna, 1976): 0.95 for Cauchy's and Tukey's k. Huber's k leaves 99 of 100 good points alone, so
@@ -18,8 +18,6 @@ the other two, which discard what is far off; they keep its scale.
 """
 
 import dataclasses
-import math
-from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -28,13 +26,18 @@ from jaxtyping import Float
 
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.network.arrays import Values
+from jaxbundle.statistics.distributions import critical_length
 from jaxbundle.statistics.inspection import Inspection
+from jaxbundle.statistics.misfit import robust_scale
+from jaxbundle.statistics.readjusting import Adjust, readjust
+from jaxbundle.statistics.snooping import name_of
 
 ESTIMATORS = ("huber", "cauchy", "tukey")
 LEAST_WEIGHT = 1e-6
 """Weights of image points do not fall lower, so that the network stays determined."""
-RESTING = 1e-4
-"""Weights whose changes have a smaller root mean square are at rest."""
+RESTING, NEARLY_RESTING = 1e-4, 1e-3
+"""Weights whose changes have a smaller root mean square are at rest; those that only give the
+start of another estimator need not be so near."""
 ROUNDS = 100
 
 
@@ -56,45 +59,72 @@ def tukey(t: Float[np.ndarray, " n"], k: float = 5.1230) -> Float[np.ndarray, " 
 _WEIGHT = {"huber": huber, "cauchy": cauchy, "tukey": tukey}
 
 
+@dataclasses.dataclass(frozen=True)
+class Suspect:
+    """An observation whose residual is too long for a good one: its kind, row in the arrays, a name
+    for people, the length of its residual t in units of σ and scale, the factor of its weight."""
+
+    kind: str
+    row: int
+    name: str
+    test: float
+    weight: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Reweighted:
+    """The solution with the last weights; their factors w in the order of the arrays; the scale a
+    posteriori; whether the weights came to rest; `lengths` t in units of σ and scale."""
+
+    found: Inspection
+    weights: Float[np.ndarray, " rays"]
+    scale: float
+    rests: bool
+    lengths: Float[np.ndarray, " rays"]
+
+    def suspects(self, significance: float = 0.001) -> list[Suspect]:
+        """Image points with longer residuals than the longest of good ones, the worst first; with
+        the probability `significance` there is any in a network without blunders."""
+        problem = self.found.problem
+        used = (np.asarray(problem.data.image_weight) > 0).any(1)
+        critical = critical_length(significance, int(used.sum()))
+        rows = np.flatnonzero(used & (self.lengths > critical))
+        rows = rows[np.argsort(-self.lengths[rows], kind="stable")]
+        return [
+            Suspect("image", row, name_of(problem, "image", row), float(self.lengths[row]),
+                    float(self.weights[row]))
+            for row in rows.tolist()
+        ]  # fmt: skip
+
+
 def reweight(
     problem: Problem,
     values: Values,
-    adjust_from: Callable[[Problem, Values], Values],
+    adjust_from: Adjust,
     estimator: str,
-) -> tuple[Problem, Values, Float[np.ndarray, " rays"], bool]:
+) -> Reweighted:
     """Adjust with weights of an estimator until they rest.
 
-    **Arguments:** `adjust_from(problem, start)`: adjusted values; `estimator`: one of `ESTIMATORS`.
-
-    **Returns:** the problem with the last weights, its solution, the factor w of every image point,
-    and whether the weights came to rest.
+    **Arguments:** `adjust_from(problem, start)`: the solution of a changed problem; `estimator`:
+    one of `ESTIMATORS`.
     """
-    given = np.asarray(problem.data.image_weight)
-    weighted, w, scale = problem, np.ones(len(given)), None
+    given, scale, rests = np.asarray(problem.data.image_weight), 1.0, False
+    weighted, w, t = problem, np.ones(len(given)), Inspection(problem, values).lengths
+    move = lambda problem, values, adjust_from: adjust_from(problem, values)
     for name in dict.fromkeys(("huber", estimator)):
+        resting = RESTING if name == estimator else NEARLY_RESTING
         for _ in range(ROUNDS):
-            t = _lengths(problem, values)
-            fixed = scale if name != "huber" else _scale(problem, weighted, t)
-            now = np.maximum(_WEIGHT[name](t / fixed), LEAST_WEIGHT)
-            rests = np.sqrt(np.mean((now - w) ** 2)) < RESTING
-            w, scale = now, fixed
+            scale = robust_scale(problem, t) if name == "huber" else scale
+            before, w = w, np.maximum(_WEIGHT[name](t / scale), LEAST_WEIGHT)
+            rests = bool(np.sqrt(np.mean((w - before) ** 2)) < resting)
             if rests:
                 break
             weight = jnp.asarray(given * np.sqrt(w)[:, None])
             data = eqx.tree_at(lambda d: d.image_weight, problem.data, weight)
             weighted = dataclasses.replace(problem, data=data)
-            values = adjust_from(weighted, values)
-    return weighted, values, w, bool(rests)
+            # The first start values may be far from a solution.
+            values = move(weighted, values, adjust_from).adjusted
+            move, t = readjust, Inspection(problem, values).lengths
+    found = adjust_from(weighted, values)
+    return Reweighted(found, w, scale, rests, t / scale)
 
-
-def _lengths(problem: Problem, values: Values) -> Float[np.ndarray, " rays"]:
-    """|v/σ| of every image point with its given σ."""
-    return np.hypot(*np.asarray(Inspection(problem, values).residuals.image).T)
-
-
-def _scale(problem: Problem, weighted: Problem, t: Float[np.ndarray, " rays"]) -> float:
-    used = (np.asarray(problem.data.image_weight) > 0).any(1)
-    counts = weighted.counts
-    share = counts.redundancy / max(counts.redundancy + counts.unknowns - counts.datum, 1)
-    scale = np.median(t[used]) / math.sqrt(2 * math.log(2)) / math.sqrt(max(share, 1e-3))
-    return max(float(scale), np.finfo(float).tiny)

@@ -3,27 +3,34 @@
     |w|  > z(1 − α/2)                        Baarda (1968): each observation by itself
     |τ|  > τ(1 − α'/2, redundancy)           Pope (1976): the largest of n, α' = 1 − (1 − α)^(1/n)
 
-One blunder spoils the residuals of its neighbours. So of every image and of every point only the
-worst ray goes at a time, and only rays at least half as bad as the worst of all; a control
-coordinate or a distance goes alone. An image point goes with both of its coordinates; a tie point
-that is left with one ray goes too. In the end whatever was removed is held against the adjustment
-it took no part in, by its predicted residual v and the variance σ²·(1 + h) of that: what passes
-comes back. Removed observations keep their rows with weight zero, so nothing is compiled again.
+One blunder spoils the residuals of its neighbours. So only what cannot mask each other goes at a
+time (`separation.py`): of every point only the worst ray, of an image only rays that stay
+significant whatever the worse ones there put into their tests, and only rays at least half as bad
+as the worst of all; a control coordinate or a distance goes alone. An image point goes with both of
+its coordinates; a tie point that is left with one ray goes too. Where rays of a point cannot be
+told apart, as the two of a point that has no more, nothing says which is wrong: when nothing else
+is left, all of them go and stand in the list as one ("either of").
+
+In the end whatever was removed is held against the adjustment it took no part in, by its predicted
+residual v and the variance σ²·(1 + h) of that: what passes comes back. Removed observations keep
+their rows with weight zero, so nothing is compiled again.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbundle.adjustment.jacobian import compiled_jacobian
 from jaxbundle.adjustment.problem import Problem, count_rows
 from jaxbundle.arguments import number
 from jaxbundle.errors import InputError
-from jaxbundle.network.arrays import Values
-from jaxbundle.statistics.distributions import critical_w
+from jaxbundle.statistics.distributions import critical_w, normal_quantile
 from jaxbundle.statistics.inspection import Inspection
+from jaxbundle.statistics.readjusting import Adjust, readjust
+from jaxbundle.statistics.separation import choose_together, find_alternatives
 
 TOGETHER = 0.5
 """Rays are removed together with the worst one if their test is at least this part of its."""
@@ -31,12 +38,21 @@ TOGETHER = 0.5
 
 @dataclasses.dataclass(frozen=True)
 class Removed:
-    """A removed observation: its kind, row in the arrays, a name for people, its test value."""
+    """A removed observation: its kind, row in the arrays, a name for people, its test value.
+
+    `others`: rows of observations that may be the wrong ones instead, removed with it.
+    """
 
     kind: str
     row: int
     name: str
     test: float
+    others: tuple[int, ...] = ()
+
+    @property
+    def rows(self) -> tuple[int, ...]:
+        """All rows that were removed."""
+        return (self.row, *self.others)
 
 
 TESTS = ("pope", "baarda")
@@ -54,90 +70,138 @@ def check_test(test: str | None, significance: float, option: str = "") -> None:
 
 
 def snoop(
-    problem: Problem,
-    values: Values,
-    adjust_from: Callable[[Problem, Values], Values],
+    found: Inspection,
+    adjust_from: Adjust,
     *,
     test: str = "pope",
     significance: float = 0.001,
     limit: int | None = None,
-) -> tuple[Problem, Values, list[Removed]]:
+) -> tuple[Inspection, list[Removed]]:
     """Remove blunders, the worst first.
 
     **Arguments:**
 
-    - `adjust_from(problem, start)`: adjusted values.
+    - `found`: the solution with all observations.
+    - `adjust_from(problem, start)`: the solution of a changed problem.
     - `test`: `"pope"` (σ a posteriori, the largest of all) or `"baarda"` (σ a priori, each).
     - `significance`: α, two-sided: with `"pope"` the probability to lose anything of a network
-      without blunders, with `"baarda"` that of one observation.
+      without blunders, with `"baarda"` that of one observation. Rays of a point that cannot be told
+      apart at this level are removed together.
     - `limit`: at most so many removals.
 
-    **Returns:** the problem without the removed observations, its solution, and what was removed
-    in the order of removal.
+    **Returns:** the solution without the removed observations, and what was removed in the order
+    of removal.
 
     **Raises:** `InputError` for another test, or a level that is no probability.
     """
     check_test(test, significance)
-    whole, removed, returned = problem, [], set()
-    while True:
-        values = adjust_from(problem, values)
-        if problem.counts.redundancy < 2:
-            return problem, values, removed
-        found = Inspection(problem, values)
-        counts = problem.counts
-        tested = counts.observations + counts.control + counts.distances
-        sigma0 = float(np.sqrt(found.vtpv / counts.redundancy))
-        critical = critical_w(test, significance, tested, counts.redundancy, sigma0)
-        room = len(removed) if limit is None else limit - len(removed)
-        worst = _worst(problem, found, critical, sigma0)[: None if limit is None else max(room, 0)]
+    whole, removed, returned = found.problem, [], set()
+    while found.problem.counts.redundancy >= 2:
+        unit = _unit(found, test)
+        critical = _critical(found, test, significance) / unit
+        worst = _worst(found, unit, critical, normal_quantile(1 - significance / 2))
+        if worst and limit is not None:
+            worst = worst[: max(limit - len(removed), 0)]
         if worst:
             removed += worst
-            problem = without(problem, *worst)
-            continue
-        back = [r for r in _passing(whole, found, removed, critical) if r.row not in returned]
-        if not back:
-            return problem, values, removed
-        returned |= {r.row for r in back}
-        removed = [r for r in removed if r not in back]
-        problem = without(whole, *removed)
+        else:
+            passing = _passing(whole, found, removed, critical * unit) - returned
+            kept = list(_without_passing(whole, removed, passing))
+            if kept == removed:
+                break
+            returned |= passing
+            removed = kept
+        found = readjust(without(whole, *removed), found.adjusted, adjust_from)
+    return adjust_from(found.problem, found.adjusted) if removed else found, removed
 
 
-def _worst(
-    problem: Problem, found: Inspection, critical: float, sigma0: float
-) -> list[Removed]:
-    """What has to go now, the worst first."""
-    w = found.reliability.w
-    image = _finite(w.image).max(1, initial=0.0)
-    most = {
-        "image": image,
-        "control": _finite(w.control).ravel(),
-        "distance": _finite(w.distance),
-    }
-    kind = max(most, key=lambda kind: most[kind].max(initial=0.0))
-    largest = most[kind].max(initial=0.0)
-    if not largest > critical:
+def _unit(found: Inspection, test: str) -> float:
+    """What tests are divided by: σ0 a posteriori for Pope's."""
+    sigma0 = float(np.sqrt(found.vtpv / found.problem.counts.redundancy))
+    return sigma0 if test == "pope" and sigma0 > 0 else 1.0
+
+
+def _critical(found: Inspection, test: str, significance: float) -> float:
+    """The greatest |w| that is no blunder."""
+    counts = found.problem.counts
+    tested = counts.observations + counts.control + counts.distances
+    sigma0 = float(np.sqrt(found.vtpv / counts.redundancy))
+    return critical_w(test, significance, tested, counts.redundancy, sigma0)
+
+
+def _worst(found: Inspection, unit: float, critical: float, apart: float) -> list[Removed]:
+    """What has to go now, the worst first; tests in `unit`.
+
+    Rays of a point are told apart if the test of the suspect exceeds `apart` without the other."""
+    problem, w = found.problem, found.reliability.w
+    image = _finite(w.image).max(1, initial=0.0) / unit
+    alone = {"control": _finite(w.control).ravel(), "distance": _finite(w.distance)}
+    kind = max(alone, key=lambda kind: alone[kind].max(initial=0.0))
+    other, largest = alone[kind].max(initial=0.0) / unit, image.max(initial=0.0)
+    if other > max(critical, largest):
+        row = int(alone[kind].argmax())
+        return [Removed(kind, row, name_of(problem, kind, row), float(other))]
+    candidates = np.flatnonzero(image > max(critical, other, TOGETHER * largest))
+    if not len(candidates):
         return []
-    rows = [int(most[kind].argmax())]
-    if kind == "image":
-        s = problem.structure
-        candidates = np.flatnonzero(image > max(critical, TOGETHER * largest))
-        candidates = candidates[np.argsort(-image[candidates], kind="stable")]
-        by_image = np.unique(np.asarray(s.image)[candidates], return_index=True)[1]
-        by_point = np.unique(np.asarray(s.point)[candidates], return_index=True)[1]
-        rows = candidates[np.intersect1d(by_image, by_point)].tolist()
-    scale = sigma0 if sigma0 > 0 else 1.0
+    rays = _Rays(found, unit)
+    chosen = candidates[choose_together(
+        image[candidates], rays.point[candidates], rays.image[candidates],
+        rays.leverage(candidates), critical,
+    )]  # fmt: skip
+    others = {row: rays.alternatives(row, critical, apart) for row in chosen.tolist()}
+    certain = [row for row in others if not others[row]]
     return [
-        Removed(kind, row, _name(problem, kind, row), float(most[kind][row] / scale))
-        for row in rows
-    ]
+        Removed("image", row, name_of(problem, "image", row, *others[row]), float(image[row]),
+                others[row])
+        for row in certain or others
+    ]  # fmt: skip
+
+
+class _Rays:
+    """Image points as the rules of `separation.py` see them: rows of their point, in a block of
+    their image."""
+
+    def __init__(self, found: Inspection, unit: float):
+        s, data = found.problem.structure, found.problem.data
+        self.found, self.unit = found, unit
+        self.image, self.point = np.asarray(s.image), np.asarray(s.point)
+        jacobian = compiled_jacobian(found.structure, found.values, found.data)
+        self.by_point = np.asarray(jacobian.point)[: len(self.point)]
+        used = np.flatnonzero((np.asarray(data.image_weight) > 0).any(1))
+        self.order = used[np.argsort(self.point[used], kind="stable")]
+        self.control = dict(zip(np.asarray(s.control).tolist(), np.asarray(data.control_weight)))
+
+    def leverage(self, rows: np.ndarray) -> np.ndarray:
+        """h̃/r, the larger one of both coordinates: h less what the own point has in it."""
+        r = np.asarray(self.found.reliability.redundancy.image)[rows]
+        inverse = np.asarray(self.found.factor.point)[self.point[rows]]
+        eliminated = np.asarray(self.found.structure.eliminated)[self.point[rows]]
+        own = np.einsum("nij,naj->nai", inverse, self.by_point[rows] * eliminated[:, None])
+        h = np.clip(1 - r - (own**2).sum(2), 0.0, None)
+        return (h / np.maximum(r, np.finfo(float).tiny)).max(1, initial=0.0)
+
+    def alternatives(self, row: int, critical: float, apart: float) -> tuple[int, ...]:
+        """Rays of the same point that may be wrong instead."""
+        p = self.point[row]
+        ends = np.searchsorted(self.point[self.order], [p, p + 1])
+        rays = self.order[slice(*ends)]
+        v = np.asarray(self.found.reliability.residual.image)[rays].ravel() / self.unit
+        design = self.by_point[rays].reshape(-1, 3)
+        if p in self.control:
+            design = np.concatenate([design, np.diag(self.control[p])])
+        where = [np.array([2 * i, 2 * i + 1]) for i in range(len(rays))]
+        suspect = int(np.flatnonzero(rays == row)[0])
+        found = find_alternatives(design, v, where, suspect, critical, apart)
+        return tuple(rays[found].tolist())
 
 
 def _passing(
     whole: Problem, found: Inspection, removed: Sequence[Removed], critical: float
-) -> list[Removed]:
-    """Removed observations that agree with the adjustment without them."""
+) -> set[tuple[str, int]]:
+    """Kinds and rows of removed observations that agree with the adjustment without them."""
     if not removed:
-        return []
+        return set()
     tests = found.predicted_tests(whole.data)
     free = np.asarray(found.problem.structure.point_free).any(1)
     set_aside = np.asarray(whole.structure.point_free).any(1) & ~free
@@ -148,7 +212,20 @@ def _passing(
         "control": _finite(tests.control).ravel(),
         "distance": _finite(tests.distance),
     }
-    return [r for r in removed if value[r.kind][r.row] < critical]
+    return {(r.kind, row) for r in removed for row in r.rows if value[r.kind][row] < critical}
+
+
+def _without_passing(
+    whole: Problem, removed: Sequence[Removed], passing: set[tuple[str, int]]
+) -> Iterable[Removed]:
+    """What stays removed. Where all that may be wrong pass one by one, they still contradict each
+    other, and all of them stay away."""
+    for r in removed:
+        stay = tuple(row for row in r.rows if (r.kind, row) not in passing)
+        if stay == r.rows or (not stay and r.others):
+            yield r
+        elif stay:
+            yield Removed(r.kind, stay[0], name_of(whole, r.kind, *stay), r.test, stay[1:])
 
 
 def _finite(tests) -> np.ndarray:
@@ -157,7 +234,11 @@ def _finite(tests) -> np.ndarray:
     return np.where(np.isfinite(tests), tests, 0.0)
 
 
-def _name(problem: Problem, kind: str, row: int) -> str:
+def name_of(problem: Problem, kind: str, row: int, *others: int) -> str:
+    """An observation in words, or several of which either may be wrong."""
+    if others:
+        names = [name_of(problem, kind, one) for one in (row, *others)]
+        return f"either of {', '.join(names[:-1])} or {names[-1]}"
     s, network = problem.structure, problem.network
     if kind == "image":
         image, point = int(s.image[row]), int(s.point[row])
@@ -173,7 +254,7 @@ def without(problem: Problem, *removed: Removed) -> Problem:
     """The problem with the weights of some observations set to zero, and lone tie points set
     aside."""
     s, data = problem.structure, problem.data
-    rows = {kind: [r.row for r in removed if r.kind == kind]
+    rows = {kind: [row for r in removed if r.kind == kind for row in r.rows]
             for kind in ("image", "control", "distance")}  # fmt: skip
     image, control = np.array(data.image_weight), np.array(data.control_weight)
     distance = np.array(data.distance_weight)

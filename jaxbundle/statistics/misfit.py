@@ -1,0 +1,99 @@
+"""What σ0 and the median residual say against the a priori σ.
+
+    s = median(t)/√(2·ln 2)·√(n/r)
+
+is the scale of the image points by the median of the lengths t of their residuals in σ, a median
+absolute deviation (MAD) in the plane: the median length of normal residuals is 1.1774 σ, smaller by
+the redundancy r of n observations. A few blunders do not move it, σ that are too small do; σ0 is
+moved by both, which tells them apart.
+"""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.adjustment.problem import Problem
+from jaxbundle.statistics.distributions import chi2_quantile
+
+CONTRADICTED = 1.2
+"""A scale beyond this factor contradicts the a priori σ, if it is beyond chance too."""
+BEYOND_CHANCE = 0.001
+UNRECOGNISABLE = 20.0
+"""Residuals so many times their σ are most likely of coordinates in other axes or units."""
+
+
+def robust_scale(problem: Problem, lengths: Float[np.ndarray, " rays"]) -> float:
+    """s of the residual lengths |v/σ| of image points, in the order of the arrays; never 0."""
+    used = (np.asarray(problem.data.image_weight) > 0).any(1)
+    counts = problem.counts
+    share = counts.redundancy / max(counts.redundancy + counts.unknowns - counts.datum, 1)
+    scale = np.median(lengths[used]) / math.sqrt(2 * math.log(2)) / math.sqrt(max(share, 1e-3))
+    return max(float(scale), np.finfo(float).tiny)
+
+
+def contradicts(scale: float, redundancy: int) -> bool:
+    """Whether a scale of 1 is out of the question."""
+    low, high = (
+        math.sqrt(chi2_quantile(p, redundancy) / redundancy)
+        for p in (BEYOND_CHANCE / 2, 1 - BEYOND_CHANCE / 2)
+    )
+    return not (min(1 / CONTRADICTED, low) <= scale <= max(CONTRADICTED, high))
+
+
+def doubt_of_baarda(scale: float, removed: int, rays: int, redundancy: int) -> str | None:
+    """What Baarda's test has done with σ that the data contradict, and the remedy.
+
+    **Arguments:** `scale` of all image points, the removed ones too; how many of so many were
+    removed.
+    """
+    if not contradicts(scale, redundancy):
+        return None
+    done = "removed good observations with the blunders" if scale > 1 else "passed blunders"
+    return (
+        f"Baarda's test trusts the a priori σ, but most residuals are {scale:.3g} times as large "
+        f"as they say: it has {done} ({removed} of {rays} image points removed, "
+        f"{100 * removed / rays:.2g} %). {_remedy(scale)}, or test with the a posteriori σ "
+        "(--snooping pope)"
+    )
+
+
+def doubt_of_robust(scale: float, redundancy: int) -> str | None:
+    """That the scale of a robust estimate is not that of the σ given, and the remedy."""
+    if not contradicts(scale, redundancy):
+        return None
+    return (
+        f"the scale of the robust estimation, from the median of the residuals (MAD), is "
+        f"{scale:.3g} times that of the a priori σ, which the data contradict; the weights do not "
+        f"depend on them. {_remedy(scale)}"
+    )
+
+
+def doubt_of_fit(sigma0: float, scale: float, redundancy: int) -> str | None:
+    """That the global test is far from passed, with the ratio, and the likely causes first.
+
+    **Arguments:** `sigma0` of all observations; `scale` of the image points by their median.
+    """
+    if not (redundancy > 0 and contradicts(sigma0, redundancy)):
+        return None
+    told = f"χ² test far from passed: vᵀPv/redundancy is {sigma0**2:.3g} (σ0 {sigma0:.3g}), not 1"
+    if sigma0 < 1:
+        return f"{told}; likely cause: a priori σ that are too large. {_remedy(sigma0)}"
+    sigma, blunders = "a priori σ that are too small", "blunders (--snooping pope)"
+    missing = "a camera parameter that is missing or held"
+    mirrored = "image coordinates with a mirrored axis or in another unit"
+    if scale < CONTRADICTED or scale < sigma0 / 2:
+        causes = [blunders, missing, sigma]
+    elif scale > UNRECOGNISABLE:
+        causes = [mirrored, missing, sigma, blunders]
+    else:
+        sigma += f" (multiply them by {scale:.3g}, or --components)"
+        causes = [sigma, blunders, missing, mirrored]
+    return f"{told}; likely causes, the likeliest first: {', '.join(causes)}"
+
+
+def _remedy(scale: float) -> str:
+    return (
+        f"Multiply the a priori σ (sigma_image, or those of the observations) by {scale:.3g}, or "
+        "estimate them (--components)"
+    )

@@ -1,0 +1,91 @@
+"""Which suspicious observations can be removed together, and which cannot be told apart.
+
+A blunder ∇_b (in σ) of observation b moves the test of observation a by
+
+    Δw_a = −h_ab·∇_b/√r_a,    ∇_b ≈ w_b/√r_b                       Baarda (1968); Förstner (1985)
+
+If a and b share no eliminated unknown, h_ab = ã·S⁻¹·b̃ᵀ with the rows reduced by elimination. So
+h_ab² ≤ h̃_a·h̃_b (Cauchy and Schwarz), where h̃ is h less the part of the eliminated unknown of the
+observation. With the leverage l = h̃/r
+
+    |Δw_a| ≤ √(l_a·l_b)·|w_b|
+
+and a can go together with worse ones b when its test exceeds the critical value even without all
+they could have put into it. Of one eliminated unknown only one observation goes at a time. Between
+them there is a test of its own: T_A = v_Aᵀ·(R_AA)⁺·v_A is by how much vᵀv decreases without the
+observations A. If T_b is significant as T_a is, but T_ab − T_b is not, b explains all that a does:
+one of them is wrong, and nothing says which (separability: Förstner, 1983).
+
+Nothing here knows what an observation is: rows, groups, numbers.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+
+UNSEEN = 1e-2
+"""Directions with a smaller redundancy number say nothing of the observations in them."""
+
+
+def choose_together(
+    tests: Float[np.ndarray, " n"],
+    own: Int[np.ndarray, " n"],
+    shared: Int[np.ndarray, " n"],
+    leverage: Float[np.ndarray, " n"],
+    critical: float,
+) -> list[int]:
+    """Positions of observations that cannot mask each other, the worst first.
+
+    **Arguments:**
+
+    - `tests`: |w| > `critical` of the candidates.
+    - `own`: the eliminated unknown of each: at most one observation of it is chosen.
+    - `shared`: its block of unknowns that are not eliminated: observations of the same block are
+      taken as correlated as `leverage` (h̃/r) allows.
+    """
+    chosen: list[int] = []
+    taken: set[int] = set()
+    influence: dict[int, float] = {}
+    root = np.sqrt(leverage)
+    for a in np.argsort(-tests, kind="stable").tolist():
+        block, before = int(shared[a]), influence.get(int(shared[a]), 0.0)
+        if int(own[a]) in taken or not tests[a] - root[a] * before > critical:
+            continue
+        chosen.append(a)
+        taken.add(int(own[a]))
+        influence[block] = before + root[a] * tests[a]
+    return chosen
+
+
+def find_alternatives(
+    design: Float[np.ndarray, "rows u"],
+    residual: Float[np.ndarray, " rows"],
+    observations: Sequence[Int[np.ndarray, " k"]],
+    suspect: int,
+    critical: float,
+    apart: float,
+) -> list[int]:
+    """Observations that explain what the suspect one does, so that either may be wrong.
+
+    **Arguments:**
+
+    - `design`, `residual`: the rows of one eliminated unknown, divided by their σ.
+    - `observations`: the rows of each observation; `suspect` one of them.
+    - `critical`: others whose test is below this are above suspicion.
+    - `apart`: the suspect is wrong for certain if its test exceeds this without the other one.
+    """
+    R = np.eye(len(design)) - design @ np.linalg.pinv(design)
+
+    def explained(*which: int) -> float:
+        rows = np.concatenate([observations[i] for i in which])
+        size, axes = np.linalg.eigh(R[np.ix_(rows, rows)])
+        seen = size > UNSEEN
+        along = axes[:, seen].T @ residual[rows]
+        return float(along**2 @ (1 / size[seen]))
+
+    return [
+        other for other in range(len(observations))
+        if other != suspect and explained(other) > critical**2
+        and explained(suspect, other) - explained(other) < apart**2
+    ]  # fmt: skip
