@@ -185,7 +185,7 @@ def test_either_of_two_rays(network):
     pair = np.flatnonzero(~keep)[[0, 3]]
     keep[pair] = True
     xy = rays.xy.copy()
-    xy[pair[0]] += [30 * SIGMA, 25 * SIGMA]
+    xy[pair[0], 1] += 30 * SIGMA
     spoilt = network.replace(observations=dataclasses.replace(rays, xy=xy).take(keep))
     found = adjust(spoilt, snooping="pope")
     (removed,) = found.removed
@@ -273,9 +273,9 @@ def test_what_cannot_be_asked_for(network):
     ({"snooping": "x"}, "snooping 'x': pope or baarda"),
     ({"snooping": "pope", "significance": 2.0}, "significance 2: a number between 0 and 1"),
 ])  # fmt: skip
-def test_a_test_that_is_none_is_refused_at_once(options, said):
-    """Before the network is looked at."""
+def test_a_test_that_is_none_is_refused_at_once(network, options, said):
+    """Before anything is computed."""
     with pytest.raises(InputError, match=said):
-        jaxbundle.adjust(None, **options)
+        adjust(network, **options)
     with pytest.raises(InputError, match=said):
         jaxbundle.calibrate(["nowhere.jpg"], jaxbundle.Board(9, 6, 0.03), **options)

@@ -201,8 +201,9 @@ def test_a_level_of_significance_is_between_0_and_1():
     assert done.returncode == 2 and "--significance must be a number between 0 and 1" in done.stderr
 
 
-def test_a_global_test_far_from_passed_is_the_last_line():
-    done = run("adjust", EXAMPLE / "project.toml", "--set", "project.sigma_image=0.0001")
+def test_a_global_test_far_from_passed_is_the_last_line(project):
+    edit(project / "project.toml", "sigma_image = 1.0", "sigma_image = 0.0001")
+    done = run("adjust", project / "project.toml")
     assert done.returncode == 0 and "Warnings" in done.stdout
     last = done.stdout.splitlines()[-1]
     assert last.startswith("warning: χ² test far from passed: vᵀPv/redundancy is 39.9 (σ0 6.31)")
