@@ -7,6 +7,7 @@ import pytest
 
 LAYERS = (
     "errors",
+    "file_content",
     "arguments",
     "temporaries",
     "interrupts",

@@ -1,12 +1,12 @@
 """Cameras with the covariance of their parameters, from the JSON of `adjust` and `calibrate`."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.errors import InputError
+from jaxbundle.file_content import parse_json
 from jaxbundle.io.csv_tables import read_text
 from jaxbundle.io.opencv_file import is_opencv
 from jaxbundle.network.build import make_cameras
@@ -27,7 +27,7 @@ def read_calibrated(path: str | Path) -> list[Calibrated]:
     **Raises:** `InputError` where it is not solved, or entries are missing or wrong.
     """
     try:
-        document = json.loads(read_text(Path(path)))
+        document = parse_json(path, read_text(Path(path)))
         if document["converged"] is not True:
             raise InputError(f"{path}: was not solved; there is no camera in it")
         parts = document.get("calibrations", {"": document})
@@ -37,7 +37,7 @@ def read_calibrated(path: str | Path) -> list[Calibrated]:
         ]
     except InputError:
         raise
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise InputError(f"{path}: not a result in JSON: {str(error)[:100]}") from None
     except (KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: not the result of adjust or calibrate: {error!r:.100}") from None

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxbundle.errors import InputError
+from jaxbundle.file_content import read_content
 from jaxbundle.io.colmap_model import ColmapImage, ColmapModel, check_unique, tracks
 from jaxbundle.io.colmap_models import MODELS, NAMES, from_colmap, parameter_names, to_colmap
 from jaxbundle.io.colmap_text import GREY
@@ -30,10 +31,7 @@ class _Bytes:
 
     def __init__(self, path: Path):
         self.path = path
-        try:
-            self.data = path.read_bytes()
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+        self.data = read_content(path, text=False)
         self.position = 0
         self.what = "the head"
 

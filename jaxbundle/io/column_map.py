@@ -48,6 +48,7 @@ import numpy as np
 
 from jaxbundle import geometry
 from jaxbundle.errors import InputError
+from jaxbundle.file_content import read_content
 from jaxbundle.io.csv_tables import read_toml
 from jaxbundle.io.poses import angles_of, batched
 from jaxbundle.io.rows import Rows
@@ -75,7 +76,7 @@ def is_column_map(path: Path) -> bool:
     """Whether a TOML file has a section [table.…]."""
     if path.suffix.lower() != ".toml" or not path.is_file():
         return False
-    return re.search(rb"^\s*\[\s*table\s*\.", path.read_bytes(), re.M) is not None
+    return re.search(rb"^\s*\[\s*table\s*\.", read_content(path), re.M) is not None
 
 
 def read_column_map(path: str | Path, overrides: Sequence[str] = ()) -> Network:

@@ -4,7 +4,6 @@ import csv
 import io
 import itertools
 import re
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,12 +11,11 @@ from typing import Any
 import numpy as np
 
 from jaxbundle.errors import InputError
+from jaxbundle.file_content import DESCRIPTORS, parse_toml, read_content
 from jaxbundle.io.replacing import replaced_file, unwritable
 from jaxbundle.network.columns import Columns
 from jaxbundle.network.tables import Source
 
-DESCRIPTORS = (Path("/dev"), Path("/dev/fd"), Path("/proc/self/fd"))
-"""Where open files of the process have names."""
 PORTION = 10_000
 """Rows that are turned into text at a time."""
 
@@ -25,14 +23,12 @@ PORTION = 10_000
 def read_text(path: Path, fallback: str = "") -> str:
     """The text of a file; `fallback` is the encoding of what is not UTF-8.
 
-    **Raises:** `InputError` if there is none, it cannot be read, or it is not UTF-8.
+    **Raises:** `InputError` if there is none, it cannot be read, it is no plain file, it has a zero
+    byte, or it is not UTF-8.
     """
+    content = read_content(path)
     try:
-        return Path(path).read_bytes().decode("utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+        return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         if fallback:
             return error.object.decode(fallback)
@@ -47,13 +43,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
     **Raises:** `InputError` if it cannot be read or is not TOML.
     """
-    text = read_text(path)
-    try:
-        return tomllib.loads(text)
-    except RecursionError:
-        raise InputError(f"{path}: not valid TOML: brackets are nested too deeply") from None
-    except ValueError as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from None
+    return parse_toml(path, read_text(path))
 
 
 def read_csv(path: Path) -> Columns:

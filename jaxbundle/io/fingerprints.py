@@ -2,13 +2,15 @@
 
 import hashlib
 import os
-import tomllib
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from jaxbundle.errors import InputError
+from jaxbundle.file_content import is_plain
+from jaxbundle.io.csv_tables import read_toml
 from jaxbundle.io.project import project_file
 
 OF_A_MODEL = {".bin", ".csv", ".dat", ".toml", ".txt"}
@@ -37,6 +39,8 @@ def of_input(path: str | Path) -> str:
     for file in _files(project if project.is_file() else path):
         found.update(file.name.encode(errors="surrogateescape"))
         try:
+            if not is_plain(file):
+                continue
             with file.open("rb") as stream:
                 found.update(hashlib.file_digest(stream, _hash).digest())
         except OSError:
@@ -63,8 +67,8 @@ def _files(path: Path) -> Iterator[Path]:
     yield path
     if path.suffix.lower() == ".toml":
         try:
-            document = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
-        except (OSError, ValueError, RecursionError):
+            document = read_toml(path)
+        except InputError:
             return
         for text in _texts(document):
             if os.path.isfile(path.parent / text):

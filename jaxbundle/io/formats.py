@@ -9,6 +9,7 @@ from pathlib import Path
 from jaxbundle.arguments import path as given_path
 from jaxbundle.arguments import shown
 from jaxbundle.errors import InputError
+from jaxbundle.file_content import is_plain
 from jaxbundle.io.bal import OPENERS, is_bal, read_bal, write_bal
 from jaxbundle.io.bingo import is_bingo, read_bingo
 from jaxbundle.io.bundler import is_bundler, read_bundler, write_bundler
@@ -27,6 +28,9 @@ from jaxbundle.io.project import FILE_NAME, fill_project, project_file, read_pro
 from jaxbundle.io.project import FILES as PROJECT_FILES
 from jaxbundle.network.columns import count, did_you_mean, some
 from jaxbundle.network.tables import Network
+
+FIRST_LINES = 100_000
+"""Characters of a file that tell what it is."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,10 +67,10 @@ def _is_project(path: Path) -> bool:
 
 def _is_photo_list(path: Path) -> bool:
     """A text file whose first line is one number."""
-    if path.suffix.lower() != ".txt" or not path.is_file():
+    if path.suffix.lower() != ".txt" or not is_plain(path):
         return False
     with path.open(encoding="utf-8-sig", errors="replace") as file:
-        first = next((line for line in file if line.strip()), "")
+        first = next((line for line in file.read(FIRST_LINES).split("\n") if line.strip()), "")
     try:
         float(first)
     except ValueError:

@@ -1,12 +1,12 @@
 """Fields of a JSON document, asked for by their path; what is wrong is said with file and field."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jaxbundle.errors import InputError
+from jaxbundle.file_content import parse_json
 from jaxbundle.network.columns import shown
 from jaxbundle.network.tables import Source
 
@@ -58,12 +58,7 @@ class JsonFields:
 
 def read_object(path: str | Path, text: str, kind: str) -> dict[str, Any]:
     """The object that a text is; `kind` is what it should be, for messages."""
-    try:
-        document = json.loads(text)
-    except RecursionError:
-        raise InputError(f"{path}: not valid JSON: brackets are nested too deeply") from None
-    except ValueError as error:
-        raise InputError(f"{path}: not valid JSON: {error}") from None
+    document = parse_json(path, text)
     if not isinstance(document, dict):
         raise InputError(f"{path}: an object with the fields of {kind} is expected")
     return document

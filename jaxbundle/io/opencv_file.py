@@ -40,6 +40,7 @@ import numpy as np
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.convert_fit import images_of
 from jaxbundle.errors import InputError
+from jaxbundle.file_content import is_plain, parse_json
 from jaxbundle.io.assemble import all_parameters
 from jaxbundle.io.csv_tables import read_text, write_text
 from jaxbundle.io.nearest_camera import FittedCamera, Foreign, fitted_camera
@@ -60,9 +61,10 @@ _INNER = re.compile(r"\s+([A-Za-z_]\w*)\s*:\s*(.*)")
 
 def is_opencv(path: Path) -> bool:
     """Whether a file has a name of this kind and mentions a camera matrix."""
-    if path.suffix.lower() not in SUFFIXES or not path.is_file():
+    if path.suffix.lower() not in SUFFIXES or not is_plain(path):
         return False
-    text = path.read_bytes()[:1_000_000]
+    with path.open("rb") as file:
+        text = file.read(1_000_000)
     return any(re.search(rb"^[\s{]*\"?%s\"?\s*:" % name.encode(), text, re.M) for name in MATRIX)
 
 
@@ -187,12 +189,7 @@ def _as_json(entries: Mapping) -> str:
 
 
 def _from_json(path: Path, text: str) -> dict[str, Any]:
-    try:
-        document = json.loads(text)
-    except RecursionError:
-        raise InputError(f"{path}: not valid JSON: brackets are nested too deeply") from None
-    except ValueError as error:
-        raise InputError(f"{path}: not valid JSON: {error}") from None
+    document = parse_json(path, text)
     if not isinstance(document, dict):
         raise InputError(f"{path}: an object with camera_matrix is expected")
     return document

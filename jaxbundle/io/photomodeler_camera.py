@@ -11,7 +11,7 @@ the last decimal; otherwise it has another camera, and keeps its own, rounded nu
 """
 
 from collections.abc import Sequence
-from decimal import Decimal
+from decimal import Decimal, InvalidOperation
 
 import numpy as np
 from jaxtyping import Float
@@ -43,8 +43,15 @@ def photo_camera(row: Row, header: tuple[Inner, Inner] | None) -> tuple[Inner, I
 
 
 def _half_units(words: Sequence[str]) -> Inner:
-    given = [-int(Decimal(word).as_tuple().exponent) for word in words]
+    given = [_decimals(word) for word in words]
     return 0.5 * 10.0 ** -np.maximum(given, DECIMALS).astype(float)
+
+
+def _decimals(word: str) -> int:
+    try:
+        return -int(Decimal(word).as_tuple().exponent)
+    except InvalidOperation:  # an exponent of twenty digits: the number is 0
+        return 0
 
 
 def camera_entry(id: str, values: Inner, size: Sequence[float] | None) -> dict:

@@ -38,6 +38,7 @@ import numpy as np
 
 from jaxbundle.arguments import path as given_path
 from jaxbundle.errors import InputError
+from jaxbundle.file_content import check_plain
 from jaxbundle.io.csv_tables import read_csv, read_toml, write_csv, write_text
 from jaxbundle.io.folders import replaced_folder
 from jaxbundle.io.settings import SETTINGS, TABLES, Document, apply_overrides, network_of
@@ -122,6 +123,7 @@ def _read_table(document: Document, table: str, path: Path) -> Columns | None:
         )
     if not isinstance(file, str):
         raise InputError(f"{path}, [project]: {table} is {file!r}; the name of a file is expected")
+    check_plain(path.parent / file)
     if not os.path.isfile(path.parent / file):
         raise InputError(
             f"{path}, [project]: {table} = {file!r}: no such file {path.parent / file}"

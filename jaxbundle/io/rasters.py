@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxbundle.errors import InputError
+from jaxbundle.file_content import check_plain
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.extent import Extent
 from jaxbundle.pushbroom.terrain import Terrain, make_terrain
@@ -30,6 +31,7 @@ def unreadable(path: str | Path, error: Exception) -> InputError:
 def open_plain(path: str | Path, *arguments, **options):
     """As `rasterio.open`; an image without georeference is what is expected, and not warned of."""
     package = rasterio()
+    check_plain(path)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", package.errors.NotGeoreferencedWarning)
         return package.open(path, *arguments, **options)
@@ -55,6 +57,7 @@ def read_terrain(
     **Raises:** `InputError` if it cannot be read, has no georeference, no heights, or none there.
     """
     package = rasterio()
+    check_plain(path)
     from rasterio.vrt import WarpedVRT
 
     try:

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.errors import InputError
+from jaxbundle.file_content import check_plain
 from jaxbundle.io.csv_tables import read_text, write_text
 from jaxbundle.io.rasters import rasterio
 from jaxbundle.io.replacing import disk_of, replaced_file
@@ -166,6 +167,7 @@ def _from_rpb(path, text):
 
 def _from_raster(path):
     package = rasterio()
+    check_plain(path)
     try:
         with package.open(path) as source:
             tags = source.rpcs

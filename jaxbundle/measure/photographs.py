@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from jaxbundle.errors import InputError
+from jaxbundle.file_content import read_content
 from jaxbundle.measure.opencv import need_opencv
 
 
@@ -24,10 +25,7 @@ def read_photograph(path: str | Path) -> UInt8[np.ndarray, "rows columns"]:
         raise InputError(f"{path}: no such file")
     if os.path.isdir(path):
         raise InputError(f"{path}: is a folder; give its photographs, such as {path}/*.jpg")
-    try:
-        content = np.fromfile(path, np.uint8)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    content = np.frombuffer(read_content(path, text=False), np.uint8)
     if not len(content):
         raise InputError(f"{path}: the file is empty")
     try:

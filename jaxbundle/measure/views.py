@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from jaxbundle.arguments import numeric_array
 from jaxbundle.configuration import available_cores
 from jaxbundle.errors import InputError
+from jaxbundle.file_content import read_content
 from jaxbundle.measure.boards import Board, require_board
 from jaxbundle.measure.corners import find_board, largest_chessboard, other_sizes
 from jaxbundle.measure.photographs import read_photograph
@@ -168,8 +169,8 @@ def _repeated(paths: Mapping[str, Path]) -> dict[str, str]:
     found = {}
     for name, path in paths.items():
         try:
-            content = path.read_bytes()
-        except OSError:
+            content = read_content(path, text=False)
+        except InputError:
             continue
         same = first.setdefault(hashlib.blake2b(content).digest(), name)
         if same != name and content:

@@ -1,0 +1,140 @@
+"""The content of files: of plain files alone, of text up to its first zero byte, and of documents
+(TOML, JSON) whose nesting and numbers stay within what the program can hold."""
+
+import json
+import os
+import re
+import stat
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from jaxbundle.errors import InputError
+
+SYSTEM = ("/proc/", "/sys/")
+"""Where the system shows itself as files: without size or end, or waiting for what never comes."""
+DESCRIPTORS = (Path("/dev"), Path("/dev/fd"), Path("/proc/self/fd"))
+"""Where open files of the process have names."""
+CHUNK = 2**20
+DEEPEST = 64
+"""Levels of a document."""
+LARGEST = 2**1023
+"""Whole numbers up to here are floats as well."""
+QUOTED = re.compile(r'"(?:\\.|[^"\\])*"|\'[^\']*\'')
+DIGITS = re.compile(r"(?<![\w.])[-+]?\d[\d_]{307,}(?![\w.])")
+DOTTED = re.compile(rf"(?:[\w-]+\s*\.\s*){{{DEEPEST - 1}}}")
+
+
+def check_plain(path: str | Path) -> None:
+    """Refuse a device, a socket, a pipe, and what the system shows of itself.
+
+    A pipe that the process was given open (`/dev/stdin`, `<(…)` of a shell) is read.
+    """
+    path = Path(path)
+    try:
+        mode = os.stat(path).st_mode
+        real = os.path.realpath(path)
+    except (OSError, ValueError):
+        return  # said by whoever opens it
+    given = path.parent in DESCRIPTORS and stat.S_ISFIFO(mode)
+    system = stat.S_ISREG(mode) and real.startswith(SYSTEM)
+    if system or not (stat.S_ISREG(mode) or stat.S_ISDIR(mode) or given):
+        raise InputError(f"{path}: a file of the system, a device or a pipe; give a plain file")
+
+
+def is_plain(path: str | Path) -> bool:
+    """Whether a path is a file that can be read to its end."""
+    try:
+        check_plain(path)
+    except InputError:
+        return False
+    return os.path.isfile(path)
+
+
+def read_content(path: str | Path, text: bool = True) -> bytes:
+    """The bytes of a file; with `text` a zero byte ends the reading with an error.
+
+    **Raises:** `InputError` if there is none, it cannot be read, or it is no plain file.
+    """
+    check_plain(path)
+    chunks, lines = [], 1
+    try:
+        with open(path, "rb") as file:
+            while chunk := file.read(CHUNK):
+                if text and (zero := chunk.find(0)) >= 0:
+                    line = lines + chunk.count(b"\n", 0, zero)
+                    raise InputError(
+                        f"{path}, line {line}: a zero byte: not UTF-8 text, or damaged; save the "
+                        "file as UTF-8"
+                    )
+                lines += chunk.count(b"\n") if text else 0
+                chunks.append(chunk)
+    except (FileNotFoundError, NotADirectoryError):
+        raise InputError(f"{path}: no such file") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except ValueError as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: no such file") from None  # a zero byte in its name
+    return b"".join(chunks)
+
+
+def parse_toml(path: str | Path, text: str) -> dict[str, Any]:
+    """The document of a text in TOML.
+
+    **Raises:** `InputError` naming the line of what is nested too deeply or too large a number.
+    """
+    return _parsed(path, text, tomllib.loads, "TOML")
+
+
+def parse_json(path: str | Path, text: str) -> Any:
+    """The same of a text in JSON."""
+    return _parsed(path, text, json.loads, "JSON")
+
+
+def _parsed(path: str | Path, text: str, parse: Callable[[str], Any], kind: str):
+    try:
+        document = parse(text)
+        wrong = _beyond(document)
+    except RecursionError:
+        wrong = "nested too deeply"
+    except ValueError as error:
+        wrong = f"{error}"
+        if "digits" not in wrong:  # Python reads no whole number of more than 4300
+            raise InputError(f"{path}: not valid {kind}: {wrong}") from None
+        wrong = "too large a number"
+    if wrong:
+        line = _line_beyond(text)
+        raise InputError(f"{path}{line and f', line {line}'}: not valid {kind}: {wrong}")
+    return document
+
+
+def _beyond(document: Any) -> str:
+    """What in a document is beyond the limits, in words; empty if nothing is."""
+    level = [document]
+    for _ in range(DEEPEST):
+        if any(isinstance(v, int) and abs(v) > LARGEST for v in level):
+            return "too large a number"
+        level = [
+            part for value in level if isinstance(value, dict | list)
+            for part in (value.values() if isinstance(value, dict) else value)
+        ]  # fmt: skip
+        if not level:
+            return ""
+    return f"nested too deeply: more than {DEEPEST} levels"
+
+
+def _line_beyond(text: str) -> int | str:
+    """The first line with too long a number, too many dots in a key, or too many open brackets."""
+    depth = 0
+    for number, line in enumerate(text.split("\n"), 1):
+        bare = QUOTED.sub("s", line).partition("#")[0]
+        if DIGITS.search(bare) or DOTTED.search(bare):
+            return number
+        for bracket in re.findall(r"[][{}]", bare):
+            depth += 1 if bracket in "[{" else -1
+            if depth > DEEPEST:
+                return number
+    return ""
