@@ -21,6 +21,7 @@ DEEPEST = 64
 """Levels of a document."""
 LARGEST = 2**1023
 """Whole numbers up to here are floats as well."""
+TOO_LARGE = "too large a number; finite numbers are expected"
 QUOTED = re.compile(r'"(?:\\.|[^"\\])*"|\'[^\']*\'')
 DIGITS = re.compile(r"(?<![\w.])[-+]?\d[\d_]{307,}(?![\w.])")
 DOTTED = re.compile(rf"(?:[\w-]+\s*\.\s*){{{DEEPEST - 1}}}")
@@ -104,7 +105,7 @@ def _parsed(path: str | Path, text: str, parse: Callable[[str], Any], kind: str)
         wrong = f"{error}"
         if "digits" not in wrong:  # Python reads no whole number of more than 4300
             raise InputError(f"{path}: not valid {kind}: {wrong}") from None
-        wrong = "too large a number"
+        wrong = TOO_LARGE
     if wrong:
         line = _line_beyond(text)
         raise InputError(f"{path}{line and f', line {line}'}: not valid {kind}: {wrong}")
@@ -116,7 +117,7 @@ def _beyond(document: Any) -> str:
     level = [document]
     for _ in range(DEEPEST):
         if any(isinstance(v, int) and abs(v) > LARGEST for v in level):
-            return "too large a number"
+            return TOO_LARGE
         level = [
             part for value in level if isinstance(value, dict | list)
             for part in (value.values() if isinstance(value, dict) else value)
