@@ -256,7 +256,8 @@ def test_what_is_no_json(tmp_path):
     with pytest.raises(InputError, match="isd.json: no such file"):
         read_csm(tmp_path / "isd.json")
     deep = 100_000 * '{"a":'
-    for text, word in (("{", "not valid JSON"), ("[]", "object"), (deep, "isd.json, line 1: .* deeply")):
+    too_deep = (deep, "isd.json, line 1: .* deeply")
+    for text, word in (("{", "not valid JSON"), ("[]", "object"), too_deep):
         (tmp_path / "isd.json").write_text(text)
         with pytest.raises(InputError, match=word):
             read_csm(tmp_path / "isd.json")
