@@ -25,9 +25,10 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import bundler_pose, exterior_from_bundler
 from jaxbundle.io.assemble import all_parameters, assemble, foreign_document, image_columns
-from jaxbundle.io.csv_tables import read_text, write_bytes
+from jaxbundle.io.csv_tables import read_text
 from jaxbundle.io.losses import need_values, what_is_lost
 from jaxbundle.io.poses import matrices_of
+from jaxbundle.io.replacing import replaced_files
 from jaxbundle.io.rows import Row, Rows
 from jaxbundle.network.columns import Columns, count, some
 from jaxbundle.network.tables import Network, Source
@@ -176,11 +177,16 @@ def write_bundler(network: Network, path: str | Path) -> tuple[str, ...]:
     for position, views in zip(points.position, of_point):
         lines += [_join(position), "128 128 128", " ".join([str(len(views)), *views])]
     numbered = list(images.id) == [str(k) for k in range(len(images))]
+    names = path.parent / LIST
     if not numbered:
         if any(character.isspace() for id in images.id for character in id):
             raise InputError(f"{path.parent / LIST}: names of images cannot have blanks")
-        write_bytes(path.parent / LIST, ("\n".join(images.id) + "\n").encode())
-    write_bytes(path, ("\n".join(lines) + "\n").encode())
+    content = {path: lines}
+    if not numbered or names.is_file():  # a list that is there would name the images
+        content[names] = images.id
+    with replaced_files(*content) as temporary:
+        for place, text in zip(temporary, content.values()):
+            place.write_bytes(("\n".join(text) + "\n").encode())
     lost = what_is_lost(network, shared_cameras=True)
     return lost if _from_zero(points.id) else (*lost, "names of points, which are numbered from 0")
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxbundle.io.csv_tables import write_csv
+from jaxbundle.io.replacing import replaced_files
 from jaxbundle.network.build import IMAGE_COLUMNS, POINT_COLUMNS, POINT_SIGMAS
 from jaxbundle.network.reprojection import point_errors
 from jaxbundle.network.tables import Network
@@ -30,18 +31,19 @@ def write_coordinates(network: Network, path: str | Path) -> tuple[str, ...]:
     images, points = network.images, network.points
     angles = images.angles / ANGLE_UNITS[network.angle_unit]
     camera = [network.cameras[c].id for c in images.camera]
-    write_csv(
-        images_path(path), IMAGE_COLUMNS,
-        ((id, c, *_cells(row)) for id, c, row in
-         zip(images.id, camera, np.concatenate([images.position, angles], 1).tolist())),
-    )  # fmt: skip
     sigma = np.isfinite(points.sigma).any()
     errors, unit = point_errors(network)
     numbers = np.concatenate([points.position, *([points.sigma] if sigma else []),
                               errors[:, None]], 1)  # fmt: skip
     header = (*POINT_COLUMNS, *(POINT_SIGMAS if sigma else ()), f"error_{unit}")
     rows = zip(points.id, points.role, numbers.tolist())
-    write_csv(path, header, ((id, role, *_cells(row)) for id, role, row in rows))
+    with replaced_files(images_path(path), path) as (of_images, of_points):
+        write_csv(
+            of_images, IMAGE_COLUMNS,
+            ((id, c, *_cells(row)) for id, c, row in
+             zip(images.id, camera, np.concatenate([images.position, angles], 1).tolist())),
+        )  # fmt: skip
+        write_csv(of_points, header, ((id, role, *_cells(row)) for id, role, row in rows))
     return ("interior orientations", "image points")
 
 

@@ -50,6 +50,11 @@ def replaced_files(*paths: str | Path) -> Iterator[tuple[Path, ...]]:
         except OSError as error:
             at = dict(zip(map(str, names), paths))
             raise unwritable(at.get(str(error.filename), paths[0]), error) from None
+        except InputError as error:
+            said = str(error)
+            for name, path in zip(names, paths):
+                said = said.replace(str(name), str(path))
+            raise InputError(said) from None
 
 
 def unwritable(path: str | Path, error: OSError) -> InputError:

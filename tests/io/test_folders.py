@@ -3,15 +3,18 @@
 import errno
 import json
 import os
-import resource
 import signal
 from pathlib import Path
 
+import exchange_cases
 import pytest
+from full_disk import files_end_at
 from typer.testing import CliRunner
 
 from jaxbundle.errors import InputError
-from jaxbundle.io import folders
+from jaxbundle.io import folders, read_network
+from jaxbundle.io.bundler import write_bundler
+from jaxbundle.io.coordinates import write_coordinates
 from jaxbundle.io.folders import INSIDE, MARKER, check_folder, read_marker, replaced_folder
 from jaxbundle.temporaries import remove_temporaries
 
@@ -191,23 +194,8 @@ def in_child(action) -> int:
 
 
 def test_a_full_disk_leaves_the_old_result_whole(out):
-    """Not a byte more than 3 can be written to a file, as on a full disk."""
-    said = out.parent / "said"
-
-    def action():
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        descriptor = os.open(said, os.O_WRONLY | os.O_CREAT)
-        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (3, limits[1]))
-        try:
-            write(out, NEWER)
-        except InputError as error:
-            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-            os.write(descriptor, str(error).encode())
-
-    in_child(action)
-    assert said.read_text() == f"{out}: cannot be written: File too large"
-    said.unlink()
+    with files_end_at(3), pytest.raises(InputError, match=f"^{out}: cannot be written: File too"):
+        write(out, NEWER)
     assert content(out) == OLD and {*os.listdir(out.parent)} == {"out"}
 
 
@@ -302,3 +290,47 @@ def test_every_command_with_a_folder_refuses_a_foreign_one(tmp_path, monkeypatch
         assert message.startswith(f"--out {out}: not a folder of jaxbundle {command}: {out}/")
         assert ": already there; give a new folder, or --force " in message
         assert content(out) == mine
+
+
+def test_tables_of_line_scanners_do_not_replace_their_input(tmp_path):
+    import jaxbundle.cli.pushbroom  # noqa: F401
+    from jaxbundle.cli.app import app
+
+    table, scanner = tmp_path / "points.csv", tmp_path / "scanner.toml"
+    table.write_text("longitude,latitude,height,line,sample\n")
+    scanner.write_text('[position]\ntable = "positions.csv"\n')
+    (tmp_path / "positions.csv").write_text("t,X,Y,Z\n")
+    for command, output in (
+        (f"locate {scanner} --points {table} --csv", table),
+        (f"project {scanner} --points {table} --json", tmp_path / "positions.csv"),
+        (f"accuracy {scanner} --csv", scanner),
+        (f"rpc fit {table} --out", table),
+        (f"rpc compensate {scanner} --control {table} --out", table),
+        (f"correct {scanner} {table} --out", table),
+    ):
+        before = output.read_text()
+        done = CliRunner().invoke(app, ["pushbroom", *command.split(), str(output)])
+        assert f"{output} is part of the input and would be overwritten" in str(done.exception)
+        assert output.read_text() == before
+
+
+@pytest.mark.parametrize("name, beside", [("bundle.out", "list.txt"), ("p.csv", "p_images.csv")])
+def test_two_files_that_belong_together_are_both_replaced_or_none(tmp_path, name, beside):
+    network = exchange_cases.network("snavely", ("a", "b", "c"))
+    write_both = write_bundler if name.endswith("out") else write_coordinates
+    for file in (name, beside):
+        (tmp_path / file).write_text("old")
+
+    said = f"^{tmp_path}/({name}|{beside}): cannot be written: File too large"
+    with files_end_at(100), pytest.raises(InputError, match=said):  # some files have room
+        write_both(network, tmp_path / name)
+    assert content(tmp_path) == {name: "old", beside: "old"}
+    write_both(network, tmp_path / name)
+    assert "old" not in content(tmp_path).values() and len(content(tmp_path)) == 2
+
+
+def test_a_list_of_names_that_is_there_is_renewed(tmp_path):
+    """Else the names of other images would be taken for those of this network."""
+    (tmp_path / "list.txt").write_text("x\ny\nz\n")
+    write_bundler(exchange_cases.network("snavely", ("0", "1", "2")), tmp_path / "bundle.out")
+    assert read_network(tmp_path / "bundle.out").images.id == ("0", "1", "2")

@@ -1,12 +1,10 @@
 """A disk that is full: the raster that is written is named with its disk, and nothing is left."""
 
 import os
-import resource
-import signal
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from full_disk import files_end_at
 
 from jaxbundle.errors import InputError
 from jaxbundle.io import correction, error_maps, raster_writing
@@ -15,19 +13,6 @@ from jaxbundle.io.maps import MapGrid, MapSystem
 from jaxbundle.pushbroom.surfaces import Plane
 
 rasterio = pytest.importorskip("rasterio")
-
-
-@contextmanager
-def files_end_at(size: int):
-    """No file grows beyond so many bytes: the system refuses the write, as a full disk does."""
-    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        signal.signal(signal.SIGXFSZ, before)
 
 
 def write(target):

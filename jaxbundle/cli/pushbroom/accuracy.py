@@ -15,6 +15,7 @@ from jaxbundle.cli.pushbroom.app import (
     Json,
     Level,
     ScannerFile,
+    keep_inputs,
     open_scanner,
     pushbroom,
     surface_of,
@@ -63,6 +64,7 @@ def accuracy(
 ) -> None:
     """RMS and CE90 on the ground of errors with given σ; or the errors against a known truth."""
     jaxbundle.enable_x64()
+    keep_inputs([scanner, truth, dem], csv=csv, json=json, map=map_)
     if 0 < draws < FEWEST_DRAWS:
         raise InputError(
             f"--draws {draws}: an RMS of so few says nothing; {FEWEST_DRAWS} at least, 1000 are "

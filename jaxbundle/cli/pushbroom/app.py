@@ -1,6 +1,7 @@
 """The sub-application of line scanners, and what its commands share."""
 
 import json
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
@@ -13,6 +14,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.csv_tables import write_csv, write_text
 from jaxbundle.io.extent import image_extent, rpc_extent
+from jaxbundle.io.fingerprints import files_read
 from jaxbundle.io.geoid import add_geoid
 from jaxbundle.io.rasters import read_terrain
 from jaxbundle.io.result_json import without_nan
@@ -85,6 +87,17 @@ def open_scanner(path: Path) -> Scanner:
     for warning in file.warnings:
         warn(warning)
     return file
+
+
+def keep_inputs(inputs: Sequence[str | Path | None], **outputs: str | Path | None) -> None:
+    """Refuse a file to write, by the name of its option, that is read."""
+    read = {os.path.realpath(file) for path in inputs if path for file in files_read(path)}
+    for option, path in outputs.items():
+        if path and os.path.realpath(path) in read:
+            raise InputError(
+                f"--{option.replace('_', '-')} {path} is part of the input and would be "
+                "overwritten; give another"
+            )
 
 
 def check_resampling(kind: str) -> None:

@@ -14,6 +14,7 @@ from jaxbundle.cli.pushbroom.app import (
     Level,
     ScannerFile,
     check_resampling,
+    keep_inputs,
     open_scanner,
     pushbroom,
     surface_of,
@@ -53,6 +54,7 @@ def correct(
 ) -> None:
     """Correct an image to a map, in blocks."""
     jaxbundle.enable_x64()
+    keep_inputs([scanner, image, dem, truth], out=out, error_map=error_map)
     check_resampling(resampling)
     if spacing is not None and not spacing > 0:
         raise InputError(f"--spacing {spacing:g}: a positive number is expected")

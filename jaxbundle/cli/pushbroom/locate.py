@@ -16,6 +16,7 @@ from jaxbundle.cli.pushbroom.app import (
     Json,
     Level,
     ScannerFile,
+    keep_inputs,
     open_scanner,
     pushbroom,
     surface_of,
@@ -51,6 +52,7 @@ def locate(
 ) -> None:
     """Where on the ground places of the image are; (0, 0) is the centre of the first pixel."""
     jaxbundle.enable_x64()
+    keep_inputs([scanner, points, dem, geoid], csv=csv, json=json)
     file = open_scanner(scanner)
     surface = surface_of(file.earth, height, dem, file.image, geoid)
     ids, line, pixel, source = places(file.image, points, grid)

@@ -13,6 +13,7 @@ from jaxbundle.cli.pushbroom.app import (
     ScannerFile,
     check_spheroid,
     geographic,
+    keep_inputs,
     open_scanner,
     pushbroom,
     warn,
@@ -42,6 +43,7 @@ def project(
 ) -> None:
     """Where in the image points of the ground are: a row for every line that sees one."""
     jaxbundle.enable_x64()
+    keep_inputs([scanner, points], csv=csv, json=json)
     file = open_scanner(scanner)
     table = _with_points(read_csv(points))
     X = _points(table, file.earth)

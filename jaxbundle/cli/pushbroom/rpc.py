@@ -15,6 +15,7 @@ from jaxbundle.cli.pushbroom.app import (
     Level,
     check_spheroid,
     geographic,
+    keep_inputs,
     open_scanner,
     pushbroom,
     surface_of,
@@ -24,7 +25,7 @@ from jaxbundle.cli.pushbroom.app import (
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.io.csv_tables import read_csv
-from jaxbundle.io.rpc import read_rpc, write_rpc
+from jaxbundle.io.rpc import RASTERS, read_rpc, write_rpc
 from jaxbundle.network.columns import Columns
 from jaxbundle.pushbroom.rpc import RpcStatus, locate_points_on, project_points
 from jaxbundle.pushbroom.rpc_bias import compensated, fit_bias
@@ -65,6 +66,7 @@ def fit(
 ) -> None:
     """Fit coefficients to a scanner, or to a table; tell what they leave, in pixels."""
     jaxbundle.enable_x64()
+    keep_inputs([source], out=out, json=json)
     head = {}
     if source.suffix.lower() == ".csv":
         table, columns = _table(source)
@@ -111,6 +113,7 @@ def apply(
 ) -> None:
     """Points of the ground to the image; places in the image to a surface."""
     jaxbundle.enable_x64()
+    keep_inputs([coefficients, points, dem], csv=csv, json=json)
     given, table = read_rpc(coefficients), read_csv(points)
     ids = table.ids("id") if "id" in table.values else [str(k + 1) for k in range(len(table))]
     if "line" in table.values:
@@ -154,6 +157,9 @@ def compensate(
 ) -> None:
     """Remove the bias that control points tell of; residuals, redundancy numbers and w of each."""
     jaxbundle.enable_x64()
+    # the tags of a raster may be replaced in it
+    keep_inputs([control], out=out, csv=csv, json=json)
+    keep_inputs([coefficients], csv=csv, json=json, out=None if out.suffix in RASTERS else out)
     given = read_rpc(coefficients)
     table, columns = _table(control, ("id", *GROUND_SIGMA))
     ground = None
