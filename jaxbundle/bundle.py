@@ -3,8 +3,11 @@
 from collections.abc import Callable
 from types import MappingProxyType
 
-from jaxbundle.adjustment.problem import make_problem, with_factor
+import numpy as np
+
+from jaxbundle.adjustment.problem import Problem, make_problem, with_factor
 from jaxbundle.adjustment.solve import METHODS, converged
+from jaxbundle.adjustment.solver import Minimum
 from jaxbundle.arguments import at_least_zero, one_of, shown, truth, whole
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.check import check_network
@@ -12,6 +15,8 @@ from jaxbundle.network.columns import count, some
 from jaxbundle.network.reduction import REDUCTIONS
 from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.tables import Network, require_network
+from jaxbundle.orientation.angle_units import name_angle_unit
+from jaxbundle.orientation.exchanges import CONTRADICTION, name_contradiction
 from jaxbundle.orientation.network import Oriented, lacks_start_values
 from jaxbundle.orientation.one_place import name_one_place
 from jaxbundle.oriented import orient, orient_again, screen
@@ -26,9 +31,16 @@ from jaxbundle.solution import (
     start_with,
     weakness_without_solution,
 )
-from jaxbundle.statistics import ESTIMATORS, doubt_of_robust, intersect_check_points
+from jaxbundle.statistics import (
+    ESTIMATORS,
+    Inspection,
+    doubt_of_robust,
+    intersect_check_points,
+)
 from jaxbundle.statistics.snooping import check_test
 
+MISFIT = 5.0
+"""A σ0 above this asks for its cause."""
 UNNAMED = ("a combination of unknowns that spreads over many of them",)
 """What is not determined, where none stands out."""
 
@@ -81,15 +93,19 @@ def adjust(
         snooping=snooping, significance=significance, eliminate=eliminate, critical_t=critical_t,
         estimate_components=estimate_components, progress=progress,
     )  # fmt: skip
-    given = require_network(network)
+    given, finding = require_network(network), ""
     if lacks_start_values(given):
-        network = _placed(orient(given))
+        found = orient(given)
+        network, finding = _placed(found), found.finding
     options = {"method": method, "max_steps": max_iterations + 1, "progress": progress}
     again = lambda problem, values: minimise(problem, values, **options)
 
     def begin(network, cameras=MappingProxyType({})):
         network, *check = split_check_points(check_network(network))
-        problem = make_problem(network, reduction)
+        try:
+            problem = make_problem(network, reduction)
+        except InputError as error:  # The datum, for want of the control points left out.
+            raise InputError(f"{error} {finding}".strip()) from None
         return problem, again(problem, start_with(problem, cameras)), check
 
     problem, minimum, check = begin(network)
@@ -129,10 +145,7 @@ def adjust(
     names = () if inspection else names_of_defects(problem, minimum)
     if not inspection and converged(int(minimum.termination)):
         names = names or UNNAMED
-    weak, findings = None, ()
-    if not inspection:
-        findings = tuple(filter(None, [name_one_place(problem.network)]))
-        weak = None if names else weakness_without_solution(problem, minimum)
+    weak = None if inspection or names else weakness_without_solution(problem, minimum)
     intersected = None
     if len(check[0]):
         intersected = lambda result: intersect_check_points(
@@ -142,8 +155,8 @@ def adjust(
         network, problem, minimum, removed=tuple(removed), eliminated=tuple(eliminated),
         undetermined=tuple(names), check=intersected, method=method, reduction=used,
         sigma_factors=factors, inspection=inspection, robust=robust, weakness=weak,
-        findings=findings, reweighted=reweighted, suspects=tuple(suspects),
-        doubts=(doubt,) if doubt else (),
+        findings=_likely_causes(problem, minimum, inspection), reweighted=reweighted,
+        suspects=tuple(suspects), doubts=(doubt,) if doubt else (),
     )  # fmt: skip
 
 
@@ -175,6 +188,24 @@ def check_options(
     truth("estimate_components", estimate_components)
     if progress is not None and not callable(progress):
         raise InputError(f"progress must be a function, but is {shown(progress)}")
+
+
+def _likely_causes(
+    problem: Problem, minimum: Minimum, inspection: Inspection | None
+) -> tuple[str, ...]:
+    """Why there is no solution, or one that fits badly, in words."""
+    network = problem.network
+    tried = int(minimum.iterations)
+    accepted = np.asarray(minimum.history.accepted)[:tried]
+    vtpv = 2 * np.asarray(minimum.history.cost)[:tried][accepted][-1:]
+    if inspection and not (vtpv > MISFIT**2 * problem.counts.redundancy).any():
+        return ()
+    told = any(CONTRADICTION in line for line in network.warnings)
+    causes = (
+        name_angle_unit(network), not told and name_contradiction(network),
+        not inspection and name_one_place(network),
+    )  # fmt: skip
+    return tuple(filter(None, causes))
 
 
 def _placed(found: Oriented) -> Network:

@@ -139,3 +139,29 @@ def test_what_repeats_another_is_named():
     other = given.replace(observations=dataclasses.replace(rays, xy=twin))
     (line,) = warn_of_repetitions(other).warnings
     assert "'8' repeats '4'" in line
+
+
+def exchanged(given, *ids):
+    a, b = (given.points.id.index(id) for id in ids)
+    X = given.points.position.copy()
+    X[[a, b]] = X[[b, a]]
+    return given.replace(points=dataclasses.replace(given.points, position=X))
+
+
+def test_exchanged_control_points_are_named_where_nothing_else_can_be_had():
+    result = jaxbundle.adjust(exchanged(network(RING, **CONTROL), "1", "5"))
+    assert not result.converged
+    (finding,) = result.findings
+    assert "'1' and '5' are exchanged" in finding and finding in result.warnings
+    lacking = without_start_values(exchanged(network(RING, **CONTROL), "1", "5"))
+    with pytest.raises(jaxbundle.NotSolvedError, match="'1' and '5' are exchanged"):
+        jaxbundle.adjust(lacking)
+    sound = without_start_values(network(RING, **CONTROL))
+    assert jaxbundle.orient(sound).finding == ""
+
+
+def test_exchanged_control_points_among_others_are_a_warning():
+    six = CONTROL | {"control": (0, 4, 10, 12, 20, 24)}
+    found = jaxbundle.orient(without_start_values(exchanged(network(RING, **six), "1", "5")))
+    assert "if '1' and '5' are exchanged" in found.finding
+    assert found.finding in found.network.warnings and found.finding in str(found)

@@ -32,6 +32,7 @@ from jaxbundle.network.tables import (
     Source,
     require_network,
 )
+from jaxbundle.network.unit_mistakes import check_units
 from jaxbundle.network.units import ANGLE_UNITS
 
 
@@ -67,7 +68,7 @@ def check_tables(network: Network) -> Network:
     _check_images(network)
     network = _check_points(network)
     _check_observations(network)
-    network = _check_distances(network)
+    network = check_units(_check_distances(network))
     return _check_datum_points(network)
 
 

@@ -26,6 +26,7 @@ from jaxbundle.network.columns import count, some
 from jaxbundle.network.sightings import keep_images, keep_points
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation import many
+from jaxbundle.orientation.exchanges import name_contradiction, name_suspects
 from jaxbundle.orientation.frames import joined, mirrored, onto_the_given, to_scale
 from jaxbundle.orientation.growth import (
     AGREE,
@@ -50,6 +51,8 @@ OUT_OF_THE_QUESTION = 3.0
 CONTRADICTED = 0.1
 """Part of the rays to control points that miss them, or of the points whose rays do not meet, above
 which a mirror is thought of."""
+LEAST_CONTROL = 3
+"""Control points that must be left to fix the datum."""
 MOST = 0.8
 """A model in which this part of the image points finds its place need not compete."""
 WIDE = 0.5
@@ -60,13 +63,14 @@ WIDE = 0.5
 class Oriented:
     """A network with start values; `images`, `points`: why those that are not in it were not
     placed; `left_out`: image points that contradict the start values; `frame`: what the coordinates
-    refer to."""
+    refer to; `finding`: control points that contradict the others, and what would mend it."""
 
     network: Network
     frame: str
     images: Mapping[str, str]
     points: Mapping[str, str]
     left_out: tuple[str, ...] = ()
+    finding: str = ""
 
     def __str__(self) -> str:
         placed, known = len(self.network.images), len(self.network.points)
@@ -78,6 +82,8 @@ class Oriented:
             lines += [f"{thing} {id} not placed: {why}" for id, why in reasons.items()]
         if self.left_out:
             lines.append(_in_contradiction(self.left_out))
+        if self.finding:
+            lines.append(self.finding)
         return "\n".join(lines)
 
 
@@ -105,9 +111,30 @@ def find_start_values(network: Network, improve: Callable | None = None) -> Orie
         why = _mirrored(network, seen) or _why_nothing(network, seen)
         raise NotSolvedError(f"no start values found: {why}", _names(network))
     found = _result(network, seen, model, frame)
-    if _control_contradicts(network, seen, model) and (why := _mirrored(network, seen)):
+    missed = _missed(network, seen, model)
+    finding = name_contradiction(network, seen, model) if missed.any() else ""
+    left = (controlled(network.points) & ~missed & (_rays_of(seen, model) > 0)).sum()
+    why = ""
+    if _control_contradicts(network, seen, model):
+        why = _mirrored(network, seen) or (finding if left < LEAST_CONTROL else "")
+    if why:
         raise NotSolvedError(f"no start values found: {why}", _names(network))
-    return found
+    if missed.any() and left < LEAST_CONTROL:
+        finding = name_suspects(network, missed)
+    if not finding:
+        return found
+    return dataclasses.replace(found, network=found.network.warn(finding), finding=finding)
+
+
+def _missed(network: Network, seen: Sights, model: Model) -> Bool[np.ndarray, " points"]:
+    """Control points that most of their rays miss altogether."""
+    wrong = np.bincount(seen.point, _out_of_the_question(seen, model), seen.points)
+    return controlled(network.points) & (2 * wrong > _rays_of(seen, model))
+
+
+def _rays_of(seen: Sights, model: Model):
+    """Rays of every point from the images placed."""
+    return np.bincount(seen.point[model.placed[seen.image]], minlength=seen.points)
 
 
 def _control_contradicts(network: Network, seen: Sights, model: Model) -> bool:

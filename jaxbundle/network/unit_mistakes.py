@@ -1,0 +1,124 @@
+"""Numbers in the wrong unit, where no camera and no object could explain them.
+
+The widest lenses show 90° from the axis, where r/c is 2 in a stereographic image and less in other
+fisheyes; 84° in a central projection are r/c = 10. No lower limit is set: c may be as long as it
+likes, and microscopes and telescopes have fields of any size.
+"""
+
+import numpy as np
+
+from jaxbundle.cameras import get_model
+from jaxbundle.errors import InputError
+from jaxbundle.network.columns import some
+from jaxbundle.network.tables import Camera, Network
+
+WIDEST = 10.0
+"""r/c above which no image point is: half of those of a camera, so that blunders do not count."""
+FIELDS = (0.02, 5.0)
+"""r/c that cameras commonly have; asked of a remedy only."""
+COARSE, FINE, NARROW = 0.1, 1e-4, 1e-3
+"""Pixels, mm, larger or smaller than those of sensors; and r/c less than those of cameras."""
+THOUSAND = (300.0, 3000.0)
+"""Ratios of two lengths of one object in millimetres and in metres."""
+
+
+def check_units(network: Network) -> Network:
+    """The network, with warnings for lengths that seem to be in another unit.
+
+    **Raises:** `InputError` where half of a camera's image points would lie beyond any lens."""
+    of_camera = network.images.camera[network.observations.image]
+    said = []
+    for c, camera in enumerate(network.cameras):
+        xy = network.observations.xy[of_camera == c]
+        if len(xy):
+            said.append(_check_field(camera, xy))
+    said += [_control_against_ties(network), _distances_against_control(network)]
+    return network.warn(*filter(None, said))
+
+
+def _check_field(camera: Camera, xy) -> str:
+    """A warning for a pixel size in metres; refuses a principal distance too short for anything."""
+    model = get_model(camera.model)
+    values = [camera.parameters.get(name) for name in model.principal_distance]
+    name, c = model.principal_distance[0], min(float(value) for value in values)
+    point = [camera.parameters.get(n, camera.parameters.get(m, 0.0))
+             for n, m in (("x0", "cx"), ("y0", "cy"))]  # fmt: skip
+    usual = float(np.median(np.hypot(*(xy - point).T)))
+    size = camera.pixel_size
+    if usual > WIDEST * c:
+        raise InputError(
+            f"camera {camera.id!r}: {name} is {c:g} {model.unit} and half of its image points lie "
+            f"more than {usual:.4g} {model.unit} from the principal point, "
+            f"{np.degrees(np.arctan(usual / c)):.1f}° from the axis: no lens shows that. "
+            f"{_remedy(camera, model.unit, name, c, usual)}"
+        )
+    if size is not None and max(size) < FINE and usual < NARROW * c:
+        return (
+            f"camera {camera.id!r}: pixel_size is {max(size):g} mm, and half of its image points "
+            f"lie within {usual / c:.2g} of {name} about the axis; is it in metres? It is expected "
+            f"in mm ({1000 * max(size):g})"
+        )
+    return ""
+
+
+def _remedy(camera: Camera, unit: str, name: str, c: float, usual: float) -> str:
+    if unit != "mm":
+        return f"Is {name} in mm? It is expected in {unit}: divided by the size of a pixel"
+    causes = []
+    if camera.pixel_size is not None and max(camera.pixel_size) > COARSE:
+        return (
+            f"Is pixel_size {max(camera.pixel_size):g} in µm? It is expected in mm "
+            f"({max(camera.pixel_size) / 1000:g})"
+        )
+    if FIELDS[0] < usual / (1000 * c) < FIELDS[1]:
+        causes.append(f"Is {name} in metres? It is expected in mm ({1000 * c:g})")
+    causes.append(
+        'Are the image coordinates pixels? Set image_unit = "px" and give the camera its '
+        "image_size and pixel_size"
+    )
+    return "; or: ".join(causes)
+
+
+def _control_against_ties(network: Network) -> str:
+    """Control in millimetres and start values in metres, or the other way round."""
+    points = network.points
+    there = np.isfinite(points.position).all(1)
+    control = there & points.has_role("control", "fixed")
+    tie = there & points.has_role("tie")
+    if min(control.sum(), tie.sum()) < 3:
+        return ""
+    extents = [float(np.ptp(points.position[rows], axis=0).max()) for rows in (control, tie)]
+    if not _thousand(*extents):
+        return ""
+    return (
+        f"the control points extend over {extents[0]:.4g} and the start values of the tie points "
+        f"over {extents[1]:.4g} {network.object_unit}: is one of them in mm, the other in m? "
+        "Give all object coordinates in one unit"
+    )
+
+
+def _distances_against_control(network: Network) -> str:
+    """Distances in millimetres between control points in metres, or the other way round."""
+    points, distances = network.points, network.distances
+    known = points.has_role("control", "fixed") & np.isfinite(points.position).all(1)
+    if not len(distances):
+        return ""
+    a, b = points.position[distances.points].transpose(1, 0, 2)
+    length = np.linalg.norm(a - b, axis=1)
+    off = [
+        f"{points.id[i]} to {points.id[j]}"
+        for row, (i, j) in enumerate(distances.points)
+        if known[i] and known[j] and _thousand(distances.value[row], length[row])
+    ]
+    if not off:
+        return ""
+    return (
+        f"distances a thousand times those of the control points, or a thousandth: {some(off)}; "
+        f"are they in {network.object_unit}, as the control points?"
+    )
+
+
+def _thousand(a: float, b: float) -> bool:
+    if not min(a, b) > 0:
+        return False
+    return THOUSAND[0] < max(a / b, b / a) < THOUSAND[1]

@@ -1,0 +1,43 @@
+"""Angles of start values in another unit than the one stated: degrees for gon, radians, …
+
+Start values of images and points say where every image point should be. Where that is nowhere near
+the measurements, and near them with the same numbers in another unit, that is their unit.
+"""
+
+import numpy as np
+
+from jaxbundle.network.tables import Network
+from jaxbundle.network.units import ANGLE_UNITS
+from jaxbundle.orientation import many
+from jaxbundle.orientation.growth import Model, misclosures
+from jaxbundle.orientation.sights import sights
+
+FAR = 3.0
+"""Tolerances of start values by which half of the image points miss."""
+
+
+def name_angle_unit(network: Network) -> str:
+    """The unit in which the start values of the images fit the measurements, in words; empty where
+    the one given does, or no other."""
+    seen, images = sights(network), network.images
+    there = np.isfinite(images.position).all(1) & np.isfinite(images.angles).all(1)
+    known = np.isfinite(network.points.position).all(1)
+    rows = there[seen.image] & known[seen.point]
+    given = ANGLE_UNITS[network.angle_unit]
+    if not rows.any():
+        return ""
+    missed = {}
+    for unit, factor in ANGLE_UNITS.items():
+        model = Model.empty(seen)
+        M = many.matrices(images.angles[there] * factor / given)
+        model.place(there, images.position[there], M)
+        model.X[known] = network.points.position[known]
+        off = misclosures(seen, model)[rows] / seen.tolerance[seen.image[rows]]
+        missed[unit] = float(np.median(off))
+    best = min(missed, key=missed.get)
+    if not (missed[best] < 1 and missed[network.angle_unit] > FAR):
+        return ""
+    return (
+        f"the start values of the images fit the measurements if omega, phi, kappa are in {best}, "
+        f"not in {network.angle_unit}: set angle_unit = \"{best}\""
+    )

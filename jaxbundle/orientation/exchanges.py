@@ -1,0 +1,175 @@
+"""Control points that contradict each other, and the exchange of names that would mend it.
+
+The images alone give the control points up to a similarity. Where the coordinates given do not fit
+that, those that most of them agree on are looked for (a similarity from every three of them), and
+of the others two whose coordinates fit exchanged; of few points every exchange is tried.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxbundle.network.columns import some
+from jaxbundle.network.tables import Network
+from jaxbundle.orientation import many
+from jaxbundle.orientation.frames import FITS
+from jaxbundle.orientation.growth import FOR_ITSELF, Model, controlled, intersect
+from jaxbundle.orientation.sights import Sights, sights
+
+CONTRADICTION = "control points contradict each other"
+TRIPLES = 120
+"""Similarities of three points that are tried."""
+FEW = 12
+"""Of so many points every exchange of two is tried."""
+AGREED = 4
+"""Points that agree before the others are the ones in question: three always may."""
+AS_GOOD = 3.0
+"""Explanations that fit so many times worse than the best are explanations still."""
+
+
+def name_contradiction(network: Network, seen: Sights | None = None, model=None) -> str:
+    """Which control points contradict the others and what would mend it, in words; empty where
+    none do, or where no exchange and no single point explains it.
+
+    `model`: images placed in any frame; those of the start values if not given."""
+    seen = sights(network) if seen is None else seen
+    points = network.points
+    alone = _without_control(network, seen, model)
+    control = np.flatnonzero(controlled(points) & alone.known)
+    found = contradiction(alone.X[control], points.position[control])
+    if found is None:
+        return ""
+    ids, unit = [points.id[p] for p in control], network.object_unit
+    causes = [f"{ids[i]!r} and {ids[j]!r} are exchanged" for i, j in found.exchanges]
+    causes += [f"the coordinates or the number of {ids[k]!r} are wrong" for k in found.wrong]
+    shown = [*causes[:5], *(["…"] if len(causes) > 5 else [])]
+    begin = f"the {len(ids)} {CONTRADICTION} by {found.before:.2g} {unit}"
+    if found.together or len(causes) == 1:
+        return (
+            f"{begin}, and fit to {found.after:.2g} {unit} if {' and '.join(shown)}: correct the "
+            "control points, or the numbers in the image points"
+        )
+    return (
+        f"{begin}, and fit to {found.after:.2g} {unit} if {', or if '.join(shown)}; with so few "
+        "points more than one explanation is possible: look at the images"
+    )
+
+
+def name_suspects(network: Network, suspects: Bool[np.ndarray, " points"]) -> str:
+    """Control points that contradict the images, where nothing explains it."""
+    names = [network.points.id[p] for p in np.flatnonzero(suspects)]
+    return (
+        f"the control points {some(names)} contradict the images or each other, and no exchange "
+        "of two explains it: look for wrong numbers, wrong coordinates, wrong units, and a wrong "
+        "principal distance"
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Contradiction:
+    """How far points miss `before`, and `after` two are exchanged (`exchanges`) or one is left out
+    (`wrong`): all of these `together`, or each by itself one of several explanations."""
+
+    before: float
+    after: float
+    exchanges: Sequence[tuple[int, int]]
+    wrong: Sequence[int]
+    together: bool
+
+
+def contradiction(
+    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]
+) -> Contradiction | None:
+    """How two lists of points contradict each other after a similarity; None where they do not
+    (less than 1/`FITS` of their extent), or where no explanation is found."""
+    n = len(source)
+    if n < 3:
+        return None
+    tolerance = float(np.ptp(target, axis=0).max()) / FITS
+    off = _misfits(source, target, np.ones(n, bool))
+    if off is None or off.max() < tolerance:
+        return None
+    good = _agreeing(source, target, tolerance)
+    if good.sum() >= max(AGREED, n / 2):
+        return _by_majority(source, target, good, tolerance, off.max())
+    return _by_trial(source, target, tolerance, off.max())
+
+
+def _by_majority(source, target, good, tolerance, before):
+    A, t = many.similarity(source, target, good.astype(float))
+    moved, suspects = source @ A.T + t, set(np.flatnonzero(~good).tolist())
+    off = [np.linalg.norm(moved - target, axis=1)[good].max()]
+    exchanges = []
+    for i, j in itertools.combinations(sorted(suspects), 2):
+        miss = max(np.linalg.norm(moved[i] - target[j]), np.linalg.norm(moved[j] - target[i]))
+        if miss < tolerance and {i, j} <= suspects:
+            exchanges.append((i, j))
+            suspects -= {i, j}
+            off.append(miss)
+    return Contradiction(before, max(off), exchanges, sorted(suspects), together=True)
+
+
+def _by_trial(source, target, tolerance, before):
+    n = len(source)
+    if n > FEW:
+        return None
+    trials = [(pair, ()) for pair in itertools.combinations(range(n), 2)]
+    trials += [((), (k,)) for k in range(n) if n >= AGREED]
+    found = []
+    for pair, left_out in trials:
+        order = np.arange(n)
+        order[list(pair)] = pair[::-1]
+        use = ~np.isin(np.arange(n), left_out)
+        off = _misfits(source, target[order], use)
+        if off is not None and off[use].max() < tolerance:
+            found.append((off[use].max(), pair, left_out))
+    if not found:
+        return None
+    best = min(found)[0]
+    found = [entry for entry in sorted(found) if entry[0] <= AS_GOOD * best]
+    exchanges = [pair for _, pair, _ in found if pair]
+    wrong = [k for *_, left_out in found for k in left_out]
+    return Contradiction(before, best, exchanges, wrong, together=False)
+
+
+def _agreeing(source, target, tolerance) -> Bool[np.ndarray, " n"]:
+    """The most points that fit one similarity from three of them, seen once more."""
+    triples = list(itertools.islice(itertools.combinations(range(len(source)), 3), 2 * TRIPLES))
+    if len(source) > FEW:
+        rng = np.random.default_rng(0)
+        triples = [rng.choice(len(source), 3, replace=False) for _ in range(TRIPLES)]
+    best = np.zeros(len(source), bool)
+    for triple in triples:
+        use = np.isin(np.arange(len(source)), triple)
+        off = _misfits(source, target, use)
+        if off is not None and (off < tolerance).sum() > best.sum():
+            best = off < tolerance
+    off = _misfits(source, target, best) if best.sum() >= 3 else None
+    return best if off is None else off < tolerance
+
+
+def _misfits(source, target, use):
+    """Distances of points after the similarity of some of them; None: these are on a line."""
+    found = many.similarity(source, target, use.astype(float))
+    if found is None:
+        return None
+    A, t = found
+    return np.linalg.norm(source @ A.T + t - target, axis=1)
+
+
+def _without_control(network: Network, seen: Sights, model: Model | None) -> Model:
+    """The points as the images alone give them."""
+    alone = Model.empty(seen)
+    if model is None:
+        images = network.images
+        there = np.isfinite(images.position).all(1) & np.isfinite(images.angles).all(1)
+        if there.any():
+            M = many.matrices(images.angles[there])
+            alone.place(there, images.position[there], M)
+    else:
+        alone.place(model.placed, model.X0[model.placed], model.M[model.placed])
+    intersect(seen, alone, FOR_ITSELF)
+    return alone

@@ -1,0 +1,51 @@
+"""Which names of points are exchanged, from two lists of them in different frames."""
+
+import numpy as np
+import pytest
+
+from jaxbundle.orientation.exchanges import contradiction
+
+RNG = np.random.default_rng(5)
+POINTS = RNG.uniform(-1, 1, (20, 3)) * [3, 2, 1]
+TURN, _ = np.linalg.qr(RNG.standard_normal((3, 3)))
+TURN *= np.sign(np.linalg.det(TURN))
+
+
+def lists(n, *exchanges, wrong=()):
+    """n points in a frame of their own, and as they were given: some exchanged, some wrong."""
+    target = POINTS[:n].copy()
+    for i, j in exchanges:
+        target[[i, j]] = target[[j, i]]
+    target[list(wrong)] += [0.9, -0.7, 0.4]
+    noise = 0.001 * np.random.default_rng(n).standard_normal((n, 3))
+    return 0.3 * (POINTS[:n] + noise) @ TURN.T + [5, 6, 7], target
+
+
+@pytest.mark.parametrize("n", [3, 4, 5, 6, 9, 20])
+def test_two_exchanged_points_are_found(n):
+    found = contradiction(*lists(n, (0, 2)))
+    assert found.exchanges[0] == (0, 2)
+    assert found.after < 0.01 < 0.5 < found.before
+    if n >= 6:  # four or more of the others agree: there is no other explanation
+        assert found.together and found.exchanges == [(0, 2)] and not found.wrong
+
+
+@pytest.mark.parametrize("n", [2, 3, 5, 20])
+def test_points_that_fit_contradict_nothing(n):
+    assert contradiction(*lists(n)) is None
+
+
+def test_two_exchanges_and_a_wrong_point_of_many():
+    found = contradiction(*lists(20, (0, 2), (5, 11), wrong=[7]))
+    assert found.together and found.exchanges == [(0, 2), (5, 11)] and found.wrong == [7]
+
+
+def test_the_corners_of_a_square_have_two_explanations():
+    """With A and B exchanged, C and D may be: the square turned over fits as well."""
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+    found = contradiction(square @ TURN.T, square[[1, 0, 2, 3]])
+    assert not found.together and {(0, 1), (2, 3)} <= set(found.exchanges)
+
+
+def test_points_of_another_object_have_no_explanation():
+    assert contradiction(POINTS[:8], POINTS[8:16]) is None
