@@ -14,6 +14,10 @@ LEAST = 3
 """Image points that agree to the last digit before an image repeats another; of a point, images."""
 
 
+MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+"""Odd numbers that spread the bits of measurements over a hash."""
+
+
 def warn_of_repetitions(network: Network) -> Network:
     """The network with a warning for images, and points, whose measurements are those of others."""
     rays, images, points = network.observations, network.images, network.points
@@ -34,17 +38,23 @@ def warn_of_repetitions(network: Network) -> Network:
 def _repetitions(of, by, xy) -> Sequence[tuple[int, int]]:
     """(first, repetition) of the things whose rows (`by`, x, y) are all the same.
 
-    Sums of x and y find candidates among millions of points; only these are compared row by row."""
-    number = np.bincount(of)
-    sums = np.stack([number, *(np.bincount(of, column) for column in (by, *xy.T))], 1)
-    things = np.flatnonzero(number >= LEAST)
-    _, group, size = np.unique(sums[things], axis=0, return_inverse=True, return_counts=True)
-    candidates = things[size[group.ravel()] > 1]
+    Sums of hashed rows, modulo 2⁶⁴ and so in any order, find candidates among millions of points;
+    only these are compared row by row."""
+    if not len(of):
+        return ()
+    x, y = np.ascontiguousarray(xy.T, float).view(np.uint64)
+    mixed = x * MIX[0] ^ (y * MIX[1] + by.astype(np.uint64) * MIX[2])
+    mixed = (mixed ^ (mixed >> np.uint64(29))) * MIX[0]
+    order = np.argsort(of, kind="stable")
+    first = np.flatnonzero(np.diff(of[order], prepend=-1))
+    total, number = np.add.reduceat(mixed[order], first), np.diff([*first, len(of)])
+    _, group, size = np.unique(total, return_inverse=True, return_counts=True)
+    candidates = of[order[first]][(size[group] > 1) & (number >= LEAST)]
+    rows = np.flatnonzero(np.isin(of, candidates))
+    rows = rows[np.lexsort((by[rows], of[rows]))]
     known, found = {}, []
-    for thing in candidates.tolist():
-        rows = np.flatnonzero(of == thing)
-        rows = rows[np.argsort(by[rows])]
-        key = by[rows].tobytes(), xy[rows].tobytes()
+    for part in np.split(rows, np.flatnonzero(np.diff(of[rows])) + 1) if len(rows) else ():
+        key, thing = (by[part].tobytes(), xy[part].tobytes()), int(of[part[0]])
         if (same := known.setdefault(key, thing)) != thing:
             found.append((same, thing))
     return found

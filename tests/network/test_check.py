@@ -338,7 +338,7 @@ def test_a_large_network_is_checked_quickly():
          for i in range(images)],
         {"id": np.arange(points), "role": ["tie"] * points,
          "X": XYZ[:, 0], "Y": XYZ[:, 1], "Z": XYZ[:, 2]},
-        {"image": key // points, "point": key % points, "x": key * 1.0, "y": key * 1.0},
+        {"image": key // points, "point": key % points, "x": key * 1e-5, "y": key * 1e-5},
         datum="inner",
     )  # fmt: skip
     start = time.perf_counter()
