@@ -19,7 +19,7 @@ from jaxbundle import plotting
 from jaxbundle.cameras import default_parameters, get_model, project
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.geometry import matrix_from_quaternion
-from jaxbundle.plotting import files
+from jaxbundle.plotting import files, quality
 from jaxbundle.plotting.distortion import distortion_at
 from jaxbundle.plotting.style import extent, round_number
 from jaxbundle.plotting.views import camera_pyramids, error_ellipses
@@ -137,6 +137,55 @@ def test_sigma_of_the_profile(convergent4):
     data, structure = convergent4.problem.data, convergent4.problem.structure
     away = np.asarray(data.image_xy)[np.asarray(structure.camera) == 0] - [p["x0"], p["y0"]]
     assert r[-1] == pytest.approx(np.hypot(*away.T).max())
+
+
+def test_the_distortion_curve_goes_to_the_corner_of_the_image(convergent4, axes):
+    """Where the size of the image is known; a line marks the farthest measurement."""
+    network = convergent4.problem.network
+    size = dict(image_size=(3000, 2000), pixel_size=(0.01, 0.01))
+    camera = dataclasses.replace(network.cameras[0], **size)
+    problem = dataclasses.replace(convergent4.problem, network=network.replace(cameras=(camera,)))
+    sized = Adjustment(problem.network, problem, convergent4.minimum)
+    ax = sized.plot_distortion("cam", axes())
+    p = sized.camera_parameters("cam")
+    expected = np.hypot(15 + abs(p["x0"]), 10 + abs(p["y0"]))
+    last = [line.get_xdata()[-1] for line in ax.lines if line.get_label().startswith("symm")]
+    assert last == [pytest.approx(expected)] and ax.get_xlim()[1] == pytest.approx(expected)
+    mark = next(line for line in ax.lines if line.get_label() == "farthest measurement")
+    measured = plotting.distortion_profile(sized, "cam").radius[-1]
+    assert mark.get_xdata()[0] == pytest.approx(measured)
+
+
+def test_ids_of_a_plan_stay_inside_and_apart(convergent4):
+    figure = Figure(figsize=(7.5, 6.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    ax = convergent4.plot_plan(figure.add_subplot())
+    figure.draw_without_rendering()
+    frame = ax.get_window_extent()
+    boxes = [text.get_window_extent() for text in ax.texts]
+    assert len(boxes) >= 12
+    for k, box in enumerate(boxes):
+        inside = frame.x0 <= box.x0 and box.x1 <= frame.x1
+        assert inside and frame.y0 <= box.y0 and box.y1 <= frame.y1, ax.texts[k]
+        assert not any(box.overlaps(other) for other in boxes[:k]), ax.texts[k]
+
+
+def test_names_of_figures_have_one_suffix():
+    names = files._Names(())
+    assert [names("residuals", id) for id in ("photo_01.jpg", "photo_01.TIF", "12.5", ".png")] == [
+        "residuals_photo_01", "residuals_photo_01_2", "residuals_12.5", "residuals_png",
+    ]  # fmt: skip
+
+
+def test_contours_are_smooth_and_true():
+    """A spline of the logarithm of a few places, against the function itself."""
+    u, v = np.linspace(0, 479, 21), np.linspace(0, 359, 17)
+    sigma = lambda u, v: 0.01 + 0.6 * (np.hypot(u - 240, v[:, None] - 180) / 300) ** 6
+    x, y, fine = quality._smooth(u, v, sigma(u, v))
+    np.testing.assert_allclose(fine, sigma(x, y), rtol=0.03)
+    assert fine.shape == (129, 161)
+    holes = np.where(u > 400, np.nan, sigma(u, v))
+    assert quality._smooth(u, v, holes)[2] is holes
 
 
 def test_distortion_curve(convergent4, axes):

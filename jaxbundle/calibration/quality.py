@@ -1,6 +1,7 @@
 """How good is a calibration: maps of uncertainty, coverage of the image, two halves compared."""
 
 import dataclasses
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -102,6 +103,27 @@ def uncertainty_map(
     per_unit = 1 / np.array(unit_size(model, given.pixel_size))
     C = C * per_unit[:, None] * per_unit
     return UncertaintyMap(frame, float(distance), uv, C.reshape(*uv.shape[:2], 2, 2))
+
+
+def over_distance(
+    maps: Sequence[UncertaintyMap], distances: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """σ of a projected point in the middle and in the corners, pixels, [n] each.
+
+    The image of a point held in the scene changes with the projection centre in proportion to 1/d,
+    so that its variance is a polynomial of the second degree in 1/d: that of Lagrange through
+    `maps` of three distances is exact.
+    """
+    near = np.array([1 / m.distance for m in maps])
+    variance = np.array([m.sigma**2 for m in maps])[:, [0, 0, -1, -1], [0, -1, 0, -1]]
+    middle = np.array([m.middle**2 for m in maps])
+    t = 1 / np.asarray(distances, float)
+    weight = np.array([
+        np.prod([(t - other) / (own - other) for other in near if other != own], axis=0)
+        for own in near
+    ])
+    of = lambda values: np.sqrt(np.clip(values @ weight, 0, None))
+    return of(middle), np.nanmax(of(variance.T), axis=0, initial=0.0)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,8 +17,8 @@ from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.tables import Camera
 from jaxbundle.result import Adjustment
 
-DISTANCES = 15
-"""Distances of a curve of uncertainty."""
+DISTANCES = 400
+"""Distances of a curve of uncertainty, so many that no dip is missed."""
 
 
 class Calibration:
@@ -143,8 +143,11 @@ class Calibration:
 
     def uncertainty_over_distance(self, distances: Float[np.ndarray, " n"]):
         """σ of a projected point in the middle and in the corners, pixels, [n] each."""
-        maps = [self.uncertainty(d) for d in distances]
-        return np.array([m.middle for m in maps]), np.array([m.corners for m in maps])
+        return quality.over_distance(self._scene_maps, distances)
+
+    @property
+    def _scene_maps(self) -> list[UncertaintyMap]:
+        return [m for m in self.reported_maps if m.frame == "scene"]
 
     @property
     def _unit(self) -> str:
@@ -163,11 +166,16 @@ class Calibration:
 
     def plot_uncertainty_over_distance(self, ax=None):
         """σ of a projected point in the middle and in the corners, from a quarter of the nearest
-        distance of the board to a hundred times the farthest; matplotlib axes."""
+        distance of the board to a hundred times the farthest, with the figures of the report
+        marked; matplotlib axes."""
         span = float(self.distances.min()), float(self.distances.max())
-        distances = np.geomspace(span[0] / 4, 100 * span[1], DISTANCES)
+        reported = np.array([(m.distance, m.middle, m.corners) for m in self._scene_maps]).T
+        near = reported[0, np.isfinite(reported[0])]
+        distances = np.union1d(np.geomspace(span[0] / 4, 100 * span[1], DISTANCES), near)
         curves = self.uncertainty_over_distance(distances)
-        return plotting.uncertainty_curve(distances, *curves, span, self._unit, self.name, ax)
+        return plotting.uncertainty_curve(
+            distances, *curves, span, self._unit, self.name, ax, reported=reported
+        )
 
     def plot_halves(self, ax=None):
         """How far the images of the two halves' cameras are apart (`cross_validation`); matplotlib

@@ -23,6 +23,8 @@ WINDOW = 0.35
 """Half a window, in distances to the next corner: no other corner's edges end in it."""
 SIDES = (1600, 3200)
 """Longer sides of the copies in which boards are sought, in pixels, one after the other."""
+MARKERS = 3
+"""More markers than this show that a board has another dictionary: false ones are rare."""
 QUICK = 800
 """The same, where boards of other sizes are tried."""
 SMALLEST, LARGEST = 2, 15
@@ -47,13 +49,14 @@ def find_board(grey: Grey, board: Board) -> Float[np.ndarray, "points 2"]:
 def other_sizes(grey: Grey, board: Board) -> Board | None:
     """The largest board of another size, of the same kind, that is in the photograph.
 
-    Chessboards of any size; circles with columns and rows changed, and some less or more of either.
+    Chessboards of any size; circles with columns and rows changed, and some less or more of either;
+    ChArUco boards of the same size with markers of another dictionary.
     """
     if board.kind == "chessboard":
         other = largest_chessboard(grey, board)
         return None if other == board else other
     if board.kind == "charuco":
-        return None
+        return _with_other_markers(grey, board)
     m, n = board.columns, board.rows
     near = [(n, m)] + [(m + i, n + j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
     grey, _ = _reduced(need_opencv(), grey, QUICK)
@@ -66,6 +69,24 @@ def other_sizes(grey: Grey, board: Board) -> Board | None:
         except InputError:
             continue
     return None
+
+
+def _with_other_markers(grey: Grey, board: Board) -> Board | None:
+    """The board with the dictionary of which most markers are in the photograph; of several that
+    have the same markers the smallest."""
+    aruco = need_opencv().aruco
+    names = sorted(name for name in dir(aruco) if name.startswith("DICT_"))
+    known = {name: aruco.getPredefinedDictionary(getattr(aruco, name)) for name in names}
+    markers = board.columns * board.rows // 2
+    best, most = None, MARKERS
+    for name, dictionary in sorted(known.items(), key=lambda item: len(item[1].bytesList)):
+        if name == board.dictionary or len(dictionary.bytesList) < markers:
+            continue
+        _, ids, _ = aruco.ArucoDetector(dictionary).detectMarkers(grey)
+        number = 0 if ids is None else len(np.unique(ids[ids < markers]))
+        if number > most:
+            best, most = name, number
+    return None if best is None else dataclasses.replace(board, dictionary=best)
 
 
 def largest_chessboard(grey: Grey, board: Board) -> Board | None:

@@ -30,6 +30,7 @@ SEARCHED = 3
 have it, and in the others, whether the board they have is a part of a larger one."""
 
 HINT = "give --board"
+HINTS = (HINT, "give --dictionary")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -209,7 +210,8 @@ def _look(path, board):
 
 def _nothing_found(paths: Mapping[str, Path], failed: Mapping[str, str]) -> str:
     """One line about photographs without a board; one that has another board speaks for all."""
-    first = next((name for name in failed if HINT in failed[name]), next(iter(failed)))
+    hinted = (name for name in failed if any(hint in failed[name] for hint in HINTS))
+    first = next(hinted, next(iter(failed)))
     return f"no photograph of {len(failed)} shows the board: {paths[first]}: {failed[first]}"
 
 
@@ -221,6 +223,12 @@ def _other_boards(paths: Mapping[str, Path], board: Board, failed: Mapping[str, 
             sizes[name] = other_sizes(read_photograph(paths[name]), board)
         except InputError:
             continue
+    if board.kind == "charuco":
+        return {
+            name: f"{failed[name]}. But there are markers of {other.dictionary}: give --dictionary "
+            f"{other.dictionary}"
+            for name, other in sizes.items() if other is not None
+        }  # fmt: skip
     return {
         name: f"{failed[name]}. But there is one of {other.columns}x{other.rows}: {HINT} "
         f"{other.columns}x{other.rows}, if it is seen whole"

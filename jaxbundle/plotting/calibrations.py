@@ -13,6 +13,7 @@ from jaxbundle.plotting.style import (
     INK,
     RUST,
     axes,
+    image_axes,
     label,
     legend,
     micrometres,
@@ -73,8 +74,7 @@ def difference_map(comparison: Comparison, ax=None, name: str = "Difference of t
     )
     ax.set_aspect("equal")
     quiet(ax, grid=False)
-    for axis in "xy":
-        label(ax, axis, axis, comparison.unit)
+    image_axes(ax, comparison.unit)
     removed = ", rotation removed" if comparison.rotation.any() else ""
     title(ax, name, f"RMS {factor * comparison.rms:.3g} {unit}{removed}")
     return ax
@@ -96,8 +96,7 @@ def expected_map(comparison: Comparison, covariance, ax=None, name: str = "Expec
         ax.invert_yaxis()
     ax.set_aspect("equal")
     quiet(ax, grid=False)
-    for axis in "xy":
-        label(ax, axis, axis, comparison.unit)
+    image_axes(ax, comparison.unit)
     title(ax, name, f"RMS {np.sqrt(np.nanmean(sigma**2)):.3g} {unit}")
     return ax
 

@@ -2,9 +2,15 @@
 
 import numpy as np
 
-from jaxbundle.plotting.distortion import distortion_profile
+from jaxbundle.plotting.distortion import (
+    distortion_profile,
+    farthest_measurement,
+    principal_point,
+)
+from jaxbundle.plotting.frame import image_frame
 from jaxbundle.plotting.style import (
     BLUE,
+    GREY,
     INK,
     RUST,
     axes,
@@ -26,12 +32,19 @@ def distortion_curve(adjustment, camera: str, ax=None):
     """Radial distortion and decentring of a camera over the radius, each with its ±σ.
 
     measured − ideal, so that pincushion distortion is positive whatever the model; from the
-    principal point to the farthest measurement (see `distortion_profile`).
+    principal point to the farthest corner of the image, where its size is known; a line marks the
+    farthest measurement, beyond which the curve is extrapolated (see `distortion_profile`).
 
     **Returns:** matplotlib `Axes`; distortion in µm for a camera in mm, else in its unit.
     """
     ax = axes(ax, (6.5, 4.2))
-    found = distortion_profile(adjustment, camera)
+    adjustment.camera_parameters(camera)  # refuses what is not there
+    low, high, known_frame = image_frame(adjustment, camera)
+    measured, reach = farthest_measurement(adjustment, camera), 0.0
+    if known_frame:
+        centre = principal_point(adjustment, camera)
+        reach = float(np.hypot(*np.maximum(high - centre, centre - low)))
+    found = distortion_profile(adjustment, camera, reach=max(measured, reach))
     scale, unit = micrometres(found.unit)
     for value, sigma, colour, name in (
         (found.radial, found.radial_sigma, BLUE, "symmetric radial"),
@@ -45,6 +58,8 @@ def distortion_curve(adjustment, camera: str, ax=None):
         ax.fill_between(found.radius, low, high, color=colour, alpha=0.2, linewidth=0, zorder=2)
         ax.plot(found.radius, scale * value, color=colour, linewidth=1.5, label=name, zorder=3)
     ax.axhline(0, color=INK, linewidth=0.6, zorder=1)
+    if reach > measured:
+        ax.axvline(measured, color=GREY, linewidth=0.9, linestyle=":", label="farthest measurement")
     quiet(ax)
     ax.set_xlim(0, found.radius[-1] or 1.0)
     bottom, top = ax.get_ylim()

@@ -39,10 +39,13 @@ class DistortionProfile:
     decentring_sigma: Float[np.ndarray, " radii"]
 
 
-def distortion_profile(adjustment, camera: str, radii: int = 81) -> DistortionProfile:
+def distortion_profile(
+    adjustment, camera: str, radii: int = 81, reach: float | None = None
+) -> DistortionProfile:
     """The distortion of a camera from its principal point to its farthest measurement.
 
-    **Arguments:** `adjustment` a solved one; `camera` its id; `radii` how many values.
+    **Arguments:** `adjustment` a solved one; `camera` its id; `radii` how many values; `reach` the
+    last radius, if not that of the farthest measurement.
 
     **Returns:** radial distortion and decentring, measured − ideal; σ are 0 for a camera that is
     held, NaN where a radius has no image.
@@ -50,7 +53,8 @@ def distortion_profile(adjustment, camera: str, radii: int = 81) -> DistortionPr
     parameters = adjustment.camera_parameters(camera)
     free, covariance = adjustment.camera_covariance(camera)
     model = _model(adjustment, camera)
-    radius = np.linspace(0, farthest_measurement(adjustment, camera), radii)
+    reach = farthest_measurement(adjustment, camera) if reach is None else reach
+    radius = np.linspace(0, reach, radii)
     p = jnp.array(list(parameters.values()))
     (radial, decentring), slopes = distortion_at(model, p, radius)
     slopes = slopes[:, :, [list(parameters).index(name) for name in free]]

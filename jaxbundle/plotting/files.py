@@ -20,6 +20,8 @@ from jaxbundle.plotting.views import network_perspective, network_plan
 MOST_IMAGES = 12
 MOST_CAMERAS = 6
 DOTS_PER_INCH = 150
+PHOTOGRAPH = re.compile(r"\.(jpe?g|png|tiff?|bmp|webp|pgm|ppm|jp2)$", re.IGNORECASE)
+"""The end of an id that is the name of a photograph; a figure has its own."""
 FIGURES = ("plan.png", "perspective.png", "histogram.png",
            "residuals_*.png", "distortion_*.png", "correlations_*.png")  # fmt: skip
 """Patterns of the names of all files written here."""
@@ -116,6 +118,7 @@ class _Names:
         self.taken = {name.casefold() for name in taken}
 
     def __call__(self, kind: str, id: str) -> str:
+        id = PHOTOGRAPH.sub("", str(id)) or id
         safe = re.sub(r"[^\w.-]+", "_", str(id), flags=re.ASCII).strip("._")[:60] or "unnamed"
         name, number = f"{kind}_{safe}", 1
         while name.casefold() in self.taken:

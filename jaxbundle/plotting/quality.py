@@ -14,6 +14,8 @@ from jaxbundle.plotting.style import (
     title,
 )
 
+MARGIN = 0.08
+"""Labels of contours keep away from the frame by this part of the image."""
 SMALL = 0.02
 """Scales of σ begin here, in pixels, at the least."""
 
@@ -52,6 +54,31 @@ def coverage_map(coverage, uv, image_size, name: str = "camera", ax=None):
     return ax
 
 
+def _smooth(u, v, sigma, times: int = 8):
+    """σ over a finer grid: a cubic spline of its logarithm, where it is known everywhere."""
+    if not (np.isfinite(sigma) & (sigma > 0)).all() or min(sigma.shape) < 4:
+        return u, v, sigma
+    from scipy.interpolate import RectBivariateSpline
+
+    spline = RectBivariateSpline(v, u, np.log(sigma))
+    fine = [np.linspace(a[0], a[-1], times * (len(a) - 1) + 1) for a in (u, v)]
+    return *fine, np.exp(spline(fine[1], fine[0]))
+
+
+def _label_places(lines, size):
+    """Where the contours have their labels: in the middle of the longest piece of each, away from
+    the frame of the image and from one another."""
+    margin, found = MARGIN * size, []
+    for pieces in lines.allsegs:
+        for vertices in sorted(pieces, key=len, reverse=True)[:1]:
+            inside = ((vertices > margin) & (vertices < size - 1 - margin)).all(1)
+            apart = [np.abs((vertices - place) / margin).max(1) > 1 for place in found]
+            good = vertices[np.all([inside, *apart], axis=0)]
+            if len(good):
+                found.append(tuple(good[len(good) // 2]))
+    return found
+
+
 def uncertainty_image(uncertainty, image_size, unit: str = "m", name: str = "camera", ax=None):
     """σ of a projected point over the image, with the larger axis of its error ellipse.
 
@@ -66,11 +93,14 @@ def uncertainty_image(uncertainty, image_size, unit: str = "m", name: str = "cam
     high = max(float(finite.max(initial=0.0)), 1.01 * low)
     u, v = uncertainty.uv[0, :, 0], uncertainty.uv[:, 0, 1]
     levels = np.geomspace(low, high, 13)
+    u, v, sigma = _smooth(u, v, sigma)
     shown = ax.contourf(u, v, np.ma.masked_invalid(sigma), levels, cmap="viridis",
                         norm=LogNorm(low, high), extend="both")  # fmt: skip
     lines = ax.contour(u, v, np.ma.masked_invalid(sigma), levels[2:-1:3], colors="white",
                        linewidths=0.7)  # fmt: skip
-    ax.clabel(lines, fmt="%.2g", fontsize=7)
+    places = _label_places(lines, np.array(image_size))
+    if places:
+        ax.clabel(lines, fmt="%.2g", fontsize=7, manual=places)
     _frame(ax, image_size)
     bar = ax.figure.colorbar(shown, ax=ax, shrink=0.8, pad=0.02, format="%.2g")
     bar.set_label("σ of a projected point [px]", fontsize=9, color=INK)
@@ -87,11 +117,14 @@ def uncertainty_image(uncertainty, image_size, unit: str = "m", name: str = "cam
     return ax
 
 
-def uncertainty_curve(distances, middle, corners, range_=None, unit="m", name="camera", ax=None):
+def uncertainty_curve(
+    distances, middle, corners, range_=None, unit="m", name="camera", ax=None, reported=None
+):
     """σ of a projected point over its distance, in the middle and in the corners of the image.
 
     **Arguments:** `range_`: nearest and farthest distance of the object the camera was calibrated
-    from, drawn as a band.
+    from, drawn as a band; `reported`: distances, middle and corners [n] each that a report states,
+    marked.
 
     **Returns:** matplotlib `Axes`: pixels over the object unit, both logarithmic.
     """
@@ -100,6 +133,19 @@ def uncertainty_curve(distances, middle, corners, range_=None, unit="m", name="c
         ax.axvspan(*range_, color=GREY, alpha=0.2, linewidth=0, label="distances of the board")
     ax.loglog(distances, middle, color=BLUE, linewidth=1.5, label="middle of the image")
     ax.loglog(distances, corners, color=RUST, linewidth=1.5, label="worst corner")
+    if reported is not None:
+        away, *both = reported
+        for values, colour in zip(both, (BLUE, RUST)):
+            there = np.isfinite(away)
+            ax.plot(away[there], values[there], "o", color=colour, markersize=5)
+            for x, y in zip(away[there], values[there]):
+                ax.annotate(f"{y:.3g}", (x, y), xytext=(5, 5), textcoords="offset points",
+                            fontsize=7, color=colour)  # fmt: skip
+            for y in values[~there]:
+                ax.axhline(y, color=colour, linewidth=0.8, linestyle=":")
+                ax.annotate(f"{y:.3g} at infinity", (1, y), xycoords=("axes fraction", "data"),
+                            xytext=(-4, 3), textcoords="offset points", ha="right", fontsize=7,
+                            color=colour)  # fmt: skip
     quiet(ax)
     label(ax, "x", "distance", unit)
     label(ax, "y", "σ of a projected point", "px")

@@ -80,6 +80,12 @@ def label(ax, axis: str, name: str, unit: str = "") -> None:
     getattr(ax, f"set_{axis}label")(text, fontsize=9, color=INK, parse_math=False)
 
 
+def image_axes(ax, unit: str) -> None:
+    """The names of image coordinates: u, v in pixels, else x, y."""
+    for axis, name in zip("xy", ("u", "v") if unit == "px" else ("x", "y")):
+        label(ax, axis, name, unit)
+
+
 def round_number(x: float) -> float:
     """The largest of 1, 2, 5 times a power of ten that is not above x."""
     if not (math.isfinite(x) and x > 0):

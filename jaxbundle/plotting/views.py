@@ -26,6 +26,8 @@ from jaxbundle.plotting.style import (
     title,
 )
 
+LETTER, LINE, GAP = 4.9, 8.0, 4.0
+"""Width of a letter, height of a line and distance from the place, of ids, in points."""
 ELLIPSES = 2000
 """Error ellipses are drawn for at most so many points."""
 
@@ -59,8 +61,6 @@ def network_plan(adjustment, ax=None):
                        **_lighter(style, len(points["id"])))  # fmt: skip
     ellipses = _draw_ellipses(adjustment, ax, size)
     away = centres - pyramids[:, 1:].mean(1)
-    _write_ids(ax, points["id"], points["xyz"], BLUE, LABELLED)
-    _write_ids(ax, adjustment.images["id"], centres, INK, LABELLED // 2, away / size)
     drawn = (points["xyz"][:, :2], pyramids[:, :, :2].reshape(-1, 2), ellipses.reshape(-1, 2))
     low, high = _inside(np.concatenate(drawn))
     ax.set_xlim(low[0], high[0])
@@ -74,6 +74,10 @@ def network_plan(adjustment, ax=None):
     below = ax.transAxes + ScaledTranslation(0, -0.5, ax.figure.dpi_scale_trans)
     legend(ax, loc="upper left", bbox_to_anchor=(0, 0), bbox_transform=below, ncols=5,
            frameon=False, borderaxespad=0, handletextpad=0.3, columnspacing=1.5)  # fmt: skip
+    ids = [(adjustment.images["id"], centres, INK, LABELLED // 2, away / size),
+           (points["id"], points["xyz"], BLUE, LABELLED, None)]  # fmt: skip
+    places = np.concatenate([centres, points["xyz"][:ELLIPSES]])[:, :2]
+    _write_ids(ax, [table for table in ids if len(table[0]) <= table[3]], places)
     return ax
 
 
@@ -231,20 +235,48 @@ def _draw_ellipses(adjustment, ax, size: float) -> np.ndarray:
     return polygons
 
 
-def _write_ids(ax, ids, xyz, colour, most: int, away=None) -> None:
-    """Ids beside their places; on the far side of what the images look at."""
-    if len(ids) > most:
-        return
-    away = np.full((len(ids), 2), 0.7) if away is None else away[:, :2]
-    for id, place, (dx, dy) in zip(ids, xyz, away):
-        length = np.hypot(dx, dy)
-        dx, dy = (dx / length, dy / length) if length > 0.01 else (0.7, 0.7)
-        ax.annotate(
-            plain(id), place[:2], xytext=(6 * dx, 6 * dy), textcoords="offset points", fontsize=7,
-            color=colour, parse_math=False, annotation_clip=True, zorder=6,
-            ha="right" if dx < -0.3 else "left" if dx > 0.3 else "center",
-            va="top" if dy < -0.3 else "bottom" if dy > 0.3 else "center",
-        )  # fmt: skip
+def _write_ids(ax, tables, places) -> None:
+    """Ids beside their places where they cover no other id, none of the places drawn and not the
+    frame; first on the far side of what the images look at. Where there is no room, no id."""
+    ax.figure.draw_without_rendering()  # the layout moves the axes
+    frame = ax.get_window_extent()
+    dots = ax.figure.dpi / 72
+    taken = [(x - dots, x + dots, y - dots, y + dots) for x, y in ax.transData.transform(places)]
+    for ids, xyz, colour, _, away in tables:
+        wanted = np.full((len(ids), 2), 0.7) if away is None else away[:, :2]
+        for id, place, far in zip(ids, xyz, wanted):
+            text = plain(id)
+            wide, high = dots * LETTER * len(text), dots * LINE
+            x, y = ax.transData.transform(place[:2])
+            angle = np.arctan2(*far[::-1]) if np.hypot(*far) > 0.01 else np.pi / 4
+            turns = angle + np.pi / 4 * np.array([0, 1, -1, 2, -2, 3, -3, 4])
+            boxes = [_box(x, y, wide, high, dots * GAP, turn) for turn in turns]
+            best = min(range(len(boxes)), key=lambda i: _covered(boxes[i], taken, frame))
+            if _covered(boxes[best], taken, frame) > 0:
+                continue
+            taken.append(boxes[best])
+            left, right, low, top = boxes[best]
+            ax.annotate(
+                text, place[:2], xytext=((0.5 * (left + right) - x) / dots,
+                                         (0.5 * (low + top) - y) / dots),
+                textcoords="offset points", fontsize=7, color=colour, parse_math=False,
+                annotation_clip=True, zorder=6, ha="center", va="center",
+            )  # fmt: skip
+
+
+def _box(x, y, wide, high, gap, turn):
+    """Left, right, low, top of a text beside (x, y) in a direction, pixels."""
+    dx, dy = np.cos(turn), np.sin(turn)
+    middle_x = x + dx * gap + 0.5 * wide * np.clip(1.5 * dx, -1, 1)
+    middle_y = y + dy * gap + 0.5 * high * np.clip(1.5 * dy, -1, 1)
+    return (middle_x - wide / 2, middle_x + wide / 2, middle_y - high / 2, middle_y + high / 2)
+
+
+def _covered(box, taken, frame) -> float:
+    """How many of the boxes taken a box covers, and whether it leaves the frame."""
+    left, right, low, top = box
+    out = left < frame.x0 or right > frame.x1 or low < frame.y0 or top > frame.y1
+    return out + sum(left <= b[1] and b[0] <= right and low <= b[3] and b[2] <= top for b in taken)
 
 
 def _inside(xyz):

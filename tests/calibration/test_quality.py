@@ -231,8 +231,24 @@ def test_figures(calibration, tmp_path):
     assert axes["curve"].get_xscale() == "log"
     shown = axes["coverage"].images[0].get_array()
     np.testing.assert_array_equal(shown.filled(0), calibration.coverage.counts)
-    near = axes["curve"].lines[0].get_ydata().min()
-    assert near < calibration.uncertainty().middle
+    # The figures of the report lie on the curve, at the bottom of its dip too.
+    curve = axes["curve"].lines[0]
+    for m in calibration.reported_maps[:2]:
+        place = np.flatnonzero(curve.get_xdata() == m.distance)
+        np.testing.assert_allclose(curve.get_ydata()[place], m.middle, rtol=1e-9)
+        assert len(place) and f"{m.middle:.3g}" in {t.get_text() for t in axes["curve"].texts}
+    assert curve.get_ydata().min() <= calibration.reported_maps[0].middle
+    assert axes["halves"].get_xlabel() == "u [px]" and axes["halves"].get_ylabel() == "v [px]"
+
+
+def test_the_curve_over_distance_is_the_uncertainty_at_every_distance(calibration):
+    """A polynomial in 1/d through three maps, against the maps themselves."""
+    near = float(np.median(calibration.distances))
+    for distance in (0.4 * near, 1.1 * near, 50 * near):
+        found = calibration.uncertainty(distance)
+        middle, corners = calibration.uncertainty_over_distance([distance])
+        np.testing.assert_allclose(middle, found.middle, rtol=1e-5)
+        np.testing.assert_allclose(corners, found.corners, rtol=1e-5)
 
 
 def test_the_expected_difference_is_that_of_a_sample(sample):

@@ -154,3 +154,11 @@ def test_reading_photographs(tmp_path):
     ):  # fmt: skip
         with pytest.raises(InputError, match=said):
             read_photograph(tmp_path / name)
+
+
+def test_markers_of_another_dictionary_are_named():
+    """The board drawn has DICT_4X4_50; the dictionaries are tried, the smallest that fits named."""
+    picture, _ = taken(CHARUCO, *POSES[2])
+    other = dataclasses.replace(CHARUCO, dictionary="DICT_6X6_250")
+    assert other_sizes(picture, other).dictionary == "DICT_4X4_50"
+    assert other_sizes(np.full_like(picture, 128), other) is None
