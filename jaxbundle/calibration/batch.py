@@ -50,6 +50,8 @@ from jaxbundle.geometry import (
 )
 from jaxbundle.statistics.snooping import check_test
 
+OF_A_START = ("quaternion", "shift")
+"""Poses as the solver has them, for data snooping alone."""
 OF_A_VIEW = ("position", "angles", "sigma_position", "sigma_angles", "rotation")
 
 
@@ -126,7 +128,8 @@ def calibrate_batch(
 def _without_padding(portion: Portion, shape: tuple[int, int], solved: dict) -> dict:
     """The rows of the cameras of a portion, views at their places among all."""
     views, points = shape
-    rows = {name: values[: len(portion.cameras)] for name, values in solved.items()}
+    rows = {name: values[: len(portion.cameras)] for name, values in solved.items()
+            if name not in OF_A_START}  # fmt: skip
     camera = np.arange(len(portion.cameras))[:, None]
     for name in ({"views", "removed", *OF_A_VIEW} & {*rows}):
         values = rows[name] if name != "removed" else rows[name][:, :, :points]
@@ -147,8 +150,7 @@ def _result(model: CameraModel, batch: Batch, rows: dict) -> BatchCalibration:
             values[~solved] = np.nan
     ended = np.where(solved & undetermined.any(1), WEAK, ended)
     ended = np.where(misfits(rows["rms"], rows["mean_length"], solved), MISFIT, ended)
-    for name in ("reduced", "mean_length", "quaternion", "shift"):
-        del rows[name]
+    del rows["reduced"], rows["mean_length"]
     rows["undetermined"], rows["status"] = undetermined, np.array(STATUS)[ended]
     rows["remark"] = _remarks(model, batch, rows["interior"], solved & (ended == CONVERGED))
     free = tuple(model.parameters[column] for column in batch.free)

@@ -21,6 +21,8 @@ from jaxbundle.statistics.projection import (
 
 GRID = (11, 9)
 """Columns and rows of the places a map is computed at."""
+DRAWN = (21, 17)
+"""The same for a figure: between them σ is interpolated."""
 CELLS = (12, 9)
 """Columns and rows of the cells in which coverage is counted."""
 HELD_OUT_FEWEST = 4

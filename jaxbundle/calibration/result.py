@@ -161,7 +161,7 @@ class Calibration:
 
     def plot_uncertainty(self, distance: float = np.inf, frame: str = "scene", ax=None):
         """σ of a projected point over the image; matplotlib axes."""
-        found = self.uncertainty(distance, frame)
+        found = self.uncertainty(distance, frame, quality.DRAWN)
         return plotting.uncertainty_image(found, self.views.image_size, self._unit, self.name, ax)
 
     def plot_uncertainty_over_distance(self, ax=None):

@@ -17,7 +17,7 @@ from jaxbundle.adjustment.rig_normal import (
     mounting_columns,
 )
 from jaxbundle.calibration.frames import unit_size
-from jaxbundle.calibration.quality import GRID, Coverage, UncertaintyMap
+from jaxbundle.calibration.quality import DRAWN, GRID, Coverage, UncertaintyMap
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.rig_quality import rig_coverage, rig_points, rig_uncertainty
 from jaxbundle.cameras import get_model
@@ -169,7 +169,7 @@ class RigCalibration:
 
     def plot_uncertainty(self, name: str, distance: float = np.inf, frame: str = "rig", ax=None):
         """σ of a projected point over the image of a camera; matplotlib axes."""
-        found, one = self.uncertainty(name, distance, frame), self.cameras[name]
+        found, one = self.uncertainty(name, distance, frame, DRAWN), self.cameras[name]
         unit = one.adjustment.network.object_unit
         return plotting.uncertainty_image(found, one.views.image_size, unit, name, ax)
 

@@ -305,6 +305,8 @@ def test_few_views_are_not_filled_up_to_many(three, solved, monkeypatch):
         np.testing.assert_allclose(getattr(apart, name), getattr(together, name), rtol=1e-7)
     assert np.isnan(apart.position[0, ::2]).all() and np.isfinite(apart.position[0, 1::2]).all()
     np.testing.assert_allclose(apart.values[1:], solved.values[1:], rtol=1e-9)
+    snooped = jaxbundle.calibrate_batch(BOARD, three[0], SIZE, visible=visible, snooping="pope")
+    assert snooped.removed.shape == visible.shape and not (snooped.removed & ~visible).any()
 
 
 def test_progress_is_told_and_portions_keep_the_order(three, solved):
