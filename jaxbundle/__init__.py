@@ -53,6 +53,8 @@ if TYPE_CHECKING:
     from jaxbundle.orientation.network import Oriented as Oriented
     from jaxbundle.oriented import orient as orient
     from jaxbundle.result import Adjustment as Adjustment
+    from jaxbundle.statistics.precision import Precision as Precision
+    from jaxbundle.statistics.precision import precision as precision
 
 _HOME = {
     "jaxbundle.adjustment": ("Problem", "make_problem", "solve"),
@@ -77,6 +79,7 @@ _HOME = {
     "jaxbundle.orientation.network": ("Oriented",),
     "jaxbundle.oriented": ("orient",),
     "jaxbundle.result": ("Adjustment",),
+    "jaxbundle.statistics.precision": ("Precision", "precision"),
 }
 _MODULE = {name: module for module, names in _HOME.items() for name in names}
 __all__ = [*_MODULE]

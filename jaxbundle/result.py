@@ -6,7 +6,7 @@ values to ask for: every accessor raises `NotSolvedError` and says why.
 """
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -18,19 +18,21 @@ from jaxbundle.adjustment.jacobian import zero_tangent
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.adjustment.solve import converged
 from jaxbundle.adjustment.solver import TERMINATIONS, Minimum
-from jaxbundle.adjustment.unknowns import Name, interior_names
-from jaxbundle.arguments import at_least_zero, shown
-from jaxbundle.cameras import get_model
-from jaxbundle.errors import InputError, NotSolvedError
-from jaxbundle.geometry import (
-    matrix_from_quaternion,
-    omega_phi_kappa_near,
-    retract_quaternion,
+from jaxbundle.adjustment.unknowns import (
+    Name,
+    angles_near,
+    interior_names,
+    named,
+    place_of,
+    value_of,
 )
+from jaxbundle.arguments import at_least_zero
+from jaxbundle.cameras import get_model
+from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.arrays import Tangent, Values, retract
-from jaxbundle.network.columns import did_you_mean, some
+from jaxbundle.network.columns import some
 from jaxbundle.network.reduction import FACTORS
-from jaxbundle.network.tables import EXTERIOR, Network
+from jaxbundle.network.tables import Network
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.statistics import (
     CheckPoints,
@@ -316,7 +318,7 @@ class Adjustment:
         return [names[i].parameter for i in free], Q
 
     def _camera(self, camera: str) -> int:
-        return _place(camera, [given.id for given in self.problem.network.cameras], "camera")
+        return place_of(camera, [given.id for given in self.problem.network.cameras], "camera")
 
     def insignificant(self, critical: float = 2.0) -> list[tuple[float, Name]]:
         """Free interior parameters with t = |value|/σ below `critical`, the least first.
@@ -337,40 +339,12 @@ class Adjustment:
 
         **Raises:** `InputError` where nothing is named, or a name has other than three parts;
         `KeyError` for a name that is not there."""
-        for name in names or (None,):
-            if isinstance(name, str) or np.shape(name) != (3,):
-                given = "none is given" if name is None else f"one is {shown(name)}"
-                raise InputError(
-                    'covariance: names of unknowns are expected, such as ("camera", "cam", "c") or '
-                    f'("point", "7", "Z"), but {given}'
-                )
-        wanted = [Name(*map(str, name)) for name in names]
-        for name in wanted:
-            self._value_of(name, self.values)  # refuses what is not there
+        wanted = named(self.problem, names)
 
         def pick(values: Values):
-            return jnp.stack([self._value_of(name, values) for name in wanted])
+            return jnp.stack([value_of(self.problem, name, values) for name in wanted])
 
         return self.covariance_of(pick)
-
-    def _value_of(self, name: Name, values: Values):
-        """The unknown of this name."""
-        network = self.problem.network
-        if name.kind == "camera":
-            c = self._camera(name.id)
-            parameters = get_model(network.cameras[c].model).parameters
-            return values.camera[c, _place(name.parameter, parameters, "camera parameter")]
-        if name.kind == "image":
-            i = _place(name.id, network.images.id, "image")
-            angles = _angles_near(
-                values.rotation[i], jnp.zeros(3), network.images.angles[i]
-            )
-            pose = jnp.concatenate([values.position[i], angles])
-            return pose[_place(name.parameter, EXTERIOR, "image parameter")]
-        if name.kind == "point":
-            p = _place(name.id, network.points.id, "point")
-            return values.point[p, _place(name.parameter, ("X", "Y", "Z"), "coordinate")]
-        raise KeyError(f"an unknown is of a camera, an image or a point, not of a {name.kind!r}")
 
     def covariance_of(self, function: Callable[[Values], jax.Array]) -> Float[np.ndarray, "n n"]:
         """Covariance of any differentiable function of the adjusted unknowns (`Values` → [n])."""
@@ -472,24 +446,11 @@ class Adjustment:
         return pandas.DataFrame(self.table(name))
 
 
-def _place(name: str, names: Sequence[str], thing: str) -> int:
-    if name not in names:
-        known = did_you_mean(name, names, listing=len(names) <= 20)
-        raise KeyError(f"there is no {thing} {name!r}{known}")
-    return names.index(name)
-
-
-def _angles_near(rotation, d_theta, given):
-    return omega_phi_kappa_near(
-        matrix_from_quaternion(retract_quaternion(rotation, d_theta)), given
-    )
-
-
 @jax.jit
 def _all_angles(rotation, given):
     """ω, φ, κ of all images near the given ones, and their Jacobians by δθ."""
     zero = jnp.zeros((rotation.shape[0], 3))
     return (
-        jax.vmap(_angles_near)(rotation, zero, given),
-        jax.vmap(jax.jacfwd(_angles_near, 1))(rotation, zero, given),
+        jax.vmap(angles_near)(rotation, zero, given),
+        jax.vmap(jax.jacfwd(angles_near, 1))(rotation, zero, given),
     )

@@ -12,6 +12,7 @@ LAYERS = (
     "temporaries",
     "interrupts",
     "configuration",
+    "implicit",
     "geometry",
     "cameras",
     "network",

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float
 
+from jaxbundle.adjustment.cholesky import cholesky_of_lower
 from jaxbundle.adjustment.parts import Parts
 from jaxbundle.network.structure import Structure
 
@@ -134,16 +135,14 @@ def factorise_band(s: Structure, parts: Parts, scale, free, regular) -> BandFact
     def step(carry, block):
         C, X = carry
         D, E, B = block
-        L = jnp.linalg.cholesky(D - C @ C.T, symmetrize_input=False)
+        L = cholesky_of_lower(D - C @ C.T)
         X = solve_triangular(L, B - C @ X, lower=True)
         C_next = solve_triangular(L, E.T, lower=True).T
         return (C_next, X), (L, C, X)
 
     start = (jnp.zeros((m, m)), jnp.zeros((m, border.shape[2])))
     _, (L, C, X) = jax.lax.scan(step, start, (D, E, border))
-    corner = jnp.linalg.cholesky(
-        corner - jnp.einsum("bmi,bmj->ij", X, X), symmetrize_input=False
-    )
+    corner = cholesky_of_lower(corner - jnp.einsum("bmi,bmj->ij", X, X))
     return BandFactor(s, L, C, X, corner, scale)
 
 

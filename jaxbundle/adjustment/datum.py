@@ -30,6 +30,7 @@ from jaxbundle.geometry import (
     transform_point,
     transform_pose,
 )
+from jaxbundle.implicit import implicit_root, solve_dense
 from jaxbundle.network.arrays import Data, Tangent, Values
 from jaxbundle.network.structure import Structure
 
@@ -138,7 +139,7 @@ def move_to_datum(
 ) -> Values:
     """The network after the finite similarity (of the open kind) for which Bᵀ(x − x_start) = 0.
 
-    `derivatives`: those of the motion are attached to it (implicit function theorem)."""
+    `derivatives`: those of the motion, of every order, are attached to it."""
     s = structure
     if not s.defect:
         return values
@@ -146,7 +147,15 @@ def move_to_datum(
     values = _moved(s, _motion_to_datum(s, point, target), values)
     if not derivatives:
         return values
-    return _moved(s, s.gauge @ _newton_step(s, values.point, start.point), values)
+    tau = jnp.zeros(s.defect)
+    tau = implicit_root(_missing, solve_dense, tau, s, (values.point, start.point))
+    return _moved(s, _exponential(s.gauge @ tau), values)
+
+
+def _missing(tau, s: Structure, places) -> Float[Array, " defect"]:
+    """Bᵀ(x − x_start) after a motion along the open directions."""
+    point, target = places
+    return _datum_equations(s, _moved_points(s, _exponential(s.gauge @ tau), point), target)[0]
 
 
 def _motion_to_datum(s: Structure, point, target, steps: int = 50):
@@ -178,10 +187,9 @@ def _motion_to_datum(s: Structure, point, target, steps: int = 50):
 
 
 def _newton_step(s: Structure, point, target) -> Float[Array, " defect"]:
-    """The motion that meets Bᵀ(x − x_start) = 0 to first order; its slope is held constant."""
-    x, still = jax.lax.stop_gradient((point, target))
-    G = jax.vmap(helmert_point)(x) @ s.gauge * (s.point_free > 0)[..., None]
-    after = lambda tau: _datum_equations(s, x + G @ tau, still)[0]
+    """The motion that meets Bᵀ(x − x_start) = 0 to first order."""
+    G = jax.vmap(helmert_point)(point) @ s.gauge * (s.point_free > 0)[..., None]
+    after = lambda tau: _datum_equations(s, point + G @ tau, target)[0]
     slope = jax.jacfwd(after)(jnp.zeros(s.defect))
     return -jnp.linalg.solve(slope, _datum_equations(s, point, target)[0])
 

@@ -20,6 +20,7 @@ import optimistix as optx
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
+from jaxbundle.adjustment.cholesky import cholesky_of_lower
 from jaxbundle.adjustment.parts import Parts, to_images, to_points
 from jaxbundle.network.structure import Structure
 
@@ -101,8 +102,7 @@ def precondition(
     own = parts.own * scales[:, :, None] * scales[:, None, :]
     own = own + jax.vmap(jnp.diag)(held(of_images(free)))
     corner = parts.corner * rest[:, None] * rest[None, :] + jnp.diag(held(free[n:]))
-    cholesky = lambda matrix: jnp.linalg.cholesky(matrix, symmetrize_input=False)
     return ConjugateGradients(
-        s, image, ray, parts.border, parts.corner, free, cholesky(own), cholesky(corner), scale,
-        tolerance,
+        s, image, ray, parts.border, parts.corner, free, cholesky_of_lower(own),
+        cholesky_of_lower(corner), scale, tolerance,
     )  # fmt: skip

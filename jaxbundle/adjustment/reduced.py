@@ -15,6 +15,7 @@ from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 
 from jaxbundle.adjustment.banded import factorise_band
+from jaxbundle.adjustment.cholesky import cholesky_of_lower
 from jaxbundle.adjustment.parts import Parts, parts_of
 from jaxbundle.network.structure import Structure
 
@@ -50,7 +51,7 @@ def factorise_reduced(structure: Structure, parts: Parts, scale, free, regular=T
     if structure.reduction == "banded":
         return factorise_band(structure, parts, scale, free, regular)
     S = dense_matrix(structure, parts, scale, free, regular)
-    lower = jnp.linalg.cholesky(S, symmetrize_input=False)
+    lower = cholesky_of_lower(S)
     return DenseFactor(structure, lower, scale)
 
 

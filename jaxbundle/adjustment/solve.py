@@ -70,7 +70,7 @@ def solve(
     """Adjusted unknowns as a differentiable function of the observations and all that is given.
 
     Use it under `jax.jit`, `jax.vmap` (over any field of `data`), `jax.grad`, `jax.jacfwd` and
-    `jax.jacrev`.
+    `jax.jacrev`, one inside the other to any order.
 
     **Arguments:**
 
@@ -78,11 +78,15 @@ def solve(
     - `data`: numbers that replace `problem.data` (same shapes); object coordinates relative to
       `problem.origin`.
     - `sensitivity`: `"exact"` (implicit function theorem with the full Hessian) or
-      `"gauss-newton"` ((JᵀPJ)⁻¹JᵀP, error propagation); see `jaxbundle.adjustment.sensitivity`.
+      `"gauss-newton"` ((JᵀPJ)⁻¹JᵀP, error propagation, first order only); see
+      `jaxbundle.adjustment.sensitivity`.
     - `atol`: stop when no unknown would move by more than this fraction of its σ.
 
-    **Returns:** `Values`; NaN throughout where the solver did not converge, so that a failure can
-    never be taken for an answer.
+    **Returns:** `Values`; NaN throughout, derivatives too, where the solver did not converge, so
+    that a failure can never be taken for an answer.
+
+    **Raises:** `InputError` for arguments of another kind, and for a second derivative of the
+    Gauss–Newton form.
     """
     if not isinstance(problem, Problem):
         raise InputError(
@@ -97,7 +101,8 @@ def solve(
     minimum = find_minimum(solver, jax.lax.stop_gradient(data))
     good = converged(minimum.termination)
     values = attach_derivatives(problem.structure, minimum.values, data, sensitivity)
-    return jax.tree.map(lambda x: jnp.where(good, x, jnp.nan), values)
+    # A factor, not a choice: derivatives of what was not found are NaN as well, not 0.
+    return jax.tree.map(lambda x: x * jnp.where(good, 1.0, jnp.nan), values)
 
 
 def converged(termination):

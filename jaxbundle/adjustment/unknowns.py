@@ -1,16 +1,26 @@
 """Names for the columns of the adjustment, for people: which image, which parameter."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.adjustment.jacobian import jacobian
 from jaxbundle.adjustment.normal import normal_from_jacobian
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.adjustment.schur import scaled_matrix
+from jaxbundle.arguments import shown
 from jaxbundle.cameras import get_model
+from jaxbundle.errors import InputError
+from jaxbundle.geometry import (
+    matrix_from_quaternion,
+    omega_phi_kappa_near,
+    retract_quaternion,
+)
 from jaxbundle.network.arrays import Data, Values
+from jaxbundle.network.columns import did_you_mean
 from jaxbundle.network.tables import EXTERIOR
 
 INDETERMINATE = 1e-12
@@ -51,6 +61,62 @@ def interior_names(problem: Problem, c: int) -> list[Name]:
     parameters = get_model(camera.model).parameters
     columns = np.asarray(problem.structure.camera_columns)[c]
     return [Name("camera", camera.id, parameters[column]) for column in columns]
+
+
+def named(problem: Problem, names: Sequence[tuple[str, str, str]]) -> list[Name]:
+    """Unknowns by name, e.g. `("camera", "cam", "c")`, `("image", "12", "kappa")`,
+    `("point", "7", "Z")`.
+
+    **Raises:** `InputError` where nothing is named, or a name has other than three parts;
+    `KeyError` for a name that is not there."""
+    for name in names or (None,):
+        if isinstance(name, str) or np.shape(name) != (3,):
+            given = "none is given" if name is None else f"one is {shown(name)}"
+            raise InputError(
+                'covariance: names of unknowns are expected, such as ("camera", "cam", "c") or '
+                f'("point", "7", "Z"), but {given}'
+            )
+    wanted = [Name(*map(str, name)) for name in names]
+    for name in wanted:
+        value_of(problem, name, problem.data.start)
+    return wanted
+
+
+def value_of(problem: Problem, name: Name, values: Values):
+    """The unknown of this name; of an exterior orientation X0, Y0, Z0, ω, φ, κ (radians).
+
+    **Raises:** `KeyError` for a name that is not there."""
+    network = problem.network
+    if name.kind == "camera":
+        c = place_of(name.id, [camera.id for camera in network.cameras], "camera")
+        parameters = get_model(network.cameras[c].model).parameters
+        return values.camera[c, place_of(name.parameter, parameters, "camera parameter")]
+    if name.kind == "image":
+        i = place_of(name.id, network.images.id, "image")
+        angles = angles_near(values.rotation[i], jnp.zeros(3), network.images.angles[i])
+        pose = jnp.concatenate([values.position[i], angles])
+        return pose[place_of(name.parameter, EXTERIOR, "image parameter")]
+    if name.kind == "point":
+        p = place_of(name.id, network.points.id, "point")
+        return values.point[p, place_of(name.parameter, ("X", "Y", "Z"), "coordinate")]
+    raise KeyError(f"an unknown is of a camera, an image or a point, not of a {name.kind!r}")
+
+
+def angles_near(rotation, d_theta, given):
+    """ω, φ, κ after a small rotation, on the turn and branch of the given ones."""
+    return omega_phi_kappa_near(
+        matrix_from_quaternion(retract_quaternion(rotation, d_theta)), given
+    )
+
+
+def place_of(name: str, names: Sequence[str], thing: str) -> int:
+    """The place of a name among others.
+
+    **Raises:** `KeyError` where it is not there, with the nearest one that is."""
+    if name not in names:
+        known = did_you_mean(name, names, listing=len(names) <= 20)
+        raise KeyError(f"there is no {thing} {name!r}{known}")
+    return names.index(name)
 
 
 def undetermined(problem: Problem, values: Values, data: Data) -> list[str]:

@@ -1,0 +1,73 @@
+"""Roots of equations as functions of what the equations depend on: derivatives of every order.
+
+A root x(θ) of g(x, θ) = 0, however it was found, moves with θ by the implicit function theorem,
+
+    ẋ = −(∂g/∂x)⁻¹·∂g/∂θ·θ̇,        everything at x(θ).
+
+The root in that rule is again the function x(θ), and the linear system in it is differentiated as
+one, A·x = b → A·ẋ = ḃ − Ȧ·x. So the rule holds to every order in forward, reverse and mixed mode
+(Griewank and Walther 2008, section 15.3). The iterations that found the root are never
+differentiated, nor is a factorisation of A.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import PyTree
+
+from jaxbundle.errors import InputError
+
+
+@eqx.filter_custom_jvp
+def implicit_root(
+    equations: Callable, solve: Callable, root: PyTree, fixed: PyTree, data: PyTree
+) -> PyTree:
+    """`root` as a function of `data`, differentiable to every order.
+
+    **Arguments:** `equations(x, fixed, data)`, zero at the root, in the form of x; `solve(times,
+    fixed, b)`, the solution of A·x = b, where `times(x)` is A·x, A = ∂equations/∂x at the root;
+    it has to be differentiable in b and in what `times` depends on (`solve_dense`,
+    `jax.lax.custom_linear_solve`); `root` and `fixed` without derivatives (`stop_gradient`).
+    """
+    return root
+
+
+@implicit_root.def_jvp
+def _(primals, tangents):
+    equations, solve, root, fixed, data = primals
+    root = implicit_root(*primals)
+    at_root = lambda data: equations(root, fixed, data)
+    change = derivative_along(at_root, data, tangents[-1])
+    at_data = lambda x: equations(x, fixed, data)
+    times = lambda x: jax.jvp(at_data, (root,), (x,))[1]
+    return root, jax.tree.map(jnp.negative, solve(times, fixed, change))
+
+
+def derivative_along(function: Callable, data: PyTree, change: PyTree) -> PyTree:
+    """The derivative of a function along a change of its data, None where that does not change."""
+    value, moved = eqx.filter_jvp(function, (data,), (change,))
+    return jax.tree.map(lambda x, d: jnp.zeros_like(x) if d is None else d, value, moved)
+
+
+def solve_dense(times: Callable, fixed: PyTree, b: PyTree) -> PyTree:
+    """The solution of a small system A·x = b, by its matrix; NaN where A is singular."""
+    flat, unravel = ravel_pytree(b)
+    column = lambda e: ravel_pytree(times(unravel(e)))[0]
+    A = jax.vmap(column, out_axes=1)(jnp.eye(flat.size, dtype=flat.dtype))
+    return unravel(jnp.linalg.solve(A, flat))
+
+
+@eqx.filter_custom_jvp
+def differentiable_once(x: PyTree, message: str) -> PyTree:
+    """`x`, to be used in a rule for derivatives that is not to be differentiated again.
+
+    **Raises:** `InputError` with the message, where it is."""
+    return x
+
+
+@differentiable_once.def_jvp
+def _(primals, tangents):
+    raise InputError(primals[1])

@@ -1,0 +1,131 @@
+"""`precision` against the dense inverse of networks built anew, and its derivatives against their
+differences."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from adjustment_checks import (
+    bordered_inverse,
+    camera,
+    datum_matrices,
+    flat,
+    synthetic,
+)
+
+import jaxbundle
+from jaxbundle.adjustment.jacobian import compiled_jacobian, free_tangent
+from jaxbundle.errors import InputError
+
+NETWORK = dict(
+    cameras=(camera(free=("c", "K1")),), images=4, points=7, datum="inner", noise=0.0,
+    disturbance=0.0,
+)  # fmt: skip
+NAMES = ("camera", "cam", "c"), ("point", "P1", "Z"), ("image", "image 2", "Y0")
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return jaxbundle.make_problem(synthetic(**NETWORK)[0])
+
+
+@pytest.fixture(scope="module")
+def program(problem):
+    """The precision and the derivatives of the covariance by the whole design, at any design."""
+
+    def covariance(data):
+        found = jaxbundle.precision(problem, data, names=NAMES)
+        return found.covariance, found
+
+    return eqx.filter_jit(jax.jacrev(covariance, has_aux=True))
+
+
+def dense_covariance(problem, data):
+    """Of the unknowns of `NAMES`, from the whole Jacobian at measurements made anew."""
+    s, values = problem.structure, data.start
+    rays = np.einsum(
+        "nij,nj->ni",
+        np.asarray(jax.vmap(jaxbundle.geometry.matrix_from_quaternion)(values.rotation))[s.image],
+        np.asarray(values.point)[s.point] - np.asarray(values.position)[s.image],
+    )
+    model = jaxbundle.cameras.get_model("brown")
+    xy = np.stack(jaxbundle.cameras.project(model, tuple(values.camera[0]), *rays.T), 1)
+    data = dataclasses.replace(data, image_xy=jnp.asarray(xy))
+    J = np.asarray(compiled_jacobian(s, values, data).as_matrix())
+    _, B = datum_matrices(s, values)
+    Q = bordered_inverse(J.T @ J, B, flat(free_tangent(s)))
+    at_camera = 6 * s.images
+    pick = [at_camera, at_camera + s.camera_width + 3 + 2, 6 * 2 + 1]
+    return Q[np.ix_(pick, pick)]
+
+
+def moved(data, field, place, h):
+    at = lambda d: getattr(d.start, field) if hasattr(d.start, field) else getattr(d, field)
+    return eqx.tree_at(at, data, at(data).at[place].add(h))
+
+
+def test_precision_is_that_of_the_dense_inverse(problem, program):
+    _, found = program(problem.data)
+    dense = dense_covariance(problem, problem.data)
+    sigma = np.sqrt(np.diag(dense))
+    assert np.abs((found.covariance - dense) / np.outer(sigma, sigma)).max() < 1e-7
+    np.testing.assert_allclose(
+        [found.cameras[0, 0], found.points[1, 2], found.images[2, 1]], sigma, rtol=1e-7
+    )
+    assert (np.asarray(found.cameras) > 0).sum() == 2  # what is held has none
+
+
+def test_derivatives_by_stations_targets_cameras_and_weights(problem, program):
+    slopes, _ = program(problem.data)
+    places = {
+        "position": ((1, 2), 1e-3), "rotation": ((3, 1), 1e-4), "point": ((2, 0), 1e-3),
+        "camera": ((0, 0), 1e-2), "image_weight": ((5, 1), 1.0),
+    }  # fmt: skip
+    for field, (place, h) in places.items():
+        at = lambda d, f=field: getattr(d.start, f) if hasattr(d.start, f) else getattr(d, f)
+        slope = np.asarray(at(slopes))[(..., *place)]
+        ends = {k: dense_covariance(problem, moved(problem.data, field, place, k * h))
+                for k in (-2, -1, 1, 2)}  # fmt: skip
+        difference = (8 * (ends[1] - ends[-1]) - (ends[2] - ends[-2])) / (12 * h)
+        assert np.abs(slope).max() > 0
+        assert np.abs(slope - difference).max() < 1e-5 * np.abs(difference).max(), field
+    # What was measured is not asked for.
+    assert not np.asarray(slopes.image_xy).any()
+
+
+def test_a_station_moves_the_precision_of_the_principal_distance_in_a_batch(problem, program):
+    """∂²σ²/∂X0² under vmap, jit and reverse over reverse."""
+    X0 = problem.data.start.position[1, 0]
+
+    def variance(x):
+        data = eqx.tree_at(
+            lambda d: d.start.position, problem.data,
+            problem.data.start.position.at[1, 0].set(x),
+        )  # fmt: skip
+        return jaxbundle.precision(problem, data, names=NAMES[:1], sigma0=2.0).covariance[0, 0]
+
+    h = 1e-3
+    x = X0 + h * np.array([0, -2, -1, 1, 2])
+    orders = lambda x: (variance(x), jax.grad(variance)(x), jax.grad(jax.grad(variance))(x))
+    value, first, second = map(np.asarray, jax.jit(jax.vmap(orders))(x))
+    assert value[0] == pytest.approx(4 * dense_covariance(problem, problem.data)[0, 0], rel=1e-7)
+    stencil = lambda y: (8 * (y[3] - y[2]) - (y[4] - y[1])) / (12 * h)
+    assert first[0] == pytest.approx(stencil(value), rel=1e-6)
+    assert second[0] == pytest.approx(stencil(first), rel=1e-6)
+
+
+def test_a_design_that_determines_nothing_is_nan(problem):
+    """All stations at one place."""
+    same = jnp.tile(problem.data.start.position[:1], (4, 1))
+    data = eqx.tree_at(lambda d: d.start.position, problem.data, same)
+    assert np.isnan(jaxbundle.precision(problem, data).points).all()
+
+
+def test_names_that_are_not_there(problem):
+    with pytest.raises(KeyError, match="no camera parameter 'f'"):
+        jaxbundle.precision(problem, names=(("camera", "cam", "f"),))
+    with pytest.raises(InputError, match="problem must be"):
+        jaxbundle.precision(problem.network)
