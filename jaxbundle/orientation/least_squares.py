@@ -4,8 +4,8 @@
 
 J = ∂v(x ⊞ δ)/∂δ at δ = 0 by forward differentiation; v contains the roots of the weights. λ
 falls with success and rises with failure (Levenberg, 1944; Marquardt, 1963). The iterations are
-not differentiated: the last step is without damping from an estimate held fixed, so that its
-derivative by the data is that of the solution (implicit function theorem, with N for the Hessian).
+not differentiated: the derivatives, of every order, are those of the root of ∂(vᵀv)/∂δ = 0
+(`jaxbundle.implicit`), curvature of v included.
 """
 
 from collections.abc import Callable
@@ -17,6 +17,8 @@ from jax import Array
 from jax.lax import stop_gradient
 from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Float, PyTree
+
+from jaxbundle.implicit import implicit_root, solve_dense
 
 DETERMINED = 1e-10
 """Least eigenvalue of the normal matrix scaled to a unit diagonal, below it nothing is solved."""
@@ -70,23 +72,34 @@ def minimise(residuals: Callable, retract: Callable, start, data: tuple, unknown
 
 
 def finish(residuals: Callable, retract: Callable, estimate, data: tuple, unknowns: int) -> Fit:
-    """The last step, which carries the derivatives, and the cofactors."""
-    x = stop_gradient(estimate)
-    N, g = normal_equations(residuals, retract, x, data, unknowns)
-    diagonal = stop_gradient(jnp.diag(N))
+    """The last step, without damping, the derivatives and the cofactors."""
+    x, held = stop_gradient((estimate, data))
+    N, g = normal_equations(residuals, retract, x, held, unknowns)
+    diagonal = jnp.diag(N)
     scale = 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
-    scaled = stop_gradient(N) * scale * scale[:, None]
+    scaled = N * scale * scale[:, None]
     weakest = jnp.linalg.eigvalsh(jnp.where(jnp.isfinite(scaled), scaled, 0))[0]
     determined = weakest > DETERMINED
     N = jnp.where(determined, N, jnp.eye(unknowns, dtype=N.dtype))
     step = jnp.where(determined, -_solve(N, g), 0)
-    square = lambda x: jnp.sum(residuals(x, *data) ** 2)
+    square = lambda x, data: jnp.sum(residuals(x, *data) ** 2)
     # at the minimum, rounding may let vᵀv rise; far from it, an undamped step may be wrong
     rounding = 1e-22 * jnp.sum(diagonal)
-    good = stop_gradient(square(retract(x, step)) <= 1.001 * square(x) + rounding)
+    good = square(retract(x, step), held) <= 1.001 * square(x, held) + rounding
     x = retract(x, jnp.where(good, step, 0))
+    still = jnp.zeros(unknowns, step.dtype)
+    fixed = (residuals, retract, x)
+    x = retract(x, implicit_root(_half_gradient, solve_dense, still, fixed, data))
+    N, _ = normal_equations(residuals, retract, x, data, unknowns)
+    N = jnp.where(determined, N, jnp.eye(unknowns, dtype=N.dtype))
     cofactor = jnp.where(determined, inverse(N), jnp.inf)
-    return Fit(x, square(x), cofactor, weakest)
+    return Fit(x, square(x, data), cofactor, weakest)
+
+
+def _half_gradient(delta, fixed, data):
+    """∂(½vᵀv)/∂δ after a step δ from the estimate."""
+    residuals, retract, x = fixed
+    return jax.grad(lambda delta: 0.5 * jnp.sum(residuals(retract(x, delta), *data) ** 2))(delta)
 
 
 def normal_equations(residuals, retract, x, data, unknowns):

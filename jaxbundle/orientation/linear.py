@@ -1,11 +1,9 @@
 """Linear algebra of start values: null vectors, normalised coordinates, the extent of points.
 
 A homogeneous system A·h ≈ 0, |h| = 1, is solved by the right singular vector of the least singular
-value. Its exact first derivative, also where that value is zero, is that of
+value. Its derivatives, of every order, also where that value is zero, are those of the root of
 
-    h − (AᵀA − σₙ²·I)⁺·AᵀA·h
-
-with all but the last AᵀA held: the correction itself is zero (Golub and Pereyra, 1973).
+    (AᵀA − λ·I)·h = 0,   hᵀh = 1                            (Golub and Pereyra, 1973)
 """
 
 import jax.numpy as jnp
@@ -13,17 +11,21 @@ from jax import Array
 from jax.lax import stop_gradient
 from jaxtyping import Float
 
+from jaxbundle.implicit import implicit_root, solve_dense
+
 
 def null_vector(
     A: Float[Array, "rows n"],
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """h of least |A·h|, |h| = 1, and the singular values, largest first; zero if rows are few."""
     _, s, Vt = _right_singular(stop_gradient(A))
-    gap = s[:-1] ** 2 - s[-1] ** 2
-    usable = gap > 1e-28 * s[0] ** 2
-    h, others = Vt[-1], Vt[:-1]
-    slope = others @ (A.T @ (A @ h))
-    return h - (jnp.where(usable, slope / jnp.where(usable, gap, 1), 0) @ others), s
+    root = (Vt[-1], s[-1] ** 2)
+    return implicit_root(_null_equations, solve_dense, root, None, A)[0], s
+
+
+def _null_equations(root, _, A):
+    h, eigenvalue = root
+    return A.T @ (A @ h) - eigenvalue * h, 0.5 * (h @ h - 1)
 
 
 def null_space(A: Float[Array, "rows n"], k: int) -> Float[Array, "k n"]:

@@ -25,6 +25,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, normal
 from jaxbundle.geometry.vectors import Vector, difference, dot, turned_back
+from jaxbundle.implicit import implicit_root, solve_dense
 
 from .corrections import seen_point
 from .footprint import Footprint, make_footprint
@@ -140,20 +141,23 @@ def project_near(
     pixel: Float[Array, ""],
     earth: Ellipsoid | None = WGS84,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Line and pixel of one point seen near a place; differentiable in image and point."""
-    g = lambda image, X, tu: misclosure(image, X, *tu, earth)
-    fixed, point = stop_gradient((image, X))
+    """Line and pixel of one point seen near a place; differentiable in image and point, to every
+    order."""
+    fixed = stop_gradient((image, X))
 
-    def newton(_, state):
-        tu, _ = state
-        J = jax.jacfwd(g, 2)(fixed, point, tu)
-        return tu - jnp.linalg.solve(J, g(fixed, point, tu)), J
+    def newton(_, tu):
+        J = jax.jacfwd(_misclosure_near)(tu, earth, fixed)
+        return tu - jnp.linalg.solve(J, _misclosure_near(tu, earth, fixed))
 
-    start = jnp.stack([fixed.times.time(line), pixel * 1.0]), jnp.eye(2)
-    # the last step is too short to change J
-    tu, J = stop_gradient(jax.lax.fori_loop(0, NEAR_STEPS, newton, start))
-    t, u = tu - jnp.linalg.solve(J, g(image, X, tu))
+    start = stop_gradient(jnp.stack([fixed[0].times.time(line), pixel * 1.0]))
+    tu = jax.lax.fori_loop(0, NEAR_STEPS + 1, newton, start)
+    t, u = implicit_root(_misclosure_near, solve_dense, tu, earth, (image, X))
     return image.times.line(t), u
+
+
+def _misclosure_near(tu, earth, data):
+    image, X = data
+    return misclosure(image, X, *tu, earth)
 
 
 def misclosure(

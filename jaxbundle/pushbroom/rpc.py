@@ -29,6 +29,7 @@ from jaxtyping import Array, Float
 
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, earth_fixed
 from jaxbundle.geometry.vectors import Vector, along, difference, unit
+from jaxbundle.implicit import implicit_root, solve_dense
 
 from .surfaces import Surface
 
@@ -102,21 +103,17 @@ def locate(
         (line - rpc.line_offset) / rpc.line_scale,
         (sample - rpc.sample_offset) / rpc.sample_scale,
     ])  # fmt: skip
-    fixed = stop_gradient((rpc, H, target))
-
-    def misclosure(place, rpc, H, target):
-        v = jnp.stack(_ratios(rpc, *place, H)) - target
-        return v, v
+    held = stop_gradient((rpc, H, target))
 
     def newton(_, state):
-        place, _, _ = state
-        J, v = jax.jacfwd(misclosure, has_aux=True)(place, *fixed)
+        place, _ = state
+        J, v = jax.jacfwd(_twice_misclosure, has_aux=True)(place, held)
         step = _solved(J, v)
-        return place - step, jnp.max(jnp.abs(step)), J
+        return place - step, jnp.max(jnp.abs(step))
 
-    start = (jnp.zeros(2), jnp.asarray(jnp.inf), jnp.zeros((2, 2)))
-    place, last, J = stop_gradient(jax.lax.fori_loop(0, STEPS, newton, start))
-    L, P = place - _solved(J, misclosure(place, rpc, H, target)[0])
+    start = (jnp.zeros(2), jnp.asarray(jnp.inf))
+    place, last = jax.lax.fori_loop(0, STEPS + 1, newton, start)
+    L, P = implicit_root(_misclosure, solve_dense, place, None, (rpc, H, target))
     settled = last < SETTLED
     longitude = jnp.radians(rpc.longitude_offset + rpc.longitude_scale * L)
     latitude = jnp.radians(rpc.latitude_offset + rpc.latitude_scale * P)
@@ -125,6 +122,16 @@ def locate(
         settled, _inside(jnp.stack([L, P, H, *target])), int(RpcStatus.NOT_CONVERGED)
     )
     return found(longitude), found(latitude), status
+
+
+def _misclosure(place, _, data):
+    rpc, H, target = data
+    return jnp.stack(_ratios(rpc, *place, H)) - target
+
+
+def _twice_misclosure(place, data):
+    v = _misclosure(place, None, data)
+    return v, v
 
 
 def domain(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> Array:

@@ -33,6 +33,7 @@ from jaxtyping import Array, Float
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, at_height, geodetic, ray_to_ellipsoid
 from jaxbundle.geometry.vectors import Scalar, Vector, along
+from jaxbundle.implicit import implicit_root, solve_dense
 
 from .polynomial import value, value_and_rate
 from .surfaces import Surface
@@ -59,13 +60,14 @@ class Terrain(Surface):
     over_voids: bool = eqx.field(static=True, default=True)
 
     def distance(self, o: Vector, d: Vector) -> Scalar:
-        top, bottom = self._slab(o, d)
-        path = self._path(*stop_gradient((o, d, top, bottom)))
-        tau = _first_hit(path, self.heights, self.over_voids)
-        s = stop_gradient(top + tau * (bottom - top))
-        x, y, h = self.grid(along(o, d, s))
-        slope = _rate(path, tau, self.heights) / stop_gradient(bottom - top)
-        return s - (h - bilinear(self.heights, x, y)) / slope
+        still, *ray = stop_gradient((self, o, d))
+        top, bottom = still._slab(*ray)
+        path = still._path(*ray, top, bottom)
+        tau = _first_hit(path, still.heights, self.over_voids)
+        s = top + tau * (bottom - top)
+        slope = _rate(path, tau, still.heights) / (bottom - top)
+        s = s - _above_ground(s, None, (still, *ray)) / slope
+        return implicit_root(_above_ground, solve_dense, s, None, (self, o, d))
 
     def grid(self, X: Vector) -> Vector:
         """(column, row, height) of a point."""
@@ -118,6 +120,13 @@ def make_terrain(
         jnp.asarray(heights), tuple(map(float, origin)), tuple(map(float, step)), low, high, earth,
         over_voids,
     )  # fmt: skip
+
+
+def _above_ground(s, _, data):
+    """The height above the terrain at the distance s along a ray."""
+    terrain, o, d = data
+    x, y, h = terrain.grid(along(o, d, s))
+    return h - bilinear(terrain.heights, x, y)
 
 
 def bilinear(heights: Float[Array, "rows columns"], x: Scalar, y: Scalar) -> Scalar:

@@ -82,6 +82,26 @@ def test_derivatives_of_the_way_back():
         np.testing.assert_allclose(exact, numeric, rtol=2e-6)
 
 
+def test_second_derivatives_of_the_way_back():
+    """Along a direction of the place and of all coefficients, against differences of the first."""
+    rng = np.random.default_rng(1)
+    flat, back = jax.flatten_util.ravel_pytree(RPC)
+    place = np.array([1200.0, 3100.0, 250.0])
+    of_flat, of_place = 1e-6 * rng.normal(size=flat.size), rng.normal(size=3)
+
+    @jax.jit
+    def along(s):
+        def longitude(s):
+            return r.locate(back(flat + s * of_flat), *(place + 300 * s * of_place))[0]
+
+        first = jax.jvp(longitude, (s,), (1.0,))[1]
+        return first, jax.grad(jax.grad(longitude))(s)
+
+    h = 0.05
+    numeric = (along(h)[0] - along(-h)[0]) / (2 * h)
+    assert float(along(0.0)[1]) == pytest.approx(float(numeric), rel=1e-3)
+
+
 def test_a_line_of_sight_on_surfaces():
     """Points on a height and a sloping terrain project back to where they came."""
     line, sample, _ = r.project_points(RPC, *PLACES)
