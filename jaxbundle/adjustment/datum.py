@@ -16,6 +16,8 @@ is moved by the finite similarity that makes the datum hold exactly against the 
 Bᵀ(x − x_start) = 0. So the result does not depend on the path of the iterations.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -54,8 +56,31 @@ def helmert(structure: Structure, values: Values) -> Tangent:
 
 
 def gauge_directions(structure: Structure, values: Values) -> Tangent:
-    """The open directions only: G times the combinations found by `open_similarities`."""
-    return jax.tree.map(lambda g: g @ structure.gauge, helmert(structure, values))
+    """The open directions only: G times the open combinations."""
+    gauge = open_combinations(structure, values)
+    return jax.tree.map(lambda g: g @ gauge, helmert(structure, values))
+
+
+def open_combinations(structure: Structure, values: Values) -> Float[Array, "7 defect"]:
+    """The combinations found by `open_similarities`, changed least so that what is held stays where
+    it is now: a rotation about a fixed point goes with the point. What only fills the arrays, and
+    is held as well, is seen by no ray."""
+    s = structure
+    if not 0 < s.defect < 7:
+        return s.gauge
+    G, free, used = helmert(s, values), free_tangent(s), s.table.used
+    images = s.table.sum_by_image(used[:, None])
+    points = jax.ops.segment_sum(used, s.point, s.points)[:, None]
+    held = [
+        (g * ((f == 0) & (rays > 0))[..., None]).reshape(-1, 7)
+        for g, f, rays in ((G.image, free.image, images), (G.point, free.point, points))
+    ]
+    A = sum(rows.T @ rows for rows in held)
+    scale = jax.lax.stop_gradient(jnp.diagonal(A))
+    scale = jnp.where(scale > 0, jax.lax.rsqrt(jnp.where(scale > 0, scale, 1.0)), 1.0)
+    A = A * scale * scale[:, None]
+    moved = A @ (s.gauge / scale[:, None])
+    return s.gauge - scale[:, None] * (jnp.linalg.pinv(A, HELD, hermitian=True) @ moved)
 
 
 def compiled_helmert(structure: Structure, values: Values) -> Tangent:
@@ -143,18 +168,22 @@ def move_to_datum(
     s = structure
     if not s.defect:
         return values
-    point, target = jax.lax.stop_gradient((values.point, start.point))
-    values = _moved(s, _motion_to_datum(s, point, target), values)
+    gauge = open_combinations(s, values)
+    still, point, target = jax.lax.stop_gradient((gauge, values.point, start.point))
+    motion = _motion_to_datum(dataclasses.replace(s, gauge=still), point, target)
+    values = _moved(s, motion, values)
     if not derivatives:
         return values
+    # What is held has not moved, and the combinations that leave it there are the same.
     tau = jnp.zeros(s.defect)
-    tau = implicit_root(_missing, solve_dense, tau, s, (values.point, start.point))
-    return _moved(s, _exponential(s.gauge @ tau), values)
+    tau = implicit_root(_missing, solve_dense, tau, s, (gauge, values.point, start.point))
+    return _moved(s, _exponential(gauge @ tau), values)
 
 
 def _missing(tau, s: Structure, places) -> Float[Array, " defect"]:
     """Bᵀ(x − x_start) after a motion along the open directions."""
-    point, target = places
+    gauge, point, target = places
+    s = dataclasses.replace(s, gauge=gauge)
     return _datum_equations(s, _moved_points(s, _exponential(s.gauge @ tau), point), target)[0]
 
 

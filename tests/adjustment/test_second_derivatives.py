@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from adjustment_checks import camera, flat, solved, synthetic
+from adjustment_checks import camera, flat, make, solved, synthetic, vtpv
 from test_sensitivity import STENCIL, directions, weights_of_values
 
 import jaxbundle
@@ -23,6 +23,7 @@ from jaxbundle.adjustment.sensitivity import attach_derivatives
 from jaxbundle.adjustment.solve import solve
 from jaxbundle.errors import InputError
 from jaxbundle.network.check import check_network
+from jaxbundle.solution import minimise
 
 pytestmark = pytest.mark.slow
 
@@ -79,6 +80,32 @@ def test_mixed_second_derivatives_by_everything_that_was_given(name):
         assert {"control", "control_weight", "distance", "interior"} <= seen
     else:
         assert "start point" in seen  # the datum refers to it
+
+
+def test_a_fixed_point_takes_the_datum_with_it():
+    """Free but for a point that is held: where that goes, all goes, and the minimum stays. (The
+    rotations and the scale that are open are those about the point.)"""
+    problem = make("one fixed point")
+    s, data = problem.structure, problem.data
+    (held,) = np.flatnonzero(np.asarray(s.point_free)[:, 0] == 0)
+    shift = jnp.array([0.3, -0.2, 0.1])
+    only = eqx.tree_at(lambda d: d.start.point, data, data.start.point.at[held].add(shift))
+    filled_in = minimise(dataclasses.replace(problem, data=only), only.start)
+    for minimum in (solved(problem, only), filled_in):
+        assert vtpv(dataclasses.replace(problem, data=only), minimum.values) == pytest.approx(
+            vtpv(problem, solved(problem).values), rel=1e-9
+        )
+
+    @jax.jit
+    def moved(values, step):
+        at = lambda step: eqx.tree_at(
+            lambda d: d.start.point, data, data.start.point.at[held].add(step * shift)
+        )
+        adjusted = lambda step: attach_derivatives(s, values, at(step)).camera[0, 0]
+        return jax.grad(adjusted)(step)
+
+    # A shift of everything moves no principal distance.
+    assert abs(moved(solved(problem).values, 0.0)) < 1e-9
 
 
 def with_observations(data, xy, weight):
