@@ -81,7 +81,7 @@ def calibrate_batch(
     - `model`: a camera model in pixels: "opencv", "kannala-brandt", "snavely".
     - `visible`: which points were measured where; all, if not given. What is not visible may have
       any coordinates. A point that is NaN or masked is not visible: in an image, where it was not
-      measured, or in the object.
+      measured, or in the object (`make_network` refuses such a row).
     - `free`: the parameters to estimate; if not given, for "opencv" those of OpenCV's model of 5
       coefficients, otherwise all.
     - `start`: start values of parameters, for all cameras or [cameras]; without focal lengths these

@@ -3,6 +3,8 @@
 import math
 from collections.abc import Mapping
 
+import numpy as np
+
 from .model import CameraModel
 from .names import closest
 
@@ -46,6 +48,6 @@ def check_parameters(model: CameraModel, given: Mapping[str, float]) -> None:
 
 def _is_finite_number(value) -> bool:
     try:
-        return not isinstance(value, bool) and math.isfinite(value)
+        return not (isinstance(value, bool) or np.ma.is_masked(value)) and math.isfinite(value)
     except (TypeError, OverflowError):
         return False

@@ -90,7 +90,9 @@ def make_network(
     - `images`: exterior orientation, start values (object unit, `angle_unit`) and prior σ.
     - `points`: object coordinates (object unit) and σ.
     - `observations`: image coordinates and σ in `image_unit`; they are converted to the unit of
-      the camera's model, which needs its image_size and pixel_size.
+      the camera's model, which needs its image_size and pixel_size. A row is a measurement: a
+      coordinate that is NaN or masked is refused with its row, while in the arrays of
+      `calibrate_batch`, where every view has a place for every point, it was not measured.
     - `sigma_image`: σ of image coordinates without their own (None: 1, with a warning).
 
     **Raises:** `InputError` naming table, row and column. `check_network` does the rest.

@@ -26,6 +26,7 @@ def test_defaults_leave_the_principal_distance_open(name):
         ("brown", dict(c=20.0, K1=np.nan), "K1 must be a finite number, but is nan"),
         ("brown", dict(c=20.0, K1="1e-4"), "K1 must be a finite number, but is '1e-4'"),
         ("brown", dict(c=20.0, K1=True), "K1 must be a finite number, but is True"),
+        ("brown", dict(c=np.ma.masked), "c must be a finite number, but is masked"),
         ("brown", dict(K1=1e-4), "c is missing; give the principal distance in mm"),
         ("brown", dict(c=0.0), "c must be positive, but is 0.0"),
         ("opencv", dict(fx=500.0, fy=-500.0), "fy must be positive, but is -500.0"),
