@@ -14,7 +14,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.io.json_fields import JsonFields
 from jaxbundle.io.sight_frames import sight_frame
-from jaxbundle.network.columns import shown
+from jaxbundle.network.columns import shown, some
 from jaxbundle.pushbroom.scanner import AngleTable, FocalLine, Optics
 
 ALIGNED = 1e-9
@@ -69,6 +69,10 @@ def _distortion(isd, x, y):
     """Its kind, and the coordinates free of it, mm."""
     given = isd.document.setdefault("optical_distortion", {"radial": {"coefficients": [0.0]}})
     kind = next(iter(given), None) if isinstance(given, dict) else None
+    if isinstance(given, dict) and len(given) > 1:
+        raise InputError(
+            f"{isd.path}: optical_distortion has {len(given)} kinds ({some(given)}); one is expected"
+        )
     where = f"optical_distortion.{kind}"
     coefficients = lambda n: isd.array(f"{where}.coefficients", (n,))
     match kind:

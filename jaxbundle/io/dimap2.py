@@ -82,12 +82,17 @@ def read_dimap2(file: XmlFields) -> Scanner:
 def _period(file, lines, epoch):
     period = file.number(f"{MODEL}/Time/Time_Stamp/LINE_PERIOD")
     span = seconds(file.time(f"{MODEL}/Time/Time_Range/END"), epoch)
-    for unit in UNITS:
-        if period > 0 and abs(unit * period * (lines - 0.5) - span) <= FITS * span + unit * period:
-            return unit * period
+    fits = lambda unit: (
+        period > 0 and abs(unit * period * (lines - 0.5) - span) <= FITS * span + unit * period
+    )
     profile = file.text("Metadata_Identification/METADATA_PROFILE", "").partition("_")[0]
-    if profile in PROFILES and period > 0:
-        return PROFILES[profile] * period
+    known = (PROFILES[profile],) if profile in PROFILES else ()
+    # Of few lines several units fit: that of the product goes first.
+    for unit in (*known, *UNITS):
+        if fits(unit):
+            return unit * period
+    if known and period > 0:
+        return known[0] * period
     raise InputError(
         f"{file.path}: LINE_PERIOD is {period:g} and START to END {span:g} s for {lines} lines; a "
         "period in seconds, milliseconds or microseconds that fits is expected"

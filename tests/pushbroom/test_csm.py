@@ -221,6 +221,10 @@ BROKEN = {
     "period": (changed("line_scan_rate", [[0.5, 0.0, 0.0]]), ["line_scan_rate", "positive"]),
     "unit": (changed("radii.unit", "miles"), ["radii.unit", "'miles'"]),
     "distortion": (changed("optical_distortion", {"fisheye": {}}), ["'fisheye'", "radial"]),
+    "two distortions": (
+        changed("optical_distortion", {"radial": {"coefficients": [0.0]}, "legendre": {}}),
+        ["2 kinds", "'legendre'"],
+    ),
     "legendre": (changed("optical_distortion", {"legendre": {}}), ["'legendre' is not supported"]),
     "themisir": (changed("optical_distortion", {"themisir": {}}), ["'themisir' is not supported"]),
     "quaternion": (
