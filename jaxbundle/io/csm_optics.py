@@ -71,7 +71,8 @@ def _distortion(isd, x, y):
     kind = next(iter(given), None) if isinstance(given, dict) else None
     if isinstance(given, dict) and len(given) > 1:
         raise InputError(
-            f"{isd.path}: optical_distortion has {len(given)} kinds ({some(given)}); one is expected"
+            f"{isd.path}: optical_distortion has {len(given)} kinds ({some(given)}); "
+            "one is expected"
         )
     where = f"optical_distortion.{kind}"
     coefficients = lambda n: isd.array(f"{where}.coefficients", (n,))
