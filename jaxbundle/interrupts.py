@@ -7,7 +7,7 @@ C++, which takes minutes for a large network, it is not raised at all.
 
 So nothing is raised. The handler removes what is temporary and ends the process. Python calls it
 between two steps of the main thread, wherever that is. Where it is not called within `GRACE`, for
-the main thread is in C++, a thread that the signal wakes does the same.
+the main thread is in C++ or in a block `unbroken`, a thread that the signal wakes does the same.
 
 Nothing of this is set up by importing jaxbundle: only the command line calls `handle_interrupts`.
 """
@@ -29,7 +29,9 @@ if os.name == "posix":
 
 _advice = ""
 _status = 1
-_heard = False
+_screen = 2
+"""Standard error: from `handle_interrupts` on a second way to it, for a writer of rasters silences
+the first."""
 _ending = _temporaries = None
 """A lock, and the module that knows what is temporary: once they are imported."""
 
@@ -40,7 +42,7 @@ def handle_interrupts() -> None:
     At its end the process leaves without taking the interpreter apart, which takes JAX up to a
     second in which a signal would end it in other ways.
     """
-    global _ending, _temporaries
+    global _ending, _screen, _temporaries
     for number in WORDS:
         if signal.getsignal(number) in (signal.default_int_handler, signal.SIG_DFL):
             try:
@@ -56,6 +58,7 @@ def handle_interrupts() -> None:
     _ending = threading.RLock()
     _temporaries = temporaries
     _open_standard_streams()
+    _screen = os.dup(2)
     atexit.register(_leave)  # the first to be registered is the last to be called
     if os.name == "posix":
         reader, writer = os.pipe()
@@ -77,8 +80,6 @@ def set_status(status: int) -> None:
 
 
 def _handle(number: int, frame: object) -> None:
-    global _heard
-    _heard = True
     if _temporaries is None:  # Then nothing is.
         _say_and_exit(number)
     if not _temporaries.put_off(lambda: _end(number)):
@@ -87,14 +88,16 @@ def _handle(number: int, frame: object) -> None:
 
 def _watch(reader: int) -> None:
     """Wait for the byte that Python writes for a signal, whatever the main thread does."""
+    import threading
+
     number = 0
     while number not in WORDS:
         number = os.read(reader, 1)[0]
     time.sleep(GRACE)
-    if not _heard:
-        _end(number)
-    time.sleep(2 * PATIENCE)
-    os._exit(128 + number)
+    last = threading.Timer(2 * PATIENCE, _say_and_exit, (number,))  # The disk does not answer.
+    last.daemon = True
+    last.start()
+    _end(number)
 
 
 def _end(number: int) -> None:
@@ -121,9 +124,9 @@ def _become_deaf() -> None:
 def _say_and_exit(number: int) -> None:
     line = f"jaxbundle: {WORDS[number]}" + (_advice and f"; {_advice}") + "\n"
     try:
-        if os.isatty(2):  # There may be a bar of progress, which hides the cursor.
+        if os.isatty(_screen):  # There may be a bar of progress, which hides the cursor.
             line = "\r\x1b[2K\x1b[?25h" + line
-        os.write(2, line.encode())
+        os.write(_screen, line.encode())
     except OSError:
         pass  # Nobody listens.
     os._exit(128 + number)

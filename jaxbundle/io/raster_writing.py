@@ -18,7 +18,6 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.io.rasters import open_plain, rasterio
 from jaxbundle.io.replacing import disk_of, replaced_file
-from jaxbundle.temporaries import unbroken
 
 
 class RasterWriter:
@@ -33,7 +32,7 @@ class RasterWriter:
     def write(self, values: np.ndarray, top: int = 0, left: int = 0) -> None:
         """Write values [band, row, column] from a row and a column on."""
         window = (top, top + values.shape[1]), (left, left + values.shape[2])
-        with self._lock, _silence():
+        with self._lock, _silence:
             self._raster.write(values, window=window)
         self.sums[window] = _checksum(values)
 
@@ -59,7 +58,7 @@ def written_raster(
             raise _unwritable(target, f"{needed / 1e6:.6g} MB are needed")
     with replaced_file(target) as temporary:
         try:
-            with _silence():
+            with _silence:
                 raster = open_plain(
                     temporary, "w", driver="GTiff", width=width, height=height, count=count,
                     dtype=dtype, BIGTIFF="IF_SAFER", **profile,
@@ -68,9 +67,9 @@ def written_raster(
             try:
                 yield writer
             finally:
-                with _silence():
+                with _silence:
                     raster.close()
-            with _silence(), open_plain(temporary) as raster:
+            with _silence, open_plain(temporary) as raster:
                 whole = all(
                     _checksum(raster.read(window=window)) == sum
                     for window, sum in writer.sums.items()
@@ -90,19 +89,32 @@ def _checksum(values: np.ndarray) -> int:
     return zlib.crc32(np.ascontiguousarray(values).data)
 
 
-@contextmanager
-def _silence() -> Iterator[None]:
-    """Send the standard error of the process nowhere; an interrupt waits to say its line."""
-    with unbroken():
-        try:
-            kept = os.dup(2)
-        except OSError:
-            yield
-            return
-        try:
-            with open(os.devnull, "wb") as nowhere:
-                os.dup2(nowhere.fileno(), 2)
-            yield
-        finally:
-            os.dup2(kept, 2)
-            os.close(kept)
+class _Silence:
+    """Standard error of the process goes nowhere while any thread is in such a block.
+
+    The line of an interrupt is said all the same: `jaxbundle.interrupts` keeps a way of its own.
+    """
+
+    def __init__(self):
+        self._lock = threading.Lock()
+        self._blocks = 0
+        self._kept: int | None = None
+
+    def __enter__(self) -> None:
+        with self._lock:
+            self._blocks += 1
+            if self._blocks == 1:
+                with suppress(OSError), open(os.devnull, "wb") as nowhere:
+                    self._kept = os.dup(2)
+                    os.dup2(nowhere.fileno(), 2)
+
+    def __exit__(self, *_) -> None:
+        with self._lock:
+            self._blocks -= 1
+            if self._blocks == 0 and self._kept is not None:
+                os.dup2(self._kept, 2)
+                os.close(self._kept)
+                self._kept = None
+
+
+_silence = _Silence()

@@ -121,6 +121,24 @@ open("third", "w").close()
     assert sorted(os.listdir(tmp_path)) == ["first", "second"]
 
 
+def test_what_belongs_together_and_does_not_end_holds_nobody(tmp_path):
+    """A disk that does not answer between two renames: after `PATIENCE` all is as without it."""
+    code = """
+from jaxbundle import interrupts
+interrupts.PATIENCE = 0.2
+with temporary("half"), unbroken():
+    open("half", "w").close()
+    interrupt()
+    threading.Event().wait(20)
+"""
+    check(run(STARTED + code, tmp_path))
+    assert os.listdir(tmp_path) == []
+
+
+def test_the_line_is_said_while_a_library_is_silenced(tmp_path):
+    check(run(STARTED + "os.dup2(os.open(os.devnull, os.O_WRONLY), 2)\ninterrupt()", tmp_path))
+
+
 def test_work_in_c_does_not_hold_it_up(tmp_path):
     """A hash that takes minutes and knows no interrupts, as a compilation of XLA."""
     code = """

@@ -11,6 +11,7 @@ from jaxbundle.io import correction, error_maps, raster_writing
 from jaxbundle.io.map_blocks import write_map
 from jaxbundle.io.maps import MapGrid, MapSystem
 from jaxbundle.pushbroom.surfaces import Plane
+from jaxbundle.temporaries import put_off
 
 rasterio = pytest.importorskip("rasterio")
 
@@ -45,6 +46,28 @@ def test_a_disk_too_small_is_found_before_anything_is_made(tmp_path, monkeypatch
     with pytest.raises(InputError, match="map.tif: cannot be written: 0.36 MB are needed; 0.3 MB"):
         write(tmp_path / "map.tif")
     assert os.listdir(tmp_path) == []
+
+
+def test_no_interrupt_waits_while_a_raster_is_written_or_verified(tmp_path, monkeypatch, capfd):
+    """Both take minutes for a large one, and nobody sees what libraries say of it."""
+    moments = []
+
+    def note(package, name):
+        work = getattr(package, name)
+
+        def noted(*arguments, **options):
+            os.write(2, name.encode())
+            moments.append((name, put_off(lambda: None)))
+            return work(*arguments, **options)
+
+        monkeypatch.setattr(package, name, noted)
+
+    for name in ("write", "close"):
+        note(rasterio.io.DatasetWriter, name)
+    note(rasterio.io.DatasetReader, "read")
+    write(tmp_path / "map.tif")
+    assert moments == [("write", False)] * 9 + [("close", False)] + [("read", False)] * 9
+    assert capfd.readouterr().err == ""
 
 
 def test_a_raster_of_errors_on_a_full_disk(tmp_path):
