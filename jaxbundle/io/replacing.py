@@ -26,8 +26,10 @@ def replaced_file(path: str | Path) -> Iterator[Path]:
 def replaced_files(*paths: str | Path) -> Iterator[tuple[Path, ...]]:
     """Temporary names, beside some files, to write to; at the end they are renamed to those.
 
-    Where anything fails, none is renamed and the temporary files are removed; the files that were
-    there stay as they are. A link stays a link: what it leads to is replaced.
+    Where writing fails, none is renamed and the temporary files are removed; the files that were
+    there stay as they are. Of several, the renames follow each other: where the system refuses a
+    later one (a file that must not be changed), the earlier files are the new ones and the message
+    names that one. A link stays a link: what it leads to is replaced.
 
     **Raises:** `InputError` for an error of the disk, and for what is there and no file.
     """
