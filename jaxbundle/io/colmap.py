@@ -14,6 +14,7 @@ from jaxbundle.io.colmap_text import (
 )
 from jaxbundle.io.csv_tables import write_bytes
 from jaxbundle.io.folders import replaced_folder
+from jaxbundle.io.nearest_camera import NoPlaceError
 from jaxbundle.network.tables import Camera, Network
 
 PARTS = ("cameras", "images", "points3D")
@@ -51,10 +52,17 @@ def read_colmap(path: str | Path, overrides: Sequence[str] = ()) -> Network:
 
 
 def read_colmap_cameras(path: str | Path) -> tuple[Camera, ...]:
-    """The cameras of a cameras.bin or cameras.txt, called by number."""
+    """The cameras of a cameras.bin or cameras.txt, called by number.
+
+    **Raises:** `InputError`; for a camera that none of ours comes near too.
+    """
     path = Path(path)
     read = read_binary_cameras if path.suffix.lower() == ".bin" else read_text_cameras
-    return tuple(read(path).values())
+    cameras = tuple(read(path).values())
+    for camera in cameras:
+        if isinstance(camera, NoPlaceError):
+            raise camera
+    return cameras
 
 
 def write_colmap_cameras(cameras: Sequence[Camera], path: str | Path) -> None:

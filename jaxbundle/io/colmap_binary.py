@@ -18,8 +18,9 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.file_content import read_content
 from jaxbundle.io.colmap_model import ColmapImage, ColmapModel, check_unique, tracks
-from jaxbundle.io.colmap_models import MODELS, NAMES, from_colmap, parameter_names, to_colmap
+from jaxbundle.io.colmap_models import MODELS, NAMES, camera_or_why_not, parameter_names, to_colmap
 from jaxbundle.io.colmap_text import GREY
+from jaxbundle.io.nearest_camera import NoPlaceError
 from jaxbundle.network.tables import Camera, Source
 
 POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
@@ -87,8 +88,8 @@ def read_binary_model(folder: Path) -> ColmapModel:
     return ColmapModel(cameras, images, ids, points, source)
 
 
-def read_binary_cameras(path: Path) -> dict[int, Camera]:
-    """The cameras of a cameras.bin by number."""
+def read_binary_cameras(path: Path) -> dict[int, Camera | NoPlaceError]:
+    """The cameras of a cameras.bin by number, or why one has no place."""
     file, cameras = _Bytes(path), {}
     for k in range(file.count("cameras", 24)):
         file.what = f"camera {k + 1}"
@@ -99,7 +100,7 @@ def read_binary_cameras(path: Path) -> dict[int, Camera]:
         values = file.numbers(len(parameter_names(name, file.error)), "parameters")
         if not (0 < width < 10**9 and 0 < height < 10**9):
             raise file.error(f"the image size {width} × {height} is impossible")
-        cameras[id] = from_colmap(str(id), name, (width, height), values, f"{path}, ")
+        cameras[id] = camera_or_why_not(str(id), name, (width, height), values, f"{path}, ")
     file.end()
     return cameras
 

@@ -18,7 +18,7 @@ from jaxbundle.geometry.pose_conventions import cv_pose, exterior_from_cv
 from jaxbundle.io.assemble import assemble, foreign_document, image_columns
 from jaxbundle.io.colmap_models import HALF, to_colmap
 from jaxbundle.io.losses import need_values, what_is_lost
-from jaxbundle.io.nearest_camera import fits_told
+from jaxbundle.io.nearest_camera import NoPlaceError, fits_told
 from jaxbundle.io.poses import matrices_of, matrices_of_quaternions, quaternions_of
 from jaxbundle.network.columns import Columns, count, some
 from jaxbundle.network.reprojection import point_errors
@@ -45,9 +45,12 @@ class ColmapImage:
 
 @dataclasses.dataclass(frozen=True)
 class ColmapModel:
-    """The contents of `cameras`, `images` and `points3D`; `errors` of points: only written."""
+    """The contents of `cameras`, `images` and `points3D`; `errors` of points: only written.
 
-    cameras: dict[int, Camera]
+    For a camera that has no place here, `cameras` has the error that says why.
+    """
+
+    cameras: dict[int, Camera | NoPlaceError]
     images: Sequence[ColmapImage]
     point_ids: Int[np.ndarray, " points"]
     points: Float[np.ndarray, "points 3"]
@@ -66,7 +69,8 @@ def check_unique(ids: Sequence[int], place, thing: str) -> None:
 def to_network(path: Path, model: ColmapModel, overrides: Sequence[str]) -> Network:
     """The network of a sparse model; cameras are called by number, images by name.
 
-    Nothing of the cameras is free, σ is 1 px, the datum inner.
+    Nothing of the cameras is free, σ is 1 px, the datum inner. Images of a camera that has no place
+    here are left out.
 
     **Raises:** `InputError` for ids that are not there.
     """
@@ -81,6 +85,8 @@ def to_network(path: Path, model: ColmapModel, overrides: Sequence[str]) -> Netw
             )
         if not np.any(image.q):
             raise InputError(f"{image.place}: image {image.name!r}: the quaternion is 0")
+    model, told = _with_place(path, model)
+    images = model.images
     names = [image.name for image in images]
     if len(set(names)) < len(names):
         twice = next(name for k, name in enumerate(names) if name in names[:k])
@@ -100,8 +106,24 @@ def to_network(path: Path, model: ColmapModel, overrides: Sequence[str]) -> Netw
             {"id": model.point_ids, "role": ["tie"] * len(model.points),
              **dict(zip("XYZ", model.points.T))}, model.points_source,
         ),
-        observed, (*warnings, *fits_told(model.cameras.values())),
+        observed, (*told, *warnings, *fits_told(model.cameras.values())),
     )  # fmt: skip
+
+
+def _with_place(path: Path, model: ColmapModel) -> tuple[ColmapModel, list[str]]:
+    """The model without cameras that have no place here and their images, and what to tell."""
+    cameras = {k: c for k, c in model.cameras.items() if not isinstance(c, NoPlaceError)}
+    images = [image for image in model.images if image.camera in cameras]
+    told = []
+    for number, error in model.cameras.items():
+        if number in cameras:
+            continue
+        if not images:
+            raise error
+        lost = [image.name for image in model.images if image.camera == number]
+        why = str(error).removeprefix(f"{path}/")
+        told.append(f"{why}; left out {count(len(lost), 'image')}: {some(lost)}")
+    return dataclasses.replace(model, cameras=cameras, images=images), told
 
 
 def _entry(camera: Camera) -> dict:

@@ -29,7 +29,7 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.assemble import all_parameters
-from jaxbundle.io.nearest_camera import Foreign, fitted_camera
+from jaxbundle.io.nearest_camera import Foreign, NoPlaceError, fitted_camera
 from jaxbundle.network.tables import Camera
 
 HALF = 0.5
@@ -89,7 +89,7 @@ def from_colmap(
 ) -> Camera:
     """A camera of ours from one of COLMAP's, a `FittedCamera` where it is none of ours.
 
-    **Raises:** `InputError` that begins with `where`, if none of ours comes near it.
+    **Raises:** `NoPlaceError` that begins with `where`, if none of ours comes near it.
     """
     names = FITTED[model][1] if model in FITTED else MODELS[model][2]
     p = dict(zip(names, map(float, values)))
@@ -106,6 +106,14 @@ def from_colmap(
         foreign = Foreign(lambda X, Y, Z: _image(model, p, X, Y, Z), start, size, fisheye=True)
         return fitted_camera(id, foreign, f"{where}camera {id!r}", f"is of COLMAP's model {model}")
     return Camera(id, ours, exact, image_size=(int(size[0]), int(size[1])))
+
+
+def camera_or_why_not(*camera) -> Camera | NoPlaceError:
+    """A camera as by `from_colmap`, or why there is none: its images can be left out."""
+    try:
+        return from_colmap(*camera)
+    except NoPlaceError as error:
+        return error
 
 
 def _exact(model: str, p: dict) -> tuple[str, dict | None]:

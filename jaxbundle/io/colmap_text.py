@@ -15,7 +15,8 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.colmap_model import ColmapImage, ColmapModel, check_unique, tracks
-from jaxbundle.io.colmap_models import from_colmap, parameter_names, to_colmap
+from jaxbundle.io.colmap_models import camera_or_why_not, parameter_names, to_colmap
+from jaxbundle.io.nearest_camera import NoPlaceError
 from jaxbundle.io.rows import Row, Rows
 from jaxbundle.network.tables import Camera, Source
 
@@ -31,9 +32,9 @@ def read_text_model(folder: Path) -> ColmapModel:
     return ColmapModel(cameras, images, ids, points, source)
 
 
-def read_text_cameras(path: Path) -> dict[int, Camera]:
-    """The cameras of a cameras.txt by number."""
-    cameras: dict[int, Camera] = {}
+def read_text_cameras(path: Path) -> dict[int, Camera | NoPlaceError]:
+    """The cameras of a cameras.txt by number, or why one has no place."""
+    cameras: dict[int, Camera | NoPlaceError] = {}
     for row in Rows(path, "#"):
         number = row.whole(0, "CAMERA_ID")
         if number in cameras:
@@ -42,7 +43,7 @@ def read_text_cameras(path: Path) -> dict[int, Camera]:
         names = parameter_names(model, row.error)
         size = [row.whole(k, what, 1) for k, what in ((2, "WIDTH"), (3, "HEIGHT"))]
         values, where = row.numbers(names, 4), f"{path}, line {row.number}: "
-        cameras[number] = from_colmap(str(number), model, size, values, where)
+        cameras[number] = camera_or_why_not(str(number), model, size, values, where)
     return cameras
 
 

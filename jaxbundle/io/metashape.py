@@ -11,8 +11,9 @@
       settings/property accuracy_markers      σ of references that have none
 
 The sensors are in `metashape_camera.py`. Cameras that are disabled or not aligned are left out, and
-those of sensors that no model comes near (spherical, RPC). A chunk with a transform gives world
-coordinates (geocentric where it is georeferenced), one without its own.
+those of sensors that no model comes near (spherical, RPC, of size 0, with a distortion that turns
+back inside the image). A chunk with a transform gives world coordinates (geocentric where it is
+georeferenced), one without its own.
 
 Markers are points. Where their references are in a local coordinate system, three of them or more
 are control points, and those that are not enabled check points; otherwise they are tie points
@@ -33,12 +34,12 @@ from jaxbundle.io.assemble import assemble, foreign_document, image_columns
 from jaxbundle.io.control import with_control
 from jaxbundle.io.csv_tables import read_text
 from jaxbundle.io.metashape_camera import (
-    NoPlaceError,
     label_of,
     number_of,
     numbers_of,
     sensor_camera,
 )
+from jaxbundle.io.nearest_camera import NoPlaceError
 from jaxbundle.network.columns import Columns, count, some
 from jaxbundle.network.tables import Network, Points, Source
 

@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.nearest_camera import Foreign, nearest_camera
+from jaxbundle.io.nearest_camera import Foreign, NoPlaceError, nearest_camera
 from jaxbundle.network.columns import shown
 
 COEFFICIENTS = ("f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
@@ -38,15 +38,11 @@ TYPES = ("frame", *FISHEYE)
 PIXEL = ("pixel_width", "pixel_height")
 
 
-class NoPlaceError(InputError):
-    """A sensor that none of our models comes near: its photographs can be left out."""
-
-
 def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict, tuple[str, ...]]:
     """The entry of a sensor in a document, and a warning where it is fitted.
 
     **Raises:** `InputError` naming file, sensor and element; `NoPlaceError` for a sensor of
-    another kind.
+    another kind, of size 0, or that no model comes near.
     """
     label = label_of(sensor)
     where = f"{path}, sensor {label!r}"
@@ -73,7 +69,7 @@ def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict, tuple[str, ...]
         "k1": p["k1"], "k2": p["k2"], "k3": p["k3"],
     }  # fmt: skip
     if not (np.array([w, h, values["fx"], values["fy"]]) > 0).all():
-        raise InputError(f"{where}: sizes and f must be positive")
+        raise NoPlaceError(f"{where}: sizes and f must be positive")
     entry = {"id": label, "image_size": [w, h]}
     decentred = p["p1"] != 0 or p["p2"] != 0
     if kind == "frame":

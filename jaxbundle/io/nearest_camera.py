@@ -44,6 +44,10 @@ NARROW = np.cos(np.radians(75))
 """Rays within this angle of the axis may have a perspective model."""
 
 
+class NoPlaceError(InputError):
+    """A camera that none of our models comes near: its photographs can be left out."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Foreign:
     """A camera of another program.
@@ -63,14 +67,14 @@ def nearest_camera(camera: Foreign, where: str) -> tuple[dict, str]:
     """The model and parameters of the nearest of our cameras as an entry of a document, and in
     words how near it is.
 
-    **Raises:** `InputError` beginning with `where` if less than half of the image has rays, or
+    **Raises:** `NoPlaceError` beginning with `where` if less than half of the image has rays, or
     nothing could be fitted.
     """
     sizes = (camera.image_size, camera.pixel_size)
     uv = image_grid([-0.5, -0.5], np.array(camera.image_size, float) - 0.5)
     rays, there = _rays(camera, uv)
     if there.mean() < MEASURABLE:
-        raise InputError(
+        raise NoPlaceError(
             f"{where}: only {100 * there.mean():.0f} % of the image has rays: its distortion turns "
             "back inside the image"
         )
@@ -96,7 +100,7 @@ def nearest_camera(camera: Foreign, where: str) -> tuple[dict, str]:
         if largest <= GOOD:
             break
     if not found or not np.isfinite(min(found, key=lambda one: one[0])[0]):
-        raise InputError(f"{where}: none of our models comes near it; {problem}")
+        raise NoPlaceError(f"{where}: none of our models comes near it; {problem}")
     largest, rms, target, values = min(found, key=lambda one: one[0])
     entry = {"model": target.name, **values}
     told = f"fitted as {target.name}, largest difference {largest:.2g} px, RMS {rms:.2g} px"
@@ -113,7 +117,10 @@ class FittedCamera(Camera):
 
 
 def fitted_camera(id: str, camera: Foreign, where: str, why: str) -> FittedCamera:
-    """The nearest of our cameras; `why` its own model has no place here. Raises `InputError`."""
+    """The nearest of our cameras; `why` its own model has no place here.
+
+    **Raises:** `NoPlaceError`.
+    """
     entry, told = nearest_camera(camera, where)
     pixel = entry.pop("pixel_size", None)
     model, size = entry.pop("model"), camera.image_size

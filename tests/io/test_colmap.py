@@ -227,11 +227,32 @@ def test_terms_that_are_0_need_no_place(tmp_path, line, model, values):
     assert (camera.model, camera.parameters) == (model, values)
 
 
+FOLDED = "SIMPLE_DIVISION 640 480 500 320 240 30"
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_images_of_a_camera_that_cannot_be_fitted_are_left_out(folder, binary):
+    if binary:
+        write_colmap(read_colmap(folder), folder / "binary")
+        folder = folder / "binary"
+        data = (folder / "cameras.bin").read_bytes()
+        first = struct.pack("<IiQQ4d", 1, 12, 640, 480, 500, 320, 240, 30)
+        assert data[8:16] == struct.pack("<Ii", 1, 2)  # SIMPLE_RADIAL, four values as well
+        (folder / "cameras.bin").write_bytes(data[:8] + first + data[8 + len(first) :])
+    else:
+        text = FILES["cameras.txt"].replace("SIMPLE_RADIAL 640 480 500 320 240 -0.1", FOLDED)
+        (folder / "cameras.txt").write_text(text)
+    net = read_colmap(folder)
+    assert net.images.id == ("right.jpg",) and [c.id for c in net.cameras] == ["7"]
+    (told,) = [w for w in net.warnings if "camera '1': only" in w]
+    assert told.endswith("left out 1 image: 'left.jpg'")
+
+
 BROKEN = {
     "unknown model": ("cameras.txt", "SIMPLE_RADIAL", "FISHY", "line 2: the camera model FISHY is"),
     "not offered": ("cameras.txt", "SIMPLE_RADIAL", "EQUIRECTANGULAR", "R is not offered"),
-    "folded": ("cameras.txt", "SIMPLE_RADIAL 640 480 500 320 240 -0.1",
-               "SIMPLE_DIVISION 640 480 500 320 240 30", "camera '1': only .* % of the image has"),
+    "all folded": ("cameras.txt", FILES["cameras.txt"], f"1 {FOLDED}\n7 {FOLDED}\n",
+                   "camera '1': only .* % of the image has"),
     "too few parameters": ("cameras.txt", " -0.1\n", "\n", "3 values where 4 are expected"),
     "too many": ("cameras.txt", "-0.1\n", "-0.1 7\n", "5 values where 4"),
     "focal": ("cameras.txt", " 500 ", " -500 ", "fx must be positive"),

@@ -183,6 +183,24 @@ def test_photographs_of_a_sensor_that_none_comes_near_are_left_out(tmp_path):
         read(tmp_path, text.replace('sensor_id="0"', 'sensor_id="7"'))
 
 
+UNFIT = {
+    "turns back": ((1280, 720), "<f>1000</f><k1>-5</k1><b2>1</b2>", "turns back inside the image"),
+    "size": ((0, 720), "<f>1000</f>", "sizes and f must be positive"),
+}
+
+
+@pytest.mark.parametrize("name", UNFIT)
+def test_a_sensor_that_cannot_be_fitted_costs_its_photographs_only(tmp_path, name):
+    (w, h), calibration, why = UNFIT[name]
+    sensor = (f'<sensor id="7" label="bad" type="frame"><resolution width="{w}" height="{h}"/>'
+              f"<calibration>{calibration}</calibration></sensor></sensors>")  # fmt: skip
+    text = xml().replace("</sensors>", sensor)
+    net = read(tmp_path, text.replace('id="1" sensor_id="0"', 'id="1" sensor_id="7"'))
+    assert net.images.id == ("a#0", "a#2") and [c.id for c in net.cameras] == ["cam"]
+    (told,) = [w for w in net.warnings if "sensor 'bad'" in w]
+    assert why in told and told.endswith("left out 1 camera: 'b'")
+
+
 def with_markers(system="", enabled=("true", "1", "true", "true", "false"), transform=True):
     """Five points of `exchange_cases` as markers with references in the frame of the chunk's
     transform; a location that is not valid has no coordinates."""
