@@ -4,6 +4,11 @@ A camera is a misfit by itself where few points make most of its vᵀv. The leng
 residuals have √(mean of squares)/mean = 2/√π = 1.128; beyond `TAIL` times that they are not normal.
 It is one beside the others where its RMS is above `FARTHER` times their median, and above it, in
 the logarithm, by more than `DEVIATIONS` times their spread (1.4826 times the median deviation).
+Fewer than `FEWEST` cameras have no spread: there its RMS is above `FARTHER_OF_FEW` times the
+smallest of the others.
+
+What escapes: errors spread so evenly over the residuals that these look normal, in a camera alone,
+in all cameras alike, or below these factors.
 """
 
 import numpy as np
@@ -13,6 +18,8 @@ TAIL = 1.5
 """1 for normal residuals, 1.2 for half the views five times as noisy as the others."""
 NORMAL = 2 / np.sqrt(np.pi)
 FARTHER, DEVIATIONS = 3.0, 5.0
+FARTHER_OF_FEW = 10.0
+"""Lenses, boards and focus of two good cameras may differ by less than this."""
 FEWEST = 5
 """So many solved cameras are a population."""
 NEGLIGIBLE = 0.01
@@ -30,13 +37,37 @@ def misfits(
     found = np.zeros(len(rms), bool)
     candidates = np.flatnonzero(solved & (rms > NEGLIGIBLE))
     found[candidates] = rms[candidates] > TAIL * NORMAL * mean_length[candidates]
+    factor = FARTHER_OF_FEW
     if solved.sum() >= FEWEST:
         log = np.log(np.maximum(rms[solved], NEGLIGIBLE))
-        middle = np.median(log)
-        spread = 1.4826 * np.median(np.abs(log - middle))
-        limit = np.exp(middle + max(np.log(FARTHER), DEVIATIONS * spread))
-        found[candidates] |= rms[candidates] > limit
-    return found
+        spread = 1.4826 * np.median(np.abs(log - np.median(log)))
+        factor = np.exp(max(np.log(FARTHER), DEVIATIONS * spread))
+    return found | (rms > factor * rms_beside(rms, solved))
+
+
+def rms_beside(
+    rms: Float[np.ndarray, " cameras"], solved: Bool[np.ndarray, " cameras"]
+) -> Float[np.ndarray, " cameras"]:
+    """What the RMS of each solved camera is compared with: the median of all, of few cameras the
+    smallest of the others; NaN for one alone, and one without a solution."""
+    beside = np.full(len(rms), np.nan)
+    some = np.maximum(rms[solved], NEGLIGIBLE)
+    if len(some) >= FEWEST:
+        beside[solved] = np.median(some)
+    elif len(some) > 1:
+        least, second = np.sort(some)[:2]
+        beside[solved] = np.where(np.arange(len(some)) == some.argmin(), second, least)
+    return beside
+
+
+def rms_remark(rms: float, beside: float) -> str:
+    """Says so where the RMS is far above that of the other cameras."""
+    if not rms > FARTHER * beside:
+        return ""
+    return (
+        f"RMS {rms:.2g} px beside {beside:.2g} px of the others: wrong points may be why "
+        "parameters are not determined"
+    )
 
 
 def axes_remark(

@@ -27,7 +27,8 @@ class BatchCalibration:
       the batch (see `jaxbundle.calibration.batch_misfit`). Without a solution "iteration limit",
       "singular", "not finite" (an infinite number among the measurements, or the start) or
       "too few points" (no view of use, or no redundancy).
-    - `remark`: what seems not to be meant about the axes of its image points; mostly empty.
+    - `remark`: what seems not to be meant about its image points, and of a camera that is not
+      determined an RMS far above that of the others; mostly empty.
     - `undetermined`: the free parameters that the views do not determine, where that is why the
       camera is weak, is singular or came to no end.
     - `values`, `sigma`, `covariance`: of the free parameters; pixels, coefficients without unit.

@@ -8,7 +8,7 @@ import pytest
 import jaxbundle
 from jaxbundle.adjustment.batch_normal import Calibration, Sightings, design
 from jaxbundle.adjustment.batch_tests import point_tests
-from jaxbundle.calibration.batch_misfit import axes_remark
+from jaxbundle.calibration.batch_misfit import NORMAL, axes_remark, misfits
 from jaxbundle.cameras import get_model
 
 SIZE, VIEWS, NOISE = (1280, 960), 8, 0.2
@@ -67,14 +67,45 @@ def test_a_camera_with_gross_errors_is_a_misfit(clean, plain):
 
 
 def test_a_camera_far_worse_than_the_others_is_a_misfit(clean):
-    """Its own residuals are normal; four cameras are no population."""
+    """Its own residuals are normal; four cameras are no population, and alone nothing shows it."""
     xy = clean.copy()
     xy[BAD] += np.random.default_rng(1).normal(0, 2, xy[BAD].shape)
     found = jaxbundle.calibrate_batch(BOARD, xy, SIZE)
     assert [i for i, s in enumerate(found.status) if s != "converged"] == [BAD]
     assert found.status[BAD] == "misfit"
-    few = jaxbundle.calibrate_batch(BOARD, xy[BAD - 3 : BAD + 1], SIZE)
-    assert few.status[3] == "converged"
+    for noise, status in ((1, "converged"), (4, "misfit")):
+        xy = clean[:4] + 0.0
+        xy[BAD] += np.random.default_rng(1).normal(0, noise, xy[BAD].shape)
+        few = jaxbundle.calibrate_batch(BOARD, xy, SIZE)
+        assert list(few.status) == ["converged"] * 3 + [status]
+        alone = jaxbundle.calibrate_batch(BOARD, xy[BAD:], SIZE)
+        assert alone.status[0] not in ("misfit", "iteration limit") and not alone.remark[0]
+        equal(few, jaxbundle.calibrate_batch(BOARD, clean[:4], SIZE), slice(BAD))
+
+
+def test_a_weak_camera_is_judged_by_its_residuals_too(clean):
+    """Three views with normal errors of some pixels determine nothing: why is said."""
+    for noise, status in ((1.2, "weak"), (6, "misfit")):
+        xy, visible = clean[:3].copy(), np.ones((3, VIEWS, 40), bool)
+        xy[1] += np.random.default_rng(1).normal(0, noise, xy[1].shape)
+        visible[1, 3:] = False
+        found = jaxbundle.calibrate_batch(BOARD, xy, SIZE, visible=visible)
+        assert list(found.status) == ["converged", status, "converged"]
+        assert found.undetermined[1].any() and list(found.remark[::2]) == ["", ""]
+        said = f"RMS {found.rms[1]:.2g} px beside {found.rms[::2].min():.2g} px of the others"
+        assert said in found.remark[1] and said in str(found)
+
+
+def test_two_cameras_are_compared_with_each_other():
+    """[cameras] RMS, pixels; the residuals of each normal by themselves."""
+    for rms, expected in (
+        ([0.3, 2.9], [0, 0]), ([0.3, 3.1], [0, 1]), ([3.1, 0.3, np.nan, 3.1], [1, 0, 0, 1]),
+        ([5.0], [0]), ([np.nan, 5.0], [0, 0]), ([5.0, 5.0, 0.6], [0, 0, 0]),
+        ([1e-9, 0.09], [0, 0]), ([0.3] * 4 + [1.0], [0] * 4 + [1]),
+    ):  # fmt: skip
+        rms = np.array(rms)
+        found = misfits(rms, rms / NORMAL, np.isfinite(rms))
+        assert found.tolist() == [bool(one) for one in expected], rms
 
 
 def test_snooping_is_the_calibration_without_the_corner(clean, shifted, plain, snooped):
