@@ -5,6 +5,7 @@ adjusted network as a project.
 """
 
 import os
+import re
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -31,6 +32,9 @@ FILES = (
 )  # fmt: skip
 """What is written into a folder, figures as patterns."""
 
+JSON = re.compile(rb'\s*(\{\s*["}]|\[[\s\[]*([]{"\d-]|true|false|null))')
+"""How JSON begins; a table of TOML, `[project]`, does not."""
+
 
 def network_files(
     input: Path, network: Network, control: Path | None = None
@@ -50,7 +54,7 @@ def check_writable(
     force: bool = False,
 ) -> None:
     """Refuse a JSON file, or a folder for files of these names, that the command `by` cannot or may
-    not write (`jaxbundle.io.folders`), or that would replace one of the inputs."""
+    not write (`jaxbundle.io.folders`, `check_json`), or that would replace one of the inputs."""
     inputs = tuple(inputs)
     if out is not None:
         check_folder(out, by, names, inputs, force)
@@ -69,6 +73,25 @@ def check_writable(
             raise InputError(f"--json {json}: cannot be written: no permission in {path.parent}")
     if str(real) in map(os.path.realpath, inputs):
         raise InputError(f"{path} is part of the input and would be overwritten; give another")
+    if not force:
+        check_json(json, ", or --force to replace it")
+
+
+def check_json(json: str, way: str = "") -> None:
+    """Refuse to replace by JSON a file that is not JSON, for it was not meant, unless it is empty.
+
+    `way`: what else than to give another name the command offers, for the message.
+    """
+    path = Path(json)
+    if json in ("", "-") or not path.is_file():
+        return
+    try:
+        with path.open("rb") as file:
+            head = file.read(4096)
+    except OSError as error:
+        raise InputError(f"--json {json}: cannot be read: {error.strerror}") from None
+    if head and not JSON.match(head):
+        raise InputError(f"--json {json}: exists and is not JSON; give another name{way}")
 
 
 def check_targets(

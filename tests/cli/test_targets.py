@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 import jaxbundle
+from jaxbundle.cli.pushbroom.app import keep_inputs
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.csv_tables import write_text
 from jaxbundle.io.folders import MARKER
@@ -36,7 +37,7 @@ def names(folder):
 def test_what_cannot_be_written_is_refused(network, tmp_path, json, out, said):
     (tmp_path / "file").write_text("")
     (tmp_path / "folder").mkdir()
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=f"{said}, or --force to replace it$"):
         check_targets(
             EXAMPLE, network, json and str(tmp_path / json), out and tmp_path / out
         )
@@ -49,6 +50,27 @@ def test_what_cannot_be_written_is_refused(network, tmp_path, json, out, said):
 def test_the_input_is_not_overwritten(network, json, out):
     with pytest.raises(InputError, match="part of the input and would be overwritten"):
         check_targets(EXAMPLE, network, json, out)
+
+
+@pytest.mark.parametrize("text", ["id,X,Y,Z\n", "[project]\n", "[[camera]]\n", " \n", "\0"])
+def test_only_json_gives_way_to_json(network, tmp_path, text):
+    target = tmp_path / "points.csv"
+    target.write_text(text)
+    said = f"^--json {target}: exists and is not JSON; give another name"
+    for out in (None, tmp_path / "out"):
+        with pytest.raises(InputError, match=f"{said}, or --force to replace it$"):
+            check_targets(EXAMPLE, network, str(target), out)
+    check_targets(EXAMPLE, network, str(target), None, force=True)
+    assert target.read_text() == text
+    with pytest.raises(InputError, match=f"{said}$"):
+        keep_inputs([], csv=target, json=str(target))  # of the commands without --force
+
+
+@pytest.mark.parametrize("text", ["", "{}", ' {\n "a": 1}', "[]", "[\n[-1", '[{"a', "[ null]"])
+def test_json_gives_way_to_json(network, tmp_path, text):
+    target = tmp_path / "result"
+    target.write_text(text)
+    check_targets(EXAMPLE, network, str(target), None)
 
 
 def test_folders_to_be_made_are_fine(network, tmp_path):

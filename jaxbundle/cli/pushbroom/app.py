@@ -24,6 +24,7 @@ from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.resample import RESAMPLINGS
 from jaxbundle.pushbroom.rpc import Rpc
 from jaxbundle.pushbroom.surfaces import Ground, Height, Plane, Surface
+from jaxbundle.targets import check_json
 
 pushbroom = typer.Typer(
     help="Line scanners: image to ground and back, simulation, correction, accuracy.",
@@ -90,7 +91,7 @@ def open_scanner(path: Path) -> Scanner:
 
 
 def keep_inputs(inputs: Sequence[str | Path | None], **outputs: str | Path | None) -> None:
-    """Refuse a file to write, by the name of its option, that is read."""
+    """Refuse a file to write, by the name of its option, that is read; for JSON, `check_json`."""
     read = {os.path.realpath(file) for path in inputs if path for file in files_read(path)}
     for option, path in outputs.items():
         if path and os.path.realpath(path) in read:
@@ -98,6 +99,7 @@ def keep_inputs(inputs: Sequence[str | Path | None], **outputs: str | Path | Non
                 f"--{option.replace('_', '-')} {path} is part of the input and would be "
                 "overwritten; give another"
             )
+    check_json(str(outputs.get("json") or ""))
 
 
 def check_resampling(kind: str) -> None:
