@@ -24,12 +24,14 @@ the formulas of the models that are fitted.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.assemble import all_parameters
-from jaxbundle.io.nearest_camera import Foreign, NoPlaceError, fitted_camera
+from jaxbundle.io.nearest_camera import Foreign, NoPlaceError, fitted_camera, root
 from jaxbundle.network.tables import Camera
 
 HALF = 0.5
@@ -103,7 +105,7 @@ def from_colmap(
         if model == "FOV":
             wide = 2 * np.tan(p["omega"] / 2) / p["omega"]
             start |= {"fx": p["fx"] * wide, "fy": p["fy"] * wide}
-        foreign = Foreign(lambda X, Y, Z: _image(model, p, X, Y, Z), start, size, fisheye=True)
+        foreign = Foreign(FORMULAS[model], p, start, size, fisheye=True)
         return fitted_camera(id, foreign, f"{where}camera {id!r}", f"is of COLMAP's model {model}")
     return Camera(id, ours, exact, image_size=(int(size[0]), int(size[1])))
 
@@ -132,21 +134,25 @@ def _exact(model: str, p: dict) -> tuple[str, dict | None]:
 def _image(model: str, p: dict, X, Y, Z):
     """Pixels from the centre of the first one, by COLMAP's formulas."""
     square = X * X + Y * Y
-    rho = np.sqrt(square)
+    rho = root(square)
+    some = jnp.where(rho > 0, rho, 1.0)
     if "FISHEYE" in model:
-        scale = np.where(rho > 0, np.arctan2(rho, Z) / np.where(rho > 0, rho, 1), 1.0)
+        scale = jnp.where(rho > 0, jnp.arctan2(rho, Z) / some, 1.0)
         x, y = (_thin_prism if model == "THIN_PRISM_FISHEYE" else _rad_tan)(p, X * scale, Y * scale)
     else:
         if model == "FOV":
-            angle = np.arctan2(2 * rho * np.tan(p["omega"] / 2), Z) / p["omega"]
-            limit = 2 * np.tan(p["omega"] / 2) / (p["omega"] * Z)
-            scale = np.where(rho > 0, angle / np.where(rho > 0, rho, 1), limit)
+            angle = jnp.arctan2(2 * rho * jnp.tan(p["omega"] / 2), Z) / p["omega"]
+            limit = 2 * jnp.tan(p["omega"] / 2) / (p["omega"] * Z)
+            scale = jnp.where(rho > 0, angle / some, limit)
         elif model == "EUCM":
-            scale = 1 / (p["alpha"] * np.sqrt(p["beta"] * square + Z * Z) + (1 - p["alpha"]) * Z)
+            scale = 1 / (p["alpha"] * jnp.sqrt(p["beta"] * square + Z * Z) + (1 - p["alpha"]) * Z)
         else:
-            scale = 2 / (Z + np.sqrt(Z * Z - 4 * p["k"] * square))
+            scale = 2 / (Z + jnp.sqrt(Z * Z - 4 * p["k"] * square))
         x, y = X * scale, Y * scale
-    return np.stack([p["fx"] * x + p["cx"], p["fy"] * y + p["cy"]], 1)
+    return jnp.stack([p["fx"] * x + p["cx"], p["fy"] * y + p["cy"]])
+
+
+FORMULAS = {model: partial(_image, model) for model in FITTED}
 
 
 def _thin_prism(p: dict, x, y):

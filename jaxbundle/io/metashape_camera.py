@@ -23,12 +23,14 @@ appendix.
 """
 
 import xml.etree.ElementTree as ET
+from functools import partial
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.nearest_camera import Foreign, NoPlaceError, nearest_camera
+from jaxbundle.io.nearest_camera import Foreign, NoPlaceError, nearest_camera, root
 from jaxbundle.network.columns import shown
 
 COEFFICIENTS = ("f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
@@ -82,8 +84,8 @@ def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict, tuple[str, ...]
     if not rest and "equisolid" not in kind:
         return entry | {"model": "opencv" if kind == "frame" else "kannala-brandt", **values}, ()
     foreign = Foreign(
-        lambda X, Y, Z: _published(kind, p, (w, h), X, Y, Z), values, (w, h),
-        _pixel_size(where, sensor), kind != "frame",
+        FORMULAS[kind], p | {"w": w, "h": h}, values, (w, h), _pixel_size(where, sensor),
+        kind != "frame",
     )  # fmt: skip
     found, told = nearest_camera(foreign, where)
     has = "".join(f"{name} {value:g}, " for name, value in rest.items()).rstrip(", ")
@@ -114,23 +116,26 @@ def _pixel_size(where: str, sensor: ET.Element) -> list[float] | None:
     return pixel if min(pixel) > 0 else None
 
 
-def _published(kind: str, p: dict, size, X, Y, Z):
+def _published(kind: str, p: dict, X, Y, Z):
     """The manual's formula, from the centre of the first pixel."""
     if kind == "frame":
         x, y = X / Z, Y / Z
     else:
-        off = np.hypot(X, Y)
-        angle = np.arctan2(off, Z)
-        length = 2 * np.sin(angle / 2) if "equisolid" in kind else angle
-        scale = np.where(off > 0, length / np.where(off > 0, off, 1), 1.0)
+        off = root(X * X + Y * Y)
+        angle = jnp.arctan2(off, Z)
+        length = 2 * jnp.sin(angle / 2) if "equisolid" in kind else angle
+        scale = jnp.where(off > 0, length / jnp.where(off > 0, off, 1.0), 1.0)
         x, y = X * scale, Y * scale
     r2 = x * x + y * y
     radial = 1 + r2 * (p["k1"] + r2 * (p["k2"] + r2 * (p["k3"] + r2 * p["k4"])))
     more = 1 + r2 * (p["p3"] + r2 * p["p4"])
     xd = x * radial + (p["p1"] * (r2 + 2 * x * x) + 2 * p["p2"] * x * y) * more
     yd = y * radial + (p["p2"] * (r2 + 2 * y * y) + 2 * p["p1"] * x * y) * more
-    u = size[0] / 2 + p["cx"] + xd * (p["f"] + p["b1"]) + yd * p["b2"]
-    return np.stack([u, size[1] / 2 + p["cy"] + yd * p["f"]], 1) - 0.5
+    u = p["w"] / 2 + p["cx"] + xd * (p["f"] + p["b1"]) + yd * p["b2"]
+    return jnp.stack([u, p["h"] / 2 + p["cy"] + yd * p["f"]]) - 0.5
+
+
+FORMULAS = {kind: partial(_published, kind) for kind in TYPES}
 
 
 def label_of(element: ET.Element) -> str:

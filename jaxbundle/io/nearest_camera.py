@@ -8,9 +8,13 @@ these rays nearest to the points (`cameras.convert_fit`). The first candidate th
 
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.convert import MEASURABLE
@@ -25,15 +29,17 @@ from jaxbundle.cameras.frames import pixel_frame
 from jaxbundle.errors import InputError
 from jaxbundle.network.tables import Camera
 
-Formula = Callable[..., Float[np.ndarray, "n 2"]]
-"""(X, Y, Z), right, down and forward, to pixels from the centre of the first one."""
+Formula = Callable[..., Float[Array, "2"]]
+"""Parameters and one ray X, Y, Z, right, down and forward, to pixels from the centre of the first
+one: a function of JAX whose derivatives are finite on the axis, the same object for every camera of
+a kind (it is compiled once)."""
 
 GOOD = 0.05
 """Pixels: a candidate that is as near is taken without a look at the next."""
 ON_THE_POINT = 1e-7
 """Pixels by which a ray may miss its point."""
-ROUNDS, STEP, LONGEST = 60, 1e-6, 0.2
-"""Newton's method for rays: rounds, radians of its differences, and of its steps."""
+ROUNDS, LONGEST = 60, 0.2
+"""Newton's method for rays: rounds, and radians of its steps."""
 RATIONAL = (*FITTED["opencv"], "k4", "k5", "k6")
 PRISM = (*FITTED["opencv"], "s1", "s2", "s3", "s4")
 PERSPECTIVE = (("opencv", FITTED["opencv"]), ("opencv", RATIONAL), ("opencv", PRISM),
@@ -52,11 +58,13 @@ class NoPlaceError(InputError):
 class Foreign:
     """A camera of another program.
 
-    `start`: the parameters of `opencv`, or of `kannala-brandt` if it is a `fisheye`, that come
-    nearest to its formula; `image_size` in pixels, `pixel_size` in mm where it is known.
+    `parameters`: those of the formula, numbers in any container of JAX; `start`: the parameters of
+    `opencv`, or of `kannala-brandt` if it is a `fisheye`, that come nearest to its formula;
+    `image_size` in pixels, `pixel_size` in mm where it is known.
     """
 
     formula: Formula
+    parameters: Any
     start: Mapping[str, float]
     image_size: Sequence[float]
     pixel_size: Sequence[float] | None = None
@@ -142,26 +150,40 @@ def _rays(camera: Foreign, uv) -> tuple[Float[np.ndarray, "n 3"], np.ndarray]:
     at = (uv - [p["cx"], p["cy"]]) / [p["fx"], p["fy"]]
     r = np.linalg.norm(at, axis=1, keepdims=True)
     m = at if camera.fisheye else at * np.arctan(r) / np.where(r > 0, r, 1)
-    image = lambda m: camera.formula(*_direction(m).T)
-    with np.errstate(all="ignore"):
+    with jax.enable_x64(True):
+        newton = partial(_newton, camera.formula, camera.parameters, uv)
         for _ in range(ROUNDS):
-            J = np.stack(
-                [(image(m + h) - image(m - h)) / (2 * STEP) for h in STEP * np.eye(2)], -1
-            )
-            det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
-            off = uv - image(m)
-            step = np.stack([J[:, 1, 1] * off[:, 0] - J[:, 0, 1] * off[:, 1],
-                             J[:, 0, 0] * off[:, 1] - J[:, 1, 0] * off[:, 0]], 1)  # fmt: skip
-            step /= det[:, None]
-            length = np.linalg.norm(step, axis=1, keepdims=True)
-            step = np.nan_to_num(step * np.minimum(1, LONGEST / np.maximum(length, LONGEST)))
+            step = np.nan_to_num(newton(m)[0], posinf=0.0, neginf=0.0)
             m = m + step
             if np.abs(step).max() < 1e-14:
                 break
-        there = (np.linalg.norm(uv - image(m), axis=1) < ON_THE_POINT) & (det > 0)
-    return _direction(m), there
+        _, off, det = map(np.asarray, newton(m))
+        return np.asarray(jax.vmap(_direction)(m)), (off < ON_THE_POINT) & (det > 0)
 
 
-def _direction(m):
-    angle = np.linalg.norm(m, axis=1)
-    return np.concatenate([m * np.sinc(angle / np.pi)[:, None], np.cos(angle)[:, None]], 1)
+@partial(jax.jit, static_argnums=0)
+def _newton(formula: Formula, p, uv, m):
+    """Steps of Newton's method, by how much the images miss the points, and the determinants."""
+
+    def one(uv, m):
+        image = lambda m: formula(p, *_direction(m))
+        (a, b), (c, d) = jax.jacfwd(image)(m)
+        du, dv = uv - image(m)
+        det = a * d - b * c
+        step = jnp.stack([d * du - b * dv, a * dv - c * du]) / det
+        limit = jnp.minimum(1.0, LONGEST / jnp.maximum(jnp.linalg.norm(step), LONGEST))
+        return step * limit, jnp.hypot(du, dv), det
+
+    return jax.vmap(one)(uv, m)
+
+
+def _direction(m: Float[Array, "2"]) -> Float[Array, "3"]:
+    """The unit vector that is an angle from the axis: m is this angle times its direction."""
+    angle = root(m @ m)
+    shrink = jnp.where(angle > 0, jnp.sin(angle) / jnp.where(angle > 0, angle, 1.0), 1.0)
+    return jnp.append(m * shrink, jnp.cos(angle))
+
+
+def root(square: Float[Array, ""]) -> Float[Array, ""]:
+    """The square root, with the derivative 0 at 0."""
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)

@@ -32,13 +32,15 @@ Source: OpenCV 4 documentation, XML/YAML/JSON file storages; ROS wiki, camera_ca
 import json
 import re
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.cameras import get_model
-from jaxbundle.cameras.convert_fit import images_of
+from jaxbundle.cameras.model import project
 from jaxbundle.errors import InputError
 from jaxbundle.file_content import is_plain, parse_json
 from jaxbundle.io.assemble import all_parameters
@@ -112,20 +114,26 @@ def _fitted(path: Path, camera: Camera, skew: float, tilt: Sequence[float]) -> F
             f"{path}: a skew or a tilted sensor has no place in our models; to fit the nearest one "
             "the image size is needed: give image_width and image_height"
         )
-    model, p = get_model(camera.model), all_parameters(camera)
-    one = p | {"fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0}
-    homography = _tilted(*tilt) if tilt else np.eye(3)
-
-    def formula(X, Y, Z):
-        xy = images_of(model, one, np.stack([X, -Y, -Z], 1))
-        x, y, s = (np.concatenate([xy, np.ones((len(xy), 1))], 1) @ homography.T).T
-        u = p["fx"] * x / s + skew * y / s + p["cx"]
-        return np.stack([u, p["fy"] * y / s + p["cy"]], 1)
-
+    p = all_parameters(camera)
+    parameters = {"camera": p, "skew": skew, "H": _tilted(*tilt) if tilt else np.eye(3)}
     has = [f"skew {skew:g}"] if skew else []
     has += [f"tilt τx {tilt[0]:g}, τy {tilt[1]:g}"] if any(tilt) else []
-    foreign = Foreign(formula, p, camera.image_size, fisheye=camera.model == "kannala-brandt")
+    foreign = Foreign(FORMULAS[camera.model], parameters, p, camera.image_size,
+                      fisheye=camera.model == "kannala-brandt")  # fmt: skip
     return fitted_camera(camera.id, foreign, str(path), f"has {' and '.join(has)}")
+
+
+def _image(name: str, p: Mapping, X, Y, Z):
+    """Pixels of a ray in a camera with a skew and a tilted sensor."""
+    model, own = get_model(name), p["camera"]
+    one = own | {"fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0}
+    xy = project(model, tuple(one[key] for key in model.parameters), X, -Y, -Z)
+    x, y, s = p["H"] @ jnp.stack([*xy, 1.0])
+    u = own["fx"] * x / s + p["skew"] * y / s + own["cx"]
+    return jnp.stack([u, own["fy"] * y / s + own["cy"]])
+
+
+FORMULAS = {name: partial(_image, name) for name in ("opencv", "kannala-brandt")}
 
 
 def _tilted(tx: float, ty: float) -> np.ndarray:
