@@ -15,6 +15,7 @@ from jaxbundle.solution import require_solved, solved
 from jaxbundle.statistics import (
     Component,
     Inspection,
+    contradicts,
     doubt_of_baarda,
     rescale,
     reweight,
@@ -22,6 +23,7 @@ from jaxbundle.statistics import (
     snoop,
     variance_components,
 )
+from jaxbundle.statistics.snooping import Removed, without
 
 CORE_PARAMETERS = ("c", "x0", "y0", "fx", "fy", "cx", "cy", "f")
 """Interior parameters that are never eliminated for want of significance."""
@@ -33,14 +35,38 @@ ROUNDS = 20
 def snooped(found: Inspection, minimum, again, test: str, significance: float):
     """The problem and its minimum without blunders, what was removed, and what is to be said of σ
     that the test trusts though the data contradict them."""
-    whole, doubt = found.problem, None
+    whole, doubt = found, None
     repeat = _Repeat(again, "after data snooping", minimum)
     found, removed = snoop(found, repeat, test=test, significance=significance)
-    if test == "baarda" and whole.counts.redundancy > 0:
-        scale, counts = robust_scale(whole, Inspection(whole, found.adjusted).lengths), whole.counts
+    counts = whole.problem.counts
+    if test == "baarda" and counts.redundancy > 0:
+        scale = _scale_of_good(whole, _Repeat(again, "after data snooping", minimum))
         rays = sum(len(r.rows) for r in removed if r.kind == "image")
-        doubt = doubt_of_baarda(scale, rays, counts.observations // 2, counts.redundancy)
+        doubt = doubt_of_baarda(
+            scale, rays, counts.observations // 2, counts.redundancy, significance
+        )
     return found.problem, repeat.minimum, removed, doubt
+
+
+def _scale_of_good(found: Inspection, repeat: "_Repeat") -> float:
+    """The robust scale of the image points, whatever the a priori σ.
+
+    What Baarda's test leaves fits too well, for it is what fitted; and blunders spread over the
+    residuals of good points. So where the scale of all points is large, it is that of those which
+    Tukey's estimator does not suspect, whose own scale is a posteriori.
+    """
+    problem = found.problem
+    scale = robust_scale(problem, found.lengths)
+    if scale < 1 or not contradicts(scale, problem.counts.redundancy):
+        return scale
+    try:
+        tukey = reweight(problem, found.adjusted, repeat, "tukey")
+    except NotSolvedError:
+        return scale
+    suspects = [Removed("image", s.row, s.name, s.test) for s in tukey.suspects()]
+    if not suspects:
+        return scale
+    return robust_scale(without(problem, *suspects), tukey.lengths * tukey.scale)
 
 
 def robustly(problem: Problem, minimum, again, estimator: str):

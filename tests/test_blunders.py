@@ -232,13 +232,32 @@ def contradicted(network):
     return network.replace(observations=dataclasses.replace(rays, sigma=rays.sigma / 1.49))
 
 
-def test_baardas_test_with_wrong_sigma_says_so(contradicted, clean):
-    found = adjust(contradicted, snooping="baarda")
-    assert len(found.removed) > 0.02 * len(contradicted.observations)
+@pytest.mark.parametrize("factor, significance", [(1.5, 0.05), (3.0, 0.001)])
+def test_baardas_test_with_wrong_sigma_says_so(network, factor, significance):
+    """The scale is that of all good points, not of those which fitted and so were left."""
+    rays = network.observations
+    wrong = network.replace(observations=dataclasses.replace(rays, sigma=rays.sigma / factor))
+    found = adjust(wrong, snooping="baarda", significance=significance)
+    assert len(found.removed) > 0.2 * len(rays)
     doubt = found.doubts[0]
-    assert re.search(r"most residuals are 1\.[45]\d? times", doubt) and "--snooping pope" in doubt
+    scale = float(re.search(r"most residuals are ([\d.]+) times", doubt)[1])
+    assert scale == pytest.approx(factor, rel=0.05) and "--snooping pope" in doubt
+    assert f"the significance {significance:g} removes" in doubt
     assert doubt in result_dict(found, brief=True)["warnings"]
     assert "Baarda's test trusts" in text(found)
+
+
+@pytest.mark.parametrize("part, said", [(0.01, False), (0.2, True)])
+def test_baardas_test_does_not_take_blunders_for_wrong_sigma(network, part, said):
+    """A fifth of blunders makes the scale before their removal 3.8: too many are said to be gone,
+    not that σ are wrong."""
+    spoilt, _, _ = with_blunders(network, 1, part)
+    found = adjust(spoilt, snooping="baarda")
+    assert any("Baarda's test has removed many" in doubt for doubt in found.doubts) == said
+    assert not any("Baarda's test trusts" in doubt for doubt in found.doubts)
+
+
+def test_popes_test_does_not_believe_the_sigma(contradicted, clean):
     (other,) = adjust(contradicted, snooping="pope").doubts
     assert other.startswith("χ² test far from passed: vᵀPv/redundancy is 2.")
     assert clean.doubts == ()

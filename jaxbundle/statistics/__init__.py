@@ -16,6 +16,7 @@ from jaxbundle.statistics.distributions import normal_quantile as normal_quantil
 from jaxbundle.statistics.distributions import t_quantile as t_quantile
 from jaxbundle.statistics.distributions import tau_quantile as tau_quantile
 from jaxbundle.statistics.inspection import Inspection as Inspection
+from jaxbundle.statistics.misfit import contradicts as contradicts
 from jaxbundle.statistics.misfit import doubt_of_baarda as doubt_of_baarda
 from jaxbundle.statistics.misfit import doubt_of_fit as doubt_of_fit
 from jaxbundle.statistics.misfit import doubt_of_robust as doubt_of_robust

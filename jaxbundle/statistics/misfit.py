@@ -19,6 +19,8 @@ from jaxbundle.statistics.distributions import chi2_quantile
 CONTRADICTED = 1.2
 """A scale beyond this factor contradicts the a priori σ, if it is beyond chance too."""
 BEYOND_CHANCE = 0.001
+MANY = 0.05
+"""More than this part of the image points, beyond those removed by chance, is worth a word."""
 UNRECOGNISABLE = 20.0
 """Residuals so many times their σ are most likely of coordinates in other axes or units."""
 
@@ -41,21 +43,34 @@ def contradicts(scale: float, redundancy: int) -> bool:
     return not (min(1 / CONTRADICTED, low) <= scale <= max(CONTRADICTED, high))
 
 
-def doubt_of_baarda(scale: float, removed: int, rays: int, redundancy: int) -> str | None:
-    """What Baarda's test has done with σ that the data contradict, and the remedy.
+def doubt_of_baarda(
+    scale: float, removed: int, rays: int, redundancy: int, significance: float
+) -> str | None:
+    """What Baarda's test has done with σ that the data contradict, or that it has removed many more
+    image points than chance makes it, and the remedy.
 
-    **Arguments:** `scale` of all image points, the removed ones too; how many of so many were
-    removed.
+    **Arguments:** `scale` of the good image points, without their selection by this test; how many
+    of so many were removed; the level of the test, of one coordinate.
     """
-    if not contradicts(scale, redundancy):
-        return None
-    done = "removed good observations with the blunders" if scale > 1 else "passed blunders"
-    return (
-        f"Baarda's test trusts the a priori σ, but most residuals are {scale:.3g} times as large "
-        f"as they say: it has {done} ({removed} of {rays} image points removed, "
-        f"{100 * removed / rays:.2g} %). {_remedy(scale)}, or test with the a posteriori σ "
-        "(--snooping pope)"
+    by_chance = 1 - (1 - significance) ** 2
+    took = (
+        f"{removed} of {rays} image points removed, {100 * removed / rays:.2g} %; of good ones the "
+        f"significance {significance:g} removes {100 * by_chance:.2g} %"
     )
+    pope = "test with the a posteriori σ (--snooping pope)"
+    if contradicts(scale, redundancy):
+        done = "removed good observations with the blunders" if scale > 1 else "passed blunders"
+        return (
+            f"Baarda's test trusts the a priori σ, but most residuals are {scale:.3g} times as "
+            f"large as they say: it has {done} ({took}). {_remedy(scale)}, or {pope}"
+        )
+    chance = 3 * math.sqrt(rays * by_chance)
+    if removed - by_chance * rays > max(MANY * rays, chance):
+        return (
+            f"Baarda's test has removed many observations ({took}): there are as many blunders, or "
+            f"the a priori σ are a little too small. Look at what was removed, or {pope}"
+        )
+    return None
 
 
 def doubt_of_robust(scale: float, redundancy: int) -> str | None:

@@ -26,7 +26,7 @@ def test_the_likeliest_cause_comes_first(sigma0, scale, first):
 
 def test_nothing_is_said_of_what_fits():
     assert doubt_of_fit(1.1, 1.1, 2000) is doubt_of_robust(0.95, 2000) is None
-    assert doubt_of_baarda(1.0, 3, 1000, 2000) is doubt_of_fit(float("nan"), 1.0, 0) is None
+    assert doubt_of_baarda(1.0, 3, 1000, 2000, 0.001) is doubt_of_fit(float("nan"), 1.0, 0) is None
 
 
 def test_the_longest_of_many_residuals():
