@@ -35,11 +35,11 @@ from jaxbundle.io.control import with_control
 from jaxbundle.io.csv_tables import read_text
 from jaxbundle.io.metashape_camera import (
     label_of,
-    number_of,
     numbers_of,
     sensor_camera,
 )
 from jaxbundle.io.nearest_camera import NoPlaceError
+from jaxbundle.io.xml_fields import number_in
 from jaxbundle.network.columns import Columns, count, some
 from jaxbundle.network.tables import Network, Points, Source
 
@@ -162,7 +162,7 @@ def _pose(where: str, camera: ET.Element, chunk: ET.Element):
         of = f"{where}, transform of the chunk"
         R = numbers_of(f"{of}, rotation", transform.findtext("rotation"), 9).reshape(3, 3)
         t = numbers_of(f"{of}, translation", transform.findtext("translation"), 3)
-        scale = number_of(f"{of}, scale", transform.findtext("scale"))
+        scale = number_in(transform.findtext("scale", ""), f"{of}, scale")
         to_chunk, centre = R @ to_chunk, scale * (R @ centre) + t
     if abs(to_chunk @ to_chunk.T - np.eye(3)).max() > ROTATION or np.linalg.det(to_chunk) < 0:
         raise InputError(f"{where}: the transform is not a rotation and a shift")
@@ -181,7 +181,7 @@ def _markers(path: Path, chunk: ET.Element, images: dict):
             if location.get("camera_id") not in images or not _true(location.get("valid")):
                 continue
             where = f"{path}, marker {label_of(markers[id])!r}, camera {location.get('camera_id')}"
-            x, y = (number_of(f"{where}, {k}", location.get(k)) for k in "xy")
+            x, y = (number_in(location.get(k, ""), f"{where}, {k}") for k in "xy")
             rows.append((images[location.get("camera_id")], id, x - 0.5, y - 0.5))
             seen[id] = None
     if not rows:
@@ -211,8 +211,8 @@ def _references(path: Path, chunk: ET.Element, markers: dict) -> Points | None:
         where = f"{path}, reference of marker {id!r}"
         ids.append(id)
         roles.append("control" if _true(reference.get("enabled")) else "check")
-        position.append([number_of(f"{where}, {k}", reference.get(k)) for k in "xyz"])
-        sigma.append([number_of(f"{where}, {k}", reference.get(k, str(_accuracy(chunk))))
+        position.append([number_in(reference.get(k), f"{where}, {k}") for k in "xyz"])
+        sigma.append([number_in(reference.get(k, str(_accuracy(chunk))), f"{where}, {k}")
                       for k in ("sx", "sy", "sz")])  # fmt: skip
     if roles.count("control") < LEAST_CONTROL:
         return None
@@ -240,8 +240,8 @@ def _accuracy(chunk: ET.Element) -> float:
     for element in chunk.iterfind("settings/property"):
         if element.get("name") == "accuracy_markers":
             try:
-                accuracy = float((element.get("value") or "").split("/")[0])
-            except ValueError:
+                accuracy = number_in((element.get("value") or "").split("/")[0], "accuracy")
+            except InputError:
                 continue
             if accuracy > 0:
                 return accuracy

@@ -22,6 +22,7 @@ Source: Agisoft Metashape user manual, appendix "Camera models"; PhotoScan user 
 appendix.
 """
 
+import re
 import xml.etree.ElementTree as ET
 from functools import partial
 from pathlib import Path
@@ -31,6 +32,7 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.nearest_camera import Foreign, NoPlaceError, nearest_camera, root
+from jaxbundle.io.xml_fields import number_in
 from jaxbundle.network.columns import shown
 
 COEFFICIENTS = ("f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
@@ -41,7 +43,8 @@ PIXEL = ("pixel_width", "pixel_height")
 
 
 def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict, tuple[str, ...]]:
-    """The entry of a sensor in a document, and a warning where it is fitted.
+    """The entry of a sensor in a document, and warnings: where it is fitted, and of
+    coefficients that are not known.
 
     **Raises:** `InputError` naming file, sensor and element; `NoPlaceError` for a sensor of
     another kind, of size 0, or that no model comes near.
@@ -63,8 +66,9 @@ def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict, tuple[str, ...]
     size = sensor.find("resolution") if size is None else size
     if size is None:
         raise InputError(f"{where}: there is no <resolution>")
-    w, h = (number_of(f"{where}, resolution, {k}", size.get(k)) for k in ("width", "height"))
-    p = _coefficients(where, calibration, w, h)
+    w, h = (number_in(size.get(k, ""), f"{where}, resolution, {k}") for k in ("width", "height"))
+    p, ignored = _coefficients(where, calibration, w, h)
+    told = (f"sensor {label!r}: not known here and not applied: {ignored}",) if ignored else ()
     values = {
         "fx": p["f"] + p["b1"], "fy": p["f"],
         "cx": w / 2 + p["cx"] - 0.5, "cy": h / 2 + p["cy"] - 0.5,
@@ -82,37 +86,50 @@ def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict, tuple[str, ...]
         rest = {name: p[name] for name in ("p1", "p2", "b2")}
     rest = {name: value for name, value in rest.items() if value != 0}
     if not rest and "equisolid" not in kind:
-        return entry | {"model": "opencv" if kind == "frame" else "kannala-brandt", **values}, ()
+        return entry | {"model": "opencv" if kind == "frame" else "kannala-brandt", **values}, told
     foreign = Foreign(
         FORMULAS[kind], p | {"w": w, "h": h}, values, (w, h), _pixel_size(where, sensor),
         kind != "frame",
     )  # fmt: skip
-    found, told = nearest_camera(foreign, where)
+    found, fit = nearest_camera(foreign, where)
     has = "".join(f"{name} {value:g}, " for name, value in rest.items()).rstrip(", ")
     why = f"has {has}" if has else "is equisolid"
-    return entry | found, (f"sensor {label!r} {why}: {told}",)
+    return entry | found, (*told, f"sensor {label!r} {why}: {fit}")
 
 
-def _coefficients(where: str, calibration: ET.Element, w: float, h: float) -> dict[str, float]:
-    """All coefficients in the form of today."""
+def _coefficients(where: str, calibration: ET.Element, w: float, h: float):
+    """All coefficients in the form of today, and in words those not 0 that are none of them."""
+    tags = [element.tag for element in calibration]
+    twice = next((tag for tag in (*COEFFICIENTS, *OLD) if tags.count(tag) > 1), None)
+    if twice:
+        raise InputError(f"{where}: <{twice}> stands there twice")
     given = {
-        element.tag: number_of(f"{where}, {element.tag}", element.text)
-        for element in calibration if element.tag in (*COEFFICIENTS, *OLD)
-    }  # fmt: skip
-    p = dict.fromkeys(COEFFICIENTS, 0.0) | given
-    if "f" in given or "fy" not in given:
-        return p
-    p |= {"f": p["fy"], "b1": p.get("fx", p["fy"]) - p["fy"], "b2": p.get("skew", 0.0),
-          "cx": given.get("cx", w / 2) - w / 2, "cy": given.get("cy", h / 2) - h / 2,
-          "p1": p["p2"], "p2": p["p1"]}  # fmt: skip
-    return p
+        element.tag: number_in(element.text or "", f"{where}, {element.tag}")
+        for element in calibration
+        if element.tag in (*COEFFICIENTS, *OLD) or _is_coefficient(element)
+    }
+    old = "f" not in given and "fy" in given
+    known = {*COEFFICIENTS, *OLD} - {"f", "b1", "b2"} if old else {*COEFFICIENTS}
+    ignored = [f"{tag} {value:g}" for tag, value in given.items() if tag not in known and value]
+    p = dict.fromkeys(COEFFICIENTS, 0.0) | {k: v for k, v in given.items() if k in known}
+    if old:
+        fy = p.pop("fy")
+        p |= {"f": fy, "b1": p.pop("fx", fy) - fy, "b2": p.pop("skew", 0.0),
+              "cx": given.get("cx", w / 2) - w / 2, "cy": given.get("cy", h / 2) - h / 2,
+              "p1": p["p2"], "p2": p["p1"]}  # fmt: skip
+    return p, ", ".join(ignored)
+
+
+def _is_coefficient(element: ET.Element) -> bool:
+    """Whether an element is called as coefficients are, such as k5."""
+    return re.fullmatch(r"[a-z]\d+", element.tag) is not None and not len(element)
 
 
 def _pixel_size(where: str, sensor: ET.Element) -> list[float] | None:
     properties = {e.get("name"): e.get("value") for e in sensor.iterfind("property")}
     if not all(name in properties for name in PIXEL):
         return None
-    pixel = [number_of(f"{where}, {name}", properties[name]) for name in PIXEL]
+    pixel = [number_in(properties[name] or "", f"{where}, {name}") for name in PIXEL]
     return pixel if min(pixel) > 0 else None
 
 
@@ -148,15 +165,4 @@ def numbers_of(where: str, text: str | None, n: int) -> np.ndarray:
     words = (text or "").split()
     if len(words) != n:
         raise InputError(f"{where}: {len(words)} numbers where {n} are expected")
-    return np.array([number_of(where, word) for word in words])
-
-
-def number_of(where: str, text: str | None) -> float:
-    """A finite number."""
-    try:
-        number = float(text or "")
-    except ValueError:
-        number = np.nan
-    if not np.isfinite(number):
-        raise InputError(f"{where}: {shown(text)} where a number is expected")
-    return number
+    return np.array([number_in(word, where) for word in words])

@@ -34,7 +34,8 @@ def published(X, Y, Z, **more):
 def xml(transform=False, more="", sensor='type="frame"', extra_calibration="") -> str:
     """The three images of `exchange_cases`, as a chunk with or without a transform."""
     text = lambda values: " ".join(repr(float(v)) for v in np.ravel(values))
-    calibration = "".join(f"<{k}>{v!r}</{k}>" for k, v in P.items()) + extra_calibration
+    own = {k: v for k, v in P.items() if f"<{k}>" not in extra_calibration}
+    calibration = "".join(f"<{k}>{v!r}</{k}>" for k, v in own.items()) + extra_calibration
     cameras = ""
     for i, label in enumerate(["a", "b", "a"]):
         T = np.eye(4)
@@ -146,6 +147,17 @@ def test_parameters_that_are_0_have_no_effect(tmp_path, extra):
     assert largest_difference(net.cameras[0], **more) < 1e-9
 
 
+@pytest.mark.parametrize("extra, ignored", [
+    ("<k5>0.3</k5><k6>0</k6>", "k5 0.3"), ("<skew>2</skew>", "skew 2"),
+    ("<covariance><params>f</params></covariance><p5>-1</p5>", "p5 -1"), ("<k5>0</k5>", None),
+])  # fmt: skip
+def test_coefficients_that_are_not_known_are_told(tmp_path, extra, ignored):
+    net = read(tmp_path, xml(extra_calibration=extra))
+    told = [w for w in net.warnings if "not known here and not applied" in w]
+    assert [w.rpartition(": ")[2] for w in told] == ([ignored] if ignored else [])
+    assert all("sensor 'cam'" in w for w in told)
+
+
 def test_a_fisheye_is_exact(tmp_path):
     text = xml(extra_calibration="<p1>0</p1><p2>0</p2><k4>-0.0004</k4>")
     (camera,) = read(tmp_path, text.replace('type="frame"', 'type="fisheye"')).cameras
@@ -252,7 +264,9 @@ BROKEN = {
     "spherical": (
         lambda t: t.replace('"cam" type="frame"', '"cam" type="spherical"'), "type 'spherical'"
     ),
-    "NaN": (lambda t: t.replace("<k2>0.02", "<k2>nan"), "sensor 'cam', k2: 'nan'"),
+    "NaN": (lambda t: t.replace("<k2>0.02", "<k2>nan"), "sensor 'cam', k2 is 'nan'"),
+    "digits": (lambda t: t.replace("<f>1000.0", "<f>1_000"), "sensor 'cam', f is '1_000'"),
+    "repeated": (lambda t: t.replace("<k1>", "<f>1</f><k1>"), "sensor 'cam': <f> stands there tw"),
     "focal": (lambda t: t.replace("<f>1000.0", "<f>-1000.0"), "must be positive"),
     "size": (lambda t: t.replace('width="1280"', ""), "resolution, width"),
     "sensor": (lambda t: t.replace('id="0" label="cam"', 'id="5" label="cam"'), "sensor '0' is no"),
