@@ -15,6 +15,7 @@ from jaxbundle.network.columns import count, some
 from jaxbundle.network.reduction import REDUCTIONS
 from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.tables import Network, require_network
+from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.orientation.angle_units import name_angle_unit
 from jaxbundle.orientation.exchanges import CONTRADICTION, name_contradiction
 from jaxbundle.orientation.network import Oriented, lacks_start_values
@@ -202,7 +203,7 @@ def _likely_causes(
         return ()
     told = any(CONTRADICTION in line for line in network.warnings)
     causes = (
-        name_angle_unit(network), not told and name_contradiction(network),
+        name_pixels(network), name_angle_unit(network), not told and name_contradiction(network),
         not inspection and name_one_place(network),
     )  # fmt: skip
     return tuple(filter(None, causes))
@@ -218,9 +219,11 @@ def _placed(found: Oriented) -> Network:
     ):  # fmt: skip
         if len(reasons) >= left:
             said = some((f"{thing} {id} ({why})" for id, why in reasons.items()), 5, str)
+            cause = name_pixels(network)
             raise NotSolvedError(
                 f"not solved: no start values were found for {len(reasons)} of "
-                f"{count(len(reasons) + left, thing)}: {said}; jaxbundle orient lists all of them",
+                f"{count(len(reasons) + left, thing)}: {said}; jaxbundle orient lists all of them"
+                + (f"; {cause}" if cause else ""),
                 [f"{thing} {id}" for id in reasons],
             )
     return network

@@ -33,6 +33,7 @@ from jaxbundle.network.arrays import Tangent, Values, retract
 from jaxbundle.network.columns import some
 from jaxbundle.network.reduction import FACTORS
 from jaxbundle.network.tables import Network
+from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.statistics import (
     CheckPoints,
@@ -141,10 +142,11 @@ class Adjustment:
         distortions that turn back, and a σ0 far from 1."""
         found = self.distortion_reach.values() if self.converged else ()
         turns = (reach.message for reach in found if reach.message is not None)
-        return (
+        lines = (
             *self.problem.network.warnings, *self.findings, *self.weakness.lines, *turns,
             *self.doubts,
         )  # fmt: skip
+        return tuple(dict.fromkeys(lines))
 
     @functools.cached_property
     def weakness(self) -> Weakness:
@@ -163,7 +165,8 @@ class Adjustment:
         doubt, downweighted = None, self.robust and self.sigma0 < 1
         if not (self.sigma_factors or downweighted or report.unit_weights(self)):
             scale = robust_scale(self.problem, self.inspection.lengths)
-            doubt = doubt_of_fit(self.sigma0, scale, self.redundancy)
+            in_pixels = bool(name_pixels(self.problem.network))
+            doubt = doubt_of_fit(self.sigma0, scale, self.redundancy, in_pixels)
         return self._doubts if doubt is None else (*self._doubts, doubt)
 
     @functools.cached_property

@@ -11,6 +11,7 @@ import pytest
 import jaxbundle
 from jaxbundle import Camera, grid_of_targets, ring_of_stations, simulate, stations_looking_at
 from jaxbundle.adjustment.problem import make_problem
+from jaxbundle.cli.adjust import _why_not
 from jaxbundle.network.repetitions import warn_of_repetitions
 from jaxbundle.network.stations import Stations
 from jaxbundle.orientation.one_place import name_one_place
@@ -87,6 +88,54 @@ def test_two_images_from_one_place_are_told_from_two_that_are_not():
     two = lambda stations: network(Stations(stations.position[:2], stations.angles[:2]), camera())
     assert "'1', '2'" in name_one_place(two(ONE_PLACE))
     assert name_one_place(two(RING)) == ""
+
+
+def test_a_narrow_field_cannot_tell_a_turn_from_a_shift():
+    """Two vertical images of a flat object are shifts of each other, to 2 µm of noise."""
+    stations = Stations(NADIR.position[:2], NADIR.angles[:2])
+    flat = network(stations, targets=TARGETS * [1, 1, 0])
+    of = lambda c: flat.replace(
+        cameras=(dataclasses.replace(flat.cameras[0], parameters={"c": c}),)
+    )
+    assert name_one_place(of(24.0)) == ""
+    assert name_one_place(of(4000.0)) == ""
+
+
+@pytest.mark.parametrize("size", [None, (0.006, 0.006)])
+def test_c_in_pixels_is_named_where_the_adjustment_fails(size):
+    """c begins at 4000 of 0.006 mm, and is free."""
+    pixels = Camera("cam", "brown", {"c": 4000.0}, free=("c",), pixel_size=size)
+    result = jaxbundle.adjust(network(RING, **CONTROL).replace(cameras=(pixels,)))
+    assert not result.converged
+    (line,) = (line for line in result.warnings if "is c in pixels" in line)
+    assert line in result.findings and ("in mm (24)" in line) == (size is not None)
+    with pytest.raises(jaxbundle.NotSolvedError, match="is c in pixels"):
+        assert result.cameras
+    assert "one place" not in said(result)
+    told = _why_not(result)  # names of what is not determined do not hide the cause
+    assert result.undetermined and "is c in pixels" in told
+
+
+def test_c_in_pixels_is_the_first_cause_of_a_far_off_chi_square():
+    """A long lens cannot be told from it; it is asked of misfits only."""
+    lens = Camera("cam", "brown", {"c": 400.0}, free=("c",))
+    given = network(RING, lens, TARGETS / 20, **CONTROL)
+    sigma = given.observations.sigma / 10
+    rays = dataclasses.replace(given.observations, sigma=sigma)
+    result, misfit = (jaxbundle.adjust(n) for n in (given, given.replace(observations=rays)))
+    assert result.converged and misfit.converged and misfit.sigma0 > 5 * result.sigma0
+    assert "in pixels" not in said(result)
+    assert "is c in pixels" in said(misfit)
+    assert "the likeliest first: a principal distance in pixels for mm" in misfit.doubts[-1]
+
+
+def test_c_in_pixels_is_named_where_no_start_values_are_found():
+    given = without_start_values(network(RING))
+    pixels = dataclasses.replace(given.cameras[0], parameters={"c": 4000.0})
+    rays = given.observations
+    few = given.replace(cameras=(pixels,), observations=rays.take(rays.point < 4))
+    with pytest.raises(jaxbundle.NotSolvedError, match="no start values .* is c in pixels"):
+        jaxbundle.orient(few)
 
 
 @pytest.mark.parametrize("control", [CONTROL, {}])

@@ -126,6 +126,7 @@ def _why_not(result: Adjustment) -> str:
     if result.undetermined:
         parts.append(f"not determined: {some(result.undetermined, 12, str)}")
         parts.append("fix them, give them a prior σ, or measure what determines them")
+        parts += result.findings
     elif result.findings or result.weakness.lines:
         parts += [*result.findings, *result.weakness.lines]
     elif "limit" in result.termination:

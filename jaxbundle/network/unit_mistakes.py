@@ -1,15 +1,17 @@
 """Numbers in the wrong unit, where no camera and no object could explain them.
 
 The widest lenses show 90° from the axis, where r/c is 2 in a stereographic image and less in other
-fisheyes; 84° in a central projection are r/c = 10. No lower limit is set: c may be as long as it
-likes, and microscopes and telescopes have fields of any size.
+fisheyes; 84° in a central projection are r/c = 10. Nothing is refused for a narrow field: c may be
+as long as it likes, and microscopes and telescopes have fields of any size. Where it is narrower
+than `NARROW_FIELD` and the same number in pixels would be that of a usual lens, that is said: as a
+warning if the size of the pixels tells, else as a likely cause where the adjustment fails.
 """
 
 import numpy as np
 
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import some
+from jaxbundle.network.columns import count, some
 from jaxbundle.network.tables import Camera, Network
 
 WIDEST = 10.0
@@ -18,6 +20,15 @@ FIELDS = (0.02, 5.0)
 """r/c that cameras commonly have; asked of a remedy only."""
 COARSE, FINE, NARROW = 0.1, 1e-4, 1e-3
 """Pixels, mm, larger or smaller than those of sensors; and r/c less than those of cameras."""
+NARROW_FIELD = 0.02
+"""r/c, half of the image points within 1.1°, below which c may be in pixels: those of sensors of
+2 to 20 µm are 50 to 500 to the millimetre."""
+USUAL_FIELDS = (0.05, 1.0)
+"""r/c of usual lenses, 3° to 45°; 600 mm before a full frame would be 3 if they were pixels."""
+LEAST_PIXELS = 300.0
+"""No camera has a c of fewer pixels."""
+HALF_OF_POINTS = 1 / 3
+"""Width of an image evenly filled from whose centre half of its points lie (sides 3 : 2)."""
 THOUSAND = (300.0, 3000.0)
 """Ratios of two lengths of one object in millimetres and in metres."""
 
@@ -58,7 +69,43 @@ def _check_field(camera: Camera, xy) -> str:
             f"lie within {usual / c:.2g} of {name} about the axis; is it in metres? It is expected "
             f"in mm ({1000 * max(size):g})"
         )
+    if size is not None or camera.image_size is not None:
+        return _in_pixels(camera, xy)
     return ""
+
+
+def name_pixels(network: Network) -> str:
+    """Which principal distance in mm may be one in pixels, in words; empty where none may.
+
+    A likely cause only: a telescope cannot be told from it where pixels have no size."""
+    of_camera = network.images.camera[network.observations.image]
+    rows = (network.observations.xy[of_camera == c] for c in range(len(network.cameras)))
+    first, *more = [
+        line for camera, xy in zip(network.cameras, rows, strict=True)
+        if len(xy) and (line := _in_pixels(camera, xy))
+    ] or [""]  # fmt: skip
+    return first + (f"; so with {count(len(more), 'other camera')}" if more else "")
+
+
+def _in_pixels(camera: Camera, xy) -> str:
+    model = get_model(camera.model)
+    name, c = model.principal_distance[0], float(camera.parameters[model.principal_distance[0]])
+    spread = float(np.median(np.hypot(*(xy - np.median(xy, axis=0)).T)))
+    if model.unit != "mm" or c < LEAST_PIXELS or not 0 < spread < NARROW_FIELD * c:
+        return ""
+    expected = "multiplied by the size of a pixel"
+    pixels = None
+    if camera.pixel_size is not None:
+        pixels, expected = spread / max(camera.pixel_size), f"{c * max(camera.pixel_size):.4g}"
+    elif camera.image_size is not None:
+        pixels = HALF_OF_POINTS * max(camera.image_size)
+    if pixels is not None and not USUAL_FIELDS[0] < pixels / c < USUAL_FIELDS[1]:
+        return ""
+    return (
+        f"camera {camera.id!r}: {name} is {c:g} mm and half of its image points lie within "
+        f"{spread:.3g} mm of their centre, {np.degrees(np.arctan(spread / c)):.2g}° for such a "
+        f"lens: is {name} in pixels? It is expected in mm ({expected})"
+    )
 
 
 def _remedy(camera: Camera, unit: str, name: str, c: float, usual: float) -> str:

@@ -25,6 +25,7 @@ from jaxbundle.network.check import check_tables
 from jaxbundle.network.columns import count, some
 from jaxbundle.network.sightings import keep_images, keep_points
 from jaxbundle.network.tables import Network
+from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.orientation import many
 from jaxbundle.orientation.exchanges import name_contradiction, name_suspects
 from jaxbundle.orientation.frames import joined, mirrored, onto_the_given, to_scale
@@ -109,7 +110,7 @@ def find_start_values(network: Network, improve: Callable | None = None) -> Orie
     model, frame = _model(network, seen, improve and partial(improve, network))
     if not model.placed.any():
         why = _mirrored(network, seen) or _why_nothing(network, seen)
-        raise NotSolvedError(f"no start values found: {why}", _names(network))
+        raise _no_start_values(network, why)
     found = _result(network, seen, model, frame)
     missed = _missed(network, seen, model)
     finding = name_contradiction(network, seen, model) if missed.any() else ""
@@ -118,12 +119,17 @@ def find_start_values(network: Network, improve: Callable | None = None) -> Orie
     if _control_contradicts(network, seen, model):
         why = _mirrored(network, seen) or (finding if left < LEAST_CONTROL else "")
     if why:
-        raise NotSolvedError(f"no start values found: {why}", _names(network))
+        raise _no_start_values(network, why)
     if missed.any() and left < LEAST_CONTROL:
         finding = name_suspects(network, missed)
     if not finding:
         return found
     return dataclasses.replace(found, network=found.network.warn(finding), finding=finding)
+
+
+def _no_start_values(network: Network, why: str) -> NotSolvedError:
+    causes = "; ".join(filter(None, (why, name_pixels(network))))
+    return NotSolvedError(f"no start values found: {causes}", _names(network))
 
 
 def _missed(network: Network, seen: Sights, model: Model) -> Bool[np.ndarray, " points"]:

@@ -3,6 +3,10 @@
 Seen from one place, points have directions and no depth, whatever their start values say. With the
 unit rays u of points that two images share, R·u₁ = u₂ to the precision of the measurements; R by
 Horn (1987), as in `absolute.py`.
+
+A camera that moves sideways before a flat object shifts its image, one that turns by ρ shifts it
+too, and distorts it by ρ³ where ρ = r/c is the field itself. Where that is not seen among the noise
+of the rays, nothing is said.
 """
 
 import numpy as np
@@ -47,6 +51,10 @@ def _turned_only(seen, sigma, one: int, other: int) -> bool:
     _, k, l = np.intersect1d(seen.point[a], seen.point[b], return_indices=True)
     if len(k) < IN_COMMON:
         return False
+    noise = np.sqrt((sigma[a][k] ** 2).sum(1) + (sigma[b][l] ** 2).sum(1))
+    field = min(_field(seen.xy[a][k]), _field(seen.xy[b][l]))
+    if field**3 < NOISE * np.median(noise):
+        return False
     rays = []
     for rows, at in ((a, k), (b, l)):
         ray = np.pad(seen.xy[rows][at], ((0, 0), (0, 1)), constant_values=-1.0)
@@ -54,5 +62,9 @@ def _turned_only(seen, sigma, one: int, other: int) -> bool:
     U, _, V = np.linalg.svd(rays[0].T @ rays[1])
     turn = U @ np.diag([1, 1, np.linalg.det(U @ V)]) @ V
     off = np.linalg.norm(rays[0] @ turn - rays[1], axis=1)
-    noise = np.sqrt((sigma[a][k] ** 2).sum(1) + (sigma[b][l] ** 2).sum(1))
     return bool(np.median(off / noise) < NOISE)
+
+
+def _field(xy) -> float:
+    """r/c about the centre of the points: half of them are within it."""
+    return float(np.median(np.linalg.norm(xy - np.median(xy, axis=0), axis=1)))

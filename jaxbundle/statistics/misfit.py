@@ -84,10 +84,13 @@ def doubt_of_robust(scale: float, redundancy: int) -> str | None:
     )
 
 
-def doubt_of_fit(sigma0: float, scale: float, redundancy: int) -> str | None:
+def doubt_of_fit(
+    sigma0: float, scale: float, redundancy: int, in_pixels: bool = False
+) -> str | None:
     """That the global test is far from passed, with the ratio, and the likely causes first.
 
-    **Arguments:** `sigma0` of all observations; `scale` of the image points by their median.
+    **Arguments:** `sigma0` of all observations; `scale` of the image points by their median;
+    whether a principal distance in mm may be `in_pixels`.
     """
     if not (redundancy > 0 and contradicts(sigma0, redundancy)):
         return None
@@ -104,6 +107,8 @@ def doubt_of_fit(sigma0: float, scale: float, redundancy: int) -> str | None:
     else:
         sigma += f" (multiply them by {scale:.3g}, or --components)"
         causes = [sigma, blunders, missing, mirrored]
+    if in_pixels:
+        causes.insert(0, "a principal distance in pixels for mm")
     return f"{told}; likely causes, the likeliest first: {', '.join(causes)}"
 
 

@@ -9,6 +9,7 @@ import pytest
 import jaxbundle
 from jaxbundle import Camera, InputError, grid_of_targets, ring_of_stations, simulate
 from jaxbundle.network.check import check_tables
+from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.orientation.angle_units import name_angle_unit
 
@@ -96,8 +97,51 @@ def test_long_lenses_microscopes_and_fisheyes_pass(field, model):
     usual = np.median(np.hypot(*given.observations.xy.T))
     c = usual / field
     parameters = {"c": c} if model == "brown" else {"fx": c, "fy": c}
-    given = with_camera(given, model=model, parameters=parameters)
+    # With the pixels' size, r/c of 1e-3 is the usual lens of `test_c_in_pixels…` and asked about.
+    size = None if field == 1e-3 else PIXEL["pixel_size"]
+    given = with_camera(given, model=model, parameters=parameters, image_size=None, pixel_size=size)
     assert check_tables(given).warnings == ()
+
+
+IN_PIXELS = {"c": 4000.0}  # of 0.006 mm: 24 mm
+
+
+@pytest.mark.parametrize(
+    "known, expected",
+    [
+        (PIXEL, r"\(24\)"),
+        ({"image_size": None, "pixel_size": PIXEL["pixel_size"]}, r"\(24\)"),
+        ({"image_size": PIXEL["image_size"], "pixel_size": None}, "size of a pixel"),
+    ],
+    ids=["both", "pixel size", "image size"],
+)
+def test_c_in_pixels_is_warned_of_where_the_pixels_are_known(known, expected):
+    given = with_camera(network(), **known)
+    assert check_tables(given).warnings == ()
+    (line,) = check_tables(with_camera(given, parameters=IN_PIXELS)).warnings
+    assert re.search(f"c is 4000 mm .* is c in pixels.* in mm .*{expected}", line)
+
+
+@pytest.mark.parametrize("known", [PIXEL, {"image_size": None, "pixel_size": None}])
+def test_long_lenses_and_points_close_together_are_not_in_pixels(known):
+    given = with_camera(network(), **known)
+    assert name_pixels(given) == ""
+    assert name_pixels(measured(given, 0.02)) == ""  # half of the points within 0.1 mm
+    full_frame = measured(given, 2.0)  # half of them within 10 mm
+    assert name_pixels(with_camera(full_frame, parameters={"c": 450.0})) == ""
+    lens = with_camera(full_frame, parameters={"c": 600.0})
+    assert bool(name_pixels(lens)) == (known is not PIXEL)  # cannot be told, and only asked
+
+
+def test_c_in_pixels_is_a_likely_cause_where_nothing_is_known_of_the_pixels():
+    given = with_camera(network(), image_size=None, pixel_size=None, parameters=IN_PIXELS)
+    assert check_tables(given).warnings == ()
+    assert "camera 'cam': c is 4000 mm" in name_pixels(given)
+    two = dataclasses.replace(given.cameras[0], id="second")
+    images = given.images
+    each = dataclasses.replace(images, camera=np.arange(len(images)) % 2)
+    both = given.replace(cameras=(given.cameras[0], two), images=each)
+    assert name_pixels(both).endswith("so with 1 other camera")
 
 
 def test_blunders_are_no_unit():
