@@ -38,7 +38,7 @@ from jaxbundle.adjustment.batch_tests import point_tests
 from jaxbundle.adjustment.batch_weakness import vague, vanishing
 from jaxbundle.adjustment.problem import require_x64
 from jaxbundle.arguments import one_of, whole
-from jaxbundle.calibration.batch_misfit import axes_remark, misfits, rms_beside, rms_remark
+from jaxbundle.calibration.batch_misfit import axes_remark, far_outside, misfits, rms_beside, rms_remark
 from jaxbundle.calibration.batch_result import BatchCalibration as BatchCalibration
 from jaxbundle.calibration.batch_snooping import ROUNDS, TESTS, Snooping
 from jaxbundle.cameras import CameraModel, get_model
@@ -53,6 +53,11 @@ from jaxbundle.statistics.snooping import check_test
 OF_A_START = ("quaternion", "shift")
 """Poses as the solver has them, for data snooping alone."""
 OF_A_VIEW = ("position", "angles", "sigma_position", "sigma_angles", "rotation")
+
+TESTED = (CONVERGED, LIMIT, SINGULAR)
+"""Statuses of cameras with residuals that data snooping can test."""
+MOST_FAILED = 60
+"""So many rounds without a solution, and data snooping of a camera ends."""
 
 
 def calibrate_batch(
@@ -88,7 +93,8 @@ def calibrate_batch(
       are found by themselves. What is neither free nor given is 0, or the middle of the image. A
       view is left out if the given camera turns too few of its points into rays.
     - `snooping`: `"pope"`: image points that are blunders at the level `significance`, the
-      probability to lose anything of a camera without blunders, are removed, camera by camera.
+      probability to lose anything of a camera without blunders, are removed, camera by camera;
+      before that those more than one image size outside the image.
     - `threads`: portions solved at the same time on a CPU; the number of cores if not given.
     - `progress(done, total)`: called after every portion.
 
@@ -105,6 +111,10 @@ def calibrate_batch(
     threads = available_cores() if threads is None else whole("threads", threads)
     batch = Batch.of(object_points, image_points, image_size, model, visible, free, start)
     camera_model = get_model(model)
+    if snooping is not None:
+        down = camera_model.axes == "down"
+        far = far_outside(batch.xy, batch.visible, batch.image_size, down)
+        batch = dataclasses.replace(batch, visible=batch.visible & ~far)
     on_cpu = jax.default_backend() == "cpu"
     portions = list(batch.portions(on_cpu))
     fixed = camera_model, batch.free, batch.known, max_iterations, batch.size, on_cpu
@@ -122,6 +132,8 @@ def calibrate_batch(
                 progress(done, len(batch))
     order = np.argsort(np.concatenate([portion.cameras for portion in portions]))
     rows = {name: np.concatenate([p[name] for p in parts])[order] for name in parts[0]}
+    if snooping is not None:
+        rows["removed"] |= far
     return _result(camera_model, batch, rows)
 
 
@@ -188,19 +200,27 @@ def _undetermined(model: CameraModel, batch: Batch, ended, rows) -> Bool[np.ndar
 def _snooped(
     model, free, known, max_steps, size, on_cpu, portion: Portion, rows, test, significance
 ) -> dict:
-    """The rows of a portion without blunders; only cameras that lose any are solved again."""
+    """The rows of a portion without blunders; only cameras that lose any are solved again.
+
+    One without a solution is tested where its iterations ended, for blunders may be why. Where it
+    has none without them either, everything stays as it was.
+    """
     weight = np.asarray(portion.seen.weight)
     found = [Snooping(seen > 0, test, significance) for seen in weight]
     open_ones = np.arange(len(portion.cameras))
+    first = {name: values.copy() for name, values in rows.items()}
+    failed = np.zeros(len(weight), int)
     for _ in range(ROUNDS):
         used = np.stack([camera.used for camera in found]).astype(float)
         tests = np.asarray(_tests_program(
             model, free, on_cpu, portion.seen, used, rows["interior"], rows["quaternion"],
             rows["shift"], rows["views"],
         ))  # fmt: skip
+        tested = np.isin(rows["status"], TESTED) & np.isfinite(rows["sigma0"])
+        failed += rows["status"] != CONVERGED
         open_ones = np.array([
             i for i in open_ones
-            if rows["status"][i] == CONVERGED
+            if tested[i] and failed[i] <= MOST_FAILED
             and found[i].next(tests[i], rows["sigma0"][i], rows["redundancy"][i])
         ], int)  # fmt: skip
         if not len(open_ones):
@@ -212,6 +232,11 @@ def _snooped(
         again = _solve_portion(model, free, known, max_steps, size, on_cpu, again)
         for name, values in rows.items():
             values[open_ones] = again[name][open_ones]
+    lost = (first["status"] != CONVERGED) & (rows["status"] != CONVERGED)
+    for name, values in rows.items():
+        values[lost] = first[name][lost]
+    for i in np.flatnonzero(lost):
+        found[i].used = found[i].seen
     rows["removed"] = np.stack([camera.seen & ~camera.used for camera in found])
     return rows
 

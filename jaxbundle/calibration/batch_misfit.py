@@ -24,6 +24,8 @@ FEWEST = 5
 """So many solved cameras are a population."""
 NEGLIGIBLE = 0.01
 """An RMS below this is no misfit, pixels."""
+FAR = 1.0
+"""Points outside the image by more than this times its size are no measurements."""
 OUTSIDE = 0.5
 """More than this part of the image points is outside the image: their axes are not those meant."""
 
@@ -70,19 +72,45 @@ def rms_remark(rms: float, beside: float) -> str:
     )
 
 
+def far_outside(
+    xy: Float[np.ndarray, "cameras views points 2"],
+    visible: Bool[np.ndarray, "cameras views points"],
+    size: Float[np.ndarray, "2"],
+    down: bool,
+) -> Bool[np.ndarray, "cameras views points"]:
+    """Which visible points lie so far outside the image that they cannot be measurements; none of
+    a camera where most do, for there the axes or the size are not those meant."""
+    far = visible & _beyond(xy, size, down, FAR)
+    most = far.sum((1, 2)) > OUTSIDE * visible.sum((1, 2))
+    return far & ~most[:, None, None]
+
+
+def _corner(size, down: bool):
+    """The least coordinates in an image."""
+    return np.full(2, -0.5) if down else -size / 2
+
+
+def _beyond(xy, size, down: bool, margin: float):
+    """Which points are outside the image by more than `margin` times its size."""
+    low = _corner(size, down)
+    return ((xy < low - margin * size) | (xy > low + (1 + margin) * size)).any(-1)
+
+
 def axes_remark(
     xy: Float[np.ndarray, "points 2"], size: Float[np.ndarray, "2"], down: bool
 ) -> str:
-    """What is odd about the axes of image points; empty where most of them are in the image.
+    """What is odd about the axes of image points; where most of them are in the image, how many
+    are far outside, if any.
 
     **Arguments:** `down`: y is counted downwards from the upper left pixel, else upwards from the
     middle.
     """
-    low = np.full(2, -0.5) if down else -size / 2
-    outside = (xy < low) | (xy > low + size)
-    part = outside.any(1).mean() if len(xy) else 0.0
+    low = _corner(size, down)
+    part = _beyond(xy, size, down, 0).mean() if len(xy) else 0.0
     if part <= OUTSIDE:
-        return ""
+        far = int(_beyond(xy, size, down, FAR).sum())
+        points = "image point is" if far == 1 else "image points are"
+        return f"{far} {points} far outside the image: data snooping leaves such out" * (far > 0)
     if not down and ((xy > -0.5) & (xy < size)).all(1).mean() > 0.9:
         return (
             "the image points seem to be counted from a corner of the image: in this model (0, 0) "

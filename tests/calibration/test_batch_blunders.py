@@ -8,7 +8,7 @@ import pytest
 import jaxbundle
 from jaxbundle.adjustment.batch_normal import Calibration, Sightings, design
 from jaxbundle.adjustment.batch_tests import point_tests
-from jaxbundle.calibration.batch_misfit import NORMAL, axes_remark, misfits
+from jaxbundle.calibration.batch_misfit import NORMAL, axes_remark, far_outside, misfits
 from jaxbundle.cameras import get_model
 
 SIZE, VIEWS, NOISE = (1280, 960), 8, 0.2
@@ -135,6 +135,46 @@ def test_what_fits_after_all_comes_back(clean):
     found = jaxbundle.calibrate_batch(BOARD, xy, SIZE, snooping="pope")
     assert found.removed[BAD, 2, [0, 1, 8]].all()
     assert found.removed[BAD].sum() <= 5 and found.status[BAD] == "converged"
+
+
+def test_blunders_of_any_size_are_removed(clean):
+    """One that spoils the iterations, two far outside the image, none, and nothing but blunders."""
+    xy, expected = clean[:4].copy(), np.zeros((3, VIEWS, 40), bool)
+    xy[0, 2, 7, 0], xy[1, 1, 3], xy[1, 4, 9, 1] = 1600, [-1e5, 1e5], 3000
+    expected[0, 2, 7] = expected[1, 1, 3] = expected[1, 4, 9] = True
+    xy[3] = np.random.default_rng(0).uniform(0, SIZE, xy[3].shape)
+    plain = jaxbundle.calibrate_batch(BOARD, xy, SIZE)
+    lost = "iteration limit"
+    assert list(plain.status) == [lost, lost, "converged", lost]
+    assert plain.remark[1].startswith("2 image points are far outside the image")
+    assert [len(said) > 0 for said in plain.remark] == [False, True, False, False]
+    found = jaxbundle.calibrate_batch(BOARD, xy, SIZE, snooping="pope")
+    assert list(found.status) == ["converged"] * 3 + [lost] and not any(found.remark)
+    np.testing.assert_array_equal(found.removed[:3], expected)
+    assert not found.removed[3].any()
+    good = jaxbundle.calibrate_batch(BOARD, clean[:4], SIZE)
+    equal(found, good, 2)
+    equal(plain, good, 2)
+    without = jaxbundle.calibrate_batch(BOARD, xy[:3], SIZE, visible=~expected)
+    np.testing.assert_allclose((found.values[:3] - without.values) / without.sigma, 0, atol=1e-4)
+
+
+def test_a_view_of_something_else_goes_by_snooping(clean):
+    xy = clean[:3].copy()
+    xy[1, 1] = np.random.default_rng(3).uniform(0, SIZE, xy[1, 1].shape)
+    assert jaxbundle.calibrate_batch(BOARD, xy, SIZE).status[1] == "iteration limit"
+    found = jaxbundle.calibrate_batch(BOARD, xy, SIZE, snooping="pope")
+    assert found.converged.all() and found.removed[1, 1].sum() >= 35
+    assert found.removed[1].sum() - found.removed[1, 1].sum() <= 1
+
+
+def test_nothing_is_screened_where_most_is_outside():
+    """Then the size or the axes are not those meant."""
+    size, visible = np.array(SIZE, float), np.ones((2, 1, 5), bool)
+    xy = np.array([[[[100, 100], [-1e3, 5], [2600, 5], [5, 1e9], [5, 5]]]] * 2)
+    xy[1, 0, 4] = 4000
+    far = far_outside(xy, visible, size, True)
+    assert far.tolist() == [[[False, False, True, True, False]], [[False] * 5]]
 
 
 def test_good_cameras_lose_nothing_at_the_level_of_significance():
