@@ -38,7 +38,7 @@ from jaxbundle.adjustment.batch_tests import point_tests
 from jaxbundle.adjustment.batch_weakness import vague, vanishing
 from jaxbundle.adjustment.problem import require_x64
 from jaxbundle.arguments import one_of, whole
-from jaxbundle.calibration.batch_misfit import axes_remark, far_outside, misfits, rms_beside, rms_remark
+from jaxbundle.calibration.batch_misfit import far_outside, misfits, remarks
 from jaxbundle.calibration.batch_result import BatchCalibration as BatchCalibration
 from jaxbundle.calibration.batch_snooping import ROUNDS, TESTS, Snooping
 from jaxbundle.cameras import CameraModel, get_model
@@ -164,28 +164,9 @@ def _result(model: CameraModel, batch: Batch, rows: dict) -> BatchCalibration:
     ended = np.where(misfits(rows["rms"], rows["mean_length"], solved), MISFIT, ended)
     del rows["reduced"], rows["mean_length"]
     rows["undetermined"], rows["status"] = undetermined, np.array(STATUS)[ended]
-    rows["remark"] = _remarks(model, batch, rows, solved & (ended == CONVERGED))
+    rows["remark"] = remarks(model, batch, rows, solved & (ended == CONVERGED))
     free = tuple(model.parameters[column] for column in batch.free)
     return BatchCalibration(model=model.name, parameters=free, **rows)
-
-
-def _remarks(model: CameraModel, batch: Batch, rows, good) -> np.ndarray:
-    """What is odd about the image points: looked for where the principal point is outside the
-    image, or there is no good result. Of a camera that is not determined, an RMS that is odd."""
-    frame = batch.image_size
-    if "cx" in model.parameters:
-        middle = rows["interior"][:, [model.parameters.index(name) for name in ("cx", "cy")]]
-        good = good & ((middle > -0.5) & (middle < frame - 0.5)).all(1)
-    remark = [""] * len(batch)
-    beside = rms_beside(rows["rms"], np.isfinite(rows["rms"]))
-    vague = rows["undetermined"].any(1)
-    for camera in np.flatnonzero(~good & batch.finite):
-        xy = batch.xy[camera][batch.visible[camera]]
-        said = [axes_remark(xy, frame, model.axes == "down")]
-        if vague[camera]:
-            said.append(rms_remark(rows["rms"][camera], beside[camera]))
-        remark[camera] = "; ".join(filter(None, said))
-    return np.array(remark)
 
 
 def _undetermined(model: CameraModel, batch: Batch, ended, rows) -> Bool[np.ndarray, "cameras k"]:

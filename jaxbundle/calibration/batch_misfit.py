@@ -14,6 +14,9 @@ in all cameras alike, or below these factors.
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxbundle.adjustment.batch_input import Batch
+from jaxbundle.cameras import CameraModel
+
 TAIL = 1.5
 """1 for normal residuals, 1.2 for half the views five times as noisy as the others."""
 NORMAL = 2 / np.sqrt(np.pi)
@@ -128,3 +131,24 @@ def axes_remark(
             "left pixel"
         )
     return f"{100 * part:.0f} % of the image points are outside the image: is image_size right?"
+
+
+def remarks(
+    model: CameraModel, batch: Batch, rows: dict, good: Bool[np.ndarray, " cameras"]
+) -> np.ndarray:
+    """What is odd about the image points: looked for where the principal point is outside the
+    image, or there is no good result. Of a camera that is not determined, an RMS that is odd."""
+    frame = batch.image_size
+    if "cx" in model.parameters:
+        middle = rows["interior"][:, [model.parameters.index(name) for name in ("cx", "cy")]]
+        good = good & ((middle > -0.5) & (middle < frame - 0.5)).all(1)
+    remark = [""] * len(batch)
+    beside = rms_beside(rows["rms"], np.isfinite(rows["rms"]))
+    vague = rows["undetermined"].any(1)
+    for camera in np.flatnonzero(~good & batch.finite):
+        xy = batch.xy[camera][batch.visible[camera]]
+        said = [axes_remark(xy, frame, model.axes == "down")]
+        if vague[camera]:
+            said.append(rms_remark(rows["rms"][camera], beside[camera]))
+        remark[camera] = "; ".join(filter(None, said))
+    return np.array(remark)
