@@ -101,7 +101,7 @@ def read_photomodeler(path: str | Path, overrides: Sequence[str] = ()) -> Networ
     control, objects = _points(rows, "control points"), _points(rows, "object points")
     names = dict(zip((photo.number for photo in photos), _names([photo.name for photo in photos])))
     marks = _marks(rows, names)
-    renumbered = renumber_smart(objects, marks)
+    renumbered = renumber_smart(path, objects, marks)
     points = point_table(path, control, objects, marks.id)
     if len(control):
         document["project"]["datum"] = "control"

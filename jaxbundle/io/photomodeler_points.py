@@ -1,9 +1,11 @@
 """Points and image points of a PhotoModeler export, and the ids of its smart points.
 
 Points found by matching ("smart points") have an id sequence of their own. It may run through ids
-of points that were marked by hand: then an id stands in the list of object points twice, once
-before the smart points begin and once after it, and image points of both have it. Those of smart
-points have σ 0. Where both kinds have an id, the smart point gets another.
+of points that were marked by hand: then an id stands in the list of object points twice, first for
+the point marked by hand, and image points of both have it. Those of smart points have σ 0. Where
+both kinds have an id, the smart point gets another. An id of both that is listed once is a smart
+point's if it stands after one of those, as ids do that only smart points have, or, where this
+leaves it open, after the first descent of the ids.
 
 Source: exported files; the same convention in the Damped Bundle Adjustment Toolbox (Börlin and
 Grussenmeyer 2013).
@@ -32,32 +34,67 @@ class Block:
         return len(self.id)
 
 
-def renumber_smart(objects: Block, marks: Block) -> str:
+def renumber_smart(path: Path, objects: Block, marks: Block) -> str:
     """Give smart points that have the id of another point ids of their own, in place.
 
     **Returns:** what was renumbered, in words; empty if nothing was.
+
+    **Raises:** `InputError` for an id that stands in the object points three times, or once where
+    it cannot be told for which of its two points.
     """
     smart = (marks.values[:, 2:] == 0).all(1)
     of_smart = {id for id, s in zip(marks.id, smart) if s}
     of_others = {id for id, s in zip(marks.id, smart) if not s}
-    seen: set[str] = set()
-    listed_twice = {id for id in objects.id if id in seen or seen.add(id)}
-    repeated = of_smart & (of_others | listed_twice)
+    listed: dict[str, list[int]] = {}
+    for k, id in enumerate(objects.id):
+        listed.setdefault(id, []).append(k)
+    repeated = of_smart & (of_others | {id for id, at in listed.items() if len(at) > 1})
     if not repeated:
         return ""
     above = 10 ** max(len(id) for id in (*objects.id, *marks.id))
-    other = {id: str(above + int(id)) for id in repeated}
-    numbers = np.array([int(id) for id in objects.id], float)
-    begin = next(iter(np.flatnonzero(np.diff(numbers) < 0) + 1), len(objects))
-    for k in range(begin, len(objects)):
-        objects.id[k] = other.get(objects.id[k], objects.id[k])
+    other = {id: str(above + int(id)) for id in sorted(repeated, key=int)}
+    for k in _smart_objects(path, objects, listed, repeated, (of_smart, of_others)):
+        objects.id[k] = other[objects.id[k]]
     marks.id[:] = [other.get(id, id) if s else id for id, s in zip(marks.id, smart)]
-    first = sorted(other, key=int)
     return (
-        f"{count(len(first), 'smart point')} had the id of another point and "
-        f"{'was' if len(first) == 1 else 'were'} renumbered: "
-        f"{some((f'{id} is {other[id]}' for id in first), 3, str)}"
+        f"{count(len(other), 'smart point')} had the id of another point and "
+        f"{'was' if len(other) == 1 else 'were'} renumbered: "
+        f"{some((f'{id} is {new}' for id, new in other.items()), 3, str)}"
     )
+
+
+def _smart_objects(path, objects, listed, repeated, of) -> list[int]:
+    """The rows of smart points among the object points with a repeated id: the second of two; of
+    one, by what is known of the rows around it."""
+    twice = {id: at for id, at in listed.items() if id in repeated and len(at) > 1}
+    for id, at in twice.items():
+        if len(at) > 2:
+            raise InputError(
+                f"{path}, line {objects.line[at[2]]}: point {id!r} stands in the object points "
+                f"{len(at)} times; at most a point marked by hand and a smart point have the same "
+                "id"
+            )
+    of_smart, of_others = of
+    once = [at[0] for id, at in listed.items() if id in repeated and len(at) == 1]
+    only = lambda ids: [k for id in ids for k in listed.get(id, ())]
+    first_smart = min([at[1] for at in twice.values()] + only(of_smart - of_others - repeated),
+                      default=len(objects))  # fmt: skip
+    last_other = max([at[0] for at in twice.values()] + only(of_others - of_smart), default=-1)
+    numbers = [int(id) for id in objects.id]
+    descent = next((k for k in range(max(last_other, 0) + 1, min(first_smart + 1, len(objects)))
+                    if numbers[k] < numbers[k - 1]), None)  # fmt: skip
+    found = [at[1] for at in twice.values()]
+    for k in once:
+        after, before = k > first_smart, k < last_other
+        if after == before and (after or descent is None):
+            raise InputError(
+                f"{path}, line {objects.line[k]}: point {objects.id[k]!r} has image points of a "
+                "point marked by hand and of a smart point (σ 0), but stands in the object points "
+                "once, and it cannot be told for which; give one of the two another id"
+            )
+        if after or (not before and k >= descent):
+            found.append(k)
+    return found
 
 
 def point_table(path: Path, control: Block, objects: Block, marked: list[str]) -> Columns:

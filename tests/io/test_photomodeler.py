@@ -13,6 +13,7 @@ import jaxbundle
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_network
 from jaxbundle.io.photomodeler import is_photomodeler
+from jaxbundle.io.photomodeler_points import Block, renumber_smart
 
 BROWN = CAMERAS["brown"]
 NAMES = ("a.jpg", "b.jpg", "c.jpg")
@@ -154,6 +155,39 @@ def test_a_repeated_id_that_is_no_smart_point_is_refused(tmp_path):
     text = smart(export()).replace("0.00000 0.00000\n", "0.10000 0.10000\n")
     with pytest.raises(InputError, match="point '2' stands already in"):
         read(tmp_path, text)
+
+
+def renumbered(listed, marked):
+    """Ids of object points and of image points, those of smart points with a minus."""
+    objects = Block([str(k) for k in listed], np.zeros((len(listed), 6)), [*range(len(listed))])
+    values = np.array([[1.0, 1.0, *[float(k > 0)] * 2] for k in marked])
+    marks = Block([str(abs(k)) for k in marked], values, [*range(len(marked))])
+    renumber_smart(Path("export.txt"), objects, marks)
+    return [[int(id) for id in block.id] for block in (objects, marks)]
+
+
+@pytest.mark.parametrize("listed, marked, objects, marks", [
+    ([5, 3, 7, 3, 8], [5, 3, 7, -3, -8], [5, 3, 7, 13, 8], [5, 3, 7, 13, 8]),
+    ([1, 5, 5, 6], [1, 5, -5, -6], [1, 5, 15, 6], [1, 5, 15, 6]),
+    ([1, 2, 3, 2, 20, 3], [1, 2, 3, -2, -20, -3], [1, 2, 3, 102, 20, 103],
+     [1, 2, 3, 102, 20, 103]),
+    # listed once: after a smart point, before a point marked by hand, after the descent
+    ([1, 2, 4, 5], [1, 2, 5, -4, -5], [1, 2, 4, 15], [1, 2, 5, 4, 15]),
+    ([1, 5, 6, 7], [1, 5, 6, -5, -7], [1, 5, 6, 7], [1, 5, 6, 15, 7]),
+    ([1, 7, 2, 3], [1, 2, 7, -7, -2, -3], [1, 7, 12, 3], [1, 2, 7, 17, 12, 3]),
+])  # fmt: skip
+def test_which_of_the_points_of_an_id_is_the_smart_one(listed, marked, objects, marks):
+    assert renumbered(listed, marked) == [objects, marks]
+
+
+@pytest.mark.parametrize("listed, marked, message", [
+    ([1, 2, 2, 2], [1, 2, -2], "line 3: point '2' stands in the object points 3 times"),
+    ([1, 5, 6], [1, 5, -5, -6], "line 1: point '5' has image points .* once"),
+    ([9, 5, 1], [1, 5, -5, -9], "line 1: point '5' has image points .* once"),
+])  # fmt: skip
+def test_an_id_whose_point_cannot_be_told_is_refused(listed, marked, message):
+    with pytest.raises(InputError, match=message):
+        renumbered(listed, marked)
 
 
 def in_windows(lines):
