@@ -12,6 +12,8 @@ SOLVED = (STATUS[CONVERGED], STATUS[WEAK], STATUS[MISFIT])
 """Statuses of cameras that have values."""
 MOST_ROWS = 20
 """Cameras in the HTML table; those that need attention first."""
+MOST_REMARKS = 10
+"""Remarks that differ, in the text."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,11 +87,13 @@ class BatchCalibration:
         if self.removed is not None:
             said.append(f"{int(self.removed.sum())} image points removed by data snooping")
         remarks, first, counts = np.unique(self.remark, return_index=True, return_counts=True)
-        said += [
+        lines = [
             f"camera {row}{f' and {count - 1} more' if count > 1 else ''}: {remark}"
-            for remark, row, count in zip(remarks, first, counts) if remark
+            for row, remark, count in sorted(zip(first, remarks, counts)) if remark
         ]  # fmt: skip
-        return "\n".join(said)
+        if len(lines) > MOST_REMARKS:
+            lines[MOST_REMARKS:] = [f"and {len(lines) - MOST_REMARKS} more remarks, see `remark`"]
+        return "\n".join(said + lines)
 
     def table(self) -> dict[str, np.ndarray]:
         """A row a camera: status, remark, rms and sigma0 (pixels), redundancy, iterations, views,

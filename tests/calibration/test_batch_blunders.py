@@ -1,5 +1,7 @@
 """Gross errors in batches: found, removed, or at least a status; axes that are not those meant."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -234,6 +236,9 @@ def test_a_table_and_html(plain, snooped):
     html = plain._repr_html_()
     assert html.count("<tr>") == CAMERAS + 1 and "misfit" in html and "&" not in html
     assert html.index(f">{BAD}<") < html.index(">0<")  # what needs attention first
+    many = dataclasses.replace(plain, remark=np.array([f"no. {i}" for i in range(3, 18)]))
+    assert len(str(many).splitlines()) == 12 and "and 5 more remarks" in str(many)
+    assert "camera 0: no. 3\ncamera 1: no. 4" in str(many)
     assert "8 image points removed" in str(snooped) or "removed by data snooping" in str(snooped)
 
 
