@@ -35,6 +35,7 @@ from jaxbundle.network.reduction import FACTORS
 from jaxbundle.network.tables import Network
 from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.network.units import ANGLE_UNITS
+from jaxbundle.orientation.exchanges import CONTRADICTION
 from jaxbundle.statistics import (
     CheckPoints,
     Component,
@@ -151,10 +152,20 @@ class Adjustment:
     @functools.cached_property
     def weakness(self) -> Weakness:
         """What is determined in name only: unknowns with a σ above a fiftieth of their extent, or,
-        without a solution, with such a σ a priori where the iterations ended."""
+        without a solution, with such a σ a priori where the iterations ended.
+
+        The σ are a posteriori, but neither blunders, which the robust scale leaves out, nor a
+        contradiction that is named make good geometry weak."""
         if self._weakness is not None or not self.converged:
             return self._weakness or Weakness()
-        return weakness(self.inspection, self.sigma0)
+        scale = self._scale
+        if any(CONTRADICTION in line for line in (*self.problem.network.warnings, *self.findings)):
+            scale = min(scale, 1.0)
+        return weakness(self.inspection, min(self.sigma0, scale))
+
+    @functools.cached_property
+    def _scale(self) -> float:
+        return robust_scale(self.problem, self.inspection.lengths)
 
     @functools.cached_property
     def doubts(self) -> tuple[str, ...]:
@@ -164,9 +175,8 @@ class Adjustment:
             return self._doubts
         doubt, downweighted = None, self.robust and self.sigma0 < 1
         if not (self.sigma_factors or downweighted or report.unit_weights(self)):
-            scale = robust_scale(self.problem, self.inspection.lengths)
             in_pixels = bool(name_pixels(self.problem.network))
-            doubt = doubt_of_fit(self.sigma0, scale, self.redundancy, in_pixels)
+            doubt = doubt_of_fit(self.sigma0, self._scale, self.redundancy, in_pixels)
         return self._doubts if doubt is None else (*self._doubts, doubt)
 
     @functools.cached_property

@@ -64,6 +64,25 @@ def test_a_sound_network_says_nothing(sound):
     assert sound.weakness.worst < 0.002
 
 
+def test_blunders_do_not_make_good_geometry_weak():
+    """σ0 is that of 3 in 100 rays, which are wrong by 150 σ."""
+    given = network(RING, **CONTROL)
+    xy = given.observations.xy.copy()
+    xy[[10, 44, 83]] += 0.3
+    result = jaxbundle.adjust(
+        given.replace(observations=dataclasses.replace(given.observations, xy=xy))
+    )
+    assert result.converged and result.sigma0 > 20
+    assert result.weakness.unknowns == () and "poorly determined" not in said(result)
+
+
+def test_exchanged_control_points_do_not_make_good_geometry_weak():
+    six = CONTROL | {"control": (0, 4, 10, 12, 20, 24)}
+    result = jaxbundle.adjust(exchanged(network(RING, **six), "11", "13"))
+    assert "'11' and '13' are exchanged" in said(result)
+    assert result.converged and result.sigma0 > 30 and "poorly determined" not in said(result)
+
+
 def test_images_from_one_place_are_named_where_there_is_no_solution():
     result = jaxbundle.adjust(network(ONE_PLACE))
     assert not result.converged
