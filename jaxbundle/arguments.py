@@ -77,7 +77,8 @@ def one_of(name: str, value: Any, choices: Sequence[str], none: bool = False) ->
     **Raises:** `InputError`."""
     if (value is None and none) or (isinstance(value, str) and value in choices):
         return value
-    raise InputError(f"{name} must be one of {', '.join(choices)}, not {shown(value)}")
+    expected = f"one of {', '.join(choices)}" if len(choices) > 1 else choices[0]
+    raise InputError(f"{name} must be {expected}{' or None' * none}, not {shown(value)}")
 
 
 def truth(name: str, value: Any) -> bool:
@@ -121,7 +122,7 @@ def numeric_array(name: str, values: Any, expected: str, truths: bool = False) -
     except (ValueError, TypeError):
         raise InputError(f"{name} must be {expected}, but its rows differ in length") from None
     if array.dtype.kind not in "biuf" or (array.dtype.kind == "b" and not truths):
-        raise InputError(f"{name} must be {expected}, but is {_kind_of(array)}")
+        raise InputError(f"{name} must be {expected}, but {_found(array)}")
     if isinstance(array, np.ma.MaskedArray):
         array = array.filled(False) if array.dtype.kind == "b" else array.astype(float).filled(
             np.nan)  # fmt: skip
@@ -163,8 +164,8 @@ def _stacked_masks(values: Any) -> np.ma.MaskedArray | None:
     return None
 
 
-def _kind_of(array: np.ndarray) -> str:
+def _found(array: np.ndarray) -> str:
+    if array.shape == ():
+        return f"is {shown(array.item())}"
     kinds = {"U": "text", "S": "text", "c": "complex numbers", "b": "truth values"}
-    if array.dtype.kind == "O" and array.shape == ():
-        return shown(array.item())
-    return kinds.get(array.dtype.kind, f"an array of {array.dtype}")
+    return f"contains {kinds.get(array.dtype.kind, f'values of type {array.dtype}')}"

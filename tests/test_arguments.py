@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbundle
-from jaxbundle.arguments import numeric_array
+from jaxbundle.arguments import numeric_array, one_of
 from jaxbundle.network.columns import as_columns
 
 pytestmark = pytest.mark.xdist_group("convergent4")
@@ -243,6 +243,17 @@ def test_masks_of_arrays_become_nan():
         np.testing.assert_array_equal(views(xy=given).visible, ~mask.any(2))
     whole = np.ma.masked_array([1, 2, 3], mask=[0, 1, 0])
     assert_allclose(numeric_array("n", whole, "numbers"), [1, NAN, 3])
+
+
+@pytest.mark.parametrize("call, said", [
+    (lambda: numeric_array("xy", [1j], "pixels"), "xy must be pixels, but contains complex"),
+    (lambda: numeric_array("xy", "a", "pixels"), "xy must be pixels, but is 'a'"),
+    (lambda: one_of("snooping", True, ("pope",), none=True), "must be pope or None, not True"),
+    (lambda: one_of("unit", "m", ("mm", "px")), "unit must be one of mm, px, not 'm'"),
+])  # fmt: skip
+def test_messages_say_what_is_expected_and_what_is_found(call, said):
+    with pytest.raises(jaxbundle.InputError, match=said):
+        call()
 
 
 @pytest.mark.parametrize("transform", ["jit", "vmap", "grad"])

@@ -289,7 +289,8 @@ def test_what_cannot_be_asked_for(network):
 
 
 @pytest.mark.parametrize("options, said", [
-    ({"snooping": "x"}, "snooping 'x': pope or baarda"),
+    ({"snooping": "x"}, "snooping must be one of pope, baarda or None, not 'x'"),
+    ({"snooping": True}, "snooping must be one of pope, baarda or None, not True"),
     ({"snooping": "pope", "significance": 2.0}, "significance .*a number between 0 and 1"),
 ])  # fmt: skip
 def test_a_test_that_is_none_is_refused_at_once(network, options, said):

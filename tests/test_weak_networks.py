@@ -16,7 +16,7 @@ from jaxbundle.network.repetitions import warn_of_repetitions
 from jaxbundle.network.stations import Stations
 from jaxbundle.orientation.one_place import name_one_place
 from jaxbundle.statistics import Inspection
-from jaxbundle.statistics.weakness import VAGUE, weakness, weakness_of_unsolved
+from jaxbundle.statistics.weakness import VAGUE, Weakness, weakness, weakness_of_unsolved
 
 TARGETS = grid_of_targets(5, 5, 0.5, relief=0.2, seed=1)
 RING = ring_of_stations(4, 3.0, 2.5, roll_every=2)
@@ -62,6 +62,12 @@ def sound():
 def test_a_sound_network_says_nothing(sound):
     assert sound.converged and sound.warnings == ()
     assert sound.weakness.worst < 0.002
+
+
+def test_weak_lines_compare_with_the_extent():
+    for worst, said in ((0.05, "a σ is up to 0.05 of the"), (1.5, "a σ is larger than the")):
+        (line,) = Weakness(("c of camera cam",), worst).lines
+        assert f"{said} principal distance" in line
 
 
 def test_blunders_do_not_make_good_geometry_weak():

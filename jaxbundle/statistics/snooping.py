@@ -25,8 +25,7 @@ import numpy as np
 
 from jaxbundle.adjustment.jacobian import compiled_jacobian
 from jaxbundle.adjustment.problem import Problem, count_rows
-from jaxbundle.arguments import number
-from jaxbundle.errors import InputError
+from jaxbundle.arguments import number, one_of
 from jaxbundle.statistics.distributions import critical_w, normal_quantile
 from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.statistics.readjusting import Adjust, readjust
@@ -64,8 +63,7 @@ def check_test(test: str | None, significance: float, option: str = "") -> None:
 
     **Raises:** `InputError`.
     """
-    if test is not None and (not isinstance(test, str) or test not in TESTS):
-        raise InputError(f"{option}snooping {test!r}: {' or '.join(TESTS)}")
+    one_of(f"{option}snooping", test, TESTS, none=True)
     number(f"{option}significance", significance, "a number between 0 and 1", lambda a: 0 < a < 1)
 
 

@@ -77,11 +77,11 @@ class Weakness:
         found = []
         if self.unknowns:
             kinds = [kind for kind in ADVICE_FOR if any(f" of {kind} " in n for n in self.unknowns)]
-            worst = f"{self.worst:.2g} of" if self.worst < 1 else "more than"
+            worst = f"is up to {self.worst:.2g} of" if self.worst < 1 else "is larger than"
             found.append(
-                f"poorly determined: {some(self.unknowns, 8, str)}; a σ is up to {worst} the "
+                f"poorly determined: {some(self.unknowns, 8, str)}; a σ {worst} the "
                 f"principal distance, the distance to the object, or a radian, and above "
-                f"{1 / VAGUE:g} the solution is one in name only. {ADVICE_FOR[kinds[0]]}"
+                f"{1 / VAGUE:g} of it the solution is one in name only. {ADVICE_FOR[kinds[0]]}"
             )
         if self.points:
             most = 2 * len(self.points) > self.of
