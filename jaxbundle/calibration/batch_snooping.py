@@ -12,10 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbundle.statistics.distributions import critical_w
+from jaxbundle.statistics.snooping import TOGETHER
 
 TESTS = ("pope",)
-TOGETHER = 0.5
-"""Points are removed together with the worst one if their test is at least this part of its."""
 MEDIAN = 1.0518
 """Median of the larger of two normal |w|: (2Φ(m) − 1)² = ½."""
 ROUNDING = 1e-6
