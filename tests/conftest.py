@@ -1,11 +1,13 @@
 """All tests run in float64, which the package itself never switches on.
 
 Compiled programs are kept in .cache/jax, so that test processes, the command line and notebooks
-share them; a process drops its own after a file of tests when it holds many, because each takes
-memory maps, of which Linux allows 65 530 a process. Programs are compiled with little optimisation:
-here compiling takes longer than running.
+share them; a process drops its own whenever they have grown by `MOST_GROWTH`: a worker then stays
+under 2 GB, and far from the 65 530 memory maps that Linux allows a process. Programs are compiled
+with little optimisation: here compiling takes longer than running.
 """
 
+import ctypes
+import gc
 import os
 from pathlib import Path
 
@@ -25,15 +27,31 @@ import jaxbundle  # noqa: E402
 jaxbundle.enable_x64()
 
 
-MAPS = Path("/proc/self/maps")
-MANY_MAPS = 20_000
+MEMORY = Path("/proc/self/statm")
+MOST_GROWTH = 500e6
+"""Bytes; a test may hold as much again before it ends."""
 
 
-@pytest.fixture(scope="module", autouse=True)
+def memory() -> float:
+    """Memory of this process, bytes; 0 where it is not known."""
+    if not MEMORY.exists():
+        return 0.0
+    return int(MEMORY.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+held = memory()
+
+
+@pytest.fixture(autouse=True)
 def drop_compiled_programs():
     yield
-    if not MAPS.exists() or MAPS.read_bytes().count(b"\n") > MANY_MAPS:
+    global held
+    if memory() - held > MOST_GROWTH:
         jax.clear_caches()
+        gc.collect()
+        if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
+            trim(0)  # What was freed goes back to the system.
+        held = memory()
 
 
 @pytest.fixture(scope="session")
