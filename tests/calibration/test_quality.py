@@ -282,9 +282,9 @@ def test_compare_tells_what_is_expected(calibration, tmp_path, monkeypatch, caps
     expected = calibration.adjustment.camera_covariance(calibration.name)
     assert tuple(names) == tuple(expected[0]) and camera.image_size == (480, 360)
     np.testing.assert_allclose(C, expected[1], rtol=1e-9, atol=1e-20)
-    for text, complaint in (("{", "not a result in JSON"), ("[]", "not the result of adjust"),
+    for text, complaint in (("{", "not valid JSON"), ("[]", "not the result of adjust"),
                             ('{"converged": false}', "was not solved"),
-                            ("[" * 100_000, "not a result in JSON")):  # fmt: skip
+                            ("[" * 100_000, "not valid JSON")):  # fmt: skip
         file.write_text(text)
         with pytest.raises(InputError, match=complaint):
             read_calibrated(file)
