@@ -284,7 +284,7 @@ def test_compare_tells_what_is_expected(calibration, tmp_path, monkeypatch, caps
     np.testing.assert_allclose(C, expected[1], rtol=1e-9, atol=1e-20)
     for text, complaint in (("{", "not valid JSON"), ("[]", "not the result of adjust"),
                             ('{"converged": false}', "was not solved"),
-                            ("[" * 100_000, "not valid JSON")):  # fmt: skip
+                            ("[" * 100_000, "nested too deeply")):  # fmt: skip
         file.write_text(text)
         with pytest.raises(InputError, match=complaint):
             read_calibrated(file)
