@@ -251,7 +251,7 @@ def test_orient_names_what_is_missing(project):
         (("--join", "127.0.0.1:99999", 2, 0), "'127.0.0.1:99999'"),
         (("--join", "127.0.0.1:0", 2, 0), "'127.0.0.1:0'"),
         (("--join", "127.0.0.1:9922", 2, 5), "process 5 of 2"),
-        (("--join", "127.0.0.1:9922", 2, -1), "process -1 of 2"),
+        (("--join", "127.0.0.1:9922", 2, -1), "process must be a whole number from 0"),
         (("--join", "no.machine.invalid:9922", 2, 1), "no machine 'no.machine.invalid'"),
         (("--join", "127.0.0.1:9922", 2, 0, "--cluster"), "give one of them"),
         (("--join", "127.0.0.1:9922", 2, 0, "--json", "-"), "give a file"),
