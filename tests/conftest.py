@@ -9,6 +9,7 @@ with little optimisation: here compiling takes longer than running.
 import ctypes
 import gc
 import os
+import signal
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
@@ -26,6 +27,12 @@ import jaxbundle  # noqa: E402
 
 jaxbundle.enable_x64()
 
+
+# Where signals are ignored (in the background, under nohup), the programs that tests start would
+# ignore them too; a handler is not inherited.
+for name in ("SIGINT", "SIGHUP"):
+    if signal.getsignal(getattr(signal, name, signal.SIGTERM)) is signal.SIG_IGN:
+        signal.signal(getattr(signal, name), lambda *_: None)
 
 MEMORY = Path("/proc/self/statm")
 MOST_GROWTH = 500e6
