@@ -190,11 +190,11 @@ def test_a_bad_override_is_refused(folder, override, said):
     ("project.toml", '"deg"', '"degrees"', "angle_unit must be one of rad, deg, gon"),
     ("project.toml", "0.01", '"0.01"', "[project]: sigma_image is '0.01'; a number is expected"),
     ("project.toml", "0.01", "0", "[project]: sigma_image is 0; it must be finite and positive"),
-    ("project.toml", "0.01", "1" + "0" * 400, "…; it must be finite and positive"),
-    ("project.toml", "0.01", "1" + "0" * 5000, "not valid TOML: Exceeds the limit"),
-    ("project.toml", "0.01", "[" * 3000 + "]" * 3000, "not valid TOML: brackets are nested too"),
-    ("project.toml", "c = 50.0", "c = 5" + "0" * 400, "camera 'cam.1': c is 5000"),
-    ("project.toml", "c = 0.1", "c = 1" + "0" * 400, "sigma of c is 1000"),
+    ("project.toml", "0.01", "1" + "0" * 400, "too large a number; finite numbers are expected"),
+    ("project.toml", "0.01", "1" + "0" * 5000, "too large a number"),
+    ("project.toml", "0.01", "[" * 3000 + "]" * 3000, "line 6: not valid TOML: nested too"),
+    ("project.toml", "c = 50.0", "c = 5" + "0" * 400, "line 17: not valid TOML: too large"),
+    ("project.toml", "c = 0.1", "c = 1" + "0" * 400, "line 19: not valid TOML: too large"),
     ("project.toml", '"images.csv"', f'"{"a" * 300}.csv"', "[project]: images = 'aaa"),
     ("project.toml", 'name = "small"', "name = 5", "[project]: name is 5; text in quotes"),
     ("project.toml", 'name = "small"', "datum_points = 1", "datum_points must be a list of ids"),
@@ -294,7 +294,7 @@ def test_an_override_of_a_sigma_that_is_no_table_is_refused(folder):
 
 
 @pytest.mark.parametrize("id, X, said", [
-    ('"a"', "1" + "0" * 400, "entry 1: X is 1000"),
+    ('"a"', "1" + "0" * 400, "line 23: not valid TOML: too large"),
     ('"a"', "true", "entry 1: X is True; a number is expected"),
     ("inf", "0", "point 'a' is unknown"),
 ])  # fmt: skip
