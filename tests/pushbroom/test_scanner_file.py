@@ -151,13 +151,13 @@ def test_there_and_back_by_the_commands(tmp_path, monkeypatch, capsys):
 def test_what_the_commands_refuse(tmp_path, monkeypatch, capsys):
     scanner = write_scanner(tmp_path)
     off, gone = tmp_path / "off.csv", tmp_path / "gone.csv"
-    off.write_text("line,pixel\n1,2\n3,400\n")
+    off.write_text("line,pixel\n3,400\n")  # all of them: one of several is told in its row
     north, lon = tmp_path / "north.csv", tmp_path / "lon.csv"
     north.write_text("longitude,latitude,height\n1,2,3\n1,95,3\n")
     lon.write_text("lon,lat,height\n1,2,3\n")
     gone.write_text("X,Y,Z\n6378137,0,0\n6378137,0,1\n")  # as many as there and back
     cases = [
-        (["locate", scanner, "--points", off], ["off.csv, line 3", "pixel 400", "399.5"]),
+        (["locate", scanner, "--points", off], ["off.csv, line 2", "pixel 400", "399.5"]),
         (["locate", scanner, "--grid", "few"], ["--grid 'few'", "11x11"]),
         (["locate", scanner, "--height", "7e6", "--grid", "1x2"], ["misses the surface", "2 of 2"]),
         (["project", scanner, "--points", gone], ["gone.csv, line 2", "not", "in the image"]),
