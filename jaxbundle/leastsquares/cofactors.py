@@ -1,0 +1,148 @@
+"""Cofactors: the blocks of the inverse normal matrix that statistics need, never all of it.
+
+From the factor (`elimination.py`), with Q the inverse of S and Z = L⁻¹·Wᵀ of every incidence,
+
+    K_n  = Σ_m Z_m·Q[m, n]              over the incidences m of the same eliminated row
+    Q_en = −L⁻ᵀ·K_n                     an eliminated row with the kept row of its incidence n
+    Q_ee = L⁻ᵀ·(1 + Σ_n K_n·Z_nᵀ)·L⁻¹   an eliminated row
+
+These are marginal cofactors: the uncertainty of what is kept is in those of the eliminated rows.
+In a problem that may float they belong to the datum by the S-transformation Q ← S·Q·Sᵀ.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbundle.leastsquares.datum import contract, datum_directions
+from jaxbundle.leastsquares.elimination import Factor, solve
+from jaxbundle.leastsquares.normal import Tangent
+from jaxbundle.leastsquares.plan import PAIR_ROWS_AT_ONCE, Key, Plan
+from jaxbundle.leastsquares.reduced import Reduced
+from jaxbundle.leastsquares.rows import Declared, Values
+
+
+class Cofactors(eqx.Module):
+    """Blocks of Q = N⁻¹.
+
+    `own`: of every row of every group, in the datum of the problem. The others are what residuals
+    need, in the regularised datum of the factor (use them for estimable quantities only): `kept`,
+    the blocks of the reduced system; `eliminated`; `coupled`, every eliminated row with the kept
+    row of its incidences. What is held has zeros.
+    """
+
+    own: dict[str, Float[Array, "rows w w"]]
+    kept: Reduced
+    eliminated: Float[Array, "rows w w"] | None
+    coupled: dict[str, Float[Array, "chunks length w v"]]
+
+
+def cofactors(declared: Declared, values: Values, factor: Factor) -> Cofactors:
+    """All cofactor blocks of a solved problem."""
+    plan = factor.plan
+    Q = _without_held(plan, factor.reduced.inverse())
+    eliminated, coupled = None, {}
+    own = dict(Q.own)
+    if plan.eliminated is not None:
+        K, L = _couplings(factor, Q), factor.lower_inverse
+        inner = jnp.eye(L.shape[1])
+        for g, k in K.items():
+            at = plan.incidences[g].eliminated.ravel()
+            rows = jnp.einsum("clij,clkj->clik", k, factor.Z[g]).reshape(-1, *L.shape[1:])
+            inner = inner + jax.ops.segment_sum(rows, at, L.shape[0])
+            coupled[g] = -jnp.einsum("clji,cljk->clik", L[plan.incidences[g].eliminated], k)
+        free = plan.groups[plan.eliminated].free
+        eliminated = jnp.einsum("nji,njk,nkl->nil", L, inner, L)
+        eliminated = eliminated * free[:, :, None] * free[:, None, :]
+        own[plan.eliminated] = eliminated
+    return Cofactors(_in_datum(declared, values, factor, own), Q, eliminated, coupled)
+
+
+def _without_held(plan: Plan, Q: Reduced) -> Reduced:
+    """The inverse of S with zeros, where S had ones, for what is held."""
+    mask = lambda B, g: B * plan.groups[g].free[:, :, None] * plan.groups[g].free[:, None, :]
+    return Reduced({g: mask(B, g) for g, B in Q.own.items()}, Q.off)
+
+
+def _couplings(factor: Factor, Q: Reduced):
+    """K of every incidence."""
+    plan, Z = factor.plan, factor.Z
+    K = {
+        g: jnp.einsum("clij,cjk->clik", z, Q.own[g][plan.incidences[g].row]) for g, z in Z.items()
+    }
+    flat = {g: k.reshape(-1, *k.shape[2:]) for g, k in K.items()}
+    rows = {g: z.reshape(-1, *z.shape[2:]) for g, z in Z.items()}
+    for (later, earlier), at in plan.blocks.items():
+        if at.pairs is None:
+            continue
+        flat[later], flat[earlier] = _spread(
+            at.pairs, rows[later], rows[earlier], Q.off[later, earlier],
+            flat[later], flat[earlier], later == earlier,
+        )  # fmt: skip
+    return {g: flat[g].reshape(k.shape) for g, k in K.items()}
+
+
+def _spread(pairs, a, b, Q, to_first, to_second, within: bool):
+    """To the first of the totals is added b·Qᵀ for every partner b of its row, to the second a·Q; Q
+    is the block of each pair. `within`: the two totals are one."""
+    totals = (to_first,) if within else (to_first, to_second)
+    for first, second, block in zip(pairs.first, pairs.second, pairs.block):
+        length = first.shape[1]
+
+        def add(totals, chunk):
+            i, j, k = chunk
+            forth = jnp.einsum("clij,cjk->clik", a[i], Q[k])
+            back = jnp.einsum("clij,ckj->clik", b[j], Q[k])
+            if within:
+                return (totals[0].at[i].add(back).at[j].add(forth),), None
+            return (totals[0].at[i].add(back), totals[1].at[j].add(forth)), None
+
+        chunks, step = first.shape[0], max(1, PAIR_ROWS_AT_ONCE // length)
+        whole = chunks // step * step
+        if chunks > step:
+            steps = lambda x: x[:whole].reshape(-1, step, *x.shape[1:])
+            totals, _ = jax.lax.scan(add, totals, (steps(first), steps(second), steps(block)))
+            first, second, block = first[whole:], second[whole:], block[whole:]
+        if len(block):
+            totals, _ = add(totals, (first, second, block))
+    # What stands for nothing has collected what the fillings of chunks have in common.
+    return (totals[0], totals[0]) if within else totals
+
+
+def _in_datum(declared, values, factor, own):
+    """The diagonal blocks in the datum of the problem: S·Q·Sᵀ."""
+    plan = factor.plan
+    if plan.datum is None:
+        return own
+    G, B = datum_directions(declared, plan, values)
+    H = jax.vmap(lambda b: solve(factor, b), -1, -1)(B)
+    M = jnp.linalg.inv(contract(plan, B, G))
+    A = {g: h @ M.T for g, h in H.items()}
+    C = M @ contract(plan, B, A)
+
+    def moved(Q, g, a):
+        cross = jnp.einsum("nik,njk->nij", g, a)
+        return Q - cross - cross.transpose(0, 2, 1) + jnp.einsum("nik,kl,njl->nij", g, C, g)
+
+    return {name: moved(Q, G[name], A[name]) for name, Q in own.items()}
+
+
+def propagate(declared: Declared, values: Values, factor: Factor, rows: Tangent):
+    """F·Q·Fᵀ in the datum for any linear functions F of the unknowns (first axis of `rows`): one
+    structured solve for each function."""
+    plan = factor.plan
+    from_datum = jax.vmap(lambda r: _datum_transposed(declared, plan, values, r))(rows)
+    solved = jax.vmap(lambda r: solve(factor, r))(from_datum)
+    return sum(
+        jnp.einsum("fni,gni->fg", from_datum[g], solved[g]) for g in from_datum
+    )
+
+
+def _datum_transposed(declared, plan, values, row):
+    """Sᵀ·f: f − B(GᵀB)⁻¹Gᵀf."""
+    if plan.datum is None:
+        return row
+    G, B = datum_directions(declared, plan, values)
+    along = jnp.linalg.solve(contract(plan, G, B), contract(plan, G, row))
+    return {g: f - B[g] @ along for g, f in row.items()}

@@ -1,0 +1,61 @@
+"""The metric of the damping: λ·D is added to N, and the step becomes shorter as λ grows.
+
+Marquardt (1963) takes D = diag(N), which depends on what the unknowns are. A space may say in which
+unknowns they are to be damped (`Space.chart`): D is diag(N) in these, carried back,
+
+    D = Tᵀ·diag(T⁻ᵀ·N·T⁻¹)·T,   T = ∂(those unknowns)/∂(ours).
+
+Without a chart D is a diagonal. Identity damping does not converge on real problems: radians stand
+beside metres and beside coefficients of 1e-8.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbundle.leastsquares.plan import Plan
+from jaxbundle.leastsquares.rows import Declared, Values
+
+Metric = dict[str, Float[Array, "rows w *w"]]
+
+
+def measure(declared: Declared, plan: Plan, values: Values, own) -> Metric:
+    """D of every group: matrices [rows, w, w] where a space has a chart, diagonals [rows, w] where
+    none has; 1 for what is held. `own`: the diagonal blocks of N."""
+    return {name: _of_group(declared, plan.groups[name], values, B) for name, B in own.items()}
+
+
+def _of_group(declared, group, values, blocks):
+    charts = []
+    for member in group.members:
+        rows = values[member.table]
+        rows = rows if member.rows is None else jax.tree.map(lambda x, m=member: x[m.rows], rows)
+        charts.append(jax.vmap(declared.spaces[member.table].chart)(rows))
+    if all(T is None for T in charts):
+        return _positive(jnp.diagonal(blocks, axis1=1, axis2=2))
+    T = jnp.zeros(blocks.shape)
+    for member, chart in zip(group.members, charts):
+        at = slice(member.start, member.start + member.width)
+        T = T.at[:, at, at].set(jnp.eye(member.width) if chart is None else chart)
+
+    def one(T, N):
+        inverse = jnp.linalg.inv(T)
+        D = T.T @ (jnp.diagonal(inverse.T @ N @ inverse)[:, None] * T)
+        return D + jnp.diag(jnp.where(jnp.diagonal(D) > 0, 0.0, 1.0))
+
+    return jax.vmap(one)(T, blocks)
+
+
+def _positive(diagonal):
+    return jnp.where(diagonal > 0, diagonal, 1.0)
+
+
+def times(D: Metric, change):
+    """D·δ."""
+    product = lambda d, x: jnp.einsum("nij,nj->ni", d, x) if d.ndim == 3 else d * x
+    return {name: product(D[name], x) for name, x in change.items()}
+
+
+def matrices(D: Metric) -> Metric:
+    """D as matrices [rows, w, w]."""
+    return {name: d if d.ndim == 3 else d[:, :, None] * jnp.eye(d.shape[1]) for name, d in D.items()}

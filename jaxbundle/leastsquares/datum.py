@@ -1,0 +1,317 @@
+"""The datum: which motions of the whole problem the observations leave open, and how they are pinned.
+
+A motion that changes no observation makes the normal equations singular along its directions G
+(Blaha 1971; Illner 1985). Which combinations of the declared motions stay open is found from the
+observations that are not invariant, and from what is held.
+
+The datum is imposed by an S-transformation (Baarda 1973; Teunissen 1985): with a choice B of datum
+unknowns,
+
+    δ ← δ − G(BᵀG)⁻¹Bᵀδ,      Q ← S·Q·Sᵀ,  S = I − G(BᵀG)⁻¹Bᵀ,
+
+B = G on the datum rows for inner constraints (trace of their covariance smallest), B = as many
+single unknowns as there are defects for a minimal datum. After convergence the whole problem is
+moved, by finite open motions, to where Bᵀ(x − x_start) = 0 holds exactly: the result does not
+depend on the path of the iterations.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.linearise import differentiate
+from jaxbundle.leastsquares.normal import Tangent, dot, total
+from jaxbundle.leastsquares.plan import Datum, Plan
+from jaxbundle.leastsquares.rows import Data, Declared, Values, lay_out_data, prepare
+
+OPEN = 1e-10
+"""Relative size of J·G below which a direction counts as open (rounding gives about 1e-14)."""
+HELD = 1e-7
+"""Relative size of the least motion of datum unknowns that hold the datum."""
+NEAR = 1e-3
+"""A motion into the datum by less than this fraction of the problem is near its end."""
+LONGEST = 1.0
+"""Of a single motion into the datum: radians, or a factor of e."""
+MOST_MOTIONS = 50
+
+
+def generators(declared: Declared, values: Values) -> Tangent:
+    """How every table moves along each motion, [rows, width, motions]; zero where it does not."""
+    motions = len(declared.motions.names)
+    actions = dict(declared.motions.actions)
+
+    def of_table(name):
+        space, act = declared.spaces[name], actions.get(name)
+        if act is None:
+            rows = jax.tree.leaves(values[name])[0].shape[0]
+            return jnp.zeros((rows, space.width, motions))
+        change = lambda value, m: space.difference(act(m, value), value)
+        return jax.vmap(jax.jacfwd(change, 1), (0, None))(values[name], jnp.zeros(motions))
+
+    return {name: of_table(name) for name in values}
+
+
+def of_groups(plan: Plan, of_tables) -> Tangent:
+    """What belongs to the directions of the tables, [rows, width, …], for the groups; zero where
+    something is held."""
+    found = {}
+    for name, group in plan.groups.items():
+        parts = [
+            of_tables[m.table] if m.rows is None else of_tables[m.table][m.rows]
+            for m in group.members
+        ]
+        rows = jnp.concatenate(parts, 1)
+        free = group.free.reshape(*group.free.shape, *(1,) * (rows.ndim - 2))
+        found[name] = rows * free
+    return found
+
+
+def open_directions(declared: Declared, plan: Plan, values: Values) -> Tangent:
+    """G: the directions of the open motions, [rows, w, defect]."""
+    moves = generators(declared, values)
+    return {name: rows @ plan.datum.gauge for name, rows in of_groups(plan, moves).items()}
+
+
+def find_open_motions(
+    declared: Declared, plan: Plan, data: Data, real: dict[str, np.ndarray]
+) -> Float[np.ndarray, "motions defect"]:
+    """The combinations of the declared motions that change no observation and nothing held. `real`:
+    by table, which of its rows are not filled in.
+
+    Found at the start values from the singular values of J·G, its columns scaled by the size of
+    their terms, so that neither units nor the number of observations matter."""
+    products, terms, held = map(np.asarray, _directional_products(declared, plan, data, real))
+    # What cannot be computed from the start values says nothing; the solver will complain.
+    products, terms, held = (x[np.isfinite(x).all(1)] for x in (products, terms, held))
+    scale = np.sqrt((np.concatenate([terms, held]) ** 2).sum(0))
+    scale = np.where(scale > 0, scale, 1.0)
+    held = held / scale
+    size = np.linalg.norm(held, axis=1, keepdims=True)
+    held = held / np.where(size > 0, size, 1.0)
+    motions = len(declared.motions.names)
+    # Singular values of a QR, not of the Gram matrix, which would lose half of the digits.
+    rows = np.concatenate([products / scale, held, np.zeros((motions, motions))])
+    _, singular, directions = np.linalg.svd(np.linalg.qr(rows, mode="r"))
+    return directions[singular < OPEN].T / scale[:, None]
+
+
+@eqx.filter_jit
+def _directional_products(declared: Declared, plan: Plan, data: Data, real):
+    """J·G of all observations that are not invariant, the terms that cancel in it, and G on what is
+    held."""
+    laid, prepared = lay_out_data(plan, data), prepare(declared, data.start)
+    moves = generators(declared, data.start)
+    motions = len(declared.motions.names)
+    everywhere = {
+        name: (jnp.concatenate([
+            moves[m.table] if m.rows is None else moves[m.table][m.rows] for m in group.members
+        ], 1), group.free)
+        for name, group in plan.groups.items()
+    }  # fmt: skip
+    products, terms = [], []
+    for number, part in enumerate(plan.parts):
+        if declared.kinds[part.observations].invariant:
+            continue
+        _, touches, E = differentiate(declared, plan, number, prepared, laid)
+        found = [
+            jnp.einsum("clri,cim->clrm", J, everywhere[t.group][0][t.row, t.start : t.stop])
+            for t, J in zip(part.touches, touches)
+        ]
+        if E is not None:
+            found.append(jnp.einsum("clri,clim->clrm", E, everywhere[plan.eliminated][0][part.eliminated]))
+        products.append(sum(found).reshape(-1, motions))
+        terms += [x.reshape(-1, motions) for x in found]
+    free = free_of_tables(plan, declared, data.start)
+    held = [
+        jnp.where((free[name] > 0)[..., None] | ~real[name][:, None, None], 0.0, rows)
+        for name, rows in moves.items()
+    ]
+    flat = lambda rows: jnp.concatenate([jnp.zeros((0, motions)), *rows])
+    return flat(products), flat(terms), flat([rows.reshape(-1, motions) for rows in held])
+
+
+def make_datum(
+    declared: Declared, plan: Plan, data: Data, gauge, weight: dict[str, np.ndarray], minimal: bool
+) -> Datum:
+    """The datum held by the unknowns with a `weight` (by table, [rows, width]); `minimal`: by as
+    many of them as there are defects, chosen well spread.
+
+    **Raises:** `InputError` where they cannot hold it."""
+    moves = {name: np.asarray(g) @ gauge for name, g in _generators(declared, data.start).items()}
+    free = jax.tree.map(np.asarray, free_of_tables(plan, declared, data.start))
+    weight = {name: np.asarray(w) * free[name] for name, w in weight.items()}
+    defect = gauge.shape[1]
+    directions = np.concatenate([moves[t].reshape(-1, defect) for t in weight])
+    candidates = np.concatenate([w.ravel() for w in weight.values()])
+    chosen = directions * candidates[:, None]
+    if np.isfinite(chosen).all():  # otherwise the solver will complain
+        singular = np.linalg.svd(chosen / np.linalg.norm(directions, axis=0), compute_uv=False)
+        if len(singular) < defect or singular[-1] < HELD * singular[0]:
+            raise InputError(
+                "the chosen unknowns cannot hold the datum, of which "
+                f"{defect} of {len(declared.motions.names)} parameters are open"
+            )
+    if minimal:
+        picked = _pick_rows(directions, candidates)
+        cuts = np.cumsum([w.size for w in weight.values()])[:-1]
+        weight = {
+            t: part.reshape(weight[t].shape) for t, part in zip(weight, np.split(picked, cuts))
+        }
+    pins = _choose_pins(plan, {n: np.asarray(x) for n, x in of_groups(plan, moves).items()})
+    return Datum(gauge, weight, pins)
+
+
+_generators = eqx.filter_jit(generators)
+
+
+def _choose_pins(plan: Plan, G) -> dict[str, np.ndarray]:
+    """As many kept unknowns as there are defects, chosen well spread; every kind of direction
+    counts by its own size."""
+    rows, shapes = [], []
+    for name in plan.kept:
+        sized = G[name] / np.maximum(np.sqrt((G[name] ** 2).mean((0, 2), keepdims=True)), 1e-300)
+        rows.append(sized.reshape(-1, sized.shape[2]))
+        shapes.append(G[name].shape[:2])
+    whole = np.concatenate(rows)
+    free = np.concatenate([np.asarray(plan.groups[g].free).ravel() for g in plan.kept])
+    picked = _pick_rows(whole, free)
+    cuts = np.cumsum([len(r) for r in rows])[:-1]
+    return {
+        name: part.reshape(shape)
+        for name, part, shape in zip(plan.kept, np.split(picked, cuts), shapes)
+    }
+
+
+def _pick_rows(G, candidates):
+    """1 for as many rows of G as it has columns, the independent ones, 0 for the others."""
+    q, _ = np.linalg.qr(G)
+    rows = q * candidates[:, None]
+    chosen = np.zeros(len(rows))
+    for _ in range(G.shape[1]):
+        pick = np.argmax((rows**2).sum(1))
+        direction = rows[pick] / np.linalg.norm(rows[pick])
+        rows = rows - np.outer(rows @ direction, direction)
+        chosen[pick] = 1.0
+    return chosen
+
+
+def s_transform(declared: Declared, plan: Plan, values: Values, change: Tangent) -> Tangent:
+    """A change with the datum imposed: δ − G(BᵀG)⁻¹Bᵀδ; unchanged where nothing is open."""
+    if plan.datum is None:
+        return change
+    G, B = datum_directions(declared, plan, values)
+    gram = contract(plan, B, G)
+    along = jnp.linalg.solve(gram, contract(plan, B, change))
+    return {name: d - G[name] @ along for name, d in change.items()}
+
+
+def datum_directions(declared: Declared, plan: Plan, values: Values) -> tuple[Tangent, Tangent]:
+    """G and B of all groups, [rows, w, defect]."""
+    G = open_directions(declared, plan, values)
+    zero = {
+        name: jnp.zeros((jax.tree.leaves(rows)[0].shape[0], declared.spaces[name].width))
+        for name, rows in values.items()
+    }
+    weight = of_groups(plan, zero | plan.datum.weight)
+    return G, {name: g * weight[name][..., None] for name, g in G.items()}
+
+
+def move_to_datum(declared: Declared, plan: Plan, values: Values, start: Values) -> Values:
+    """The problem moved along its open motions to where Bᵀ(x − x_start) = 0.
+
+    Gauss–Newton steps, of a radian and a factor e at most, until near; then Newton's. Until
+    rounding: no move at all, or a small one that is no smaller than the one before."""
+    if plan.datum is None:
+        return values
+    weighted = tuple(plan.datum.weight)
+    size = max(
+        jnp.abs(x).max() for name in weighted for x in jax.tree.leaves(start[name])
+    )
+
+    def moving(state):
+        _, distance, before, count = state
+        falling = (distance > 1e-6 * size) | (distance < 0.5 * before)
+        return (distance > 1e-12 * size) & falling & (count < MOST_MOTIONS)
+
+    def further(state):
+        values, before, _, count = state
+        missing, gram = _datum_equations(declared, plan, values, start)
+        far = before > NEAR * size
+        slope = jnp.where(far, gram, _slope(declared, plan, values, start))
+        step = plan.datum.gauge @ -jnp.linalg.solve(slope, missing)
+        curved = jnp.abs(step[jnp.array(declared.motions.curved, int)]).max(initial=0.0)
+        moved = _moved(declared, plan, step / jnp.maximum(curved / LONGEST, 1.0), values)
+        distance = max(
+            jnp.abs(a - b).max() for name in weighted
+            for a, b in zip(jax.tree.leaves(moved[name]), jax.tree.leaves(values[name]))
+        )  # fmt: skip
+        return moved, distance, before, count + 1
+
+    begin = values, jnp.asarray(1e300), jnp.asarray(jnp.inf), 0
+    return jax.lax.while_loop(moving, further, begin)[0]
+
+
+def _datum_equations(declared, plan, values, start):
+    """Bᵀ(x − x_start) and BᵀG, over the datum tables."""
+    missing = gram = 0.0
+    moves = generators(declared, {name: values[name] for name in plan.datum.weight})
+    for name, weight in plan.datum.weight.items():
+        G = moves[name] @ plan.datum.gauge
+        B = G * weight[..., None]
+        x = jax.vmap(declared.spaces[name].difference)(values[name], start[name])
+        missing += jnp.einsum("nwk,nw->k", B, x)
+        gram += jnp.einsum("nwk,nwl->kl", B, G)
+    return missing, gram
+
+
+def _slope(declared, plan, values, start):
+    """How the datum equations change along the open motions."""
+    moves = generators(declared, {name: values[name] for name in plan.datum.weight})
+
+    def after(tau):
+        moved = {
+            name: jax.vmap(declared.spaces[name].retract)(
+                values[name], moves[name] @ (plan.datum.gauge @ tau) * (weight > 0)
+            )
+            for name, weight in plan.datum.weight.items()
+        }
+        return _datum_equations(declared, plan, moved, start)[0]
+
+    return jax.jacfwd(after)(jnp.zeros(plan.datum.gauge.shape[1]))
+
+
+def _moved(declared, plan, motion, values):
+    """All tables moved; what is held stays."""
+    moved, free = dict(values), free_of_tables(plan, declared, values)
+    for name, act in declared.motions.actions:
+        space = declared.spaces[name]
+        one = lambda value, f, act=act, space=space: space.hold(act(motion, value), value, f)
+        moved[name] = jax.vmap(one)(values[name], free[name])
+    return moved
+
+
+def free_of_tables(plan: Plan, declared: Declared, values: Values) -> dict[str, Array]:
+    """1 for every direction of every table that is free, 0 where it is held."""
+    free = {
+        name: jnp.zeros((jax.tree.leaves(rows)[0].shape[0], declared.spaces[name].width))
+        for name, rows in values.items()
+    }
+    for group in plan.groups.values():
+        for m in group.members:
+            columns = group.free[:, m.start : m.start + m.width]
+            rows = slice(None) if m.rows is None else m.rows
+            free[m.table] = free[m.table].at[rows].max(columns)
+    return free
+
+
+def contract(plan: Plan, B: Tangent, x: Tangent):
+    """Bᵀx over all rows; x may have a last axis of its own."""
+    parts = {name: jnp.einsum("nwk,nw...->k...", b, x[name]) for name, b in B.items()}
+    e = plan.eliminated
+    kept = sum(part for name, part in parts.items() if name != e)
+    return kept if e is None else kept + total(plan, parts[e])

@@ -1,0 +1,192 @@
+"""What a user declares: tables of unknowns, and kinds of observations of them.
+
+A problem that is no network at all:
+
+    height = Table("height", start)                                                   # [n]
+    levelled = Kind("levelled difference", lambda a, b, dh: b - a - dh, of=("height", "height"))
+    observations = levelled(rows=(i, j), measured=dh, sigma=s)
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int, PyTree
+
+from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.spaces import Space, Vector
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """Unknowns of one sort: rows that move alike.
+
+    **Arguments:**
+
+    - `name`: as the kinds of observations call it.
+    - `value`: start values, arrays whose first axis is the rows.
+    - `space`: how a row moves; numbers that add if not given.
+    - `free`: [rows, width], whether each direction of each row is free (one value for all, or one
+      a row); all are if not given. What is held is a given quantity, of which derivatives can be
+      taken.
+    """
+
+    name: str
+    value: PyTree[np.ndarray]
+    space: Space | None = None
+    free: Any = None
+
+    def __post_init__(self):
+        leaves = jax.tree.leaves(self.value)
+        if not leaves or any(np.ndim(x) == 0 for x in leaves):
+            raise InputError(f"table {self.name!r}: the values must be arrays of rows")
+        if len({len(x) for x in leaves}) > 1:
+            raise InputError(f"table {self.name!r}: its arrays differ in their number of rows")
+        if self.space is None:
+            shape = np.shape(leaves[0])
+            if len(leaves) > 1 or len(shape) > 2:
+                raise InputError(
+                    f"table {self.name!r}: values of this shape need a space, such as Pose()"
+                )
+            object.__setattr__(self, "space", Vector(shape[1] if len(shape) == 2 else 0))
+        free = True if self.free is None else np.asarray(self.free)
+        try:
+            free = free if np.ndim(free) != 1 else np.asarray(free)[:, None]
+            free = np.broadcast_to(free, (self.rows, self.space.width)).astype(float)
+        except ValueError:
+            raise InputError(
+                f"table {self.name!r}: `free` must be [rows, {self.space.width}] or [rows], not "
+                f"{list(np.shape(self.free))}"
+            ) from None
+        object.__setattr__(self, "free", free)
+
+    @property
+    def rows(self) -> int:
+        return len(jax.tree.leaves(self.value)[0])
+
+
+@dataclasses.dataclass(frozen=True)
+class Kind:
+    """A kind of observation: one pure function of ONE observation.
+
+    **Arguments:**
+
+    - `name`: of the kind, as it is reported; a σ0 group of its own.
+    - `residual`: `(blocks…, measured) -> residuals`, computed minus observed. Of a table of vectors
+      a block is an array [m] (a number where the table is [rows]), of poses a `Posed`. It returns
+      one number or an array [r]; with `scalars`, blocks and `measured` are tuples of scalars, and
+      so is what it returns: quicker where there are many observations.
+    - `of`: the names of the tables it touches, one for each block (one table may be touched twice).
+    - `axes`: names of the residuals ("x", "y"), for reports.
+    - `invariant`: it does not change when the whole problem is moved (see `Motions`), as image
+      points do not: such kinds are not asked about the datum.
+    """
+
+    name: str
+    residual: Callable
+    of: tuple[str, ...]
+    axes: tuple[str, ...] = ()
+    scalars: bool = False
+    invariant: bool = False
+
+    def __call__(
+        self, rows: Sequence[Int[np.ndarray, " n"]], measured: PyTree = (), *,
+        sigma: Any = None, covariance: Any = None,
+    ) -> "Observations":  # fmt: skip
+        """Observations of this kind; see `Observations`."""
+        return Observations(self, tuple(rows), measured, sigma, covariance)
+
+
+@dataclasses.dataclass(frozen=True)
+class Motions:
+    """Motions of the whole problem that may be left open by its observations, as similarities are
+    by image points: the datum.
+
+    **Arguments:**
+
+    - `names`: of the parameters of a motion ("shift X", …, "scale").
+    - `actions`: by table, `(motion, value) -> value` of one row; motion 0 moves nothing, and moving
+      along one direction by 1 twice is moving by 2 (canonical coordinates).
+    - `curved`: parameters whose motions are no straight lines (rotations, scale).
+    """
+
+    names: tuple[str, ...]
+    actions: tuple[tuple[str, Callable], ...]
+    curved: tuple[int, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Observations:
+    """Observations of one kind.
+
+    **Arguments:** `rows`: for each touched table the row every observation touches, [n];
+    `measured`: arrays of n rows; `sigma`: one number, [n] or [n, r] (1 if neither is given;
+    infinite: a weight of 0), or `covariance` [n, r, r] of the residuals of an observation.
+
+    `weight` [n, r] is 1/σ, or [n, r, r] L⁻¹ of the covariance L·Lᵀ.
+    """
+
+    kind: Kind
+    rows: tuple[Int[np.ndarray, " n"], ...]
+    measured: PyTree[np.ndarray]
+    sigma: Any = None
+    covariance: Any = None
+
+    def __post_init__(self):
+        name, kind = self.kind.name, self.kind
+        rows = tuple(np.asarray(r, np.int64).ravel() for r in self.rows)
+        if len(rows) != len(kind.of):
+            raise InputError(
+                f"{name}: rows of {len(kind.of)} tables are expected ({', '.join(kind.of)}), not of "
+                f"{len(rows)}"
+            )
+        if len({len(r) for r in rows}) > 1:
+            raise InputError(f"{name}: the columns of rows differ in length")
+        object.__setattr__(self, "rows", rows)
+        measured = jax.tree.map(lambda x: np.asarray(x, float), self.measured)
+        if any(len(x) != self.number for x in jax.tree.leaves(measured)):
+            raise InputError(f"{name}: {self.number} observations, but not as many measured values")
+        object.__setattr__(self, "measured", measured)
+        if self.sigma is not None and self.covariance is not None:
+            raise InputError(f"{name}: give sigma or covariance, not both")
+
+    @property
+    def number(self) -> int:
+        return len(self.rows[0])
+
+    def weight(self, residuals: int) -> Float[np.ndarray, "n ..."]:
+        """The weights for so many residuals of an observation."""
+        if self.covariance is not None:
+            return _whitening(self.kind.name, np.asarray(self.covariance, float), residuals)
+        sigma = np.asarray(1.0 if self.sigma is None else self.sigma, float)
+        sigma = sigma[:, None] if sigma.ndim == 1 else sigma
+        try:
+            sigma = np.broadcast_to(sigma, (self.number, residuals))
+        except ValueError:
+            raise InputError(
+                f"{self.kind.name}: sigma must be one number, [{self.number}] or "
+                f"[{self.number}, {residuals}], not {list(np.shape(self.sigma))}"
+            ) from None
+        bad = ~(sigma > 0)
+        if bad.any():
+            row = int(np.argwhere(bad)[0][0])
+            raise InputError(
+                f"{self.kind.name}: sigma of observation {row + 1} is {sigma[bad][0]:g}; a positive "
+                "number is expected"
+            )
+        return 1 / sigma
+
+
+def _whitening(name: str, covariance, residuals: int):
+    if covariance.shape[1:] != (residuals, residuals):
+        raise InputError(
+            f"{name}: a covariance of an observation must be {residuals} by {residuals}, not "
+            f"{list(covariance.shape[1:])}"
+        )
+    try:
+        lower = np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        raise InputError(f"{name}: a covariance is not positive definite") from None
+    return np.linalg.inv(lower)

@@ -1,0 +1,86 @@
+"""Index arrays of a plan while it is made on the host, and their last step.
+
+Three rules serve all of them:
+
+- −1 stands for nothing. Every list that is pointed into ends with at least one empty row, and −1
+  becomes the number of that row.
+- Every array knows along which list its first axis runs (`along`), so that filling up to rounder
+  sizes, or to the common size of several devices, is one function for all.
+- What is filled in is nothing: −1 in an index, a stated value in a column.
+"""
+
+import dataclasses
+from collections.abc import Callable, Hashable, Iterable
+
+import jax
+import numpy as np
+
+STEPS = 8
+"""Round sizes between one power of two and the next: at most an eighth is filled in."""
+
+
+@dataclasses.dataclass
+class Index:
+    """Row numbers into the list `into`, whose items are `times` rows each."""
+
+    rows: np.ndarray
+    along: Hashable
+    into: Hashable
+    times: int = 1
+
+
+@dataclasses.dataclass
+class Column:
+    """Values along a list; `multiple`: its size is one of so many."""
+
+    rows: np.ndarray
+    along: Hashable
+    fill: float = 0.0
+
+
+Sizes = dict[Hashable, int]
+
+
+def is_leaf(x) -> bool:
+    return isinstance(x, Index | Column)
+
+
+def count(plan) -> Sizes:
+    """The sizes of all lists of a plan as they are, an empty row at the end included."""
+    sizes: Sizes = {}
+    for leaf in jax.tree.leaves(plan, is_leaf=is_leaf):
+        if is_leaf(leaf):
+            sizes[leaf.along] = len(leaf.rows) + 1
+    return sizes
+
+
+def common(all_sizes: Iterable[Sizes], rounder: Callable[[Hashable, int], int]) -> Sizes:
+    """Sizes that hold each of these, made rounder."""
+    largest: Sizes = {}
+    for sizes in all_sizes:
+        for key, size in sizes.items():
+            largest[key] = max(size, largest.get(key, 0))
+    return {key: rounder(key, size) for key, size in largest.items()}
+
+
+def rounded(number: int) -> int:
+    """The next number of the form m·2ⁿ with STEPS ≤ m < 2·STEPS; small ones as they are."""
+    step = 1 << max(number.bit_length() - STEPS.bit_length(), 0)
+    return -(-number // step) * step
+
+
+def finish(plan, sizes: Sizes):
+    """The plan in arrays of these sizes, −1 replaced by the last row of its list."""
+
+    def one(leaf):
+        if not is_leaf(leaf):
+            return leaf
+        nothing = -1 if isinstance(leaf, Index) else leaf.fill
+        rows = np.asarray(leaf.rows)
+        more = np.full((sizes[leaf.along] - len(rows), *rows.shape[1:]), nothing, rows.dtype)
+        rows = np.concatenate([rows, more])
+        if isinstance(leaf, Index):
+            rows = np.where(rows < 0, sizes[leaf.into] * leaf.times - 1, rows).astype(np.int32)
+        return rows
+
+    return jax.tree.map(one, plan, is_leaf=is_leaf)

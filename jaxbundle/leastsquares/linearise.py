@@ -1,0 +1,87 @@
+"""The derivatives of the observations, in blocks, by automatic differentiation.
+
+Each observation touches few rows, so its derivatives are a few small blocks. They come from one
+pure function of one observation (`rows.residual_of`): by reverse mode over its scalars where there
+are many observations (straight loops; measured 5 to 7 ms for 83 718 image points, 29 by forward
+mode), by forward mode along all directions at once where there are few (a tenth of the loops to
+compile).
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbundle.leastsquares.plan import Part, Plan
+from jaxbundle.leastsquares.rows import Declared, Laid, over, residual_of
+
+Jacobians = list[tuple[Float[Array, "chunks length r"], tuple, Float[Array, "chunks length r w"]]]
+
+
+def widths_of(declared: Declared, plan: Plan, part: Part) -> tuple[int, ...]:
+    """The directions of every slot of a part in which it is differentiated."""
+    of = declared.kinds[part.observations].of
+    used = {s for touch in part.touches for s, _ in touch.slots} | {part.slot}
+    return tuple(declared.spaces[name].width if s in used else 0 for s, name in enumerate(of))
+
+
+def differentiate(declared: Declared, plan: Plan, number: int, prepared, laid: Laid):
+    """Residuals [chunks, length, r] of a part, the blocks of its touches, [chunks, length, r, w]
+    each, and of its eliminated rows (None where it has none). Columns of what is held are zero."""
+    part = plan.parts[number]
+    kind, widths = declared.kinds[part.observations], widths_of(declared, plan, part)
+    residual = residual_of(declared, part)
+    rows = _reverse if part.large else _forward
+    r, columns = over(
+        part, kind, prepared, laid, number, lambda *row: rows(residual, widths, row)
+    )
+    shape = r[0].shape
+
+    def block(slots, start, stop):
+        """The columns of some slots (slot, first column) side by side."""
+        place = {}
+        for slot, first in slots:
+            for j in range(widths[slot]):
+                place[first + j] = slot, j
+        parts = [
+            columns[i][place[c][0]][place[c][1]] if c in place else jnp.zeros(shape)
+            for i in range(len(r)) for c in range(start, stop)
+        ]  # fmt: skip
+        return jnp.stack(parts, -1).reshape(*shape, len(r), stop - start)
+
+    touches = []
+    for touch in part.touches:
+        J, group = block(touch.slots, touch.start, touch.stop), plan.groups[touch.group]
+        if not group.all_free:
+            J = J * group.free[touch.row, touch.start : touch.stop][:, None, None, :]
+        touches.append(J)
+    E = None
+    if part.slot is not None:
+        E, group = block(((part.slot, 0),), 0, widths[part.slot]), plan.groups[plan.eliminated]
+        if not group.all_free:
+            E = E * group.free[part.eliminated][:, :, None, :]
+    return jnp.stack(r, -1), tuple(touches), E
+
+
+def _reverse(residual, widths, row):
+    """Residuals, and for each of them the derivatives by slot and direction."""
+    weight = row[2]
+    nil = jnp.zeros_like(jax.tree.leaves(weight)[0])
+    still = tuple((nil,) * w for w in widths)
+    r, pull = jax.vjp(lambda d: residual(d, *row), still)
+    unit = lambda i: tuple(jnp.ones_like(nil) if a == i else nil for a in range(len(r)))
+    return r, tuple(_where_weighted(weight, i, pull(unit(i))[0]) for i in range(len(r)))
+
+
+def _forward(residual, widths, row):
+    ends = [sum(widths[:s]) for s in range(len(widths) + 1)]
+    split = lambda x: tuple(tuple(x[a:b]) for a, b in zip(ends, ends[1:]))
+    stacked = lambda x: jnp.stack(residual(split(x), *row))
+    J = jax.jacfwd(stacked)(jnp.zeros(ends[-1]))
+    r = residual(tuple(() for _ in widths), *row)
+    return r, tuple(_where_weighted(row[2], i, split(J[i])) for i in range(len(r)))
+
+
+def _where_weighted(weight, i, columns):
+    """Zero where an observation has no weight, even where it has no derivative."""
+    w = weight[i][i] if isinstance(weight[i], tuple) else weight[i]
+    return jax.tree.map(lambda x: jnp.where(w > 0, x, 0.0), columns)

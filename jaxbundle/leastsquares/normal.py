@@ -1,0 +1,231 @@
+"""The normal equations N·δ = −g in blocks.
+
+    N = ⎡ A   W ⎤   A: kept groups, `own` diagonal blocks and `off` blocks beside them
+        ⎣ Wᵀ  V ⎦   V: one small block for each eliminated row; W: one for each incidence
+
+They are filled either from the Jacobian (N = JᵀPJ, Gauss–Newton) or from second derivatives of
+every observation (the exact Hessian, `hessian.py`); everything after that is the same.
+"""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+from jaxtyping import Array, Float
+
+from jaxbundle.leastsquares.damping import measure
+from jaxbundle.leastsquares.linearise import differentiate
+from jaxbundle.leastsquares.plan import Key, Part, Plan
+from jaxbundle.leastsquares.rows import Declared, Laid, Values, prepare
+
+Tangent = dict[str, Float[Array, "rows width"]]
+"""A small change of all groups, the eliminated rows among them."""
+
+
+class NormalBlocks(eqx.Module):
+    """N in blocks; rows and columns of what is held are zero. `own` and `off` are sums over all
+    devices, the others belong to the eliminated rows of one. `metric`: D of the damping."""
+
+    own: dict[str, Float[Array, "rows w w"]]
+    off: dict[Key, Float[Array, "blocks w v"]]
+    eliminated: Float[Array, "rows w w"] | None
+    W: dict[str, Float[Array, "chunks length w v"]]
+    metric: dict[str, Float[Array, "rows w *w"]]
+
+
+class Normal(lx.AbstractLinearOperator):
+    """N as a linear operator on changes of the unknowns."""
+
+    plan: Plan
+    blocks: NormalBlocks
+
+    def mv(self, vector: Tangent) -> Tangent:
+        """N·x."""
+        N = self.blocks
+        product = {g: jnp.einsum("nij,nj->ni", B, vector[g]) for g, B in N.own.items()}
+        for (later, earlier), B in N.off.items():
+            at = self.plan.blocks[later, earlier]
+            down = jnp.einsum("bij,bj->bi", B, vector[earlier][at.column])
+            up = jnp.einsum("bij,bi->bj", B, vector[later][at.row])
+            product[later] = product[later].at[at.row].add(down)
+            product[earlier] = product[earlier].at[at.column].add(up)
+        e = self.plan.eliminated
+        if e is None:
+            return product
+        x, changed = vector[e], {}
+        product[e] = jnp.einsum("nij,nj->ni", N.eliminated, x)
+        for g, W in N.W.items():
+            at = self.plan.incidences[g]
+            moved = jnp.einsum("clij,cj->cli", W, vector[g][at.row])
+            product[e] = product[e].at[at.eliminated].add(moved)
+            changed[g] = jax.ops.segment_sum(
+                jnp.einsum("clij,cli->cj", W, x[at.eliminated]), at.row, product[g].shape[0]
+            )
+        for g, more in total(self.plan, changed).items():
+            product[g] = product[g] + more
+        return product
+
+    def diagonal(self) -> Tangent:
+        """The diagonal of N."""
+        N, e = self.blocks, self.plan.eliminated
+        blocks = N.own if e is None else N.own | {e: N.eliminated}
+        return {g: jnp.diagonal(B, axis1=1, axis2=2) for g, B in blocks.items()}
+
+    def as_matrix(self) -> Float[Array, "n n"]:
+        """The dense matrix, groups in the order of their names; for small problems and tests."""
+        zero = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), self.in_structure())
+        flat, unravel = jax.flatten_util.ravel_pytree(zero)
+        column = lambda e: jax.flatten_util.ravel_pytree(self.mv(unravel(e)))[0]
+        return jax.vmap(column, out_axes=1)(jnp.eye(flat.size))
+
+    def transpose(self) -> "Normal":
+        return self
+
+    def in_structure(self) -> Tangent:
+        return jax.eval_shape(self.diagonal)
+
+    def out_structure(self) -> Tangent:
+        return self.in_structure()
+
+
+for _trait in (
+    lx.is_diagonal, lx.is_tridiagonal, lx.has_unit_diagonal, lx.is_lower_triangular,
+    lx.is_upper_triangular, lx.is_negative_semidefinite,
+):  # fmt: skip
+    _trait.register(Normal)(lambda operator: False)
+for _trait in (lx.is_symmetric, lx.is_positive_semidefinite):
+    _trait.register(Normal)(lambda operator: True)
+for _same in (lx.linearise, lx.materialise, lx.conj):
+    _same.register(Normal)(lambda operator: operator)
+lx.diagonal.register(Normal)(lambda operator: operator.diagonal())
+
+
+def total(plan: Plan, parts):
+    """The sum over the devices of what each has found for its own eliminated rows."""
+    return parts if plan.axis is None else jax.lax.psum(parts, plan.axis)
+
+
+def normal_equations(
+    declared: Declared, plan: Plan, values: Values, laid: Laid
+) -> tuple[Float[Array, ""], Tangent, NormalBlocks]:
+    """½·vᵀPv, its gradient g = Jᵀr and N = JᵀJ at these values (the weights are in r and J)."""
+    prepared, sums = prepare(declared, values), _Sums(plan)
+    for number, part in enumerate(plan.parts):
+        r, touches, E = differentiate(declared, plan, number, prepared, laid)
+        sums.add_part(part, r, touches, E)
+    return sums.finished(declared, values)
+
+
+class _Sums:
+    """Blocks and gradient as they are added up, part by part."""
+
+    def __init__(self, plan: Plan):
+        self.plan = plan
+        zero = lambda g: jnp.zeros((g.rows, g.width))
+        self.gradient = {name: zero(g) for name, g in plan.groups.items()}
+        self.own = {
+            name: jnp.zeros((g.rows, g.width, g.width)) for name, g in plan.groups.items()
+        }
+        self.off = {}
+        self.W = {}
+        self.cost = 0.0
+
+    def add_part(self, part: Part, r, touches, E):
+        self.cost = self.cost + 0.5 * jnp.vdot(r, r)
+        chunks = r.shape[0]
+        tall = [J.reshape(chunks, -1, J.shape[-1]) for J in touches]
+        right = r.reshape(chunks, -1)
+        for touch, J in zip(part.touches, tall):
+            self._add_own(touch, jnp.einsum("cki,ckj->cij", J, J))
+            self._add_gradient(touch, jnp.einsum("cki,ck->ci", J, right))
+        for couple in part.couples:
+            product = jnp.einsum("cki,ckj->cij", tall[couple.first], tall[couple.second])
+            self._add_couple(part, couple, product)
+        if E is not None:
+            flat = lambda x: x.reshape(-1, *x.shape[2:])
+            J = flat(E)
+            both = products(J, jnp.concatenate([J, flat(r)[..., None]], -1))
+            at = part.eliminated.ravel()
+            both = jax.ops.segment_sum(both, at, self.own[self.plan.eliminated].shape[0])
+            self.own[self.plan.eliminated] += both[..., :-1]
+            self.gradient[self.plan.eliminated] += both[..., -1]
+            for touch, K in zip(part.touches, touches):
+                self._add_incidences(touch, products(J, flat(K)))
+
+    def _add_own(self, touch, N):
+        columns = slice(touch.start, touch.stop)
+        self.own[touch.group] = self.own[touch.group].at[touch.row, columns, columns].add(N)
+
+    def _add_gradient(self, touch, g):
+        columns = slice(touch.start, touch.stop)
+        self.gradient[touch.group] = self.gradient[touch.group].at[touch.row, columns].add(g)
+
+    def _add_couple(self, part, couple, N):
+        """A block beside the diagonal, or on it where the two rows are one."""
+        first, second = part.touches[couple.first], part.touches[couple.second]
+        key = first.group, second.group
+        if couple.same is not None:
+            columns, others = slice(first.start, first.stop), slice(second.start, second.stop)
+            on = N * couple.same[:, None, None]
+            own = self.own[first.group].at[first.row, columns, others].add(on)
+            self.own[first.group] = own.at[first.row, others, columns].add(on.transpose(0, 2, 1))
+        if couple.block is None:
+            return
+        shape = tuple(self.plan.groups[g].width for g in key)
+        pad = lambda B, rows, columns: jnp.zeros((B.shape[0], *shape)).at[:, rows, columns].set(B)
+        placed = pad(N, slice(first.start, first.stop), slice(second.start, second.stop))
+        if couple.turned is not None:
+            other = pad(
+                N.transpose(0, 2, 1), slice(second.start, second.stop), slice(first.start, first.stop)
+            )
+            turned = couple.turned[:, None, None]
+            placed = turned * other + (1 - turned) * placed
+        blocks = self.plan.blocks[key]
+        summed = jax.ops.segment_sum(placed, couple.block, blocks.row.shape[0])
+        summed = summed.at[-1].set(0.0)
+        self.off[key] = self.off.get(key, 0.0) + summed
+
+    def _add_incidences(self, touch, W):
+        """W of every observation, summed for each incidence."""
+        plan = self.plan.incidences[touch.group]
+        width = self.plan.groups[touch.group].width
+        if W.shape[-1] != width:
+            W = jnp.zeros((*W.shape[:-1], width)).at[..., touch.start : touch.stop].set(W)
+        if touch.incidence is not None:
+            W = jax.ops.segment_sum(W, touch.incidence.ravel(), plan.eliminated.size)
+        self.W[touch.group] = self.W.get(touch.group, 0.0) + W.reshape(
+            *plan.eliminated.shape, *W.shape[1:]
+        )
+
+    def finished(self, declared: Declared, values: Values):
+        plan, e = self.plan, self.plan.eliminated
+        kept = lambda tree: {name: x for name, x in tree.items() if name != e}
+        own, off, cost, gradient = total(
+            plan, (kept(self.own), self.off, self.cost, kept(self.gradient))
+        )
+        eliminated = None
+        if e is not None:
+            eliminated, gradient[e] = self.own[e], self.gradient[e]
+        metric = measure(declared, plan, values, own | ({e: eliminated} if e else {}))
+        return cost, gradient, NormalBlocks(own, off, eliminated, self.W, metric)
+
+
+def products(a, b):
+    """aᵀb of every row, written out: a batched product of tiny matrices takes three times as long."""
+    return functools.reduce(
+        jnp.add, (a[:, i, :, None] * b[:, i, None, :] for i in range(a.shape[1]))
+    )
+
+
+def dot(plan: Plan, a: Tangent, b: Tangent) -> Float[Array, ""]:
+    """aᵀb, the eliminated rows of all devices."""
+    e = plan.eliminated
+    kept = sum(jnp.vdot(a[g], b[g]) for g in plan.kept)
+    return kept if e is None else kept + total(plan, jnp.vdot(a[e], b[e]))
+
+
+def zero_tangent(plan: Plan) -> Tangent:
+    """No change at all."""
+    return {name: jnp.zeros((g.rows, g.width)) for name, g in plan.groups.items()}

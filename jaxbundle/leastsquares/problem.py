@@ -1,0 +1,182 @@
+"""A problem made ready for the solver: plan, numbers, and how many rows and unknowns it has."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.datum import find_open_motions, make_datum
+from jaxbundle.leastsquares.declarations import Motions, Observations, Table
+from jaxbundle.leastsquares.indices import common, finish, rounded
+from jaxbundle.leastsquares.plan import Plan, make_plan
+from jaxbundle.leastsquares.rows import Data, Declared
+from jaxbundle.leastsquares.solver import LeastSquares, Minimum, minimise
+from jaxbundle.leastsquares.stopping import Tolerance
+from jaxbundle.leastsquares.retraction import retract
+
+LARGE = 200_000
+"""Problems of more observations are compiled for their own sizes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """What is solved: declarations, plan and numbers. `rows`: the observations' residuals."""
+
+    tables: tuple[Table, ...]
+    observations: tuple[Observations, ...]
+    declared: Declared
+    plan: Plan
+    data: Data
+    sizes: dict
+    counts: "Counts"
+
+
+@dataclasses.dataclass(frozen=True)
+class Counts:
+    """Rows that carry weight, and free unknowns."""
+
+    observations: int
+    unknowns: int
+    datum: int = 0
+
+    @property
+    def redundancy(self) -> int:
+        return self.observations + self.datum - self.unknowns
+
+
+def make_problem(
+    tables: Sequence[Table], observations: Sequence[Observations], eliminate: str | None = None,
+    *, motions: Motions | None = None, datum_weight: dict[str, np.ndarray] | None = None,
+    minimal: bool = False,
+) -> Problem:  # fmt: skip
+    """Plan and arrays of declared tables and observations.
+
+    `motions`: those that may be open; `datum_weight`: by table, the unknowns that hold the datum
+    then (`minimal`: as few of them as needed)."""
+    tables, observations = tuple(tables), tuple(observations)
+    check(tables, observations)
+    spaces = tuple((t.name, t.space) for t in tables)
+    declared = Declared(tuple(o.kind for o in observations), spaces, motions)
+    host, sizes, _ = make_plan(tables, observations, eliminate)
+    number = sum(o.number for o in observations)
+    sizes = common([sizes], lambda key, n: n if number > LARGE else rounded(n))
+    plan = jax.device_put(finish(host, sizes))
+    data = make_data(declared, tables, observations)
+    counts = Counts(
+        sum(int((np.asarray(_diagonal(w)) > 0).sum()) for w in data.weight),
+        sum(int((t.free > 0).sum()) for t in tables),
+    )
+    problem = Problem(tables, observations, declared, plan, data, sizes, counts)
+    return problem if motions is None else _with_datum(problem, datum_weight, minimal)
+
+
+def _with_datum(problem: Problem, weight, minimal: bool) -> Problem:
+    data = pad_data(problem, problem.data)
+    real = {t.name: np.arange(problem.sizes["table", t.name]) < t.rows for t in problem.tables}
+    gauge = find_open_motions(problem.declared, problem.plan, data, real)
+    if not gauge.shape[1]:
+        return problem
+    if weight is None:
+        raise InputError(f"the datum is open in {gauge.shape[1]} parameters: say what holds it")
+    fill = lambda t, w: np.concatenate([w, np.zeros((problem.sizes["table", t] - len(w), w.shape[1]))])
+    weight = {t: fill(t, np.asarray(w, float)) for t, w in weight.items()}
+    datum = jax.device_put(
+        make_datum(problem.declared, problem.plan, data, gauge, weight, minimal)
+    )
+    plan = dataclasses.replace(problem.plan, datum=datum)
+    counts = dataclasses.replace(problem.counts, datum=gauge.shape[1])
+    return dataclasses.replace(problem, plan=plan, counts=counts)
+
+
+def check(tables, observations) -> None:
+    """Refuse tables of one name, observations of unknown tables, rows that do not exist."""
+    known = {}
+    for table in tables:
+        if table.name in known:
+            raise InputError(f"two tables are called {table.name!r}")
+        known[table.name] = table
+    for given in observations:
+        for name, rows in zip(given.kind.of, given.rows):
+            if name not in known:
+                raise InputError(
+                    f"{given.kind.name}: there is no table {name!r}; known: {', '.join(known)}"
+                )
+            bad = (rows < 0) | (rows >= known[name].rows)
+            if bad.any():
+                row = int(np.argmax(bad))
+                raise InputError(
+                    f"{given.kind.name}: observation {row + 1} touches row {int(rows[row])} of table "
+                    f"{name!r}, which has rows 0 to {known[name].rows - 1}"
+                )
+
+
+def make_data(declared: Declared, tables, observations) -> Data:
+    """The numbers of a problem as arrays."""
+    start = {t.name: jax.tree.map(lambda x: np.asarray(x, float), t.value) for t in tables}
+    weights = [o.weight(_number_of_residuals(declared, start, o)) for o in observations]
+    return jax.device_put(Data(start, tuple(o.measured for o in observations), tuple(weights)))
+
+
+def _number_of_residuals(declared: Declared, start, given: Observations) -> int:
+    """How many residuals an observation of a kind has, from the shapes alone."""
+    from jaxbundle.leastsquares.rows import _evaluate, scalars
+
+    one = lambda tree: jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], float), tree)
+
+    def evaluate(values, measured):
+        blocks = []
+        for name in given.kind.of:
+            space = declared.spaces[name]
+            blocks.append(space.moved(space.prepare(values[name]), ()))
+        as_scalars = scalars(jax.tree.map(lambda x: x[None], measured))
+        as_scalars = jax.tree.map(lambda x: x[0], as_scalars)
+        return _evaluate(given.kind, blocks, as_scalars)
+
+    return len(jax.eval_shape(evaluate, one(start), one(given.measured)))
+
+
+def _diagonal(weight):
+    return weight if weight.ndim == 2 else np.diagonal(weight, axis1=1, axis2=2)
+
+
+def pad_data(problem: Problem, data: Data) -> Data:
+    """The numbers filled to the sizes of the plan: rows repeat the last one, weights are 0."""
+    fill = lambda x, n: np.concatenate([np.asarray(x), np.zeros((n - len(x), *np.shape(x)[1:]))])
+    edge = lambda x, n: np.concatenate([np.asarray(x), np.repeat(np.asarray(x)[-1:], n - len(x), 0)])
+    size = problem.sizes
+    return jax.device_put(Data(
+        {t: jax.tree.map(lambda x, t=t: edge(x, size["table", t]), v) for t, v in data.start.items()},
+        tuple(
+            jax.tree.map(lambda x, o=o: fill(x, size["observations", o]), m)
+            for o, m in enumerate(data.measured)
+        ),
+        tuple(fill(w, size["observations", o]) for o, w in enumerate(data.weight)),
+    ))  # fmt: skip
+
+
+def make_solver(problem: Problem, *, atol=1e-5, rtol=0.0, retraction=None, **options) -> LeastSquares:
+    """The solver of a problem; `options` are those of `LeastSquares`."""
+    declared = problem.declared
+    squares = sum(
+        float(((np.asarray(w) * np.asarray(m)) ** 2).sum())
+        for w, m in zip(problem.data.weight, problem.data.measured)
+        if hasattr(m, "shape") and np.shape(m) == np.shape(w)
+    )
+    to_device = lambda x: jax.device_put(np.float64(x))
+    tolerance = Tolerance(to_device(problem.counts.redundancy), to_device(squares), atol, rtol)
+    return LeastSquares(declared, problem.plan, tolerance, retraction or Retraction(declared), **options)
+
+
+@dataclasses.dataclass(frozen=True)
+class Retraction:
+    declared: Any
+
+    def __call__(self, plan, values, change):
+        return retract(self.declared, plan, values, change)
+
+
+find_minimum = eqx.filter_jit(minimise)

@@ -1,0 +1,128 @@
+"""Reliability of the observations: redundancy numbers, tests for blunders, what they could hide.
+
+With the residuals divided by their a priori σ (v/σ) and h = diag(J·Q·Jᵀ) (Baarda 1968; Förstner
+1985):
+
+    r   = 1 − h                     redundancy number, 0 (uncontrolled) to 1; Σr = redundancy
+    w   = (v/σ)/√r                  Baarda's test, standard normal without a blunder (σ a priori)
+    τ   = w/σ̂0                      Pope's test (1976), σ a posteriori
+    MDB = σ·δ0/√r                   smallest blunder found with the chosen power
+    δ̄   = δ0·√((1 − r)/r)           its largest effect on any unknown, in units of that σ
+
+Of observations with a covariance, v/σ stands for L⁻¹·v.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbundle.leastsquares.cofactors import Cofactors
+from jaxbundle.leastsquares.linearise import differentiate
+from jaxbundle.leastsquares.plan import Part, Plan
+from jaxbundle.leastsquares.rows import Data, Declared, Laid, Values, in_given_order, lay_out_data, prepare
+
+UNCONTROLLED = 1e-8
+"""Redundancy numbers below this are rounding: the observation is not controlled at all."""
+ROWS_AT_ONCE = 1 << 16
+
+
+class Reliability(eqx.Module):
+    """By set of observations, [n, r]: v/σ, redundancy number, Baarda's w (NaN where r is zero)."""
+
+    residual: dict[int, Float[Array, "n r"]]
+    redundancy: dict[int, Float[Array, "n r"]]
+    w: dict[int, Float[Array, "n r"]]
+
+
+@eqx.filter_jit
+def reliability(
+    declared: Declared, plan: Plan, values: Values, data: Data, Q: Cofactors
+) -> Reliability:
+    """Redundancy numbers and test statistics of all observations."""
+    laid = lay_out_data(plan, data)
+    residual, hat = hat_diagonal(declared, plan, values, laid, Q)
+    residual, hat = in_given_order(plan, residual), in_given_order(plan, hat)
+    number = lambda h, weight: jnp.where(weight > 0, jnp.clip(1.0 - h, 0.0, 1.0), 0.0)
+    r = {o: number(h, _diagonal(data.weight[o])) for o, h in hat.items()}
+    test = lambda v, r: jnp.where(r > UNCONTROLLED, v / jnp.sqrt(jnp.maximum(r, 1e-300)), jnp.nan)
+    return Reliability(residual, r, {o: test(residual[o], r[o]) for o in r})
+
+
+def _diagonal(weight):
+    return weight if weight.ndim == 2 else jnp.diagonal(weight, axis1=1, axis2=2)
+
+
+def hat_diagonal(declared: Declared, plan: Plan, values: Values, laid: Laid, Q: Cofactors):
+    """v/σ and h = diag(J·Q·Jᵀ) of every part, [chunks, length, r], from the blocks of Q that each
+    observation touches."""
+    prepared = prepare(declared, values)
+    residual, hat = [], []
+    for number, part in enumerate(plan.parts):
+        r, touches, E = differentiate(declared, plan, number, prepared, laid)
+        residual.append(r)
+        hat.append(_of_part(plan, part, touches, E, Q))
+    return tuple(residual), tuple(hat)
+
+
+def _of_part(plan: Plan, part: Part, touches, E, Q: Cofactors):
+    """h of one part, some chunks at a time: what belongs to all of it (2 000 000 rows) is large."""
+    chunks, length = part.source.shape
+    form = lambda a, B, b: jnp.sum((a @ B) * b, -1)
+
+    def of_chunk(given):
+        at, touches, E = given
+        h = 0.0
+        if touches:
+            J = jnp.concatenate(touches, -1)
+            h = form(J, _of_kept(part, at, Q), J)
+        if E is None:
+            return h
+        h = h + form(E, Q.eliminated[at["eliminated"]], E)
+        for touch, incidence, J in zip(part.touches, at["incidences"], touches):
+            coupled = Q.coupled[touch.group]
+            rows = coupled.reshape(-1, *coupled.shape[2:])[incidence]
+            h = h + 2 * form(E, rows[..., touch.start : touch.stop], J)
+        return h
+
+    given = (_rows_of_chunks(plan, part), touches, E)
+    at_once = max(ROWS_AT_ONCE // max(length, 1), 1)
+    if chunks > at_once:
+        return jax.lax.map(of_chunk, given, batch_size=at_once)
+    return jax.vmap(of_chunk)(given)
+
+
+def _rows_of_chunks(plan: Plan, part: Part):
+    """Which blocks of Q every chunk of a part touches."""
+    in_order = jnp.arange(part.source.size).reshape(part.source.shape)
+    return {
+        "rows": tuple(t.row for t in part.touches),
+        "blocks": tuple((c.block, c.turned, c.same) for c in part.couples),
+        "eliminated": part.eliminated,
+        "incidences": tuple(
+            in_order if t.incidence is None else t.incidence for t in part.touches
+        ) if part.slot is not None else (),
+    }  # fmt: skip
+
+
+def _of_kept(part: Part, at, Q: Cofactors):
+    """The block of Q of all kept rows that a chunk touches, in the order of its touches."""
+    touches = part.touches
+    cut = lambda B, rows, columns: B[rows.start : rows.stop, columns.start : columns.stop]
+    blocks = [[None] * len(touches) for _ in touches]
+    for t, row in enumerate(at["rows"]):
+        blocks[t][t] = cut(Q.kept.own[touches[t].group][row], touches[t], touches[t])
+    for couple, (block, turned, same) in zip(part.couples, at["blocks"]):
+        first, second = touches[couple.first], touches[couple.second]
+        found = 0.0
+        if block is not None:
+            B = Q.kept.off[first.group, second.group][block]
+            found = cut(B, first, second)
+            if turned is not None:
+                found = jnp.where(turned > 0, cut(B, second, first).T, found)
+        if same is not None:
+            on = cut(Q.kept.own[first.group][at["rows"][couple.first]], first, second)
+            found = jnp.where(same > 0, on, found)
+        blocks[couple.first][couple.second] = found
+        blocks[couple.second][couple.first] = found.T
+    return jnp.block(blocks)

@@ -1,0 +1,149 @@
+"""From tables and measurements to the columns that observation equations are computed on.
+
+    values (tables)  ──prepare, once a row──▶  columns  ──look up──▶  blocks of every observation
+
+Everything is a structure of arrays: one array for each scalar of a block.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from jaxbundle.leastsquares.declarations import Kind, Motions
+from jaxbundle.leastsquares.plan import Part, Plan
+from jaxbundle.leastsquares.spaces import Space
+
+Values = dict[str, PyTree[Float[Array, "rows ..."]]]
+"""The rows of every table."""
+
+
+class Data(eqx.Module):
+    """The numbers of a problem; all can be differentiated.
+
+    `start`: the start values of the tables, and the values of what is held; for every set of
+    observations `measured` and `weight` (see `Observations`), in the order they were given.
+    """
+
+    start: Values
+    measured: tuple[PyTree[Float[Array, "n ..."]], ...]
+    weight: tuple[Float[Array, "n ..."], ...]
+
+
+class Laid(eqx.Module):
+    """Measurements and weights of every part in the order of computing, scalar by scalar."""
+
+    measured: tuple[PyTree[Float[Array, "chunks length"]], ...]
+    weight: tuple[PyTree[Float[Array, "chunks length"]], ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Declared:
+    """The functions of a problem: its kinds of observations, the spaces of its tables, the motions
+    that may be open. Hashable: a static argument of compiled programs."""
+
+    kinds: tuple[Kind, ...]
+    named_spaces: tuple[tuple[str, Space], ...]
+    motions: Motions | None = None
+
+    @property
+    def spaces(self) -> dict[str, Space]:
+        return dict(self.named_spaces)
+
+
+def lay_out_data(plan: Plan, data: Data) -> Laid:
+    """The measurements, looked up once a solution."""
+    look_up = lambda rows, source: jax.tree.map(lambda x: x[source], scalars(rows))
+    return Laid(
+        tuple(look_up(data.measured[p.observations], p.source) for p in plan.parts),
+        tuple(look_up(data.weight[p.observations], p.source) for p in plan.parts),
+    )
+
+
+def scalars(rows: PyTree[Float[Array, "n ..."]]) -> PyTree[Float[Array, " n"]]:
+    """The elements of every row: numbers as they are, vectors as tuples, matrices as tuples of
+    tuples."""
+
+    def split(x):
+        return x if x.ndim == 1 else tuple(split(x[:, i]) for i in range(x.shape[1]))
+
+    return jax.tree.map(split, rows)
+
+
+def prepare(declared: Declared, values: Values) -> dict[str, PyTree[Float[Array, " rows"]]]:
+    """What observations see of every row of every table."""
+    return {name: jax.vmap(declared.spaces[name].prepare)(rows) for name, rows in values.items()}
+
+
+def residual_of(declared: Declared, part: Part):
+    """`(changes, blocks, measured, weight) -> residuals / σ`, tuples of scalars, of one observation
+    of a part; `changes` has one tuple for each slot, empty where the table is held."""
+    kind = declared.kinds[part.observations]
+    spaces = [declared.spaces[name] for name in kind.of]
+
+    def residual(changes, blocks, measured, weight):
+        moved = [s.moved(b, d) for s, b, d in zip(spaces, blocks, changes)]
+        return _weighted(_evaluate(kind, moved, measured), weight)
+
+    return residual
+
+
+def _evaluate(kind: Kind, blocks, measured):
+    if not kind.scalars:
+        blocks, measured = (_stacked(b) for b in blocks), _stacked(measured)
+    found = kind.residual(*blocks, measured)
+    if isinstance(found, tuple):
+        return found
+    return (found,) if jnp.ndim(found) == 0 else tuple(found)
+
+
+def _stacked(block):
+    """Tuples of scalars as arrays; other blocks as they are."""
+    if type(block) is tuple and block:
+        return jnp.stack([_stacked(x) for x in block])
+    return block
+
+
+def _weighted(v, weight):
+    """L⁻¹·v, or v/σ; 0 where the weight is 0, whatever v is."""
+    if isinstance(weight[0], tuple):
+        rows = [sum(w * x for w, x in zip(row, v)) for row in weight]
+        return tuple(jnp.where(row[i] > 0, r, 0.0) for i, (row, r) in enumerate(zip(weight, rows)))
+    return tuple(jnp.where(w > 0, w * x, 0.0) for w, x in zip(weight, v))
+
+
+def over(part: Part, kind: Kind, prepared, laid: Laid, number: int, function):
+    """`function(blocks, measured, weight)` of every observation of a part; its scalars get the
+    axes [chunks, length]."""
+    blocks = tuple(
+        jax.tree.map(lambda column, at=at: column[at], prepared[name])
+        for name, at in zip(kind.of, part.lookup)
+    )
+    axes = tuple(0 if by_row else None for by_row in part.by_row)
+    return jax.vmap(jax.vmap(function, (axes, 0, 0)))(
+        blocks, laid.measured[number], laid.weight[number]
+    )
+
+
+def residuals(declared: Declared, plan: Plan, values: Values, laid: Laid):
+    """Residuals divided by σ of every part, [chunks, length, r]."""
+    prepared, found = prepare(declared, values), []
+    for number, part in enumerate(plan.parts):
+        kind = declared.kinds[part.observations]
+        residual, still = residual_of(declared, part), ((),) * len(kind.of)
+        rows = over(part, kind, prepared, laid, number, lambda *row, f=residual, d=still: f(d, *row))
+        found.append(jnp.stack(rows, -1))
+    return tuple(found)
+
+
+def in_given_order(plan: Plan, parts) -> dict[int, Float[Array, "n ..."]]:
+    """What belongs to the observations of every part, for each set of observations in the order
+    they were given."""
+    found: dict[int, Float[Array, "n ..."]] = {}
+    for part, rows in zip(plan.parts, parts):
+        flat = rows.reshape(-1, *rows.shape[2:])[part.place]
+        known = found.get(part.observations)
+        found[part.observations] = flat if known is None else known + flat
+    return found

@@ -1,0 +1,118 @@
+"""Descents and searches on optimistix's public interfaces; they compose with optimistix's own.
+
+A *descent* turns a step size into a change of the unknowns, a *search* accepts or refuses it and
+says the next step size. What both get is an `optimistix.FunctionInfo.EvalGradHessian`: ½vᵀPv, its
+gradient, and N as a linear operator (`normal.Normal`). Unknowns move on manifolds, so points are
+handed over in the tangent space of the accepted one: `y` is zero, `y_eval` the step tried.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
+
+from jaxbundle.leastsquares.damping import times
+from jaxbundle.leastsquares.elimination import Factor, damp, factorise, solve
+from jaxbundle.leastsquares.normal import Normal, Tangent, dot
+
+
+class Info(optx.FunctionInfo.EvalGradHessian):
+    """What is known at an accepted point: ½vᵀPv, its gradient and N; `damping`: λ of the step that
+    is judged; `noise`: how much of a change of ½vᵀPv is rounding."""
+
+    damping: Float[Array, ""]
+    noise: Float[Array, ""]
+
+
+SUFFICIENT = 1e-3
+"""A step is accepted if it keeps this fraction of the decrease it promised."""
+WIDEST = 1e16
+"""Radius of the trust region beyond which damping is rounding."""
+UNDAMPED_DATUM = 1e8
+"""Steps less damped than this need the datum directions made regular."""
+
+
+class Elimination(lx.AbstractLinearSolver):
+    """Solves with N by elimination, for any descent that takes a linear solver."""
+
+    regular: bool | Bool[Array, ""] = True
+
+    def init(self, operator: Normal, options: dict[str, Any]) -> Factor:
+        if not isinstance(operator, Normal):
+            raise ValueError("Elimination solves with the normal equations of a plan only")
+        return factorise(operator, self.regular)
+
+    def compute(self, state: Factor, vector: Tangent, options: dict[str, Any]):
+        return solve(state, vector), lx.RESULTS.successful, {}
+
+    def transpose(self, state: Factor, options: dict[str, Any]):
+        return state, options
+
+    def conj(self, state: Factor, options: dict[str, Any]):
+        return state, options
+
+    def assume_full_rank(self) -> bool:
+        return True
+
+
+class MarquardtDescent(optx.AbstractDescent):
+    """The step −(N + λ·D)⁻¹·g with λ = 1/`step_size`; infinite: undamped."""
+
+    undamped: float = eqx.field(static=True, default=float("inf"))
+
+    def init(self, y: Tangent, f_info_struct: Info) -> None:
+        return None
+
+    def query(self, y: Tangent, f_info: Info, state: None) -> Info:
+        return f_info
+
+    def step(self, step_size: Float[Array, ""], state: Info):
+        damped = damp(state.hessian, 1 / step_size)
+        solver = Elimination(step_size > UNDAMPED_DATUM)
+        change = lx.linear_solve(damped, state.grad, solver, throw=False).value
+        return jax.tree.map(jnp.negative, change), optx.RESULTS.successful
+
+
+class RegionState(eqx.Module):
+    """Radius 1/λ, and the divisor of the next reduction."""
+
+    radius: Float[Array, ""]
+    reduction: Float[Array, ""]
+
+
+class NielsenTrustRegion(optx.AbstractSearch):
+    """Accept what decreases vᵀPv; widen by the rule of Nielsen (1999), narrow by 2, 4, 8, …"""
+
+    initial: float = 1e4
+
+    def init(self, y: Tangent, f_info_struct: Info) -> RegionState:
+        return RegionState(jnp.asarray(self.initial), jnp.asarray(2.0))
+
+    def step(self, first_step, y, y_eval, f_info, f_eval_info, state: RegionState):
+        change = jax.tree.map(jnp.subtract, y_eval, y)
+        promised, kept = promise(f_info, change, f_eval_info.as_min())
+        accept = first_step | (kept > SUFFICIENT)
+        finite = jnp.minimum(state.radius, WIDEST)
+        wider = jnp.minimum(finite / jnp.maximum(1 / 3, 1 - (2 * kept - 1) ** 3), WIDEST)
+        radius = jnp.where(accept, wider, finite / state.reduction)
+        radius = jnp.where(first_step, state.radius, radius)
+        reduction = jnp.where(accept, 2.0, 2.0 * state.reduction)
+        return radius, accept, optx.RESULTS.successful, RegionState(radius, reduction)
+
+
+def promise(info: Info, change: Tangent, cost: Float[Array, ""]):
+    """The decrease of ½vᵀPv that a damped step promised, ½(−gᵀδ + λ·δᵀDδ), and the fraction it
+    kept; −1 where that cannot be computed. A promise below rounding is kept unless the sum of
+    squares visibly grows."""
+    plan, D = info.hessian.plan, info.hessian.blocks.metric
+    damped = info.damping * dot(plan, change, times(D, change))
+    promised = 0.5 * (damped - dot(plan, info.grad, change))
+    gain = info.as_min() - cost
+    kept = jnp.where(promised > 0, gain / promised, -1.0)
+    kept = jnp.where(jnp.isfinite(kept), kept, -1.0)
+    unseen = (promised > 0) & (promised < info.noise) & (gain > -info.noise)
+    return promised, jnp.where(unseen, 1.0, kept)

@@ -1,0 +1,267 @@
+"""How one row of a table of unknowns moves: vectors, rotations, poses, directions.
+
+A space says, for ONE row, how many directions it is free to move in (`width`), what an observation
+sees of it (`prepare`, a block of scalars), how a small change δ moves that block (`moved`, right to
+second order at δ = 0, the only place where derivatives are taken), where a finite change leads
+(`retract`), and which change leads from one value to another (`difference`). `hold` is a value
+with what is held taken from another; `chart` gives the unknowns in which damping is measured,
+T = ∂(those)/∂δ.
+
+Blocks consist of scalars, not of small arrays: under `vmap` every scalar becomes one long array, and
+XLA turns the observation equations into straight loops over the observations (a third of the time
+of small matrix products).
+"""
+
+import dataclasses
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbundle.geometry import (
+    matrix_from_quaternion,
+    quaternion_difference,
+    retract_quaternion,
+)
+
+Scalar = float | Float[Array, ""]
+Change = tuple[Scalar, ...]
+
+
+class Space(Protocol):
+    """What the engine asks of a space; instances are hashable and compare by their fields."""
+
+    @property
+    def width(self) -> int: ...
+
+    def prepare(self, value: Any) -> Any: ...
+
+    def moved(self, block: Any, change: Change) -> Any: ...
+
+    def retract(self, value: Any, change: Float[Array, " width"]) -> Any: ...
+
+    def difference(self, value: Any, origin: Any) -> Float[Array, " width"]: ...
+
+    def hold(self, value: Any, given: Any, free: Float[Array, " width"]) -> Any: ...
+
+    def chart(self, value: Any) -> Float[Array, "width width"] | None: ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Vector:
+    """Numbers that add. `size`: how many (0: a single number, not in a tuple); `columns`: those of
+    them that move (None: all)."""
+
+    size: int
+    columns: tuple[int, ...] | None = None
+
+    @property
+    def moving(self) -> tuple[int, ...]:
+        return tuple(range(max(self.size, 1))) if self.columns is None else self.columns
+
+    @property
+    def width(self) -> int:
+        return len(self.moving)
+
+    def prepare(self, value):
+        return tuple(value) if self.size else value
+
+    def moved(self, block, change):
+        if not self.size:
+            return block + change[0] if change else block
+        block = list(block)
+        for column, d in zip(self.moving, change):
+            block[column] = block[column] + d
+        return tuple(block)
+
+    def retract(self, value, change):
+        if not self.size:
+            return value + change[0] if change.shape[0] else value
+        return value.at[jnp.array(self.moving, int)].add(change)
+
+    def difference(self, value, origin):
+        change = value - origin
+        return change[jnp.array(self.moving, int)] if self.size else change[None]
+
+    def hold(self, value, given, free):
+        if not self.size:
+            return jnp.where(free[0] > 0, value, given) if self.width else given
+        moves = jnp.zeros(self.size).at[jnp.array(self.moving, int)].set(free)
+        return jnp.where(moves > 0, value, given)
+
+    def chart(self, value):
+        return None
+
+
+class Turned(NamedTuple):
+    """A rotation M as observations see it: `rows`, 9 scalars, and a small turn on top of it."""
+
+    rows: tuple[Scalar, ...]
+    turn: tuple[Scalar, Scalar, Scalar] | None = None
+
+    def apply(self, X):
+        """M·X."""
+        m = self.rows
+        ray = tuple(m[3 * i] * X[0] + m[3 * i + 1] * X[1] + m[3 * i + 2] * X[2] for i in range(3))
+        if self.turn is None:
+            return ray
+        first = cross(self.turn, ray)
+        second = cross(self.turn, first)
+        return tuple(a + b + 0.5 * c for a, b, c in zip(ray, first, second))
+
+    def apply_inverse(self, x):
+        """Mᵀ·x."""
+        if self.turn is not None:
+            first = cross(x, self.turn)
+            second = cross(first, self.turn)
+            x = tuple(a + b + 0.5 * c for a, b, c in zip(x, first, second))
+        m = self.rows
+        return tuple(m[i] * x[0] + m[3 + i] * x[1] + m[6 + i] * x[2] for i in range(3))
+
+
+class Posed(NamedTuple):
+    """A pose as observations see it: rotation M and projection centre X0."""
+
+    rotation: Turned
+    centre: tuple[Scalar, Scalar, Scalar]
+
+    def ray(self, X):
+        """M·(X − X0): a place of object space in the frame of the pose."""
+        return self.rotation.apply(tuple(a - b for a, b in zip(X, self.centre)))
+
+    def place(self, x):
+        """X0 + Mᵀ·x: a place of the frame of the pose in object space."""
+        return tuple(a + b for a, b in zip(self.centre, self.rotation.apply_inverse(x)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Rotation:
+    """Unit quaternions (w, x, y, z); a change is a rotation vector, M ← exp([δ]×)·M."""
+
+    width = 3
+
+    def prepare(self, value):
+        return Turned(tuple(matrix_from_quaternion(value).ravel()))
+
+    def moved(self, block, change):
+        return block._replace(turn=tuple(change)) if change else block
+
+    def retract(self, value, change):
+        return retract_quaternion(value, change)
+
+    def difference(self, value, origin):
+        return quaternion_difference(value, origin)
+
+    def hold(self, value, given, free):
+        return jnp.where(free.max() > 0, value, given)
+
+    def chart(self, value):
+        return None
+
+
+class PoseValue(NamedTuple):
+    """Projection centres and rotations of poses, as arrays of a table."""
+
+    position: Float[Array, "*rows 3"]
+    rotation: Float[Array, "*rows 4"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Pose:
+    """A projection centre X0 and a rotation M, `PoseValue`; a change is (δX0, δθ).
+
+    Damping weighs a turn δθ and a shift δX0 as programs do that store [R t]: by the turn and by the
+    change of t = −M·X0, the place of the origin of object space in the camera frame. A turn is
+    then about that origin and weighs the more the farther away it is; with both damped lightly,
+    long steps of one against the other would be tried and refused.
+    """
+
+    width = 6
+
+    def prepare(self, value):
+        matrix = tuple(matrix_from_quaternion(value.rotation).ravel())
+        return Posed(Turned(matrix), tuple(value.position))
+
+    def moved(self, block, change):
+        if not change:
+            return block
+        centre = tuple(c + d for c, d in zip(block.centre, change[:3]))
+        return Posed(block.rotation._replace(turn=tuple(change[3:])), centre)
+
+    def retract(self, value, change):
+        return PoseValue(
+            value.position + change[:3], retract_quaternion(value.rotation, change[3:])
+        )
+
+    def difference(self, value, origin):
+        turn = quaternion_difference(value.rotation, origin.rotation)
+        return jnp.concatenate([value.position - origin.position, turn])
+
+    def hold(self, value, given, free):
+        return PoseValue(
+            jnp.where(free[:3] > 0, value.position, given.position),
+            jnp.where(free[3:].max() > 0, value.rotation, given.rotation),
+        )
+
+    def chart(self, value):
+        M = matrix_from_quaternion(value.rotation)
+
+        def shift(change):
+            # exp([δθ]×) ≈ 1 + [δθ]×: the derivative is taken at 0 only.
+            t = -M @ (value.position + change[:3])
+            return t + jnp.cross(change[3:], t)
+
+        return jnp.eye(6).at[:3].set(jax.jacfwd(shift)(jnp.zeros(6)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Direction:
+    """Unit vectors of `size` numbers; a change is one in the tangent plane, in an orthonormal basis
+    of it (of the Householder reflection that takes the vector to an axis)."""
+
+    size: int
+
+    @property
+    def width(self) -> int:
+        return self.size - 1
+
+    def prepare(self, value):
+        return tuple(value), tuple(map(tuple, _tangent_basis(value)))
+
+    def moved(self, block, change):
+        value, basis = block
+        if not change:
+            return value
+        square = sum(d * d for d in change)
+        return tuple(
+            v * (1 - 0.5 * square) + sum(b * d for b, d in zip(row, change))
+            for v, row in zip(value, basis)
+        )
+
+    def retract(self, value, change):
+        moved = value + _tangent_basis(value) @ change
+        return moved / jnp.linalg.norm(moved)
+
+    def difference(self, value, origin):
+        return _tangent_basis(origin).T @ value / (value @ origin)
+
+    def hold(self, value, given, free):
+        return jnp.where(free.max() > 0, value, given)
+
+    def chart(self, value):
+        return None
+
+
+def _tangent_basis(value: Float[Array, " n"]) -> Float[Array, "n n-1"]:
+    """Columns orthogonal to a unit vector: those of a reflection that takes it to ∓ its last axis,
+    without the last."""
+    sign = jnp.where(value[-1] < 0, -1.0, 1.0)
+    axis = value.at[-1].add(sign)
+    reflection = jnp.eye(len(value)) - 2 * jnp.outer(axis, axis) / (axis @ axis)
+    return reflection[:, :-1]
+
+
+def cross(a, b):
+    """The vector product of two triples of scalars."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])

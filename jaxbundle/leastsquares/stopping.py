@@ -1,0 +1,121 @@
+"""When to stop, and why: one rule for everything that is adjusted.
+
+With the undamped step δ and g = JᵀPv, the decrement d² = −gᵀδ = δᵀNδ bounds every single unknown:
+|δᵢ| ≤ d/σ₀·σᵢ. A problem is *settled* when d ≤ `atol`·σ₀: no unknown would move by more than `atol`
+of its own standard deviation. Near the solution the damping is therefore dropped altogether; a
+problem whose undamped equations cannot be solved ends as *singular*, never as converged.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+TERMINATIONS = (
+    "iteration limit",
+    "settled: no unknown would move by more than the tolerance times its standard deviation",
+    "relative cost: the sum of squares no longer decreases",
+    "singular: the undamped normal equations cannot be solved",
+    "stuck: no step reduces the sum of squares",
+    "not finite: the residuals of the start values, or of a full step, cannot be computed",
+)
+LIMIT, SETTLED, RELATIVE_COST, SINGULAR, STUCK, NOT_FINITE = range(6)
+
+ROUNDING = 2e-14
+"""A promised decrease of vᵀPv below this fraction of it is rounding noise."""
+COST_ROUNDING = 1e-15
+"""Relative precision of a measured value, to estimate that of vᵀPv."""
+NOISE_FLOOR, NOISE_FLOOR_WITHOUT_REDUNDANCY = 1e-14, 1e-12
+"""Relative precision of a measured value; residuals below it are noise of the arithmetic.
+
+Without redundancy all residuals vanish and no σ0 says when to stop: the wider floor does.
+"""
+NEAR = 1e-3
+"""Near the solution: the last step promised to decrease vᵀPv by less than this fraction."""
+KEPT, FALLING = 0.95, 0.1
+"""And it kept so much of the promise, which was less than this fraction of the one before."""
+REFUSALS = 2
+"""So many undamped steps refused where the damped ones have settled: singular, if not exactly."""
+SHORTEST = 1e-20
+"""A step size below which nothing can be tried any more."""
+
+
+class Tolerance(eqx.Module):
+    """What counts as nothing. `atol`: see the module; `rtol`: stop when an accepted step decreases
+    vᵀPv by less than this fraction (0: never for this reason); `squares`: the sum of the squares
+    of all measured values, divided by their σ."""
+
+    redundancy: Float[Array, ""]
+    squares: Float[Array, ""]
+    atol: float
+    rtol: float
+
+    def limit(self, cost):
+        """The decrement d² below which a problem is settled."""
+        sigma0_squared = 2 * cost / jnp.maximum(self.redundancy, 1.0)
+        precision = jnp.where(
+            self.redundancy > 0, NOISE_FLOOR, NOISE_FLOOR_WITHOUT_REDUNDANCY
+        )
+        floor = precision**2 * self.squares
+        return jnp.maximum(self.atol**2 * sigma0_squared, ROUNDING * cost) + floor
+
+    def noise(self, cost):
+        """How much of a change of ½vᵀPv is rounding."""
+        return COST_ROUNDING * jnp.sqrt(self.squares * 2 * cost)
+
+
+class Approach(eqx.Module):
+    """How near the end is: what the step before promised, how often undamped steps were refused,
+    whether the undamped equations could not be solved."""
+
+    near: Float[Array, ""]
+    promised: Float[Array, ""]
+    singular: Bool[Array, ""]
+    trial: Bool[Array, ""]
+    tried: Bool[Array, ""]
+    refusals: Int[Array, ""]
+
+    @classmethod
+    def begin(cls) -> "Approach":
+        no = jnp.asarray(False)
+        return cls(jnp.asarray(NEAR), jnp.asarray(0.0), no, no, no, jnp.asarray(0))
+
+    def choose_step(self, step_size, last_size, first, accept, promised, kept, cost):
+        """The step size, infinite where the damping is to be dropped; and the approach after it."""
+        # An undamped step that was refused was tried too early.
+        near = jnp.where(jnp.isinf(last_size) & ~accept, 0.1 * self.near, self.near)
+        quadratic = accept & (kept > KEPT) & ~self.singular & ~first
+        quadratic &= (promised < near * cost) & (promised < FALLING * self.promised)
+        refusals = self.refusals + (self.tried & ~accept)
+        approach = Approach(
+            near=near, promised=jnp.where(accept, promised, self.promised),
+            singular=self.singular, trial=self.trial, tried=self.trial, refusals=refusals,
+        )  # fmt: skip
+        return jnp.where(quadratic | self.trial, jnp.inf, step_size), approach
+
+    def judge(self, tolerance: Tolerance, step_size, finite, decrement, first, accept, before, cost, tried):
+        """The termination code after a step was computed, and the approach.
+
+        `cost`: at the accepted point; `before`: at the one before; `tried`: at the point tried."""
+        undamped = jnp.isinf(step_size)
+        small = finite & (decrement <= tolerance.limit(cost))
+        settled = small & undamped
+        again = self.singular & undamped & ~finite
+        singular = self.singular | (~finite & undamped) | (self.refusals >= REFUSALS)
+        # Steps that are all accepted may grow: what grows visibly has not stalled.
+        stalled = accept & ~first & (before - tried < tolerance.rtol * before)
+        stalled &= tried - before <= tolerance.noise(before)
+        reasons = (
+            (~jnp.isfinite(cost), NOT_FINITE),
+            (settled, SETTLED),
+            (stalled & ~singular, RELATIVE_COST),
+            ((small | stalled) & singular, SINGULAR),
+            (again, SINGULAR),
+            ((step_size < SHORTEST) & ~small, STUCK),
+        )
+        termination = jnp.asarray(LIMIT)
+        for happened, reason in reversed(reasons):
+            termination = jnp.where(happened, reason, termination)
+        # A small step that still was damped: try it undamped before calling it settled.
+        trial = small & ~singular & ~settled
+        approach = Approach(self.near, self.promised, singular, trial, self.tried, self.refusals)
+        return termination, approach
