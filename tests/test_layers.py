@@ -14,6 +14,7 @@ LAYERS = (
     "configuration",
     "implicit",
     "geometry",
+    "leastsquares",
     "cameras",
     "network",
     "orientation",

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from jaxbundle.leastsquares.datum import contract, datum_directions
 from jaxbundle.leastsquares.elimination import Factor, solve
 from jaxbundle.leastsquares.normal import Tangent
-from jaxbundle.leastsquares.plan import PAIR_ROWS_AT_ONCE, Key, Plan
+from jaxbundle.leastsquares.plan import PAIR_ROWS_AT_ONCE, Plan
 from jaxbundle.leastsquares.reduced import Reduced
 from jaxbundle.leastsquares.rows import Declared, Values
 
@@ -68,9 +68,7 @@ def _without_held(plan: Plan, Q: Reduced) -> Reduced:
 def _couplings(factor: Factor, Q: Reduced):
     """K of every incidence."""
     plan, Z = factor.plan, factor.Z
-    K = {
-        g: jnp.einsum("clij,cjk->clik", z, Q.own[g][plan.incidences[g].row]) for g, z in Z.items()
-    }
+    K = {g: jnp.einsum("clij,cjk->clik", z, Q.own[g][plan.incidences[g].row]) for g, z in Z.items()}
     flat = {g: k.reshape(-1, *k.shape[2:]) for g, k in K.items()}
     rows = {g: z.reshape(-1, *z.shape[2:]) for g, z in Z.items()}
     for (later, earlier), at in plan.blocks.items():
@@ -101,7 +99,7 @@ def _spread(pairs, a, b, Q, to_first, to_second, within: bool):
         chunks, step = first.shape[0], max(1, PAIR_ROWS_AT_ONCE // length)
         whole = chunks // step * step
         if chunks > step:
-            steps = lambda x: x[:whole].reshape(-1, step, *x.shape[1:])
+            steps = lambda x, n=whole, step=step: x[:n].reshape(-1, step, *x.shape[1:])
             totals, _ = jax.lax.scan(add, totals, (steps(first), steps(second), steps(block)))
             first, second, block = first[whole:], second[whole:], block[whole:]
         if len(block):
@@ -134,9 +132,7 @@ def propagate(declared: Declared, values: Values, factor: Factor, rows: Tangent)
     plan = factor.plan
     from_datum = jax.vmap(lambda r: _datum_transposed(declared, plan, values, r))(rows)
     solved = jax.vmap(lambda r: solve(factor, r))(from_datum)
-    return sum(
-        jnp.einsum("fni,gni->fg", from_datum[g], solved[g]) for g in from_datum
-    )
+    return sum(jnp.einsum("fni,gni->fg", from_datum[g], solved[g]) for g in from_datum)
 
 
 def _datum_transposed(declared, plan, values, row):

@@ -58,4 +58,6 @@ def times(D: Metric, change):
 
 def matrices(D: Metric) -> Metric:
     """D as matrices [rows, w, w]."""
-    return {name: d if d.ndim == 3 else d[:, :, None] * jnp.eye(d.shape[1]) for name, d in D.items()}
+    return {
+        name: d if d.ndim == 3 else d[:, :, None] * jnp.eye(d.shape[1]) for name, d in D.items()
+    }

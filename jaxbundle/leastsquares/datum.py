@@ -1,4 +1,4 @@
-"""The datum: which motions of the whole problem the observations leave open, and how they are pinned.
+"""The datum: which motions of the whole problem the observations leave open, and what pins them.
 
 A motion that changes no observation makes the normal equations singular along its directions G
 (Blaha 1971; Illner 1985). Which combinations of the declared motions stay open is found from the
@@ -15,8 +15,6 @@ moved, by finite open motions, to where Bᵀ(x − x_start) = 0 holds exactly: t
 depend on the path of the iterations.
 """
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -25,7 +23,7 @@ from jaxtyping import Array, Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.linearise import differentiate
-from jaxbundle.leastsquares.normal import Tangent, dot, total
+from jaxbundle.leastsquares.normal import Tangent, total
 from jaxbundle.leastsquares.plan import Datum, Plan
 from jaxbundle.leastsquares.rows import Data, Declared, Values, lay_out_data, prepare
 
@@ -123,7 +121,9 @@ def _directional_products(declared: Declared, plan: Plan, data: Data, real):
             for t, J in zip(part.touches, touches)
         ]
         if E is not None:
-            found.append(jnp.einsum("clri,clim->clrm", E, everywhere[plan.eliminated][0][part.eliminated]))
+            found.append(
+                jnp.einsum("clri,clim->clrm", E, everywhere[plan.eliminated][0][part.eliminated])
+            )
         products.append(sum(found).reshape(-1, motions))
         terms += [x.reshape(-1, motions) for x in found]
     free = free_of_tables(plan, declared, data.start)
@@ -229,9 +229,7 @@ def move_to_datum(declared: Declared, plan: Plan, values: Values, start: Values)
     if plan.datum is None:
         return values
     weighted = tuple(plan.datum.weight)
-    size = max(
-        jnp.abs(x).max() for name in weighted for x in jax.tree.leaves(start[name])
-    )
+    size = max(jnp.abs(x).max() for name in weighted for x in jax.tree.leaves(start[name]))
 
     def moving(state):
         _, distance, before, count = state

@@ -139,8 +139,8 @@ class Observations:
         rows = tuple(np.asarray(r, np.int64).ravel() for r in self.rows)
         if len(rows) != len(kind.of):
             raise InputError(
-                f"{name}: rows of {len(kind.of)} tables are expected ({', '.join(kind.of)}), not of "
-                f"{len(rows)}"
+                f"{name}: rows of {len(kind.of)} tables are expected ({', '.join(kind.of)}), not "
+                f"of {len(rows)}"
             )
         if len({len(r) for r in rows}) > 1:
             raise InputError(f"{name}: the columns of rows differ in length")
@@ -173,8 +173,8 @@ class Observations:
         if bad.any():
             row = int(np.argwhere(bad)[0][0])
             raise InputError(
-                f"{self.kind.name}: sigma of observation {row + 1} is {sigma[bad][0]:g}; a positive "
-                "number is expected"
+                f"{self.kind.name}: sigma of observation {row + 1} is {sigma[bad][0]:g}; a "
+                "positive number is expected"
             )
         return 1 / sigma
 

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxbundle.leastsquares.damping import matrices
 from jaxbundle.leastsquares.normal import Normal, NormalBlocks, Tangent, total
-from jaxbundle.leastsquares.plan import PAIR_ROWS_AT_ONCE, Key, Pairs, Plan
+from jaxbundle.leastsquares.plan import PAIR_ROWS_AT_ONCE, Pairs, Plan
 from jaxbundle.leastsquares.reduced import DenseFactor, Reduced, factorise_reduced
 
 PIVOT = 1e-13
@@ -137,7 +137,7 @@ def sum_pairs(pairs: Pairs, blocks: int, a, b) -> Float[Array, "blocks w v"]:
         chunks, step = first.shape[0], max(1, PAIR_ROWS_AT_ONCE // length)
         whole = chunks // step * step
         if chunks > step:
-            steps = lambda x: x[:whole].reshape(-1, step, *x.shape[1:])
+            steps = lambda x, n=whole, step=step: x[:n].reshape(-1, step, *x.shape[1:])
             sums, _ = jax.lax.scan(add, sums, (steps(first), steps(second), steps(block)))
             first, second, block = first[whole:], second[whole:], block[whole:]
         if len(block):

@@ -31,9 +31,7 @@ def differentiate(declared: Declared, plan: Plan, number: int, prepared, laid: L
     kind, widths = declared.kinds[part.observations], widths_of(declared, plan, part)
     residual = residual_of(declared, part)
     rows = _reverse if part.large else _forward
-    r, columns = over(
-        part, kind, prepared, laid, number, lambda *row: rows(residual, widths, row)
-    )
+    r, columns = over(part, kind, prepared, laid, number, lambda *row: rows(residual, widths, row))
     shape = r[0].shape
 
     def block(slots, start, stop):

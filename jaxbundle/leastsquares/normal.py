@@ -125,9 +125,7 @@ class _Sums:
         self.plan = plan
         zero = lambda g: jnp.zeros((g.rows, g.width))
         self.gradient = {name: zero(g) for name, g in plan.groups.items()}
-        self.own = {
-            name: jnp.zeros((g.rows, g.width, g.width)) for name, g in plan.groups.items()
-        }
+        self.own = {name: jnp.zeros((g.rows, g.width, g.width)) for name, g in plan.groups.items()}
         self.off = {}
         self.W = {}
         self.cost = 0.0
@@ -178,7 +176,9 @@ class _Sums:
         placed = pad(N, slice(first.start, first.stop), slice(second.start, second.stop))
         if couple.turned is not None:
             other = pad(
-                N.transpose(0, 2, 1), slice(second.start, second.stop), slice(first.start, first.stop)
+                N.transpose(0, 2, 1),
+                slice(second.start, second.stop),
+                slice(first.start, first.stop),
             )
             turned = couple.turned[:, None, None]
             placed = turned * other + (1 - turned) * placed
@@ -213,7 +213,7 @@ class _Sums:
 
 
 def products(a, b):
-    """aᵀb of every row, written out: a batched product of tiny matrices takes three times as long."""
+    """aᵀb of every row, written out: a batched product of tiny matrices takes thrice the time."""
     return functools.reduce(
         jnp.add, (a[:, i, :, None] * b[:, i, None, :] for i in range(a.shape[1]))
     )

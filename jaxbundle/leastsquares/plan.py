@@ -271,7 +271,10 @@ class _Planner:
             return False
         met = False
         for part in self.parts:
-            of, rows = self.observations[part.observations].kind.of, self.observations[part.observations].rows
+            of, rows = (
+                self.observations[part.observations].kind.of,
+                self.observations[part.observations].rows,
+            )
             if part.slot is None:
                 continue
             a = [s for s, t in enumerate(of) if t == first]
@@ -291,7 +294,9 @@ class _Planner:
         incidences = {g: self.incidences_of(g, parts) for g in self.kept}
         incidences = {g: found for g, found in incidences.items() if found is not None}
         blocks = self.find_blocks(parts, incidences)
-        groups = {g: self.group(g) for g in [*self.kept, *([self.eliminate] if self.eliminate else [])]}
+        groups = {
+            g: self.group(g) for g in [*self.kept, *([self.eliminate] if self.eliminate else [])]
+        }
         return Plan(
             groups=groups,
             eliminated=self.eliminate,
@@ -312,11 +317,14 @@ class _Planner:
 
     def part(self, k, part):
         """The part k: laid out in chunks, with its touches (couples and incidences come later)."""
-        given, of = self.observations[part.observations], self.observations[part.observations].kind.of
+        given, of = (
+            self.observations[part.observations],
+            self.observations[part.observations].kind.of,
+        )
         rows = [np.asarray(r)[part.source] for r in given.rows]
         slots = self._touched_groups(part, of)
         major = np.zeros(len(part.source), np.int64)
-        for group, touched in slots:
+        for _, touched in slots:
             slot = touched[0][0]
             row = self.group_of[of[slot]][2][rows[slot]]
             major = np.unique(major * (row.max(initial=0) + 1) + row, return_inverse=True)[1]
@@ -339,7 +347,9 @@ class _Planner:
             row = chunk(self.group_of[of[slot]][2][rows[slot]])[:, 0]
             stop = max(start + self.tables[of[s]].space.width for s, start in touched)
             start = min(start for _, start in touched)
-            touches.append(Touch(group, touched, start, stop, Index(row, along, ("group", group)), None))
+            touches.append(
+                Touch(group, touched, start, stop, Index(row, along, ("group", group)), None)
+            )
         source = np.where(used, part.source[order], -1).reshape(-1, length)
         place = np.full(given.number, -1)
         place[part.source[order][used]] = np.flatnonzero(used)
@@ -364,7 +374,9 @@ class _Planner:
             if s == part.slot or name not in self.group_of:
                 continue
             group, start, _ = self.group_of[name]
-            entry = next((f for f in found if f[0] == group and all(of[q] != name for q, _ in f[1])), None)
+            entry = next(
+                (f for f in found if f[0] == group and all(of[q] != name for q, _ in f[1])), None
+            )
             if entry is None:
                 found.append((group, [(s, start)]))
             else:
@@ -388,7 +400,9 @@ class _Planner:
             row.append(np.repeat(p["part"].touches[t].row.rows, p["length"]))
             used.append(p["used"])
         eliminated, row, used = (np.concatenate(x) for x in (eliminated, row, used))
-        keys, of = np.unique(row[used].astype(np.int64) * number + eliminated[used], return_inverse=True)
+        keys, of = np.unique(
+            row[used].astype(np.int64) * number + eliminated[used], return_inverse=True
+        )
         apart = len(at) == 1 and len(keys) == used.sum()
         if self.choose("incidences apart", group, found=apart):
             p = parts[at[0][0]]
@@ -413,7 +427,14 @@ class _Planner:
             Index(row[::length], along, ("group", group)),
         )
         live = np.flatnonzero(used)
-        return dict(plan=plan, live=live, eliminated=eliminated[live], row=row[live], along=along, length=length)
+        return dict(
+            plan=plan,
+            live=live,
+            eliminated=eliminated[live],
+            row=row[live],
+            along=along,
+            length=length,
+        )
 
     def find_blocks(self, parts, incidences):
         """The blocks of the reduced matrix between kept groups: from pairs of incidences, and from
@@ -425,7 +446,9 @@ class _Planner:
         for b, later in enumerate(self.kept):
             for earlier in self.kept[: b + 1]:
                 key = later, earlier
-                pairs = self._pairs(incidences.get(later), incidences.get(earlier), later == earlier)
+                pairs = self._pairs(
+                    incidences.get(later), incidences.get(earlier), later == earlier
+                )
                 made = self._block_list(key, pairs, direct.get(key, ()), parts)
                 if made is not None:
                     blocks[key] = made

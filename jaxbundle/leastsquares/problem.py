@@ -13,10 +13,10 @@ from jaxbundle.leastsquares.datum import find_open_motions, make_datum
 from jaxbundle.leastsquares.declarations import Motions, Observations, Table
 from jaxbundle.leastsquares.indices import common, finish, rounded
 from jaxbundle.leastsquares.plan import Plan, make_plan
-from jaxbundle.leastsquares.rows import Data, Declared
-from jaxbundle.leastsquares.solver import LeastSquares, Minimum, minimise
-from jaxbundle.leastsquares.stopping import Tolerance
 from jaxbundle.leastsquares.retraction import retract
+from jaxbundle.leastsquares.rows import Data, Declared
+from jaxbundle.leastsquares.solver import LeastSquares, minimise
+from jaxbundle.leastsquares.stopping import Tolerance
 
 LARGE = 200_000
 """Problems of more observations are compiled for their own sizes."""
@@ -82,11 +82,11 @@ def _with_datum(problem: Problem, weight, minimal: bool) -> Problem:
         return problem
     if weight is None:
         raise InputError(f"the datum is open in {gauge.shape[1]} parameters: say what holds it")
-    fill = lambda t, w: np.concatenate([w, np.zeros((problem.sizes["table", t] - len(w), w.shape[1]))])
-    weight = {t: fill(t, np.asarray(w, float)) for t, w in weight.items()}
-    datum = jax.device_put(
-        make_datum(problem.declared, problem.plan, data, gauge, weight, minimal)
+    fill = lambda t, w: np.concatenate(
+        [w, np.zeros((problem.sizes["table", t] - len(w), w.shape[1]))]
     )
+    weight = {t: fill(t, np.asarray(w, float)) for t, w in weight.items()}
+    datum = jax.device_put(make_datum(problem.declared, problem.plan, data, gauge, weight, minimal))
     plan = dataclasses.replace(problem.plan, datum=datum)
     counts = dataclasses.replace(problem.counts, datum=gauge.shape[1])
     return dataclasses.replace(problem, plan=plan, counts=counts)
@@ -109,8 +109,8 @@ def check(tables, observations) -> None:
             if bad.any():
                 row = int(np.argmax(bad))
                 raise InputError(
-                    f"{given.kind.name}: observation {row + 1} touches row {int(rows[row])} of table "
-                    f"{name!r}, which has rows 0 to {known[name].rows - 1}"
+                    f"{given.kind.name}: observation {row + 1} touches row {int(rows[row])} of "
+                    f"table {name!r}, which has rows 0 to {known[name].rows - 1}"
                 )
 
 
@@ -146,10 +146,15 @@ def _diagonal(weight):
 def pad_data(problem: Problem, data: Data) -> Data:
     """The numbers filled to the sizes of the plan: rows repeat the last one, weights are 0."""
     fill = lambda x, n: np.concatenate([np.asarray(x), np.zeros((n - len(x), *np.shape(x)[1:]))])
-    edge = lambda x, n: np.concatenate([np.asarray(x), np.repeat(np.asarray(x)[-1:], n - len(x), 0)])
+    edge = lambda x, n: np.concatenate(
+        [np.asarray(x), np.repeat(np.asarray(x)[-1:], n - len(x), 0)]
+    )
     size = problem.sizes
     return jax.device_put(Data(
-        {t: jax.tree.map(lambda x, t=t: edge(x, size["table", t]), v) for t, v in data.start.items()},
+        {
+            t: jax.tree.map(lambda x, t=t: edge(x, size["table", t]), v)
+            for t, v in data.start.items()
+        },
         tuple(
             jax.tree.map(lambda x, o=o: fill(x, size["observations", o]), m)
             for o, m in enumerate(data.measured)
@@ -158,7 +163,9 @@ def pad_data(problem: Problem, data: Data) -> Data:
     ))  # fmt: skip
 
 
-def make_solver(problem: Problem, *, atol=1e-5, rtol=0.0, retraction=None, **options) -> LeastSquares:
+def make_solver(
+    problem: Problem, *, atol=1e-5, rtol=0.0, retraction=None, **options
+) -> LeastSquares:
     """The solver of a problem; `options` are those of `LeastSquares`."""
     declared = problem.declared
     squares = sum(
@@ -168,7 +175,9 @@ def make_solver(problem: Problem, *, atol=1e-5, rtol=0.0, retraction=None, **opt
     )
     to_device = lambda x: jax.device_put(np.float64(x))
     tolerance = Tolerance(to_device(problem.counts.redundancy), to_device(squares), atol, rtol)
-    return LeastSquares(declared, problem.plan, tolerance, retraction or Retraction(declared), **options)
+    return LeastSquares(
+        declared, problem.plan, tolerance, retraction or Retraction(declared), **options
+    )
 
 
 @dataclasses.dataclass(frozen=True)

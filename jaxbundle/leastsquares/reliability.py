@@ -20,7 +20,15 @@ from jaxtyping import Array, Float
 from jaxbundle.leastsquares.cofactors import Cofactors
 from jaxbundle.leastsquares.linearise import differentiate
 from jaxbundle.leastsquares.plan import Part, Plan
-from jaxbundle.leastsquares.rows import Data, Declared, Laid, Values, in_given_order, lay_out_data, prepare
+from jaxbundle.leastsquares.rows import (
+    Data,
+    Declared,
+    Laid,
+    Values,
+    in_given_order,
+    lay_out_data,
+    prepare,
+)
 
 UNCONTROLLED = 1e-8
 """Redundancy numbers below this are rounding: the observation is not controlled at all."""

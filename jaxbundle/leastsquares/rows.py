@@ -133,7 +133,9 @@ def residuals(declared: Declared, plan: Plan, values: Values, laid: Laid):
     for number, part in enumerate(plan.parts):
         kind = declared.kinds[part.observations]
         residual, still = residual_of(declared, part), ((),) * len(kind.of)
-        rows = over(part, kind, prepared, laid, number, lambda *row, f=residual, d=still: f(d, *row))
+        rows = over(
+            part, kind, prepared, laid, number, lambda *row, f=residual, d=still: f(d, *row)
+        )
         found.append(jnp.stack(rows, -1))
     return tuple(found)
 

@@ -7,9 +7,9 @@ second order at δ = 0, the only place where derivatives are taken), where a fin
 with what is held taken from another; `chart` gives the unknowns in which damping is measured,
 T = ∂(those)/∂δ.
 
-Blocks consist of scalars, not of small arrays: under `vmap` every scalar becomes one long array, and
-XLA turns the observation equations into straight loops over the observations (a third of the time
-of small matrix products).
+Blocks consist of scalars, not of small arrays: under `vmap` every scalar becomes one long array,
+and XLA turns the observation equations into straight loops over the observations (a third of the
+time of small matrix products).
 """
 
 import dataclasses

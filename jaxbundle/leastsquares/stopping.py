@@ -52,9 +52,7 @@ class Tolerance(eqx.Module):
     def limit(self, cost):
         """The decrement d² below which a problem is settled."""
         sigma0_squared = 2 * cost / jnp.maximum(self.redundancy, 1.0)
-        precision = jnp.where(
-            self.redundancy > 0, NOISE_FLOOR, NOISE_FLOOR_WITHOUT_REDUNDANCY
-        )
+        precision = jnp.where(self.redundancy > 0, NOISE_FLOOR, NOISE_FLOOR_WITHOUT_REDUNDANCY)
         floor = precision**2 * self.squares
         return jnp.maximum(self.atol**2 * sigma0_squared, ROUNDING * cost) + floor
 
@@ -92,7 +90,9 @@ class Approach(eqx.Module):
         )  # fmt: skip
         return jnp.where(quadratic | self.trial, jnp.inf, step_size), approach
 
-    def judge(self, tolerance: Tolerance, step_size, finite, decrement, first, accept, before, cost, tried):
+    def judge(
+        self, tolerance: Tolerance, step_size, finite, decrement, first, accept, before, cost, tried
+    ):
         """The termination code after a step was computed, and the approach.
 
         `cost`: at the accepted point; `before`: at the one before; `tried`: at the point tried."""
