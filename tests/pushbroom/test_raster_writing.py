@@ -4,6 +4,7 @@ import os
 
 import numpy as np
 import pytest
+import rasterio
 from full_disk import files_end_at
 
 from jaxbundle.errors import InputError
@@ -12,8 +13,6 @@ from jaxbundle.io.map_blocks import write_map
 from jaxbundle.io.maps import MapGrid, MapSystem
 from jaxbundle.pushbroom.surfaces import Plane
 from jaxbundle.temporaries import put_off
-
-rasterio = pytest.importorskip("rasterio")
 
 
 def write(target):
