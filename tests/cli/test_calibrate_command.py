@@ -86,7 +86,7 @@ def test_two_cameras_and_brief_json_alone(command, folder, monkeypatch):
     (["--board", "9x6", "--square", "1", "--camera", "a"], "--camera a: NAME=PATTERN"),
     (["--board", "9x6", "--square", "1", "--camera", "a=x", "--camera", "a = y"],
      "--camera a is given twice: a=x, a=y"),
-    (["FOLDER", "--board", "9x6", "--square", "1", "--snooping", "x"], "--snooping 'x'"),
+    (["FOLDER", "--board", "9x6", "--square", "1", "--snooping", "x"], "--snooping must be one of pope, baarda"),
     (["FOLDER", "--board", "9x6", "--square", "1", "--rig"], "a rig has two cameras or more"),
     (["FOLDER", "--board", "9x6", "--square", "1", "--json", "FOLDER"], "is a folder"),
     (["FOLDER", "--board", "9x6", "--square", "1", "--json", "FOLDER/text.jpg"], "overwritten"),
