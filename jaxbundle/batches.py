@@ -30,7 +30,7 @@ from jaxbundle.io.fingerprints import of_input
 from jaxbundle.io.json_lines import JsonLines
 from jaxbundle.io.locks import locked
 from jaxbundle.io.result_json import result_dict
-from jaxbundle.statistics.snooping import check_test
+from jaxbundle.leastsquares.snooping import check_test
 
 SNOOPING = ("snooping", "significance")
 """Settings that only a line has whose measurements were searched for blunders."""

@@ -5,14 +5,16 @@ from types import MappingProxyType
 
 import numpy as np
 
-from jaxbundle.adjustment.problem import Problem, make_problem, with_factor
-from jaxbundle.adjustment.solve import METHODS, converged
-from jaxbundle.adjustment.solver import Minimum
+from jaxbundle.adjustment.problem import REDUCTIONS, Problem, make_problem
 from jaxbundle.arguments import at_least_zero, one_of, shown, truth, whole
 from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.leastsquares.robust import ESTIMATORS
+from jaxbundle.leastsquares.search import METHODS
+from jaxbundle.leastsquares.snooping import check_test
+from jaxbundle.leastsquares.solver import Minimum
+from jaxbundle.leastsquares.stopping import converged
 from jaxbundle.network.check import check_network
 from jaxbundle.network.columns import count, some
-from jaxbundle.network.reduction import REDUCTIONS
 from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.tables import Network, require_network
 from jaxbundle.network.unit_mistakes import name_pixels
@@ -32,13 +34,10 @@ from jaxbundle.solution import (
     start_with,
     weakness_without_solution,
 )
-from jaxbundle.statistics import (
-    ESTIMATORS,
-    Inspection,
-    doubt_of_robust,
-    intersect_check_points,
-)
-from jaxbundle.statistics.snooping import check_test
+from jaxbundle.statistics.blunders import name_suspect
+from jaxbundle.statistics.check_points import intersect_check_points
+from jaxbundle.statistics.inspection import Inspection
+from jaxbundle.statistics.misfit import doubt_of_robust
 
 MISFIT = 5.0
 """A σ0 above this asks for its cause."""
@@ -98,7 +97,7 @@ def adjust(
     if lacks_start_values(given):
         found = orient(given)
         network, finding = _placed(found), found.finding
-    options = {"method": method, "max_steps": max_iterations + 1, "progress": progress}
+    options = {"search": METHODS[method], "max_steps": max_iterations + 1, "progress": progress}
     again = lambda problem, values: minimise(problem, values, **options)
 
     def begin(network, cameras=MappingProxyType({})):
@@ -117,17 +116,18 @@ def adjust(
         if network is fewer:
             break
         problem, minimum, check = begin(network, cameras)
-    if (robust or snooping) and not solved(with_factor(problem), minimum):
+    if (robust or snooping) and not solved(problem.with_factor(), minimum):
         screened = screen(network)
         if len(screened.observations) < len(network.observations):
             problem, minimum, check = begin(screened)
-    network, used = problem.network, problem.structure.reduction
-    problem = with_factor(problem)
+    network, used = problem.network, problem.reduction
+    problem = problem.with_factor()
 
     removed, eliminated, factors, reweighted, suspects, doubt = [], [], {}, None, [], None
     if robust:
         reweighted, minimum = robustly(problem, minimum, again, robust)
-        problem, suspects = reweighted.found.problem, reweighted.suspects(significance)
+        suspects = [name_suspect(problem, s) for s in reweighted.suspects(significance)]
+        problem = problem.with_system(reweighted.found.problem)
         doubt = doubt_of_robust(reweighted.scale, problem.counts.redundancy)
     inspection = solved(problem, minimum)
     if inspection and (snooping or estimate_components or eliminate):
@@ -150,7 +150,7 @@ def adjust(
     intersected = None
     if len(check[0]):
         intersected = lambda result: intersect_check_points(
-            result.inspection, result.values, *check, factors
+            result.inspection, *check, factors
         )
     return Adjustment(
         network, problem, minimum, removed=tuple(removed), eliminated=tuple(eliminated),

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from jaxbundle.adjustment import Problem, solve
+from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.solve import solve
 from jaxbundle.arguments import positive, shown, whole
 from jaxbundle.cameras import CameraModel, project
 from jaxbundle.errors import InputError

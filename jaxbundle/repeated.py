@@ -5,25 +5,21 @@ import dataclasses
 import equinox as eqx
 import numpy as np
 
-from jaxbundle.adjustment.problem import Problem, count_rows
-from jaxbundle.adjustment.unknowns import Name
+from jaxbundle.adjustment.problem import Problem
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import NotSolvedError
+from jaxbundle.leastsquares.components import Component, rescale, variance_components
+from jaxbundle.leastsquares.names import Name
+from jaxbundle.leastsquares.robust import residual_lengths, reweight, robust_scale
+from jaxbundle.leastsquares.snooping import Removed, snoop, without
+from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.network.arrays import Values
 from jaxbundle.result import Adjustment
 from jaxbundle.solution import require_solved, solved
-from jaxbundle.statistics import (
-    Component,
-    Inspection,
-    contradicts,
-    doubt_of_baarda,
-    rescale,
-    reweight,
-    robust_scale,
-    snoop,
-    variance_components,
-)
-from jaxbundle.statistics.snooping import Removed, without
+from jaxbundle.statistics.blunders import name_removed
+from jaxbundle.statistics.components import groups
+from jaxbundle.statistics.inspection import Inspection
+from jaxbundle.statistics.misfit import contradicts, doubt_of_baarda
 
 CORE_PARAMETERS = ("c", "x0", "y0", "fx", "fy", "cx", "cy", "f")
 """Interior parameters that are never eliminated for want of significance."""
@@ -35,20 +31,21 @@ ROUNDS = 20
 def snooped(found: Inspection, minimum, again, test: str, significance: float):
     """The problem and its minimum without blunders, what was removed, and what is to be said of σ
     that the test trusts though the data contradict them."""
-    whole, doubt = found, None
-    repeat = _Repeat(again, "after data snooping", minimum)
-    found, removed = snoop(found, repeat, test=test, significance=significance)
-    counts = whole.problem.counts
+    problem, whole, doubt = found.problem, found.solution, None
+    repeat = _Repeat(problem, again, "after data snooping", minimum)
+    solution, removed = snoop(whole, repeat, test=test, significance=significance)
+    removed = [name_removed(problem, r) for r in removed]
+    counts = problem.counts
     if test == "baarda" and counts.redundancy > 0:
-        scale = _scale_of_good(whole, _Repeat(again, "after data snooping", minimum))
+        scale = _scale_of_good(whole, _Repeat(problem, again, "after data snooping", minimum))
         rays = sum(len(r.rows) for r in removed if r.kind == "image")
         doubt = doubt_of_baarda(
             scale, rays, counts.observations // 2, counts.redundancy, significance
         )
-    return found.problem, repeat.minimum, removed, doubt
+    return problem.with_system(solution.problem), repeat.minimum, removed, doubt
 
 
-def _scale_of_good(found: Inspection, repeat: "_Repeat") -> float:
+def _scale_of_good(found: Solution, repeat: "_Repeat") -> float:
     """The robust scale of the image points, whatever the a priori σ.
 
     What Baarda's test leaves fits too well, for it is what fitted; and blunders spread over the
@@ -56,25 +53,26 @@ def _scale_of_good(found: Inspection, repeat: "_Repeat") -> float:
     Tukey's estimator does not suspect, whose own scale is a posteriori.
     """
     problem = found.problem
-    scale = robust_scale(problem, found.lengths)
+    scale = robust_scale(problem, residual_lengths(found))
     if scale < 1 or not contradicts(scale, problem.counts.redundancy):
         return scale
     try:
-        tukey = reweight(problem, found.adjusted, repeat, "tukey")
+        tukey = reweight(problem, found.values, repeat, "tukey")
     except NotSolvedError:
         return scale
-    suspects = [Removed("image", s.row, s.name, s.test) for s in tukey.suspects()]
+    suspects = [Removed(s.set, s.row, None, s.test) for s in tukey.suspects()]
     if not suspects:
         return scale
-    return robust_scale(without(problem, *suspects), tukey.lengths * tukey.scale)
+    lengths = {o: t * tukey.scale for o, t in tukey.lengths.items()}
+    return robust_scale(without(problem, suspects), lengths)
 
 
 def robustly(problem: Problem, minimum, again, estimator: str):
     """The solution with the weights of a robust estimator, and its minimum. The first weights come
     from the minimum, or from the start values if it is no solution."""
-    repeat = _Repeat(again, "by robust estimation", minimum)
+    repeat = _Repeat(problem, again, "by robust estimation", minimum)
     first = minimum.values if solved(problem, minimum) else problem.data.start
-    reweighted = reweight(problem, first, repeat, estimator)
+    reweighted = reweight(problem.system, problem.layout.tables(first), repeat, estimator)
     if not reweighted.rests:
         raise NotSolvedError(
             f"not solved by robust estimation: the weights of {estimator} do not come to rest; use "
@@ -84,14 +82,15 @@ def robustly(problem: Problem, minimum, again, estimator: str):
 
 
 class _Repeat:
-    """Adjusts a changed problem, and keeps the minimum."""
+    """Adjusts a changed system of a problem, and keeps the minimum."""
 
-    def __init__(self, again, when: str, minimum):
-        self.again, self.when, self.minimum = again, when, minimum
+    def __init__(self, problem: Problem, again, when: str, minimum):
+        self.problem, self.again, self.when, self.minimum = problem, again, when, minimum
 
-    def __call__(self, problem: Problem, values: Values) -> Inspection:
-        self.minimum = self.again(problem, values)
-        return require_solved(problem, self.minimum, self.when)
+    def __call__(self, system, tables) -> Solution:
+        problem = self.problem.with_system(system)
+        self.minimum = self.again(problem, self.problem.layout.values(tables))
+        return require_solved(problem, self.minimum, self.when).solution
 
 
 def with_components(problem, minimum, again, tolerance: float = 1e-3):
@@ -101,16 +100,15 @@ def with_components(problem, minimum, again, tolerance: float = 1e-3):
     """
     factors: dict[str, float] = {}
     for done in range(ROUNDS + 1):
-        found = Inspection(problem, minimum.values).reliability
-        components = variance_components(problem, problem.data, found, factors)
+        found = Inspection(problem, minimum.values).solution
+        components = variance_components(found, groups(problem), factors)
         estimable = {name: c for name, c in components.items() if c.usable}
         factors = {name: c.factor for name, c in estimable.items()} | factors
         open_ones = [name for name, c in estimable.items() if abs(c.ratio - 1) >= tolerance]
         if done == ROUNDS or not open_ones:
             break
         ratios = {name: c.ratio for name, c in estimable.items()}
-        data = rescale(problem.network.cameras, problem.structure, problem.data, ratios)
-        problem = dataclasses.replace(problem, data=data)
+        problem = problem.with_system(rescale(problem.system, groups(problem), ratios))
         minimum = again(problem, minimum.values)
         require_solved(problem, minimum, "with the estimated variance components")
         factors |= {name: c.sigma for name, c in estimable.items()}
@@ -149,25 +147,16 @@ def eliminated_parameters(problem, minimum, again, critical_t):
 
 
 def _without_parameter(problem: Problem, values: Values, name: Name):
-    s, data = problem.structure, problem.data
     c = [camera.id for camera in problem.network.cameras].index(name.id)
-    model = get_model(problem.network.cameras[c].model)
-    column = model.parameters.index(name.parameter)
-    position = np.flatnonzero(
-        (np.asarray(s.camera_columns)[c] == column) & (np.asarray(s.camera_free)[c] > 0)
-    )[0]
-    s = eqx.tree_at(
-        lambda s: s.camera_free,
-        dataclasses.replace(s, all_free=False),
-        s.camera_free.at[c, position].set(0.0),
-    )
-    data = eqx.tree_at(
-        lambda d: d.start.camera, data, data.start.camera.at[c, column].set(0.0)
-    )
-    row = np.flatnonzero(np.asarray(s.interior) == c)
+    column = get_model(problem.network.cameras[c].model).parameters.index(name.parameter)
+    zero = lambda v: eqx.tree_at(lambda v: v.camera, v, v.camera.at[c, column].set(0.0))
+    data = dataclasses.replace(problem.data, start=zero(problem.data.start))
+    row = np.flatnonzero(problem.layout.given["interior"] == c)
     if len(row):
         weight = data.interior_weight.at[row[0], column].set(0.0)
-        data = eqx.tree_at(lambda d: d.interior_weight, data, weight)
-    values = eqx.tree_at(lambda v: v.camera, values, values.camera.at[c, column].set(0.0))
-    counts = count_rows(s, data)
-    return dataclasses.replace(problem, structure=s, data=data, counts=counts), values
+        data = dataclasses.replace(data, interior_weight=weight)
+    table = next(t for t in problem.layout.cameras if c in t.cameras)
+    row = np.flatnonzero(table.cameras == c)
+    moving = problem.system.table(table.name).space.moving.index(column)
+    problem = problem.with_data(data).hold(table.name, row, [moving])
+    return problem, zero(values)

@@ -14,14 +14,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle import plotting, report, result_tables
-from jaxbundle.adjustment.jacobian import zero_tangent
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.adjustment.solve import converged
-from jaxbundle.adjustment.solver import TERMINATIONS, Minimum
 from jaxbundle.adjustment.unknowns import (
-    Name,
     angles_near,
-    interior_names,
     named,
     place_of,
     value_of,
@@ -29,28 +24,27 @@ from jaxbundle.adjustment.unknowns import (
 from jaxbundle.arguments import at_least_zero
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import NotSolvedError
-from jaxbundle.network.arrays import Tangent, Values, retract
+from jaxbundle.leastsquares.components import Component, variance_components
+from jaxbundle.leastsquares.distributions import chi2_quantile
+from jaxbundle.leastsquares.names import Name
+from jaxbundle.leastsquares.reduction import FACTORS
+from jaxbundle.leastsquares.reliability import Reliability
+from jaxbundle.leastsquares.robust import Reweighted, residual_lengths, robust_scale
+from jaxbundle.leastsquares.solver import Minimum
+from jaxbundle.leastsquares.stopping import SINGULAR, TERMINATIONS
+from jaxbundle.leastsquares.stopping import converged as reached_minimum
+from jaxbundle.network.arrays import Values
 from jaxbundle.network.columns import some
-from jaxbundle.network.reduction import FACTORS
 from jaxbundle.network.tables import Network
 from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.orientation.exchanges import CONTRADICTION
-from jaxbundle.statistics import (
-    CheckPoints,
-    Component,
-    Inspection,
-    Reach,
-    Reliability,
-    Removed,
-    Reweighted,
-    Suspect,
-    chi2_quantile,
-    distortion_reach,
-    doubt_of_fit,
-    robust_scale,
-    variance_components,
-)
+from jaxbundle.statistics.blunders import Removed, Suspect
+from jaxbundle.statistics.check_points import CheckPoints
+from jaxbundle.statistics.components import groups
+from jaxbundle.statistics.inspection import Inspection
+from jaxbundle.statistics.misfit import doubt_of_fit
+from jaxbundle.statistics.validity import Reach, distortion_reach
 from jaxbundle.statistics.weakness import Weakness, weakness
 
 
@@ -106,10 +100,10 @@ class Adjustment:
         self.eliminated = eliminated
         self.undetermined = undetermined
         self.method = method
-        self.reduction = reduction or problem.structure.reduction
+        self.reduction = reduction or problem.reduction
         self.sigma_factors = dict(sigma_factors or {})
         self.robust = robust
-        self.weights = None if reweighted is None else reweighted.weights[problem.rays]
+        self.weights = None if reweighted is None else _of_image_points(problem, reweighted.weights)
         self.robust_scale = None if reweighted is None else reweighted.scale
         self.suspects = suspects
         self._doubts = doubts
@@ -123,13 +117,13 @@ class Adjustment:
     @property
     def converged(self) -> bool:
         """Whether a minimum was reached and everything in it is determined."""
-        return bool(converged(int(self.minimum.termination))) and not self.undetermined
+        return bool(reached_minimum(int(self.minimum.termination))) and not self.undetermined
 
     @property
     def termination(self) -> str:
         """Why the iterations ended, in words."""
         if self.undetermined:
-            return TERMINATIONS[3]
+            return TERMINATIONS[SINGULAR]
         return TERMINATIONS[int(self.minimum.termination)]
 
     @property
@@ -165,7 +159,7 @@ class Adjustment:
 
     @functools.cached_property
     def _scale(self) -> float:
-        return robust_scale(self.problem, self.inspection.lengths)
+        return robust_scale(self.problem.system, residual_lengths(self.inspection.solution))
 
     @functools.cached_property
     def doubts(self) -> tuple[str, ...]:
@@ -245,26 +239,29 @@ class Adjustment:
         return self._inspection or Inspection(self.problem, self.values)
 
     @property
-    def cofactors(self):
-        """Blocks of the cofactor matrix (see `jaxbundle.statistics.cofactors`)."""
-        if self.problem.structure.reduction not in FACTORS:
+    def cofactors(self) -> Inspection:
+        """The inspection, where there is a factor to compute cofactors from.
+
+        **Raises:** `NotSolvedError`."""
+        if self.problem.reduction not in FACTORS:
             raise NotSolvedError(
-                f"the reduced system of {self.problem.structure.reduced_size} unknowns was solved "
+                f"the reduced system of {self.problem.system.reduced_size} unknowns was solved "
                 "by iteration and its factor does not fit into memory: there are coordinates, σ0 "
                 "and covariances of single unknowns (`covariance`), but no others"
             )
-        return self.inspection.cofactors
+        return self.inspection
 
     @property
     def reliability(self) -> Reliability:
         """Redundancy numbers and w of all observations, in the order of the arrays."""
-        return self.inspection.reliability
+        return self.cofactors.reliability
 
     @functools.cached_property
     def variance_components(self) -> dict[str, Component]:
         """For every group of observations σ̂ over the a priori σ it was given, and σ̂ itself."""
+        self.cofactors
         return variance_components(
-            self.problem, self.problem.data, self.reliability, self.sigma_factors
+            self.inspection.solution, groups(self.problem), self.sigma_factors
         )
 
     @functools.cached_property
@@ -290,12 +287,11 @@ class Adjustment:
     @functools.cached_property
     def image_covariance(self) -> Float[np.ndarray, "images 6 6"]:
         """Covariance of X0, Y0, Z0, ω, φ, κ, angles by their exact Jacobian; radians."""
-        s = self.problem.structure
-        Q = np.asarray(self.cofactors.image)[: s.images, :6, :6]
-        A = np.zeros((s.images, 6, 6))
+        Q = self.cofactors.image_cofactors
+        A = np.zeros((len(Q), 6, 6))
         A[:, :3, :3] = np.eye(3)
         A[:, 3:, 3:] = self._angles[1]
-        free = np.asarray(s.image_free)
+        free = self.problem.system.table("image").free
         Q = Q * free[:, :, None] * free[:, None, :]
         return self.sigma0**2 * A @ Q @ A.transpose(0, 2, 1)
 
@@ -307,8 +303,7 @@ class Adjustment:
     @functools.cached_property
     def point_covariance(self) -> Float[np.ndarray, "points 3 3"]:
         """Marginal covariance of every point; zero where it is fixed."""
-        points = self.problem.structure.points
-        return self.sigma0**2 * np.asarray(self.cofactors.point)[:points]
+        return self.sigma0**2 * self.cofactors.point_cofactors
 
     def camera_parameters(self, camera: str) -> dict[str, float]:
         """All parameters of a camera by name."""
@@ -323,12 +318,9 @@ class Adjustment:
 
     def camera_cofactor(self, camera: str) -> tuple[list[str], Float[np.ndarray, "n n"]]:
         """Names and cofactors of the free parameters of a camera."""
-        c, s = self._camera(camera), self.problem.structure
-        free = np.flatnonzero(np.asarray(s.camera_free)[c])
-        Q = self.cofactors.image[c, 6:, 6:] if s.own_camera else self.cofactors.camera[c]
-        Q = np.asarray(Q)[np.ix_(free, free)]
-        names = interior_names(self.problem, c)
-        return [names[i].parameter for i in free], Q
+        names, free = self.problem.interior(self._camera(camera))
+        Q = self.cofactors.camera_cofactors[self._camera(camera)]
+        return [names[i] for i in free], Q[np.ix_(free, free)]
 
     def _camera(self, camera: str) -> int:
         return place_of(camera, [given.id for given in self.problem.network.cameras], "camera")
@@ -361,14 +353,8 @@ class Adjustment:
 
     def covariance_of(self, function: Callable[[Values], jax.Array]) -> Float[np.ndarray, "n n"]:
         """Covariance of any differentiable function of the adjusted unknowns (`Values` → [n])."""
-        s, values = self.problem.structure, self.values
-        zero = zero_tangent(s)
-
-        def of_tangent(tangent: Tangent):
-            return jnp.atleast_1d(function(retract(s, values, tangent)))
-
-        rows = jax.jacrev(of_tangent)(zero)
-        return self.sigma0**2 * np.asarray(self.inspection.propagate(rows))
+        self._require_solved()
+        return self.sigma0**2 * self.inspection.propagate(function)
 
     # --- tables -----------------------------------------------------------------------------
 
@@ -467,3 +453,12 @@ def _all_angles(rotation, given):
         jax.vmap(angles_near)(rotation, zero, given),
         jax.vmap(jax.jacfwd(angles_near, 1))(rotation, zero, given),
     )
+
+
+def _of_image_points(problem: Problem, weights) -> Float[np.ndarray, " rays"]:
+    """The factors of the weights of image points, from those of the sets of observations."""
+    found = np.ones(len(problem.network.observations))
+    for o, s in enumerate(problem.layout.sets):
+        if s.field == "image":
+            found[slice(None) if s.rows is None else s.rows] = weights[o]
+    return found

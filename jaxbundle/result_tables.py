@@ -6,13 +6,9 @@
 import numpy as np
 
 from jaxbundle.cameras import get_model
+from jaxbundle.leastsquares.reliability import external_reliability, minimal_detectable
 from jaxbundle.network.tables import EXTERIOR
-from jaxbundle.statistics import (
-    correlation_matrix,
-    external_reliability,
-    minimal_detectable,
-    total_correlation,
-)
+from jaxbundle.statistics.correlation import correlation_matrix, total_correlation
 
 
 def cameras(adjustment) -> dict[str, dict]:
@@ -55,21 +51,20 @@ def parameters(adjustment) -> dict[str, np.ndarray]:
 def images(adjustment) -> dict[str, np.ndarray]:
     """Columns id, X0 … kappa, sX0 … skappa (angles in the network's unit), rays, rms (of v,
     image unit)."""
-    s = adjustment.problem.structure
+    problem = adjustment.problem
     scale = np.array([1, 1, 1, *[adjustment.angle_scale] * 3])
     values = adjustment.image_values * scale
     sigma = np.sqrt(np.clip(np.diagonal(adjustment.image_covariance, axis1=1, axis2=2), 0, None))
     sigma = sigma * scale
-    image = np.asarray(s.image)
-    table = {"id": np.array(adjustment.problem.network.images.id, dtype=object)}
+    table = {"id": np.array(problem.network.images.id, dtype=object)}
     table |= {name: values[:, i] for i, name in enumerate(EXTERIOR)}
     table |= {f"s{name}": sigma[:, i] for i, name in enumerate(EXTERIOR)}
-    return table | _rays_and_rms(adjustment, image, s.images)
+    return table | _rays_and_rms(adjustment, problem.image, len(values))
 
 
 def points(adjustment) -> dict[str, np.ndarray]:
     """Columns id, role, X, Y, Z, sX, sY, sZ, rays, rms (of v of its image points, image unit)."""
-    network, s = adjustment.problem.network, adjustment.problem.structure
+    problem, network = adjustment.problem, adjustment.problem.network
     sigma = np.sqrt(np.clip(np.diagonal(adjustment.point_covariance, axis1=1, axis2=2), 0, None))
     table = {
         "id": np.array(network.points.id, dtype=object),
@@ -77,7 +72,7 @@ def points(adjustment) -> dict[str, np.ndarray]:
     }
     table |= {axis: adjustment.point_values[:, i] for i, axis in enumerate("XYZ")}
     table |= {f"s{axis}": sigma[:, i] for i, axis in enumerate("XYZ")}
-    return table | _rays_and_rms(adjustment, np.asarray(s.point), s.points)
+    return table | _rays_and_rms(adjustment, problem.point, len(network.points))
 
 
 def _rays_and_rms(adjustment, of_ray, n: int) -> dict[str, np.ndarray]:
@@ -97,35 +92,32 @@ def residuals(adjustment) -> dict[str, np.ndarray]:
     """One row an observation: kind, image, point, axis, v, sigma (a priori), r, w (Baarda),
     tau (Pope), mdb, external, and weight (the factor) after robust estimation; image observations
     first, in the order they were given."""
-    s, data, found = adjustment.problem.structure, adjustment.problem.data, adjustment.reliability
-    network = adjustment.problem.network
+    problem, data, found = adjustment.problem, adjustment.problem.data, adjustment.reliability
+    network = problem.network
     images = np.array(network.images.id, dtype=object)
     points = np.array(network.points.id, dtype=object)
     cameras = np.array([c.id for c in network.cameras], dtype=object)
     blank = lambda rows: np.full(rows, "", dtype=object)
-    back = adjustment.problem.rays
-    image = np.asarray(s.image)[back]
-    point = np.asarray(s.point)[back]
     parts = [
-        ("image", images[image], points[point], ("x", "y"), back,
+        ("image", images[problem.image], points[problem.point], ("x", "y"),
          found.residual.image, data.image_weight, found.redundancy.image, found.w.image),
     ]  # fmt: skip
-    control = points[np.asarray(s.control)]
-    parts.append(("control", blank(len(control)), control, tuple("XYZ"), np.s_[:],
+    control = points[problem.layout.given["control"]]
+    parts.append(("control", blank(len(control)), control, tuple("XYZ"),
                   found.residual.control, data.control_weight, found.redundancy.control,
                   found.w.control))  # fmt: skip
-    exterior = images[np.asarray(s.exterior)]
-    parts.append(("prior", exterior, blank(len(exterior)), EXTERIOR, np.s_[:],
+    exterior = images[problem.layout.given["exterior"]]
+    parts.append(("prior", exterior, blank(len(exterior)), EXTERIOR,
                   found.residual.exterior, data.exterior_weight, found.redundancy.exterior,
                   found.w.exterior))  # fmt: skip
-    for row, c in enumerate(np.asarray(s.interior)):
+    for row, c in enumerate(problem.layout.given["interior"]):
         axes = get_model(network.cameras[c].model).parameters
         one = np.s_[row : row + 1, : len(axes)]
-        parts.append(("prior", cameras[[c]], blank(1), axes, np.s_[:],
+        parts.append(("prior", cameras[[c]], blank(1), axes,
                       found.residual.interior[one], data.interior_weight[one],
                       found.redundancy.interior[one], found.w.interior[one]))  # fmt: skip
-    a, b = (points[np.asarray(s.distance)[:, i]] for i in range(2))
-    parts.append(("distance", a, b, ("d",), np.s_[:], found.residual.distance[:, None],
+    a, b = (points[network.distances.points[:, i]] for i in range(2))
+    parts.append(("distance", a, b, ("d",), found.residual.distance[:, None],
                   data.distance_weight[:, None], found.redundancy.distance[:, None],
                   found.w.distance[:, None]))  # fmt: skip
     return _concatenate([_residual_rows(adjustment, *part) for part in parts])
@@ -145,9 +137,9 @@ def checks(adjustment) -> dict[str, np.ndarray]:
     return table | {"rays": found.rays}
 
 
-def _residual_rows(adjustment, kind, image, point, axes, order, v, weight, r, w):
+def _residual_rows(adjustment, kind, image, point, axes, v, weight, r, w):
     """The rows of one kind of observation [things × axes] as columns; weightless rows left out."""
-    v, weight, r, w = (np.asarray(x)[order] for x in (v, weight, r, w))
+    v, weight, r, w = (np.asarray(x) for x in (v, weight, r, w))
     if kind == "prior" and axes == EXTERIOR:
         unit = np.array([1, 1, 1, *[adjustment.angle_scale] * 3])
     else:

@@ -7,23 +7,18 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxbundle.adjustment.datum import move_to_datum
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.adjustment.sharding import distribute, find_minimum_of_shards
-from jaxbundle.adjustment.solve import converged, find_minimum, make_solver
-from jaxbundle.adjustment.solver import SINGULAR, TERMINATIONS, Minimum
-from jaxbundle.adjustment.unknowns import undetermined
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import NotSolvedError
+from jaxbundle.leastsquares.names import undetermined
+from jaxbundle.leastsquares.solution import find_minimum
+from jaxbundle.leastsquares.solver import Minimum
+from jaxbundle.leastsquares.stopping import SINGULAR, TERMINATIONS, converged
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.columns import some
-from jaxbundle.network.padding import filled, pad_values, without_filling
 from jaxbundle.network.tables import Camera
-from jaxbundle.statistics import Inspection
+from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.statistics.weakness import Weakness, weakness_of_unsolved
-
-RAYS_TO_SHARE = 10_000
-"""Networks with so many rays are distributed over the devices, where there are several."""
 
 MISJUDGED = 1.03
 """A principal distance that changed by more than this factor was too wrong for start values."""
@@ -37,19 +32,8 @@ RUNAWAY = 20.0
 
 def minimise(problem: Problem, start: Values, **options) -> Minimum:
     """Iterate from `start`; the datum and what is held stay those of the problem's own start."""
-    solver = make_solver(problem, **options)
-    structure, data, sizes = filled(problem.structure, problem.data)
-    if len(jax.devices()) > 1 and problem.structure.rays >= RAYS_TO_SHARE:
-        minimum = find_minimum_of_shards(solver, distribute(problem), start)
-        values = _move_to_datum(structure, pad_values(minimum.values, sizes), data.start)
-    else:
-        solver = dataclasses.replace(solver, structure=structure)
-        minimum = find_minimum(solver, data, pad_values(start, sizes))
-        values = minimum.values
-    return eqx.tree_at(lambda m: m.values, minimum, without_filling(values, problem.data.start))
-
-
-_move_to_datum = eqx.filter_jit(move_to_datum)
+    minimum = find_minimum(problem.system, problem.layout.tables(start), **options)
+    return dataclasses.replace(minimum, values=problem.layout.values(minimum.values))
 
 
 def solved(problem: Problem, minimum: Minimum) -> Inspection | None:
@@ -67,8 +51,9 @@ def names_of_defects(problem: Problem, minimum: Minimum) -> list[str]:
     values = minimum.values
     if bool(converged(int(minimum.termination))) and _collapsed(problem, values):
         return _collapsed(problem, values)
-    if problem.structure.reduction == "dense" and problem.structure.reduced_size <= EIGENVECTORS:
-        return undetermined(problem, _last(problem, minimum), problem.data)
+    system = problem.system
+    if system.plan.reduction == "dense" and system.reduced_size <= EIGENVECTORS:
+        return undetermined(system, problem.layout.tables(_last(problem, minimum)))
     singular = bool(converged(int(minimum.termination))) or int(minimum.termination) == SINGULAR
     return list(weakness_without_solution(problem, minimum).unknowns) if singular else []
 

@@ -15,7 +15,7 @@ from jaxbundle.errors import NotSolvedError
 from jaxbundle.io import csv_tables
 from jaxbundle.io.result_json import result_dict, result_text, without_nan
 from jaxbundle.network.tables import EXTERIOR
-from jaxbundle.statistics.distributions import tau_quantile
+from jaxbundle.leastsquares.distributions import tau_quantile
 
 pytestmark = pytest.mark.xdist_group("bundle")
 

@@ -1,26 +1,25 @@
-"""A network made ready for the solver: index plan, arrays, datum and the count of its rows."""
+"""A network made ready for the engine: plan, arrays, datum and the count of its rows."""
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbundle.adjustment.datum import (
-    choose_minimal_coordinates,
-    choose_pins,
-    hold_the_datum,
-    open_directions_in_words,
-    open_similarities,
-)
 from jaxbundle.arguments import one_of
 from jaxbundle.errors import InputError
-from jaxbundle.network.arrays import Data
-from jaxbundle.network.reduction import FACTORS, REDUCTIONS
+from jaxbundle.leastsquares import problem as engine
+from jaxbundle.leastsquares.datum import CannotHold
+from jaxbundle.leastsquares.search import METHODS
+from jaxbundle.network.arrays import Data, Values
+from jaxbundle.network.datum_words import open_directions_in_words
+from jaxbundle.network.declare import Layout, declare, order_cameras
+from jaxbundle.network.kinds import SIMILARITY
+from jaxbundle.network.retraction import TurnAboutSeen
 from jaxbundle.network.sightings import split_check_points
-from jaxbundle.network.structure import Structure, make_structure, order_cameras
 from jaxbundle.network.tables import Network, require_network
+
+REDUCTIONS = ("dense", "banded", "iterative")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,23 +45,72 @@ class Counts:
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """What `jaxbundle.solve` solves: structure (indices) and data (numbers) of one network.
+    """What `jaxbundle.solve` solves: a network as the engine sees it.
 
-    `network` is the network as adjusted (cameras in the order of the arrays); `origin` [3] was
-    subtracted from all object coordinates; `rays` [observations]: the row of every observation of
-    the network in the arrays (big blocks have some empty rows there, of weight 0).
+    `network` is the network as adjusted (cameras in the order of the arrays); `data` its numbers,
+    `system` the engine's problem, `layout` how the arrays of the one stand in the other; `origin`
+    [3] was subtracted from all object coordinates.
     """
 
     network: Network
-    structure: Structure
+    system: engine.Problem
+    layout: Layout
     data: Data
     origin: Float[np.ndarray, "3"]
-    rays: Int[np.ndarray, " observations"]
     counts: Counts
+
+    @property
+    def image(self) -> Int[np.ndarray, " rays"]:
+        """The image of every image point, in the order of `data` and of the network."""
+        return self.network.observations.image
+
+    @property
+    def point(self) -> Int[np.ndarray, " rays"]:
+        """The object point of every image point."""
+        return self.network.observations.point
+
+    @property
+    def camera(self) -> Int[np.ndarray, " rays"]:
+        """The camera of every image point."""
+        return self.network.images.camera[self.image]
+
+    def interior(self, c: int) -> tuple[tuple[str, ...], Int[np.ndarray, " k"]]:
+        """The parameters of a camera that move in any camera of its model, and which of them are
+        free in this one."""
+        table = next(t for t in self.layout.cameras if c in t.cameras)
+        given = self.system.table(table.name)
+        row = int(np.flatnonzero(table.cameras == c)[0])
+        return given.parameters, np.flatnonzero(given.free[row])
+
+    @property
+    def reduction(self) -> str:
+        """How the reduced system is solved."""
+        return self.system.plan.reduction
+
+    def with_system(self, system: engine.Problem) -> "Problem":
+        """The same after its system was changed: weights, what is held."""
+        return self._with(system, self.layout.with_weights(self.data, system.data.weight))
+
+    def with_factor(self) -> "Problem":
+        """The same with a reduced system that can be factorised, as statistics need it; unchanged
+        where no factor fits into memory."""
+        return self.with_system(engine.with_factor(self.system))
+
+    def with_data(self, data: Data) -> "Problem":
+        """The same with other numbers (not other start values of what moves the datum)."""
+        return self._with(engine.with_data(self.system, self.layout.data(data)), data)
+
+    def hold(self, table: str, rows, columns=slice(None)) -> "Problem":
+        """The same with some unknowns held at their start values."""
+        return self._with(engine.hold(self.system, table, rows, columns), self.data)
+
+    def _with(self, system, data: Data) -> "Problem":
+        counts = count_rows(self.layout, system)
+        return dataclasses.replace(self, system=system, data=data, counts=counts)
 
 
 def make_problem(network: Network, reduction: str | None = None) -> Problem:
-    """Index plan, arrays and datum of a checked network (see `jaxbundle.network.check_network`).
+    """Plan, arrays and datum of a checked network (see `jaxbundle.network.check_network`).
 
     Check points take no part: they and their rays are left out.
 
@@ -76,43 +124,29 @@ def make_problem(network: Network, reduction: str | None = None) -> Problem:
     one_of("reduction", reduction, REDUCTIONS, none=True)
     require_network(network)
     network = order_cameras(split_check_points(network)[0])
-    ways = REDUCTIONS if reduction is None else (reduction,)
-    structure, data, origin, rays = make_structure(network, ways=ways)
-    gauge = open_similarities(structure, data)
-    defect = gauge.shape[1]
-    if network.datum == "control" and defect:
-        known = network.points.has_role("control") | network.points.has_role("fixed")
-        about = (network.points.position - origin)[known]
-        words = open_directions_in_words(gauge, about.mean(0) if len(about) else np.zeros(3))
-        raise InputError(
-            f"the datum is not fixed: the observations leave open {words}"
-            f" ({defect} of 7). Give control points or distances, or choose datum = \"inner\" "
-            "or \"minimal\"."
-        )
-    if defect:
-        structure = eqx.tree_at(lambda s: s.gauge, structure, jax.device_put(gauge))
-        structure = eqx.tree_at(
-            lambda s: s.datum_weight, structure,
-            jax.device_put(_datum_weight(network, structure, data)),
+    declared = declare(network)
+    chosen = _datum_points(network)
+    try:
+        system = engine.make_problem(
+            declared.tables, declared.observations, "point", motions=SIMILARITY,
+            datum=lambda gauge: _datum(network, gauge, declared.origin, chosen),
+            reduction=reduction, retraction=TurnAboutSeen,
         )  # fmt: skip
-        pins = jax.device_put(choose_pins(structure, data))
-        structure = eqx.tree_at(lambda s: s.pins, structure, pins)
-    return Problem(network, structure, data, origin, rays, count_rows(structure, data))
+    except CannotHold as error:
+        raise InputError(
+            f"the {int(chosen.sum())} datum points cannot hold the datum, of which "
+            f"{error.defect} of 7 parameters are open: give at least three free points that "
+            "are not on one line (datum_points), or leave the choice to the program"
+        ) from None
+    data = jax.device_put(declared.data)
+    counts = count_rows(declared.layout, system)
+    return Problem(network, system, declared.layout, data, declared.origin, counts)
 
 
-def with_factor(problem: Problem) -> Problem:
-    """The problem with a reduced system that can be factorised, as statistics need it; the same
-    where no factor fits into memory."""
-    s = problem.structure
-    if s.reduction in FACTORS:
-        return problem
-    plan, *_ = make_structure(problem.network, chunk=s.table.chunk, ways=FACTORS)
-    if plan.reduction is None:
-        return problem
-    s = dataclasses.replace(
-        s, reduction=plan.reduction, image_pairs=plan.image_pairs, band=plan.band
-    )
-    return dataclasses.replace(problem, structure=s)
+def make_solver(problem: Problem, method: str = "levenberg-marquardt", **options):
+    """The solver of a problem; `options` are those of `leastsquares.solver.LeastSquares`."""
+    one_of("method", method, tuple(METHODS))
+    return engine.make_solver(problem.system, search=METHODS[method], **options)
 
 
 def require_x64() -> None:
@@ -124,42 +158,51 @@ def require_x64() -> None:
         )
 
 
-def _datum_weight(network: Network, structure: Structure, data: Data):
+def _datum_points(network: Network):
+    """Which points hold the datum where it is open."""
     points = network.points
-    free = np.asarray(structure.point_free)
     if network.datum_points:
-        chosen = np.isin(np.array(points.id, dtype=object), network.datum_points)
-    else:
-        chosen = points.has_role("tie")
-        chosen = chosen if chosen.any() else points.has_role("control")
-    candidates = chosen[:, None] * free
-    if not hold_the_datum(structure, data, candidates):
+        return np.isin(np.array(points.id, dtype=object), network.datum_points)
+    chosen = points.has_role("tie")
+    return chosen if chosen.any() else points.has_role("control")
+
+
+def _datum(network: Network, gauge, origin, chosen):
+    """What holds the datum; refused where the network says that its observations do."""
+    if network.datum == "control":
+        points = network.points
+        about = (points.position - origin)[points.has_role("control", "fixed")]
+        words = open_directions_in_words(gauge, about.mean(0) if len(about) else np.zeros(3))
         raise InputError(
-            f"the {int(chosen.sum())} datum points cannot hold the datum, of which "
-            f"{structure.defect} of 7 parameters are open: give at least three free points that "
-            "are not on one line (datum_points), or leave the choice to the program"
+            f"the datum is not fixed: the observations leave open {words}"
+            f" ({gauge.shape[1]} of 7). Give control points or distances, or choose datum = "
+            "\"inner\" or \"minimal\"."
         )
-    if network.datum == "minimal":
-        return choose_minimal_coordinates(structure, data, candidates)
-    return candidates
+    return {"point": np.repeat(chosen[:, None].astype(float), 3, 1)}, network.datum == "minimal"
 
 
-def count_rows(structure: Structure, data: Data) -> Counts:
+def count_rows(layout: Layout, system: engine.Problem) -> Counts:
     """Rows that carry weight, datum conditions, free unknowns."""
-    number = lambda weight: int((np.asarray(weight) > 0).sum())
-    free = (structure.image_free, structure.camera_free, structure.point_free)
-    interior = np.take_along_axis(
-        np.asarray(data.interior_weight),
-        np.asarray(structure.camera_columns)[np.asarray(structure.interior)], 1,
-    )  # fmt: skip
+    number = dict.fromkeys(("image", "control", "exterior", "interior", "distance"), 0)
+    for s, weight in zip(layout.sets, system.data.weight):
+        number[s.field] += int((np.asarray(weight) > 0).sum())
     return Counts(
-        observations=number(data.image_weight),
-        control=number(data.control_weight),
-        exterior=number(data.exterior_weight),
-        interior=number(
-            interior * np.asarray(structure.camera_free)[np.asarray(structure.interior)]
-        ),
-        distances=number(data.distance_weight),
-        datum=structure.defect,
-        unknowns=sum(number(x) for x in free),
+        observations=number["image"], control=number["control"], exterior=number["exterior"],
+        interior=number["interior"], distances=number["distance"], datum=system.counts.datum,
+        unknowns=system.counts.unknowns,
     )  # fmt: skip
+
+
+def shifted_problem(network: Network, like: Problem, values: Values) -> Problem:
+    """Other points of a network with the orientations and cameras of `values`, without priors and
+    datum: for points that took no part."""
+    declared = declare(network, like.origin)
+    layout = declared.layout
+    start = dataclasses.replace(values, point=declared.data.start.point)
+    start = layout.tables(jax.tree.map(np.asarray, start))
+    tables = tuple(dataclasses.replace(t, value=start[t.name]) for t in declared.tables)
+    seen = len([s for s in layout.sets if s.field == "image"])
+    system = engine.make_problem(tables, declared.observations[:seen], "point")
+    layout = dataclasses.replace(layout, sets=layout.sets[:seen])
+    counts = count_rows(layout, system)
+    return Problem(network, system, layout, declared.data, like.origin, counts)

@@ -48,7 +48,7 @@ from jaxbundle.geometry import (
     matrix_from_rotation_vector,
     omega_phi_kappa_from_matrix,
 )
-from jaxbundle.statistics.snooping import check_test
+from jaxbundle.leastsquares.snooping import check_test
 
 OF_A_START = ("quaternion", "shift")
 """Poses as the solver has them, for data snooping alone."""

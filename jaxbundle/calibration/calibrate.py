@@ -31,13 +31,13 @@ from jaxbundle.calibration.start import Start, default_free, start_values
 from jaxbundle.cameras import CameraModel, get_model
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_quaternion
+from jaxbundle.leastsquares.snooping import check_test
 from jaxbundle.measure.boards import Board, require_board
 from jaxbundle.measure.ellipses import rim_centre_shift
 from jaxbundle.measure.views import BoardViews, measure_boards
 from jaxbundle.network.build import make_network
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.orientation.pose import Pose
-from jaxbundle.statistics.snooping import check_test
 
 SIGMA = 0.1
 """A priori σ of an image coordinate in pixels; σ0 of the result says what it was."""

@@ -15,16 +15,14 @@ Source: Rao (1948), Proceedings of the Cambridge Philosophical Society 44, 50-57
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.adjustment import residuals
-from jaxbundle.adjustment.jacobian import zero_tangent
 from jaxbundle.cameras import get_model
-from jaxbundle.network.arrays import retract
+from jaxbundle.leastsquares.spaces import Pose, PoseValue
+from jaxbundle.network.kinds import ImagePoint
 
 AFFINE = ("b1", "b2")
 CRITICAL = 4.0
@@ -67,10 +65,15 @@ def left_out(adjustment) -> LeftOut | None:
     if not names or given.pixel_size is None or not adjustment.sigma0 > 0:
         return None
     columns = tuple(model.parameters.index(name) for name in names)
-    problem = adjustment.problem
-    B, v, rows = _rows(problem.structure, columns, adjustment.values, problem.data)
-    B, v = np.asarray(B), np.asarray(v)
-    S = B @ B.T - np.asarray(adjustment.inspection.propagate(rows))
+    problem, solution = adjustment.problem, adjustment.inspection.solution
+    B, v = _slopes(problem, model, columns, adjustment.values)
+
+    def missed(tables):
+        """JᵀB as functions of the unknowns: B·v(unknowns), B held."""
+        values = problem.layout.values(tables)
+        return jnp.asarray(B) @ _residuals(problem, model, values, jnp.zeros(0), ()).ravel()
+
+    S = B @ B.T - solution.propagate(missed)
     cofactor = np.linalg.inv(S)
     b = -cofactor @ (B @ v)
     sigma = adjustment.sigma0 * np.sqrt(np.diagonal(cofactor))
@@ -80,19 +83,27 @@ def left_out(adjustment) -> LeftOut | None:
     return LeftOut(names, b, sigma, float(np.abs(b) @ reach / given.pixel_size[0]))
 
 
-@eqx.filter_jit
-def _rows(structure, columns, values, data):
-    """B [k, n], v [n] and JᵀB as k rows of the unknowns' tangents."""
+def _slopes(problem, model, columns, values):
+    """B [k, n] and v [n]."""
+    of = lambda b: _residuals(problem, model, values, b, columns).ravel()
+    zero = jnp.zeros(len(columns))
+    return np.asarray(jax.jacfwd(of)(zero)).T, np.asarray(of(zero))
 
-    def of(tangent, b):
-        at = retract(structure, values, tangent)
-        moved = at.camera.at[0, jnp.array(columns)].add(b)
-        at = dataclasses.replace(at, camera=moved)
-        return residuals(structure, at, data).image.ravel()
 
-    zero, none = zero_tangent(structure), jnp.zeros(len(columns))
-    v = of(zero, none)
-    B = jax.jacfwd(of, 1)(zero, none).T
-    _, back = jax.vjp(lambda tangent: of(tangent, none), zero)
-    rows = jax.vmap(lambda column: back(column)[0])(B)
-    return B, v, rows
+def _residuals(problem, model, values, b, columns):
+    """v/σ of all image points of the one camera, some of its parameters changed by b."""
+    p = values.camera[0, : len(model.parameters)]
+    p = p.at[jnp.array(columns, int)].add(b)
+    of = ImagePoint(problem.network.cameras[0].model, problem.network.residuals)
+    space = Pose()
+
+    def one(position, rotation, point, xy, weight):
+        pose = space.prepare(PoseValue(position, rotation))
+        v = of(pose, tuple(p), tuple(point), tuple(xy))
+        return jnp.where(weight > 0, weight * jnp.stack(v), 0.0)
+
+    i, data = problem.image, problem.data
+    return jax.vmap(one)(
+        values.position[i], values.rotation[i], values.point[problem.point], data.image_xy,
+        data.image_weight,
+    )  # fmt: skip

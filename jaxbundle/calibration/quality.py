@@ -190,7 +190,7 @@ class CrossValidation:
 
 def kept_rays(adjustment):
     """Which observations of the adjusted network were not removed as gross errors."""
-    weight = np.asarray(adjustment.problem.data.image_weight)[adjustment.problem.rays]
+    weight = np.asarray(adjustment.problem.data.image_weight)
     return (weight > 0).all(1)
 
 
@@ -287,15 +287,14 @@ def _rms(adjustment) -> float:
 def residuals_in_pixels(adjustment, camera):
     """Residuals v [n, 2] of the image points of a camera, and the points [n, 2], in pixels; v is
     NaN where a point was removed."""
-    s, data, model = adjustment.problem.structure, adjustment.problem.data, get_model(camera.model)
+    problem, data, model = adjustment.problem, adjustment.problem.data, get_model(camera.model)
     weight = np.asarray(data.image_weight)
-    rows = adjustment.problem.rays
-    v = np.asarray(adjustment.inspection.residuals.image)[rows]
-    used = (weight[rows] > 0).all(1)
-    v = np.where(used[:, None], v / np.where(used[:, None], weight[rows], 1.0), np.nan)
+    v = adjustment.inspection.residuals.image
+    used = (weight > 0).all(1)
+    v = np.where(used[:, None], v / np.where(used[:, None], weight, 1.0), np.nan)
     c = [given.id for given in adjustment.problem.network.cameras].index(camera.id)
-    own = np.asarray(s.camera)[rows] == c
-    xy = np.asarray(data.image_xy)[rows][own]
+    own = problem.camera == c
+    xy = np.asarray(data.image_xy)[own]
     size = np.array(unit_size(model, camera.pixel_size))
     uv = in_pixels(xy, model, camera.image_size, camera.pixel_size)
     return v[own] / size, uv

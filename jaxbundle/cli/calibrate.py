@@ -20,8 +20,8 @@ from jaxbundle.cli.app import Force, Quiet, app
 from jaxbundle.cli.progress import counting
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.result_json import unsolved_text
+from jaxbundle.leastsquares.snooping import check_test
 from jaxbundle.measure.views import photographs
-from jaxbundle.statistics.snooping import check_test
 from jaxbundle.targets import can_plot, check_writable, name_inside, written
 
 

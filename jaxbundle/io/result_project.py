@@ -28,7 +28,7 @@ def adjusted_network(adjustment) -> Network:
         )
         for camera in network.cameras
     )  # fmt: skip
-    used = (np.asarray(problem.data.image_weight)[problem.rays] > 0).any(1)
+    used = (np.asarray(problem.data.image_weight) > 0).any(1)
     roles = tuple("tie" if role == "control" else role for role in points.role)
     return network.replace(
         cameras=cameras,

@@ -29,13 +29,14 @@ class Cofactors(eqx.Module):
     `own`: of every row of every group, in the datum of the problem. The others are what residuals
     need, in the regularised datum of the factor (use them for estimable quantities only): `kept`,
     the blocks of the reduced system; `eliminated`; `coupled`, every eliminated row with the kept
-    row of its incidences. What is held has zeros.
+    row of its incidences; `lower_inverse`, L⁻¹ of the eliminated rows. What is held has zeros.
     """
 
     own: dict[str, Float[Array, "rows w w"]]
     kept: Reduced
     eliminated: Float[Array, "rows w w"] | None
     coupled: dict[str, Float[Array, "chunks length w v"]]
+    lower_inverse: Float[Array, "rows w w"] | None
 
 
 def cofactors(declared: Declared, values: Values, factor: Factor) -> Cofactors:
@@ -56,7 +57,9 @@ def cofactors(declared: Declared, values: Values, factor: Factor) -> Cofactors:
         eliminated = jnp.einsum("nji,njk,nkl->nil", L, inner, L)
         eliminated = eliminated * free[:, :, None] * free[:, None, :]
         own[plan.eliminated] = eliminated
-    return Cofactors(_in_datum(declared, values, factor, own), Q, eliminated, coupled)
+    return Cofactors(
+        _in_datum(declared, values, factor, own), Q, eliminated, coupled, factor.lower_inverse
+    )
 
 
 def _without_held(plan: Plan, Q: Reduced) -> Reduced:
@@ -130,12 +133,12 @@ def propagate(declared: Declared, values: Values, factor: Factor, rows: Tangent)
     """F·Q·Fᵀ in the datum for any linear functions F of the unknowns (first axis of `rows`): one
     structured solve for each function."""
     plan = factor.plan
-    from_datum = jax.vmap(lambda r: _datum_transposed(declared, plan, values, r))(rows)
+    from_datum = jax.vmap(lambda r: datum_transposed(declared, plan, values, r))(rows)
     solved = jax.vmap(lambda r: solve(factor, r))(from_datum)
     return sum(jnp.einsum("fni,gni->fg", from_datum[g], solved[g]) for g in from_datum)
 
 
-def _datum_transposed(declared, plan, values, row):
+def datum_transposed(declared, plan, values, row):
     """Sᵀ·f: f − B(GᵀB)⁻¹Gᵀf."""
     if plan.datum is None:
         return row

@@ -38,6 +38,16 @@ LONGEST = 1.0
 MOST_MOTIONS = 50
 
 
+class CannotHold(InputError):
+    """The unknowns chosen cannot hold the datum; `defect` of its parameters are open."""
+
+    def __init__(self, defect: int):
+        super().__init__(
+            f"the chosen unknowns cannot hold the datum, of which {defect} parameters are open"
+        )
+        self.defect = defect
+
+
 def generators(declared: Declared, values: Values) -> Tangent:
     """How every table moves along each motion, [rows, width, motions]; zero where it does not."""
     motions = len(declared.motions.names)
@@ -141,7 +151,7 @@ def make_datum(
     """The datum held by the unknowns with a `weight` (by table, [rows, width]); `minimal`: by as
     many of them as there are defects, chosen well spread.
 
-    **Raises:** `InputError` where they cannot hold it."""
+    **Raises:** `CannotHold`."""
     moves = {name: np.asarray(g) @ gauge for name, g in _generators(declared, data.start).items()}
     free = jax.tree.map(np.asarray, free_of_tables(plan, declared, data.start))
     weight = {name: np.asarray(w) * free[name] for name, w in weight.items()}
@@ -152,10 +162,7 @@ def make_datum(
     if np.isfinite(chosen).all():  # otherwise the solver will complain
         singular = np.linalg.svd(chosen / np.linalg.norm(directions, axis=0), compute_uv=False)
         if len(singular) < defect or singular[-1] < HELD * singular[0]:
-            raise InputError(
-                "the chosen unknowns cannot hold the datum, of which "
-                f"{defect} of {len(declared.motions.names)} parameters are open"
-            )
+            raise CannotHold(defect)
     if minimal:
         picked = _pick_rows(directions, candidates)
         cuts = np.cumsum([w.size for w in weight.values()])[:-1]

@@ -31,12 +31,17 @@ class Table:
     - `free`: [rows, width], whether each direction of each row is free (one value for all, or one
       a row); all are if not given. What is held is a given quantity, of which derivatives can be
       taken.
+    - `labels`: a name for every row, and `parameters` for the directions in which rows move, for
+      people; `title`: what one row is called, if not as the table.
     """
 
     name: str
     value: PyTree[np.ndarray]
     space: Space | None = None
     free: Any = None
+    labels: Sequence[str] | None = None
+    parameters: tuple[str, ...] = ()
+    title: str = ""
 
     def __post_init__(self):
         leaves = jax.tree.leaves(self.value)
@@ -61,10 +66,19 @@ class Table:
                 f"{list(np.shape(self.free))}"
             ) from None
         object.__setattr__(self, "free", free)
+        object.__setattr__(self, "title", self.title or self.name)
 
     @property
     def rows(self) -> int:
         return len(jax.tree.leaves(self.value)[0])
+
+    def label(self, row: int) -> str:
+        """The name of a row; its number, counted from 1, if it has none."""
+        return str(row + 1) if self.labels is None else str(self.labels[row])
+
+    def parameter(self, column: int) -> str:
+        """The name of a direction; its number, counted from 1, if it has none."""
+        return self.parameters[column] if self.parameters else str(column + 1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,6 +94,8 @@ class Kind:
       so is what it returns: quicker where there are many observations.
     - `of`: the names of the tables it touches, one for each block (one table may be touched twice).
     - `axes`: names of the residuals ("x", "y"), for reports.
+    - `snooped`: how it is tested for blunders, and removed: `"whole"` with all of its residuals,
+      `"single"` each residual by itself, `""` never, as priors.
     - `invariant`: it does not change when the whole problem is moved (see `Motions`), as image
       points do not: such kinds are not asked about the datum.
     """
@@ -89,6 +105,7 @@ class Kind:
     of: tuple[str, ...]
     axes: tuple[str, ...] = ()
     scalars: bool = False
+    snooped: str = "whole"
     invariant: bool = False
 
     def __call__(
@@ -155,6 +172,13 @@ class Observations:
     @property
     def number(self) -> int:
         return len(self.rows[0])
+
+    def label(self, tables: Sequence[Table], row: int) -> str:
+        """An observation in words: its kind and what it touches."""
+        called = {t.name: t for t in tables}
+        rows = zip(self.kind.of, self.rows)
+        touched = (f"{called[t].title} {called[t].label(int(r[row]))}" for t, r in rows)
+        return f"{self.kind.name} of {' and '.join(touched)}"
 
     def weight(self, residuals: int) -> Float[np.ndarray, "n ..."]:
         """The weights for so many residuals of an observation."""

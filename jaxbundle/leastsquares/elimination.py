@@ -27,6 +27,10 @@ PIVOT = 1e-13
 """A pivot below this fraction of its diagonal element is rounding: nothing determines it."""
 
 
+LIFT = 1e-10
+"""Added to normal equations that cannot be solved, in parts of their diagonal."""
+
+
 class Factor(eqx.Module):
     """N factorised: what is needed to solve with it, and to read blocks of its inverse."""
 
@@ -42,6 +46,15 @@ def damp(normal: Normal, damping: Float[Array, ""]) -> Normal:
     more = {name: damping * d for name, d in matrices(N.metric).items()}
     own = {name: B + more[name] for name, B in N.own.items()}
     eliminated = None if e is None else N.eliminated + more[e]
+    return Normal(normal.plan, dataclasses.replace(N, own=own, eliminated=eliminated))
+
+
+def lift(normal: Normal) -> Normal:
+    """N lifted by a little of its diagonal, so that it can be factorised where it is singular."""
+    N, e = normal.blocks, normal.plan.eliminated
+    more = lambda B: B + LIFT * jnp.diagonal(B, axis1=1, axis2=2)[:, :, None] * jnp.eye(B.shape[1])
+    own = {name: more(B) for name, B in N.own.items()}
+    eliminated = None if e is None else more(N.eliminated)
     return Normal(normal.plan, dataclasses.replace(N, own=own, eliminated=eliminated))
 
 

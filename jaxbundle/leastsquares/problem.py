@@ -1,12 +1,12 @@
 """A problem made ready for the solver: plan, numbers, and how many rows and unknowns it has."""
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
-import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.datum import find_open_motions, make_datum
@@ -14,8 +14,8 @@ from jaxbundle.leastsquares.declarations import Motions, Observations, Table
 from jaxbundle.leastsquares.indices import common, finish, rounded
 from jaxbundle.leastsquares.plan import Plan, make_plan
 from jaxbundle.leastsquares.retraction import retract
-from jaxbundle.leastsquares.rows import Data, Declared
-from jaxbundle.leastsquares.solver import LeastSquares, minimise
+from jaxbundle.leastsquares.rows import Data, Declared, Values
+from jaxbundle.leastsquares.solver import LeastSquares
 from jaxbundle.leastsquares.stopping import Tolerance
 
 LARGE = 200_000
@@ -33,6 +33,27 @@ class Problem:
     data: Data
     sizes: dict
     counts: "Counts"
+    retraction: Callable
+
+    def table(self, name: str) -> Table:
+        """The table of this name."""
+        return next(t for t in self.tables if t.name == name)
+
+    def weights(self, o: int, weight=None) -> Float[np.ndarray, "n r"]:
+        """1/σ of the residuals of a set of observations, 0 where they do not count; of those with a
+        covariance the diagonal of L⁻¹."""
+        return _diagonal(np.asarray(self.data.weight[o] if weight is None else weight))
+
+    @property
+    def kept_rows(self) -> Bool[np.ndarray, " rows"]:
+        """Rows of the eliminated table that are kept."""
+        kept = np.zeros(self.table(self.plan.eliminated).rows, bool)
+        for name, group in self.plan.groups.items():
+            for m in group.members:
+                if m.table == self.plan.eliminated != name:
+                    rows = np.asarray(m.rows)
+                    kept[rows[rows < len(kept)]] = True
+        return kept
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,13 +71,14 @@ class Counts:
 
 def make_problem(
     tables: Sequence[Table], observations: Sequence[Observations], eliminate: str | None = None,
-    *, motions: Motions | None = None, datum_weight: dict[str, np.ndarray] | None = None,
-    minimal: bool = False,
+    *, motions: Motions | None = None, datum: Callable | None = None, retraction=None,
 ) -> Problem:  # fmt: skip
     """Plan and arrays of declared tables and observations.
 
-    `motions`: those that may be open; `datum_weight`: by table, the unknowns that hold the datum
-    then (`minimal`: as few of them as needed)."""
+    `motions`: those that may be open. `datum(gauge)` is asked where some are, with the combinations
+    [motions, defect] that change no observation: which unknowns are to hold the datum, [rows,
+    width] by table, and whether as few of them as needed. `retraction(declared)` gives the function
+    `(plan, values, change)` that says where a change leads, if not `Retraction`."""
     tables, observations = tuple(tables), tuple(observations)
     check(tables, observations)
     spaces = tuple((t.name, t.space) for t in tables)
@@ -66,30 +88,68 @@ def make_problem(
     sizes = common([sizes], lambda key, n: n if number > LARGE else rounded(n))
     plan = jax.device_put(finish(host, sizes))
     data = make_data(declared, tables, observations)
-    counts = Counts(
-        sum(int((np.asarray(_diagonal(w)) > 0).sum()) for w in data.weight),
-        sum(int((t.free > 0).sum()) for t in tables),
-    )
-    problem = Problem(tables, observations, declared, plan, data, sizes, counts)
-    return problem if motions is None else _with_datum(problem, datum_weight, minimal)
+    problem = Problem(tables, observations, declared, plan, data, sizes, count(tables, data),
+                      (retraction or Retraction)(declared))  # fmt: skip
+    return problem if motions is None else _with_datum(problem, datum)
 
 
-def _with_datum(problem: Problem, weight, minimal: bool) -> Problem:
+def _with_datum(problem: Problem, choose: Callable | None) -> Problem:
     data = pad_data(problem, problem.data)
     real = {t.name: np.arange(problem.sizes["table", t.name]) < t.rows for t in problem.tables}
     gauge = find_open_motions(problem.declared, problem.plan, data, real)
     if not gauge.shape[1]:
         return problem
-    if weight is None:
+    if choose is None:
         raise InputError(f"the datum is open in {gauge.shape[1]} parameters: say what holds it")
-    fill = lambda t, w: np.concatenate(
-        [w, np.zeros((problem.sizes["table", t] - len(w), w.shape[1]))]
-    )
-    weight = {t: fill(t, np.asarray(w, float)) for t, w in weight.items()}
-    datum = jax.device_put(make_datum(problem.declared, problem.plan, data, gauge, weight, minimal))
-    plan = dataclasses.replace(problem.plan, datum=datum)
+    weight, minimal = choose(gauge)
+    weight = {
+        t: _longer(np.asarray(w, float), problem.sizes["table", t], "constant")
+        for t, w in weight.items()
+    }
+    datum = make_datum(problem.declared, problem.plan, data, gauge, weight, minimal)
+    plan = dataclasses.replace(problem.plan, datum=jax.device_put(datum))
     counts = dataclasses.replace(problem.counts, datum=gauge.shape[1])
     return dataclasses.replace(problem, plan=plan, counts=counts)
+
+
+def hold(problem: Problem, table: str, rows, columns=slice(None)) -> Problem:
+    """The problem with some unknowns held at their start values; they hold no datum any more."""
+    given = next(t for t in problem.tables if t.name == table)
+    free = given.free.copy()
+    free[np.ix_(np.atleast_1d(rows), np.arange(given.space.width)[columns])] = 0.0
+    tables = tuple(
+        dataclasses.replace(t, free=free) if t.name == table else t for t in problem.tables
+    )
+    wide = _longer(free, problem.sizes["table", table], "constant")
+    plan, groups = problem.plan, dict(problem.plan.groups)
+    for name, group in groups.items():
+        for m in group.members:
+            if m.table == table:
+                part = wide if m.rows is None else wide[np.asarray(m.rows)]
+                now = np.array(group.free)
+                now[:, m.start : m.start + m.width] *= part[: len(now)]
+                group = dataclasses.replace(group, free=jax.device_put(now), all_free=False)
+        groups[name] = group
+    if plan.datum is not None and table in plan.datum.weight:
+        weight = plan.datum.weight | {table: plan.datum.weight[table] * wide}
+        plan = dataclasses.replace(plan, datum=dataclasses.replace(plan.datum, weight=weight))
+    plan = dataclasses.replace(plan, groups=groups)
+    counts = dataclasses.replace(count(tables, problem.data), datum=problem.counts.datum)
+    return dataclasses.replace(problem, tables=tables, plan=plan, counts=counts)
+
+
+def with_data(problem: Problem, data: Data) -> Problem:
+    """The problem with other numbers of the same shapes."""
+    counts = dataclasses.replace(count(problem.tables, data), datum=problem.counts.datum)
+    return dataclasses.replace(problem, data=data, counts=counts)
+
+
+def count(tables, data: Data) -> Counts:
+    """Rows that carry weight, and free unknowns."""
+    return Counts(
+        sum(int((np.asarray(_diagonal(w)) > 0).sum()) for w in data.weight),
+        sum(int((t.free > 0).sum()) for t in tables),
+    )
 
 
 def check(tables, observations) -> None:
@@ -144,30 +204,34 @@ def _diagonal(weight):
 
 
 def pad_data(problem: Problem, data: Data) -> Data:
-    """The numbers filled to the sizes of the plan: rows repeat the last one, weights are 0."""
-    fill = lambda x, n: np.concatenate([np.asarray(x), np.zeros((n - len(x), *np.shape(x)[1:]))])
-    edge = lambda x, n: np.concatenate(
-        [np.asarray(x), np.repeat(np.asarray(x)[-1:], n - len(x), 0)]
-    )
-    size = problem.sizes
+    """The numbers filled to the sizes of the plan: weights are 0."""
+    fill = lambda o: lambda x: _longer(x, problem.sizes["observations", o], "constant")
     return jax.device_put(Data(
-        {
-            t: jax.tree.map(lambda x, t=t: edge(x, size["table", t]), v)
-            for t, v in data.start.items()
-        },
-        tuple(
-            jax.tree.map(lambda x, o=o: fill(x, size["observations", o]), m)
-            for o, m in enumerate(data.measured)
-        ),
-        tuple(fill(w, size["observations", o]) for o, w in enumerate(data.weight)),
+        pad_values(problem, data.start),
+        tuple(jax.tree.map(fill(o), m) for o, m in enumerate(data.measured)),
+        tuple(fill(o)(w) for o, w in enumerate(data.weight)),
     ))  # fmt: skip
 
 
-def make_solver(
-    problem: Problem, *, atol=1e-5, rtol=0.0, retraction=None, **options
-) -> LeastSquares:
+def pad_values(problem: Problem, values: Values) -> Values:
+    """The tables filled to the sizes of the plan: rows repeat the last one."""
+    fill = lambda t: lambda x: _longer(x, problem.sizes["table", t], "edge")
+    return {t: jax.tree.map(fill(t), rows) for t, rows in values.items()}
+
+
+def without_filling(problem: Problem, values: Values) -> Values:
+    """The tables in their own sizes."""
+    return {t.name: jax.tree.map(lambda x, n=t.rows: x[:n], values[t.name]) for t in problem.tables}
+
+
+def _longer(x, n: int, mode: str):
+    """At least one row more, so that there is one to which nothing refers."""
+    module = jnp if isinstance(x, jax.core.Tracer) else np
+    return module.pad(x, ((0, n - len(x)), *((0, 0),) * (x.ndim - 1)), mode=mode)
+
+
+def make_solver(problem: Problem, *, atol=1e-5, rtol=0.0, **options) -> LeastSquares:
     """The solver of a problem; `options` are those of `LeastSquares`."""
-    declared = problem.declared
     squares = sum(
         float(((np.asarray(w) * np.asarray(m)) ** 2).sum())
         for w, m in zip(problem.data.weight, problem.data.measured)
@@ -175,17 +239,14 @@ def make_solver(
     )
     to_device = lambda x: jax.device_put(np.float64(x))
     tolerance = Tolerance(to_device(problem.counts.redundancy), to_device(squares), atol, rtol)
-    return LeastSquares(
-        declared, problem.plan, tolerance, retraction or Retraction(declared), **options
-    )
+    return LeastSquares(problem.declared, problem.plan, tolerance, problem.retraction, **options)
 
 
 @dataclasses.dataclass(frozen=True)
 class Retraction:
-    declared: Any
+    """Every table moves by the rule of its space."""
+
+    declared: Declared
 
     def __call__(self, plan, values, change):
         return retract(self.declared, plan, values, change)
-
-
-find_minimum = eqx.filter_jit(minimise)

@@ -15,6 +15,7 @@ Of observations with a covariance, v/σ stands for L⁻¹·v.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbundle.leastsquares.cofactors import Cofactors
@@ -36,11 +37,13 @@ ROWS_AT_ONCE = 1 << 16
 
 
 class Reliability(eqx.Module):
-    """By set of observations, [n, r]: v/σ, redundancy number, Baarda's w (NaN where r is zero)."""
+    """By set of observations, [n, r]: v/σ, redundancy number, Baarda's w (NaN where r is zero), and
+    the part of h = 1 − r that the eliminated row of the observation alone has in it."""
 
     residual: dict[int, Float[Array, "n r"]]
     redundancy: dict[int, Float[Array, "n r"]]
     w: dict[int, Float[Array, "n r"]]
+    own: dict[int, Float[Array, "n r"]]
 
 
 @eqx.filter_jit
@@ -49,12 +52,12 @@ def reliability(
 ) -> Reliability:
     """Redundancy numbers and test statistics of all observations."""
     laid = lay_out_data(plan, data)
-    residual, hat = hat_diagonal(declared, plan, values, laid, Q)
-    residual, hat = in_given_order(plan, residual), in_given_order(plan, hat)
+    found = hat_diagonal(declared, plan, values, laid, Q)
+    residual, hat, own = (in_given_order(plan, rows) for rows in found)
     number = lambda h, weight: jnp.where(weight > 0, jnp.clip(1.0 - h, 0.0, 1.0), 0.0)
     r = {o: number(h, _diagonal(data.weight[o])) for o, h in hat.items()}
     test = lambda v, r: jnp.where(r > UNCONTROLLED, v / jnp.sqrt(jnp.maximum(r, 1e-300)), jnp.nan)
-    return Reliability(residual, r, {o: test(residual[o], r[o]) for o in r})
+    return Reliability(residual, r, {o: test(residual[o], r[o]) for o in r}, own)
 
 
 def _diagonal(weight):
@@ -62,15 +65,20 @@ def _diagonal(weight):
 
 
 def hat_diagonal(declared: Declared, plan: Plan, values: Values, laid: Laid, Q: Cofactors):
-    """v/σ and h = diag(J·Q·Jᵀ) of every part, [chunks, length, r], from the blocks of Q that each
-    observation touches."""
+    """v/σ, h = diag(J·Q·Jᵀ) and its part E·V⁻¹·Eᵀ of the eliminated row alone, of every part,
+    [chunks, length, r], from the blocks of Q that each observation touches."""
     prepared = prepare(declared, values)
-    residual, hat = [], []
+    residual, hat, own = [], [], []
     for number, part in enumerate(plan.parts):
         r, touches, E = differentiate(declared, plan, number, prepared, laid)
         residual.append(r)
         hat.append(_of_part(plan, part, touches, E, Q))
-    return tuple(residual), tuple(hat)
+        own.append(jnp.zeros_like(r) if E is None else _of_eliminated(part, E, Q))
+    return tuple(residual), tuple(hat), tuple(own)
+
+
+def _of_eliminated(part: Part, E, Q: Cofactors):
+    return jnp.sum(jnp.einsum("clri,clji->clrj", E, Q.lower_inverse[part.eliminated]) ** 2, -1)
 
 
 def _of_part(plan: Plan, part: Part, touches, E, Q: Cofactors):
@@ -134,3 +142,18 @@ def _of_kept(part: Part, at, Q: Cofactors):
         blocks[couple.first][couple.second] = found
         blocks[couple.second][couple.first] = found.T
     return jnp.block(blocks)
+
+
+def minimal_detectable(sigma, redundancy, delta0: float = 4.13) -> Float[np.ndarray, "..."]:
+    """Smallest blunder found by the w-test, in the unit of σ (δ0 = 4.13: α 0.1 %, power 80 %)."""
+    r = np.asarray(redundancy)
+    return np.where(
+        r > UNCONTROLLED, np.asarray(sigma) * delta0 / np.sqrt(np.maximum(r, UNCONTROLLED)), np.inf
+    )
+
+
+def external_reliability(redundancy, delta0: float = 4.13) -> Float[np.ndarray, "..."]:
+    """Largest effect of an undetected blunder on any unknown, in units of that unknown's σ."""
+    r = np.asarray(redundancy)
+    bounded = np.maximum(r, UNCONTROLLED)
+    return np.where(r > UNCONTROLLED, delta0 * np.sqrt((1 - bounded) / bounded), np.inf)

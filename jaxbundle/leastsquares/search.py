@@ -104,6 +104,19 @@ class NielsenTrustRegion(optx.AbstractSearch):
         return radius, accept, optx.RESULTS.successful, RegionState(radius, reduction)
 
 
+class FullStep(optx.AbstractSearch):
+    """Gauss–Newton: every step undamped, every step taken."""
+
+    def init(self, y: Tangent, f_info_struct: Info) -> None:
+        return None
+
+    def step(self, first_step, y, y_eval, f_info, f_eval_info, state: None):
+        return jnp.asarray(jnp.inf), jnp.asarray(True), optx.RESULTS.successful, None
+
+
+METHODS = {"levenberg-marquardt": NielsenTrustRegion(), "gauss-newton": FullStep()}
+
+
 def promise(info: Info, change: Tangent, cost: Float[Array, ""]):
     """The decrease of ½vᵀPv that a damped step promised, ½(−gᵀδ + λ·δᵀDδ), and the fraction it
     kept; −1 where that cannot be computed. A promise below rounding is kept unless the sum of

@@ -110,6 +110,11 @@ class Turned(NamedTuple):
         second = cross(self.turn, first)
         return tuple(a + b + 0.5 * c for a, b, c in zip(ray, first, second))
 
+    def matrix(self):
+        """M as an array [3, 3]."""
+        columns = [self.apply(axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))]
+        return jnp.stack([jnp.stack(column) for column in columns], 1)
+
     def apply_inverse(self, x):
         """Mᵀ·x."""
         if self.turn is not None:

@@ -1,14 +1,16 @@
-"""The arrays an adjustment works on: unknowns, observations, and small changes of the unknowns.
+"""The arrays an adjustment works on, in the order of the network: unknowns and observations.
 
 Rotations live on the manifold: an image carries a unit quaternion, and its change is a rotation
 vector δθ in the camera frame, M ← exp([δθ]×)·M. Everything else adds. Object coordinates are
 relative to the network's `origin`, so that a national grid of 10⁷ m loses no digit.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jaxbundle.geometry import matrix_from_quaternion, retract_quaternion
 
@@ -19,12 +21,14 @@ class Values(eqx.Module):
     `camera`: interior orientation in the order of the model's parameters (padded with 0);
     `position`: projection centres; `rotation`: unit quaternions (w, x, y, z), object → camera;
     `point`: object coordinates. Positions and points are relative to the network's origin.
+    `other`: the tables that came with further kinds of observations, by name.
     """
 
     camera: Float[Array, "cameras parameters"]
     position: Float[Array, "images 3"]
     rotation: Float[Array, "images 4"]
     point: Float[Array, "points 3"]
+    other: dict[str, PyTree[Array]] = dataclasses.field(default_factory=dict)
 
 
 class Data(eqx.Module):
@@ -32,7 +36,7 @@ class Data(eqx.Module):
 
     A weight is 1/σ (a priori), in the reciprocal unit of its value; 0 switches a row off.
     `start` holds the start values of the unknowns, the values of what is fixed, and the
-    coordinates the datum refers to.
+    coordinates the datum refers to; `other` (measured, weight) of observations of further kinds.
     """
 
     start: Values
@@ -46,6 +50,16 @@ class Data(eqx.Module):
     interior_weight: Float[Array, "interior parameters"]
     distance: Float[Array, " distances"]
     distance_weight: Float[Array, " distances"]
+    other: tuple[tuple[PyTree[Array], Array], ...] = ()
+
+    def measured(self, kind: str) -> Array:
+        """What was measured, or is given, of a kind: image, control, exterior, interior,
+        distance."""
+        return self.image_xy if kind == "image" else getattr(self, kind)
+
+    def weight(self, kind: str) -> Array:
+        """The weights of a kind."""
+        return getattr(self, f"{kind}_weight")
 
 
 class Tangent(eqx.Module):

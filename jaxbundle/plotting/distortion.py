@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.cameras import get_model
-from jaxbundle.statistics import farthest_measurements, measured_centre
+from jaxbundle.statistics.validity import farthest_measurements, measured_centre
 
 AZIMUTHS = 12
 

@@ -12,7 +12,7 @@ def image_frame(adjustment, camera: str):
     **Returns:** lowest and highest (x, y), in the unit of the camera's model, and True if they
     follow from the image size; else the rectangle of the measurements, and False.
     """
-    network, s = adjustment.problem.network, adjustment.problem.structure
+    network = adjustment.problem.network
     c = camera_index(adjustment, camera)
     given, model = network.cameras[c], get_model(network.cameras[c].model)
     size, pitch = given.image_size, given.pixel_size
@@ -23,7 +23,7 @@ def image_frame(adjustment, camera: str):
     if size is not None and pitch is not None:
         half = np.array(size) * np.abs(pitch) / 2
         return -half, half, True
-    used = np.asarray(s.camera) == c
+    used = adjustment.problem.camera == c
     xy = np.asarray(adjustment.problem.data.image_xy)[used]
     if not len(xy):
         return -np.ones(2), np.ones(2), False
@@ -36,15 +36,15 @@ def measured(adjustment, image: str):
     Coordinates and v = computed − observed in the unit of the camera's model; τ and v of a
     coordinate that was removed are NaN.
     """
-    s, data = adjustment.problem.structure, adjustment.problem.data
+    problem, data = adjustment.problem, adjustment.problem.data
     i = image_index(adjustment, image)
     weight = np.asarray(data.image_weight)
-    rows = np.flatnonzero((np.asarray(s.image) == i) & (weight > 0).any(1))
+    rows = np.flatnonzero((problem.image == i) & (weight > 0).any(1))
     weight = np.where(weight[rows] > 0, weight[rows], np.nan)
     found = adjustment.reliability
     ids = np.array(adjustment.problem.network.points.id, dtype=object)
     return (
-        ids[np.asarray(s.point)[rows]],
+        ids[problem.point[rows]],
         np.asarray(data.image_xy)[rows],
         np.asarray(found.residual.image)[rows] / weight,
         adjustment.pope(np.asarray(found.w.image)[rows]),

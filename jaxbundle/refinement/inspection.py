@@ -19,10 +19,10 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.errors import NotSolvedError
+from jaxbundle.leastsquares.distributions import critical_w
+from jaxbundle.leastsquares.reliability import UNCONTROLLED
 from jaxbundle.refinement.equations import System, Unknowns, compiled_rescaled
 from jaxbundle.refinement.solver import Reduced, normal, polished, solve
-from jaxbundle.statistics.distributions import critical_w
-from jaxbundle.statistics.reliability import UNCONTROLLED
 
 Weak = Callable[[System, Unknowns], list[str]]
 """Sentences on what is not determined."""

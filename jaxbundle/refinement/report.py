@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from jaxbundle.leastsquares.reliability import minimal_detectable
 from jaxbundle.refinement.inspection import Blunder
 from jaxbundle.refinement.refining import Refinement
-from jaxbundle.statistics.reliability import minimal_detectable
 
 STRONG = 0.9
 """Correlations above this are listed."""

@@ -6,9 +6,8 @@ precision of an image coordinate is σ0 times its a priori σ, in the unit of th
 
 import numpy as np
 
-from jaxbundle.adjustment.datum import open_directions_in_words
-from jaxbundle.adjustment.solver import LIMIT, NOT_FINITE, SINGULAR, STUCK
 from jaxbundle.cameras import get_model
+from jaxbundle.leastsquares.stopping import LIMIT, NOT_FINITE, SINGULAR, STUCK
 from jaxbundle.network.columns import count, some
 from jaxbundle.network.tables import ROLES
 from jaxbundle.report.layout import (
@@ -85,23 +84,24 @@ def settings(adjustment) -> list[str]:
 
 def reduced_system(adjustment) -> str:
     """How large the system of images and cameras is, and how it was solved."""
-    s = adjustment.problem.structure
+    plan = adjustment.problem.system.plan
     how = REDUCTIONS[adjustment.reduction]
     if adjustment.reduction == "banded":
-        how += f" of {s.band.width * s.image_width} unknowns"
-    return f"{s.reduced_size} unknowns, {how}"
+        how += f" of {plan.band.width} unknowns"
+    return f"{adjustment.problem.system.reduced_size} unknowns, {how}"
 
 
 def datum(adjustment) -> str:
     """What the coordinates refer to, and what the observations leave open."""
-    network, s = adjustment.problem.network, adjustment.problem.structure
+    network, data = adjustment.problem.network, adjustment.problem.data
+    system = adjustment.problem.system
     defect = adjustment.counts.datum
     if not defect:
         known = [
             (int(network.points.has_role("control").sum()), "control point", ""),
             (int(network.points.has_role("fixed").sum()), "fixed point", ""),
-            (len(s.exterior), "image", " with a prior exterior orientation"),
-            (int((np.asarray(s.image_free) == 0).any(1).sum()), "image", " held"),
+            (len(data.exterior), "image", " with a prior exterior orientation"),
+            (int((system.table("image").free == 0).any(1).sum()), "image", " held"),
             (len(network.distances), "distance", ""),
         ]
         parts = [count(*part) for part in known if part[0]]
@@ -110,11 +110,11 @@ def datum(adjustment) -> str:
     if defect < 7:
         known = network.points.has_role("control", "fixed")
         about = (network.points.position[known] - adjustment.problem.origin).sum(0)
-        words = open_directions_in_words(np.asarray(s.gauge), about / max(known.sum(), 1))
+        words = open_directions_in_words(np.asarray(system.plan.datum.gauge), about / max(known.sum(), 1))
         if defect == 6 and "scale" not in words:
             words = "position and orientation"
         open_ones = f"defect {defect}: the observations leave open {words}"
-    weight = np.asarray(s.datum_weight) > 0
+    weight = np.asarray(system.plan.datum.weight["point"])[: len(network.points)] > 0
     ids = network.points.id
     if network.datum == "minimal":
         held = [f"{'XYZ'[i]} of {clean(ids[p])}" for p, i in zip(*np.nonzero(weight))]
@@ -132,7 +132,7 @@ def datum(adjustment) -> str:
 
 def counts(adjustment) -> list[str]:
     """How many of what, and the redundancy they leave."""
-    network, s, n = adjustment.problem.network, adjustment.problem.structure, adjustment.counts
+    network, n = adjustment.problem.network, adjustment.counts
     roles = [(role, int(network.points.has_role(role).sum())) for role in ROLES]
     kinds = [
         ("coordinates of control points", n.control),

@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 
+from jaxbundle.leastsquares.distributions import normal_quantile, tau_quantile
 from jaxbundle.network.columns import count
 from jaxbundle.report.head import image_unit, span
 from jaxbundle.report.layout import (
@@ -23,7 +24,6 @@ from jaxbundle.report.layout import (
     table,
     to_place_of,
 )
-from jaxbundle.statistics import normal_quantile, tau_quantile
 
 TESTS = {"pope": "tau", "baarda": "w"}
 SYMBOLS = {"pope": "τ", "baarda": "w"}

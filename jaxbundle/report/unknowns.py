@@ -173,7 +173,7 @@ def points(adjustment, most: int, accuracy_unit: float | None = None) -> list[st
 def _precision(adjustment, accuracy_unit) -> list[str]:
     found, unit = adjustment.points, clean(adjustment.network.object_unit)
     sigma = np.stack([found[f"s{axis}"] for axis in "XYZ"], 1)
-    free = np.asarray(adjustment.problem.structure.point_free) > 0
+    free = adjustment.problem.system.table("point").free > 0
     free = free & np.isfinite(sigma) & (sigma > 0)
     if not free.any():
         return ["No point has an estimated coordinate with a standard deviation."]

@@ -9,10 +9,10 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.adjustment.problem import make_problem, with_factor
+from jaxbundle.adjustment.problem import make_problem
 from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.reduction import FACTORS
 from jaxbundle.network.check import check_network
-from jaxbundle.network.reduction import FACTORS
 from jaxbundle.network.tables import Network
 from jaxbundle.statistics.inspection import Inspection
 
@@ -41,16 +41,15 @@ def expected_precision(network: Network) -> ExpectedPrecision:
 
     **Raises:** `InputError` for a network that cannot be adjusted.
     """
-    problem = with_factor(make_problem(check_network(network)))
-    if problem.structure.reduction not in FACTORS:
+    problem = make_problem(check_network(network)).with_factor()
+    if problem.reduction not in FACTORS:
         raise InputError("the planned network is too large for its covariance; plan a part of it")
     found = Inspection(problem, problem.data.start)
     if not found.determined:
         raise InputError("the planned network leaves something undetermined; plan more overlap")
-    s = problem.structure
     sigma = lambda Q: np.sqrt(np.clip(np.diagonal(np.asarray(Q), axis1=1, axis2=2), 0, None))
     points = problem.network.points
     return ExpectedPrecision(
-        points.id, points.role, sigma(found.cofactors.point)[: s.points],
-        sigma(found.cofactors.image)[: s.images, :3], problem.counts.redundancy,
+        points.id, points.role, sigma(found.point_cofactors),
+        sigma(found.image_cofactors)[:, :3], problem.counts.redundancy,
     )  # fmt: skip

@@ -1,20 +1,12 @@
 """What σ0 and the median residual say against the a priori σ.
 
-    s = median(t)/√(2·ln 2)·√(n/r)
-
-is the scale of the image points by the median of the lengths t of their residuals in σ, a median
-absolute deviation (MAD) in the plane: the median length of normal residuals is 1.1774 σ, smaller by
-the redundancy r of n observations. A few blunders do not move it, σ that are too small do; σ0 is
-moved by both, which tells them apart.
+A few blunders do not move the robust scale of the residuals (`leastsquares/robust.py`), σ that are
+too small do; σ0 is moved by both, which tells them apart.
 """
 
 import math
 
-import numpy as np
-from jaxtyping import Float
-
-from jaxbundle.adjustment.problem import Problem
-from jaxbundle.statistics.distributions import chi2_quantile
+from jaxbundle.leastsquares.distributions import chi2_quantile
 
 CONTRADICTED = 1.2
 """A scale beyond this factor contradicts the a priori σ, if it is beyond chance too."""
@@ -23,15 +15,6 @@ MANY = 0.05
 """More than this part of the image points, beyond those removed by chance, is worth a word."""
 UNRECOGNISABLE = 20.0
 """Residuals so many times their σ are most likely of coordinates in other axes or units."""
-
-
-def robust_scale(problem: Problem, lengths: Float[np.ndarray, " rays"]) -> float:
-    """s of the residual lengths |v/σ| of image points, in the order of the arrays; never 0."""
-    used = (np.asarray(problem.data.image_weight) > 0).any(1)
-    counts = problem.counts
-    share = counts.redundancy / max(counts.redundancy + counts.unknowns - counts.datum, 1)
-    scale = np.median(lengths[used]) / math.sqrt(2 * math.log(2)) / math.sqrt(max(share, 1e-3))
-    return max(float(scale), np.finfo(float).tiny)
 
 
 def contradicts(scale: float, redundancy: int) -> bool:

@@ -47,13 +47,13 @@ def distortion_reach(problem: Problem, values: Values) -> dict[str, Reach]:
 
 def farthest_measurements(problem: Problem, values: Values) -> Float[np.ndarray, " cameras"]:
     """The largest distance of a measurement of every camera from its principal point."""
-    s, data, cameras = problem.structure, problem.data, problem.network.cameras
+    data, cameras = problem.data, problem.network.cameras
     models = [get_model(given.model) for given in cameras]
     centre = np.array([
         measured_centre(model, p[: len(model.parameters)])
         for model, p in zip(models, np.asarray(values.camera))
     ])
-    camera = np.asarray(s.camera)
+    camera = problem.camera
     used = (np.asarray(data.image_weight) > 0).any(1)
     away = np.linalg.norm(np.asarray(data.image_xy) - centre[camera], axis=1)
     farthest = np.zeros(len(cameras))

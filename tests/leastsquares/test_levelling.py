@@ -35,7 +35,9 @@ def test_against_dense_algebra(held):
     free = np.ones(HEIGHTS)
     free[0] = 0 if held else 1
     table = Table("height", start, free=free)
-    datum = {} if held else {"motions": SHIFT, "datum_weight": {"height": np.ones((HEIGHTS, 1))}}
+    datum = {} if held else {
+        "motions": SHIFT, "datum": lambda gauge: ({"height": np.ones((HEIGHTS, 1))}, False)
+    }
     problem = make_problem([table], observations, **datum)
     data = pad_data(problem, problem.data)
     minimum = find_minimum(make_solver(problem), data, data.start)

@@ -1,0 +1,79 @@
+"""Rows that took no part: determined from the solution, with the uncertainty of what it knows.
+
+With V and W of their own observations and Q of the solution,
+
+    Q_XX = V⁻¹ + V⁻¹·Wᵀ·Q·W·V⁻¹.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.leastsquares.normal import normal_equations
+from jaxbundle.leastsquares.problem import Problem, pad_data, pad_values, without_filling
+from jaxbundle.leastsquares.retraction import changes_of_tables
+from jaxbundle.leastsquares.rows import Data, Values, lay_out_data
+from jaxbundle.leastsquares.solution import Solution
+
+STEPS = 20
+
+
+def determine(
+    found: Solution, problem: Problem
+) -> tuple[Values, Float[np.ndarray, "rows width width"]]:
+    """The eliminated rows of a problem whose other tables are those of a solution, and their
+    cofactors.
+
+    **Arguments:** `problem`: with the kept tables of the solution's problem, at their adjusted
+    values and as free as they are there.
+    """
+    plan, e = problem.plan, problem.plan.eliminated
+    data = pad_data(problem, problem.data)
+    values, inverse, spread = _intersect(problem.declared, plan, data)
+    number, cofactors = problem.table(e).rows, []
+    blank = {t.name: np.zeros((t.rows, t.space.width)) for t in found.problem.tables}
+    by_row = {g: _by_row(at, W) for (g, W), at in zip(spread.items(), plan.incidences.values())}
+    start = pad_values(problem, problem.data.start)
+    for row in range(number):
+        functions = []
+        for i in range(inverse.shape[1]):
+            change = {name: np.zeros(group.free.shape) for name, group in plan.groups.items()}
+            for g, (eliminated, kept, W) in by_row.items():
+                mine = slice(*np.searchsorted(eliminated, [row, row + 1]))
+                np.add.at(change[g], kept[mine], W[mine, i])
+            tables = changes_of_tables(plan, start, change)
+            functions.append(blank | {
+                t: np.asarray(x)[: len(blank[t])] for t, x in tables.items() if t in blank and t != e
+            })  # fmt: skip
+        rows = {t: np.stack([f[t] for f in functions]) for t in blank}
+        cofactors.append(np.asarray(inverse[row]) + found.propagate_rows(rows))
+    return without_filling(problem, values), np.array(cofactors)
+
+
+def _by_row(at, W):
+    """The incidences of a group sorted by eliminated row: that, the row of the group, V⁻¹·Wᵀ."""
+    eliminated = np.asarray(at.eliminated).ravel()
+    kept = np.repeat(np.asarray(at.row), at.eliminated.shape[1])
+    order = np.argsort(eliminated, kind="stable")
+    return eliminated[order], kept[order], np.asarray(W).reshape(-1, *W.shape[2:])[order]
+
+
+@eqx.filter_jit
+def _intersect(declared, plan, data: Data):
+    laid, e = lay_out_data(plan, data), plan.eliminated
+    group = plan.groups[e]
+    held = (1.0 - group.free)[:, :, None] * jnp.eye(group.width)
+    space = declared.spaces[e]
+
+    def further(values, _):
+        _, gradient, N = normal_equations(declared, plan, values, laid)
+        step = -jnp.linalg.solve(N.eliminated + held, gradient[e][..., None])[..., 0]
+        return values | {e: jax.vmap(space.retract)(values[e], step)}, None
+
+    values, _ = jax.lax.scan(further, data.start, None, STEPS)
+    *_, N = normal_equations(declared, plan, values, laid)
+    inverse = jnp.linalg.inv(N.eliminated + held)
+    of = lambda g: inverse[plan.incidences[g].eliminated]
+    return values, inverse, {g: jnp.einsum("clij,cljk->clik", of(g), W) for g, W in N.W.items()}

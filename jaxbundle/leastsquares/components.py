@@ -1,0 +1,101 @@
+"""Variance components: does each group of observations keep the precision it was given?
+
+    σ̂²_g = (vᵀPv)_g / r_g,    r_g = Σ redundancy numbers of the group
+
+(Förstner 1979). A value near 1 confirms the a priori σ of the group. Estimation repeats: scale
+the σ of every group by σ̂_g, adjust again, until all components are 1. The product of these
+scales is the *factor* of the group: what the σ it was given have been multiplied by.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxbundle.leastsquares.problem import Problem, with_data
+from jaxbundle.leastsquares.solution import Solution
+
+LEAST_REDUNDANCY = 1.0
+"""A group with less redundancy than this has no usable component."""
+
+EXACT = 1e-9
+"""Residuals below this fraction of their a priori σ are rounding: there is nothing to estimate."""
+
+
+class Group(NamedTuple):
+    """Observations whose σ are estimated together: sets, and which [rows, residuals] of each."""
+
+    name: str
+    parts: Sequence[tuple[int, Any]]
+    unit: float = 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Component:
+    """A group of observations: how many, their redundancy, vᵀPv.
+
+    `given`: the smallest and the largest a priori σ it was given (in the unit of the group; NaN
+    where units differ). `factor`: what these were multiplied by before the adjustment, 1 unless
+    components are estimated.
+    """
+
+    observations: int
+    redundancy: float
+    vtpv: float
+    given: tuple[float, float]
+    factor: float = 1.0
+
+    @property
+    def ratio(self) -> float:
+        """σ̂_g: estimated over used standard deviation; NaN with too little redundancy."""
+        if self.redundancy < 1e-6:
+            return float("nan")
+        return float(np.sqrt(self.vtpv / self.redundancy))
+
+    @property
+    def sigma(self) -> float:
+        """Estimated over given standard deviation, `factor` × `ratio`."""
+        return self.factor * self.ratio
+
+    @property
+    def estimated(self) -> tuple[float, float]:
+        """The smallest and the largest σ of the group as they are estimated."""
+        return tuple(self.sigma * sigma for sigma in self.given)
+
+    @property
+    def usable(self) -> bool:
+        """Whether the σ of the group can be estimated from its residuals."""
+        return self.redundancy >= LEAST_REDUNDANCY and self.sigma > EXACT
+
+
+def variance_components(
+    found: Solution, groups: Sequence[Group], factors: Mapping[str, float]
+) -> dict[str, Component]:
+    """The components of groups of observations; `factors`: by group, what the weights have been
+    divided by (1 if not there)."""
+    problem, tested, components = found.problem, found.reliability, {}
+    for group in groups:
+        take = lambda by_set, group=group: np.concatenate(
+            [np.asarray(by_set(o))[at].ravel() for o, at in group.parts]
+        )
+        weight = take(problem.weights)
+        used = weight[weight > 0]
+        if used.size:
+            v, r = take(tested.residual.get), take(tested.redundancy.get)
+            factor = factors.get(group.name, 1.0)
+            unit = group.unit / factor
+            components[group.name] = Component(
+                used.size, float(r.sum()), float((v**2).sum()),
+                (float(unit / used.max()), float(unit / used.min())), factor,
+            )  # fmt: skip
+    return components
+
+
+def rescale(problem: Problem, groups: Sequence[Group], factors: Mapping[str, float]) -> Problem:
+    """The problem with every group's σ multiplied by its factor."""
+    weight = [np.array(w) for w in problem.data.weight]
+    for group in groups:
+        for o, at in group.parts:
+            weight[o][at] /= factors.get(group.name, 1.0)
+    return with_data(problem, dataclasses.replace(problem.data, weight=tuple(weight)))

@@ -1,0 +1,89 @@
+"""Names for the unknowns, for people, and for those that the observations do not determine."""
+
+import dataclasses
+
+import equinox as eqx
+import numpy as np
+
+from jaxbundle.leastsquares.elimination import reduced_system
+from jaxbundle.leastsquares.normal import Normal, normal_equations
+from jaxbundle.leastsquares.plan import Plan
+from jaxbundle.leastsquares.problem import Problem, pad_data, pad_values
+from jaxbundle.leastsquares.reduced import dense_matrix
+from jaxbundle.leastsquares.rows import Data, Declared, Values, lay_out_data
+
+INDETERMINATE = 1e-12
+"""Scaled eigenvalues of the normal matrix below this are rounding: nothing determines them."""
+SHARE = 0.05
+"""An unknown that takes part in undetermined directions by more than this is named."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Name:
+    """One unknown: what it belongs to (kind and id), and which of its parameters it is."""
+
+    kind: str
+    id: str
+    parameter: str
+
+    def __str__(self) -> str:
+        return f"{self.parameter} of {self.kind} {self.id}"
+
+
+def name_of(problem: Problem, group: str, row: int, column: int) -> Name:
+    """The unknown in a column of a row of a group."""
+    for m in problem.plan.groups[group].members:
+        if m.start <= column < m.start + m.width:
+            table = problem.table(m.table)
+            row = row if m.rows is None else int(m.rows[row])
+            return Name(table.title, table.label(row), table.parameter(column - m.start))
+    raise IndexError(column)
+
+
+def kept_unknowns(problem: Problem) -> list[tuple[str, int, int]]:
+    """Group, row and column of all unknowns of the reduced system, in its order."""
+    return [
+        (g, row, column) for g in problem.plan.kept
+        for row, column in np.ndindex(problem.plan.groups[g].free.shape)
+    ]  # fmt: skip
+
+
+def undetermined(problem: Problem, values: Values) -> list[str]:
+    """The unknowns that the observations do not determine, most affected first."""
+    plan, data = problem.plan, pad_data(problem, problem.data)
+    S, V = _scaled(problem.declared, plan, pad_values(problem, values), data)
+    rows = [] if V is None else _undetermined_rows(problem, np.asarray(V))
+    S = np.tril(S) + np.tril(S, -1).T
+    if not np.isfinite(S).all():
+        return rows
+    eigenvalues, vectors = np.linalg.eigh(S) if S.size else (np.zeros(0), S)
+    null = vectors[:, eigenvalues < INDETERMINATE * max(1.0, eigenvalues[-1:].sum())]
+    share, names = (null**2).sum(1), kept_unknowns(problem)
+    order = np.argsort(-share, kind="stable")
+    return [str(name_of(problem, *names[i])) for i in order if share[i] > SHARE] + rows
+
+
+@eqx.filter_jit
+def _scaled(declared: Declared, plan: Plan, values: Values, data: Data):
+    *_, blocks = normal_equations(declared, plan, values, lay_out_data(plan, data))
+    S, *_ = reduced_system(Normal(plan, blocks))
+    return dense_matrix(plan, plan.kept, S), blocks.eliminated
+
+
+def _undetermined_rows(problem: Problem, V) -> list[str]:
+    """Eliminated rows that are not determined even with everything else given."""
+    e = problem.plan.eliminated
+    group, table = problem.plan.groups[e], problem.table(e)
+    finite = np.isfinite(V).all((1, 2))
+    V = np.where(finite[:, None, None], V, np.eye(V.shape[1]))
+    held = 1.0 - np.asarray(group.free)
+    V = V + held[:, :, None] * np.eye(V.shape[1])
+    diagonal = np.diagonal(V, axis1=1, axis2=2)
+    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    smallest = np.linalg.eigvalsh(V * scale[:, :, None] * scale[:, None, :])[:, 0]
+    weak = np.flatnonzero(finite & (smallest < INDETERMINATE))
+    rows = group.members[0].rows
+    rows = weak if rows is None else np.asarray(rows)[weak]
+    all_of = ", ".join(table.parameter(j) for j in range(table.space.width))
+    return [f"{all_of} of {table.title} {table.label(int(row))}" for row in rows]
+

@@ -1,0 +1,300 @@
+"""Data snooping: remove what the test calls a blunder, adjust again, until nothing is worse.
+
+    |w|  > z(1 − α/2)                        Baarda (1968): each residual by itself
+    |τ|  > τ(1 − α'/2, redundancy)           Pope (1976): the largest of n, α' = 1 − (1 − α)^(1/n)
+
+One blunder spoils the residuals of its neighbours. So only what cannot mask each other goes at a
+time (`separation.py`): of every eliminated row only the worst observation, of a kept row only those
+that stay significant whatever the worse ones there put into their tests, and only those at least
+half as bad as the worst of all; what touches no eliminated row, or whose residuals are tested one
+by one, goes alone. An eliminated row that is left with too few residuals is set aside with them.
+Where observations of a row cannot be told apart, as the two of a point that has no more, nothing
+says which is wrong: when nothing else is left, all of them go and stand in the list as one ("either
+of").
+
+In the end whatever was removed is held against the adjustment it took no part in, by its predicted
+residual v and the variance σ²·(1 + h) of that: what passes comes back. Removed observations keep
+their rows with weight zero, so nothing is compiled again.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxbundle.arguments import number, one_of
+from jaxbundle.leastsquares.distributions import critical_w, normal_quantile
+from jaxbundle.leastsquares.problem import Problem, hold, with_data
+from jaxbundle.leastsquares.rows import Values
+from jaxbundle.leastsquares.separation import choose_together, find_alternatives
+from jaxbundle.leastsquares.solution import Solution, take_step
+
+TOGETHER = 0.5
+"""Observations go together with the worst one if their test is at least this part of its."""
+STEPPING = 20_000
+"""Problems of so many observations take single steps from one removal to the next."""
+
+Adjust = Callable[[Problem, Values], Solution]
+"""The solution of a problem, from start values; refuses what is not solved."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Removed:
+    """A removed observation: its set, its row there, which of its residuals (None: all), its test
+    value. `others`: rows of observations that may be the wrong ones instead, removed with it."""
+
+    set: int
+    row: int
+    residual: int | None
+    test: float
+    others: tuple[int, ...] = ()
+
+    @property
+    def rows(self) -> tuple[int, ...]:
+        """All rows that were removed."""
+        return (self.row, *self.others)
+
+
+TESTS = ("pope", "baarda")
+
+
+def check_test(test: str | None, significance: float, option: str = "") -> None:
+    """Refuse a test that is none, and a level that is no probability; `option` stands before the
+    names in the message.
+
+    **Raises:** `InputError`.
+    """
+    one_of(f"{option}snooping", test, TESTS, none=True)
+    number(f"{option}significance", significance, "a number between 0 and 1", lambda a: 0 < a < 1)
+
+
+def readjust(problem: Problem, values: Values, adjust_from: Adjust) -> Solution:
+    """The solution of a problem that was changed a little, less weight here, none there. A large
+    one takes a single Gauss–Newton step, which lands within the square of the change, if it
+    decreases vᵀPv; a small one would wait longer for the compilation of the step. What is final is
+    to be adjusted once more."""
+    if sum(given.number for given in problem.observations) >= STEPPING:
+        before = Solution(problem, values)
+        after = Solution(problem, take_step(problem, values))
+        if after.vtpv <= before.vtpv:
+            return after
+    return adjust_from(problem, values)
+
+
+def snoop(
+    found: Solution,
+    adjust_from: Adjust,
+    *,
+    test: str = "pope",
+    significance: float = 0.001,
+    limit: int | None = None,
+) -> tuple[Solution, list[Removed]]:
+    """Remove blunders, the worst first.
+
+    **Arguments:**
+
+    - `found`: the solution with all observations.
+    - `adjust_from(problem, start)`: the solution of a changed problem.
+    - `test`: `"pope"` (σ a posteriori, the largest of all) or `"baarda"` (σ a priori, each).
+    - `significance`: α, two-sided: with `"pope"` the probability to lose anything of data without
+      blunders, with `"baarda"` that of one residual. Observations of one eliminated row that cannot
+      be told apart at this level are removed together.
+    - `limit`: at most so many removals.
+
+    **Returns:** the solution without the removed observations, and what was removed in the order
+    of removal.
+
+    **Raises:** `InputError` for another test, or a level that is no probability.
+    """
+    check_test(test, significance)
+    whole, removed, returned = found.problem, [], set()
+    touched = _Touched(whole)
+    while found.problem.counts.redundancy >= 2:
+        unit = found.sigma0 if test == "pope" and found.sigma0 > 0 else 1.0
+        counts = found.problem.counts
+        critical = critical_w(
+            test, significance, touched.tested(found.problem), counts.redundancy, found.sigma0
+        )
+        worst = _worst(found, touched, unit, critical / unit, normal_quantile(1 - significance / 2))
+        if worst and limit is not None:
+            worst = worst[: max(limit - len(removed), 0)]
+        if worst:
+            removed += worst
+        else:
+            passing = _passing(whole, found, touched, removed, critical) - returned
+            kept = list(_without_passing(removed, passing))
+            if kept == removed:
+                break
+            returned |= passing
+            removed = kept
+        found = readjust(without(whole, removed), found.values, adjust_from)
+    return adjust_from(found.problem, found.values) if removed else found, removed
+
+
+class _Touched:
+    """What the observations that are tested touch: by set the eliminated row of each (−1: none) and
+    a number for its first kept row; `whole`: sets whose observations are removed as a whole."""
+
+    def __init__(self, problem: Problem):
+        self.eliminated = problem.plan.eliminated
+        self.own: dict[int, Int[np.ndarray, " n"]] = {}
+        self.shared: dict[int, Int[np.ndarray, " n"]] = {}
+        first = np.cumsum([0, *(t.rows for t in problem.tables)])
+        start = {t.name: n for t, n in zip(problem.tables, first)}
+        moves = {t.name: t.free.any(1) for t in problem.tables}
+        stays = problem.kept_rows
+        for o, given in enumerate(problem.observations):
+            own, shared = np.full(given.number, -1), np.full(given.number, -1)
+            for name, rows in zip(given.kind.of, given.rows):
+                if name == self.eliminated:
+                    own = np.where(moves[name][rows] & ~stays[rows], rows, own)
+                elif moves[name].any():
+                    shared = np.where(shared < 0, start[name] + rows, shared)
+            self.own[o], self.shared[o] = own, shared
+        kinds = [given.kind.snooped for given in problem.observations]
+        self.whole = [o for o, policy in enumerate(kinds) if policy == "whole"]
+        self.single = [o for o, policy in enumerate(kinds) if policy == "single"]
+
+    def tested(self, problem: Problem) -> int:
+        """How many residuals are tested."""
+        weight = [problem.weights(o) for o in (*self.whole, *self.single)]
+        return sum(int((w > 0).sum()) for w in weight)
+
+
+def _worst(found, touched: _Touched, unit, critical: float, apart: float) -> list[Removed]:
+    """What has to go now, the worst first; tests in `unit`.
+
+    Observations of a row are told apart if the test of the suspect exceeds `apart` without the
+    other."""
+    tests = {o: _finite(w) / unit for o, w in found.reliability.w.items()}
+    alone = [Removed(o, *_place(tests[o]), tests[o].max(initial=0.0)) for o in touched.single]
+    together, of, row = [], [], []
+    for o in touched.whole:
+        of_one = tests[o].max(1, initial=0.0)
+        lonely = np.where(touched.own[o] < 0, of_one, 0.0)
+        alone.append(Removed(o, int(lonely.argmax()), None, float(lonely.max(initial=0.0))))
+        together.append(np.where(touched.own[o] < 0, 0.0, of_one))
+        of.append(np.full(len(of_one), o))
+        row.append(np.arange(len(of_one)))
+    together, of, row = (np.concatenate([*x, []]) for x in (together, of, row))
+    of, row = of.astype(int), row.astype(int)
+    worst = max(alone, key=lambda r: r.test, default=None)
+    other, largest = worst.test if worst else 0.0, together.max(initial=0.0)
+    if other > max(critical, largest):
+        return [worst]
+    at = np.flatnonzero(together > max(critical, other, TOGETHER * largest))
+    if not len(at):
+        return []
+    pick = lambda by_set: np.array([by_set[o][k] for o, k in zip(of[at], row[at])])
+    chosen = at[choose_together(
+        together[at], pick(touched.own), pick(touched.shared), pick(_leverage(found)), critical,
+    )]  # fmt: skip
+    rays = _Neighbours(found, touched, unit)
+    others = {k: rays.alternatives(of[k], row[k], critical, apart) for k in chosen.tolist()}
+    certain = [k for k in others if not others[k]]
+    return [
+        Removed(int(of[k]), int(row[k]), None, float(together[k]), others[k])
+        for k in certain or others
+    ]
+
+
+def _place(tests):
+    """Row and residual of the largest."""
+    row, residual = np.unravel_index(tests.argmax(), tests.shape)
+    return int(row), int(residual)
+
+
+def _leverage(found: Solution):
+    """h̃/r of every observation, the largest of its residuals: h less what its eliminated row alone
+    has in it."""
+    tested, tiny = found.reliability, np.finfo(float).tiny
+    return {
+        o: (np.clip(1 - r - tested.own[o], 0.0, None) / np.maximum(r, tiny)).max(1, initial=0.0)
+        for o, r in tested.redundancy.items()
+    }
+
+
+class _Neighbours:
+    """The observations of every eliminated row, to tell them apart."""
+
+    def __init__(self, found: Solution, touched: _Touched, unit: float):
+        self.found, self.unit, self.sets = found, unit, touched.own
+        self.order, self.sorted = {}, {}
+        for o, own in touched.own.items():
+            used = np.flatnonzero((found.problem.weights(o) > 0).any(1) & (own >= 0))
+            self.order[o] = used[np.argsort(own[used], kind="stable")]
+            self.sorted[o] = own[self.order[o]]
+
+    def alternatives(self, o: int, row: int, critical: float, apart: float) -> tuple[int, ...]:
+        """Rows of the same set and eliminated row that may be wrong instead."""
+        own = self.sets[o][row]
+        rows = {
+            s: self.order[s][slice(*np.searchsorted(self.sorted[s], [own, own + 1]))]
+            for s in (o, *(s for s in self.sets if s != o))
+        }
+        E, v = self.found.by_eliminated, self.found.residuals
+        width = next(iter(E.values())).shape[2]
+        design = np.concatenate([E[s][k].reshape(-1, width) for s, k in rows.items()])
+        residual = np.concatenate([v[s][k].ravel() for s, k in rows.items()]) / self.unit
+        size = v[o].shape[1]
+        where = [np.arange(size) + size * i for i in range(len(rows[o]))]
+        suspect = int(np.flatnonzero(rows[o] == row)[0])
+        alternatives = find_alternatives(design, residual, where, suspect, critical, apart)
+        return tuple(rows[o][alternatives].tolist())
+
+
+def _passing(whole: Problem, found: Solution, touched, removed: Sequence[Removed], critical: float):
+    """Sets, rows and residuals of what was removed that agree with the adjustment without them."""
+    if not removed:
+        return set()
+    tests = {o: _finite(t) for o, t in found.predicted_tests(whole.data).items()}
+    if touched.eliminated is not None:
+        free = lambda problem: problem.table(touched.eliminated).free.any(1)
+        aside = free(whole) & ~free(found.problem)
+        for o, own in touched.own.items():
+            tests[o][(own >= 0) & aside[own]] = np.inf
+    value = lambda r, row: tests[r.set][row, r.residual if r.residual is not None else slice(None)]
+    return {
+        (r.set, row, r.residual) for r in removed for row in r.rows
+        if np.max(value(r, row)) < critical
+    }  # fmt: skip
+
+
+def _without_passing(removed: Sequence[Removed], passing) -> Iterable[Removed]:
+    """What stays removed. Where all that may be wrong pass one by one, they still contradict each
+    other, and all of them stay away."""
+    for r in removed:
+        stay = tuple(row for row in r.rows if (r.set, row, r.residual) not in passing)
+        if stay == r.rows or (not stay and r.others):
+            yield r
+        elif stay:
+            yield dataclasses.replace(r, row=stay[0], others=stay[1:])
+
+
+def _finite(tests) -> Float[np.ndarray, "..."]:
+    """|tests|, 0 where there is none."""
+    tests = np.abs(np.asarray(tests))
+    return np.where(np.isfinite(tests), tests, 0.0)
+
+
+def without(problem: Problem, removed: Sequence[Removed]) -> Problem:
+    """The problem with the weights of what was removed set to zero; eliminated rows that are left
+    with too few residuals are set aside."""
+    weight = [np.array(w) for w in problem.data.weight]
+    for r in removed:
+        weight[r.set][list(r.rows), r.residual if r.residual is not None else slice(None)] = 0.0
+    e, lone = problem.plan.eliminated, []
+    if e is not None and removed:
+        touched, width = _Touched(problem), problem.table(e).space.width
+        left = np.zeros(problem.table(e).rows)
+        for o, own in touched.own.items():
+            rows = (np.asarray(problem.weights(o, weight[o])) > 0).sum(1)
+            np.add.at(left, own[own >= 0], rows[own >= 0])
+        changed = {int(touched.own[r.set][row]) for r in removed for row in r.rows} - {-1}
+        lone = [row for row in sorted(changed) if left[row] < width]
+        for o, own in touched.own.items():
+            weight[o][np.isin(own, lone)] = 0.0
+    data = dataclasses.replace(problem.data, weight=tuple(weight))
+    problem = with_data(problem, data)
+    return hold(problem, e, lone) if len(lone) else problem

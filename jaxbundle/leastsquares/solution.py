@@ -1,0 +1,226 @@
+"""A solution looked at: its factor, cofactors and reliability, each computed when first asked for.
+
+What is filled into the arrays, so that problems of nearly the same size share their compiled
+programs, is taken off again here.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbundle.leastsquares.cofactors import Cofactors, cofactors, propagate
+from jaxbundle.leastsquares.datum import move_to_datum, of_groups
+from jaxbundle.leastsquares.elimination import PIVOT, Factor, factorise, solve
+from jaxbundle.leastsquares.linearise import differentiate
+from jaxbundle.leastsquares.normal import Normal, normal_equations
+from jaxbundle.leastsquares.plan import Plan
+from jaxbundle.leastsquares.problem import (
+    Problem,
+    make_solver,
+    pad_data,
+    pad_values,
+    without_filling,
+)
+from jaxbundle.leastsquares.reliability import Reliability, hat_diagonal, reliability
+from jaxbundle.leastsquares.retraction import changes_of_tables
+from jaxbundle.leastsquares.rows import (
+    Data,
+    Declared,
+    Values,
+    in_given_order,
+    lay_out_data,
+    prepare,
+    residuals,
+)
+from jaxbundle.leastsquares.solver import Minimum, minimise
+
+Rows = dict[int, Float[np.ndarray, "n r"]]
+"""By set of observations, in the order they were given."""
+
+
+def find_minimum(problem: Problem, start: Values | None = None, **options) -> Minimum:
+    """Iterate from `start` (the problem's own if not given) and move the solution into the datum;
+    `options`: of the solver (`make_solver`). What is held, and the datum, stay the problem's."""
+    data = pad_data(problem, problem.data)
+    start = data.start if start is None else pad_values(problem, start)
+    minimum = _find(make_solver(problem, **options), data, start)
+    return dataclasses.replace(minimum, values=without_filling(problem, minimum.values))
+
+
+@eqx.filter_jit
+def _find(solver, data: Data, start: Values) -> Minimum:
+    minimum = minimise(solver, data, start)
+    values = move_to_datum(solver.declared, solver.plan, minimum.values, data.start)
+    return dataclasses.replace(minimum, values=values)
+
+
+def take_step(problem: Problem, values: Values) -> Values:
+    """The unknowns after one undamped Gauss–Newton step, near a solution; NaN if singular."""
+    data = pad_data(problem, problem.data)
+    moved = _step(
+        problem.declared, problem.plan, pad_values(problem, values), data, problem.retraction
+    )
+    return without_filling(problem, moved)
+
+
+@eqx.filter_jit
+def _step(declared, plan, values, data, retraction):
+    _, gradient, blocks = normal_equations(declared, plan, values, lay_out_data(plan, data))
+    factor = factorise(Normal(plan, blocks))
+    return retraction(plan, values, solve(factor, jax.tree.map(jnp.negative, gradient)))
+
+
+class Solution:
+    """What statistics need of a problem at some `values`, which should be its adjusted ones."""
+
+    def __init__(self, problem: Problem, values: Values):
+        self.problem, self.values = problem, values
+        self._data, self._values = pad_data(problem, problem.data), pad_values(problem, values)
+
+    @functools.cached_property
+    def residuals(self) -> Rows:
+        """All residuals divided by their σ."""
+        return self._rows(_residuals(*self.given))
+
+    @functools.cached_property
+    def vtpv(self) -> float:
+        """vᵀPv of all observations."""
+        return float(sum((v**2).sum() for v in self.residuals.values()))
+
+    @property
+    def sigma0(self) -> float:
+        """√(vᵀPv/redundancy); NaN without redundancy."""
+        r = self.problem.counts.redundancy
+        return float(np.sqrt(self.vtpv / r)) if r > 0 else float("nan")
+
+    @functools.cached_property
+    def factor(self) -> Factor:
+        """The normal equations, undamped, factorised."""
+        return dataclasses.replace(_factor(*self.given), plan=self.problem.plan)
+
+    @property
+    def determined(self) -> bool:
+        """Whether no unknown is so weak that its σ is rounding noise."""
+        pivots = np.abs(np.asarray(self.factor.reduced.pivots))
+        return bool(np.isfinite(pivots).all() and pivots.min(initial=1.0) ** 2 > PIVOT)
+
+    @functools.cached_property
+    def cofactors(self) -> Cofactors:
+        """Blocks of the cofactor matrix."""
+        return _cofactors(self.problem.declared, self._values, self.factor)
+
+    def cofactor(self, table: str) -> Float[np.ndarray, "rows width width"]:
+        """The cofactors of every row of a table among themselves; zero where it is held."""
+        given = self.problem.table(table)
+        number, width = given.rows, given.space.width
+        found = np.zeros((number, width, width))
+        for name, group in self.problem.plan.groups.items():
+            for m in group.members:
+                if m.table == table:
+                    at = slice(m.start, m.start + m.width)
+                    Q = np.asarray(self.cofactors.own[name])[:, at, at]
+                    rows = np.arange(len(Q)) if m.rows is None else np.asarray(m.rows)
+                    real = rows < number
+                    found[rows[real]] += Q[real]
+        return found
+
+    @functools.cached_property
+    def reliability(self) -> Reliability:
+        """Redundancy numbers and w of all observations."""
+        found = reliability(*self.given, self.cofactors)
+        return Reliability(**{f: self._rows(rows) for f, rows in vars(found).items()})
+
+    def predicted_tests(self, data: Data) -> Rows:
+        """v/√(1 + h) of all observations with the weights of `data`, as if none of them had taken
+        part: normalised residuals of those that did not."""
+        given = (*self.given[:3], pad_data(self.problem, data))
+        return self._rows(_held_against(*given, self.cofactors))
+
+    @functools.cached_property
+    def by_eliminated(self) -> Rows:
+        """The derivatives [n, r, w] of all observations by the eliminated rows they touch, divided
+        by their σ; nothing of those that touch none."""
+        return self._rows(_by_eliminated(*self.given))
+
+    def propagate(self, function: Callable[[Values], Array]) -> Float[np.ndarray, "n n"]:
+        """The cofactors of any differentiable function (`Values` → [n]) of the unknowns."""
+        declared, plan, values = self.given[:3]
+        spaces = declared.spaces
+
+        def of_change(change):
+            moved = dict(self.values)
+            for name, d in change.items():
+                moved[name] = jax.vmap(spaces[name].retract)(self.values[name], d)
+            return jnp.atleast_1d(function(moved))
+
+        still = {t.name: jnp.zeros((t.rows, t.space.width)) for t in self.problem.tables}
+        return self.propagate_rows(jax.jacrev(of_change)(still))
+
+    def propagate_rows(self, rows) -> Float[np.ndarray, "n n"]:
+        """F·Q·Fᵀ of linear functions F of the changes of tables, [n, rows, width] each."""
+        declared, plan, values = self.given[:3]
+        size = self.problem.sizes
+        wide = {
+            t: np.pad(np.asarray(x), ((0, 0), (0, size["table", t] - x.shape[1]), (0, 0)))
+            for t, x in rows.items()
+        }
+        return np.asarray(_propagate(declared, values, self.factor, wide))
+
+    @property
+    def given(self):
+        problem = self.problem
+        return problem.declared, problem.plan, self._values, self._data
+
+    def _rows(self, by_set) -> Rows:
+        sets = self.problem.observations
+        return {o: np.asarray(x)[: sets[o].number] for o, x in by_set.items()}
+
+
+@eqx.filter_jit
+def _residuals(declared: Declared, plan: Plan, values: Values, data: Data):
+    return in_given_order(plan, residuals(declared, plan, values, lay_out_data(plan, data)))
+
+
+@eqx.filter_jit
+def _factor(declared: Declared, plan: Plan, values: Values, data: Data) -> Factor:
+    """Without its plan, which a compiled function would return as a copy."""
+    *_, blocks = normal_equations(declared, plan, values, lay_out_data(plan, data))
+    return dataclasses.replace(factorise(Normal(plan, blocks)), plan=None)
+
+
+_cofactors = eqx.filter_jit(cofactors)
+
+
+@eqx.filter_jit
+def _held_against(declared, plan, values, data, Q):
+    v, h, _ = hat_diagonal(declared, plan, values, lay_out_data(plan, data), Q)
+    v, h = in_given_order(plan, v), in_given_order(plan, h)
+    return {o: v[o] / jnp.sqrt(1 + h[o]) for o in v}
+
+
+@eqx.filter_jit
+def _by_eliminated(declared, plan, values, data):
+    laid, prepared, found = lay_out_data(plan, data), prepare(declared, values), []
+    width = plan.groups[plan.eliminated].width
+    for number in range(len(plan.parts)):
+        r, _, E = differentiate(declared, plan, number, prepared, laid)
+        found.append(jnp.zeros((*r.shape, width)) if E is None else E)
+    return in_given_order(plan, found)
+
+
+@eqx.filter_jit
+def _propagate(declared, values, factor, rows):
+    plan = factor.plan
+    return propagate(declared, values, factor, jax.vmap(lambda r: of_groups(plan, r))(rows))
+
+
+def table_changes(problem: Problem, change) -> dict[str, np.ndarray]:
+    """A change of groups as changes of tables."""
+    values = pad_values(problem, problem.data.start)
+    return changes_of_tables(problem.plan, values, change)

@@ -1,0 +1,273 @@
+"""A network as tables of unknowns and sets of observations for the engine.
+
+Cameras of one model share a table, which is called "camera" where there is one model only. A
+`Layout` knows where each array of `Data` and `Values`, in the order of the network, stands among
+the engine's tables and sets.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxbundle.cameras import default_parameters, get_model
+from jaxbundle.geometry import matrix_from_omega_phi_kappa, quaternion_from_matrix
+from jaxbundle.leastsquares import declarations as ls
+from jaxbundle.leastsquares.rows import Data as EngineData
+from jaxbundle.leastsquares.rows import Values as Tables
+from jaxbundle.leastsquares.spaces import Pose, PoseValue, Vector
+from jaxbundle.network import kinds
+from jaxbundle.network.arrays import Data, Values
+from jaxbundle.network.tables import EXTERIOR, Network
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraTable:
+    """The cameras of one model: the name of their table, the model, how many parameters, and which
+    of the network's cameras they are."""
+
+    name: str
+    model: str
+    parameters: tuple[str, ...]
+    cameras: Int[np.ndarray, " rows"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Set:
+    """A set of observations: the field of `Data`, its rows and columns there (None: all)."""
+
+    field: str
+    rows: Int[np.ndarray, " n"] | None = None
+    columns: int | None = None
+
+    def cut(self, x):
+        """The part of an array of the field that belongs to this set."""
+        x = x if self.columns is None else x[:, : self.columns]
+        return x if self.rows is None else x[self.rows]
+
+
+    def put(self, whole, part) -> None:
+        """Writes this set's part [n, r] of an array of the field."""
+        rows = slice(None) if self.rows is None else self.rows
+        if whole.ndim == 1:
+            whole[rows] = part[:, 0]
+        else:
+            whole[rows, : self.columns] = part
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """Where the arrays of a network stand; `width`: of `Values.camera`; `given`: the points, images
+    and cameras that the rows of control, exterior and interior belong to."""
+
+    cameras: tuple[CameraTable, ...]
+    sets: tuple[Set, ...]
+    width: int
+    given: Mapping[str, Int[np.ndarray, " rows"]]
+
+    def tables(self, values: Values) -> Tables:
+        """The unknowns as the engine's tables."""
+        found = {"image": PoseValue(values.position, values.rotation), "point": values.point}
+        for table in self.cameras:
+            found[table.name] = values.camera[table.cameras, : len(table.parameters)]
+        return found | values.other
+
+    def values(self, tables: Tables) -> Values:
+        """The engine's tables as the arrays of the network."""
+        cameras = sum(len(table.cameras) for table in self.cameras)
+        camera = jnp.zeros((cameras, self.width))
+        for table in self.cameras:
+            rows = tables[table.name]
+            camera = camera.at[table.cameras, : rows.shape[1]].set(rows)
+        own = {"image", "point", *(table.name for table in self.cameras)}
+        other = {name: rows for name, rows in tables.items() if name not in own}
+        return Values(camera, *tables["image"], tables["point"], other)
+
+    def data(self, data: Data) -> EngineData:
+        """The numbers of a network as the engine's."""
+        measured = tuple(s.cut(data.measured(s.field)) for s in self.sets)
+        weight = tuple(_of_rows(s.cut(data.weight(s.field))) for s in self.sets)
+        other = tuple(zip(*data.other)) or ((), ())
+        return EngineData(self.tables(data.start), measured + other[0], weight + other[1])
+
+
+    def with_weights(self, data: Data, weight) -> Data:
+        """The numbers with the weights of the engine's sets."""
+        found = {}
+        for s, w in zip(self.sets, weight):
+            name = f"{s.field}_weight"
+            whole = found.setdefault(name, np.array(data.weight(s.field)))
+            s.put(whole, np.asarray(w))
+        other = tuple((m, w) for (m, _), w in zip(data.other, weight[len(self.sets) :]))
+        return dataclasses.replace(data, other=other, **jax.device_put(found))
+
+    def rows(self, by_set, data: Data) -> "Rows":
+        """What the engine has found for every set of observations, in the order of `Data`."""
+        found = {}
+        for field in ("image", "control", "exterior", "interior", "distance"):
+            found[field] = np.zeros(np.shape(data.weight(field)))
+        for o, s in enumerate(self.sets):
+            s.put(found[s.field], np.asarray(by_set[o]))
+        return Rows(**found, other=tuple(by_set[o] for o in range(len(self.sets), len(by_set))))
+
+
+class Rows(NamedTuple):
+    """One number for every residual, by kind, in the order of `Data`."""
+
+    image: Float[np.ndarray, "rays 2"]
+    control: Float[np.ndarray, "control 3"]
+    exterior: Float[np.ndarray, "exterior 6"]
+    interior: Float[np.ndarray, "interior parameters"]
+    distance: Float[np.ndarray, " distances"]
+    other: tuple[Float[np.ndarray, "n r"], ...]
+
+
+def _of_rows(weight):
+    """[n, r], also of kinds with one residual."""
+    return weight if weight.ndim == 2 else weight[:, None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Declared:
+    """What the engine is asked, and how its arrays are those of the network (`layout`, `data`);
+    `origin` [3] was subtracted from all object coordinates."""
+
+    tables: tuple[ls.Table, ...]
+    observations: tuple[ls.Observations, ...]
+    layout: Layout
+    data: Data
+    origin: Float[np.ndarray, "3"]
+
+
+def declare(network: Network, origin=None) -> Declared:
+    """The tables and observations of a checked network (`check_network`) without check points;
+    `origin`: of its coordinates, the middle of its points if not given."""
+    data, origin, priors = _data(network, origin)
+    images, points, observations = network.images, network.points, network.observations
+    cameras = _camera_tables(network)
+    table_of = {int(c): (t, row) for t in cameras for row, c in enumerate(t.cameras)}
+    start = data.start
+    tables = [
+        ls.Table("image", PoseValue(start.position, start.rotation), Pose(), images.sigma != 0,
+                 images.id, EXTERIOR),
+        *(_camera_table(network, t, start) for t in cameras),
+        ls.Table("point", start.point, free=~points.has_role("fixed"), labels=points.id,
+                 parameters=("X", "Y", "Z")),
+    ]
+    sets, given = [], []
+
+    def observe(kind, rows, *where):
+        if len(rows[0]):
+            s = Set(*where)
+            sets.append(s)
+            weight = s.cut(data.weight(s.field))
+            sigma = np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0), np.inf)
+            given.append(kind(rows, s.cut(data.measured(s.field)), sigma=sigma))
+
+    row_of_camera = np.array([table_of[c][1] for c in range(len(network.cameras))], np.int64)
+    camera = images.camera[observations.image]
+    for t in cameras:
+        kind = kinds.image_points(t.model, network.residuals, t.name)
+        rows = None if len(cameras) == 1 else np.flatnonzero(np.isin(camera, t.cameras))
+        take = lambda x, rows=rows: x if rows is None else x[rows]
+        touched = observations.image, row_of_camera[camera], observations.point
+        observe(kind, tuple(map(take, touched)), "image", rows)
+    observe(kinds.CONTROL, (priors["control"],), "control")
+    observe(kinds.EXTERIOR, (priors["exterior"],), "exterior")
+    for t in cameras:
+        rows = np.flatnonzero(np.isin(priors["interior"], t.cameras))
+        kind = kinds.interior_orientation(t.name, t.parameters)
+        columns = len(t.parameters)
+        observe(kind, (row_of_camera[priors["interior"][rows]],), "interior", rows, columns)
+    observe(kinds.DISTANCES, tuple(network.distances.points.T), "distance")
+    layout = Layout(cameras, tuple(sets), start.camera.shape[1], priors)
+    return Declared(tuple(tables), tuple(given), layout, data, origin)
+
+
+def order_cameras(network: Network) -> Network:
+    """The same network with its cameras in the order of the images, where each has its own: the
+    engine then has one block for an image and its camera."""
+    used = network.images.camera
+    if len(used) == len(network.cameras) and len(set(used)) == len(used):
+        images = dataclasses.replace(network.images, camera=np.arange(len(used)))
+        network = network.replace(cameras=tuple(network.cameras[c] for c in used), images=images)
+    return network
+
+
+def _camera_tables(network: Network) -> tuple[CameraTable, ...]:
+    models = [get_model(c.model) for c in network.cameras]
+    by_name = {m.name: m for m in models}
+    return tuple(
+        CameraTable(
+            "camera" if len(by_name) == 1 else f"camera, {name}", name, model.parameters,
+            np.array([c for c, m in enumerate(models) if m.name == name]),
+        )
+        for name, model in by_name.items()
+    )  # fmt: skip
+
+
+def _camera_table(network: Network, table: CameraTable, start: Values) -> ls.Table:
+    """Only parameters that are free in some camera of the table move."""
+    free = np.array([
+        [name in network.cameras[c].free for name in table.parameters] for c in table.cameras
+    ])  # fmt: skip
+    moving = tuple(np.flatnonzero(free.any(0)).tolist())
+    value = start.camera[table.cameras, : len(table.parameters)]
+    return ls.Table(
+        table.name, value, Vector(len(table.parameters), moving), free[:, moving],
+        [network.cameras[c].id for c in table.cameras],
+        tuple(table.parameters[j] for j in moving), "camera",
+    )  # fmt: skip
+
+
+@jax.jit
+def _quaternions(angles):
+    return jax.vmap(lambda a: quaternion_from_matrix(matrix_from_omega_phi_kappa(a)))(angles)
+
+
+def _data(network: Network, origin):
+    """Values and weights of the network, object coordinates relative to their origin."""
+    images, points, observations = network.images, network.points, network.observations
+    if origin is None:
+        origin = np.round(points.position.mean(0)) if len(points) else np.zeros(3)
+    models = [get_model(c.model) for c in network.cameras]
+    width = max(len(m.parameters) for m in models)
+    camera = np.zeros((len(models), width))
+    camera_sigma = np.full((len(models), width), np.inf)
+    for c, (given, model) in enumerate(zip(network.cameras, models)):
+        values = {**default_parameters(model), **given.parameters}
+        for j, name in enumerate(model.parameters):
+            camera[c, j] = values[name]
+            if name in given.free:
+                camera_sigma[c, j] = given.sigma.get(name, np.inf)
+    start = Values(
+        camera=camera,
+        position=images.position - origin,
+        rotation=np.asarray(_quaternions(images.angles)),
+        point=points.position - origin,
+    )
+    weight = lambda sigma: np.where(
+        np.isfinite(sigma) & (sigma > 0), 1 / np.where(sigma > 0, sigma, 1), 0.0
+    )
+    control = np.flatnonzero(points.has_role("control"))
+    exterior = np.flatnonzero((np.isfinite(images.sigma) & (images.sigma > 0)).any(1))
+    interior = np.flatnonzero(np.isfinite(camera_sigma).any(1))
+    exterior_value = np.concatenate([images.position - origin, images.angles], 1)
+    data = Data(
+        start=start,
+        image_xy=observations.xy,
+        image_weight=1 / observations.sigma,
+        control=(points.position - origin)[control],
+        control_weight=weight(points.sigma[control]),
+        exterior=exterior_value[exterior],
+        exterior_weight=weight(images.sigma[exterior]),
+        interior=camera[interior],
+        interior_weight=weight(camera_sigma[interior]),
+        distance=network.distances.value,
+        distance_weight=1 / network.distances.sigma,
+    )
+    return data, origin, {"control": control, "exterior": exterior, "interior": interior}

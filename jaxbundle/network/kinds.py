@@ -1,0 +1,83 @@
+"""The kinds of observations of a network: one function for one observation each.
+
+| kind | residuals | touches |
+|---|---|---|
+| image coordinates | x, y | image, camera, point (collinearity equations, distortion) |
+| control points | X, Y, Z | point |
+| exterior orientation | X0, Y0, Z0, ω, φ, κ | image |
+| interior orientation | the camera's parameters | camera |
+| distances | d | two points |
+
+Residuals are computed minus observed. Nothing else in the package knows how an image coordinate
+depends on an unknown. A similarity of object space changes no image coordinate: what is left open
+by the others of these is the datum.
+"""
+
+import dataclasses
+
+import jax.numpy as jnp
+
+from jaxbundle import cameras
+from jaxbundle.geometry import omega_phi_kappa_near, transform_point, transform_pose
+from jaxbundle.leastsquares.declarations import Kind, Motions
+from jaxbundle.leastsquares.spaces import PoseValue
+
+
+@dataclasses.dataclass(frozen=True)
+class ImagePoint:
+    """The two residuals of an image point, in the unit of the camera model; of poses, cameras and
+    points it takes scalars."""
+
+    model: str
+    domain: str
+
+    def __call__(self, pose, interior, point, xy):
+        model = cameras.get_model(self.model)
+        return cameras.residual(model, self.domain, interior, pose.ray(point), xy)
+
+
+def image_points(model: str, domain: str, camera: str) -> Kind:
+    """Image points of the cameras of one model, whose table is `camera`; `domain`: "corrected" or
+    "measured"."""
+    of = ("image", camera, "point")
+    name = "image coordinates" if camera == "camera" else f"image coordinates, {model}"
+    return Kind(name, ImagePoint(model, domain), of, ("x", "y"), scalars=True, invariant=True)
+
+
+def _difference(value, given):
+    return value - given
+
+
+def _exterior(pose, given):
+    """Projection centre and ω, φ, κ (on the branch of the given ones) less the given values [6]."""
+    angles = omega_phi_kappa_near(pose.rotation.matrix(), given[3:])
+    return jnp.concatenate([jnp.stack(pose.centre), angles]) - given
+
+
+def _distance(a, b, given):
+    return jnp.sqrt(jnp.sum((a - b) ** 2)) - given
+
+
+CONTROL = Kind("control points", _difference, ("point",), ("X", "Y", "Z"), snooped="single")
+EXTERIOR = Kind(
+    "exterior orientation", _exterior, ("image",), ("X0", "Y0", "Z0", "omega", "phi", "kappa"),
+    snooped="",
+)  # fmt: skip
+DISTANCES = Kind("distances", _distance, ("point", "point"), ("d",), snooped="single")
+
+
+def interior_orientation(camera: str, parameters: tuple[str, ...]) -> Kind:
+    """Priors of the parameters of the cameras of a table."""
+    return Kind("interior orientation", _difference, (camera,), parameters, snooped="",
+                invariant=True)  # fmt: skip
+
+
+def _move_pose(motion, value: PoseValue) -> PoseValue:
+    return PoseValue(*transform_pose(motion, *value))
+
+
+SIMILARITY = Motions(
+    ("shift X", "shift Y", "shift Z", "rotation X", "rotation Y", "rotation Z", "scale"),
+    (("image", _move_pose), ("point", transform_point)),
+    curved=(3, 4, 5, 6),
+)  # fmt: skip

@@ -1,0 +1,66 @@
+"""Where a step leads: images turn about what they see."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from jaxbundle.geometry import matrix_from_quaternion
+from jaxbundle.leastsquares.normal import Tangent, total
+from jaxbundle.leastsquares.plan import Plan
+from jaxbundle.leastsquares.retraction import changes_of_tables, retract
+from jaxbundle.leastsquares.rows import Declared, Values
+from jaxbundle.leastsquares.spaces import PoseValue
+from jaxbundle.network.kinds import ImagePoint
+
+
+@dataclasses.dataclass(frozen=True)
+class TurnAboutSeen:
+    """`retract`, but every image turns about the middle of the points it sees.
+
+    To first order the same. A long step that turns an image and shifts it, so that it keeps its
+    points, keeps them only if the turn is about them: about its own projection centre they leave
+    the image by the second-order terms. (A problem of 16 images of close-up scenes: 12 steps to
+    the minimum instead of 21.) The middle is that of the points weighted by 1/distance², as much as
+    they say about the position; so far ones do not pull it away. Images whose position is held
+    turn about it.
+    """
+
+    declared: Declared
+
+    def __call__(self, plan: Plan, values: Values, change: Tangent) -> Values:
+        moved = retract(self.declared, plan, values, change)
+        changes = changes_of_tables(plan, values, change)
+        if "image" not in changes:
+            return moved
+        old, new, pivot = values["image"], moved["image"], self._middle(plan, values)
+
+        def position(old, M, new_M, change, pivot):
+            Y = M @ (pivot - old)
+            return pivot - new_M.T @ (Y + jnp.cross(change[3:], Y) - M @ change[:3])
+
+        matrices = jax.vmap(matrix_from_quaternion)
+        turned = jax.vmap(position)(
+            old.position, matrices(old.rotation), matrices(new.rotation), changes["image"], pivot
+        )
+        free = plan.groups["image"].free[:, :3].all(1, keepdims=True)
+        return moved | {"image": PoseValue(jnp.where(free, turned, new.position), new.rotation)}
+
+    def _middle(self, plan: Plan, values: Values):
+        """The middle of the points that each image sees; 0 where it sees none."""
+        position, points = values["image"].position, values["point"]
+        seen = jnp.zeros((position.shape[0], 4))
+        for part in plan.parts:
+            if not isinstance(self.declared.kinds[part.observations].residual, ImagePoint):
+                continue
+            image, point = part.lookup[0], points[part.lookup[2]]
+            centre = position[image] if part.by_row[0] else position[image][:, None]
+            used = part.source != part.place.shape[0] - 1
+            square = jnp.sum((point - centre) ** 2, -1)
+            weight = jnp.where(used, 1 / jnp.maximum(square, 1e-300), 0.0)[..., None]
+            rows = jnp.concatenate([weight * point, weight], -1)
+            rows = rows if part.by_row[0] else rows.sum(1)
+            rows = rows.reshape(-1, 4)
+            seen = seen + jax.ops.segment_sum(rows, image.ravel(), position.shape[0])
+        seen = total(plan, seen)
+        return seen[:, :3] / jnp.where(seen[:, 3:] > 0, seen[:, 3:], 1.0)

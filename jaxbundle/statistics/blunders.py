@@ -1,0 +1,77 @@
+"""Blunders and suspects in the words of a network."""
+
+import dataclasses
+
+from jaxbundle.adjustment.problem import Problem
+from jaxbundle.leastsquares import robust, snooping
+
+
+@dataclasses.dataclass(frozen=True)
+class Removed:
+    """A removed observation: its kind, row in the arrays of its kind, a name for people, its test
+    value. `others`: rows of observations that may be the wrong ones instead, removed with it."""
+
+    kind: str
+    row: int
+    name: str
+    test: float
+    others: tuple[int, ...] = ()
+
+    @property
+    def rows(self) -> tuple[int, ...]:
+        """All rows that were removed."""
+        return (self.row, *self.others)
+
+
+@dataclasses.dataclass(frozen=True)
+class Suspect:
+    """An observation whose residual is too long for a good one: its kind, row in the arrays, a name
+    for people, the length of its residual t in units of σ and scale, the factor of its weight."""
+
+    kind: str
+    row: int
+    name: str
+    test: float
+    weight: float
+
+
+def name_removed(problem: Problem, found: snooping.Removed) -> Removed:
+    """What data snooping has removed, with its name."""
+    kind, rows = _place(problem, found.set, found.rows)
+    names = [_name(problem, found.set, row, found.residual) for row in found.rows]
+    name = names[0]
+    if len(names) > 1:
+        name = f"either of {', '.join(names[:-1])} or {names[-1]}"
+    if kind == "control":
+        rows = tuple(3 * row + found.residual for row in rows)
+    return Removed(kind, rows[0], name, found.test, rows[1:])
+
+
+def name_suspect(problem: Problem, found: robust.Suspect) -> Suspect:
+    """What robust estimation suspects, with its name."""
+    kind, rows = _place(problem, found.set, (found.row,))
+    name = _name(problem, found.set, found.row, None)
+    return Suspect(kind, rows[0], name, found.test, found.weight)
+
+
+def _place(problem: Problem, o: int, rows):
+    """Kind and rows in the arrays of that kind."""
+    if o >= len(problem.layout.sets):
+        return problem.system.observations[o].kind.name, tuple(rows)
+    s = problem.layout.sets[o]
+    return s.field, tuple(int(row if s.rows is None else s.rows[row]) for row in rows)
+
+
+def _name(problem: Problem, o: int, row: int, residual: int | None) -> str:
+    kind, (place,) = _place(problem, o, (row,))
+    network, given = problem.network, problem.system.observations[o]
+    points = network.points.id
+    if kind == "image":
+        image = network.images.id[problem.image[place]]
+        return f"point {points[problem.point[place]]} in image {image}"
+    if kind == "control":
+        return f"{'XYZ'[residual]} of control point {points[given.rows[0][row]]}"
+    if kind == "distance":
+        a, b = (points[int(p)] for p in network.distances.points[place])
+        return f"distance {a}–{b}"
+    return given.label(problem.system.tables, row)
