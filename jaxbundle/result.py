@@ -259,10 +259,8 @@ class Adjustment:
     @functools.cached_property
     def variance_components(self) -> dict[str, Component]:
         """For every group of observations σ̂ over the a priori σ it was given, and σ̂ itself."""
-        self.cofactors
-        return variance_components(
-            self.inspection.solution, groups(self.problem), self.sigma_factors
-        )
+        found = self.cofactors.solution
+        return variance_components(found, groups(self.problem), self.sigma_factors)
 
     @functools.cached_property
     def check_points(self) -> CheckPoints | None:

@@ -49,19 +49,6 @@ def cross(a, b):
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
-def exterior_residual(position, rotation, given, weight, d_image):
-    """An image's exterior orientation against its prior (X0, Y0, Z0, ω, φ, κ) [6]."""
-    M = matrix_from_quaternion(retract_quaternion(rotation, d_image[3:]))
-    angles = omega_phi_kappa_near(M, given[3:])
-    change = jnp.concatenate([position + d_image[:3], angles]) - given
-    return weight * change
-
-
-def cross(a, b):
-    """The vector product of two triples of scalars."""
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
-
-
 def control_residual(point, given, weight, d_point):
     """A control point's coordinates against their given values [3]."""
     return weight * (point + d_point - given)

@@ -44,9 +44,8 @@ def determine(
                 mine = slice(*np.searchsorted(eliminated, [row, row + 1]))
                 np.add.at(change[g], kept[mine], W[mine, i])
             tables = changes_of_tables(plan, start, change)
-            functions.append(blank | {
-                t: np.asarray(x)[: len(blank[t])] for t, x in tables.items() if t in blank and t != e
-            })  # fmt: skip
+            tables.pop(e)
+            functions.append(blank | {t: np.asarray(x)[: len(blank[t])] for t, x in tables.items()})
         rows = {t: np.stack([f[t] for f in functions]) for t in blank}
         cofactors.append(np.asarray(inverse[row]) + found.propagate_rows(rows))
     return without_filling(problem, values), np.array(cofactors)

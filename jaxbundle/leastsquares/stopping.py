@@ -21,7 +21,6 @@ TERMINATIONS = (
 LIMIT, SETTLED, RELATIVE_COST, SINGULAR, STUCK, NOT_FINITE = range(6)
 
 
-
 def converged(termination):
     """Whether a termination code means that a minimum was reached."""
     return (termination == SETTLED) | (termination == RELATIVE_COST)
@@ -29,14 +28,7 @@ def converged(termination):
 
 ROUNDING = 2e-14
 """A promised decrease of vᵀPv below this fraction of it is rounding noise."""
-COST_
-
-def converged(termination):
-    """Whether a termination code means that a minimum was reached."""
-    return (termination == SETTLED) | (termination == RELATIVE_COST)
-
-
-ROUNDING = 1e-15
+COST_ROUNDING = 1e-15
 """Relative precision of a measured value, to estimate that of vᵀPv."""
 NOISE_FLOOR, NOISE_FLOOR_WITHOUT_REDUNDANCY = 1e-14, 1e-12
 """Relative precision of a measured value; residuals below it are noise of the arithmetic.

@@ -135,7 +135,8 @@ def _per_extent(problem: Problem, extents: Extents) -> Float[np.ndarray, " reduc
             if m.table not in extents:
                 continue
             of = extents[m.table]
-            of = of if of.ndim == 2 else np.where(of > 0, 1 / np.where(of > 0, of, 1.0), 0.0)[:, None]
+            if of.ndim == 1:  # Kept rows of the eliminated table.
+                of = np.where(of > 0, 1 / np.where(of > 0, of, 1.0), 0.0)[:, None]
             rows = np.arange(group.rows) if m.rows is None else np.asarray(m.rows)
             real = np.flatnonzero(rows < len(of))
             found[g][real, m.start : m.start + m.width] = of[rows[real]]

@@ -110,7 +110,8 @@ def datum(adjustment) -> str:
     if defect < 7:
         known = network.points.has_role("control", "fixed")
         about = (network.points.position[known] - adjustment.problem.origin).sum(0)
-        words = open_directions_in_words(np.asarray(system.plan.datum.gauge), about / max(known.sum(), 1))
+        gauge = np.asarray(system.plan.datum.gauge)
+        words = open_directions_in_words(gauge, about / max(known.sum(), 1))
         if defect == 6 and "scale" not in words:
             words = "position and orientation"
         open_ones = f"defect {defect}: the observations leave open {words}"

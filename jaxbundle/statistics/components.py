@@ -33,7 +33,5 @@ def groups(problem: Problem) -> list[Group]:
         Group("interior orientation", every("interior"), np.nan),
         Group("distances", every("distance")),
     ]
-    further = problem.system.observations[len(layout.sets) :]
-    return found + [
-        Group(given.kind.name, [(len(layout.sets) + k, np.s_[:])]) for k, given in enumerate(further)
-    ]
+    further = enumerate(problem.system.observations[len(layout.sets) :], len(layout.sets))
+    return found + [Group(given.kind.name, [(o, np.s_[:])]) for o, given in further]
