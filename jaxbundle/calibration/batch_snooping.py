@@ -3,7 +3,8 @@
 Of every view only the worst point goes at a time, and only points at least half as bad as the worst
 of all, for a blunder spoils the residuals of its view. In the end whatever was removed is held
 against the calibration it took no part in: what passes comes back. A camera without blunders keeps
-its first solution. The test is Pope's (`leastsquares.distributions`), for a batch knows no σ a priori. Its σ0 is that of the residuals, or that of their median where this is smaller: many
+its first solution. The test is Pope's (`leastsquares.distributions`), for a batch knows no σ a
+priori. Its σ0 is that of the residuals, or that of their median where this is smaller: many
 blunders make σ0 so large that each of them hides behind the others.
 """
 

@@ -16,6 +16,8 @@ import numpy as np
 from jaxbundle.leastsquares.problem import Problem, with_data
 from jaxbundle.leastsquares.solution import Solution
 
+ROUNDS = 20
+"""Variance components are estimated at most so many times."""
 LEAST_REDUNDANCY = 1.0
 """A group with less redundancy than this has no usable component."""
 

@@ -18,9 +18,9 @@ import dataclasses
 import jax.numpy as jnp
 
 from jaxbundle import cameras
-from jaxbundle.geometry import omega_phi_kappa_near, transform_point, transform_pose
-from jaxbundle.leastsquares.declarations import Kind, Motions
-from jaxbundle.leastsquares.spaces import PoseValue
+from jaxbundle.geometry import omega_phi_kappa_near
+from jaxbundle.leastsquares.declarations import Kind
+from jaxbundle.leastsquares.motions import similarity
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,12 +72,4 @@ def interior_orientation(camera: str, parameters: tuple[str, ...]) -> Kind:
                 invariant=True)  # fmt: skip
 
 
-def _move_pose(motion, value: PoseValue) -> PoseValue:
-    return PoseValue(*transform_pose(motion, *value))
-
-
-SIMILARITY = Motions(
-    ("shift X", "shift Y", "shift Z", "rotation X", "rotation Y", "rotation Z", "scale"),
-    (("image", _move_pose), ("point", transform_point)),
-    curved=(3, 4, 5, 6),
-)  # fmt: skip
+SIMILARITY = similarity(("point",), ("image",))

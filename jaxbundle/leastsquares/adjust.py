@@ -1,0 +1,308 @@
+"""`adjust`: tables and observations in, a result with its statistics out.
+
+    from jaxbundle import leastsquares as ls
+
+    height = ls.Table("height", start)                                                   # [n]
+    levelled = ls.Kind("levelled difference", lambda a, b, dh: b - a - dh, of=("height", "height"))
+    result = ls.adjust([height], [levelled(rows=(i, j), measured=dh, sigma=s)], datum="inner")
+    result.sigma0, result["height"].value, result["height"].sigma
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from jaxbundle.arguments import one_of, truth, whole
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.leastsquares.components import ROUNDS, Component, Group, rescale, variance_components
+from jaxbundle.leastsquares.declarations import Motions, Observations, Table
+from jaxbundle.leastsquares.motions import likely_motions
+from jaxbundle.leastsquares.names import undetermined
+from jaxbundle.leastsquares.problem import Problem, make_problem, with_factor
+from jaxbundle.leastsquares.reliability import external_reliability, minimal_detectable
+from jaxbundle.leastsquares.robust import ESTIMATORS, Suspect, reweight
+from jaxbundle.leastsquares.rows import Values
+from jaxbundle.leastsquares.search import METHODS
+from jaxbundle.leastsquares.snooping import Removed, check_test, snoop
+from jaxbundle.leastsquares.solution import Solution, find_minimum
+from jaxbundle.leastsquares.solver import Minimum
+from jaxbundle.leastsquares.stopping import SINGULAR, TERMINATIONS, converged
+
+DATUMS = ("given", "inner", "minimal")
+FEW = 60
+"""Problems with fewer unknowns are solved as a whole: nothing is eliminated."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TableResult:
+    """A table after the adjustment: `value` as it was given; `sigma` a posteriori and `covariance`
+    of the directions in which a row moves, [rows, width] ([rows] of a table of numbers) and [rows,
+    width, width]; 0 where something is held."""
+
+    value: PyTree[np.ndarray]
+    sigma: Float[np.ndarray, "rows *width"]
+    covariance: Float[np.ndarray, "rows width width"]
+
+
+class Result:
+    """An adjusted problem; look at `converged` before anything else.
+
+    `converged`, `termination`, `iterations`, `sigma0`, `vtpv`, `counts` (observations, unknowns,
+    datum, redundancy); `result[table]`; `residuals(kind)`; `covariance(function)`; `removed`,
+    `suspects`, `components`; `undetermined`, names of what nothing determines.
+    """
+
+    def __init__(
+        self, problem: Problem, minimum: Minimum, removed: Sequence[Removed] = (),
+        suspects: Sequence[Suspect] = (), factors: Mapping[str, float] | None = None,
+    ):  # fmt: skip
+        self.problem, self.minimum = problem, minimum
+        self.removed, self.suspects = tuple(removed), tuple(suspects)
+        self.sigma_factors = dict(factors or {})
+
+    @property
+    def termination(self) -> str:
+        """Why the iterations ended, in words."""
+        reason = int(self.minimum.termination)
+        return TERMINATIONS[SINGULAR if converged(reason) and not self.converged else reason]
+
+    @property
+    def iterations(self) -> int:
+        """Steps tried, the rejected ones counted; the evaluation of the start is not one."""
+        return max(int(self.minimum.iterations) - 1, 0)
+
+    @functools.cached_property
+    def converged(self) -> bool:
+        """Whether a minimum was reached and everything in it is determined."""
+        return bool(converged(int(self.minimum.termination))) and self._solution.determined
+
+    @functools.cached_property
+    def undetermined(self) -> tuple[str, ...]:
+        """What nothing determines, most affected first; empty for a solved problem."""
+        return () if self.converged else tuple(undetermined(self.problem, self.minimum.values))
+
+    @functools.cached_property
+    def _solution(self) -> Solution:
+        return Solution(self.problem, self.minimum.values)
+
+    @property
+    def solution(self) -> Solution:
+        """The solution as statistics look at it.
+
+        **Raises:** `NotSolvedError` where there is none."""
+        if not self.converged:
+            names = ", ".join(self.undetermined[:8])
+            what = f"; not determined: {names}" if names else ""
+            raise NotSolvedError(f"not solved ({self.termination}){what}", list(self.undetermined))
+        return self._solution
+
+    @property
+    def counts(self):
+        """Observations, unknowns, datum conditions, redundancy."""
+        return self.problem.counts
+
+    @property
+    def vtpv(self) -> float:
+        """vᵀPv of all observations."""
+        return self.solution.vtpv
+
+    @property
+    def sigma0(self) -> float:
+        """√(vᵀPv/redundancy); NaN without redundancy."""
+        return self.solution.sigma0
+
+    def __getitem__(self, table: str) -> TableResult:
+        if table not in self.minimum.values:
+            raise KeyError(f"there is no table {table!r}; known: {', '.join(self.minimum.values)}")
+        value = jax.tree.map(np.asarray, self.solution.values[table])
+        covariance = self.sigma0**2 * self.solution.cofactor(table)
+        sigma = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0, None))
+        return TableResult(value, sigma[:, 0] if np.ndim(value) == 1 else sigma, covariance)
+
+    def redundancy(self, kind: str) -> Float[np.ndarray, "n *r"]:
+        """The redundancy numbers of the observations of a kind, in the order they were given."""
+        return self.residuals(kind)["r"]
+
+    def residuals(self, kind: str) -> dict[str, Float[np.ndarray, "n *r"]]:
+        """Of the observations of a kind, in the order they were given: v (computed − observed, in
+        the unit of the kind; of those with a covariance L⁻¹·v), sigma (a priori), r, w (Baarda),
+        tau (Pope), mdb, external."""
+        names = [given.kind.name for given in self.problem.observations]
+        if kind not in names:
+            raise KeyError(f"there is no kind {kind!r}; known: {', '.join(dict.fromkeys(names))}")
+        parts = [self._residuals(o) for o, name in enumerate(names) if name == kind]
+        columns = {c: np.concatenate([part[c] for part in parts]) for c in parts[0]}
+        one = columns["v"].shape[1] == 1
+        return {c: x[:, 0] if one else x for c, x in columns.items()}
+
+    def _residuals(self, o: int):
+        found, weight = self.solution.reliability, self.problem.data.weight[o]
+        weight = np.asarray(weight)
+        used = weight > 0 if weight.ndim == 2 else np.ones(weight.shape[:2], bool)
+        sigma = np.where(used, 1 / np.where(used, weight, 1.0) if weight.ndim == 2 else 1.0, np.inf)
+        r, w = found.redundancy[o], found.w[o]
+        return {
+            "v": found.residual[o] * np.where(used, sigma, np.nan), "sigma": sigma, "r": r, "w": w,
+            "tau": w / (self.sigma0 or np.nan), "mdb": minimal_detectable(sigma, r),
+            "external": external_reliability(r),
+        }  # fmt: skip
+
+    @functools.cached_property
+    def components(self) -> dict[str, Component]:
+        """Variance components of the kinds of observations."""
+        return variance_components(self.solution, kinds_as_groups(self.problem), self.sigma_factors)
+
+    def covariance(self, function: Callable[[Values], Array]) -> Float[np.ndarray, "n n"]:
+        """The covariance of any differentiable function of the tables (name → values) → [n]."""
+        return self.sigma0**2 * self.solution.propagate(function)
+
+    def __str__(self) -> str:
+        if not self.converged:
+            return f"not solved: {self.termination}; {', '.join(self.undetermined[:8])}"
+        n = self.counts
+        lines = [
+            f"solved in {self.iterations} iterations: {self.termination}",
+            f"{n.observations} observations, {n.unknowns} unknowns, datum defect {n.datum}, "
+            f"redundancy {n.redundancy}, sigma0 {self.sigma0:.4g}",
+            f"{'kind':32}{'number':>8}{'redundancy':>12}{'estimated sigma':>17}",
+        ]
+        lines += [
+            f"{name:32}{c.observations:8d}{c.redundancy:12.2f}{c.sigma:17.4g}"
+            for name, c in self.components.items()
+        ]
+        return "\n".join(lines)
+
+
+def adjust(
+    tables: Sequence[Table], observations: Sequence[Observations], *,
+    datum: str | Mapping[str, Any] = "given", motions: Motions | None = None,
+    eliminate: str | None = "", reduction: str | None = None,
+    method: str = "levenberg-marquardt", max_iterations: int = 100, robust: str | None = None,
+    snooping: str | None = None, significance: float = 0.001, estimate_components: bool = False,
+    progress: Callable | None = None, **options,
+) -> Result:  # fmt: skip
+    """Adjust a problem of one's own by least squares.
+
+    **Arguments:**
+
+    - `tables`: the unknowns; `observations`: sets of them, made by calling a `Kind`.
+    - `datum`: what holds a problem that may float as a whole: `"given"`, the observations and what
+      is held; `"inner"`, inner constraints on all that moves; `"minimal"`, as few unknowns as
+      needed; or by table the rows that hold it, inner constraints on those.
+    - `motions`: in which the problem may float; a similarity of all tables of coordinates and poses
+      (a shift of a table of numbers) if not given, see `motions.py`. Which of them are open is
+      found from the observations.
+    - `eliminate`: the table that is eliminated row by row; chosen if not given, None: none.
+    - `reduction`: how the rest is solved, "dense", "banded" or "iterative"; chosen if not given.
+    - `method`: "levenberg-marquardt" or "gauss-newton".
+    - `robust`: "huber", "cauchy" or "tukey"; `snooping`: "pope" or "baarda", at the level
+      `significance`.
+    - `estimate_components`: scale the σ of every kind until its variance component is 1.
+    - `progress(step, cost, λ)`: called after every evaluation.
+
+    **Returns:** a `Result`.
+
+    **Raises:** `InputError` for declarations that do not fit together; `NotSolvedError` where what
+    robust estimation, snooping or components leave determines no answer.
+    """
+    one_of("method", method, tuple(METHODS))
+    one_of("robust", robust, ESTIMATORS, none=True)
+    truth("estimate_components", estimate_components)
+    check_test(snooping, significance)
+    steps = whole("max_iterations", max_iterations) + 1
+    if robust and snooping:
+        raise InputError("robust estimation or data snooping, not both at once")
+    tables = tuple(tables)
+    eliminate = choose_eliminated(tables, observations) if eliminate == "" else eliminate
+    problem = make_problem(
+        tables, observations, eliminate, motions=_motions(tables, datum, motions),
+        datum=functools.partial(_hold_datum, tables, datum), reduction=reduction, **options,
+    )  # fmt: skip
+    minima: list[Minimum] = []
+
+    def again(problem: Problem, start: Values) -> Solution:
+        minima.append(find_minimum(
+            problem, start, search=METHODS[method], max_steps=steps, progress=progress,
+        ))  # fmt: skip
+        found = Solution(problem, minima[-1].values)
+        if len(minima) > 1 and not (converged(int(minima[-1].termination)) and found.determined):
+            names = ", ".join(undetermined(problem, minima[-1].values)[:8])
+            raise NotSolvedError(f"not solved after a change of weights: {names}")
+        return found
+
+    found, removed, suspects, factors = again(problem, problem.data.start), [], [], {}
+    problem = with_factor(problem)
+    first = Result(problem, minima[-1])
+    if not first.converged:
+        return first
+    if robust:
+        reweighted = reweight(problem, found.values, again, robust)
+        found, suspects = reweighted.found, reweighted.suspects(significance)
+    if snooping:
+        found = Solution(problem, found.values)
+        found, removed = snoop(found, again, test=snooping, significance=significance)
+    if estimate_components:
+        found, factors = estimate(found, kinds_as_groups(problem), again)
+    return Result(found.problem, minima[-1], removed, suspects, factors)
+
+
+def estimate(found: Solution, groups: Sequence[Group], again: Callable, tolerance: float = 1e-3):
+    """Repeat Förstner's estimate until every component is 1 within `tolerance`: the solution, and
+    by group what its σ have been multiplied by."""
+    factors: dict[str, float] = {}
+    for _ in range(ROUNDS):
+        components = variance_components(found, groups, factors)
+        usable = {name: c for name, c in components.items() if c.usable}
+        if all(abs(c.ratio - 1) < tolerance for c in usable.values()):
+            break
+        problem = rescale(found.problem, groups, {name: c.ratio for name, c in usable.items()})
+        found = again(problem, found.values)
+        factors |= {name: c.sigma for name, c in usable.items()}
+    return found, factors
+
+
+def kinds_as_groups(problem: Problem) -> list[Group]:
+    """Every kind of observations is a group of its own."""
+    sets: dict[str, list] = {}
+    for o, given in enumerate(problem.observations):
+        sets.setdefault(given.kind.name, []).append((o, np.s_[:]))
+    return [Group(name, parts) for name, parts in sets.items()]
+
+
+def choose_eliminated(tables: Sequence[Table], observations: Sequence[Observations]) -> str | None:
+    """The table with the most unknowns of which no observation touches two rows, if it is worth
+    it."""
+    twice = {t for given in observations for t in given.kind.of if given.kind.of.count(t) > 1}
+    size = {t.name: int(t.free.sum()) for t in tables if t.name not in twice}
+    total = sum(int(t.free.sum()) for t in tables)
+    largest = max(size, key=size.get, default=None)
+    return largest if total >= FEW and size.get(largest, 0) > total / 4 else None
+
+
+def _motions(tables, datum, motions):
+    if isinstance(datum, str):
+        one_of("datum", datum, DATUMS)
+    if motions is not None or (isinstance(datum, str) and datum == "given"):
+        return motions
+    return likely_motions(tables)
+
+
+def _hold_datum(tables, datum, gauge):
+    """By table what holds the datum, and whether by as few of them as needed."""
+    every = {t.name: np.ones((t.rows, t.space.width)) for t in tables}
+    if isinstance(datum, str):
+        if datum == "given":
+            raise InputError(f"the datum is open in {gauge.shape[1]} parameters: say what holds it")
+        return every, datum == "minimal"
+    chosen = {}
+    for name, rows in datum.items():
+        if name not in every:
+            raise InputError(f"datum: there is no table {name!r}; known: {', '.join(every)}")
+        chosen[name] = np.zeros(every[name].shape)
+        chosen[name][np.asarray(rows)] = 1.0
+    return chosen, False

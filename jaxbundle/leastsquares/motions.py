@@ -1,0 +1,54 @@
+"""Motions that observations may leave open: shifts, and similarities of places and poses."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+
+from jaxbundle.geometry import transform_point, transform_pose
+from jaxbundle.leastsquares.declarations import Motions, Table
+from jaxbundle.leastsquares.spaces import Pose, PoseValue, Vector
+
+SEVEN = ("shift X", "shift Y", "shift Z", "rotation X", "rotation Y", "rotation Z", "scale")
+
+
+def similarity(points: Sequence[str] = ("point",), poses: Sequence[str] = ()) -> Motions:
+    """The seven parameters of space that move tables of points [n, 3] and of poses."""
+    moved = [(name, transform_point) for name in points] + [(name, _move_pose) for name in poses]
+    return Motions(SEVEN, tuple(moved), curved=(3, 4, 5, 6))
+
+
+def similarity_of_plane(points: Sequence[str]) -> Motions:
+    """Two shifts, a rotation and a scale that move tables of points [n, 2]."""
+    names = ("shift X", "shift Y", "rotation", "scale")
+    return Motions(names, tuple((name, _move_in_plane) for name in points), curved=(2, 3))
+
+
+def shift(table: str) -> Motions:
+    """One constant for all rows of a table of numbers, as the level of heights."""
+    return Motions(("shift",), ((table, _shift),))
+
+
+def likely_motions(tables: Sequence[Table]) -> Motions | None:
+    """What is most likely open: a similarity of all tables of three coordinates and poses, else of
+    two, else a shift of the first table of numbers."""
+    vectors = {n: [t.name for t in tables if t.space == Vector(n)] for n in (0, 2, 3)}
+    poses = [t.name for t in tables if isinstance(t.space, Pose)]
+    if poses or vectors[3]:
+        return similarity(vectors[3], poses)
+    if vectors[2]:
+        return similarity_of_plane(vectors[2])
+    return shift(vectors[0][0]) if vectors[0] else None
+
+
+def _move_pose(motion, value: PoseValue) -> PoseValue:
+    return PoseValue(*transform_pose(motion, *value))
+
+
+def _move_in_plane(motion, value):
+    x, y, turn, log_scale = motion
+    c, s = jnp.exp(log_scale) * jnp.cos(turn), jnp.exp(log_scale) * jnp.sin(turn)
+    return jnp.stack([c * value[0] - s * value[1] + x, s * value[0] + c * value[1] + y])
+
+
+def _shift(motion, value):
+    return value + motion[0]
