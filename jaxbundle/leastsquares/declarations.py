@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int, PyTree
 
 from jaxbundle.errors import InputError
-from jaxbundle.leastsquares.spaces import Space, Vector
+from jaxbundle.leastsquares.spaces import Pose, PoseValue, Space, Vector
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +49,8 @@ class Table:
             raise InputError(f"table {self.name!r}: the values must be arrays of rows")
         if len({len(x) for x in leaves}) > 1:
             raise InputError(f"table {self.name!r}: its arrays differ in their number of rows")
+        if self.space is None and isinstance(self.value, PoseValue):
+            object.__setattr__(self, "space", Pose())
         if self.space is None:
             shape = np.shape(leaves[0])
             if len(leaves) > 1 or len(shape) > 2:
