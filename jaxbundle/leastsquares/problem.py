@@ -8,11 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxbundle.arguments import one_of
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.datum import find_open_motions, make_datum
 from jaxbundle.leastsquares.declarations import Motions, Observations, Table
 from jaxbundle.leastsquares.indices import common, finish, rounded
 from jaxbundle.leastsquares.plan import Plan, make_plan
+from jaxbundle.leastsquares.reduction import FACTORS, REDUCTIONS
 from jaxbundle.leastsquares.retraction import retract
 from jaxbundle.leastsquares.rows import Data, Declared, Values
 from jaxbundle.leastsquares.solver import LeastSquares
@@ -72,25 +74,48 @@ class Counts:
 def make_problem(
     tables: Sequence[Table], observations: Sequence[Observations], eliminate: str | None = None,
     *, motions: Motions | None = None, datum: Callable | None = None, retraction=None,
+    reduction: str | None = None,
 ) -> Problem:  # fmt: skip
     """Plan and arrays of declared tables and observations.
 
     `motions`: those that may be open. `datum(gauge)` is asked where some are, with the combinations
     [motions, defect] that change no observation: which unknowns are to hold the datum, [rows,
     width] by table, and whether as few of them as needed. `retraction(declared)` gives the function
-    `(plan, values, change)` that says where a change leads, if not `Retraction`."""
+    `(plan, values, change)` that says where a change leads, if not `Retraction`. `reduction`: how
+    the reduced system is solved, "dense", "banded" or "iterative"; chosen by its size and fill if
+    not given."""
+    one_of("reduction", reduction, REDUCTIONS, none=True)
     tables, observations = tuple(tables), tuple(observations)
     check(tables, observations)
     spaces = tuple((t.name, t.space) for t in tables)
     declared = Declared(tuple(o.kind for o in observations), spaces, motions)
-    host, sizes, _ = make_plan(tables, observations, eliminate)
-    number = sum(o.number for o in observations)
-    sizes = common([sizes], lambda key, n: n if number > LARGE else rounded(n))
-    plan = jax.device_put(finish(host, sizes))
+    ways = REDUCTIONS if reduction is None else (reduction,)
+    plan, sizes = _make_plan(tables, observations, eliminate, ways)
     data = make_data(declared, tables, observations)
     problem = Problem(tables, observations, declared, plan, data, sizes, count(tables, data),
                       (retraction or Retraction)(declared))  # fmt: skip
     return problem if motions is None else _with_datum(problem, datum)
+
+
+def _make_plan(tables, observations, eliminate, ways):
+    """The plan on the device, and the sizes of its lists."""
+    host, sizes, _ = make_plan(tables, observations, eliminate, ways=ways)
+    number = sum(o.number for o in observations)
+    sizes = common([sizes], lambda key, n: n if number > LARGE else rounded(n))
+    return jax.device_put(finish(host, sizes)), sizes
+
+
+def with_factor(problem: Problem) -> Problem:
+    """The problem with a reduced system that can be factorised, as statistics need it; the same
+    where no factor fits into memory."""
+    if problem.plan.reduction in FACTORS:
+        return problem
+    given = problem.tables, problem.observations, problem.plan.eliminated
+    plan, sizes = _make_plan(*given, FACTORS)
+    if plan.reduction not in FACTORS:
+        return problem
+    plan = dataclasses.replace(plan, datum=problem.plan.datum)
+    return dataclasses.replace(problem, plan=plan, sizes=sizes)
 
 
 def _with_datum(problem: Problem, choose: Callable | None) -> Problem:
