@@ -9,7 +9,6 @@ from jaxbundle.leastsquares.elimination import reduced_system
 from jaxbundle.leastsquares.normal import Normal, normal_equations
 from jaxbundle.leastsquares.plan import Plan
 from jaxbundle.leastsquares.problem import Problem, pad_data, pad_values
-from jaxbundle.leastsquares.reduced import dense_matrix
 from jaxbundle.leastsquares.rows import Data, Declared, Values, lay_out_data
 
 INDETERMINATE = 1e-12
@@ -67,7 +66,7 @@ def undetermined(problem: Problem, values: Values) -> list[str]:
 def _scaled(declared: Declared, plan: Plan, values: Values, data: Data):
     *_, blocks = normal_equations(declared, plan, values, lay_out_data(plan, data))
     S, *_ = reduced_system(Normal(plan, blocks))
-    return dense_matrix(plan, plan.kept, S), blocks.eliminated
+    return S.matrix(plan, plan.kept), blocks.eliminated
 
 
 def _undetermined_rows(problem: Problem, V) -> list[str]:

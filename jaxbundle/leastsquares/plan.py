@@ -137,11 +137,13 @@ class Blocks(eqx.Module):
 class Datum(eqx.Module):
     """How a problem that may float is pinned down (`datum.py`): the motions that are open, as
     combinations of all (`gauge`); the unknowns that hold the datum (`weight`, by table); elements
-    of the reduced matrix that make it regular (`pins`)."""
+    of the reduced matrix that make it regular (`pins`); by table, what is held of what the motions
+    would move (`held`, 1 or 0; no table of which nothing is)."""
 
     gauge: Float[Array, "motions defect"]
     weight: dict[str, Float[Array, "rows width"]]
     pins: dict[str, Float[Array, "rows w"]]
+    held: dict[str, Float[Array, "rows width"]]
 
 
 class Plan(eqx.Module):

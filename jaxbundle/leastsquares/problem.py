@@ -47,6 +47,13 @@ class Problem:
         return _diagonal(np.asarray(self.data.weight[o] if weight is None else weight))
 
     @property
+    def reduced_size(self) -> int:
+        """Unknowns of the reduced system, the held ones counted."""
+        e = self.plan.eliminated
+        kept = sum(t.rows * t.space.width for t in self.tables if t.free.any() and t.name != e)
+        return kept if e is None else kept + self.kept_rows.sum() * self.table(e).space.width
+
+    @property
     def kept_rows(self) -> Bool[np.ndarray, " rows"]:
         """Rows of the eliminated table that are kept."""
         kept = np.zeros(self.table(self.plan.eliminated).rows, bool)
@@ -131,7 +138,7 @@ def _with_datum(problem: Problem, choose: Callable | None) -> Problem:
         t: _longer(np.asarray(w, float), problem.sizes["table", t], "constant")
         for t, w in weight.items()
     }
-    datum = make_datum(problem.declared, problem.plan, data, gauge, weight, minimal)
+    datum = make_datum(problem.declared, problem.plan, data, gauge, weight, minimal, real)
     plan = dataclasses.replace(problem.plan, datum=jax.device_put(datum))
     counts = dataclasses.replace(problem.counts, datum=gauge.shape[1])
     return dataclasses.replace(problem, plan=plan, counts=counts)
@@ -252,7 +259,19 @@ def without_filling(problem: Problem, values: Values) -> Values:
 def _longer(x, n: int, mode: str):
     """At least one row more, so that there is one to which nothing refers."""
     module = jnp if isinstance(x, jax.core.Tracer) else np
+    x = module.asarray(x)
     return module.pad(x, ((0, n - len(x)), *((0, 0),) * (x.ndim - 1)), mode=mode)
+
+
+def given_data(problem: Problem, data: Data | None) -> Data:
+    """The numbers in the sizes of the plan: those of the problem, or others of the same shapes.
+
+    **Raises:** `InputError` where the shapes are others."""
+    known, data = problem.data, problem.data if data is None else data
+    shapes = lambda data: (jax.tree.structure(data), [jnp.shape(x) for x in jax.tree.leaves(data)])
+    if shapes(data) != shapes(known):
+        raise InputError("data must be a Data with arrays of the shapes of problem.data")
+    return pad_data(problem, data)
 
 
 def make_solver(problem: Problem, *, atol=1e-5, rtol=0.0, **options) -> LeastSquares:

@@ -9,6 +9,7 @@ at all, by conjugate gradients (`iterative.py`). All three have
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import cho_solve
@@ -82,9 +83,18 @@ def factorise_dense(plan: Plan, S: Reduced) -> DenseFactor:
     return DenseFactor(plan, cholesky(S.matrix(plan, plan.kept)))
 
 
-def cholesky(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """L of S = L·Lᵀ, from the lower triangle of S."""
+@jax.custom_jvp
+def cholesky(S: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
+    """L of S = L·Lᵀ from the lower triangle of S; NaN where it is not positive definite."""
     return jnp.linalg.cholesky(S, symmetrize_input=False)
+
+
+@cholesky.defjvp
+def _(primals, tangents):
+    # JAX's own rule takes a change for the whole of it.
+    whole = lambda S: jnp.tril(S) + jnp.tril(S, -1).mT
+    factor = lambda S: jnp.linalg.cholesky(whole(S), symmetrize_input=False)
+    return jax.jvp(factor, primals, tangents)
 
 
 def blocks_of(plan: Plan, groups: Groups, Q: Float[Array, "n n"]) -> Reduced:

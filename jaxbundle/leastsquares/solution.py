@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbundle.leastsquares.cofactors import Cofactors, cofactors, propagate
+from jaxbundle.leastsquares.cofactors import Cofactors, blocks_of_tables, cofactors, propagate
 from jaxbundle.leastsquares.datum import move_to_datum, of_groups
 from jaxbundle.leastsquares.elimination import PIVOT, Factor, factorise, solve
 from jaxbundle.leastsquares.linearise import differentiate
@@ -39,6 +39,9 @@ from jaxbundle.leastsquares.rows import (
     residuals,
 )
 from jaxbundle.leastsquares.solver import Minimum, minimise
+
+HERE = "the plan"
+"""Stands for it in a factor that leaves a compiled function."""
 
 Rows = dict[int, Float[np.ndarray, "n r"]]
 """By set of observations, in the order they were given."""
@@ -102,7 +105,7 @@ class Solution:
     @functools.cached_property
     def factor(self) -> Factor:
         """The normal equations, undamped, factorised."""
-        return dataclasses.replace(_factor(*self.given), plan=self.problem.plan)
+        return with_plan(_factor(*self.given), self.problem.plan)
 
     @property
     def determined(self) -> bool:
@@ -117,18 +120,13 @@ class Solution:
 
     def cofactor(self, table: str) -> Float[np.ndarray, "rows width width"]:
         """The cofactors of every row of a table among themselves; zero where it is held."""
-        given = self.problem.table(table)
-        number, width = given.rows, given.space.width
-        found = np.zeros((number, width, width))
-        for name, group in self.problem.plan.groups.items():
-            for m in group.members:
-                if m.table == table:
-                    at = slice(m.start, m.start + m.width)
-                    Q = np.asarray(self.cofactors.own[name])[:, at, at]
-                    rows = np.arange(len(Q)) if m.rows is None else np.asarray(m.rows)
-                    real = rows < number
-                    found[rows[real]] += Q[real]
-        return found
+        return self._own[table]
+
+    @functools.cached_property
+    def _own(self):
+        declared, plan, values = self.given[:3]
+        found = _of_tables(declared, plan, self.cofactors.own, values)
+        return jax.tree.map(np.asarray, without_filling(self.problem, found))
 
     @functools.cached_property
     def reliability(self) -> Reliability:
@@ -189,12 +187,23 @@ def _residuals(declared: Declared, plan: Plan, values: Values, data: Data):
 
 @eqx.filter_jit
 def _factor(declared: Declared, plan: Plan, values: Values, data: Data) -> Factor:
-    """Without its plan, which a compiled function would return as a copy."""
     *_, blocks = normal_equations(declared, plan, values, lay_out_data(plan, data))
-    return dataclasses.replace(factorise(Normal(plan, blocks)), plan=None)
+    return without_plan(factorise(Normal(plan, blocks)))
+
+
+def without_plan(factor: Factor) -> Factor:
+    """A factor without its plan, which a compiled function would return as a copy."""
+    is_plan = lambda x: isinstance(x, Plan)
+    return jax.tree.map(lambda x: HERE if is_plan(x) else x, factor, is_leaf=is_plan)
+
+
+def with_plan(factor: Factor, plan: Plan) -> Factor:
+    """And with it again."""
+    return jax.tree.map(lambda x: plan if x is HERE or (isinstance(x, str) and x == HERE) else x, factor)
 
 
 _cofactors = eqx.filter_jit(cofactors)
+_of_tables = eqx.filter_jit(blocks_of_tables)
 
 
 @eqx.filter_jit

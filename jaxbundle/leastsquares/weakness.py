@@ -29,7 +29,7 @@ from jaxbundle.leastsquares.problem import Problem
 from jaxbundle.leastsquares.reduced import flat, split
 from jaxbundle.leastsquares.reduction import FACTORS
 from jaxbundle.leastsquares.rows import lay_out_data
-from jaxbundle.leastsquares.solution import Solution
+from jaxbundle.leastsquares.solution import Solution, with_plan, without_plan
 
 VAGUE = 50.0
 """An unknown whose σ is above a fiftieth of its extent is determined in name only."""
@@ -70,14 +70,14 @@ def find_weak_unsolved(found: Solution, extents: Extents) -> Weak:
     equations are lifted a little, so that there is a factor."""
     if found.problem.plan.reduction not in FACTORS:
         return Weak()
-    factor = dataclasses.replace(_lifted_factor(*found.given), plan=found.problem.plan)
+    factor = with_plan(_lifted_factor(*found.given), found.problem.plan)
     return _weak(found, factor, extents, 1.0)
 
 
 @eqx.filter_jit
 def _lifted_factor(declared, plan, values, data) -> Factor:
     *_, blocks = normal_equations(declared, plan, values, lay_out_data(plan, data))
-    return dataclasses.replace(factorise(lift(Normal(plan, blocks))), plan=None)
+    return without_plan(factorise(lift(Normal(plan, blocks))))
 
 
 def _weak(found: Solution, factor: Factor, extents: Extents, sigma0: float, at_hand=False) -> Weak:
