@@ -122,7 +122,8 @@ class Result:
         value = jax.tree.map(np.asarray, self.solution.values[table])
         covariance = self.sigma0**2 * self.solution.cofactor(table)
         sigma = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0, None))
-        return TableResult(value, sigma[:, 0] if np.ndim(value) == 1 else sigma, covariance)
+        numbers = isinstance(value, np.ndarray) and value.ndim == 1
+        return TableResult(value, sigma[:, 0] if numbers else sigma, covariance)
 
     def redundancy(self, kind: str) -> Float[np.ndarray, "n *r"]:
         """The redundancy numbers of the observations of a kind, in the order they were given."""

@@ -79,7 +79,7 @@ def variance_components(
     problem, tested, components = found.problem, found.reliability, {}
     for group in groups:
         take = lambda by_set, group=group: np.concatenate(
-            [np.asarray(by_set(o))[at].ravel() for o, at in group.parts]
+            [np.zeros(0), *(np.asarray(by_set(o))[at].ravel() for o, at in group.parts)]
         )
         weight = take(problem.weights)
         used = weight[weight > 0]

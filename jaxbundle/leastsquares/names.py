@@ -3,8 +3,10 @@
 import dataclasses
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
+from jaxbundle.leastsquares.datum import open_directions
 from jaxbundle.leastsquares.elimination import reduced_system
 from jaxbundle.leastsquares.normal import Normal, normal_equations
 from jaxbundle.leastsquares.plan import Plan
@@ -50,11 +52,15 @@ def kept_unknowns(problem: Problem) -> list[tuple[str, int, int]]:
 def undetermined(problem: Problem, values: Values) -> list[str]:
     """The unknowns that the observations do not determine, most affected first."""
     plan, data = problem.plan, pad_data(problem, problem.data)
-    S, V = _scaled(problem.declared, plan, pad_values(problem, values), data)
+    S, V, G = _scaled(problem.declared, plan, pad_values(problem, values), data)
     rows = [] if V is None else _undetermined_rows(problem, np.asarray(V))
+    S, G = np.asarray(S), np.asarray(G)
     S = np.tril(S) + np.tril(S, -1).T
     if not np.isfinite(S).all():
         return rows
+    if G.shape[1]:  # The datum is held otherwise.
+        q, _ = np.linalg.qr(G)
+        S = S + q @ q.T
     eigenvalues, vectors = np.linalg.eigh(S) if S.size else (np.zeros(0), S)
     null = vectors[:, eigenvalues < INDETERMINATE * max(1.0, eigenvalues[-1:].sum())]
     share, names = (null**2).sum(1), kept_unknowns(problem)
@@ -65,8 +71,13 @@ def undetermined(problem: Problem, values: Values) -> list[str]:
 @eqx.filter_jit
 def _scaled(declared: Declared, plan: Plan, values: Values, data: Data):
     *_, blocks = normal_equations(declared, plan, values, lay_out_data(plan, data))
-    S, *_ = reduced_system(Normal(plan, blocks))
-    return S.matrix(plan, plan.kept), blocks.eliminated
+    S, scale, *_ = reduced_system(Normal(plan, blocks), regular=False)
+    G = jnp.zeros((sum(plan.groups[g].free.size for g in plan.kept), 0))
+    if plan.datum is not None:
+        open_ones = open_directions(declared, plan, values)
+        rows = [open_ones[g] / scale[g][..., None] for g in plan.kept]
+        G = jnp.concatenate([x.reshape(-1, x.shape[-1]) for x in rows])
+    return S.matrix(plan, plan.kept), blocks.eliminated, G
 
 
 def _undetermined_rows(problem: Problem, V) -> list[str]:

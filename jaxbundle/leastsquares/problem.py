@@ -56,6 +56,8 @@ class Problem:
     @property
     def kept_rows(self) -> Bool[np.ndarray, " rows"]:
         """Rows of the eliminated table that are kept."""
+        if self.plan.eliminated is None:
+            return np.zeros(0, bool)
         kept = np.zeros(self.table(self.plan.eliminated).rows, bool)
         for name, group in self.plan.groups.items():
             for m in group.members:

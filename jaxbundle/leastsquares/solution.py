@@ -199,7 +199,7 @@ def without_plan(factor: Factor) -> Factor:
 
 def with_plan(factor: Factor, plan: Plan) -> Factor:
     """And with it again."""
-    return jax.tree.map(lambda x: plan if x is HERE or (isinstance(x, str) and x == HERE) else x, factor)
+    return jax.tree.map(lambda x: plan if isinstance(x, str) else x, factor)
 
 
 _cofactors = eqx.filter_jit(cofactors)

@@ -141,10 +141,11 @@ def counts(adjustment) -> list[str]:
         ("interior orientation", n.interior),
         ("distances", n.distances),
     ]
+    free = lambda table: int(adjustment.problem.system.table(table).free.sum())
     groups = [
-        ("exterior orientation", int(np.sum(s.image_free))),
-        ("interior orientation", int(np.sum(s.camera_free))),
-        ("object coordinates", int(np.sum(s.point_free))),
+        ("exterior orientation", free("image")),
+        ("interior orientation", sum(free(t.name) for t in adjustment.problem.layout.cameras)),
+        ("object coordinates", free("point")),
     ]
     used = int((np.asarray(adjustment.problem.data.image_weight) > 0).any(1).sum())
     rows = [

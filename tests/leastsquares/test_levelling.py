@@ -3,18 +3,10 @@
 import numpy as np
 import pytest
 
-from jaxbundle.leastsquares.cofactors import cofactors
-from jaxbundle.leastsquares.datum import move_to_datum
-from jaxbundle.leastsquares.declarations import Kind, Motions, Table
-from jaxbundle.leastsquares.elimination import factorise
-from jaxbundle.leastsquares.normal import Normal, normal_equations
-from jaxbundle.leastsquares.problem import find_minimum, make_problem, make_solver, pad_data
-from jaxbundle.leastsquares.reliability import reliability
-from jaxbundle.leastsquares.rows import lay_out_data
+from jaxbundle import leastsquares as ls
 
 HEIGHTS, SIGMA = 12, 0.01
-LEVELLED = Kind("levelled difference", lambda a, b, dh: b - a - dh, of=("height", "height"))
-SHIFT = Motions(("shift",), (("height", lambda motion, height: height + motion[0]),))
+LEVELLED = ls.Kind("levelled difference", lambda a, b, dh: b - a - dh, of=("height", "height"))
 
 
 def net():
@@ -31,18 +23,13 @@ def net():
 @pytest.mark.parametrize("held", [True, False], ids=["a height held", "inner constraints"])
 def test_against_dense_algebra(held):
     i, j, measured, start = net()
-    observations = [LEVELLED((i, j), measured, sigma=SIGMA)]
     free = np.ones(HEIGHTS)
     free[0] = 0 if held else 1
-    table = Table("height", start, free=free)
-    datum = {} if held else {
-        "motions": SHIFT, "datum": lambda gauge: ({"height": np.ones((HEIGHTS, 1))}, False)
-    }
-    problem = make_problem([table], observations, **datum)
-    data = pad_data(problem, problem.data)
-    minimum = find_minimum(make_solver(problem), data, data.start)
-    assert int(minimum.termination) == 1
-    values = move_to_datum(problem.declared, problem.plan, minimum.values, data.start)
+    result = ls.adjust(
+        [ls.Table("height", start, free=free)],
+        [LEVELLED(rows=(i, j), measured=measured, sigma=SIGMA)],
+        datum="given" if held else "inner",
+    )  # fmt: skip
 
     J = (np.eye(HEIGHTS)[j] - np.eye(HEIGHTS)[i]) / SIGMA
     moving = np.flatnonzero(free)
@@ -53,18 +40,13 @@ def test_against_dense_algebra(held):
     else:
         Q = np.linalg.pinv(N)
     expected = start - Q @ J.T @ (J @ start - measured / SIGMA)
-    found = np.asarray(values["height"])[:HEIGHTS]
-    np.testing.assert_allclose(found, expected, atol=1e-9)
-
-    normal = normal_equations(
-        problem.declared, problem.plan, values, lay_out_data(problem.plan, data)
-    )[-1]
-    factor = factorise(Normal(problem.plan, normal))
-    of_all = cofactors(problem.declared, values, factor)
-    np.testing.assert_allclose(
-        np.asarray(of_all.own["height"])[:HEIGHTS, 0, 0], np.diag(Q), rtol=1e-9, atol=1e-15
-    )
-    tested = reliability(problem.declared, problem.plan, values, data, of_all)
-    r = np.asarray(tested.redundancy[0])[: len(measured), 0]
+    np.testing.assert_allclose(result["height"].value, expected, atol=1e-9)
+    v = J @ expected - measured / SIGMA
+    assert result.counts.redundancy == len(i) - HEIGHTS + 1
+    assert result.vtpv == pytest.approx(v @ v)
+    sigma = result.sigma0 * np.sqrt(np.diag(Q))
+    np.testing.assert_allclose(result["height"].sigma, sigma, rtol=1e-9, atol=1e-12)
+    r = result.redundancy("levelled difference")
     np.testing.assert_allclose(r, 1 - np.einsum("ij,jk,ik->i", J, Q, J), atol=1e-9)
-    assert r.sum() == pytest.approx(problem.counts.redundancy)
+    ends = result.covariance(lambda tables: tables["height"][np.array([3, 7])])
+    np.testing.assert_allclose(ends, result.sigma0**2 * Q[np.ix_([3, 7], [3, 7])], atol=1e-12)
