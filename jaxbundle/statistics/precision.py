@@ -1,6 +1,6 @@
 """The precision of a design: σ of everything as a differentiable function of the design.
 
-    C = σ0²·S·(JᵀPJ)⁻¹·Sᵀ,        S the S-transformation into the datum (`datum.py`)
+    C = σ0²·S·(JᵀPJ)⁻¹·Sᵀ,        S the S-transformation into the datum (`leastsquares/datum.py`)
 
 Nothing is adjusted, and no measurement enters. J is taken at the given values (`Data.start`:
 stations, targets, cameras), with image coordinates that are predicted from them, so that it is a
@@ -15,20 +15,18 @@ second order (weights, P).
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbundle import cameras
-from jaxbundle.adjustment.jacobian import zero_tangent
-from jaxbundle.adjustment.problem import Problem, with_factor
-from jaxbundle.adjustment.residuals import gather_groups, over_rays
+from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.solve import check_given
 from jaxbundle.adjustment.unknowns import angles_near, named, value_of
-from jaxbundle.arguments import shown
 from jaxbundle.errors import InputError
-from jaxbundle.network.arrays import Data, Values, retract
-from jaxbundle.network.reduction import FACTORS
-from jaxbundle.network.structure import Structure
-from jaxbundle.statistics.cofactors import cofactors, propagate, undamped_factor
-from jaxbundle.statistics.inspection import DETERMINED
+from jaxbundle.leastsquares import precision as engine
+from jaxbundle.leastsquares.reduction import FACTORS
+from jaxbundle.leastsquares.spaces import Pose, PoseValue
+from jaxbundle.network.arrays import Data, Values
 
 ROUNDING = 1e-14
 """A variance below this fraction of the largest of its kind is that of what the datum holds: 0."""
@@ -74,45 +72,45 @@ def precision(
     **Raises:** `InputError` where no factor of the network fits into memory; `KeyError` for a name
     that is not there.
     """
-    if not isinstance(problem, Problem):
-        raise InputError(
-            f"problem must be what jaxbundle.make_problem gives, but is {shown(problem)}"
-        )
-    if data is not None and not isinstance(data, Data):
-        raise InputError(f"data must be a Data, as problem.data is one, but is {shown(data)}")
-    problem, wanted = with_factor(problem), named(problem, names) if names else []
-    if problem.structure.reduction not in FACTORS:
+    check_given(problem, data)
+    problem, wanted = problem.with_factor(), named(problem, names) if names else []
+    if problem.reduction not in FACTORS:
         raise InputError("precision: the network is too large for its covariance; take part of it")
-    s, data = problem.structure, problem.data if data is None else data
-    values = data.start
-    factor = undamped_factor(s, values, _predicted(s, data))
-    sound = jnp.all(factor.reduced.pivots**2 > DETERMINED)
-    found = cofactors(s, values, factor)
-    parts = Precision(
-        images=_root(_image_variances(problem, values, found.image)),
-        cameras=_camera_sigma(s, values, found),
-        points=_root(jnp.diagonal(found.point, axis1=1, axis2=2)),
-        covariance=_covariance(problem, values, factor, wanted),
+    data = problem.data if data is None else data
+
+    def of(tables):
+        values = problem.layout.values(tables)
+        return jnp.stack([value_of(problem, name, values) for name in wanted])
+
+    found = engine.precision(
+        problem.system, problem.layout.data(_predicted(problem, data)), of if wanted else None
     )
-    unit = sigma0 * jnp.where(sound, 1.0, jnp.nan)
-    scales = Precision(unit, unit, unit, unit**2)
+    parts = Precision(
+        images=_root(_image_variances(problem, data.start, found.own["image"])),
+        cameras=_camera_sigma(problem, data.start, found.own),
+        points=_root(jnp.diagonal(found.own["point"], axis1=1, axis2=2)),
+        covariance=found.covariance,
+    )
+    scales = Precision(sigma0, sigma0, sigma0, jnp.square(sigma0))
     return jax.tree.map(jnp.multiply, parts, scales)
 
 
-@eqx.filter_jit
-def _predicted(s: Structure, data: Data) -> Data:
+def _predicted(problem: Problem, data: Data) -> Data:
     """The data with the image coordinates that the given values have."""
-    parts = []
-    for group in s.groups:
-        model = cameras.get_model(group.model)
+    space, values, xy = Pose(), data.start, data.image_xy
+    poses = PoseValue(values.position, values.rotation)
+    for table in problem.layout.cameras:
+        model = cameras.get_model(table.model)
+        rows = np.flatnonzero(np.isin(problem.camera, table.cameras))
 
-        def one(rotation, centre, interior, point, xy, weight, model=model):
-            sight = [p - c for p, c in zip(point, centre)]
-            ray = (sum(m * x for m, x in zip(rotation[3 * i : 3 * i + 3], sight)) for i in range(3))
-            return cameras.project(model, interior, *ray)
+        def one(pose, interior, point, model=model):
+            return jnp.stack(cameras.project(model, interior, *space.prepare(pose).ray(point)))
 
-        parts.append(jnp.stack(over_rays(s, group, one, data.start, data), -1))
-    return eqx.tree_at(lambda d: d.image_xy, data, gather_groups(s, parts))
+        at = lambda x, index, rows=rows: jax.tree.map(lambda x: x[index[rows]], x)
+        interior = values.camera[problem.camera[rows], : len(table.parameters)]
+        found = jax.vmap(one)(at(poses, problem.image), interior, at(values.point, problem.point))
+        xy = jnp.asarray(xy).at[rows].set(found)
+    return eqx.tree_at(lambda d: d.image_xy, data, xy)
 
 
 def _root(variance):
@@ -123,8 +121,6 @@ def _root(variance):
 
 def _image_variances(problem: Problem, values: Values, Q):
     """Variances of X0, Y0, Z0 and of ω, φ, κ, by the Jacobian of the angles."""
-    free = problem.structure.image_free
-    Q = Q[:, :6, :6] * free[:, :, None] * free[:, None, :]
     turn = jax.vmap(jax.jacfwd(angles_near, 1), (0, None, 0))
     A = turn(values.rotation, jnp.zeros(3), jnp.asarray(problem.network.images.angles))
     of_position = jnp.diagonal(Q[:, :3, :3], axis1=1, axis2=2)
@@ -132,23 +128,11 @@ def _image_variances(problem: Problem, values: Values, Q):
     return jnp.concatenate([of_position, of_angles], 1)
 
 
-def _camera_sigma(s: Structure, values: Values, found):
+def _camera_sigma(problem: Problem, values: Values, own):
     sigma = jnp.zeros_like(values.camera)
-    if not s.interior_width:
-        return sigma
-    Q = found.image[:, 6:, 6:] if s.own_camera else found.camera
-    variance = jnp.diagonal(Q, axis1=1, axis2=2) * s.camera_free
-    root = jnp.where(variance > 0, jnp.sqrt(jnp.where(variance > 0, variance, 1.0)), 0.0)
-    return sigma.at[jnp.arange(s.cameras)[:, None], s.camera_columns].add(root)
-
-
-def _covariance(problem: Problem, values: Values, factor, wanted):
-    if not wanted:
-        return jnp.zeros((0, 0))
-    s = problem.structure
-
-    def of_change(change):
-        moved = retract(s, values, change)
-        return jnp.stack([value_of(problem, name, moved) for name in wanted])
-
-    return propagate(s, values, factor, jax.jacrev(of_change)(zero_tangent(s)))
+    for table in problem.layout.cameras:
+        variance = jnp.diagonal(own[table.name], axis1=1, axis2=2)
+        root = jnp.where(variance > 0, jnp.sqrt(jnp.where(variance > 0, variance, 1.0)), 0.0)
+        moving = np.array(problem.system.table(table.name).space.moving, int)
+        sigma = sigma.at[table.cameras[:, None], moving].set(root)
+    return sigma
