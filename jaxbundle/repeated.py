@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxbundle.adjustment.problem import Problem, count_rows
 from jaxbundle.adjustment.unknowns import Name
-from jaxbundle.cameras import get_model
+from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.arrays import Values
 from jaxbundle.result import Adjustment
@@ -24,9 +24,6 @@ from jaxbundle.statistics import (
     variance_components,
 )
 from jaxbundle.statistics.snooping import Removed, without
-
-CORE_PARAMETERS = ("c", "x0", "y0", "fx", "fy", "cx", "cy", "f")
-"""Interior parameters that are never eliminated for want of significance."""
 
 ROUNDS = 20
 """Variance components are estimated at most so many times."""
@@ -132,13 +129,14 @@ def _doubts(components: dict[str, Component], open_ones: list[str]):
 
 
 def eliminated_parameters(problem, minimum, again, critical_t):
-    """Fix insignificant additional parameters at 0, the weakest first."""
+    """Fix insignificant additional parameters at 0, or their default, the weakest first."""
     names = []
+    models = {camera.id: get_model(camera.model) for camera in problem.network.cameras}
     while True:
         result = Adjustment(problem.network, problem, minimum)
         weak = [
             name for _, name in result.insignificant(critical_t)
-            if name.parameter not in CORE_PARAMETERS
+            if name.parameter not in models[name.id].core
         ]  # fmt: skip
         if not weak:
             return problem, minimum, names
@@ -153,6 +151,7 @@ def _without_parameter(problem: Problem, values: Values, name: Name):
     c = [camera.id for camera in problem.network.cameras].index(name.id)
     model = get_model(problem.network.cameras[c].model)
     column = model.parameters.index(name.parameter)
+    value = default_parameters(model)[name.parameter]
     position = np.flatnonzero(
         (np.asarray(s.camera_columns)[c] == column) & (np.asarray(s.camera_free)[c] > 0)
     )[0]
@@ -162,12 +161,12 @@ def _without_parameter(problem: Problem, values: Values, name: Name):
         s.camera_free.at[c, position].set(0.0),
     )
     data = eqx.tree_at(
-        lambda d: d.start.camera, data, data.start.camera.at[c, column].set(0.0)
+        lambda d: d.start.camera, data, data.start.camera.at[c, column].set(value)
     )
     row = np.flatnonzero(np.asarray(s.interior) == c)
     if len(row):
         weight = data.interior_weight.at[row[0], column].set(0.0)
         data = eqx.tree_at(lambda d: d.interior_weight, data, weight)
-    values = eqx.tree_at(lambda v: v.camera, values, values.camera.at[c, column].set(0.0))
+    values = eqx.tree_at(lambda v: v.camera, values, values.camera.at[c, column].set(value))
     counts = count_rows(s, data)
     return dataclasses.replace(problem, structure=s, data=data, counts=counts), values

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from jaxbundle.cameras import default_parameters, get_model
+from jaxbundle.cameras import CameraModel, default_parameters, get_model, key_of
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, quaternion_from_matrix
 from jaxbundle.network.arrays import Data, Values
 from jaxbundle.network.pairs import Pairs, make_pairs, pairs_between, pairs_within
@@ -37,7 +37,7 @@ from jaxbundle.network.tables import Network
 class Group(eqx.Module):
     """The rays of one camera model: which chunks (None: all), and its free parameter columns."""
 
-    model: str = eqx.field(static=True)
+    model: str | CameraModel = eqx.field(static=True)
     free: tuple[int, ...] = eqx.field(static=True)
     chunks: Int[Array, " chunks"] | None
 
@@ -323,24 +323,25 @@ def _camera_plans(image, camera, point, elim_rays, cameras, empty, lengths):
 def _interior(network: Network, camera_of_chunk):
     """Free interior columns of every camera, and the chunks of rays of every camera model."""
     models = [get_model(c.model) for c in network.cameras]
-    free_of_model: dict[str, set[int]] = {}
+    free_of_model: dict[CameraModel, set[int]] = {}
     for camera, model in zip(network.cameras, models):
-        columns = free_of_model.setdefault(model.name, set())
+        columns = free_of_model.setdefault(model, set())
         columns.update(model.parameters.index(name) for name in camera.free)
-    free = {name: tuple(sorted(columns)) for name, columns in free_of_model.items()}
+    free = {model: tuple(sorted(columns)) for model, columns in free_of_model.items()}
     k = max((len(columns) for columns in free.values()), default=0)
     camera_columns = np.zeros((len(models), k), np.int64)
     camera_free = np.zeros((len(models), k))
     for c, (camera, model) in enumerate(zip(network.cameras, models)):
-        for j, column in enumerate(free[model.name]):
+        for j, column in enumerate(free[model]):
             camera_columns[c, j] = column
             camera_free[c, j] = model.parameters[column] in camera.free
     groups = []
-    name_of_chunk = np.array([m.name for m in models], dtype=object)[camera_of_chunk]
-    for name, columns in free.items():
-        chunks = np.flatnonzero(name_of_chunk == name)
+    number = {model: i for i, model in enumerate(free)}
+    model_of_chunk = np.array([number[model] for model in models])[camera_of_chunk]
+    for model, columns in free.items():
+        chunks = np.flatnonzero(model_of_chunk == number[model])
         rows = None if len(free) == 1 else chunks.astype(np.int32)
-        groups.append(Group(name, columns, rows))
+        groups.append(Group(key_of(model), columns, rows))
     return camera_columns, camera_free, tuple(groups)
 
 

@@ -51,7 +51,6 @@ DIRECTIONS, ROUNDS = 6, 8
 """Of the subspace iteration: directions looked for, products with A."""
 LIFT = 1e-10
 """Added to the normal equations that cannot be solved, in parts of their diagonal."""
-PRINCIPAL_POINT = ("x0", "y0", "cx", "cy")
 ADVICE_FOR = {
     "camera": "Free fewer camera parameters, or give them a prior σ; c needs depth or convergent "
     "images, x0 and y0 need images turned about their axis.",
@@ -165,11 +164,7 @@ def _per_extent(inspection: Inspection, of_image, of_point) -> Float[np.ndarray,
     for c, camera in enumerate(problem.network.cameras):
         model = get_model(camera.model)
         columns = np.asarray(s.camera_columns)[c]
-        of_extent = [
-            model.parameters.index(name)
-            for name in (*model.principal_distance, *PRINCIPAL_POINT)
-            if name in model.parameters
-        ]
+        of_extent = [model.parameters.index(name) for name in model.core]
         at = [model.parameters.index(name) for name in model.principal_distance]
         shortest = np.abs(np.asarray(inspection.values.camera)[c, at]).min()
         interior[c] = np.isin(columns, of_extent) / max(shortest, np.finfo(float).tiny)

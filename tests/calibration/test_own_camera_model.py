@@ -1,0 +1,80 @@
+"""`calibrate` and `calibrate_batch` with a user's own camera model."""
+
+import board_photographs as taken
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_calibrate import TRUTH, VIEWS, normalised, simulated
+
+from jaxbundle import CameraModel
+from jaxbundle.calibration import calibrate
+from jaxbundle.calibration.batch import calibrate_batch
+from jaxbundle.calibration.files import json_text
+from jaxbundle.calibration.start import start_values
+from jaxbundle.cameras import opencv
+from jaxbundle.errors import InputError
+
+NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+AGAIN = CameraModel(
+    "again", NAMES, distort=lambda p, x, y: opencv.distort((*p, *[0.0] * 7), x, y), unit="px"
+)
+
+
+def test_opencv_said_again_has_the_figures_of_opencv():
+    views = simulated()
+    ours, own = calibrate(views), calibrate(views, model=AGAIN)
+    assert own.rms == pytest.approx(ours.rms, rel=1e-9)
+    assert own.adjustment.sigma0 == pytest.approx(ours.adjustment.sigma0, rel=1e-9)
+    for name, sigma in own.sigma.items():
+        assert abs(own.parameters[name] - ours.parameters[name]) < 1e-4 * sigma
+        assert sigma == pytest.approx(ours.sigma[name], rel=1e-6)
+    assert max(map(abs, normalised(own, TRUTH).values())) < 3
+    assert own.advice == ours.advice and "Camera (again)" in own.report()
+    assert '"model": "again"' in json_text(own)
+    xy = views.xy[None]
+    ours, own = (calibrate_batch(taken.BOARD.points, xy, views.image_size, model)
+                 for model in ("opencv", AGAIN))  # fmt: skip
+    assert own.converged.all() and own.model is AGAIN and "model again: 1 converged" in str(own)
+    np.testing.assert_allclose(own.values, ours.values, atol=1e-6 * ours.sigma.min())
+    np.testing.assert_allclose(own.sigma, ours.sigma, rtol=1e-9)
+
+
+def division(p, x, y):
+    c, x0, y0, L = p
+    r2 = (x - x0) ** 2 + (y - y0) ** 2
+    return (x - x0) / (1 + L * r2), (y - y0) / (1 + L * r2)
+
+
+def unified(p, r, s, q):
+    f, cx, cy, alpha = p
+    N = alpha * jnp.sqrt(r * r + s * s + q * q) - (1 - alpha) * q
+    return cx + f * r / N, cy - f * s / N
+
+
+def test_start_values_of_any_formula():
+    """Nothing of the formula is known but its images: a fit to those of `opencv`, or of
+    `kannala-brandt`."""
+    views = simulated()
+    model = CameraModel("division", ("c", "x0", "y0", "L"), correct=division)
+    found = start_values(views, model, model.free, (0.01, 0.01)).parameters
+    assert found["c"] == pytest.approx(0.01 * TRUTH["fx"], rel=0.01)
+    assert found["x0"] == pytest.approx(0.01 * (TRUTH["cx"] - 239.5), abs=0.03)
+    assert found["L"] * found["c"] ** 2 == pytest.approx(-TRUTH["k1"], abs=0.1)
+    model = CameraModel("unified", ("f", "cx", "cy", "alpha"), project=unified, unit="px",
+                        image="equidistant", defaults={"alpha": 0.5})  # fmt: skip
+    found = start_values(views, model, model.free).parameters
+    assert found["f"] == pytest.approx(TRUTH["fx"], rel=0.02)
+    assert len(views) == VIEWS
+
+
+def test_what_is_refused():
+    views = simulated()
+    model = CameraModel("division", ("c", "x0", "y0", "L"), correct=division)
+    with pytest.raises(InputError, match="model 'division' is in mm; a batch needs"):
+        calibrate_batch(taken.BOARD.points, views.xy[None], (480, 360), model)
+    with pytest.raises(InputError, match="'wrong': distort.*must take the parameters"):
+        calibrate(views, model=CameraModel("wrong", ("f",), distort=lambda x: x, unit="px"))
+    with pytest.raises(InputError, match="'opencv' is built in"):
+        calibrate(views, model=CameraModel("opencv", NAMES, distort=opencv.distort, unit="px"))
+    with pytest.raises(InputError, match="model 'again' has no free parameter 'k9'"):
+        calibrate(views, model=AGAIN, free=["k9"])
