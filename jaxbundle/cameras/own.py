@@ -54,7 +54,7 @@ def check_own(model: CameraModel, values: Mapping[str, float] | None = None) -> 
 def _check_form(model: CameraModel) -> None:
     name = next(n for n in ("correct", "distort", "project") if getattr(model, n) is not None)
     arguments = ("r, s, q", 3) if name == "project" else ("x, y", 2)
-    number, array = (jax.ShapeDtypeStruct(shape, jnp.result_type(float)) for shape in ((), (2, 3)))
+    number, array = (jax.ShapeDtypeStruct(shape, jnp.result_type(float)) for shape in ((), (7, 11)))
     p = (number,) * len(model.parameters)
     for given in (number, array):
         expected = (
@@ -80,7 +80,10 @@ def _near_the_axis(model: CameraModel, p):
     p = tuple(p)
     zero, formula = jnp.zeros(()), getattr(model, model.own_formula)
     size = p[model.parameters.index(model.principal_distance[0])]
-    at = model.from_ideal(p, zero, zero) if model.own_formula == "to_ideal" else (zero, zero)
+    at = zero, zero
+    if model.own_formula == "to_ideal":
+        near = [-x for x in formula(p, *at)]  # where there is no inverse, something is wrong there
+        at = [jnp.where(jnp.isfinite(x), x, y) for x, y in zip(model.from_ideal(p, *at), near)]
     value, derivative = value_and_derivative(formula, p, *at)
     near = at[0] + SLANT * size, at[1] - 0.6 * SLANT * size
     back = model.to_ideal if model.own_formula == "from_ideal" else model.from_ideal

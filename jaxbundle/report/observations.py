@@ -179,7 +179,10 @@ def removals(adjustment) -> list[str]:
     if adjustment.eliminated:
         names = ", ".join(clean(name) for name in adjustment.eliminated)
         lines += heading("Eliminated parameters")
-        lines += paragraph(f"Held at 0 because they were not significant, in this order: {names}.")
+        lines += paragraph(
+            "Held at 0, or the default of the model, because they were not significant, in this "
+            f"order: {names}."
+        )
     return lines
 
 

@@ -1,5 +1,7 @@
 """`calibrate` and `calibrate_batch` with a user's own camera model."""
 
+import json
+
 import board_photographs as taken
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +16,8 @@ from jaxbundle.calibration.start import start_values
 from jaxbundle.cameras import opencv
 from jaxbundle.errors import InputError
 
+pytestmark = pytest.mark.xdist_group("calibration")
+
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 AGAIN = CameraModel(
     "again", NAMES, distort=lambda p, x, y: opencv.distort((*p, *[0.0] * 7), x, y), unit="px"
@@ -21,22 +25,23 @@ AGAIN = CameraModel(
 
 
 def test_opencv_said_again_has_the_figures_of_opencv():
+    """By `calibrate_batch`; and `calibrate`, whose start is of another model, finds the same."""
     views = simulated()
-    ours, own = calibrate(views), calibrate(views, model=AGAIN)
-    assert own.rms == pytest.approx(ours.rms, rel=1e-9)
-    assert own.adjustment.sigma0 == pytest.approx(ours.adjustment.sigma0, rel=1e-9)
-    for name, sigma in own.sigma.items():
-        assert abs(own.parameters[name] - ours.parameters[name]) < 1e-4 * sigma
-        assert sigma == pytest.approx(ours.sigma[name], rel=1e-6)
-    assert max(map(abs, normalised(own, TRUTH).values())) < 3
-    assert own.advice == ours.advice and "Camera (again)" in own.report()
-    assert '"model": "again"' in json_text(own)
-    xy = views.xy[None]
-    ours, own = (calibrate_batch(taken.BOARD.points, xy, views.image_size, model)
-                 for model in ("opencv", AGAIN))  # fmt: skip
-    assert own.converged.all() and own.model is AGAIN and "model again: 1 converged" in str(own)
-    np.testing.assert_allclose(own.values, ours.values, atol=1e-6 * ours.sigma.min())
-    np.testing.assert_allclose(own.sigma, ours.sigma, rtol=1e-9)
+    ours, batch = (
+        calibrate_batch(taken.BOARD.points, views.xy[None], views.image_size, model)
+        for model in ("opencv", AGAIN)
+    )
+    assert batch.converged.all() and batch.model is AGAIN
+    assert "model again: 1 converged" in str(batch)
+    np.testing.assert_allclose(batch.values, ours.values, atol=1e-6 * ours.sigma.min())
+    np.testing.assert_allclose(batch.sigma, ours.sigma, rtol=1e-9)
+    one = calibrate(views, model=AGAIN, snooping=None, cross_validation=False)
+    assert one.rms == pytest.approx(ours.rms[0], rel=1e-6) and one.camera.model is AGAIN
+    assert max(map(abs, normalised(one, dict(zip(NAMES, ours.values[0]))).values())) < 1e-3
+    np.testing.assert_allclose(list(one.sigma.values()), ours.sigma[0], rtol=1e-5)
+    assert max(map(abs, normalised(one, TRUTH).values())) < 3
+    document = json.loads(json_text(one.to_dict(brief=True)))
+    assert document["cameras"]["cam"]["model"] == "again"
 
 
 def division(p, x, y):
@@ -59,7 +64,7 @@ def test_start_values_of_any_formula():
     found = start_values(views, model, model.free, (0.01, 0.01)).parameters
     assert found["c"] == pytest.approx(0.01 * TRUTH["fx"], rel=0.01)
     assert found["x0"] == pytest.approx(0.01 * (TRUTH["cx"] - 239.5), abs=0.03)
-    assert found["L"] * found["c"] ** 2 == pytest.approx(-TRUTH["k1"], abs=0.1)
+    assert found["L"] * found["c"] ** 2 == pytest.approx(TRUTH["k1"], abs=0.02)
     model = CameraModel("unified", ("f", "cx", "cy", "alpha"), project=unified, unit="px",
                         image="equidistant", defaults={"alpha": 0.5})  # fmt: skip
     found = start_values(views, model, model.free).parameters
