@@ -16,9 +16,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbundle.leastsquares.datum import contract, datum_directions
-from jaxbundle.leastsquares.elimination import Factor, solve
+from jaxbundle.leastsquares.elimination import Factor, over_pairs, solve
 from jaxbundle.leastsquares.normal import Tangent
-from jaxbundle.leastsquares.plan import PAIR_ROWS_AT_ONCE, Plan
+from jaxbundle.leastsquares.plan import Plan
 from jaxbundle.leastsquares.reduced import Reduced
 from jaxbundle.leastsquares.rows import Declared, Values
 
@@ -41,7 +41,7 @@ class Cofactors(eqx.Module):
 def cofactors(declared: Declared, values: Values, factor: Factor) -> Cofactors:
     """All cofactor blocks of a solved problem."""
     plan = factor.plan
-    Q = _without_held(plan, factor.reduced.inverse())
+    Q = _without_held(plan, factor.inverse())
     eliminated, coupled = None, {}
     own = dict(Q.own)
     if plan.eliminated is not None:
@@ -85,25 +85,15 @@ def _spread(pairs, a, b, Q, to_first, to_second, within: bool):
     """To the first of the totals is added b·Qᵀ for every partner b of its row, to the second a·Q; Q
     is the block of each pair. `within`: the two totals are one."""
     totals = (to_first,) if within else (to_first, to_second)
-    for first, second, block in zip(pairs.first, pairs.second, pairs.block):
-        length = first.shape[1]
 
-        def add(totals, chunk):
-            i, j, k = chunk
-            forth = jnp.einsum("clij,cjk->clik", a[i], Q[k])
-            back = jnp.einsum("clij,ckj->clik", b[j], Q[k])
-            if within:
-                return (totals[0].at[i].add(back).at[j].add(forth),), None
-            return (totals[0].at[i].add(back), totals[1].at[j].add(forth)), None
+    def add(totals, i, j, k):
+        forth = jnp.einsum("clij,cjk->clik", a[i], Q[k])
+        back = jnp.einsum("clij,ckj->clik", b[j], Q[k])
+        if within:
+            return (totals[0].at[i].add(back).at[j].add(forth),)
+        return totals[0].at[i].add(back), totals[1].at[j].add(forth)
 
-        chunks, step = first.shape[0], max(1, PAIR_ROWS_AT_ONCE // length)
-        whole = chunks // step * step
-        if chunks > step:
-            steps = lambda x, n=whole, step=step: x[:n].reshape(-1, step, *x.shape[1:])
-            totals, _ = jax.lax.scan(add, totals, (steps(first), steps(second), steps(block)))
-            first, second, block = first[whole:], second[whole:], block[whole:]
-        if len(block):
-            totals, _ = add(totals, (first, second, block))
+    totals = over_pairs(pairs, add, totals)
     # What stands for nothing has collected what the fillings of chunks have in common.
     return (totals[0], totals[0]) if within else totals
 

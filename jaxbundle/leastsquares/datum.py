@@ -171,10 +171,12 @@ _generators = eqx.filter_jit(generators)
 
 def _choose_pins(plan: Plan, G) -> dict[str, np.ndarray]:
     """As many kept unknowns as there are defects, chosen well spread; every kind of direction
-    counts by its own size."""
+    counts by its own size, unless that is rounding."""
     rows, shapes = [], []
+    size = {name: np.sqrt((G[name] ** 2).mean((0, 2), keepdims=True)) for name in plan.kept}
+    least = max(1e-300, OPEN * max(x.max(initial=0) for x in size.values()))
     for name in plan.kept:
-        sized = G[name] / np.maximum(np.sqrt((G[name] ** 2).mean((0, 2), keepdims=True)), 1e-300)
+        sized = G[name] / np.maximum(size[name], least)
         rows.append(sized.reshape(-1, sized.shape[2]))
         shapes.append(G[name].shape[:2])
     whole = np.concatenate(rows)
@@ -286,7 +288,7 @@ def _slope(declared, plan, values, start):
 def _moved(declared, plan, motion, values):
     """All tables moved; what is held stays."""
     moved, free = dict(values), free_of_tables(plan, declared, values)
-    for name, act in declared.motions.actions:
+    for name, act in [action for action in declared.motions.actions if action[0] in values]:
         space = declared.spaces[name]
         one = lambda value, f, act=act, space=space: space.hold(act(motion, value), value, f)
         moved[name] = jax.vmap(one)(values[name], free[name])

@@ -18,22 +18,32 @@ import jax.numpy as jnp
 from jax.experimental.layout import Layout, with_layout_constraint
 from jaxtyping import Array, Bool, Float
 
+from jaxbundle.leastsquares.banded import BandFactor, factorise_band
 from jaxbundle.leastsquares.damping import matrices
-from jaxbundle.leastsquares.normal import Normal, NormalBlocks, Tangent, total
+from jaxbundle.leastsquares.iterative import ConjugateGradients, precondition
+from jaxbundle.leastsquares.normal import Normal, Tangent, agreed, gather, scatter, total
 from jaxbundle.leastsquares.plan import PAIR_ROWS_AT_ONCE, Pairs, Plan
-from jaxbundle.leastsquares.reduced import DenseFactor, Reduced, factorise_reduced
+from jaxbundle.leastsquares.reduced import DenseFactor, Reduced, factorise_dense
 
+EXACT = 1e-13
+"""Relative residual of a reduced system solved by iteration, where it must be as good as exact."""
 PIVOT = 1e-13
 """A pivot below this fraction of its diagonal element is rounding: nothing determines it."""
 
 
 class Factor(eqx.Module):
-    """N factorised: what is needed to solve with it, and to read blocks of its inverse."""
+    """N factorised: what is needed to solve with it, and to read blocks of its inverse. `reduced`:
+    the factor of S scaled by `scale`."""
 
     plan: Plan
-    reduced: DenseFactor
+    reduced: DenseFactor | BandFactor | ConjugateGradients
+    scale: Tangent
     lower_inverse: Float[Array, "rows w w"] | None
     Z: dict[str, Float[Array, "chunks length w v"]]
+
+    def inverse(self) -> Reduced:
+        """The blocks of S⁻¹ where S has blocks."""
+        return self.reduced.inverse().scaled(self.plan, self.scale)
 
 
 def damp(normal: Normal, damping: Float[Array, ""]) -> Normal:
@@ -45,35 +55,57 @@ def damp(normal: Normal, damping: Float[Array, ""]) -> Normal:
     return Normal(normal.plan, dataclasses.replace(N, own=own, eliminated=eliminated))
 
 
-def factorise(normal: Normal, regular: Bool[Array, ""] | bool = True) -> Factor:
-    """Factorise N, datum directions made regular if `regular`. NaN where a pivot is rounding, as
-    where it is negative: chance decides between the two."""
+def factorise(
+    normal: Normal, regular: Bool[Array, ""] | bool = True, tolerance: float = EXACT
+) -> Factor:
+    """Factorise N, datum directions made regular if `regular`; `tolerance`: of a reduced system
+    solved by iteration. NaN where a pivot is rounding, as where it is negative: chance decides
+    between the two."""
     plan = normal.plan
-    parts, lower_inverse, Z = eliminate(plan, normal.blocks)
-    factor = factorise_reduced(plan, parts, normal.blocks.own, regular)
+    S, scale, lower_inverse, Z = reduced_system(normal, regular)
+    if plan.reduction == "iterative":
+        factor = precondition(normal, Z, S, scale, tolerance)
+    else:
+        factor = (factorise_band if plan.reduction == "banded" else factorise_dense)(plan, S)
     sound = jnp.all(factor.pivots**2 > PIVOT)
-    factor = jax.tree.map(
-        lambda x: jnp.where(sound, x, jnp.nan) if eqx.is_inexact_array(x) else x, factor
-    )
-    return Factor(plan, factor, lower_inverse, Z)
+    scale = {g: jnp.where(sound, s, jnp.nan) for g, s in scale.items()}
+    return Factor(plan, factor, scale, lower_inverse, Z)
 
 
-def eliminate(plan: Plan, normal: NormalBlocks):
+def reduced_system(normal: Normal, regular: Bool[Array, ""] | bool = True):
+    """S scaled by the diagonal of A; the scale, L⁻¹ and Z.
+
+    What is held gets a one. A problem that may float is singular along its open motions, made
+    `regular` by adding a one to as many diagonal elements (`Datum.pins`): the solution changes
+    along these motions only."""
+    plan = normal.plan
+    S, lower_inverse, Z = eliminate(normal)
+    diagonal = normal.diagonal()
+    scale = {g: jnp.where(diagonal[g] > 0, diagonal[g], 1.0) ** -0.5 for g in plan.kept}
+    S = S.scaled(plan, scale)
+    for g, B in S.own.items():
+        more = 1.0 - plan.groups[g].free
+        if plan.datum is not None:
+            more = more + regular * plan.datum.pins[g]
+        S.own[g] = B + more[:, :, None] * jnp.eye(B.shape[1])
+    return S, scale, lower_inverse, Z
+
+
+def eliminate(normal: Normal):
     """S = A − Zᵀ·Z in blocks, L⁻¹ of the eliminated rows, and Z."""
-    e = plan.eliminated
-    own, off = dict(normal.own), dict(normal.off)
+    plan, N, e = normal.plan, normal.blocks, normal.plan.eliminated
+    own, off = dict(N.own), dict(N.off)
     if e is None:
         return Reduced(own, off), None, {}
     held = (1.0 - plan.groups[e].free)[:, :, None] * jnp.eye(plan.groups[e].width)
-    L = inverse_cholesky(normal.eliminated + held)
+    L = inverse_cholesky(N.eliminated + held)
     Z, less, less_off = {}, {}, {}
-    for g, W in normal.W.items():
+    for g, W in N.W.items():
         at = plan.incidences[g]
         Z[g] = _row_major(_lower_times(L, at.eliminated, W))
         rows = Z[g].reshape(at.row.shape[0], -1, W.shape[-1])
-        less[g] = jax.ops.segment_sum(
-            jnp.einsum("cki,ckj->cij", rows, rows), at.row, own[g].shape[0]
-        )
+        of_chunks = jnp.einsum("cki,ckj->cij", rows, rows)
+        less[g] = jax.ops.segment_sum(of_chunks, at.row, own[g].shape[0])
     for key, at in plan.blocks.items():
         if at.pairs is not None:
             less_off[key] = sum_pairs(at.pairs, at.row.shape[0], Z[key[0]], Z[key[1]])
@@ -86,37 +118,19 @@ def eliminate(plan: Plan, normal: NormalBlocks):
 
 def solve(factor: Factor, right: Tangent) -> Tangent:
     """N⁻¹·b for one right-hand side, linear and transposable in b."""
-    plan, e = factor.plan, factor.plan.eliminated
-    kept = {g: right[g] * plan.groups[g].free for g in plan.kept}
+    plan, e, Z = factor.plan, factor.plan.eliminated, factor.Z
+    kept = {g: right[g] * plan.groups[g].free * s for g, s in factor.scale.items()}
     if e is not None:
         free = plan.groups[e].free
         h = jnp.einsum("nij,nj->ni", factor.lower_inverse, right[e] * free)
-        less = {g: _gather(plan, g, Z, h) for g, Z in factor.Z.items()}
-        for g, x in total(plan, less).items():
-            kept[g] = kept[g] - x
-    x = factor.reduced.solve(kept)
-    x = {g: rows * plan.groups[g].free for g, rows in x.items()}
+        for g, x in gather(plan, Z, h).items():
+            kept[g] = kept[g] - x * factor.scale[g]
+    x = agreed(plan, factor.reduced.solve(kept))
+    x = {g: rows * plan.groups[g].free * factor.scale[g] for g, rows in x.items()}
     if e is not None:
-        for g, Z in factor.Z.items():
-            h = h - _scatter(plan, g, Z, x[g])
+        h = h - scatter(plan, Z, x)
         x[e] = jnp.einsum("nji,nj->ni", factor.lower_inverse, h) * free
     return x
-
-
-def _gather(plan: Plan, g: str, Z, h):
-    """Zᵀ·h."""
-    at = plan.incidences[g]
-    rows = Z.reshape(at.row.shape[0], -1, Z.shape[-1])
-    of_chunks = jnp.einsum("cki,ck->ci", rows, h[at.eliminated].reshape(rows.shape[:2]))
-    return jax.ops.segment_sum(of_chunks, at.row, plan.groups[g].rows)
-
-
-def _scatter(plan: Plan, g: str, Z, x):
-    """Z·x."""
-    at = plan.incidences[g]
-    rows = Z.reshape(at.row.shape[0], -1, Z.shape[-1])
-    moved = jnp.einsum("cki,ci->ck", rows, x[at.row]).reshape(-1, Z.shape[-2])
-    return jax.ops.segment_sum(moved, at.eliminated.ravel(), plan.groups[plan.eliminated].rows)
 
 
 def sum_pairs(pairs: Pairs, blocks: int, a, b) -> Float[Array, "blocks w v"]:
@@ -124,24 +138,28 @@ def sum_pairs(pairs: Pairs, blocks: int, a, b) -> Float[Array, "blocks w v"]:
     (length × w). A quarter of the time of outer products that are scattered."""
     a, b = (x.reshape(-1, *x.shape[2:]) for x in (a, b))
     depth, m, n = a.shape[1], a.shape[2], b.shape[2]
-    sums = jnp.zeros((blocks, m, n))
-    for first, second, block in zip(pairs.first, pairs.second, pairs.block):
-        length = first.shape[1]
 
-        def add(sums, chunk, rows=length * depth):
-            i, j, k = chunk
-            left, right = a[i].reshape(-1, rows, m), b[j].reshape(-1, rows, n)
-            product = jnp.einsum("cki,ckj->cij", left, right)
-            return sums.at[k].add(product, indices_are_sorted=True), None
+    def add(sums, i, j, k):
+        rows = i.shape[1] * depth
+        left, right = a[i].reshape(-1, rows, m), b[j].reshape(-1, rows, n)
+        product = jnp.einsum("cki,ckj->cij", left, right)
+        return sums.at[k].add(product, indices_are_sorted=True)
 
-        chunks, step = first.shape[0], max(1, PAIR_ROWS_AT_ONCE // length)
-        whole = chunks // step * step
-        if chunks > step:
-            steps = lambda x, n=whole, step=step: x[:n].reshape(-1, step, *x.shape[1:])
-            sums, _ = jax.lax.scan(add, sums, (steps(first), steps(second), steps(block)))
-            first, second, block = first[whole:], second[whole:], block[whole:]
-        if len(block):
-            sums, _ = add(sums, (first, second, block))
+    return over_pairs(pairs, add, jnp.zeros((blocks, m, n)))
+
+
+def over_pairs(pairs: Pairs, add, sums):
+    """`add(sums, first, second, block)` for all chunks of pairs, some at a time."""
+    for chunks in zip(pairs.first, pairs.second, pairs.block):
+        number, length = chunks[0].shape
+        step = max(1, PAIR_ROWS_AT_ONCE // length)
+        whole = number // step * step
+        if number > step:
+            steps = [x[:whole].reshape(-1, step, *x.shape[1:]) for x in chunks]
+            sums, _ = jax.lax.scan(lambda sums, chunk: (add(sums, *chunk), None), sums, steps)
+            chunks = [x[whole:] for x in chunks]
+        if len(chunks[0]):
+            sums = add(sums, *chunks)
     return sums
 
 
@@ -171,7 +189,11 @@ def _lower_times(L, at, W):
     return jnp.stack([row(i) for i in range(w)], -2)
 
 
+@jax.jit
 def _row_major(x):
     """Blocks in row-major order. Left alone, XLA lays a shared array out to suit one of its readers
-    (the product by chunks), and the gathers of the pairs take three times as long."""
+    (the product by chunks), and the gathers of the pairs take three times as long.
+
+    In a function of its own: where a compiled function returns what it constrains, JAX (0.10) lets
+    XLA lay out the other results as it likes, but reads them in the usual order."""
     return with_layout_constraint(x, Layout(major_to_minor=tuple(range(x.ndim))))

@@ -43,28 +43,13 @@ class Normal(lx.AbstractLinearOperator):
 
     def mv(self, vector: Tangent) -> Tangent:
         """N·x."""
-        N = self.blocks
-        product = {g: jnp.einsum("nij,nj->ni", B, vector[g]) for g, B in N.own.items()}
-        for (later, earlier), B in N.off.items():
-            at = self.plan.blocks[later, earlier]
-            down = jnp.einsum("bij,bj->bi", B, vector[earlier][at.column])
-            up = jnp.einsum("bij,bi->bj", B, vector[later][at.row])
-            product[later] = product[later].at[at.row].add(down)
-            product[earlier] = product[earlier].at[at.column].add(up)
-        e = self.plan.eliminated
-        if e is None:
-            return product
-        x, changed = vector[e], {}
-        product[e] = jnp.einsum("nij,nj->ni", N.eliminated, x)
-        for g, W in N.W.items():
-            at = self.plan.incidences[g]
-            moved = jnp.einsum("clij,cj->cli", W, vector[g][at.row])
-            product[e] = product[e].at[at.eliminated].add(moved)
-            changed[g] = jax.ops.segment_sum(
-                jnp.einsum("clij,cli->cj", W, x[at.eliminated]), at.row, product[g].shape[0]
-            )
-        for g, more in total(self.plan, changed).items():
-            product[g] = product[g] + more
+        plan, N, e = self.plan, self.blocks, self.plan.eliminated
+        product = times_kept(plan, N, vector)
+        if e is not None:
+            product[e] = jnp.einsum("nij,nj->ni", N.eliminated, vector[e])
+            product[e] = product[e] + scatter(plan, N.W, vector)
+            for g, more in gather(plan, N.W, vector[e]).items():
+                product[g] = product[g] + more
         return product
 
     def diagonal(self) -> Tangent:
@@ -107,6 +92,52 @@ def total(plan: Plan, parts):
     return parts if plan.axis is None else jax.lax.psum(parts, plan.axis)
 
 
+def agreed(plan: Plan, value):
+    """The mean over the devices of what should be the same on all, so that it is, to the last
+    digit: devices that decide differently would wait for each other for ever."""
+    return value if plan.axis is None else jax.lax.pmean(value, plan.axis)
+
+
+def times_kept(plan: Plan, N: NormalBlocks, x: Tangent) -> Tangent:
+    """A·x."""
+    product = {g: jnp.einsum("nij,nj->ni", B, x[g]) for g, B in N.own.items()}
+    for (later, earlier), B in N.off.items():
+        at = plan.blocks[later, earlier]
+        down = jnp.einsum("bij,bj->bi", B, x[earlier][at.column])
+        up = jnp.einsum("bij,bi->bj", B, x[later][at.row])
+        product[later] = product[later].at[at.row].add(down)
+        product[earlier] = product[earlier].at[at.column].add(up)
+    return product
+
+
+def gather(plan: Plan, W: dict[str, Array], h: Float[Array, "rows w"]) -> Tangent:
+    """Wᵀ·h for rows h that are eliminated; the sum of all devices."""
+    found = {}
+    for g, blocks in W.items():
+        at, rows = plan.incidences[g], _tall(blocks)
+        of_chunks = jnp.einsum("cki,ck->ci", rows, h[at.eliminated].reshape(rows.shape[:2]))
+        found[g] = jax.ops.segment_sum(of_chunks, at.row, plan.groups[g].rows)
+    return total(plan, found)
+
+
+def scatter(plan: Plan, W: dict[str, Array], x: Tangent):
+    """W·x."""
+    found = 0.0
+    for g, blocks in W.items():
+        at = plan.incidences[g]
+        moved = jnp.einsum("cki,ci->ck", _tall(blocks), x[g][at.row])
+        found = found + jax.ops.segment_sum(
+            moved.reshape(-1, blocks.shape[-2]), at.eliminated.ravel(),
+            plan.groups[plan.eliminated].rows,
+        )  # fmt: skip
+    return found
+
+
+def _tall(blocks):
+    """The blocks of a chunk as one matrix."""
+    return blocks.reshape(blocks.shape[0], -1, blocks.shape[-1])
+
+
 def normal_equations(
     declared: Declared, plan: Plan, values: Values, laid: Laid
 ) -> tuple[Float[Array, ""], Tangent, NormalBlocks]:
@@ -132,12 +163,13 @@ class _Sums:
 
     def add_part(self, part: Part, r, touches, E):
         self.cost = self.cost + 0.5 * jnp.vdot(r, r)
-        chunks = r.shape[0]
-        tall = [J.reshape(chunks, -1, J.shape[-1]) for J in touches]
-        right = r.reshape(chunks, -1)
+        tall = [_tall(J) for J in touches]
+        right = r.reshape(r.shape[0], -1)
         for touch, J in zip(part.touches, tall):
-            self._add_own(touch, jnp.einsum("cki,ckj->cij", J, J))
-            self._add_gradient(touch, jnp.einsum("cki,ck->ci", J, right))
+            g, columns = touch.group, slice(touch.start, touch.stop)
+            N, more = jnp.einsum("cki,ckj->cij", J, J), jnp.einsum("cki,ck->ci", J, right)
+            self.own[g] = self.own[g].at[touch.row, columns, columns].add(N)
+            self.gradient[g] = self.gradient[g].at[touch.row, columns].add(more)
         for couple in part.couples:
             product = jnp.einsum("cki,ckj->cij", tall[couple.first], tall[couple.second])
             self._add_couple(part, couple, product)
@@ -152,40 +184,25 @@ class _Sums:
             for touch, K in zip(part.touches, touches):
                 self._add_incidences(touch, products(J, flat(K)))
 
-    def _add_own(self, touch, N):
-        columns = slice(touch.start, touch.stop)
-        self.own[touch.group] = self.own[touch.group].at[touch.row, columns, columns].add(N)
-
-    def _add_gradient(self, touch, g):
-        columns = slice(touch.start, touch.stop)
-        self.gradient[touch.group] = self.gradient[touch.group].at[touch.row, columns].add(g)
-
     def _add_couple(self, part, couple, N):
         """A block beside the diagonal, or on it where the two rows are one."""
         first, second = part.touches[couple.first], part.touches[couple.second]
         key = first.group, second.group
+        columns, others = slice(first.start, first.stop), slice(second.start, second.stop)
         if couple.same is not None:
-            columns, others = slice(first.start, first.stop), slice(second.start, second.stop)
             on = N * couple.same[:, None, None]
             own = self.own[first.group].at[first.row, columns, others].add(on)
-            self.own[first.group] = own.at[first.row, others, columns].add(on.transpose(0, 2, 1))
+            self.own[first.group] = own.at[first.row, others, columns].add(on.mT)
         if couple.block is None:
             return
         shape = tuple(self.plan.groups[g].width for g in key)
         pad = lambda B, rows, columns: jnp.zeros((B.shape[0], *shape)).at[:, rows, columns].set(B)
-        placed = pad(N, slice(first.start, first.stop), slice(second.start, second.stop))
+        placed = pad(N, columns, others)
         if couple.turned is not None:
-            other = pad(
-                N.transpose(0, 2, 1),
-                slice(second.start, second.stop),
-                slice(first.start, first.stop),
-            )
             turned = couple.turned[:, None, None]
-            placed = turned * other + (1 - turned) * placed
-        blocks = self.plan.blocks[key]
-        summed = jax.ops.segment_sum(placed, couple.block, blocks.row.shape[0])
-        summed = summed.at[-1].set(0.0)
-        self.off[key] = self.off.get(key, 0.0) + summed
+            placed = turned * pad(N.mT, others, columns) + (1 - turned) * placed
+        summed = jax.ops.segment_sum(placed, couple.block, self.plan.blocks[key].row.shape[0])
+        self.off[key] = self.off.get(key, 0.0) + summed.at[-1].set(0.0)
 
     def _add_incidences(self, touch, W):
         """W of every observation, summed for each incidence."""

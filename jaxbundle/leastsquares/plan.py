@@ -27,6 +27,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxbundle.leastsquares.declarations import Observations, Table
 from jaxbundle.leastsquares.indices import Column, Index, Sizes, count
+from jaxbundle.leastsquares.reduction import FACTORS, MOST_PAIRS, REDUCTIONS, Band, plan_reduction
 
 CHUNK_LENGTHS = (256, 64, 16)
 MOST_EMPTY = 0.1
@@ -146,13 +147,16 @@ class Datum(eqx.Module):
 class Plan(eqx.Module):
     """See the module. `kept` is in the order of the groups; `blocks` has their pairs (later,
     earlier or same). `axis`: the name of the device axis over which eliminated rows with their
-    observations are distributed; None: one device."""
+    observations are distributed; None: one device. `reduction`: how the reduced system is solved
+    (`reduction.py`); `band`: where that is its way."""
 
     groups: dict[str, Group]
     eliminated: str | None = eqx.field(static=True)
     parts: tuple[Part, ...]
     incidences: dict[str, Incidences]
     blocks: dict[Key, Blocks]
+    reduction: str | None = eqx.field(static=True, default="dense")
+    band: Band | None = None
     datum: Datum | None = None
     axis: str | None = eqx.field(static=True, default=None)
 
@@ -163,13 +167,14 @@ class Plan(eqx.Module):
 
 def make_plan(
     tables: Sequence[Table], observations: Sequence[Observations], eliminate: str | None,
-    choices: dict | None = None,
+    choices: dict | None = None, ways: Sequence[str] = REDUCTIONS,
 ) -> tuple[Plan, Sizes, dict]:  # fmt: skip
     """The plan on the host, its arrays as `Index` and `Column` (`indices.finish`), the sizes of its
     lists, and the choices made (lengths of chunks, blocks of the reduced matrix).
 
-    `choices`: those of a larger problem of which this is a part, to be made again."""
-    planner = _Planner(tables, observations, eliminate, choices)
+    `choices`: those of a larger problem of which this is a part, to be made again; `ways`: how the
+    reduced system may be solved."""
+    planner = _Planner(tables, observations, eliminate, choices, ways)
     plan = planner.plan()
     sizes = {("table", t.name): t.rows + 1 for t in tables}
     sizes |= {("observations", o): x.number + 1 for o, x in enumerate(observations)}
@@ -187,8 +192,9 @@ class _Rows:
 
 
 class _Planner:
-    def __init__(self, tables, observations, eliminate, choices):
+    def __init__(self, tables, observations, eliminate, choices, ways):
         self.given, self.choices = choices or {}, {}
+        self.ways = self.choose("ways", found=tuple(ways))
         self.tables = {t.name: t for t in tables}
         self.observations = observations
         self.moving = [t.name for t in tables if t.free.any()]
@@ -271,10 +277,8 @@ class _Planner:
             return False
         met = False
         for part in self.parts:
-            of, rows = (
-                self.observations[part.observations].kind.of,
-                self.observations[part.observations].rows,
-            )
+            given = self.observations[part.observations]
+            of, rows = given.kind.of, given.rows
             if part.slot is None:
                 continue
             a = [s for s, t in enumerate(of) if t == first]
@@ -293,17 +297,26 @@ class _Planner:
         parts = [self.part(k, p) for k, p in enumerate(self.parts)]
         incidences = {g: self.incidences_of(g, parts) for g in self.kept}
         incidences = {g: found for g, found in incidences.items() if found is not None}
-        blocks = self.find_blocks(parts, incidences)
-        groups = {
-            g: self.group(g) for g in [*self.kept, *([self.eliminate] if self.eliminate else [])]
-        }
-        return Plan(
-            groups=groups,
-            eliminated=self.eliminate,
-            parts=tuple(p["part"] for p in parts),
-            incidences={g: found["plan"] for g, found in incidences.items()},
-            blocks=blocks,
-        )
+        groups = {g: self.group(g) for g in (*self.kept, self.eliminate) if g is not None}
+        blocks, reduction, band = self.reduce(parts, incidences, groups)
+        incidences = {g: found["plan"] for g, found in incidences.items()}
+        parts = tuple(p["part"] for p in parts)
+        return Plan(groups, self.eliminate, parts, incidences, blocks, reduction, band)
+
+    def reduce(self, parts, incidences, groups):
+        """The blocks of the reduced matrix, how it is solved, its band."""
+        rows = [np.zeros(0, np.int64), *(found["eliminated"] for found in incidences.values())]
+        met, ways = np.bincount(np.concatenate(rows)).astype(float), self.ways
+        if len(ways) > 1 and (met * (met - 1)).sum() / 2 > MOST_PAIRS:
+            ways = ("iterative",)
+        blocks = self.find_blocks(parts, {} if ways == ("iterative",) else incidences)
+        shapes = {g: groups[g].free.rows.shape for g in self.kept}
+        place = lambda at: (at.row.rows, at.column.rows) if at else np.zeros((2, 0), np.int64)
+        ties = lambda g: place(blocks.get((g, g)))
+        number = sum(given.number for given in self.observations)
+        way, band = plan_reduction(shapes, ties, number, ways)
+        self.choices["ways",] = (way,)
+        return blocks if way in FACTORS else self.find_blocks(parts, {}), way, band
 
     def group(self, name):
         members, free = [], []
@@ -317,10 +330,8 @@ class _Planner:
 
     def part(self, k, part):
         """The part k: laid out in chunks, with its touches (couples and incidences come later)."""
-        given, of = (
-            self.observations[part.observations],
-            self.observations[part.observations].kind.of,
-        )
+        given = self.observations[part.observations]
+        of = given.kind.of
         rows = [np.asarray(r)[part.source] for r in given.rows]
         slots = self._touched_groups(part, of)
         major = np.zeros(len(part.source), np.int64)
@@ -347,9 +358,8 @@ class _Planner:
             row = chunk(self.group_of[of[slot]][2][rows[slot]])[:, 0]
             stop = max(start + self.tables[of[s]].space.width for s, start in touched)
             start = min(start for _, start in touched)
-            touches.append(
-                Touch(group, touched, start, stop, Index(row, along, ("group", group)), None)
-            )
+            index = Index(row, along, ("group", group))
+            touches.append(Touch(group, touched, start, stop, index, None))
         source = np.where(used, part.source[order], -1).reshape(-1, length)
         place = np.full(given.number, -1)
         place[part.source[order][used]] = np.flatnonzero(used)
@@ -400,9 +410,8 @@ class _Planner:
             row.append(np.repeat(p["part"].touches[t].row.rows, p["length"]))
             used.append(p["used"])
         eliminated, row, used = (np.concatenate(x) for x in (eliminated, row, used))
-        keys, of = np.unique(
-            row[used].astype(np.int64) * number + eliminated[used], return_inverse=True
-        )
+        keys = row[used].astype(np.int64) * number + eliminated[used]
+        keys, of = np.unique(keys, return_inverse=True)
         apart = len(at) == 1 and len(keys) == used.sum()
         if self.choose("incidences apart", group, found=apart):
             p = parts[at[0][0]]
@@ -427,13 +436,9 @@ class _Planner:
             Index(row[::length], along, ("group", group)),
         )
         live = np.flatnonzero(used)
+        eliminated, row = eliminated[live], row[live]
         return dict(
-            plan=plan,
-            live=live,
-            eliminated=eliminated[live],
-            row=row[live],
-            along=along,
-            length=length,
+            plan=plan, live=live, eliminated=eliminated, row=row, along=along, length=length
         )
 
     def find_blocks(self, parts, incidences):
@@ -445,10 +450,8 @@ class _Planner:
         blocks = {}
         for b, later in enumerate(self.kept):
             for earlier in self.kept[: b + 1]:
-                key = later, earlier
-                pairs = self._pairs(
-                    incidences.get(later), incidences.get(earlier), later == earlier
-                )
+                key, both = (later, earlier), map(incidences.get, (later, earlier))
+                pairs = self._pairs(*both, later == earlier)
                 made = self._block_list(key, pairs, direct.get(key, ()), parts)
                 if made is not None:
                     blocks[key] = made

@@ -13,6 +13,7 @@ from jaxbundle.leastsquares.datum import find_open_motions, make_datum
 from jaxbundle.leastsquares.declarations import Motions, Observations, Table
 from jaxbundle.leastsquares.indices import common, finish, rounded
 from jaxbundle.leastsquares.plan import Plan, make_plan
+from jaxbundle.leastsquares.reduction import FACTORS, REDUCTIONS
 from jaxbundle.leastsquares.retraction import retract
 from jaxbundle.leastsquares.rows import Data, Declared
 from jaxbundle.leastsquares.solver import LeastSquares, minimise
@@ -51,20 +52,21 @@ class Counts:
 def make_problem(
     tables: Sequence[Table], observations: Sequence[Observations], eliminate: str | None = None,
     *, motions: Motions | None = None, datum_weight: dict[str, np.ndarray] | None = None,
-    minimal: bool = False,
+    minimal: bool = False, reduction: str | None = None,
 ) -> Problem:  # fmt: skip
     """Plan and arrays of declared tables and observations.
 
     `motions`: those that may be open; `datum_weight`: by table, the unknowns that hold the datum
-    then (`minimal`: as few of them as needed)."""
+    then (`minimal`: as few of them as needed). `reduction`: how the reduced system is solved,
+    "dense", "banded" or "iterative"; chosen by its size and fill if not given."""
+    if reduction not in (None, *REDUCTIONS):
+        raise InputError(f"reduction {reduction!r}: {', '.join(REDUCTIONS)}")
     tables, observations = tuple(tables), tuple(observations)
     check(tables, observations)
     spaces = tuple((t.name, t.space) for t in tables)
     declared = Declared(tuple(o.kind for o in observations), spaces, motions)
-    host, sizes, _ = make_plan(tables, observations, eliminate)
-    number = sum(o.number for o in observations)
-    sizes = common([sizes], lambda key, n: n if number > LARGE else rounded(n))
-    plan = jax.device_put(finish(host, sizes))
+    ways = REDUCTIONS if reduction is None else (reduction,)
+    plan, sizes = _make_plan(tables, observations, eliminate, ways)
     data = make_data(declared, tables, observations)
     counts = Counts(
         sum(int((np.asarray(_diagonal(w)) > 0).sum()) for w in data.weight),
@@ -72,6 +74,27 @@ def make_problem(
     )
     problem = Problem(tables, observations, declared, plan, data, sizes, counts)
     return problem if motions is None else _with_datum(problem, datum_weight, minimal)
+
+
+def _make_plan(tables, observations, eliminate, ways):
+    """The plan on the device, and the sizes of its lists."""
+    host, sizes, _ = make_plan(tables, observations, eliminate, ways=ways)
+    number = sum(o.number for o in observations)
+    sizes = common([sizes], lambda key, n: n if number > LARGE else rounded(n))
+    return jax.device_put(finish(host, sizes)), sizes
+
+
+def with_factor(problem: Problem) -> Problem:
+    """The problem with a reduced system that can be factorised, as statistics need it; the same
+    where no factor fits into memory."""
+    if problem.plan.reduction in FACTORS:
+        return problem
+    given = problem.tables, problem.observations, problem.plan.eliminated
+    plan, sizes = _make_plan(*given, FACTORS)
+    if plan.reduction not in FACTORS:
+        return problem
+    plan = dataclasses.replace(plan, datum=problem.plan.datum)
+    return dataclasses.replace(problem, plan=plan, sizes=sizes)
 
 
 def _with_datum(problem: Problem, weight, minimal: bool) -> Problem:
@@ -82,9 +105,7 @@ def _with_datum(problem: Problem, weight, minimal: bool) -> Problem:
         return problem
     if weight is None:
         raise InputError(f"the datum is open in {gauge.shape[1]} parameters: say what holds it")
-    fill = lambda t, w: np.concatenate(
-        [w, np.zeros((problem.sizes["table", t] - len(w), w.shape[1]))]
-    )
+    fill = lambda t, w: np.pad(w, ((0, problem.sizes["table", t] - len(w)), (0, 0)))
     weight = {t: fill(t, np.asarray(w, float)) for t, w in weight.items()}
     datum = jax.device_put(make_datum(problem.declared, problem.plan, data, gauge, weight, minimal))
     plan = dataclasses.replace(problem.plan, datum=datum)
@@ -145,22 +166,17 @@ def _diagonal(weight):
 
 def pad_data(problem: Problem, data: Data) -> Data:
     """The numbers filled to the sizes of the plan: rows repeat the last one, weights are 0."""
-    fill = lambda x, n: np.concatenate([np.asarray(x), np.zeros((n - len(x), *np.shape(x)[1:]))])
-    edge = lambda x, n: np.concatenate(
-        [np.asarray(x), np.repeat(np.asarray(x)[-1:], n - len(x), 0)]
+
+    def grown(key, rows, mode):
+        more = lambda x: [(0, problem.sizes[key] - len(x))] + [(0, 0)] * (x.ndim - 1)
+        return jax.tree.map(lambda x: np.pad(x, more(x), mode), rows)
+
+    start = {t: grown(("table", t), rows, "edge") for t, rows in data.start.items()}
+    measured, weight = (
+        tuple(grown(("observations", o), x, "constant") for o, x in enumerate(given))
+        for given in (data.measured, data.weight)
     )
-    size = problem.sizes
-    return jax.device_put(Data(
-        {
-            t: jax.tree.map(lambda x, t=t: edge(x, size["table", t]), v)
-            for t, v in data.start.items()
-        },
-        tuple(
-            jax.tree.map(lambda x, o=o: fill(x, size["observations", o]), m)
-            for o, m in enumerate(data.measured)
-        ),
-        tuple(fill(w, size["observations", o]) for o, w in enumerate(data.weight)),
-    ))  # fmt: skip
+    return jax.device_put(Data(start, measured, weight))
 
 
 def make_solver(
@@ -169,9 +185,9 @@ def make_solver(
     """The solver of a problem; `options` are those of `LeastSquares`."""
     declared = problem.declared
     squares = sum(
-        float(((np.asarray(w) * np.asarray(m)) ** 2).sum())
+        float(((np.asarray(_diagonal(w)) * np.reshape(m, w.shape[:2])) ** 2).sum())
         for w, m in zip(problem.data.weight, problem.data.measured)
-        if hasattr(m, "shape") and np.shape(m) == np.shape(w)
+        if hasattr(m, "shape") and m.size == w.shape[0] * w.shape[1]
     )
     to_device = lambda x: jax.device_put(np.float64(x))
     tolerance = Tolerance(to_device(problem.counts.redundancy), to_device(squares), atol, rtol)

@@ -1,109 +1,112 @@
-"""The reduced system S·x = b of the kept groups, assembled, scaled, factorised.
+"""The reduced system S·x = b of the kept groups: its blocks, and its dense factor.
 
-Dense, by one Cholesky factorisation, here; or banded (`banded.py`); or not at all, by conjugate
-gradients (`iterative.py`). S is scaled by the diagonal of A (before elimination). What is held gets
-a one.
+It is solved by one dense Cholesky factorisation, here; or banded (`banded.py`); or not factorised
+at all, by conjugate gradients (`iterative.py`). All three have
 
-A problem that may float is singular along its open motions. They are made regular by adding a one
-to as many diagonal elements (`Datum.pins`): the solution changes along these motions only.
+- `solve(b)`: S⁻¹·b for rows of the kept groups;
+- `inverse()`: the blocks of S⁻¹ where S has blocks;
+- `pivots`: the square roots of the pivots, 1 without correlation, 0 without determination.
 """
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 
+from jaxbundle.leastsquares.normal import Tangent
 from jaxbundle.leastsquares.plan import Key, Plan
+
+Groups = tuple[str, ...]
 
 
 class Reduced(eqx.Module):
-    """S in the blocks it consists of; see `Normal`."""
+    """S, or another symmetric matrix, in the blocks that S consists of; see `NormalBlocks`."""
 
     own: dict[str, Float[Array, "rows w w"]]
     off: dict[Key, Float[Array, "blocks w v"]]
 
+    def scaled(self, plan: Plan, scale: Tangent) -> "Reduced":
+        """Rows and columns times `scale`."""
+        times = lambda B, s, t: B * s[:, :, None] * t[:, None, :]
+        return Reduced(
+            {g: times(B, scale[g], scale[g]) for g, B in self.own.items()},
+            {(a, b): times(B, scale[a][plan.blocks[a, b].row], scale[b][plan.blocks[a, b].column])
+             for (a, b), B in self.off.items()},
+        )  # fmt: skip
+
+    def matrix(self, plan: Plan, groups: Groups) -> Float[Array, "n n"]:
+        """The matrix of some groups; only its lower triangle is right."""
+        size = lambda g: plan.groups[g].free.size
+        rows = [
+            [self.between(plan, a, b) if j <= i else jnp.zeros((size(a), size(b)))
+             for j, b in enumerate(groups)] for i, a in enumerate(groups)
+        ]  # fmt: skip
+        return jnp.block(rows) if rows else jnp.zeros((0, 0))
+
+    def between(self, plan: Plan, a: str, b: str) -> Float[Array, "n m"]:
+        """The matrix of two groups; of one with itself only its lower triangle is right."""
+        if (b, a) in self.off and a != b:
+            return self.between(plan, b, a).T
+        (n, w), (m, v) = plan.groups[a].free.shape, plan.groups[b].free.shape
+        matrix = jnp.zeros((n, m, w, v))
+        if (a, b) in self.off:
+            at = plan.blocks[a, b]
+            matrix = matrix.at[at.row, at.column].add(self.off[a, b])
+        if a == b:
+            matrix = matrix.at[jnp.arange(n), jnp.arange(n)].add(self.own[a])
+        return matrix.transpose(0, 2, 1, 3).reshape(n * w, m * v)
+
 
 class DenseFactor(eqx.Module):
-    """S = L·Lᵀ, scaled."""
+    """S = L·Lᵀ."""
 
     plan: Plan
     lower: Float[Array, "n n"]
-    scale: Float[Array, " n"]
 
-    def solve(self, b):
-        """S⁻¹·b."""
-        x = cho_solve((self.lower, True), flat(self.plan, b) * self.scale) * self.scale
-        return split(self.plan, x)
+    def solve(self, b: Tangent) -> Tangent:
+        kept = self.plan.kept
+        return split(self.plan, kept, cho_solve((self.lower, True), flat(kept, b)))
 
     def inverse(self) -> Reduced:
-        """The blocks of S⁻¹ where S has blocks."""
-        plan = self.plan
-        Q = cho_solve((self.lower, True), jnp.diag(self.scale)) * self.scale[:, None]
-        start, place = 0, {}
-        for g in plan.kept:
-            place[g] = start
-            start += plan.groups[g].free.size
-
-        def between(later, earlier, row, column):
-            (n, w), (m, v) = (plan.groups[g].free.shape for g in (later, earlier))
-            a, b = place[later], place[earlier]
-            blocks = Q[a : a + n * w, b : b + m * v].reshape(n, w, m, v)
-            return blocks[row, :, column, :]
-
-        index = {g: jnp.arange(plan.groups[g].rows) for g in plan.kept}
-        return Reduced(
-            {g: between(g, g, i, i) for g, i in index.items()},
-            {key: between(*key, at.row, at.column) for key, at in plan.blocks.items()},
-        )
+        Q = cho_solve((self.lower, True), jnp.eye(self.lower.shape[0]))
+        return blocks_of(self.plan, self.plan.kept, Q)
 
     @property
     def pivots(self) -> Float[Array, " n"]:
-        """Square roots of the pivots, 1 without correlation, 0 without determination."""
         return jnp.diagonal(self.lower)
 
 
-def factorise_reduced(plan: Plan, parts: Reduced, before, regular=True) -> DenseFactor:
-    """The factor of S; NaN where it is not positive definite. `before`: diagonal blocks of A."""
-    diagonal = flat(plan, {g: jnp.diagonal(B, axis1=1, axis2=2) for g, B in before.items()})
-    scale = jnp.where(diagonal > 0, diagonal, 1.0) ** -0.5
-    S = dense_matrix(plan, parts, scale, regular)
-    return DenseFactor(plan, jnp.linalg.cholesky(S, symmetrize_input=False), scale)
+def factorise_dense(plan: Plan, S: Reduced) -> DenseFactor:
+    """The factor of S; NaN where it is not positive definite."""
+    return DenseFactor(plan, cholesky(S.matrix(plan, plan.kept)))
 
 
-def dense_matrix(plan: Plan, parts: Reduced, scale, regular=True) -> Float[Array, "n n"]:
-    """S scaled, the open motions of the datum made regular; only its lower triangle is right."""
-    rows = []
-    for b, later in enumerate(plan.kept):
-        row = []
-        for c, earlier in enumerate(plan.kept):
-            n, m = (plan.groups[g].rows for g in (later, earlier))
-            w, v = (plan.groups[g].width for g in (later, earlier))
-            block = jnp.zeros((n, m, w, v))
-            if (later, earlier) in parts.off and c <= b:
-                at = plan.blocks[later, earlier]
-                block = block.at[at.row, at.column].add(parts.off[later, earlier])
-            if later == earlier:
-                index = jnp.arange(n)
-                block = block.at[index, index].add(parts.own[later])
-            row.append(block.transpose(0, 2, 1, 3).reshape(n * w, m * v))
-        rows.append(jnp.concatenate(row, 1))
-    S = jnp.concatenate(rows) * scale[:, None] * scale[None, :]
-    more = 1.0 - flat(plan, {g: plan.groups[g].free for g in plan.kept})
-    if plan.datum is not None:
-        more = more + regular * flat(plan, plan.datum.pins)
-    return S + jnp.diag(more)
+def cholesky(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """L of S = L·Lᵀ, from the lower triangle of S."""
+    return jnp.linalg.cholesky(S, symmetrize_input=False)
 
 
-def flat(plan: Plan, rows) -> Float[Array, " n"]:
-    """The kept groups as one vector."""
-    return jnp.concatenate([rows[g].ravel() for g in plan.kept])
+def blocks_of(plan: Plan, groups: Groups, Q: Float[Array, "n n"]) -> Reduced:
+    """The blocks of a symmetric matrix of some groups where S has blocks."""
+    cut = lambda x: split(plan, groups, x)
+    Q = {b: cut(jnp.moveaxis(x, -1, 0)) for b, x in cut(Q).items()}
+    index = {g: jnp.arange(plan.groups[g].rows) for g in groups}
+    own = {g: Q[g][g][i, :, i] for g, i in index.items()}
+    keys = [(a, b) for a, b in plan.blocks if a in index and b in index]
+    at = plan.blocks
+    return Reduced(own, {(a, b): Q[b][a][at[a, b].row, :, at[a, b].column] for a, b in keys})
 
 
-def split(plan: Plan, vector):
-    """The vector of the kept groups, group by group."""
-    found, start = {}, 0
-    for g in plan.kept:
-        n, w = plan.groups[g].free.shape
-        found[g] = vector[start : start + n * w].reshape(n, w)
-        start += n * w
-    return found
+def flat(groups: Groups, rows: Tangent) -> Float[Array, " n"]:
+    """Some groups as one vector."""
+    return jnp.concatenate([jnp.zeros(0), *(rows[g].ravel() for g in groups)])
+
+
+def split(plan: Plan, groups: Groups, vector: Float[Array, "n ..."]):
+    """The rows of some groups in one, group by group."""
+    ends = np.cumsum([plan.groups[g].free.size for g in groups])
+    parts = jnp.split(vector, ends[:-1]) if groups else ()
+    return {
+        g: x.reshape(*plan.groups[g].free.shape, *x.shape[1:]) for g, x in zip(groups, parts)
+    }

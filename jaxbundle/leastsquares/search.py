@@ -16,7 +16,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from jaxbundle.leastsquares.damping import times
-from jaxbundle.leastsquares.elimination import Factor, damp, factorise, solve
+from jaxbundle.leastsquares.elimination import EXACT, Factor, damp, factorise, solve
 from jaxbundle.leastsquares.normal import Normal, Tangent, dot
 
 
@@ -34,17 +34,20 @@ WIDEST = 1e16
 """Radius of the trust region beyond which damping is rounding."""
 UNDAMPED_DATUM = 1e8
 """Steps less damped than this need the datum directions made regular."""
+INEXACT = 1e-2
+"""Relative residual of a reduced system solved by iteration, in the steps of the solver."""
 
 
 class Elimination(lx.AbstractLinearSolver):
     """Solves with N by elimination, for any descent that takes a linear solver."""
 
     regular: bool | Bool[Array, ""] = True
+    tolerance: float = eqx.field(static=True, default=EXACT)
 
     def init(self, operator: Normal, options: dict[str, Any]) -> Factor:
         if not isinstance(operator, Normal):
             raise ValueError("Elimination solves with the normal equations of a plan only")
-        return factorise(operator, self.regular)
+        return factorise(operator, self.regular, self.tolerance)
 
     def compute(self, state: Factor, vector: Tangent, options: dict[str, Any]):
         return solve(state, vector), lx.RESULTS.successful, {}
@@ -72,7 +75,7 @@ class MarquardtDescent(optx.AbstractDescent):
 
     def step(self, step_size: Float[Array, ""], state: Info):
         damped = damp(state.hessian, 1 / step_size)
-        solver = Elimination(step_size > UNDAMPED_DATUM)
+        solver = Elimination(step_size > UNDAMPED_DATUM, INEXACT)
         change = lx.linear_solve(damped, state.grad, solver, throw=False).value
         return jax.tree.map(jnp.negative, change), optx.RESULTS.successful
 

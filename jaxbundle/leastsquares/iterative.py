@@ -1,0 +1,75 @@
+"""The reduced system without its matrix: preconditioned conjugate gradients.
+
+S = A − Zᵀ·Z is only applied to vectors (Agarwal et al. 2010): Z·x spreads changes of kept rows over
+their incidences, Zᵀ gathers them again. No pair of incidences is ever listed, so time and memory
+grow with the incidences alone. The blocks of S of every kept row, L·Lᵀ, precondition
+(Schur–Jacobi): solved is
+
+    (L⁻¹·S·L⁻ᵀ)·y = L⁻¹·b,   x = L⁻ᵀ·y,
+
+where every element of y is a change in units of its conditional σ, so that one norm measures all.
+A problem that may float is singular but consistent, which conjugate gradients do not mind.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import optimistix as optx
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Float
+
+from jaxbundle.leastsquares.normal import Normal, Tangent, agreed, gather, scatter, times_kept
+from jaxbundle.leastsquares.reduced import Reduced
+
+MOST_STEPS = 2000
+"""Steps of conjugate gradients after which what was found so far is taken."""
+LEAST = 1e-300
+
+
+class ConjugateGradients(eqx.Module):
+    """S = A − Zᵀ·Z scaled, applied to vectors, and L⁻¹ of its diagonal blocks. `tolerance`: the
+    norm of the residual relative to that of the right-hand side."""
+
+    normal: Normal
+    Z: dict[str, Float[Array, "chunks length w v"]]
+    scale: Tangent
+    lower_inverse: dict[str, Float[Array, "rows w w"]]
+    tolerance: float = eqx.field(static=True)
+
+    def solve(self, b: Tangent) -> Tangent:
+        times = lambda indices, x: {
+            g: jnp.einsum(indices, M, x[g]) for g, M in self.lower_inverse.items()
+        }
+        divided, back = (lambda x: times("nij,nj->ni", x)), (lambda x: times("nji,nj->ni", x))
+        right, tag = divided(b), lx.positive_semidefinite_tag
+        product = lambda y: divided(self._times(back(y)))
+        operator = lx.FunctionLinearOperator(product, jax.eval_shape(lambda: right), tag)
+        limit = jnp.maximum(self.tolerance * optx.two_norm(right), LEAST)
+        method = lx.CG(rtol=0.0, atol=limit, norm=optx.two_norm, max_steps=MOST_STEPS)
+        return back(lx.linear_solve(operator, right, method, throw=False).value)
+
+    def inverse(self) -> Reduced:
+        raise ValueError("conjugate gradients have no factor to read an inverse from: with_factor")
+
+    @property
+    def pivots(self) -> Float[Array, " n"]:
+        """Those of every block by itself."""
+        roots = [jnp.diagonal(M, axis1=1, axis2=2).ravel() for M in self.lower_inverse.values()]
+        return 1 / jnp.concatenate(roots)
+
+    def _times(self, x: Tangent) -> Tangent:
+        """S·x."""
+        plan = self.normal.plan
+        x = {g: rows * self.scale[g] for g, rows in x.items()}
+        product = times_kept(plan, self.normal.blocks, x)
+        for g, less in gather(plan, self.Z, scatter(plan, self.Z, x)).items():
+            product[g] = product[g] - less
+        return agreed(plan, {g: rows * self.scale[g] for g, rows in product.items()})
+
+
+def precondition(normal: Normal, Z, S: Reduced, scale: Tangent, tolerance) -> ConjugateGradients:
+    """S for conjugate gradients, `S.own` its diagonal blocks scaled."""
+    inverse = lambda L: solve_triangular(L, jnp.eye(L.shape[1]), lower=True)
+    lower_inverse = {g: jax.vmap(inverse)(jnp.linalg.cholesky(B)) for g, B in S.own.items()}
+    return ConjugateGradients(normal, Z, scale, lower_inverse, tolerance)

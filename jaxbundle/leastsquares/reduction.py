@@ -1,0 +1,87 @@
+"""How the reduced system of the kept groups is solved: dense, banded, or by iteration.
+
+Two rows of a group share a block of the reduced matrix only where observations, or eliminated rows,
+tie them together. In the order of Cuthill and McKee (1969), reversed (George 1971), tied rows stand
+near each other: a drive along a street, a traverse, or strips flown one after the other become a
+narrow band. Cut into super-blocks as wide as the band, the matrix is block tridiagonal. The group
+with most unknowns is put in order so; all others are a border.
+
+What is chosen is what needs the fewest operations by count: n³/3 for a dense factor, a few m³ for
+each of the super-blocks of m unknowns, and for conjugate gradients some forty passes over all
+observations, which need no pairs of incidences at all.
+"""
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Int
+
+from jaxbundle.leastsquares.indices import Column
+
+REDUCTIONS = ("dense", "banded", "iterative")
+FACTORS = ("dense", "banded")
+SMALL = 1000
+"""Reduced systems with fewer unknowns are solved as they are."""
+GAIN = 3.0
+"""By how much fewer operations than the dense one another way must need."""
+LARGEST_FACTOR = 2e9 / 8
+"""Elements of a factor; what needs more is solved by iteration."""
+MOST_PAIRS = 3e8
+"""Pairs of incidences; what has more is solved by iteration."""
+STEPS, WORK = 40, 600.0
+"""Of conjugate gradients: passes, and what an observation costs in one, in operations of a
+factorisation."""
+NARROWEST = 32
+"""Unknowns of a super-block; with fewer the time goes into its steps, not into operations."""
+
+
+class Band(eqx.Module):
+    """`place`: the position of every row of `group` in the band (the last for what is filled in);
+    super-blocks of `width` rows."""
+
+    group: str = eqx.field(static=True)
+    place: Int[Array, " rows"]
+    width: int = eqx.field(static=True)
+    blocks: int = eqx.field(static=True)
+
+
+def plan_reduction(shapes: dict[str, tuple[int, int]], ties, observations: int, ways):
+    """The way for kept groups of these shapes (rows, width), None where none of `ways` fits into
+    memory, and the band where that is its way; a single one of `ways` is taken as it is.
+
+    `ties(group)`: row and column of its blocks beside the diagonal."""
+    unknowns = sum(n * w for n, w in shapes.values())
+    if not shapes or (len(ways) > 1 and unknowns < SMALL):
+        return "dense", None
+    group = max(shapes, key=lambda g: np.prod(shapes[g]))
+    band = find_band(group, *ties(group), *shapes[group]) if "banded" in ways else None
+    way, w = ways[0], shapes[group][1]
+    if len(ways) > 1:
+        way = choose_reduction(band, w, unknowns, observations, ways)
+    return way, band if way == "banded" else None
+
+
+def find_band(group: str, row, column, rows: int, w: int) -> Band:
+    """A narrow band of the blocks (row, column) of a group of so many rows of `w` unknowns."""
+    from scipy import sparse  # A tenth of a second, which small problems are spared.
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+    links = sparse.coo_matrix((np.ones(len(row)), (row, column)), (rows, rows))
+    place = np.empty(rows, np.int32)
+    place[reverse_cuthill_mckee((links + links.T).tocsr(), symmetric_mode=True)] = np.arange(rows)
+    width = max(int(np.abs(place[row] - place[column]).max(initial=0)), -(-NARROWEST // w))
+    blocks = rows // width + 1  # The last place is empty.
+    return Band(group, Column(place, ("group", group), blocks * width - 1), width, blocks)
+
+
+def choose_reduction(band: Band | None, w: int, unknowns: int, observations: int, ways):
+    """The way for so many unknowns, those of the band in blocks of `w`; None: none fits."""
+    n, work = float(unknowns), {"iterative": (STEPS * WORK * observations, 0)}
+    work["dense"] = n**3 / 3, n**2
+    if band is not None:
+        m, rows = float(band.width * w), len(band.place.rows) * w
+        q = n - rows
+        border = 2 * rows * m * q + rows * q**2 + q**3 / 3
+        work["banded"] = band.blocks * 10 / 3 * m**3 + border, 3 * band.blocks * m**2 + n * q
+    fits = {way: work[way][0] for way in ways if work[way][1] <= LARGEST_FACTOR}
+    least = min(fits, key=fits.get, default=None)
+    return "dense" if "dense" in fits and fits["dense"] < GAIN * fits[least] else least
