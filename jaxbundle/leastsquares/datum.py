@@ -288,7 +288,7 @@ def _slope(declared, plan, values, start):
 def _moved(declared, plan, motion, values):
     """All tables moved; what is held stays."""
     moved, free = dict(values), free_of_tables(plan, declared, values)
-    for name, act in [action for action in declared.motions.actions if action[0] in values]:
+    for name, act in declared.motions.actions:
         space = declared.spaces[name]
         one = lambda value, f, act=act, space=space: space.hold(act(motion, value), value, f)
         moved[name] = jax.vmap(one)(values[name], free[name])

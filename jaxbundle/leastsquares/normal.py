@@ -163,13 +163,12 @@ class _Sums:
 
     def add_part(self, part: Part, r, touches, E):
         self.cost = self.cost + 0.5 * jnp.vdot(r, r)
-        tall = [_tall(J) for J in touches]
-        right = r.reshape(r.shape[0], -1)
+        chunks = r.shape[0]
+        tall = [J.reshape(chunks, -1, J.shape[-1]) for J in touches]
+        right = r.reshape(chunks, -1)
         for touch, J in zip(part.touches, tall):
-            g, columns = touch.group, slice(touch.start, touch.stop)
-            N, more = jnp.einsum("cki,ckj->cij", J, J), jnp.einsum("cki,ck->ci", J, right)
-            self.own[g] = self.own[g].at[touch.row, columns, columns].add(N)
-            self.gradient[g] = self.gradient[g].at[touch.row, columns].add(more)
+            self._add_own(touch, jnp.einsum("cki,ckj->cij", J, J))
+            self._add_gradient(touch, jnp.einsum("cki,ck->ci", J, right))
         for couple in part.couples:
             product = jnp.einsum("cki,ckj->cij", tall[couple.first], tall[couple.second])
             self._add_couple(part, couple, product)
@@ -183,6 +182,14 @@ class _Sums:
             self.gradient[self.plan.eliminated] += both[..., -1]
             for touch, K in zip(part.touches, touches):
                 self._add_incidences(touch, products(J, flat(K)))
+
+    def _add_own(self, touch, N):
+        columns = slice(touch.start, touch.stop)
+        self.own[touch.group] = self.own[touch.group].at[touch.row, columns, columns].add(N)
+
+    def _add_gradient(self, touch, g):
+        columns = slice(touch.start, touch.stop)
+        self.gradient[touch.group] = self.gradient[touch.group].at[touch.row, columns].add(g)
 
     def _add_couple(self, part, couple, N):
         """A block beside the diagonal, or on it where the two rows are one."""

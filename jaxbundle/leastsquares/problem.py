@@ -105,7 +105,9 @@ def _with_datum(problem: Problem, weight, minimal: bool) -> Problem:
         return problem
     if weight is None:
         raise InputError(f"the datum is open in {gauge.shape[1]} parameters: say what holds it")
-    fill = lambda t, w: np.pad(w, ((0, problem.sizes["table", t] - len(w)), (0, 0)))
+    fill = lambda t, w: np.concatenate(
+        [w, np.zeros((problem.sizes["table", t] - len(w), w.shape[1]))]
+    )
     weight = {t: fill(t, np.asarray(w, float)) for t, w in weight.items()}
     datum = jax.device_put(make_datum(problem.declared, problem.plan, data, gauge, weight, minimal))
     plan = dataclasses.replace(problem.plan, datum=datum)
@@ -166,17 +168,22 @@ def _diagonal(weight):
 
 def pad_data(problem: Problem, data: Data) -> Data:
     """The numbers filled to the sizes of the plan: rows repeat the last one, weights are 0."""
-
-    def grown(key, rows, mode):
-        more = lambda x: [(0, problem.sizes[key] - len(x))] + [(0, 0)] * (x.ndim - 1)
-        return jax.tree.map(lambda x: np.pad(x, more(x), mode), rows)
-
-    start = {t: grown(("table", t), rows, "edge") for t, rows in data.start.items()}
-    measured, weight = (
-        tuple(grown(("observations", o), x, "constant") for o, x in enumerate(given))
-        for given in (data.measured, data.weight)
+    fill = lambda x, n: np.concatenate([np.asarray(x), np.zeros((n - len(x), *np.shape(x)[1:]))])
+    edge = lambda x, n: np.concatenate(
+        [np.asarray(x), np.repeat(np.asarray(x)[-1:], n - len(x), 0)]
     )
-    return jax.device_put(Data(start, measured, weight))
+    size = problem.sizes
+    return jax.device_put(Data(
+        {
+            t: jax.tree.map(lambda x, t=t: edge(x, size["table", t]), v)
+            for t, v in data.start.items()
+        },
+        tuple(
+            jax.tree.map(lambda x, o=o: fill(x, size["observations", o]), m)
+            for o, m in enumerate(data.measured)
+        ),
+        tuple(fill(w, size["observations", o]) for o, w in enumerate(data.weight)),
+    ))  # fmt: skip
 
 
 def make_solver(

@@ -9,6 +9,7 @@ at all, by conjugate gradients (`iterative.py`). All three have
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import cho_solve
@@ -79,12 +80,21 @@ class DenseFactor(eqx.Module):
 
 def factorise_dense(plan: Plan, S: Reduced) -> DenseFactor:
     """The factor of S; NaN where it is not positive definite."""
-    return DenseFactor(plan, cholesky(S.matrix(plan, plan.kept)))
+    return DenseFactor(plan, cholesky_of_lower(S.matrix(plan, plan.kept)))
 
 
-def cholesky(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """L of S = L·Lᵀ, from the lower triangle of S."""
+@jax.custom_jvp
+def cholesky_of_lower(S: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
+    """L of S = L·Lᵀ from the lower triangle of S; NaN where it is not positive definite."""
     return jnp.linalg.cholesky(S, symmetrize_input=False)
+
+
+@cholesky_of_lower.defjvp
+def _(primals, tangents):
+    # JAX's own rule takes a change for the whole of it.
+    whole = lambda S: jnp.tril(S) + jnp.tril(S, -1).mT
+    factor = lambda S: jnp.linalg.cholesky(whole(S), symmetrize_input=False)
+    return jax.jvp(factor, primals, tangents)
 
 
 def blocks_of(plan: Plan, groups: Groups, Q: Float[Array, "n n"]) -> Reduced:

@@ -4,13 +4,11 @@ or without, the datum held or open."""
 import dataclasses
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxbundle.errors import InputError
-from jaxbundle.geometry import similarity
 from jaxbundle.leastsquares.cofactors import cofactors
 from jaxbundle.leastsquares.declarations import Kind, Motions, Table
 from jaxbundle.leastsquares.elimination import damp, factorise, solve
@@ -25,54 +23,52 @@ from jaxbundle.leastsquares.problem import (
 from jaxbundle.leastsquares.reduction import FACTORS, choose_reduction, find_band
 from jaxbundle.leastsquares.reliability import reliability
 from jaxbundle.leastsquares.rows import lay_out_data
-from jaxbundle.leastsquares.spaces import Pose, PoseValue
 from jaxbundle.leastsquares.stopping import SETTLED
 
-POSES, POINTS, REACH, NOISE = 30, 150, 5, 1e-3
+STATIONS, POINTS, REACH, NOISE = 60, 200, 5, 1e-3
 LEVELLED = Kind("levelled difference", lambda a, b, dh: b - a - dh, of=("height", "height"))
 
 
-def bearing(pose, X, factor, measured):
-    x, y, z = pose.ray(X)
-    return factor * x / z - measured[0], factor * y / z - measured[1]
+def distance(station, X, factor, measured):
+    return factor * jnp.hypot(X[0] - station[0], X[1] - station[1]) - measured
 
 
-def place(pose, shift, measured):
-    return tuple(a + b - m for a, b, m in zip(pose.centre, shift, measured))
+def direction(station, X, measured):
+    return jnp.sin(jnp.arctan2(X[0] - station[0], X[1] - station[1]) - station[2] - measured)
 
 
-BEARING = Kind("bearing", bearing, of=("pose", "point", "factor"), scalars=True, invariant=True)
-PLACE = Kind("place", place, of=("pose", "shift"), scalars=True)
-SIMILARITY = Motions(
-    ("X", "Y", "Z", "turn X", "turn Y", "turn Z", "scale"),
-    (("pose", lambda tau, p: PoseValue(*similarity.transform_pose(tau, *p))),
-     ("point", similarity.transform_point), ("shift", lambda tau, x: x - tau[:3])),
-    curved=(3, 4, 5, 6),
-)  # fmt: skip
+def turned(motion, X):
+    c, s = jnp.cos(motion[2]), jnp.sin(motion[2])
+    return jnp.stack([c * X[0] + s * X[1], c * X[1] - s * X[0]]) + motion[:2]
 
 
-def drive(reduction=None):
-    """Poses in a row, shuffled, each seeing the points beside it; one factor of all. Every other
-    place is measured, but for a shift of all."""
+DISTANCE = Kind("distance", distance, of=("station", "point", "factor"), invariant=True)
+DIRECTION = Kind("direction", direction, of=("station", "point"), invariant=True)
+PLACE = Kind("place", lambda station, e, x: station[:2] + e - x, of=("station", "shift"))
+MOTIONS = Motions(("E", "N", "turn"), (
+    ("station", lambda tau, s: jnp.append(turned(tau, s), s[2] + tau[2])),
+    ("point", turned), ("shift", lambda tau, e: e - tau[:2]),
+), curved=(2,))  # fmt: skip
+
+
+def traverse(reduction=None):
+    """Stations in a row, shuffled, with a circle each, that measure the points beside them; one
+    factor of all distances. Every other place is known, but for a shift of all."""
     random = np.random.default_rng(3)
-    X = np.c_[random.uniform(0, POSES - 1, POINTS), random.normal(size=POINTS),
-              random.uniform(4, 9, POINTS)]  # fmt: skip
-    along = random.permutation(POSES)
+    X = np.c_[random.uniform(0, STATIONS - 1, POINTS), random.choice([-3, 3], POINTS)]
+    along = random.permutation(STATIONS)
     row, point = np.nonzero(np.abs(along[:, None] - X[:, 0]) < REACH / 2)
-    centre = np.c_[along, 0.1 * random.normal(size=(POSES, 2))]
-    quaternion = np.c_[np.ones(POSES), 0.1 * random.normal(size=(POSES, 3))]
-    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
-    ray = jax.vmap(lambda q, d: Pose().prepare(PoseValue(d, q)).ray(np.zeros(3)))
-    x, y, z = np.asarray(ray(quaternion[row], centre[row] - X[point]))
-    measured = 1.5 * np.c_[x / z, y / z] + NOISE * random.normal(size=(len(x), 2))
-    near = lambda x: x + 0.01 * random.normal(size=x.shape)
-    known = np.arange(0, POSES, 2)
+    near = lambda x, sigma=0.01: x + sigma * random.normal(size=x.shape)
+    station = near(np.c_[along, np.zeros((STATIONS, 2))], 0.3)
+    d = X[point] - station[row, :2]
+    known = np.arange(0, STATIONS, 2)
     return make_problem(
-        [Table("pose", PoseValue(near(centre), quaternion), Pose()), Table("point", near(X)),
-         Table("shift", np.zeros((1, 3))), Table("factor", np.array([1.5]))],
-        [BEARING((row, point, 0 * row), measured, sigma=NOISE),
-         PLACE((known, 0 * known), near(centre[known]), sigma=0.01)],
-        "point", motions=SIMILARITY, datum_weight={"point": np.ones((POINTS, 3))},
+        [Table("station", near(station)), Table("point", near(X)), Table("shift", np.zeros((1, 2))),
+         Table("factor", np.array([1.0]))],
+        [DISTANCE((row, point, 0 * row), near(np.hypot(*d.T), NOISE), sigma=NOISE),
+         DIRECTION((row, point), near(np.arctan2(*d.T) - station[row, 2], NOISE), sigma=NOISE),
+         PLACE((known, 0 * known), near(station[known, :2]), sigma=0.01)],
+        "point", motions=MOTIONS, datum_weight={"point": np.ones((POINTS, 2))},
         reduction=reduction,
     )  # fmt: skip
 
@@ -93,7 +89,7 @@ def line(number: int, reduction=None, held=True, noise=None):
 
 
 CASES = {
-    "borders, shift open": (drive, 3),
+    "borders, shift open": (traverse, 2),
     "no border, datum open": (lambda way: line(150, way, held=False)[0], 1),
 }
 
@@ -183,13 +179,13 @@ def test_iteration_plans_no_pairs_and_finds_the_minimum(ways):
 
 
 def test_rows_that_are_tied_stand_close():
-    plan = drive("banded").plan
-    band, at = plan.band, plan.blocks["pose", "pose"]
+    plan = traverse("banded").plan
+    band, at = plan.band, plan.blocks["station", "station"]
     place = np.asarray(band.place)
-    assert band.group == "pose" and sorted(place[:POSES]) == list(range(POSES))
-    assert (place[POSES:] == band.blocks * band.width - 1).all()
+    assert band.group == "station" and sorted(place[:STATIONS]) == list(range(STATIONS))
+    assert (place[STATIONS:] == band.blocks * band.width - 1).all()
     assert np.abs(place[np.asarray(at.row)] - place[np.asarray(at.column)]).max() <= band.width
-    assert band.blocks * band.width > POSES
+    assert band.blocks * band.width > STATIONS
 
 
 def test_a_line_too_long_for_a_dense_factor_is_banded():
