@@ -202,10 +202,12 @@ _generators = eqx.filter_jit(generators)
 
 def _choose_pins(plan: Plan, G) -> dict[str, np.ndarray]:
     """As many kept unknowns as there are defects, chosen well spread; every kind of direction
-    counts by its own size."""
+    counts by its own size, unless that is rounding."""
     rows, shapes = [], []
+    size = {name: np.sqrt((G[name] ** 2).mean((0, 2), keepdims=True)) for name in plan.kept}
+    least = max(1e-300, OPEN * max(x.max(initial=0) for x in size.values()))
     for name in plan.kept:
-        sized = G[name] / np.maximum(np.sqrt((G[name] ** 2).mean((0, 2), keepdims=True)), 1e-300)
+        sized = G[name] / np.maximum(size[name], least)
         rows.append(sized.reshape(-1, sized.shape[2]))
         shapes.append(G[name].shape[:2])
     whole = np.concatenate(rows)
