@@ -9,6 +9,7 @@ to as many diagonal elements (`Datum.pins`): the solution changes along these mo
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
@@ -67,7 +68,21 @@ def factorise_reduced(plan: Plan, parts: Reduced, before, regular=True) -> Dense
     diagonal = flat(plan, {g: jnp.diagonal(B, axis1=1, axis2=2) for g, B in before.items()})
     scale = jnp.where(diagonal > 0, diagonal, 1.0) ** -0.5
     S = dense_matrix(plan, parts, scale, regular)
-    return DenseFactor(plan, jnp.linalg.cholesky(S, symmetrize_input=False), scale)
+    return DenseFactor(plan, cholesky_of_lower(S), scale)
+
+
+@jax.custom_jvp
+def cholesky_of_lower(S: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
+    """L of S = L·Lᵀ from the lower triangle of S; NaN where it is not positive definite."""
+    return jnp.linalg.cholesky(S, symmetrize_input=False)
+
+
+@cholesky_of_lower.defjvp
+def _(primals, tangents):
+    # JAX's own rule takes a change for the whole of it.
+    whole = lambda S: jnp.tril(S) + jnp.tril(S, -1).mT
+    factor = lambda S: jnp.linalg.cholesky(whole(S), symmetrize_input=False)
+    return jax.jvp(factor, primals, tangents)
 
 
 def dense_matrix(plan: Plan, parts: Reduced, scale, regular=True) -> Float[Array, "n n"]:
