@@ -312,12 +312,17 @@ def attach_motion(declared: Declared, plan: Plan, values: Values, start: Values)
     start from that can be differentiated to every order."""
     if plan.datum is None:
         return values
-    tau, fixed = jnp.zeros(plan.datum.gauge.shape[1]), (declared, plan)
+    still, fixed = jnp.zeros(plan.datum.gauge.shape[1]), (declared, plan)
+
+    def along(tau, of, values):
+        return _moved(declared, plan, leave_held(declared, plan, of).datum.gauge @ tau, values)
+
+    # What is missing first, so that derivatives are taken where nothing moves.
     known = jax.lax.stop_gradient((values, start))
-    slope = jax.jacfwd(_missing)(tau, fixed, known)
-    tau = tau - jnp.linalg.solve(slope, _missing(tau, fixed, known))
-    tau = implicit_root(_missing, solve_dense, tau, fixed, (values, start))
-    return _moved(declared, plan, leave_held(declared, plan, values).datum.gauge @ tau, values)
+    slope = jax.jacfwd(_missing)(still, fixed, known)
+    values = along(-jnp.linalg.solve(slope, _missing(still, fixed, known)), known[0], values)
+    tau = implicit_root(_missing, solve_dense, still, fixed, (values, start))
+    return along(tau, values, values)
 
 
 def _moved(declared, plan, motion, values):

@@ -40,7 +40,8 @@ def image_points(model: str | cameras.CameraModel, domain: str, camera: str) -> 
     """Image points of the cameras of one model, whose table is `camera`; `domain`: "corrected" or
     "measured"."""
     of = ("image", camera, "point")
-    name = "image coordinates" if camera == "camera" else f"image coordinates, {cameras.get_model(model).name}"
+    only = camera == "camera"
+    name = "image coordinates" if only else f"image coordinates of {cameras.get_model(model).name}"
     return Kind(name, ImagePoint(model, domain), of, ("x", "y"), scalars=True, invariant=True)
 
 
