@@ -23,7 +23,6 @@ from jaxbundle.leastsquares.hessian import exact_equations
 from jaxbundle.leastsquares.normal import Normal, zero_tangent
 from jaxbundle.leastsquares.precision import precision
 from jaxbundle.leastsquares.problem import (
-    find_minimum,
     given_data,
     make_problem,
     make_solver,
@@ -31,7 +30,10 @@ from jaxbundle.leastsquares.problem import (
 )
 from jaxbundle.leastsquares.retraction import retract
 from jaxbundle.leastsquares.rows import lay_out_data
+from jaxbundle.leastsquares.solver import minimise
 from jaxbundle.leastsquares.spaces import Pose, PoseValue
+
+find_minimum = eqx.filter_jit(minimise)
 
 pytestmark = pytest.mark.slow
 
@@ -70,7 +72,7 @@ def trilateration(held):
     return make_problem(
         [Table("point", start, free=free), devices],
         [DISTANCE((i, j, np.arange(len(i)) % 2), measured, sigma=sigma)],
-        motions=MOTIONS, datum_weight={"point": weight},
+        motions=MOTIONS, datum=lambda gauge: ({"point": weight}, False),
     )  # fmt: skip
 
 

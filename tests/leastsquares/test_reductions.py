@@ -14,7 +14,6 @@ from jaxbundle.leastsquares.declarations import Kind, Motions, Table
 from jaxbundle.leastsquares.elimination import damp, factorise, solve
 from jaxbundle.leastsquares.normal import Normal, normal_equations
 from jaxbundle.leastsquares.problem import (
-    find_minimum,
     make_problem,
     make_solver,
     pad_data,
@@ -23,10 +22,13 @@ from jaxbundle.leastsquares.problem import (
 from jaxbundle.leastsquares.reduction import FACTORS, choose_reduction, find_band
 from jaxbundle.leastsquares.reliability import reliability
 from jaxbundle.leastsquares.rows import lay_out_data
+from jaxbundle.leastsquares.solver import minimise
 from jaxbundle.leastsquares.stopping import SETTLED
 
 STATIONS, POINTS, REACH, NOISE = 60, 200, 5, 1e-3
 LEVELLED = Kind("levelled difference", lambda a, b, dh: b - a - dh, of=("height", "height"))
+
+find_minimum = eqx.filter_jit(minimise)
 
 
 def distance(station, X, factor, measured):
@@ -68,7 +70,7 @@ def traverse(reduction=None):
         [DISTANCE((row, point, 0 * row), near(np.hypot(*d.T), NOISE), sigma=NOISE),
          DIRECTION((row, point), near(np.arctan2(*d.T) - station[row, 2], NOISE), sigma=NOISE),
          PLACE((known, 0 * known), near(station[known, :2]), sigma=0.01)],
-        "point", motions=MOTIONS, datum_weight={"point": np.ones((POINTS, 2))},
+        "point", motions=MOTIONS, datum=lambda gauge: ({"point": np.ones((POINTS, 2))}, False),
         reduction=reduction,
     )  # fmt: skip
 
@@ -84,7 +86,7 @@ def line(number: int, reduction=None, held=True, noise=None):
     return make_problem(
         [Table("height", np.zeros(number), free=free)],
         [LEVELLED((order[:-1], order[1:]), noise)], motions=motions,
-        datum_weight={"height": np.ones((number, 1))}, reduction=reduction,
+        datum=lambda gauge: ({"height": np.ones((number, 1))}, False), reduction=reduction,
     ), order, noise  # fmt: skip
 
 
