@@ -279,7 +279,7 @@ def given_data(problem: Problem, data: Data | None) -> Data:
 def make_solver(problem: Problem, *, atol=1e-5, rtol=0.0, **options) -> LeastSquares:
     """The solver of a problem; `options` are those of `LeastSquares`."""
     squares = sum(
-        float(((np.asarray(_diagonal(w)) * np.reshape(m, w.shape[:2])) ** 2).sum())
+        float(((np.asarray(_diagonal(w)) * np.asarray(m).reshape(w.shape[:2])) ** 2).sum())
         for w, m in zip(problem.data.weight, problem.data.measured)
         if hasattr(m, "shape") and m.size == w.shape[0] * w.shape[1]
     )

@@ -230,7 +230,8 @@ def program(name):
         def scalar(data):
             padded = given_data(problem, data)
             solution = attach_derivatives(problem.declared, problem.plan, values, padded)
-            return sum(jax.tree.leaves(jax.tree.map(jnp.vdot, factors, without_filling(problem, solution))))
+            found = without_filling(problem, solution)
+            return sum(jax.tree.leaves(jax.tree.map(jnp.vdot, factors, found)))
 
         by_w = lambda data: jax.jvp(scalar, (data,), (w,))
         (value, by_w), (by_u, both) = jax.jvp(by_w, (data,), (u,))
