@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbundle.leastsquares.datum import contract, datum_directions
+from jaxbundle.leastsquares.datum import contract, datum_directions, zeros_of_tables
 from jaxbundle.leastsquares.elimination import Factor, over_pairs, solve
 from jaxbundle.leastsquares.normal import Tangent
 from jaxbundle.leastsquares.plan import Plan
@@ -114,6 +114,17 @@ def _in_datum(declared, values, factor, own):
         return Q - cross - cross.transpose(0, 2, 1) + jnp.einsum("nik,kl,njl->nij", g, C, g)
 
     return {name: moved(Q, G[name], A[name]) for name, Q in own.items()}
+
+
+def blocks_of_tables(declared: Declared, plan: Plan, own, values: Values):
+    """`Cofactors.own` row by row of the tables; zero where something is held."""
+    empty = zeros_of_tables(declared, values)
+    found = {name: jnp.zeros((*zero.shape, zero.shape[1])) for name, zero in empty.items()}
+    for name, group in plan.groups.items():
+        for m in group.members:
+            at, rows = slice(m.start, m.start + m.width), slice(None) if m.rows is None else m.rows
+            found[m.table] = found[m.table].at[rows].add(own[name][:, at, at])
+    return found
 
 
 def propagate(declared: Declared, values: Values, factor: Factor, rows: Tangent):

@@ -15,6 +15,8 @@ moved, by finite open motions, to where Bᵀ(x − x_start) = 0 holds exactly: t
 depend on the path of the iterations.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,6 +24,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbundle.errors import InputError
+from jaxbundle.implicit import implicit_root, solve_dense
 from jaxbundle.leastsquares.linearise import differentiate
 from jaxbundle.leastsquares.normal import Tangent, total
 from jaxbundle.leastsquares.plan import Datum, Plan
@@ -71,8 +74,27 @@ def of_groups(plan: Plan, of_tables) -> Tangent:
 
 def open_directions(declared: Declared, plan: Plan, values: Values) -> Tangent:
     """G: the directions of the open motions, [rows, w, defect]."""
-    moves = generators(declared, values)
+    moves, plan = generators(declared, values), leave_held(declared, plan, values)
     return {name: rows @ plan.datum.gauge for name, rows in of_groups(plan, moves).items()}
+
+
+def leave_held(declared: Declared, plan: Plan, values: Values) -> Plan:
+    """The plan with open motions changed least so that what is held stays where it is now: a
+    rotation about a held point goes with the point."""
+    held, gauge = plan.datum.held, plan.datum.gauge
+    if not held:
+        return plan
+    moves = generators(declared, {name: values[name] for name in held})
+    rows = jnp.concatenate([
+        (moves[name] * mask[..., None]).reshape(-1, len(gauge)) for name, mask in held.items()
+    ])  # fmt: skip
+    A = rows.T @ rows
+    scale = jax.lax.stop_gradient(jnp.diagonal(A))
+    scale = jnp.where(scale > 0, jnp.where(scale > 0, scale, 1.0) ** -0.5, 1.0)
+    A = A * scale * scale[:, None]
+    moved = jnp.linalg.pinv(A, HELD, hermitian=True) @ (A @ (gauge / scale[:, None]))
+    datum = dataclasses.replace(plan.datum, gauge=gauge - scale[:, None] * moved)
+    return dataclasses.replace(plan, datum=datum)
 
 
 def find_open_motions(
@@ -136,10 +158,11 @@ def _directional_products(declared: Declared, plan: Plan, data: Data, real):
 
 
 def make_datum(
-    declared: Declared, plan: Plan, data: Data, gauge, weight: dict[str, np.ndarray], minimal: bool
-) -> Datum:
+    declared: Declared, plan: Plan, data: Data, gauge, weight: dict[str, np.ndarray], minimal: bool,
+    real: dict[str, np.ndarray],
+) -> Datum:  # fmt: skip
     """The datum held by the unknowns with a `weight` (by table, [rows, width]); `minimal`: by as
-    many of them as there are defects, chosen well spread.
+    many of them as there are defects, chosen well spread. `real`: see `find_open_motions`.
 
     **Raises:** `InputError` where they cannot hold it."""
     moves = {name: np.asarray(g) @ gauge for name, g in _generators(declared, data.start).items()}
@@ -163,7 +186,8 @@ def make_datum(
             t: part.reshape(weight[t].shape) for t, part in zip(weight, np.split(picked, cuts))
         }
     pins = _choose_pins(plan, {n: np.asarray(x) for n, x in of_groups(plan, moves).items()})
-    return Datum(gauge, weight, pins)
+    held = {t: (1 - free[t]) * real[t][:, None] for t, _ in declared.motions.actions}
+    return Datum(gauge, weight, pins, {t: mask for t, mask in held.items() if mask.any()})
 
 
 _generators = eqx.filter_jit(generators)
@@ -215,11 +239,7 @@ def s_transform(declared: Declared, plan: Plan, values: Values, change: Tangent)
 def datum_directions(declared: Declared, plan: Plan, values: Values) -> tuple[Tangent, Tangent]:
     """G and B of all groups, [rows, w, defect]."""
     G = open_directions(declared, plan, values)
-    zero = {
-        name: jnp.zeros((jax.tree.leaves(rows)[0].shape[0], declared.spaces[name].width))
-        for name, rows in values.items()
-    }
-    weight = of_groups(plan, zero | plan.datum.weight)
+    weight = of_groups(plan, zeros_of_tables(declared, values) | plan.datum.weight)
     return G, {name: g * weight[name][..., None] for name, g in G.items()}
 
 
@@ -230,6 +250,7 @@ def move_to_datum(declared: Declared, plan: Plan, values: Values, start: Values)
     rounding: no move at all, or a small one that is no smaller than the one before."""
     if plan.datum is None:
         return values
+    plan, still = leave_held(declared, plan, values), jnp.zeros(plan.datum.gauge.shape[1])
     weighted = tuple(plan.datum.weight)
     size = max(jnp.abs(x).max() for name in weighted for x in jax.tree.leaves(start[name]))
 
@@ -242,7 +263,8 @@ def move_to_datum(declared: Declared, plan: Plan, values: Values, start: Values)
         values, before, _, count = state
         missing, gram = _datum_equations(declared, plan, values, start)
         far = before > NEAR * size
-        slope = jnp.where(far, gram, _slope(declared, plan, values, start))
+        newton = jax.jacfwd(_missing)(still, (declared, plan), (values, start))
+        slope = jnp.where(far, gram, newton)
         step = plan.datum.gauge @ -jnp.linalg.solve(slope, missing)
         curved = jnp.abs(step[jnp.array(declared.motions.curved, int)]).max(initial=0.0)
         moved = _moved(declared, plan, step / jnp.maximum(curved / LONGEST, 1.0), values)
@@ -269,26 +291,39 @@ def _datum_equations(declared, plan, values, start):
     return missing, gram
 
 
-def _slope(declared, plan, values, start):
-    """How the datum equations change along the open motions."""
-    moves = generators(declared, {name: values[name] for name in plan.datum.weight})
+def _missing(tau, fixed, given):
+    """Bᵀ(x − x_start) after a motion along the open directions."""
+    (declared, plan), (values, start) = fixed, given
+    plan = leave_held(declared, plan, values)
+    tables = {name: values[name] for name in plan.datum.weight}
+    moved = _moved(declared, plan, plan.datum.gauge @ tau, tables)
+    return _datum_equations(declared, plan, moved, start)[0]
 
-    def after(tau):
-        moved = {
-            name: jax.vmap(declared.spaces[name].retract)(
-                values[name], moves[name] @ (plan.datum.gauge @ tau) * (weight > 0)
-            )
-            for name, weight in plan.datum.weight.items()
-        }
-        return _datum_equations(declared, plan, moved, start)[0]
 
-    return jax.jacfwd(after)(jnp.zeros(plan.datum.gauge.shape[1]))
+def attach_motion(declared: Declared, plan: Plan, values: Values, start: Values) -> Values:
+    """`values`, all but in the datum, moved into it; a function of the values and of what they
+    start from that can be differentiated to every order."""
+    if plan.datum is None:
+        return values
+    still, fixed = jnp.zeros(plan.datum.gauge.shape[1]), (declared, plan)
+
+    def along(tau, of, values):
+        return _moved(declared, plan, leave_held(declared, plan, of).datum.gauge @ tau, values)
+
+    # What is missing first, so that derivatives are taken where nothing moves.
+    known = jax.lax.stop_gradient((values, start))
+    slope = jax.jacfwd(_missing)(still, fixed, known)
+    values = along(-jnp.linalg.solve(slope, _missing(still, fixed, known)), known[0], values)
+    tau = implicit_root(_missing, solve_dense, still, fixed, (values, start))
+    return along(tau, values, values)
 
 
 def _moved(declared, plan, motion, values):
     """All tables moved; what is held stays."""
     moved, free = dict(values), free_of_tables(plan, declared, values)
     for name, act in declared.motions.actions:
+        if name not in values:
+            continue
         space = declared.spaces[name]
         one = lambda value, f, act=act, space=space: space.hold(act(motion, value), value, f)
         moved[name] = jax.vmap(one)(values[name], free[name])
@@ -297,16 +332,19 @@ def _moved(declared, plan, motion, values):
 
 def free_of_tables(plan: Plan, declared: Declared, values: Values) -> dict[str, Array]:
     """1 for every direction of every table that is free, 0 where it is held."""
-    free = {
-        name: jnp.zeros((jax.tree.leaves(rows)[0].shape[0], declared.spaces[name].width))
-        for name, rows in values.items()
-    }
+    free = zeros_of_tables(declared, values)
     for group in plan.groups.values():
-        for m in group.members:
+        for m in (m for m in group.members if m.table in free):
             columns = group.free[:, m.start : m.start + m.width]
             rows = slice(None) if m.rows is None else m.rows
             free[m.table] = free[m.table].at[rows].max(columns)
     return free
+
+
+def zeros_of_tables(declared: Declared, values: Values) -> dict[str, Array]:
+    """0 for every direction of every table."""
+    rows = {name: jax.tree.leaves(value)[0].shape[0] for name, value in values.items()}
+    return {name: jnp.zeros((n, declared.spaces[name].width)) for name, n in rows.items()}
 
 
 def contract(plan: Plan, B: Tangent, x: Tangent):

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbundle.leastsquares.plan import Part, Plan
-from jaxbundle.leastsquares.rows import Declared, Laid, over, residual_of
+from jaxbundle.leastsquares.rows import Declared, Laid, diagonal_of, over, residual_of
 
 Jacobians = list[tuple[Float[Array, "chunks length r"], tuple, Float[Array, "chunks length r w"]]]
 
@@ -22,6 +22,12 @@ def widths_of(declared: Declared, plan: Plan, part: Part) -> tuple[int, ...]:
     of = declared.kinds[part.observations].of
     used = {s for touch in part.touches for s, _ in touch.slots} | {part.slot}
     return tuple(declared.spaces[name].width if s in used else 0 for s, name in enumerate(of))
+
+
+def columns_of(widths, slots, start: int, stop: int) -> list[tuple[int, int] | None]:
+    """What stands in the columns of a touch: slot and direction, None where nothing."""
+    place = {first + j: (slot, j) for slot, first in slots for j in range(widths[slot])}
+    return [place.get(c) for c in range(start, stop)]
 
 
 def differentiate(declared: Declared, plan: Plan, number: int, prepared, laid: Laid):
@@ -35,14 +41,10 @@ def differentiate(declared: Declared, plan: Plan, number: int, prepared, laid: L
     shape = r[0].shape
 
     def block(slots, start, stop):
-        """The columns of some slots (slot, first column) side by side."""
-        place = {}
-        for slot, first in slots:
-            for j in range(widths[slot]):
-                place[first + j] = slot, j
+        columns_used = columns_of(widths, slots, start, stop)
         parts = [
-            columns[i][place[c][0]][place[c][1]] if c in place else jnp.zeros(shape)
-            for i in range(len(r)) for c in range(start, stop)
+            jnp.zeros(shape) if at is None else columns[i][at[0]][at[1]]
+            for i in range(len(r)) for at in columns_used
         ]  # fmt: skip
         return jnp.stack(parts, -1).reshape(*shape, len(r), stop - start)
 
@@ -81,5 +83,5 @@ def _forward(residual, widths, row):
 
 def _where_weighted(weight, i, columns):
     """Zero where an observation has no weight, even where it has no derivative."""
-    w = weight[i][i] if isinstance(weight[i], tuple) else weight[i]
+    w = diagonal_of(weight)[i]
     return jax.tree.map(lambda x: jnp.where(w > 0, x, 0.0), columns)

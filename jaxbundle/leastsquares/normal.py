@@ -142,14 +142,29 @@ def normal_equations(
     declared: Declared, plan: Plan, values: Values, laid: Laid
 ) -> tuple[Float[Array, ""], Tangent, NormalBlocks]:
     """½·vᵀPv, its gradient g = Jᵀr and N = JᵀJ at these values (the weights are in r and J)."""
-    prepared, sums = prepare(declared, values), _Sums(plan)
+    prepared, sums = prepare(declared, values), Sums(plan)
     for number, part in enumerate(plan.parts):
         r, touches, E = differentiate(declared, plan, number, prepared, laid)
-        sums.add_part(part, r, touches, E)
+        sums.add_part(part, 0.5 * jnp.vdot(r, r), *_products_of(part, r, touches, E))
     return sums.finished(declared, values)
 
 
-class _Sums:
+def _products_of(part: Part, r, touches, E):
+    """What a part adds by Gauss and Newton, see `Sums.add_part`: products of the blocks of J."""
+    tall = [J.reshape(J.shape[0], -1, J.shape[-1]) for J in touches]
+    right, eliminated, W = r.reshape(r.shape[0], -1), None, []
+    if E is not None:
+        flat = lambda x: x.reshape(-1, *x.shape[2:])
+        J = flat(E)
+        eliminated = products(J, jnp.concatenate([J, flat(r)[..., None]], -1))
+        W = [products(J, flat(K)) for K in touches]
+    own = [jnp.einsum("cki,ckj->cij", J, J) for J in tall]
+    gradient = [jnp.einsum("cki,ck->ci", J, right) for J in tall]
+    couples = [jnp.einsum("cki,ckj->cij", tall[c.first], tall[c.second]) for c in part.couples]
+    return own, gradient, couples, eliminated, W
+
+
+class Sums:
     """Blocks and gradient as they are added up, part by part."""
 
     def __init__(self, plan: Plan):
@@ -161,27 +176,23 @@ class _Sums:
         self.W = {}
         self.cost = 0.0
 
-    def add_part(self, part: Part, r, touches, E):
-        self.cost = self.cost + 0.5 * jnp.vdot(r, r)
-        chunks = r.shape[0]
-        tall = [J.reshape(chunks, -1, J.shape[-1]) for J in touches]
-        right = r.reshape(chunks, -1)
-        for touch, J in zip(part.touches, tall):
-            self._add_own(touch, jnp.einsum("cki,ckj->cij", J, J))
-            self._add_gradient(touch, jnp.einsum("cki,ck->ci", J, right))
-        for couple in part.couples:
-            product = jnp.einsum("cki,ckj->cij", tall[couple.first], tall[couple.second])
-            self._add_couple(part, couple, product)
-        if E is not None:
-            flat = lambda x: x.reshape(-1, *x.shape[2:])
-            J = flat(E)
-            both = products(J, jnp.concatenate([J, flat(r)[..., None]], -1))
-            at = part.eliminated.ravel()
-            both = jax.ops.segment_sum(both, at, self.own[self.plan.eliminated].shape[0])
-            self.own[self.plan.eliminated] += both[..., :-1]
-            self.gradient[self.plan.eliminated] += both[..., -1]
-            for touch, K in zip(part.touches, touches):
-                self._add_incidences(touch, products(J, flat(K)))
+    def add_part(self, part: Part, cost, own, gradient, couples, eliminated, W):
+        """What a part adds: `own` [chunks, w, w] and `gradient` [chunks, w] of each of its touches,
+        `couples` [chunks, w, v]; `eliminated` [places, w, w + 1], the gradient beside the block
+        (None without), and `W` [places, w, v] of each of the touches."""
+        self.cost = self.cost + cost
+        for touch, N, g in zip(part.touches, own, gradient):
+            self._add_own(touch, N)
+            self._add_gradient(touch, g)
+        for couple, N in zip(part.couples, couples):
+            self._add_couple(part, couple, N)
+        if eliminated is not None:
+            at, e = part.eliminated.ravel(), self.plan.eliminated
+            both = jax.ops.segment_sum(eliminated, at, self.own[e].shape[0])
+            self.own[e] += both[..., :-1]
+            self.gradient[e] += both[..., -1]
+        for touch, N in zip(part.touches, W):
+            self._add_incidences(touch, N)
 
     def _add_own(self, touch, N):
         columns = slice(touch.start, touch.stop)

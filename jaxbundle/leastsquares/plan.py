@@ -137,11 +137,13 @@ class Blocks(eqx.Module):
 class Datum(eqx.Module):
     """How a problem that may float is pinned down (`datum.py`): the motions that are open, as
     combinations of all (`gauge`); the unknowns that hold the datum (`weight`, by table); elements
-    of the reduced matrix that make it regular (`pins`)."""
+    of the reduced matrix that make it regular (`pins`); by table, what is held of what the motions
+    would move (`held`, 1 or 0; no table of which nothing is)."""
 
     gauge: Float[Array, "motions defect"]
     weight: dict[str, Float[Array, "rows width"]]
     pins: dict[str, Float[Array, "rows w"]]
+    held: dict[str, Float[Array, "rows width"]]
 
 
 class Plan(eqx.Module):
@@ -267,7 +269,8 @@ class _Planner:
             rows = np.flatnonzero(~stays) if stays.any() else None
             self.members[name] = [(name, 0, rows)]
             self.row_in = place(~stays)
-        self.kept = [g for g in self.members if g != name]
+        # In the order in which JAX has them, too, wherever the plan goes.
+        self.kept = sorted(g for g in self.members if g != name)
 
     def _meet_always(self, group, name):
         """Whether the rows of a table occur in just the observations of eliminated rows in which

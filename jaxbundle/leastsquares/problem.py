@@ -6,6 +6,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.errors import InputError
@@ -109,7 +110,8 @@ def _with_datum(problem: Problem, weight, minimal: bool) -> Problem:
         [w, np.zeros((problem.sizes["table", t] - len(w), w.shape[1]))]
     )
     weight = {t: fill(t, np.asarray(w, float)) for t, w in weight.items()}
-    datum = jax.device_put(make_datum(problem.declared, problem.plan, data, gauge, weight, minimal))
+    datum = make_datum(problem.declared, problem.plan, data, gauge, weight, minimal, real)
+    datum = jax.device_put(datum)
     plan = dataclasses.replace(problem.plan, datum=datum)
     counts = dataclasses.replace(problem.counts, datum=gauge.shape[1])
     return dataclasses.replace(problem, plan=plan, counts=counts)
@@ -167,23 +169,38 @@ def _diagonal(weight):
 
 
 def pad_data(problem: Problem, data: Data) -> Data:
-    """The numbers filled to the sizes of the plan: rows repeat the last one, weights are 0."""
-    fill = lambda x, n: np.concatenate([np.asarray(x), np.zeros((n - len(x), *np.shape(x)[1:]))])
-    edge = lambda x, n: np.concatenate(
-        [np.asarray(x), np.repeat(np.asarray(x)[-1:], n - len(x), 0)]
-    )
-    size = problem.sizes
+    """The numbers filled to the sizes of the plan: rows repeat the last one, weights are 0. Under a
+    transformation of JAX as well."""
+    traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(data))
+    np_, size = jnp if traced else np, problem.sizes
+
+    def filled(x, key, mode):
+        x = np_.asarray(x)
+        return np_.pad(x, [(0, size[key] - len(x)), *[(0, 0)] * (x.ndim - 1)], mode)
+
+    of = lambda tree, key, mode="constant": jax.tree.map(lambda x: filled(x, key, mode), tree)
     return jax.device_put(Data(
-        {
-            t: jax.tree.map(lambda x, t=t: edge(x, size["table", t]), v)
-            for t, v in data.start.items()
-        },
-        tuple(
-            jax.tree.map(lambda x, o=o: fill(x, size["observations", o]), m)
-            for o, m in enumerate(data.measured)
-        ),
-        tuple(fill(w, size["observations", o]) for o, w in enumerate(data.weight)),
+        {t: of(rows, ("table", t), "edge") for t, rows in data.start.items()},
+        tuple(of(x, ("observations", o)) for o, x in enumerate(data.measured)),
+        tuple(of(x, ("observations", o)) for o, x in enumerate(data.weight)),
     ))  # fmt: skip
+
+
+def given_data(problem: Problem, data: Data | None) -> Data:
+    """The numbers in the sizes of the plan: those of the problem, or others of the same shapes.
+
+    **Raises:** `InputError` where the shapes are others."""
+    known, data = problem.data, problem.data if data is None else data
+    shapes = lambda data: (jax.tree.structure(data), [jnp.shape(x) for x in jax.tree.leaves(data)])
+    if shapes(data) != shapes(known):
+        raise InputError("data must be a Data with arrays of the shapes of problem.data")
+    return pad_data(problem, data)
+
+
+def unpad(problem: Problem, tables):
+    """The rows of the tables without those filled in."""
+    cut = lambda tree, rows: jax.tree.map(lambda x: x[:rows], tree)
+    return {t.name: cut(tables[t.name], t.rows) for t in problem.tables}
 
 
 def make_solver(

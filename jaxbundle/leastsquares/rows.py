@@ -114,6 +114,27 @@ def _weighted(v, weight):
     return tuple(jnp.where(w > 0, w * x, 0.0) for w, x in zip(weight, v))
 
 
+def diagonal_of(weight):
+    """The weight of every residual of an observation, 0 where it does not count."""
+    return tuple(w[i] if isinstance(w, tuple) else w for i, w in enumerate(weight))
+
+
+def fill_places(plan: Plan, laid: Laid) -> tuple[Plan, Laid]:
+    """Places that carry no weight see what one that does sees: what cannot be computed there, a
+    distance of a point from itself, would be NaN in reverse mode in spite of its weight."""
+    parts, measured = [], []
+    for part, values, weight in zip(plan.parts, laid.measured, laid.weight):
+        shape = part.source.shape
+        live = jnp.stack([w > 0 for w in diagonal_of(weight)]).any(0)
+        place = jnp.where(live, jnp.arange(live.size).reshape(shape), jnp.argmax(live))
+        every = lambda at, shape=shape: jnp.broadcast_to(at if at.ndim == 2 else at[:, None], shape)
+        seen = lambda x, place=place: x.ravel()[place]
+        lookup, by_row = tuple(seen(every(at)) for at in part.lookup), (True,) * len(part.lookup)
+        parts.append(dataclasses.replace(part, lookup=lookup, by_row=by_row))
+        measured.append(jax.tree.map(seen, values))
+    return dataclasses.replace(plan, parts=tuple(parts)), Laid(tuple(measured), laid.weight)
+
+
 def over(part: Part, kind: Kind, prepared, laid: Laid, number: int, function):
     """`function(blocks, measured, weight)` of every observation of a part; its scalars get the
     axes [chunks, length]."""

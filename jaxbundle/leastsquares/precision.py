@@ -1,0 +1,66 @@
+"""The precision of a design: covariances as a differentiable function of the design.
+
+    C = σ0²·S·(JᵀPJ)⁻¹·Sᵀ,        S the S-transformation into the datum (`datum.py`)
+
+Nothing is adjusted: J is taken at the given values (`Data.start`), P are the weights of the data.
+What was measured enters only where J of a kind depends on it. The precision of a problem that was
+solved is that of its solution, `dataclasses.replace(data, start=solve(problem, data))`.
+
+Source: Grafarend (1974), Bollettino di Geodesia 33: design of first order (J) and second order (P).
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxbundle.leastsquares.cofactors import blocks_of_tables, cofactors, propagate
+from jaxbundle.leastsquares.elimination import factorise
+from jaxbundle.leastsquares.normal import Normal, normal_equations, zero_tangent
+from jaxbundle.leastsquares.problem import Problem, given_data, unpad
+from jaxbundle.leastsquares.retraction import retract
+from jaxbundle.leastsquares.rows import Data, Values, fill_places, lay_out_data
+
+
+class Precision(eqx.Module):
+    """Covariances of every row of every table (`own`, zero where something is held), of the
+    directions in which its space moves, and of the functions asked for."""
+
+    own: dict[str, Float[Array, "rows width width"]]
+    covariance: Float[Array, "functions functions"]
+
+
+def precision(
+    problem: Problem, data: Data | None = None, of: Callable[[Values], Array] | None = None,
+    *, sigma0: float | Float[Array, ""] = 1.0,
+) -> Precision:  # fmt: skip
+    """The precision of a design, differentiable to every order in all of it.
+
+    **Arguments:** `data`: numbers that replace `problem.data` (same shapes): the design in `start`,
+    and weights; `of`: functions of the tables, `values -> [functions]`, whose covariance is wanted;
+    `sigma0`: of the unit weight, 1: a priori.
+
+    **Returns:** a `Precision`; NaN throughout where the design does not determine everything.
+
+    **Raises:** `InputError` for data of other shapes.
+    """
+    declared, plan, data = problem.declared, problem.plan, given_data(problem, data)
+
+    def functions(change):
+        moved = unpad(problem, retract(declared, plan, data.start, change))
+        return jnp.zeros(0) if of is None else jnp.ravel(of(moved))
+
+    rows = jax.jacrev(functions)(zero_tangent(plan))
+    own, covariance = _covariances(declared, plan, data, rows)
+    return jax.tree.map(lambda C: sigma0**2 * C, Precision(unpad(problem, own), covariance))
+
+
+@eqx.filter_jit
+def _covariances(declared, plan, data, rows):
+    filled, laid = fill_places(plan, lay_out_data(plan, data))
+    normal = normal_equations(declared, filled, data.start, laid)[-1]
+    factor = factorise(Normal(plan, normal))
+    own = blocks_of_tables(declared, plan, cofactors(declared, data.start, factor).own, data.start)
+    return own, propagate(declared, data.start, factor, rows)

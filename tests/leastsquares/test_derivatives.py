@@ -1,0 +1,383 @@
+"""Derivatives of the solution and of its precision, against central differences and dense algebra.
+
+`trilateration`: points in the plane by their distances, one of them held, the net free to turn
+about it; `photographs`: poses, points that are eliminated or kept, a camera with a full prior.
+"""
+
+import dataclasses
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry import matrix_from_quaternion
+from jaxbundle.leastsquares.datum import generators, leave_held, of_groups, zeros_of_tables
+from jaxbundle.leastsquares.declarations import Kind, Motions, Table
+from jaxbundle.leastsquares.derivatives import attach_derivatives, solve
+from jaxbundle.leastsquares.hessian import exact_equations
+from jaxbundle.leastsquares.normal import Normal, zero_tangent
+from jaxbundle.leastsquares.precision import precision
+from jaxbundle.leastsquares.problem import (
+    find_minimum,
+    given_data,
+    make_problem,
+    make_solver,
+    unpad,
+)
+from jaxbundle.leastsquares.retraction import retract
+from jaxbundle.leastsquares.rows import lay_out_data
+from jaxbundle.leastsquares.spaces import Pose, PoseValue
+
+pytestmark = pytest.mark.slow
+
+# ---------------------------------------------------------------------- two problems
+
+DISTANCE = Kind(
+    "distance", lambda a, b, device, d: device + jnp.linalg.norm(a - b) - d,
+    of=("point", "point", "device"), invariant=True,
+)  # fmt: skip
+
+
+def turn_and_shift(motion, point):
+    """Along (shift, rotation) for a unit of time."""
+    angle, half = motion[2], motion[2] / 2
+    sine, cosine = jnp.sinc(angle / jnp.pi), half * jnp.sinc(half / jnp.pi) ** 2
+    R = jnp.array([[jnp.cos(angle), -jnp.sin(angle)], [jnp.sin(angle), jnp.cos(angle)]])
+    return R @ point + jnp.array([[sine, -cosine], [cosine, sine]]) @ motion[:2]
+
+
+MOTIONS = Motions(("shift x", "shift y", "rotation"), (("point", turn_and_shift),), (2,))
+
+
+def trilateration(held):
+    random = np.random.default_rng(1)
+    point = 100 * random.random((5, 2))
+    i, j = np.triu_indices(len(point), 1)
+    measured = np.linalg.norm(point[i] - point[j], axis=1) + 0.3 * random.normal(size=len(i))
+    free = np.ones((len(point), 2))
+    if held:
+        free[2] = 0
+    weight = np.ones((len(point), 2))
+    weight[0] = 0
+    start = point + 3 * random.normal(size=point.shape)
+    sigma = 0.2 + 0.2 * random.random(len(i))
+    devices = Table("device", np.zeros(2), free=np.array([True, False]))
+    return make_problem(
+        [Table("point", start, free=free), devices],
+        [DISTANCE((i, j, np.arange(len(i)) % 2), measured, sigma=sigma)],
+        motions=MOTIONS, datum_weight={"point": weight},
+    )  # fmt: skip
+
+
+def seen(pose, camera, point, xy):
+    x, y, z = pose.ray(point)
+    u, v = x / z, y / z
+    bent = camera[0] * (1 + camera[1] * (u * u + v * v))
+    return bent * u + camera[2] - xy[0], bent * v - xy[1]
+
+
+SEEN = Kind("image point", seen, of=("pose", "camera", "point"), scalars=True)
+CAMERA = Kind("camera", lambda camera, given: camera - given, of=("camera",))
+TIE = Kind("height difference", lambda a, b, d: b[2] - a[2] - d, of=("point", "point"))
+
+
+def photographs():
+    random = np.random.default_rng(3)
+    points, poses = 7, 3
+    point = random.uniform(-1, 1, (points, 3)) * [2, 2, 0.7]
+    centre = np.array([[-1.5, 0.2, -5], [1.4, -0.3, -5.2], [0.1, 1.5, -4.6]])
+    q = np.concatenate([np.ones((poses, 1)), 0.1 * random.normal(size=(poses, 3))], 1)
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    camera = np.array([[1.0, 0.02, 0.01]])
+    i, p = (x.ravel() for x in np.indices((poses, points)))
+    M = np.asarray(jax.vmap(matrix_from_quaternion)(q))
+    sight = np.einsum("nij,nj->ni", M[i], point[p] - centre[i])
+    u, v = (sight[:, :2] / sight[:, 2:]).T
+    bent = camera[0, 0] * (1 + camera[0, 1] * (u * u + v * v))
+    xy = np.stack([bent * u + camera[0, 2], bent * v], 1) + 2e-3 * random.normal(size=(len(i), 2))
+    free_points = np.ones((points, 3))
+    free_points[4:] = 0
+    start = point + 0.02 * random.normal(size=point.shape) * free_points
+    free_cameras = np.array([[1, 1, 0]])
+    a, b = np.array([0, 1]), np.array([1, 2])
+    ties = point[b, 2] - point[a, 2] + 2e-3 * random.normal(size=2)
+    A = 0.02 * (np.eye(3) + 0.3 * random.normal(size=(1, 3, 3)))
+    return make_problem(
+        [
+            Table("pose", PoseValue(centre + 0.02 * random.normal(size=(poses, 3)), q), Pose()),
+            Table("camera", camera, free=free_cameras),
+            Table("point", start, free=free_points),
+        ],
+        [
+            SEEN((i, np.zeros_like(i), p), xy, sigma=2e-3),
+            CAMERA((np.zeros(1, int),), camera + 0.01, covariance=A @ A.transpose(0, 2, 1)),
+            TIE((a, b), ties, sigma=3e-3),
+        ],
+        "point",
+    )  # fmt: skip
+
+
+PROBLEMS = {
+    "a point held": lambda: trilateration(True),
+    "inner constraints": lambda: trilateration(False),
+    "photographs": photographs,
+}
+
+
+@cache
+def made(name):
+    return PROBLEMS[name]()
+
+
+# ---------------------------------------------------------------------- the same without the engine
+
+
+def residuals(problem, values, data):
+    """v/σ of all observations, one after the other as they were given."""
+    found = []
+    for o, given in enumerate(problem.observations):
+        blocks = []
+        for name, rows in zip(given.kind.of, given.rows):
+            of_rows = jax.tree.map(lambda x, rows=rows: x[rows], values[name])
+            poses = isinstance(values[name], PoseValue)
+            blocks.append(jax.vmap(Pose().prepare)(of_rows) if poses else of_rows)
+        v, weight = jax.vmap(given.kind.residual)(*blocks, data.measured[o]), data.weight[o]
+        v = jnp.stack(v, -1) if isinstance(v, tuple) else v.reshape(len(v), -1)
+        found.append(weight * v if weight.ndim == 2 else jnp.einsum("nij,nj->ni", weight, v))
+    return jnp.concatenate([v.ravel() for v in found])
+
+
+def after(problem, values):
+    """A change of all unknowns in one vector -> the tables; and which of them are free."""
+    padded = given_data(problem, dataclasses.replace(problem.data, start=values)).start
+    zero, unravel = ravel_pytree(zero_tangent(problem.plan))
+    free = ravel_pytree({name: g.free for name, g in problem.plan.groups.items()})[0]
+    moved = lambda x: retract(problem.declared, problem.plan, padded, unravel(x * free))
+    return lambda x: unpad(problem, moved(x)), zero, np.asarray(free) > 0
+
+
+@pytest.mark.parametrize("name", ["a point held", "photographs"])
+def test_hessian_is_that_of_the_dense_cost(name):
+    problem = made(name)
+    data = given_data(problem, None)
+    moved, zero, free = after(problem, problem.data.start)
+    cost = lambda x: 0.5 * jnp.sum(residuals(problem, moved(x), problem.data) ** 2)
+
+    @jax.jit
+    def both():
+        equations = exact_equations(
+            problem.declared, problem.plan, data.start, lay_out_data(problem.plan, data)
+        )
+        H = Normal(problem.plan, equations[2]).as_matrix()
+        return (*equations[:2], H), (cost(zero), jax.grad(cost)(zero), jax.hessian(cost)(zero))
+
+    (value, gradient, H), dense = both()
+    assert float(value) == pytest.approx(float(dense[0]), rel=1e-12)
+    gradient = ravel_pytree(gradient)[0]
+    np.testing.assert_allclose(gradient, dense[1], atol=1e-12 * np.abs(dense[1]).max())
+    size = np.sqrt(np.diag(np.where(free, dense[2], np.eye(len(free)))).clip(1e-6))
+    np.testing.assert_allclose(H / size / size[:, None], dense[2] / size / size[:, None], atol=1e-9)
+    if name == "photographs":  # Some points are eliminated, some kept.
+        assert problem.plan.groups["point (kept)"].free.sum() == 9
+
+
+# ---------------------------------------------------------------------- of the solution
+
+STENCIL = ((1, 8 / 12), (-1, -8 / 12), (2, -1 / 12), (-2, 1 / 12))
+"""Central differences of fourth order."""
+
+
+def directions(problem, size):
+    """Random changes of the start values, of what was measured, of the weights, each by itself."""
+    random, data = np.random.default_rng(4), problem.data
+    zero = jax.tree.map(jnp.zeros_like, data)
+    noise = lambda x, scale: jnp.asarray(scale * random.normal(size=x.shape))
+    for o, weight in enumerate(data.weight):
+        name = problem.observations[o].kind.name
+        sigma = 1 / np.abs(weight).max()
+        change = noise(data.measured[o], 0.3 * sigma)
+        yield f"{name}: measured", eqx.tree_at(lambda d, o=o: d.measured[o], zero, change)
+        lower = weight if weight.ndim == 2 else jnp.tril(weight)
+        change = lower * noise(weight, 0.01)
+        yield f"{name}: weight", eqx.tree_at(lambda d, o=o: d.weight[o], zero, change)
+    for name, value in data.start.items():
+        scale = size if name == "point" else 0.01
+        change = jax.tree.map(lambda x, scale=scale: noise(x, scale), value)
+        if name == "pose":
+            change = change._replace(rotation=change.rotation * 0)
+        yield f"start: {name}", eqx.tree_at(lambda d, name=name: d.start[name], zero, change)
+
+
+def along(data, u, step):
+    return jax.tree.map(lambda x, d: x + step * d, data, u)
+
+
+@cache
+def program(name):
+    """(data, u, w) → S, ∂S/∂u, ∂S/∂w, ∂²S/∂u∂w of a scalar S of all values of the solution."""
+    problem, random = made(name), np.random.default_rng(5)
+    factors = jax.tree.map(lambda x: random.normal(size=x.shape), problem.data.start)
+
+    @jax.jit
+    def derivatives(values, data, u, w):
+        def scalar(data):
+            padded = given_data(problem, data)
+            solution = attach_derivatives(problem.declared, problem.plan, values, padded)
+            return sum(jax.tree.leaves(jax.tree.map(jnp.vdot, factors, unpad(problem, solution))))
+
+        by_w = lambda data: jax.jvp(scalar, (data,), (w,))
+        (value, by_w), (by_u, both) = jax.jvp(by_w, (data,), (u,))
+        return value, by_u, by_w, both
+
+    return lambda data, u, w: derivatives(minimum(problem, data), data, u, w)
+
+
+def minimum(problem, data):
+    data = given_data(problem, data)
+    return find_minimum(make_solver(problem, atol=1e-7), data, data.start).values
+
+
+@pytest.mark.parametrize("name", ["a point held", "photographs"])
+def test_first_and_second_derivatives_by_everything_that_was_given(name):
+    problem, of = made(name), program(name)
+    found = dict(directions(problem, 0.3 if name == "a point held" else 2e-3))
+    together = jax.tree.map(lambda *x: sum(x), *found.values())
+    moving, h = set(), 0.2
+    for field, u in found.items():
+        _, first, _, second = of(problem.data, u, together)
+        turned = of(problem.data, together, u)[3]
+        differences = np.zeros(2)
+        for step, factor in STENCIL:
+            value, _, by_w, _ = of(along(problem.data, u, h * step), u, together)
+            differences += factor / h * np.array([value, by_w])
+        assert float(first) == pytest.approx(differences[0], rel=1e-6, abs=1e-11), field
+        assert float(second) == pytest.approx(float(turned), rel=1e-7, abs=1e-12), field
+        assert float(second) == pytest.approx(differences[1], rel=1e-5, abs=1e-10), field
+        moving |= {field} if abs(second) > 1e-8 else set()
+    # Start values count where they are held or hold the datum.
+    assert moving == set(found) - {"start: pose"}
+
+
+def test_gradient_of_a_gradient_in_a_batch():
+    """Reverse over reverse, forward over reverse, both under vmap; one member has no solution."""
+    problem = made("inner constraints")
+    (measured,), (weight,) = problem.data.measured, problem.data.weight
+
+    def scalar(measured, weight):
+        data = dataclasses.replace(problem.data, measured=(measured,), weight=(weight,))
+        return jnp.sin(solve(problem, data)["point"]).sum()
+
+    gradient = jax.grad(scalar)
+    squared = lambda *x: jnp.sum(gradient(*x) ** 2)
+
+    @jax.jit
+    @jax.vmap
+    def batch(*x):
+        second, first = jax.jacfwd(lambda *x: (gradient(*x),) * 2, has_aux=True)(*x)
+        return first, second, jax.grad(squared)(*x)
+
+    step = 1e-3 * np.random.default_rng(6).normal(size=measured.shape)
+    steps = jnp.stack([0 * step, step, -step, 2 * step, -2 * step, step])
+    weights = jnp.stack([weight] * 5 + [weight.at[4:].set(0.0)])
+    first, second, of_squared = (np.asarray(x) for x in batch(measured + steps, weights))
+    differences = sum(factor * first[i] for i, (_, factor) in enumerate(STENCIL, 1))
+    size = np.abs(second[0]).max()
+    np.testing.assert_allclose(second[0], second[0].T, atol=1e-9 * size)
+    np.testing.assert_allclose(second[0] @ step, differences, atol=1e-6 * size * 1e-3)
+    np.testing.assert_allclose(of_squared[0], 2 * second[0] @ first[0], rtol=1e-8, atol=1e-9 * size)
+    assert np.isnan(first[5, :4]).all() and np.isnan(second[5, :4, :4]).all()
+
+
+# ---------------------------------------------------------------------- Gauss–Newton, precision
+
+
+def dense(problem, values, data):
+    """J of the free unknowns and the directions of the datum, G and B, at these values."""
+    moved, zero, free = after(problem, values)
+    J = jax.jacfwd(lambda x: residuals(problem, moved(x), data))(zero)
+    J = np.asarray(J)[:, free]
+    if problem.plan.datum is None:
+        return J, np.zeros((J.shape[1], 0))
+    padded = given_data(problem, dataclasses.replace(data, start=values)).start
+    gauge = leave_held(problem.declared, problem.plan, padded).datum.gauge
+    flat = lambda tree: np.asarray(ravel_pytree(tree)[0])
+    moves = of_groups(problem.plan, generators(problem.declared, padded))
+    G = np.stack([flat({g: x @ k for g, x in moves.items()}) for k in gauge.T], 1)
+    zeros = zeros_of_tables(problem.declared, padded)
+    weight = flat(of_groups(problem.plan, zeros | problem.plan.datum.weight))
+    return J, (G * weight[:, None])[free]
+
+
+def bordered(J, B):
+    """Q of minimum Bᵀx = 0, and the answer to Bᵀx = c."""
+    n, d = B.shape
+    scale = np.abs(J.T @ J).max()
+    whole = np.linalg.inv(np.block([[J.T @ J, scale * B], [scale * B.T, np.zeros((d, d))]]))
+    return whole[:n, :n], whole[:n, n:] * scale
+
+
+@pytest.mark.parametrize("name", ["a point held", "photographs"])
+def test_precision_is_that_of_the_dense_inverse_and_its_derivative(name):
+    problem = made(name)
+    chosen = lambda values: jnp.concatenate([values["point"][0], jnp.sin(values["point"][1])])
+
+    def scalar(data):
+        found = precision(problem, data, chosen, sigma0=2.0)
+        return sum(C.sum() for C in found.own.values()) + found.covariance.sum(), found
+
+    program = jax.jit(jax.value_and_grad(scalar, has_aux=True))
+    data = problem.data
+    J, B = dense(problem, data.start, data)
+    Q, _ = bordered(J, B)
+    fields = dict(directions(problem, 0.3 if name == "a point held" else 2e-3))
+    u = jax.tree.map(lambda *x: sum(x), *fields.values())
+    u = eqx.tree_at(lambda u: u.measured, u, jax.tree.map(jnp.zeros_like, u.measured))
+    (_, found), gradient = program(data)
+    moved, zero, free = after(problem, data.start)
+    F = np.asarray(jax.jacfwd(lambda x: chosen(moved(x)))(zero))[:, free]
+    C = 4 * F @ Q @ F.T
+    np.testing.assert_allclose(found.covariance, C, atol=1e-8 * np.abs(C).max())
+    F = jax.jacfwd(lambda x: moved(x)["point"])(zero)[..., free]
+    own = 4 * np.einsum("nif,fg,njg->nij", F, Q, F)
+    np.testing.assert_allclose(found.own["point"], own, atol=1e-8 * np.abs(own).max())
+    h = 0.03
+    differences = sum(f / h * program(along(data, u, h * step))[0][0] for step, f in STENCIL)
+    slope = sum(jax.tree.leaves(jax.tree.map(jnp.vdot, gradient, u)))
+    assert float(slope) == pytest.approx(float(differences), rel=1e-6)
+
+
+def test_gauss_newton_is_error_propagation_and_has_no_second_derivative():
+    problem = made("a point held")
+    data, solution = problem.data, minimum(problem, problem.data)
+
+    def points(measured, start):
+        given = dataclasses.replace(data, measured=(measured,), start=data.start | {"point": start})
+        given = given_data(problem, given), "gauss-newton"
+        moved = attach_derivatives(problem.declared, problem.plan, solution, *given)
+        return unpad(problem, moved)["point"].ravel()
+
+    by = jax.jit(jax.jacfwd(points, (0, 1)))(data.measured[0], data.start["point"])
+    values = data.start | {"point": points(data.measured[0], data.start["point"]).reshape(-1, 2)}
+    values["device"] = solution["device"][:2]
+    J, B = dense(problem, values, data)
+    Q, into = bordered(J, B)
+    free = np.flatnonzero(problem.tables[0].free)
+    # ∂v/∂measured = −1/σ; the datum follows its start values. The first unknown is the device's.
+    expected = (Q @ (J.T * np.asarray(data.weight[0]).T))[1:]
+    np.testing.assert_allclose(by[0][free], expected, atol=1e-8 * np.abs(expected).max())
+    expected, found = (into @ B.T)[1:, 1:], by[1].reshape(10, 10)[np.ix_(free, free)]
+    np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
+    with pytest.raises(InputError, match="first derivatives only"):
+        jax.jacfwd(jax.grad(lambda m: points(m, data.start["point"])[0]))(data.measured[0])
+
+
+def test_data_of_another_shape_are_refused():
+    problem = made("inner constraints")
+    short = dataclasses.replace(problem.data, measured=(problem.data.measured[0][1:],))
+    with pytest.raises(InputError, match="shapes of problem.data"):
+        solve(problem, short)
