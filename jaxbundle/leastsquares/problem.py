@@ -209,7 +209,7 @@ def make_solver(
     """The solver of a problem; `options` are those of `LeastSquares`."""
     declared = problem.declared
     squares = sum(
-        float(((np.asarray(_diagonal(w)) * np.reshape(m, w.shape[:2])) ** 2).sum())
+        float(((np.asarray(_diagonal(w)) * np.asarray(m).reshape(w.shape[:2])) ** 2).sum())
         for w, m in zip(problem.data.weight, problem.data.measured)
         if hasattr(m, "shape") and m.size == w.shape[0] * w.shape[1]
     )
