@@ -243,6 +243,15 @@ def s_transform(declared: Declared, plan: Plan, values: Values, change: Tangent)
     return {name: d - G[name] @ along for name, d in change.items()}
 
 
+def s_transform_transposed(declared: Declared, plan: Plan, values: Values, row: Tangent) -> Tangent:
+    """Sᵀ·f: f − B(GᵀB)⁻¹Gᵀf, nothing of which is along the open motions."""
+    if plan.datum is None:
+        return row
+    G, B = datum_directions(declared, plan, values)
+    along = jnp.linalg.solve(contract(plan, G, B), contract(plan, G, row))
+    return {name: f - B[name] @ along for name, f in row.items()}
+
+
 def datum_directions(declared: Declared, plan: Plan, values: Values) -> tuple[Tangent, Tangent]:
     """G and B of all groups, [rows, w, defect]."""
     G = open_directions(declared, plan, values)
