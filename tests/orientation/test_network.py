@@ -60,6 +60,18 @@ def block(strips=4, images=6, points=350, control=(0, 1, 2, 3), start=NOMINAL):
     )  # fmt: skip
 
 
+@pytest.fixture(scope="module")
+def with_control():
+    """A block with eight control points, and its truth."""
+    return block(control=range(8), start=TRUE)
+
+
+@pytest.fixture(scope="module")
+def solid():
+    """Ten images of 81 targets."""
+    return close_up(jaxbundle.grid_of_targets(9, 9, 0.6, relief=0.5))
+
+
 def close_up(targets, **options):
     """Ten convergent images of targets."""
     stations = jaxbundle.ring_of_stations(10, 6.0, 5.0, roll_every=2)
@@ -90,9 +102,7 @@ def test_examples_need_no_start_values(name):
 
 
 @pytest.mark.skipif(not CASES.is_dir(), reason="the folder ../shared/cases is not here")
-@pytest.mark.parametrize(
-    "name", ["camcal", "sxb_weighted_control", "riva_3dfield", "aicon_free_scalebar"]
-)
+@pytest.mark.parametrize("name", ["camcal", "sxb_weighted_control", "riva_3dfield"])
 def test_cases_need_no_start_values(name):
     network = jaxbundle.read_network(CASES / name / "project.toml")
     assert_same_answer(network, bare(network))
@@ -108,9 +118,10 @@ def test_control_in_the_corners_of_a_block():
     assert_same_answer(simulation.network, bare(simulation.network))
 
 
-@pytest.mark.parametrize(("shift", "scale"), [((4.6e5, 5.1e6, 300.0), 1.0), ((0, 0, 0), 1000.0)])
-def test_control_seen_once_gives_the_frame(shift, scale):
-    """Of the four control points of this network two are in one image each."""
+def test_control_seen_once_gives_the_frame():
+    """Of the four control points of this network two are in one image each; far away, and in
+    millimetres."""
+    shift, scale = (4.6e5, 5.1e6, 300.0), 1000.0
     network = jaxbundle.read_network(EXAMPLES / "bingo_indoor" / "project.toml")
     points, images = network.points, network.images
     network = network.replace(
@@ -126,22 +137,21 @@ def test_control_seen_once_gives_the_frame(shift, scale):
     assert adjust(bare(network)).sigma0 == pytest.approx(adjust(network).sigma0, rel=1e-6)
 
 
-def test_control_seen_once_throughout():
+def test_control_seen_once_throughout(with_control):
     """Eight control points, each measured in a single image."""
-    simulation = block(control=range(8), start=TRUE)
-    rays = simulation.network.observations
+    rays = with_control.network.observations
     first = np.zeros(len(rays), bool)
     first[np.unique(rays.point, return_index=True)[1]] = True
-    network = simulation.network.replace(observations=rays.take(first | (rays.point >= 8)))
+    network = with_control.network.replace(observations=rays.take(first | (rays.point >= 8)))
     found = orient(bare(network))
     assert found.frame == "in the frame given" and not found.images
-    off = found.network.images.position - simulation.truth.images.position
+    off = found.network.images.position - with_control.truth.images.position
     assert np.abs(off).max() < 0.05 * 1000
 
 
-def test_half_a_network_is_none():
+def test_half_a_network_is_none(solid):
     """Two parts that share nothing: `orient` places one and names the other, `adjust` refuses."""
-    network = bare(close_up(jaxbundle.grid_of_targets(9, 9, 0.6, relief=0.5)))
+    network = bare(solid)
     rays = network.observations
     apart = (rays.image < 5) == (rays.point < 40)
     network = network.replace(observations=rays.take(apart))
@@ -150,28 +160,26 @@ def test_half_a_network_is_none():
         adjust(network)
 
 
-def test_one_measurement_in_twenty_wrong():
+def test_one_measurement_in_twenty_wrong(with_control):
     """Most of what is wrong is left out with the start values, the rest by data snooping."""
-    simulation = block(control=range(8), start=TRUE)
-    network = bare(with_blunders(simulation.network, 0.05, 20.0))
+    network = bare(with_blunders(with_control.network, 0.05, 20.0))
     found = orient(network)
     assert not found.images
-    off = found.network.images.position - simulation.truth.images.position
+    off = found.network.images.position - with_control.truth.images.position
     assert np.abs(off).max() < 0.2 * 1000
     result = adjust(network, snooping="pope")
-    off = result.image_values[:, :3] - simulation.truth.images.position
+    off = result.image_values[:, :3] - with_control.truth.images.position
     sigma = np.stack([result.images[f"s{axis}"] for axis in ("X0", "Y0", "Z0")], 1)
     assert np.abs(off / sigma).max() < 5
     assert abs(result.sigma0 - 1) < 0.15
 
 
-def test_blunders_that_leave_least_squares_no_solution():
+def test_blunders_that_leave_least_squares_no_solution(with_control):
     """With good start values, too, what contradicts them altogether goes before data snooping."""
-    simulation = block(control=range(8), start=TRUE)
-    spoilt = with_blunders(simulation.network, 0.05, 20.0)
+    spoilt = with_blunders(with_control.network, 0.05, 20.0)
     assert not adjust(spoilt).converged
     result = adjust(spoilt, snooping="pope")
-    off = result.image_values[:, :3] - simulation.truth.images.position
+    off = result.image_values[:, :3] - with_control.truth.images.position
     sigma = np.stack([result.images[f"s{axis}"] for axis in ("X0", "Y0", "Z0")], 1)
     assert np.abs(off / sigma).max() < 5
     assert any("in contradiction to the start values" in warning for warning in result.warnings)
@@ -179,7 +187,7 @@ def test_blunders_that_leave_least_squares_no_solution():
 
 def test_a_strip_that_hangs_together_by_pairs():
     """With few points in three images resection stops; a pair takes it on."""
-    simulation = block(1, 30, 350, control=())
+    simulation = block(1, 16, 190, control=())
     found = orient(bare(simulation.network))
     assert not found.images
     truth, position = simulation.truth.images.position, found.network.images.position
@@ -188,17 +196,15 @@ def test_a_strip_that_hangs_together_by_pairs():
     assert len(truth) == len(position)
 
 
-@pytest.mark.parametrize("relief", [0.0, 0.5])
-def test_planes_and_solids_without_control(relief):
-    network = close_up(jaxbundle.grid_of_targets(9, 9, 0.6, relief=relief))
+def test_a_plane_without_control():
+    network = close_up(jaxbundle.grid_of_targets(9, 9, 0.6))
     assert_same_answer(network, bare(network))
 
 
-@pytest.mark.parametrize("wrong", [0.8, 1.3])
-def test_a_principal_distance_far_from_the_truth(wrong):
+def test_a_principal_distance_far_from_the_truth():
     """What contradicts the one given, and is left out, comes back with the one adjusted."""
     true = Camera("wide", "brown", {"c": 50.0, "K1": -2e-6})
-    start = Camera("wide", "brown", {"c": 50.0 * wrong}, free=("c", "x0", "y0", "K1"))
+    start = Camera("wide", "brown", {"c": 40.0}, free=("c", "x0", "y0", "K1"))
     near = dataclasses.replace(start, parameters={"c": 50.0})
     network, other = (
         jaxbundle.simulate(
@@ -245,9 +251,9 @@ def test_a_distance_gives_the_scale():
     assert np.linalg.norm(a - b) == pytest.approx(network.distances.value[0], rel=1e-9)
 
 
-def test_what_is_given_stays():
+def test_what_is_given_stays(solid):
     """Start values of half the images: they keep them, the others follow in their frame."""
-    network = close_up(jaxbundle.grid_of_targets(9, 9, 0.6, relief=0.5))
+    network = solid
     without, every_other = bare(network), np.arange(10) % 2 == 0
     images = without.images
     given = dataclasses.replace(
@@ -262,16 +268,16 @@ def test_what_is_given_stays():
     assert np.abs(found.images.position - network.images.position).max() < 0.5
 
 
-def test_approximate_points_are_enough():
-    network = close_up(jaxbundle.grid_of_targets(9, 9, 0.6, relief=0.5))
+def test_approximate_points_are_enough(solid):
+    network = solid
     found = orient(bare(network, points=False)).network
     np.testing.assert_array_equal(found.points.position, network.points.position)
     assert np.abs(found.images.position - network.images.position).max() < 0.5
 
 
-def test_what_cannot_be_placed_is_named_with_the_reason():
+def test_what_cannot_be_placed_is_named_with_the_reason(solid):
     """An image with two points of the others, a point seen by that image and one more."""
-    network = bare(close_up(jaxbundle.grid_of_targets(9, 9, 0.6, relief=0.5)))
+    network = bare(solid)
     rays = network.observations
     keep = (rays.image != 4) | np.isin(rays.point, [10, 11])
     found = orient(network.replace(observations=rays.take(keep)))
@@ -309,7 +315,7 @@ def test_bad_data_is_found_before():
         orient(network.replace(observations=rays))
 
 
-@pytest.mark.parametrize("what", ["y downward", "X and Y exchanged", "right"])
+@pytest.mark.parametrize("what", ["y downward", "X and Y exchanged"])
 def test_a_mirror_is_named(what):
     """Control in a left-handed system, or images with y downward: both fit in part, and are a
     mirror image in truth."""
@@ -320,13 +326,10 @@ def test_a_mirror_is_named(what):
         network = network.replace(
             observations=dataclasses.replace(rays, xy=rays.xy * np.array([1, -1]))
         )
-    elif what == "X and Y exchanged":
+    else:
         exchanged = dataclasses.replace(
             points, position=points.position[:, [1, 0, 2]], sigma=points.sigma[:, [1, 0, 2]]
         )
         network = network.replace(points=exchanged)
-    if what == "right":
-        assert not orient(network).images
-    else:
-        with pytest.raises(NotSolvedError, match="8 control points .* only as in a mirror"):
-            orient(network)
+    with pytest.raises(NotSolvedError, match="8 control points .* only as in a mirror"):
+        orient(network)
