@@ -218,11 +218,12 @@ def test_a_rough_trajectory_leaves_no_holes():
     line, pixel = block_places(
         image, search, Ground(), system.nodes(Ground(), *grid.centres(steps, steps))
     )
-    every = np.arange(BLOCK)
-    X = system.nodes(Ground(), *grid.centres(every, every)).X.reshape(3, -1)
+    some = np.arange(0, BLOCK, 3)
+    X = system.nodes(Ground(), *grid.centres(some, some)).X.reshape(3, -1)
+    line = line[::3, ::3]
     found = project_points(image, search, jnp.asarray(X))
     once = np.asarray(found.count).reshape(line.shape) == 1
-    assert once.sum() > 5000
+    assert once.sum() > 5000 / 9
     assert np.isnan(line[once]).mean() < 1e-3
     expected = np.asarray(found.line[0]).reshape(line.shape)
     np.testing.assert_allclose(np.nanmax(np.abs(line - expected)[once]), 0, atol=1e-2)
