@@ -21,9 +21,6 @@ ALL_TEN = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2")
 
 SOLUTIONS = (  # free parameters, domain, redundancy, v'v in mm², σ0 in µm
     ((), "corrected", 33, 1.1855568407e-3, 5.99383),
-    (("K1",), "corrected", 32, 6.8566640e-5, 1.46380),
-    (("c", "x0", "y0"), "corrected", 30, 4.4006995868e-4, 3.83001),
-    (("c", "x0", "y0", "K1"), "corrected", 29, 1.2341864164e-5, 0.65237),
     (("c", "x0", "y0", "K1"), "measured", 29, 1.2073447447e-5, 0.64523),
     (ALL_TEN, "measured", 23, 9.0102487e-6, 0.62590),
 )
@@ -70,6 +67,9 @@ def test_all_ten_parameters(convergent4):
 
 def test_four_parameters_correlations_and_redundancy_numbers(network):
     result = adjust(with_free(network, ("c", "x0", "y0", "K1")))
+    assert result.redundancy == 29
+    assert result.vtpv == pytest.approx(1.2341864164e-5, rel=1e-7)
+    assert 1e3 * result.sigma0 == pytest.approx(0.65237, rel=1e-5)
     table = result.cameras["cam"]
     at = {name: i for i, name in enumerate(table["free"])}
     percent = {("c", "x0"): -25.5, ("c", "y0"): 55.3, ("c", "K1"): 66.3, ("x0", "y0"): -12.8,

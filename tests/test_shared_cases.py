@@ -14,9 +14,6 @@ from jaxbundle.bundle import adjust
 CASES = Path(__file__).parents[2] / "shared" / "cases"
 PROJECTS = (
     "convergent4/project",
-    "convergent4/project4",
-    "convergent4/project4m",
-    "resection63/project",
     "camcal/project",
     "sxb_weighted_control/project",
     "riva_3dfield/project",

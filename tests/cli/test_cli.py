@@ -65,7 +65,7 @@ def test_adjust_writes_everything(command, tmp_path):
 
 @pytest.mark.slow
 def test_json_alone_on_stdout(convergent4):
-    done = run("adjust", EXAMPLE / "project.toml", "--json", "-", "--brief")
+    done = run("adjust", EXAMPLE / "project.toml", "--json", "-", "--brief", "--cores", 1)
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
     assert "points" not in result and "residuals" not in result
