@@ -65,7 +65,10 @@ def find_minimum(problem: Problem, start: Values | None = None, **options) -> Mi
 
 
 def _worth_sharing(problem: Problem, start: Values | None) -> bool:
-    if len(jax.devices()) == 1 or sum(o.number for o in problem.observations) < TO_SHARE:
+    """Whether there are devices to share a problem, and rows to distribute over them."""
+    if len(jax.devices()) == 1 or problem.plan.eliminated is None:
+        return False
+    if sum(o.number for o in problem.observations) < TO_SHARE:
         return False
     given = jax.tree.leaves((problem.data.start, start))
     return all(np.isfinite(np.asarray(x)).all() for x in given)
