@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from jaxbundle.calibration import calibrate_cameras as calibrate_cameras
     from jaxbundle.calibration.batch import BatchCalibration as BatchCalibration
     from jaxbundle.calibration.batch import calibrate_batch as calibrate_batch
+    from jaxbundle.cameras import CameraModel as CameraModel
     from jaxbundle.configuration import enable_x64 as enable_x64
     from jaxbundle.configuration import join_processes as join_processes
     from jaxbundle.configuration import keep_programs as keep_programs
@@ -63,6 +64,7 @@ _HOME = {
     "jaxbundle.calibration": (
         "Board", "BoardViews", "Calibration", "calibrate", "calibrate_cameras",
     ),
+    "jaxbundle.cameras": ("CameraModel",),
     "jaxbundle.configuration": ("enable_x64", "join_processes", "keep_programs", "use_cores"),
     "jaxbundle.errors": ("InputError", "NotSolvedError"),
     "jaxbundle.gradients": ("check_gradients",),

@@ -149,7 +149,7 @@ def _cameras(path: str, name: str, options: dict, brief: bool) -> _Work:
         batch = calibrate_batch(**stack.arguments(chosen), **options)
         return [camera_row(batch, i, brief) for i in range(len(chosen))]
 
-    settings = options | {"free": list(free), "brief": brief}
+    settings = options | {"model": str(options["model"]), "free": list(free), "brief": brief}
     keys = tuple(f"{name}#{camera}" for camera in stack.ids)
     return _Work(keys, settings, stack.fingerprint, solve, True)
 
@@ -228,7 +228,7 @@ def camera_row(batch: BatchCalibration, i: int, brief: bool = False) -> dict:
     """The result of camera i as plain dicts and numbers (angles in radians)."""
     row = {
         "status": str(batch.status[i]),
-        "model": batch.model,
+        "model": str(batch.model),
         "iterations": int(batch.iterations[i]),
         "redundancy": int(batch.redundancy[i]),
         "views": int(batch.views[i].sum()),

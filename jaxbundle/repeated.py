@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.cameras import get_model
+from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.components import Component, rescale, variance_components
 from jaxbundle.leastsquares.names import Name
@@ -20,9 +20,6 @@ from jaxbundle.statistics.blunders import name_removed
 from jaxbundle.statistics.components import groups
 from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.statistics.misfit import contradicts, doubt_of_baarda
-
-CORE_PARAMETERS = ("c", "x0", "y0", "fx", "fy", "cx", "cy", "f")
-"""Interior parameters that are never eliminated for want of significance."""
 
 ROUNDS = 20
 """Variance components are estimated at most so many times."""
@@ -130,13 +127,14 @@ def _doubts(components: dict[str, Component], open_ones: list[str]):
 
 
 def eliminated_parameters(problem, minimum, again, critical_t):
-    """Fix insignificant additional parameters at 0, the weakest first."""
+    """Fix insignificant additional parameters at 0, or their default, the weakest first."""
     names = []
+    models = {camera.id: get_model(camera.model) for camera in problem.network.cameras}
     while True:
         result = Adjustment(problem.network, problem, minimum)
         weak = [
             name for _, name in result.insignificant(critical_t)
-            if name.parameter not in CORE_PARAMETERS
+            if name.parameter not in models[name.id].core
         ]  # fmt: skip
         if not weak:
             return problem, minimum, names
@@ -148,9 +146,11 @@ def eliminated_parameters(problem, minimum, again, critical_t):
 
 def _without_parameter(problem: Problem, values: Values, name: Name):
     c = [camera.id for camera in problem.network.cameras].index(name.id)
-    column = get_model(problem.network.cameras[c].model).parameters.index(name.parameter)
-    zero = lambda v: eqx.tree_at(lambda v: v.camera, v, v.camera.at[c, column].set(0.0))
-    data = dataclasses.replace(problem.data, start=zero(problem.data.start))
+    model = get_model(problem.network.cameras[c].model)
+    column = model.parameters.index(name.parameter)
+    value = default_parameters(model)[name.parameter]
+    reset = lambda v: eqx.tree_at(lambda v: v.camera, v, v.camera.at[c, column].set(value))
+    data = dataclasses.replace(problem.data, start=reset(problem.data.start))
     row = np.flatnonzero(problem.layout.given["interior"] == c)
     if len(row):
         weight = data.interior_weight.at[row[0], column].set(0.0)
@@ -159,4 +159,4 @@ def _without_parameter(problem: Problem, values: Values, name: Name):
     row = np.flatnonzero(table.cameras == c)
     moving = problem.system.table(table.name).space.moving.index(column)
     problem = problem.with_data(data).hold(table.name, row, [moving])
-    return problem, zero(values)
+    return problem, reset(values)

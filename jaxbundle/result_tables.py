@@ -5,7 +5,7 @@
 
 import numpy as np
 
-from jaxbundle.cameras import get_model
+from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.leastsquares.reliability import external_reliability, minimal_detectable
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.statistics.correlation import correlation_matrix, total_correlation
@@ -20,14 +20,16 @@ def cameras(adjustment) -> dict[str, dict]:
         free, Q = adjustment.camera_cofactor(given.id)
         sigma = dict(zip(free, adjustment.sigma0 * np.sqrt(np.diagonal(Q))))
         total = dict(zip(free, total_correlation(Q))) if free else {}
+        default = default_parameters(get_model(given.model))
         tables[given.id] = {
-            "model": given.model,
+            "model": str(given.model),
             "parameters": {
                 name: {
                     "value": value,
                     "sigma": float(sigma[name]) if name in sigma else None,
                     "free": name in sigma,
-                    "t": _significance(value, sigma[name]) if name in sigma else None,
+                    "t": _significance(value - default.get(name, 0.0), sigma[name])
+                    if name in sigma else None,
                     "total_correlation": float(total[name]) if name in sigma else None,
                 }
                 for name, value in values.items()
@@ -167,7 +169,8 @@ def _residual_rows(adjustment, kind, image, point, axes, v, weight, r, w):
 
 
 def _significance(value: float, sigma: float) -> float:
-    """t = |value|/σ; where σ is 0, as after an exact fit, infinite, or NaN for the value 0."""
+    """t = |value|/σ, the value counted from its default, mostly 0; where σ is 0, as after an exact
+    fit, infinite, or NaN for the value 0."""
     if sigma == 0:
         return float("inf") if value else float("nan")
     return abs(value) / float(sigma)

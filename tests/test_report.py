@@ -16,7 +16,7 @@ from jaxbundle.adjustment.unknowns import Name
 from jaxbundle.cameras import MODEL_NAMES, get_model
 from jaxbundle.io.result_json import result_dict
 from jaxbundle.network.columns import count
-from jaxbundle.network.tables import EXTERIOR
+from jaxbundle.network.tables import EXTERIOR, Camera
 from jaxbundle.report import head, layout, observations, unknowns
 from jaxbundle.report.equations import EQUATIONS
 from jaxbundle.result import Adjustment
@@ -279,7 +279,9 @@ def test_many_cameras_are_one_table():
         }
         for i in range(20)
     }
-    lines = unknowns.cameras(SimpleNamespace(cameras=cameras))
+    lines = unknowns.cameras(
+        SimpleNamespace(cameras=cameras, network=SimpleNamespace(cameras=[Camera("0", "snavely")]))
+    )
     table = [line.split() for line in lines]
     assert ["7", "507.000", "-0.10000"] in table and ["σ", "0.500", "0.00100"] in table
     assert "k2" not in "\n".join(lines).split("px")[-1]

@@ -8,11 +8,8 @@ import numpy as np
 
 from jaxbundle.adjustment.batch_normal import Sightings
 from jaxbundle.arguments import numeric_array
-from jaxbundle.cameras import CameraModel, default_parameters, get_model
+from jaxbundle.cameras import CameraModel, check_own, default_parameters, get_model, is_own
 from jaxbundle.errors import InputError
-
-FREE = {"opencv": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")}
-"""What is free if nothing is said; of other models everything."""
 
 FLAT = 0.02
 """A smaller extent across than this fraction of the second largest: the object starts as flat."""
@@ -203,23 +200,29 @@ def _usable(numbers: np.ndarray) -> np.ndarray:
     return np.abs(numbers) < LARGEST
 
 
-def pixel_model(name: str) -> CameraModel:
-    """The camera model of this name, if its unit is the pixel."""
-    if not isinstance(name, str):
-        raise InputError(f"model must be a name, such as 'opencv', but is {name!r}")
+def pixel_model(name: str | CameraModel) -> CameraModel:
+    """The camera model of this name, or an own one, if its unit is the pixel."""
+    if not isinstance(name, str | CameraModel):
+        raise InputError(
+            f"model must be a name, such as 'opencv', or a CameraModel, but is {name!r}"
+        )
     try:
         model = get_model(name)
+        if is_own(model):
+            check_own(model)
     except ValueError as error:
         raise InputError(str(error)) from None
     if model.unit != "px":
-        raise InputError(f"model {name!r} is in {model.unit}; a batch needs a camera in pixels")
+        raise InputError(
+            f"model {model.name!r} is in {model.unit}; a batch needs a camera in pixels"
+        )
     return model
 
 
 def free_parameters(model: CameraModel, free) -> tuple[str, ...]:
     """The parameters to estimate, checked."""
     if free is None:
-        free = FREE.get(model.name) or model.parameters
+        free = model.free
     if isinstance(free, str | bytes) or not isinstance(free, Iterable):
         raise InputError(f"free must be a list of names, such as ['fx', 'fy'], but is {free!r}")
     free = list(free)
@@ -234,10 +237,15 @@ def free_parameters(model: CameraModel, free) -> tuple[str, ...]:
     return tuple(free)
 
 
+def _middle_of(model: CameraModel) -> tuple[str, ...]:
+    """The principal point, where it is in the middle of the image and not at zero."""
+    return model.principal_point if model.axes == "down" else ()
+
+
 def _interior(model: CameraModel, free, start, size, cameras):
     """Start values [cameras, parameters]; are the focal lengths among them?"""
     values = {name: 1.0 for name in model.principal_distance} | default_parameters(model)
-    values |= {name: (n - 1) / 2 for name, n in zip(("cx", "cy"), size) if name in values}
+    values |= {name: (n - 1) / 2 for name, n in zip(_middle_of(model), size)}
     start = {} if start is None else start
     if not isinstance(start, Mapping):
         raise InputError(f"start must be like {{'fx': 900.0, 'fy': 900.0}}, but is {start!r:.80}")

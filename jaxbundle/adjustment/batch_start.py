@@ -74,9 +74,8 @@ def _ideal(model, known, seen: Sightings, interior):
         r, s, q = cameras.image_ray(model, tuple(interior), u, v)
         front = q < -0.05
         return *(jnp.where(front, c, 0.0) for c in (-r / q, s / q)), front
-    names = model.parameters
-    value = lambda name: interior[names.index(name)] if name in names else 0.0
-    x, y = u - value("cx"), v - value("cy")
+    x0, y0 = [interior[model.parameters.index(name)] for name in model.principal_point] or (0, 0)
+    x, y = u - x0, v - y0
     return x, y if model.axes == "down" else -y, jnp.isfinite(x)
 
 

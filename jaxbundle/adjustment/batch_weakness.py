@@ -15,7 +15,6 @@ from jaxbundle.cameras import CameraModel
 
 VAGUE = 50.0
 """A principal distance whose σ is above a fiftieth of it is as good as unknown."""
-POINT = ("cx", "cy")
 PART = 0.05
 """A parameter with this part of the square of a vanishing direction is named."""
 
@@ -32,7 +31,7 @@ def vague(
     """
     columns = [model.parameters.index(name) for name in model.principal_distance]
     shortest = np.abs(interior[:, columns]).min(1)
-    of_these = {*columns, *(i for i, name in enumerate(model.parameters) if name in POINT)}
+    of_these = {model.parameters.index(name) for name in model.core}
     return ~(VAGUE * sigma <= shortest[:, None]) & [column in of_these for column in free]
 
 

@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from jaxbundle.adjustment.batch_weakness import VAGUE
 from jaxbundle.calibration.quality import Coverage, CrossValidation
+from jaxbundle.cameras import CameraModel
 
 FEW_VIEWS = 8
 TURNED = 60.0
@@ -22,8 +23,6 @@ LARGE = 1.0
 CONTRADICTION = 3.0
 WEAK = 1.0
 """A distortion coefficient with |value|/σ below this says nothing."""
-DISTANCES = ("c", "f", "fx", "fy")
-STRONG = ("c", "x0", "y0", "fx", "fy", "cx", "cy", "f")
 
 
 def advice(
@@ -34,17 +33,19 @@ def advice(
     covered: Coverage,
     rms: float,
     t: dict[str, float],
+    model: CameraModel,
     validation: CrossValidation | None = None,
 ) -> list[str]:
     """Warnings in words, the gravest first; none if nothing is to be said.
 
     **Arguments:** X0 and M of the views of a board in the plane Z = const, whose centre is
-    `middle`; `covered`; `rms` of the residuals in pixels; `t` = |value|/σ by parameter.
+    `middle`; `covered`; `rms` of the residuals in pixels; `t` = |value|/σ by parameter of
+    the `model`.
     """
     found = [
         f"{name} is known to {100 / max(t[name], 1e-9):.0f} % only: the photographs do not "
         "determine the principal distance; they need tilts and distances that differ"
-        for name in DISTANCES if t.get(name, np.inf) < VAGUE
+        for name in model.principal_distance if t.get(name, np.inf) < VAGUE
     ]  # fmt: skip
     found += [*_geometry(position, rotation, middle, unit), *_image(covered)]
     if rms > LARGE:
@@ -58,7 +59,7 @@ def advice(
             "1 expected): the σ are too small; the camera may have changed (focus, zoom), or the "
             "model or the board does not fit (--model, --board-sigma)"
         )
-    weak = [name for name, value in t.items() if value < WEAK and name not in STRONG]
+    weak = [name for name, value in t.items() if value < WEAK and name not in model.core]
     if weak:
         found.append(
             f"not significant: {', '.join(f'{n} (t {t[n]:.1f})' for n in weak)}; without "

@@ -41,7 +41,7 @@ from jaxbundle.arguments import one_of, whole
 from jaxbundle.calibration.batch_misfit import far_outside, misfits, remarks
 from jaxbundle.calibration.batch_result import BatchCalibration as BatchCalibration
 from jaxbundle.calibration.batch_snooping import ROUNDS, TESTS, Snooping
-from jaxbundle.cameras import CameraModel, get_model
+from jaxbundle.cameras import CameraModel, get_model, key_of
 from jaxbundle.configuration import available_cores
 from jaxbundle.geometry import (
     matrix_from_quaternion,
@@ -64,7 +64,7 @@ def calibrate_batch(
     object_points: Float[np.ndarray, "*cameras points 3"],
     image_points: Float[np.ndarray, "cameras views points 2"],
     image_size: tuple[int, int],
-    model: str = "opencv",
+    model: str | CameraModel = "opencv",
     visible: Bool[np.ndarray, "cameras views points"] | None = None,
     *,
     free: Sequence[str] | None = None,
@@ -83,7 +83,7 @@ def calibrate_batch(
       be repeated for every view ([views, points, 3] or [cameras, views, points, 3]).
     - `image_points`: pixels in the axes of the model.
     - `image_size`: width and height in pixels: the principal point starts in the middle.
-    - `model`: a camera model in pixels: "opencv", "kannala-brandt", "snavely".
+    - `model`: a camera model in pixels: "opencv", "kannala-brandt", "snavely", or a `CameraModel`.
     - `visible`: which points were measured where; all, if not given. What is not visible may have
       any coordinates. A point that is NaN or masked is not visible: in an image, where it was not
       measured, or in the object (`make_network` refuses such a row).
@@ -166,7 +166,7 @@ def _result(model: CameraModel, batch: Batch, rows: dict) -> BatchCalibration:
     rows["undetermined"], rows["status"] = undetermined, np.array(STATUS)[ended]
     rows["remark"] = remarks(model, batch, rows, solved & (ended == CONVERGED))
     free = tuple(model.parameters[column] for column in batch.free)
-    return BatchCalibration(model=model.name, parameters=free, **rows)
+    return BatchCalibration(model=key_of(model), parameters=free, **rows)
 
 
 def _undetermined(model: CameraModel, batch: Batch, ended, rows) -> Bool[np.ndarray, "cameras k"]:

@@ -139,8 +139,9 @@ def remarks(
     """What is odd about the image points: looked for where the principal point is outside the
     image, or there is no good result. Of a camera that is not determined, an RMS that is odd."""
     frame = batch.image_size
-    if "cx" in model.parameters:
-        middle = rows["interior"][:, [model.parameters.index(name) for name in ("cx", "cy")]]
+    if model.principal_point and model.axes == "down":
+        columns = [model.parameters.index(name) for name in model.principal_point]
+        middle = rows["interior"][:, columns]
         good = good & ((middle > -0.5) & (middle < frame - 0.5)).all(1)
     remark = [""] * len(batch)
     beside = rms_beside(rows["rms"], np.isfinite(rows["rms"]))

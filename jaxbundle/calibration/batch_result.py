@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from jaxbundle.adjustment.batch_camera import CONVERGED, MISFIT, STATUS, WEAK
+from jaxbundle.cameras import CameraModel
 
 SOLVED = (STATUS[CONVERGED], STATUS[WEAK], STATUS[MISFIT])
 """Statuses of cameras that have values."""
@@ -45,7 +46,7 @@ class BatchCalibration:
       `sigma_position`, `sigma_angles`; `rotation`: the matrices M.
     """
 
-    model: str
+    model: str | CameraModel
     parameters: tuple[str, ...]
     status: Shaped[np.ndarray, " cameras"]
     remark: Shaped[np.ndarray, " cameras"]

@@ -27,8 +27,8 @@ from jaxbundle.arguments import number, positive, shown, text, vector
 from jaxbundle.bundle import adjust, check_options
 from jaxbundle.calibration.frames import in_model_units, in_pixels, unit_size
 from jaxbundle.calibration.result import Calibration
-from jaxbundle.calibration.start import Start, default_free, start_values
-from jaxbundle.cameras import CameraModel, get_model
+from jaxbundle.calibration.start import Start, start_values
+from jaxbundle.cameras import CameraModel, check_own, get_model, is_own
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.leastsquares.snooping import check_test
@@ -48,7 +48,7 @@ def calibrate(
     photographs: Sequence[str | Path] | BoardViews,
     board: Board | None = None,
     *,
-    model: str = "opencv",
+    model: str | CameraModel = "opencv",
     free: Sequence[str] | None = None,
     given: Mapping[str, float] | None = None,
     pixel_size: float | tuple[float, float] | None = None,
@@ -69,8 +69,8 @@ def calibrate(
 
     - `photographs`: files, patterns or folders; or `BoardViews`, image points already measured.
     - `board`: what is in the photographs; its unit is the object unit.
-    - `model`, `free`: camera model and the parameters to estimate; the model's usual ones if not
-      named. `given`: values of parameters, held where they are not free.
+    - `model`, `free`: camera model, by name or a `CameraModel`, and the parameters to estimate; the
+      model's usual ones if not named. `given`: values of parameters, held where they are not free.
     - `pixel_size`: mm, for models in mm.
     - `sigma_image`: a priori σ of an image coordinate, pixels.
     - `board_sigma`: σ of a coordinate of the board (object unit); `board_free`: its points are
@@ -196,22 +196,24 @@ def _shifts(model, p, poses, centres, radius):
     return jax.vmap(jax.vmap(one, (None, 0)), (0, None))(poses, centres)
 
 
-def _model(name: str, free) -> tuple[CameraModel, tuple[str, ...]]:
+def _model(name: str | CameraModel, free) -> tuple[CameraModel, tuple[str, ...]]:
     try:
         model = get_model(name)
+        if is_own(model):
+            check_own(model)
     except ValueError as error:
         raise InputError(str(error)) from None
     if isinstance(free, str) or not (free is None or isinstance(free, Iterable)):
         raise InputError(f"free must be a list of names, such as ['fx', 'fy'], but is {free!r:.60}")
-    free = default_free(model) if free is None else tuple(free)
+    free = model.free if free is None else tuple(free)
     if not free or len({*free}) < len(free):
         raise InputError("free: name at least one parameter, and each once")
     for parameter in free:
         if parameter not in model.parameters or parameter in model.never_free:
             known = [p for p in model.parameters if p not in model.never_free]
             raise InputError(
-                f"free: camera model {name!r} has no free parameter {parameter!r}; its parameters "
-                f"are {', '.join(known)}"
+                f"free: camera model {model.name!r} has no free parameter {parameter!r}; its "
+                f"parameters are {', '.join(known)}"
             )
     return model, free
 

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.cameras import get_model
+from jaxbundle.cameras import get_model, is_own
 from jaxbundle.leastsquares.spaces import Pose, PoseValue
 from jaxbundle.network.kinds import ImagePoint
 
@@ -61,7 +61,8 @@ def left_out(adjustment) -> LeftOut | None:
     """
     given = adjustment.problem.network.cameras[0]
     model = get_model(given.model)
-    names = tuple(n for n in AFFINE if n in model.parameters and n not in given.free)
+    known = () if is_own(model) else AFFINE
+    names = tuple(n for n in known if n in model.parameters and n not in given.free)
     if not names or given.pixel_size is None or not adjustment.sigma0 > 0:
         return None
     columns = tuple(model.parameters.index(name) for name in names)

@@ -12,6 +12,7 @@ from jaxbundle.calibration import quality
 from jaxbundle.calibration.advice import advice
 from jaxbundle.calibration.left_out import left_out
 from jaxbundle.calibration.quality import Coverage, CrossValidation, UncertaintyMap
+from jaxbundle.cameras import get_model
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.tables import Camera
@@ -114,7 +115,7 @@ class Calibration:
         t = {name: abs(self.parameters[name]) / s for name, s in self.sigma.items() if s > 0}
         found = advice(
             self.position, self.rotation, self.views.board.points.mean(0),
-            self._unit, self.coverage, self.rms, t,
+            self._unit, self.coverage, self.rms, t, get_model(self.camera.model),
             self.__dict__.get("cross_validation"),
         )  # fmt: skip
         missed = left_out(self.adjustment)

@@ -5,6 +5,9 @@ pixels. For a model in millimetres that is `opencv` with k1 and k2; to first ord
 
     c = (fx·p_x + fy·p_y)/2,   K1 = ∓k1/c²  (− for a correction, + for a distortion)
 
+The parameters of a user's own model, whose formula is not known here, are those with the same
+images as `opencv` (or `kannala-brandt`), by a fit over the image.
+
 A view whose points do not fit the others (a wrong board, a wrong order of corners) is left out:
 more than a third of its residuals are gross, measured by the median of all; or it looks at the
 board from behind, as a mirror image does.
@@ -15,10 +18,9 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.adjustment.batch_input import FREE
 from jaxbundle.calibration.batch import BatchCalibration, calibrate_batch
 from jaxbundle.calibration.frames import images_of_board, in_model_units
-from jaxbundle.cameras import CameraModel, get_model
+from jaxbundle.cameras import CameraModel, convert_camera, get_model, is_own
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.columns import count
@@ -29,11 +31,6 @@ LEAST_GROSS = 3.0
 """And above so many pixels."""
 PART = 1 / 3
 SIMPLE = ("fx", "fy", "cx", "cy", "k1", "k2")
-FREE_IN_MM = {
-    "brown": ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2"),
-    "brown-projected": ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2"),
-    "usgs": ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2"),
-}
 WIDE = tuple(np.radians([60.0, 100.0, 140.0, 180.0]))
 """Fields of view tried where the views alone give no start for a fisheye."""
 
@@ -48,12 +45,6 @@ class Start:
     angles: Float[np.ndarray, "views 3"]
 
 
-def default_free(model: CameraModel) -> tuple[str, ...]:
-    """What is estimated of a model if nothing is said."""
-    given = FREE.get(model.name) or FREE_IN_MM.get(model.name)
-    return given or tuple(p for p in model.parameters if p not in model.never_free)
-
-
 def start_values(
     views: BoardViews, model: CameraModel, free: tuple[str, ...], pixel_size=None, given=None
 ) -> Start:
@@ -61,13 +52,15 @@ def start_values(
 
     **Raises:** `InputError` for too few views; `NotSolvedError` where they determine no camera.
     """
+    fisheye = get_model("kannala-brandt")
+    known, wanted = (fisheye, fisheye.free) if is_own(model) and model.wide else (model, free)
     while True:
         if len(views) < 2:
             raise InputError(
                 f"only {count(len(views), 'photograph')} can be used{_why(views)}; a camera needs "
                 "several, 8 or more, from different directions"
             )
-        solved = _solve(views, model, free)
+        solved = _solve(views, known, wanted)
         used = solved.views[0]
         if not used.all():
             views = views.take(used, "its points are too few or lie on a line")
@@ -86,7 +79,11 @@ def start_values(
                 "boards, another camera, a zoom that moved"
             )
         views = views.take(~gross, "its points do not fit those of the other photographs")
-    parameters = _parameters(views, solved, model, free, pixel_size) | dict(given or {})
+    given = dict(given or {})
+    if is_own(model):
+        parameters = _fitted(views, solved, model, free, pixel_size, given) | given
+    else:
+        parameters = _parameters(views, solved, model, free, pixel_size) | given
     return Start(views, parameters, solved.position[0], solved.angles[0])
 
 
@@ -96,8 +93,8 @@ def _why(views):
 
 def _solve(views: BoardViews, model: CameraModel, free) -> BatchCalibration:
     """The first attempt with a solution, a weak one as well."""
-    size = views.image_size
-    if model.unit == "px":
+    size, direct = views.image_size, model.unit == "px" and not is_own(model)
+    if direct:
         attempts = [(model.name, free, None)]
         if model.name == "opencv":
             attempts.append(("opencv", tuple(n for n in free if n in SIMPLE), None))
@@ -111,7 +108,7 @@ def _solve(views: BoardViews, model: CameraModel, free) -> BatchCalibration:
     xy = in_model_units(views.xy, get_model(attempts[0][0]), size)
     for name, wanted, start in attempts:
         held = [n for n in model.principal_distance if n not in wanted]
-        if start is None and model.unit == "px":
+        if start is None and direct:
             wanted = (*held, *wanted)
         solved = calibrate_batch(
             views.board.points, xy[None], size, name, views.visible[None],
@@ -164,3 +161,24 @@ def _parameters(views, solved, model, free, pixel_size) -> dict[str, float]:
         diagonal = np.hypot(*(np.array(views.image_size) * pixel_size))
         parameters["format_factor"] = 200 / float(diagonal)
     return parameters
+
+
+def _fitted(views, solved, model, free, pixel_size, given) -> dict[str, float]:
+    """Parameters of an own model with the images of the camera as found, where points are."""
+    source, xy = get_model(solved.model), views.xy[views.visible]
+    found = dict(zip(source.parameters, solved.interior[0].tolist()))
+    if {*given} - {*model.principal_distance}:
+        model = dataclasses.replace(model, defaults=dict(model.defaults) | given)
+    wanted = [n for n in model.parameters if n in (*model.principal_distance, *free)]
+    try:
+        cost = convert_camera(
+            source, found, model, image_size=views.image_size, pixel_size=pixel_size,
+            area=(xy.min(0), xy.max(0)),
+            free=[n for n in wanted if n not in given],
+        )  # fmt: skip
+    except ValueError as error:
+        raise NotSolvedError(
+            f"not solved: no start values of model {model.name!r}: {error}; start with fewer "
+            "parameters (free), or give values (given)"
+        ) from None
+    return dict(cost.parameters)

@@ -1,6 +1,6 @@
 """Cameras: interior orientation and distortion, as pure functions of one image point.
 
-Batch them with `jax.vmap`. A model is a `CameraModel`, found by name:
+Batch them with `jax.vmap`. A model is a `CameraModel`: a user's own, or one found by name:
 
 | name | formula | unit, axes |
 |---|---|---|
@@ -15,6 +15,8 @@ Batch them with `jax.vmap`. A model is a `CameraModel`, found by name:
 
 from .catalogue import MODEL_NAMES as MODEL_NAMES
 from .catalogue import get_model as get_model
+from .catalogue import is_own as is_own
+from .catalogue import key_of as key_of
 from .compare import Comparison as Comparison
 from .compare import compare_cameras as compare_cameras
 from .compare import difference_rings as difference_rings
@@ -25,6 +27,7 @@ from .model import CameraModel as CameraModel
 from .model import image_ray as image_ray
 from .model import project as project
 from .model import residual as residual
+from .own import check_own as check_own
 from .parameters import check_parameters as check_parameters
 from .parameters import default_parameters as default_parameters
 from .validity import turning_radius as turning_radius

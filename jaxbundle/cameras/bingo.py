@@ -21,9 +21,9 @@ published there and not offered here.
 
 import jax.numpy as jnp
 
-from . import brown, perspective
-from .inverse import implicit_inverse
-from .model import CameraModel, Pair, Parameters, Scalar
+from . import brown
+from .model import CameraModel
+from .scalars import Pair, Parameters, Scalar
 
 S25 = 0.3737850724543663
 S26 = 0.304789700626975
@@ -50,14 +50,10 @@ def _radius(x, y):
 
 
 BINGO = CameraModel(
-    name="bingo",
-    parameters=("c", "x0", "y0", "p25", "p26", "format_factor"),
-    unit="mm",
-    axes="up",
-    own_formula="to_ideal",
-    ideal=perspective.ideal,
-    ray=perspective.ray,
-    to_ideal=correct,
-    from_ideal=implicit_inverse(correct, start=brown.unreduce),
+    "bingo",
+    ("c", "x0", "y0", "p25", "p26", "format_factor"),
+    correct=correct,
+    start=brown.unreduce,
+    defaults={"format_factor": 1.0},
     never_free=("format_factor",),
 )

@@ -18,9 +18,8 @@ Source: Brown (1971), Close-Range Camera Calibration, Photogrammetric Engineerin
 balanced form: Luhmann, Robson, Kyle and Boehm (2014), Close-Range Photogrammetry and 3D Imaging.
 """
 
-from . import perspective
-from .inverse import implicit_inverse
-from .model import CameraModel, Pair, Parameters, Scalar
+from .model import CameraModel
+from .scalars import Pair, Parameters, Scalar
 
 PARAMETERS = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2", "r0")
 
@@ -59,27 +58,10 @@ def distort(p: Parameters, xi: Scalar, yi: Scalar) -> Pair:
 
 
 BROWN = CameraModel(
-    name="brown",
-    parameters=PARAMETERS,
-    unit="mm",
-    axes="up",
-    own_formula="to_ideal",
-    ideal=perspective.ideal,
-    ray=perspective.ray,
-    to_ideal=correct,
-    from_ideal=implicit_inverse(correct, start=unreduce),
-    never_free=("r0",),
+    "brown", PARAMETERS, correct=correct, start=unreduce, free=PARAMETERS[:8], never_free=("r0",)
 )
 
 BROWN_PROJECTED = CameraModel(
-    name="brown-projected",
-    parameters=PARAMETERS,
-    unit="mm",
-    axes="up",
-    own_formula="from_ideal",
-    ideal=perspective.ideal,
-    ray=perspective.ray,
-    to_ideal=implicit_inverse(distort, start=reduce),
-    from_ideal=distort,
+    "brown-projected", PARAMETERS, distort=distort, start=reduce, free=PARAMETERS[:8],
     never_free=("r0",),
-)
+)  # fmt: skip

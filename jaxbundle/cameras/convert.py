@@ -74,7 +74,7 @@ def convert_camera(
     - `area`: the corners of the image (low, high) in the source's coordinates; the whole image
       if not given.
     - `r0`: of the target, mm, if it has one.
-    - `free`: what a fit may change (`convert_fit.FITTED` if empty); the rest has its default.
+    - `free`: what a fit may change (`convert_fit.fitted` if empty); the rest has its default.
 
     **Raises:** `ValueError` naming what is missing, or why there is nothing to be fitted.
     """
@@ -91,7 +91,7 @@ def convert_camera(
             "distortion turns back inside the image"
         )
     wanted, rays = (shift + step * xy)[there], rays[there]
-    if target.name != "kannala-brandt" and (rays[:, 2] >= 0).any():
+    if not target.wide and (rays[:, 2] >= 0).any():
         raise ValueError(
             f"part of the image looks 90° and more from the axis, where model {target.name!r} has "
             "no image; convert a smaller area, or keep the fisheye model"

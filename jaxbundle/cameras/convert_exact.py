@@ -60,7 +60,7 @@ def exact_parameters(
 
     **Raises:** `NotExact` where there are none; `ValueError` where a size is needed.
     """
-    if source.name == target.name and values.get("r0", 0.0) == (r0 if "r0" in values else 0.0):
+    if source == target and values.get("r0", 0.0) == (r0 if "r0" in values else 0.0):
         return dict(values)
     pair = {source.name, target.name}
     if pair <= set(CORRECTIONS):

@@ -28,19 +28,16 @@ from .frames import between_frames
 from .model import CameraModel, image_ray, project
 from .parameters import default_parameters
 
-FITTED = {
-    "brown": ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2"),
-    "brown-projected": ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2"),
-    "usgs": ("c", "x0", "y0", "K1", "K2", "K3", "K4", "P1", "P2"),
-    "bingo": ("c", "x0", "y0", "p25", "p26"),
-    "opencv": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"),
-    "kannala-brandt": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
-    "snavely": ("f", "k1", "k2"),
-}
-"""What is fitted if nothing else is asked for; all of it can be told apart."""
+MORE_FITTED = {"brown": ("b1", "b2"), "brown-projected": ("b1", "b2"), "usgs": ("K4",)}
+"""What is fitted beside the parameters that are free if nothing is said."""
 
 GRID = (33, 25)
 MOST_EVALUATIONS = 200
+
+
+def fitted(model: CameraModel) -> tuple[str, ...]:
+    """What is fitted of a model if nothing else is asked for; all of it can be told apart."""
+    return (*model.free, *MORE_FITTED.get(model.name, ()))
 
 
 def image_grid(low: Sequence[float], high: Sequence[float]) -> Float[np.ndarray, "points 2"]:
@@ -71,13 +68,13 @@ def fit_parameters(
     """The parameters of a model that bring rays nearest to their images.
 
     **Arguments:** `xy` in the model's unit and axes; `starts` complete sets of start values, the
-    best of them is taken; `free` what is fitted (`FITTED` of the model if empty).
+    best of them is taken; `free` what is fitted (`fitted` of the model if empty).
 
     **Raises:** `ValueError` if no start has an image of every ray, or the numbers are beyond it.
     """
     from scipy.optimize import least_squares
 
-    chosen = [model.parameters.index(name) for name in free or FITTED[model.name]]
+    chosen = [model.parameters.index(name) for name in free or fitted(model)]
     cost = lambda p: float(np.square(_images(model, p, rays) - xy).sum())
     with jax.enable_x64(True):
         start = min((_ordered(model, values) for values in starts), key=lambda p: _finite(cost(p)))
@@ -107,14 +104,15 @@ def start_values(
     """Start values of the target: without distortion, and, where the terms have counterparts, with
     the source's to the first orders."""
     shift, step = between_frames(source, target, *sizes)
-    of = lambda *names: next((values[name] for name in names if name in values), 0.0)
-    focal = np.array([of("fx", "f", "c"), of("fy", "f", "c")]) * np.abs(step)
-    point = shift + step * [of("cx", "x0"), of("cy", "y0")]
-    plain = default_parameters(target) | {"r0": r0, "format_factor": of("format_factor") or 1.0}
-    if "fx" in target.parameters:
-        plain |= {"fx": focal[0], "fy": focal[1], "cx": point[0], "cy": point[1]}
-    else:
-        plain |= {target.parameters[0]: focal.mean(), "x0": point[0], "y0": point[1]}
+    of = lambda names: np.array([values[name] for name in names])
+    focal = of(source.principal_distance) * np.abs(step)
+    point = shift + step * (of(source.principal_point) if source.principal_point else 0.0)
+    plain = default_parameters(target)
+    conventions = {"format_factor": values.get("format_factor")} | ({"r0": r0} if r0 else {})
+    plain |= {n: v for n, v in conventions.items() if v and n in target.never_free}
+    distances = target.principal_distance
+    plain |= dict(zip(distances, focal if len(distances) == 2 else [focal.mean()]))
+    plain |= dict(zip(target.principal_point, point))
     plain = {name: plain[name] for name in target.parameters}
     k, p1, p2 = _first_orders(source, values)
     backward = (source.name in CORRECTIONS) != (target.name in CORRECTIONS)

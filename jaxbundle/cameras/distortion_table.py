@@ -46,7 +46,7 @@ def distortion_table(
     out = np.stack([np.cos(azimuth), np.sin(azimuth)], 1)
     with jax.enable_x64(True):
         centre = np.asarray(_of_ideal(model, p, np.zeros((1, 2))))[0]
-        point = _principal_point(values)
+        point = np.array([values[name] for name in model.principal_point] or [0.0, 0.0])
         begin = centre if about == "principal point" else np.zeros(2)
         xy = begin + radius[:, None, None] * out
         ideal = np.asarray(_to_ideal(model, p, xy.reshape(-1, 2))).reshape(xy.shape)
@@ -57,11 +57,6 @@ def distortion_table(
     noise = ROUNDING * (np.abs(begin).max() + radius)
     without = lambda d: np.where(np.abs(d) < noise, 0.0, d)
     return {"r": radius, "radial": without(radial), "decentring": without(decentring)}
-
-
-def _principal_point(values: Mapping[str, float]):
-    names = ("cx", "cy") if "cx" in values else ("x0", "y0")
-    return np.array([values.get(name, 0.0) for name in names])
 
 
 @partial(jax.jit, static_argnums=0)

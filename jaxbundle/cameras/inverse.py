@@ -26,15 +26,12 @@ a positive determinant and trace: at the principal point J is near the identity,
 that starts there its eigenvalues keep positive real parts.
 """
 
-from collections.abc import Callable
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 
-from .model import Pair, Parameters, Scalar
-
-Formula = Callable[[Parameters, Scalar, Scalar], Pair]
+from .scalars import Formula
 
 
 def implicit_inverse(g: Formula, start: Formula, iterations: int = 6) -> Formula:

@@ -3,58 +3,191 @@
     ray [r, s, q] ──ideal──▶ (xi, yi) ──from_ideal──▶ (x, y) measured
                   ◀──ray───           ◀──to_ideal────
 
-`ideal` is free of distortion and relative to the principal point. A model states one of `to_ideal`
-and `from_ideal` as its own formula; the other is its inverse (`inverse.py`), so the two domains of
-the residual agree to rounding.
+`ideal` is free of distortion and relative to the principal point. A model states one formula; the
+other direction is its inverse (`inverse.py`), so the two domains of the residual agree to rounding.
 
 Every function takes and returns unpacked scalars of ONE image point. Camera frame: x right, y up,
 the camera looks along −z, so that a point in front of a perspective camera has q < 0. What lies
 behind it is projected all the same, through the projection centre: the caller looks at q.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import dataclasses
+from collections.abc import Mapping
 from typing import Literal
 
-from jaxtyping import Array, Float
+from .equidistant import equidistant
+from .inverse import implicit_inverse
+from .perspective import perspective
+from .scalars import Formula, OfRay, Pair, Parameters, Scalar, ToRay, Triple
 
-Scalar = float | Float[Array, ""]
-Pair = tuple[Scalar, Scalar]
-Triple = tuple[Scalar, Scalar, Scalar]
-Parameters = Sequence[Scalar]
+IMAGES = {"perspective": perspective, "equidistant": equidistant}
+FORMULAS = ("correct", "distort", "project")
+PRINCIPAL_DISTANCES = ("c",), ("fx", "fy"), ("f",)
+PRINCIPAL_POINTS = ("x0", "y0"), ("cx", "cy")
+"""The names that are known without saying."""
+TAKEN = ("id", "model", "image_size", "pixel_size", "free", "sigma")
+"""What a camera has beside its parameters; none of these can be the name of one."""
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False, kw_only=True)
 class CameraModel:
-    """A camera model; hashable, to be a static argument of jitted functions.
+    """A camera model: one formula and the names of its parameters.
 
-    **Fields:**
+        mine = CameraModel("mine", ("c", "x0", "y0", "K1"), correct=my_function)
 
-    - `name`: as in a project file.
-    - `parameters`: names, in the order of the parameter tuple `p` of all functions below.
+    It is hashable, to be a static argument of jitted functions, and equal to a model of the same
+    formula (the same function, not one that reads the same) and fields. `str` gives its name.
+
+    **Arguments:**
+
+    - `name`: of the model in files and reports; `parameters`: names, in the order of the tuple `p`
+      of all functions below.
+    - One formula, a function of scalars, element by element, of arithmetic and `jax.numpy`:
+      `correct`, `(p, x, y) -> (xi, yi)`, from the measured to the ideal image; `distort`,
+      `(p, xi, yi) -> (x, y)`, from the ideal to the measured image; or `project`,
+      `(p, r, s, q) -> (x, y)`, from the ray to the measured image. Ideal coordinates are relative
+      to the principal point and on the scale of the principal distance.
+    - `inverse`: of `correct`, `distort`, or of `project` as it maps ideal to measured coordinates;
+      found by Newton's method with implicit derivatives, in so many `iterations` from `start`,
+      `(p, X, Y) -> (x, y)`, if not given.
     - `unit`: of image coordinates, `"mm"` or `"px"`; principal distance and principal point are in
-      the same unit.
-    - `axes`: `"up"`, x right and y up; `"down"`, u right and v down, the axes of pixels.
-    - `own_formula`: which of `to_ideal` and `from_ideal` is the model's own formula.
-    - `ideal`: `(p, r, s, q) -> (xi, yi)`.
-    - `ray`: `(p, xi, yi) -> (r, s, q)`, of length 1.
-    - `to_ideal`: `(p, x, y) -> (xi, yi)`.
-    - `from_ideal`: `(p, xi, yi) -> (x, y)`.
-    - `never_free`: parameters that are conventions, never to be estimated.
-    - `principal_distance`: parameters that must be given and positive.
+      the same unit. `axes`: `"up"`, x right and y up (of mm if not given); `"down"`, u right and
+      v down, the axes of pixels (of px).
+    - `image`: the ideal image, `"perspective"`, or `"equidistant"` for fisheyes, whose rays may be
+      90° and more from the axis.
+    - `defaults`: values of parameters that may be left out, where they are not 0.
+    - `free`: what is estimated if nothing is said; all if not given. `never_free`: parameters that
+      are conventions, never to be estimated.
+    - `principal_distance`: one parameter, or two, along and across, that must be given and
+      positive; c, fx and fy, or f if not named. `principal_point`: two parameters, the measured
+      image of the axis; x0 and y0, or cx and cy if not named, and none where it has none of these.
+
+    **Fields made of them:** `own_formula`, which of `to_ideal` and `from_ideal` the formula is;
+    `ideal`, `(p, r, s, q) -> (xi, yi)`; `ray`, `(p, xi, yi) -> (r, s, q)`, of length 1; `to_ideal`,
+    `(p, x, y) -> (xi, yi)`; `from_ideal`, `(p, xi, yi) -> (x, y)`.
+
+    **Raises:** `ValueError`.
     """
 
-    name: str
-    parameters: tuple[str, ...]
-    unit: Literal["mm", "px"]
-    axes: Literal["up", "down"]
-    own_formula: Literal["to_ideal", "from_ideal"]
-    ideal: Callable[[Parameters, Scalar, Scalar, Scalar], Pair]
-    ray: Callable[[Parameters, Scalar, Scalar], Triple]
-    to_ideal: Callable[[Parameters, Scalar, Scalar], Pair]
-    from_ideal: Callable[[Parameters, Scalar, Scalar], Pair]
+    name: str = dataclasses.field(kw_only=False)
+    parameters: tuple[str, ...] = dataclasses.field(kw_only=False)
+    correct: Formula | None = None
+    distort: Formula | None = None
+    project: OfRay | None = None
+    inverse: Formula | None = None
+    start: Formula | None = None
+    iterations: int = 6
+    unit: Literal["mm", "px"] = "mm"
+    axes: Literal["up", "down"] | None = None
+    image: Literal["perspective", "equidistant"] = "perspective"
+    defaults: Mapping[str, float] | tuple = ()
+    free: tuple[str, ...] = ()
     never_free: tuple[str, ...] = ()
-    principal_distance: tuple[str, ...] = ("c",)
+    principal_distance: tuple[str, ...] = ()
+    principal_point: tuple[str, ...] = ()
+    own_formula: Literal["to_ideal", "from_ideal"] = dataclasses.field(init=False, compare=False)
+    ideal: OfRay = dataclasses.field(init=False, compare=False)
+    ray: ToRay = dataclasses.field(init=False, compare=False)
+    to_ideal: Formula = dataclasses.field(init=False, compare=False)
+    from_ideal: Formula = dataclasses.field(init=False, compare=False)
+
+    def __post_init__(self):
+        for name, value in _completed(self).items():
+            object.__setattr__(self, name, value)
+        columns = [self.parameters.index(name) for name in self.principal_distance]
+        ideal, ray = IMAGES[self.image](columns, self.axes)
+        formula = self.formula
+        if self.project is not None:
+            formula = lambda p, xi, yi: self.project(p, *ray(p, xi, yi))
+        back = self.inverse or implicit_inverse(
+            formula, self.start or _less_its_origin(formula), self.iterations
+        )
+        own, other = ("to_ideal", "from_ideal")[:: 1 if self.correct else -1]
+        made = {"own_formula": own, own: formula, other: back, "ideal": ideal, "ray": ray}
+        for name, value in made.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def formula(self) -> Formula | OfRay:
+        """The one function the model states."""
+        return self.correct or self.distort or self.project
+
+    @property
+    def wide(self) -> bool:
+        """Whether rays may be 90° and more from the axis."""
+        return self.image == "equidistant"
+
+    @property
+    def core(self) -> tuple[str, ...]:
+        """Principal distance and principal point: what is no additional parameter."""
+        return (*self.principal_distance, *self.principal_point)
+
+    def __str__(self) -> str:
+        return self.name
+
+    def __repr__(self) -> str:
+        return f"CameraModel({self.name!r})"
+
+
+def _completed(model: CameraModel) -> dict:
+    """The fields of a model that are not functions, checked, in the form that is kept."""
+    if not isinstance(model.name, str) or not model.name.isprintable() or not model.name.strip():
+        raise ValueError(f"The name of a camera model must be a text, but is {model.name!r:.60}.")
+    where = f"Camera model {model.name!r}: "
+    text = isinstance(model.parameters, str)
+    parameters = () if text else tuple(model.parameters)
+    odd = [n for n in parameters if not (isinstance(n, str) and n.isidentifier()) or n in TAKEN]
+    if odd or not parameters or len({*parameters}) < len(parameters):
+        raise ValueError(
+            f"{where}parameters must be different names such as ('c', 'x0', 'y0', 'K1'), none of "
+            f"them {', '.join(TAKEN)}, but are {model.parameters!r:.200}."
+        )
+    given = [name for name in FORMULAS if getattr(model, name) is not None]
+    if len(given) != 1:
+        raise ValueError(
+            f"{where}give one formula as correct, distort or project, not "
+            f"{' and '.join(given) or 'none'}; its inverse is inverse."
+        )
+    for name in (*given, "inverse", "start"):
+        if getattr(model, name) is not None and not callable(getattr(model, name)):
+            raise ValueError(f"{where}{name} must be a function, not {getattr(model, name)!r:.60}.")
+    for name, choices in (("unit", ("mm", "px")), ("axes", ("up", "down", None)),
+                          ("image", tuple(IMAGES))):  # fmt: skip
+        if getattr(model, name) not in choices:
+            known = ", ".join(filter(None, choices))
+            raise ValueError(f"{where}{name} is one of {known}, not {getattr(model, name)!r:.60}.")
+    if not isinstance(model.iterations, int) or model.iterations < 1:
+        raise ValueError(f"{where}iterations must be a number above 0, not {model.iterations!r}.")
+    known = lambda sets: next((names for names in sets if {*names} <= {*parameters}), ())
+    kept = {
+        "parameters": parameters,
+        "axes": model.axes or ("up" if model.unit == "mm" else "down"),
+        "defaults": tuple(dict(model.defaults).items()),
+        "never_free": tuple(model.never_free),
+        "principal_distance": tuple(model.principal_distance) or known(PRINCIPAL_DISTANCES),
+        "principal_point": tuple(model.principal_point) or known(PRINCIPAL_POINTS),
+    }
+    kept["free"] = tuple(model.free) or tuple(n for n in parameters if n not in kept["never_free"])
+    for name in ("defaults", "free", "never_free", "principal_distance", "principal_point"):
+        unknown = {*(dict(kept[name]) if name == "defaults" else kept[name])} - {*parameters}
+        if unknown:
+            raise ValueError(f"{where}{name} names {', '.join(unknown)}, which is no parameter.")
+    if len(kept["principal_distance"]) not in (1, 2) or len(kept["principal_point"]) not in (0, 2):
+        raise ValueError(
+            f"{where}principal_distance must name one parameter, or two, along and across, and "
+            "principal_point two or none; c, fx and fy, f, x0 and y0, cx and cy need no naming."
+        )
+    return kept
+
+
+def _less_its_origin(formula: Formula) -> Formula:
+    """Undoes the shift of a formula that is near the identity but for a shift."""
+
+    def start(p: Parameters, X: Scalar, Y: Scalar) -> Pair:
+        x, y = formula(p, 0.0 * X, 0.0 * Y)
+        return X - x, Y - y
+
+    return start
 
 
 def project(model: CameraModel, p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
@@ -62,6 +195,8 @@ def project(model: CameraModel, p: Parameters, r: Scalar, s: Scalar, q: Scalar) 
 
     NaN where the model has no image of the ray (`inverse.py`).
     """
+    if model.project is not None:
+        return model.project(p, r, s, q)
     return model.from_ideal(p, *model.ideal(p, r, s, q))
 
 

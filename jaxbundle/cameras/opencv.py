@@ -16,9 +16,8 @@ coefficients without unit. Ideal coordinates are pixels from the principal point
 Source: OpenCV 4 documentation, calib3d, "Camera Calibration and 3D Reconstruction".
 """
 
-from . import perspective
-from .inverse import implicit_inverse
-from .model import CameraModel, Pair, Parameters, Scalar
+from .model import CameraModel
+from .scalars import Pair, Parameters, Scalar
 
 
 def distort(p: Parameters, xi: Scalar, yi: Scalar) -> Pair:
@@ -38,17 +37,14 @@ def reduce(p: Parameters, u: Scalar, v: Scalar) -> Pair:
 
 
 OPENCV = CameraModel(
-    name="opencv",
-    parameters=(
+    "opencv",
+    (
         "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6",
         "s1", "s2", "s3", "s4",
     ),
+    distort=distort,
     unit="px",
-    axes="down",
-    own_formula="from_ideal",
-    ideal=perspective.ideal_px,
-    ray=perspective.ray_px,
-    to_ideal=implicit_inverse(distort, start=reduce, iterations=8),
-    from_ideal=distort,
-    principal_distance=("fx", "fy"),
+    start=reduce,
+    iterations=8,
+    free=("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"),
 )

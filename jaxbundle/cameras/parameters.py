@@ -10,12 +10,13 @@ from .names import closest
 
 
 def default_parameters(model: CameraModel) -> dict[str, float]:
-    """The values of the parameters that may be left out: 0, and 1 for a format factor.
+    """The values of the parameters that may be left out: 0, or what the model says.
 
     The principal distance has no default.
     """
+    given = dict(model.defaults)
     return {
-        name: 1.0 if name == "format_factor" else 0.0
+        name: float(given.get(name, 0.0))
         for name in model.parameters
         if name not in model.principal_distance
     }

@@ -1,38 +1,35 @@
 """The perspective image of a ray: the collinearity equations after the rotation.
 
-    xi = −c·r/q,  yi = −c·s/q                       mm, y up
-    xi = fx·X/Z,  yi = fy·Y/Z                       px, v down, [X, Y, Z] = [r, −s, −q]
+    xi = −c·r/q,  yi = −c·s/q                       y up
+    xi = fx·X/Z,  yi = fy·Y/Z                       v down, [X, Y, Z] = [r, −s, −q]
 
 Source: Kraus (2007), Photogrammetry, section 2.1.
 """
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 
-from .model import Pair, Parameters, Scalar, Triple
+from .scalars import OfRay, Pair, Parameters, Scalar, ToRay, Triple
 
 
-def ideal(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
-    """Ideal coordinates of a ray, y up; the principal distance is the first parameter."""
-    c = p[0]
-    return -c * r / q, -c * s / q
+def perspective(columns: Sequence[int], axes: str) -> tuple[OfRay, ToRay]:
+    """The ideal image of a ray, and the ray of an ideal image.
 
+    **Arguments:** `columns` of the principal distance among the parameters, or of the two, along
+    and across; `axes`: "up" or "down".
+    """
+    first, last, up = columns[0], columns[-1], axes == "up"
 
-def ray(p: Parameters, xi: Scalar, yi: Scalar) -> Triple:
-    """The ray of ideal coordinates, y up."""
-    c = p[0]
-    length = jnp.sqrt(xi * xi + yi * yi + c * c)
-    return xi / length, yi / length, -c / length
+    def ideal(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
+        return -p[first] * r / q, -p[last] * s / q if up else p[last] * s / q
 
+    def ray(p: Parameters, xi: Scalar, yi: Scalar) -> Triple:
+        if first == last:
+            X, Y, Z = xi, yi, p[first]
+        else:
+            X, Y, Z = xi / p[first], yi / p[last], 1
+        length = jnp.sqrt(X * X + Y * Y + Z * Z)
+        return X / length, Y / length if up else -Y / length, -Z / length
 
-def ideal_px(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
-    """Ideal pixel coordinates of a ray, v down; fx and fy are the first two parameters."""
-    fx, fy = p[0], p[1]
-    return -fx * r / q, fy * s / q
-
-
-def ray_px(p: Parameters, xi: Scalar, yi: Scalar) -> Triple:
-    """The ray of ideal pixel coordinates, v down."""
-    fx, fy = p[0], p[1]
-    X, Y = xi / fx, yi / fy
-    length = jnp.sqrt(X * X + Y * Y + 1)
-    return X / length, -Y / length, -1 / length
+    return ideal, ray

@@ -10,9 +10,8 @@ Source: Snavely, Seitz and Szeliski (2006), Photo Tourism; Agarwal et al. (2010)
 in the Large.
 """
 
-from . import perspective
-from .inverse import implicit_inverse
-from .model import CameraModel, Pair, Parameters, Scalar
+from .model import CameraModel
+from .scalars import Pair, Parameters, Scalar
 
 
 def distort(p: Parameters, xi: Scalar, yi: Scalar) -> Pair:
@@ -24,14 +23,6 @@ def distort(p: Parameters, xi: Scalar, yi: Scalar) -> Pair:
 
 
 SNAVELY = CameraModel(
-    name="snavely",
-    parameters=("f", "k1", "k2"),
-    unit="px",
-    axes="up",
-    own_formula="from_ideal",
-    ideal=perspective.ideal,
-    ray=perspective.ray,
-    to_ideal=implicit_inverse(distort, start=lambda p, X, Y: (X, Y), iterations=8),
-    from_ideal=distort,
-    principal_distance=("f",),
-)
+    "snavely", ("f", "k1", "k2"), distort=distort, unit="px", axes="up",
+    start=lambda p, X, Y: (X, Y), iterations=8,
+)  # fmt: skip

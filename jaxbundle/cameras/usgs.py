@@ -15,9 +15,9 @@ Source: Light (1992), The new camera calibration system at the U.S. Geological S
 the figures of a Report of Calibration of 16 June 2005 follow.
 """
 
-from . import brown, perspective
-from .inverse import implicit_inverse
-from .model import CameraModel, Pair, Parameters, Scalar
+from . import brown
+from .model import CameraModel
+from .scalars import Pair, Parameters, Scalar
 
 
 def polynomial(p: Parameters, x: Scalar, y: Scalar) -> Pair:
@@ -39,13 +39,9 @@ def correct(p: Parameters, x: Scalar, y: Scalar) -> Pair:
 
 
 USGS = CameraModel(
-    name="usgs",
-    parameters=("c", "x0", "y0", "K0", "K1", "K2", "K3", "K4", "P1", "P2", "P3", "P4"),
-    unit="mm",
-    axes="up",
-    own_formula="to_ideal",
-    ideal=perspective.ideal,
-    ray=perspective.ray,
-    to_ideal=correct,
-    from_ideal=implicit_inverse(correct, start=brown.unreduce),
+    "usgs",
+    ("c", "x0", "y0", "K0", "K1", "K2", "K3", "K4", "P1", "P2", "P3", "P4"),
+    correct=correct,
+    start=brown.unreduce,
+    free=("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2"),
 )

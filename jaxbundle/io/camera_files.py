@@ -11,6 +11,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from jaxbundle.cameras import CameraModel
 from jaxbundle.errors import InputError
 from jaxbundle.io.colmap import read_colmap_cameras
 from jaxbundle.io.column_map import is_column_map
@@ -37,8 +38,8 @@ def is_camera_file(path: Path) -> bool:
                                "project" not in read_toml(path))  # fmt: skip
 
 
-def read_cameras(path: str | Path) -> tuple[Camera, ...]:
-    """The cameras of a camera file or a project file.
+def read_cameras(path: str | Path, models: Sequence[CameraModel] = ()) -> tuple[Camera, ...]:
+    """The cameras of a camera file or a project file; `models`: own ones a .toml may name.
 
     **Raises:** `InputError`.
     """
@@ -54,7 +55,7 @@ def read_cameras(path: str | Path) -> tuple[Camera, ...]:
         cameras = read_toml(path).get("camera", [])
         if not isinstance(cameras, list) or not all(isinstance(c, dict) for c in cameras):
             raise InputError(f"{path}: write [[camera]] in double brackets, one for each camera")
-        return make_cameras(cameras, f"{path}, ")
+        return make_cameras(cameras, f"{path}, ", models)
     return (read_opencv(path),)
 
 

@@ -183,7 +183,7 @@ def to_colmap(camera: Camera) -> tuple[str, list[float]]:
                   if ours == camera.model]  # fmt: skip
     if not candidates:
         raise InputError(
-            f"{where}: COLMAP has no model {camera.model!r}; convert it with --model opencv"
+            f"{where}: COLMAP has no model {str(camera.model)!r}; convert it with --model opencv"
         )
     if camera.image_size is None:
         raise InputError(f"{where}: COLMAP needs the image size; give image_size")

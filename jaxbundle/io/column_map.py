@@ -47,6 +47,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxbundle import geometry
+from jaxbundle.cameras import CameraModel
 from jaxbundle.errors import InputError
 from jaxbundle.file_content import read_content
 from jaxbundle.io.csv_tables import read_toml
@@ -79,8 +80,10 @@ def is_column_map(path: Path) -> bool:
     return re.search(rb"^\s*\[\s*table\s*\.", read_content(path), re.M) is not None
 
 
-def read_column_map(path: str | Path, overrides: Sequence[str] = ()) -> Network:
-    """The network of the tables a map names.
+def read_column_map(
+    path: str | Path, overrides: Sequence[str] = (), models: Sequence[CameraModel] = ()
+) -> Network:
+    """The network of the tables a map names; `models`: own camera models it may name.
 
     **Raises:** `InputError` naming file, line and column.
     """
@@ -117,7 +120,7 @@ def read_column_map(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             rows = ["tie"] * len(columns)
             columns = Columns({**columns.values, "role": rows}, columns.source)
         tables[name] = columns
-    return network_of(settings, tables, str(path))
+    return network_of(settings, tables, str(path), models)
 
 
 def _read(folder: Path, where: str, entry: Mapping) -> Columns:

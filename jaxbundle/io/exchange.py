@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxbundle.arguments import path as given_path
-from jaxbundle.cameras import Conversion
+from jaxbundle.cameras import CameraModel, Conversion, key_of
 from jaxbundle.errors import InputError
 from jaxbundle.io.bundler import LIST
 from jaxbundle.io.camera_files import (
@@ -22,7 +22,7 @@ from jaxbundle.io.camera_files import (
 from jaxbundle.io.colmap import write_colmap_cameras
 from jaxbundle.io.coordinates import images_path
 from jaxbundle.io.folders import check_folder, replaced_folder
-from jaxbundle.io.formats import PIXEL_MODELS, TARGETS, read_network
+from jaxbundle.io.formats import PIXEL_MODELS, TARGETS, check_own_models, read_network
 from jaxbundle.io.nearest_camera import fits_told
 from jaxbundle.io.opencv_file import SUFFIXES, write_opencv
 from jaxbundle.io.project import FILE_NAME
@@ -64,7 +64,7 @@ def convert(
     input: str | Path,
     output: str | Path,
     to: str | None = None,
-    model: str | None = None,
+    model: str | CameraModel | None = None,
     camera: str | None = None,
     format: str | None = None,
     overrides: Sequence[str] = (),
@@ -73,6 +73,7 @@ def convert(
     pixel_size: Sequence[float] | None = None,
     force: bool = False,
     control: str | Path | None = None,
+    models: Sequence[CameraModel] = (),
 ) -> Converted:
     """Write an input in another format.
 
@@ -80,10 +81,10 @@ def convert(
 
     - `to`: kind of output, a name of `TARGETS` or `CAMERA_KINDS`; recognised from the name of
       the output if not given.
-    - `model`: camera model to convert to. Without it cameras are converted only where the output
-      has not their model and the conversion is exact.
+    - `model`: camera model to convert to, by name or a `CameraModel`. Without it cameras are
+      converted only where the output has not their model and the conversion is exact.
     - `camera`: which camera, where the output holds one.
-    - `format`, `overrides`, `control`: of the input, as in `read_network`.
+    - `format`, `overrides`, `control`, `models`: of the input, as in `read_network`.
     - `measured`: what is fitted is fitted over the area of the measurements, not the whole image.
     - `image_size` (pixels), `pixel_size` (mm): of all cameras that have none.
     - `force`: files that are there, the output and those written beside it, are replaced. Without
@@ -94,15 +95,16 @@ def convert(
     input, output = Path(given_path("input", input)), Path(given_path("output", output))
     kind = _kind(output, to)
     _check_output(output, kind)
+    model, models = key_of(model), check_own_models(models)
     if format in (None, *CAMERA_KINDS) and is_camera_file(input):
         _keep_camera_file(input, output)
         _keep_others(output, kind, force)
-        cameras = _sized(read_cameras(input), image_size, pixel_size)
+        cameras = _sized(read_cameras(input, models), image_size, pixel_size)
         made = _convert_cameras(input, cameras, output, kind, model, camera)
         return dataclasses.replace(
             made, warnings=(*fits_told(cameras), *outside_warnings(cameras))
         )
-    network = read_network(input, format, overrides, control)
+    network = read_network(input, format, overrides, control, models)
     network = network.replace(cameras=_sized(network.cameras, image_size, pixel_size))
     network = network.warn(*outside_warnings(network.cameras, network))
     _keep_input(input, network, output, kind, control)
@@ -215,7 +217,9 @@ def _keep_others(output: Path, kind: str, force: bool) -> None:
         )
 
 
-def _with_model(network: Network, kind: str, model: str | None, measured: bool):
+def _with_model(
+    network: Network, kind: str, model: str | CameraModel | None, measured: bool
+):
     """The network with cameras the output has, and by camera what that cost."""
     models = TARGETS[kind].models
     if model is not None:
@@ -235,15 +239,15 @@ def _refuse_inexact(cameras: Sequence[Camera], id: str, kind: str, cost: Convers
     if not cost.exact:
         model = next(camera.model for camera in cameras if camera.id == id)
         raise InputError(
-            f"camera {id!r}: {kind} has no model {model!r}, and {cost.model} is not the same: "
+            f"camera {id!r}: {kind} has no model {str(model)!r}, and {cost.model} is not the same: "
             f"{cost.reason}; fitted over the image the largest difference is {cost.largest:.3g} "
             f"{cost.unit}; give --model {cost.model} to accept that"
         )
 
 
 def _convert_cameras(
-    input: Path, cameras: Sequence[Camera], output: Path, kind: str, model: str | None,
-    id: str | None,
+    input: Path, cameras: Sequence[Camera], output: Path, kind: str,
+    model: str | CameraModel | None, id: str | None,
 ) -> Converted:  # fmt: skip
     if kind not in CAMERA_KINDS:
         raise InputError(

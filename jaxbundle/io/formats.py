@@ -8,6 +8,7 @@ from pathlib import Path
 
 from jaxbundle.arguments import path as given_path
 from jaxbundle.arguments import shown
+from jaxbundle.cameras import CameraModel
 from jaxbundle.errors import InputError
 from jaxbundle.file_content import is_plain
 from jaxbundle.io.bal import OPENERS, is_bal, read_bal, write_bal
@@ -27,7 +28,8 @@ from jaxbundle.io.ply import write_ply
 from jaxbundle.io.project import FILE_NAME, fill_project, project_file, read_project
 from jaxbundle.io.project import FILES as PROJECT_FILES
 from jaxbundle.network.columns import count, did_you_mean, some
-from jaxbundle.network.tables import Network
+from jaxbundle.network.rules import check_unique, model_of
+from jaxbundle.network.tables import Network, Source
 
 FIRST_LINES = 100_000
 """Characters of a file that tell what it is."""
@@ -36,12 +38,14 @@ FIRST_LINES = 100_000
 @dataclasses.dataclass(frozen=True)
 class Format:
     """A kind of input: how it is recognised, how it is read, and what it looks like in words;
-    `adjusted` where its control points have adjusted coordinates and a posteriori σ."""
+    `adjusted` where its control points have adjusted coordinates and a posteriori σ; `names_models`
+    where cameras name their models, and `read` takes own ones."""
 
     recognises: Callable[[Path], bool]
-    read: Callable[[Path, Sequence[str]], Network]
+    read: Callable[..., Network]
     looks: str
     adjusted: bool = False
+    names_models: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,12 +83,16 @@ def _is_photo_list(path: Path) -> bool:
 
 
 FORMATS: dict[str, Format] = {
-    "project": Format(_is_project, read_project, "a .toml file, or a folder with project.toml"),
+    "project": Format(
+        _is_project, read_project, "a .toml file, or a folder with project.toml", names_models=True
+    ),
     "photo-list": Format(
         _is_photo_list, read_photo_list, "a .txt file whose first line is the focal length"
     ),
     "bal": Format(is_bal, read_bal, "a text file (.gz, .bz2) whose first line is three numbers"),
-    "column-map": Format(is_column_map, read_column_map, "a .toml file with [table.…] sections"),
+    "column-map": Format(
+        is_column_map, read_column_map, "a .toml file with [table.…] sections", names_models=True
+    ),
     "colmap": Format(is_colmap, read_colmap, "a folder with cameras.bin or cameras.txt"),
     "bingo": Format(is_bingo, read_bingo, "a folder with image.dat and geoin.dat"),
     "metashape": Format(is_metashape, read_metashape, "an .xml file of Metashape's cameras"),
@@ -147,6 +155,7 @@ def read_network(
     format: str | None = None,
     overrides: Sequence[str] = (),
     control: str | Path | None = None,
+    models: Sequence[CameraModel] = (),
 ) -> Network:
     """The network of an input in any known format.
 
@@ -156,6 +165,7 @@ def read_network(
     - `format`: a name in `FORMATS`; recognised from the path and its content if not given.
     - `overrides`: settings `KEY=VALUE` that replace those of the input.
     - `control`: a table whose control points replace those of the input (`jaxbundle.io.control`).
+    - `models`: `CameraModel`s of one's own that a project, or a column map, may name.
 
     **Raises:** `InputError`.
     """
@@ -185,11 +195,22 @@ def read_network(
         known = "; ".join(f"{name}: {kind.looks}" for name, kind in FORMATS.items())
         raise InputError(f"{path}: the kind of input is not recognised; known formats: {known}")
     given = None if control is None else read_control(control)
-    network = FORMATS[format].read(path, overrides)
+    own = (check_own_models(models),) if FORMATS[format].names_models else ()
+    network = FORMATS[format].read(path, overrides, *own)
     if given is not None:
         datum = any(text.partition("=")[0].strip() == "datum" for text in overrides)
         return with_control(network, given, datum=not datum)
     return network.warn(*_of_adjusted_control(network)) if FORMATS[format].adjusted else network
+
+
+def check_own_models(models: Sequence[CameraModel]) -> tuple[CameraModel, ...]:
+    """Own models that a file may name, each of them once.
+
+    **Raises:** `InputError`."""
+    if not (isinstance(models, list | tuple) and all(isinstance(m, CameraModel) for m in models)):
+        raise InputError(f"models must be a list of CameraModels, but is {shown(models)}")
+    check_unique([model_of(m).name for m in models], Source("models", None, "number"), "model")
+    return tuple(models)
 
 
 def _of_adjusted_control(network: Network):

@@ -14,8 +14,8 @@ def need_values(network: Network, model: str = "", format: str = "", points: boo
     for camera in network.cameras:
         if model and camera.model != model:
             raise InputError(
-                f"camera {camera.id!r}: {format} has no model {camera.model!r}; convert it with "
-                f"--model {model}"
+                f"camera {camera.id!r}: {format} has no model {str(camera.model)!r}; convert it "
+                f"with --model {model}"
             )
     tables = [(network.images, network.images.position, "image", "orientation"),
               (network.images, network.images.angles, "image", "orientation")]  # fmt: skip

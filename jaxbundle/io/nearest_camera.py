@@ -19,8 +19,8 @@ from jaxtyping import Array, Float
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.convert import MEASURABLE
 from jaxbundle.cameras.convert_fit import (
-    FITTED,
     fit_parameters,
+    fitted,
     image_grid,
     images_of,
     start_values,
@@ -40,12 +40,13 @@ ON_THE_POINT = 1e-7
 """Pixels by which a ray may miss its point."""
 ROUNDS, LONGEST = 60, 0.2
 """Newton's method for rays: rounds, and radians of its steps."""
-RATIONAL = (*FITTED["opencv"], "k4", "k5", "k6")
-PRISM = (*FITTED["opencv"], "s1", "s2", "s3", "s4")
-PERSPECTIVE = (("opencv", FITTED["opencv"]), ("opencv", RATIONAL), ("opencv", PRISM),
+OPENCV = fitted(get_model("opencv"))
+RATIONAL = (*OPENCV, "k4", "k5", "k6")
+PRISM = (*OPENCV, "s1", "s2", "s3", "s4")
+PERSPECTIVE = (("opencv", OPENCV), ("opencv", RATIONAL), ("opencv", PRISM),
                ("opencv", (*RATIONAL, *PRISM[-4:])),
-               ("brown-projected", FITTED["brown-projected"]))  # fmt: skip
-FISHEYE = (("kannala-brandt", FITTED["kannala-brandt"]),)
+               ("brown-projected", fitted(get_model("brown-projected"))))  # fmt: skip
+FISHEYE = (("kannala-brandt", fitted(get_model("kannala-brandt"))),)
 NARROW = np.cos(np.radians(75))
 """Rays within this angle of the axis may have a perspective model."""
 

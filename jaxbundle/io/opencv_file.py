@@ -150,7 +150,7 @@ def opencv_text(camera: Camera, as_json: bool = False) -> str:
     """
     if camera.model not in ("opencv", "kannala-brandt"):
         raise InputError(
-            f"camera {camera.id!r}: OpenCV has no model {camera.model!r}; convert it with "
+            f"camera {camera.id!r}: OpenCV has no model {str(camera.model)!r}; convert it with "
             "--model opencv"
         )
     p = all_parameters(camera)

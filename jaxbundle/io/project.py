@@ -37,6 +37,7 @@ from types import MappingProxyType
 import numpy as np
 
 from jaxbundle.arguments import path as given_path
+from jaxbundle.cameras import CameraModel, is_own
 from jaxbundle.errors import InputError
 from jaxbundle.file_content import check_plain
 from jaxbundle.io.csv_tables import read_csv, read_toml, write_csv, write_text
@@ -65,11 +66,13 @@ INLINE = {table: table.removesuffix("s") for table in TABLES}
 """The tables and the name of one of their rows in the TOML file."""
 
 
-def read_project(path: str | Path, overrides: Sequence[str] = ()) -> Network:
+def read_project(
+    path: str | Path, overrides: Sequence[str] = (), models: Sequence[CameraModel] = ()
+) -> Network:
     """The network of a project file, or of the one in a folder (`project_file`).
 
     `overrides` are settings `KEY=VALUE` that replace those of the file, see
-    `jaxbundle.io.settings`.
+    `jaxbundle.io.settings`; `models` own camera models that the file may name.
 
     **Raises:** `InputError` naming file, line and column.
     """
@@ -77,7 +80,8 @@ def read_project(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     document = apply_overrides(_read_document(path), overrides, (*SETTINGS, *TABLES))
     document["project"].setdefault("name", path.resolve().parent.name)
     tables = {table: _read_table(document, table, path) for table in TABLES}
-    return network_of(document, {k: v for k, v in tables.items() if v is not None}, str(path))
+    return network_of(document, {k: v for k, v in tables.items() if v is not None}, str(path),
+                      models)  # fmt: skip
 
 
 def project_file(path: Path) -> Path:
@@ -209,12 +213,21 @@ def _document_text(network: Network) -> str:
 
 def cameras_text(cameras: Sequence[Camera]) -> str:
     """Cameras as the `[[camera]]` entries of a TOML file."""
-    entries = (["[[camera]]", *assignments(_camera_entry(camera)), ""] for camera in cameras)
+    entries = ([*_of_own(camera), "[[camera]]", *assignments(_camera_entry(camera)), ""]
+               for camera in cameras)  # fmt: skip
     return "\n".join(line for entry in entries for line in entry)
 
 
+def _of_own(camera: Camera) -> Sequence[str]:
+    """A remark on a model that a file can only name."""
+    if not is_own(camera.model):
+        return ()
+    return (f"# {str(camera.model)!r} is a model of the user's own: give the object to "
+            "jaxbundle.read_network(path, models=[…])",)  # fmt: skip
+
+
 def _camera_entry(camera: Camera) -> dict:
-    entry = {"id": camera.id, "model": camera.model}
+    entry = {"id": camera.id, "model": str(camera.model)}
     for name in ("image_size", "pixel_size"):
         if getattr(camera, name) is not None:
             entry[name] = getattr(camera, name)

@@ -8,6 +8,7 @@ import copy
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from jaxbundle.cameras import CameraModel
 from jaxbundle.errors import InputError
 from jaxbundle.network.build import CAMERA_FIELDS, make_cameras, make_network
 from jaxbundle.network.columns import Columns, did_you_mean, shown, some
@@ -106,13 +107,17 @@ def _number(key: str, text: str) -> float:
         raise InputError(f"--set {key}={text}: {text!r} is not a number") from None
 
 
-def network_of(document: Document, tables: Mapping[str, Columns], where: str) -> Network:
-    """The network of a document and its tables; `where` is the file, for messages."""
+def network_of(
+    document: Document, tables: Mapping[str, Columns], where: str,
+    models: Sequence[CameraModel] = (),
+) -> Network:  # fmt: skip
+    """The network of a document and its tables; `where` is the file, for messages; `models`: own
+    camera models it may name."""
     project = document["project"]
     check_settings(project, f"{where}, [project]: ")
     settings = {key: project[key] for key in SETTINGS if key in project}
     settings.setdefault("sigma_image", None)
-    cameras = make_cameras(document["camera"], f"{where}, ")
+    cameras = make_cameras(document["camera"], f"{where}, ", models)
     return make_network(cameras, **tables, **settings)
 
 

@@ -22,7 +22,14 @@ from jaxtyping import Array, Float
 
 from jaxbundle.leastsquares.normal import Tangent
 from jaxbundle.leastsquares.plan import Plan
-from jaxbundle.leastsquares.reduced import Groups, Reduced, blocks_of, cholesky, flat, split
+from jaxbundle.leastsquares.reduced import (
+    Groups,
+    Reduced,
+    blocks_of,
+    cholesky_of_lower,
+    flat,
+    split,
+)
 
 
 class BandFactor(eqx.Module):
@@ -119,7 +126,7 @@ def factorise_band(plan: Plan, S: Reduced) -> BandFactor:
     def step(carry, block):
         C, X = carry
         D, E, B = block
-        L = cholesky(D - C @ C.T)
+        L = cholesky_of_lower(D - C @ C.T)
         X = solve_triangular(L, B - C @ X, lower=True)
         C = solve_triangular(L, E.T, lower=True).T
         return (C, X), (L, C, X)
@@ -127,7 +134,7 @@ def factorise_band(plan: Plan, S: Reduced) -> BandFactor:
     start = jnp.zeros((m, m)), jnp.zeros((m, border.shape[2]))
     _, (L, C, X) = jax.lax.scan(step, start, (D, matrices(E), border))
     corner = S.matrix(plan, others) - jnp.einsum("bmi,bmj->ij", X, X)
-    return BandFactor(plan, L, C, X, cholesky(corner))
+    return BandFactor(plan, L, C, X, cholesky_of_lower(corner))
 
 
 def _groups(plan: Plan) -> tuple[str, Groups]:

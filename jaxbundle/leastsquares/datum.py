@@ -202,10 +202,12 @@ _generators = eqx.filter_jit(generators)
 
 def _choose_pins(plan: Plan, G) -> dict[str, np.ndarray]:
     """As many kept unknowns as there are defects, chosen well spread; every kind of direction
-    counts by its own size."""
+    counts by its own size, unless that is rounding."""
     rows, shapes = [], []
+    size = {name: np.sqrt((G[name] ** 2).mean((0, 2), keepdims=True)) for name in plan.kept}
+    least = max(1e-300, OPEN * max(x.max(initial=0) for x in size.values()))
     for name in plan.kept:
-        sized = G[name] / np.maximum(np.sqrt((G[name] ** 2).mean((0, 2), keepdims=True)), 1e-300)
+        sized = G[name] / np.maximum(size[name], least)
         rows.append(sized.reshape(-1, sized.shape[2]))
         shapes.append(G[name].shape[:2])
     whole = np.concatenate(rows)
@@ -239,6 +241,15 @@ def s_transform(declared: Declared, plan: Plan, values: Values, change: Tangent)
     gram = contract(plan, B, G)
     along = jnp.linalg.solve(gram, contract(plan, B, change))
     return {name: d - G[name] @ along for name, d in change.items()}
+
+
+def s_transform_transposed(declared: Declared, plan: Plan, values: Values, row: Tangent) -> Tangent:
+    """Sᵀ·f: f − B(GᵀB)⁻¹Gᵀf, nothing of which is along the open motions."""
+    if plan.datum is None:
+        return row
+    G, B = datum_directions(declared, plan, values)
+    along = jnp.linalg.solve(contract(plan, G, B), contract(plan, G, row))
+    return {name: f - B[name] @ along for name, f in row.items()}
 
 
 def datum_directions(declared: Declared, plan: Plan, values: Values) -> tuple[Tangent, Tangent]:
@@ -310,12 +321,17 @@ def attach_motion(declared: Declared, plan: Plan, values: Values, start: Values)
     start from that can be differentiated to every order."""
     if plan.datum is None:
         return values
-    tau, fixed = jnp.zeros(plan.datum.gauge.shape[1]), (declared, plan)
+    still, fixed = jnp.zeros(plan.datum.gauge.shape[1]), (declared, plan)
+
+    def along(tau, of, values):
+        return _moved(declared, plan, leave_held(declared, plan, of).datum.gauge @ tau, values)
+
+    # What is missing first, so that derivatives are taken where nothing moves.
     known = jax.lax.stop_gradient((values, start))
-    slope = jax.jacfwd(_missing)(tau, fixed, known)
-    tau = tau - jnp.linalg.solve(slope, _missing(tau, fixed, known))
-    tau = implicit_root(_missing, solve_dense, tau, fixed, (values, start))
-    return _moved(declared, plan, leave_held(declared, plan, values).datum.gauge @ tau, values)
+    slope = jax.jacfwd(_missing)(still, fixed, known)
+    values = along(-jnp.linalg.solve(slope, _missing(still, fixed, known)), known[0], values)
+    tau = implicit_root(_missing, solve_dense, still, fixed, (values, start))
+    return along(tau, values, values)
 
 
 def _moved(declared, plan, motion, values):

@@ -202,7 +202,11 @@ def _lower_times(L, at, W):
     return jnp.stack([row(i) for i in range(w)], -2)
 
 
+@jax.jit
 def _row_major(x):
     """Blocks in row-major order. Left alone, XLA lays a shared array out to suit one of its readers
-    (the product by chunks), and the gathers of the pairs take three times as long."""
+    (the product by chunks), and the gathers of the pairs take three times as long.
+
+    In a function of its own: where a compiled function returns what it constrains, JAX (0.10) lets
+    XLA lay out the other results as it likes, but reads them in the usual order."""
     return with_layout_constraint(x, Layout(major_to_minor=tuple(range(x.ndim))))

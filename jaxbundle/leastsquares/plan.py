@@ -269,7 +269,8 @@ class _Planner:
             rows = np.flatnonzero(~stays) if stays.any() else None
             self.members[name] = [(name, 0, rows)]
             self.row_in = place(~stays)
-        self.kept = [g for g in self.members if g != name]
+        # In the order in which JAX has them, too, wherever the plan goes.
+        self.kept = sorted(g for g in self.members if g != name)
 
     def _meet_always(self, group, name):
         """Whether the rows of a table occur in just the observations of eliminated rows in which

@@ -279,9 +279,9 @@ def given_data(problem: Problem, data: Data | None) -> Data:
 def make_solver(problem: Problem, *, atol=1e-5, rtol=0.0, **options) -> LeastSquares:
     """The solver of a problem; `options` are those of `LeastSquares`."""
     squares = sum(
-        float(((np.asarray(w) * np.asarray(m)) ** 2).sum())
+        float(((np.asarray(_diagonal(w)) * np.asarray(m).reshape(w.shape[:2])) ** 2).sum())
         for w, m in zip(problem.data.weight, problem.data.measured)
-        if hasattr(m, "shape") and np.shape(m) == np.shape(w)
+        if hasattr(m, "shape") and m.size == w.shape[0] * w.shape[1]
     )
     to_device = lambda x: jax.device_put(np.float64(x))
     tolerance = Tolerance(to_device(problem.counts.redundancy), to_device(squares), atol, rtol)

@@ -80,16 +80,16 @@ class DenseFactor(eqx.Module):
 
 def factorise_dense(plan: Plan, S: Reduced) -> DenseFactor:
     """The factor of S; NaN where it is not positive definite."""
-    return DenseFactor(plan, cholesky(S.matrix(plan, plan.kept)))
+    return DenseFactor(plan, cholesky_of_lower(S.matrix(plan, plan.kept)))
 
 
 @jax.custom_jvp
-def cholesky(S: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
+def cholesky_of_lower(S: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
     """L of S = L·Lᵀ from the lower triangle of S; NaN where it is not positive definite."""
     return jnp.linalg.cholesky(S, symmetrize_input=False)
 
 
-@cholesky.defjvp
+@cholesky_of_lower.defjvp
 def _(primals, tangents):
     # JAX's own rule takes a change for the whole of it.
     whole = lambda S: jnp.tril(S) + jnp.tril(S, -1).mT

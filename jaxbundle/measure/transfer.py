@@ -40,7 +40,7 @@ def ground_point(view: View, xy: Float[Array, "2"], Z: float) -> Float[Array, "3
 def image_point(view: View, X: Float[Array, "3"]) -> Float[Array, "2"]:
     """The image of an object point; NaN behind a perspective camera."""
     r, s, q = to_camera(view.pose, X)
-    behind = (q >= 0) & (view.model.name != "kannala-brandt")
+    behind = (q >= 0) & (not view.model.wide)
     xy = jnp.stack(project(view.model, tuple(view.parameters), r, s, q))
     return jnp.where(behind, jnp.nan, xy)
 

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from jaxbundle.arguments import text
-from jaxbundle.cameras import MODEL_NAMES, get_model
+from jaxbundle.cameras import MODEL_NAMES, CameraModel
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import (
     NO_NUMBERS,
@@ -37,8 +37,10 @@ from jaxbundle.network.rules import (
     CHOICES,
     check_camera,
     check_choice,
+    check_models,
     check_sigma_image,
     check_unique,
+    model_of,
 )
 from jaxbundle.network.tables import (
     EXTERIOR,
@@ -139,8 +141,13 @@ def make_network(
     return network
 
 
-def make_cameras(cameras: Any, where: str = "") -> tuple[Camera, ...]:
-    """Checked cameras from `Camera`s, dict rows, or a table; `where` begins every message."""
+def make_cameras(
+    cameras: Any, where: str = "", models: Sequence[CameraModel] = ()
+) -> tuple[Camera, ...]:
+    """Checked cameras from `Camera`s, dict rows, or a table; `where` begins every message.
+
+    `models`: own models that the rows may name.
+    """
     if isinstance(cameras, Camera):
         cameras = [cameras]
     elif isinstance(cameras, Mapping) and isinstance(cameras.get("id"), str | int):
@@ -155,7 +162,7 @@ def make_cameras(cameras: Any, where: str = "") -> tuple[Camera, ...]:
             f"{shown(cameras)}"
         )
     made = tuple(
-        camera if isinstance(camera, Camera) else _camera(camera, number, where)
+        camera if isinstance(camera, Camera) else _camera(camera, number, where, models)
         for number, camera in enumerate(cameras, 1)
     )
     if not made:
@@ -163,18 +170,20 @@ def make_cameras(cameras: Any, where: str = "") -> tuple[Camera, ...]:
     check_unique([camera.id for camera in made], Source(f"{where}cameras"), "camera")
     for camera in made:
         check_camera(camera, where)
+    check_models(made, where)
     return made
 
 
-def _camera(row: Mapping[str, Any], number: int, where: str) -> Camera:
+def _camera(row: Mapping[str, Any], number: int, where: str, models) -> Camera:
     id = str(row.get("id", "")).strip() if isinstance(row, Mapping) else ""
     if not id:
         raise InputError(f"{where}camera {number}: id is missing")
     model = row.get("model", "brown")
+    model = next((own for own in models if own.name == model), model)
     where = f"{where}camera {id!r}: "
     parameters = {key: value for key, value in row.items() if key not in CAMERA_FIELDS}
-    if model in MODEL_NAMES:
-        known = get_model(model).parameters
+    if isinstance(model, CameraModel) or model in MODEL_NAMES:
+        known = model_of(model, where).parameters
         for key in parameters:
             if key not in known:
                 raise InputError(

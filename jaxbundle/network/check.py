@@ -12,7 +12,14 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import count, did_you_mean, some
 from jaxbundle.network.repetitions import warn_of_repetitions
-from jaxbundle.network.rules import AXES, CHOICES, check_camera, check_choice, check_unique
+from jaxbundle.network.rules import (
+    AXES,
+    CHOICES,
+    check_camera,
+    check_choice,
+    check_models,
+    check_unique,
+)
 from jaxbundle.network.sightings import (
     check_images,
     check_parts,
@@ -123,6 +130,7 @@ def _check_cameras(network: Network) -> Network:
     check_unique([camera.id for camera in network.cameras], Source("cameras"), "camera")
     for camera in network.cameras:
         check_camera(camera)
+    check_models(network.cameras)
     used, index = np.unique(network.images.camera, return_inverse=True)
     if len(used) == len(network.cameras):
         return network

@@ -12,10 +12,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from jaxbundle.cameras import MODEL_NAMES, Conversion, convert_camera, get_model
+from jaxbundle.cameras import CameraModel, Conversion, convert_camera, get_model, is_own, key_of
 from jaxbundle.cameras.frames import between_frames
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import did_you_mean
+from jaxbundle.network.rules import model_of
 from jaxbundle.network.tables import Camera, Network, Observations
 
 SIZES = ("image_size", "pixel_size")
@@ -27,10 +27,10 @@ COUNTERPARTS = (
 
 
 def convert_cameras(
-    network: Network, model: str, r0: float = 0.0, only: Sequence[str] | None = None,
+    network: Network, model: str | CameraModel, r0: float = 0.0, only: Sequence[str] | None = None,
     measured: bool = False,
 ) -> tuple[Network, dict[str, Conversion]]:  # fmt: skip
-    """The network with all cameras, or `only` some, in the model of this name.
+    """The network with all cameras, or `only` some, in the model of this name, or an own one.
 
     **Arguments:** `r0` of the target, mm, where it has one; `measured`: a fit looks at the area the
     measurements cover, as it does where the camera has no image size, and not at the whole image.
@@ -39,8 +39,7 @@ def convert_cameras(
 
     **Raises:** `InputError` where a size is missing, or nothing can be fitted.
     """
-    if model not in MODEL_NAMES:
-        raise InputError(f"unknown camera model {model!r}{did_you_mean(model, MODEL_NAMES)}")
+    model = key_of(model_of(model))
     rays = network.observations
     xy, sigma = rays.xy.copy(), rays.sigma.copy()
     of_ray = network.images.camera[rays.image]
@@ -69,15 +68,17 @@ def convert_cameras(
     return converted, done
 
 
-def convert_one(camera: Camera, model: str, r0: float = 0.0) -> tuple[Camera, Conversion]:
-    """A camera in the model of this name, and what the conversion cost."""
+def convert_one(
+    camera: Camera, model: str | CameraModel, r0: float = 0.0
+) -> tuple[Camera, Conversion]:
+    """A camera in the model of this name, or an own one, and what the conversion cost."""
     made, conversion, _, _ = _converted(camera, model, r0, np.zeros((0, 2)))
     return made, conversion
 
 
-def _converted(camera: Camera, model: str, r0: float, xy, measured: bool = False):
+def _converted(camera: Camera, model: str | CameraModel, r0: float, xy, measured: bool = False):
     """The camera, the conversion, and shift and step of its image points."""
-    source, target = get_model(camera.model), get_model(model)
+    source, target = get_model(camera.model), model_of(model)
     sizes = camera.image_size, camera.pixel_size
     parameters, centre = dict(camera.parameters), np.zeros(2)
     if model == "snavely" and camera.model != "bingo":
@@ -96,7 +97,7 @@ def _converted(camera: Camera, model: str, r0: float, xy, measured: bool = False
         raise InputError(f"camera {camera.id!r}: {error}{remedy}") from None
     made = dataclasses.replace(
         camera, model=model, parameters=conversion.parameters, sigma={},
-        free=_counterparts(camera.free, target.parameters),
+        free=_counterparts(camera.free, source, target),
     )  # fmt: skip
     return made, conversion, shift - step * centre, step
 
@@ -104,15 +105,23 @@ def _converted(camera: Camera, model: str, r0: float, xy, measured: bool = False
 def _centred(camera: Camera):
     """The camera with its principal point at the image centre, and how far it was from there."""
     model, parameters = get_model(camera.model), dict(camera.parameters)
-    names = ("cx", "cy") if model.axes == "down" else ("x0", "y0")
-    size = camera.image_size or (1, 1)
+    names, size = model.principal_point, camera.image_size or (1, 1)
+    if not names:
+        return parameters, np.zeros(2), (size, camera.pixel_size)
     middle = (np.array(size) - 1) / 2 if model.axes == "down" else np.zeros(2)
     centre = np.array([parameters.get(name, 0.0) for name in names]) - middle
     parameters |= dict(zip(names, middle.tolist()))
     return parameters, centre, (size, camera.pixel_size)
 
 
-def _counterparts(free: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
+def _counterparts(free: Sequence[str], source: CameraModel, target: CameraModel):
+    """What is free of the target. Distortion of an own model has no counterparts: of such a model,
+    or from one, all of it is free that is free if nothing is said, or none."""
+    if is_own(source) or is_own(target):
+        fields = "principal_distance", "principal_point"
+        wanted = {n for f in fields if {*getattr(source, f)} & {*free} for n in getattr(target, f)}
+        more = {*free} - {*source.core} and {*target.free} - {*target.core}
+        return tuple(name for name in target.parameters if name in wanted | more)
     groups: Mapping[str, tuple[str, ...]] = {n: group for group in COUNTERPARTS for n in group}
     wanted = {other for name in free for other in groups.get(name, (name,))}
-    return tuple(name for name in names if name in wanted)
+    return tuple(name for name in target.parameters if name in wanted)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbundle.cameras import default_parameters, get_model
+from jaxbundle.cameras import CameraModel, default_parameters, get_model, key_of
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, quaternion_from_matrix
 from jaxbundle.leastsquares import declarations as ls
 from jaxbundle.leastsquares.rows import Data as EngineData
@@ -31,7 +31,7 @@ class CameraTable:
     of the network's cameras they are."""
 
     name: str
-    model: str
+    model: str | CameraModel
     parameters: tuple[str, ...]
     cameras: Int[np.ndarray, " rows"]
 
@@ -200,13 +200,13 @@ def order_cameras(network: Network) -> Network:
 
 def _camera_tables(network: Network) -> tuple[CameraTable, ...]:
     models = [get_model(c.model) for c in network.cameras]
-    by_name = {m.name: m for m in models}
+    different = tuple(dict.fromkeys(models))
     return tuple(
         CameraTable(
-            "camera" if len(by_name) == 1 else f"camera, {name}", name, model.parameters,
-            np.array([c for c, m in enumerate(models) if m.name == name]),
+            "camera" if len(different) == 1 else f"camera, {model.name}", key_of(model),
+            model.parameters, np.array([c for c, m in enumerate(models) if m == model]),
         )
-        for name, model in by_name.items()
+        for model in different
     )  # fmt: skip
 
 

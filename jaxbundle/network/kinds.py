@@ -28,7 +28,7 @@ class ImagePoint:
     """The two residuals of an image point, in the unit of the camera model; of poses, cameras and
     points it takes scalars."""
 
-    model: str
+    model: str | cameras.CameraModel
     domain: str
 
     def __call__(self, pose, interior, point, xy):
@@ -36,11 +36,12 @@ class ImagePoint:
         return cameras.residual(model, self.domain, interior, pose.ray(point), xy)
 
 
-def image_points(model: str, domain: str, camera: str) -> Kind:
+def image_points(model: str | cameras.CameraModel, domain: str, camera: str) -> Kind:
     """Image points of the cameras of one model, whose table is `camera`; `domain`: "corrected" or
     "measured"."""
     of = ("image", camera, "point")
-    name = "image coordinates" if camera == "camera" else f"image coordinates, {model}"
+    only = camera == "camera"
+    name = "image coordinates" if only else f"image coordinates of {cameras.get_model(model).name}"
     return Kind(name, ImagePoint(model, domain), of, ("x", "y"), scalars=True, invariant=True)
 
 

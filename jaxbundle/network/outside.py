@@ -28,10 +28,9 @@ def outside_warnings(cameras: Sequence[Camera], network: Network | None = None) 
     for c, camera in enumerate(cameras):
         model, size = get_model(camera.model), camera.image_size
         origin = "image centre" if model.axes != "down" else "centre of the upper-left pixel"
-        names = ("cx", "cy") if model.axes == "down" else ("x0", "y0")
-        point = np.array([[camera.parameters.get(name, 0.0) for name in names]])
+        point = np.array([[camera.parameters.get(name, 0.0) for name in model.principal_point]])
         where = f"camera {camera.id!r}: "
-        if is_outside(camera, point).any():
+        if point.size and is_outside(camera, point).any():
             found.append(
                 f"{where}the principal point ({point[0, 0]:.6g}, {point[0, 1]:.6g}) {model.unit} "
                 f"is outside the image of {size[0]} × {size[1]} pixels; it counts from the {origin}"

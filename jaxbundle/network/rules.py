@@ -6,7 +6,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxbundle.arguments import one_of
-from jaxbundle.cameras import MODEL_NAMES, check_parameters, default_parameters, get_model
+from jaxbundle.cameras import (
+    MODEL_NAMES,
+    CameraModel,
+    check_own,
+    check_parameters,
+    default_parameters,
+    get_model,
+    is_own,
+)
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import did_you_mean, shown
 from jaxbundle.network.tables import DATUMS, RESIDUAL_DOMAINS, Camera, Source
@@ -40,19 +48,47 @@ def check_unique(ids: Sequence[str], source: Source, thing: str) -> None:
             )
 
 
+def model_of(model: str | CameraModel, where: str = "") -> CameraModel:
+    """The camera model of this name, or the own model that is given.
+
+    **Raises:** `InputError`, for a name of none, or the name of another."""
+    if not isinstance(model, CameraModel) and model not in MODEL_NAMES:
+        known = did_you_mean(model, MODEL_NAMES)
+        raise InputError(
+            f"{where}unknown {'' if where else 'camera '}model {shown(model)}{known}"
+            f"{'' if known.endswith('?') else ';'} one of your own is given as a CameraModel, to a "
+            "file that names it by read_network(path, models=[…])"
+        )
+    try:
+        return get_model(model)
+    except ValueError as error:
+        raise InputError(f"{where}{error}") from None
+
+
+def check_models(cameras: Sequence[Camera], where: str = "") -> None:
+    """Refuse two different models of one name: files and reports could not tell them apart."""
+    first: dict[str, Camera] = {}
+    for camera in cameras:
+        other = first.setdefault(str(camera.model), camera)
+        if other.model != camera.model:
+            raise InputError(
+                f"{where}cameras {other.id!r} and {camera.id!r} have different models of the name "
+                f"{str(camera.model)!r}; give one of them another name, or both the same object"
+            )
+
+
 def check_camera(camera: Camera, where: str = "") -> None:
     """Refuse an unknown model or parameter, and impossible values, σ and sizes.
 
     `where` begins the message: "project.toml, ".
     """
     where = f"{where}camera {camera.id!r}: "
-    if camera.model not in MODEL_NAMES:
-        raise InputError(
-            f"{where}unknown model {camera.model!r}{did_you_mean(camera.model, MODEL_NAMES)}"
-        )
-    model = get_model(camera.model)
+    model = model_of(camera.model, where)
+    values = {**default_parameters(model), **camera.parameters}
     try:
-        check_parameters(model, {**default_parameters(model), **camera.parameters})
+        check_parameters(model, values)
+        if is_own(model):
+            check_own(model, values)
     except ValueError as error:
         raise InputError(f"{where}{error}") from None
     for name in camera.free:

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.arguments import shown
+from jaxbundle.cameras import CameraModel, key_of
 from jaxbundle.errors import InputError
 
 ROLES = ("tie", "control", "fixed", "check")
@@ -53,18 +54,21 @@ class Source:
 class Camera:
     """One camera: a model of `jaxbundle.cameras`, its start values, what is free, its priors.
 
-    `parameters` not given start at 0 (or the model's own default); `sigma` gives a parameter a
-    prior: a pseudo-observation of its start value. `image_size` is (columns, rows), `pixel_size`
-    (width, height) in mm.
+    `model` is the name of a built-in model, or a `CameraModel`, one's own. `parameters` not given
+    start at 0 (or the model's own default); `sigma` gives a parameter a prior: a pseudo-observation
+    of its start value. `image_size` is (columns, rows), `pixel_size` (width, height) in mm.
     """
 
     id: str
-    model: str = "brown"
+    model: str | CameraModel = "brown"
     parameters: Mapping[str, float] = dataclasses.field(default_factory=dict)
     free: tuple[str, ...] = ()
     sigma: Mapping[str, float] = dataclasses.field(default_factory=dict)
     image_size: tuple[int, int] | None = None
     pixel_size: tuple[float, float] | None = None
+
+    def __post_init__(self):
+        object.__setattr__(self, "model", key_of(self.model))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -52,8 +52,7 @@ def _check_field(camera: Camera, xy) -> str:
     model = get_model(camera.model)
     values = [camera.parameters.get(name) for name in model.principal_distance]
     name, c = model.principal_distance[0], min(float(value) for value in values)
-    point = [camera.parameters.get(n, camera.parameters.get(m, 0.0))
-             for n, m in (("x0", "cx"), ("y0", "cy"))]  # fmt: skip
+    point = [camera.parameters.get(n, 0.0) for n in model.principal_point] or [0.0, 0.0]
     usual = float(np.median(np.hypot(*(xy - point).T)))
     size = camera.pixel_size
     if usual > WIDEST * c:

@@ -11,8 +11,10 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from jaxbundle.cameras.perspective import ideal
+from jaxbundle.cameras.perspective import perspective
 from jaxbundle.geometry import matrix_from_rotation_vector
+
+_ideal, _ = perspective((0,), "up")
 
 
 class Pose(eqx.Module):
@@ -29,7 +31,7 @@ def to_camera(pose: Pose, X: Float[Array, "3"]) -> Float[Array, "3"]:
 
 def image_of(pose: Pose, X: Float[Array, "3"]) -> Float[Array, "2"]:
     """(x, y) of a point by the collinearity equations (Kraus, 2007, section 4.1), c = 1."""
-    return jnp.stack(ideal((1.0,), *to_camera(pose, X)))
+    return jnp.stack(_ideal((1.0,), *to_camera(pose, X)))
 
 
 def ray_of(xy: Float[Array, "2"]) -> Float[Array, "3"]:

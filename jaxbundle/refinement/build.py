@@ -216,7 +216,7 @@ def _photographs(points, network, columns, rays, index):
             jnp.asarray(columns.frames[i]), jnp.asarray(network.observations.xy[rows]),
             jnp.asarray(index[point_of[rows]]), jnp.asarray(1 / network.observations.sigma[rows]),
             jnp.asarray(np.r_[network.images.position[i], angles]), jnp.asarray(prior),
-            model.name, network.residuals,
+            camera.model, network.residuals,
         ))  # fmt: skip
     return found
 

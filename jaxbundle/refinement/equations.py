@@ -73,7 +73,7 @@ class FrameRays(eqx.Module):
     weight: Float[Array, "rays 2"]
     prior: Float[Array, "6"]
     prior_weight: Float[Array, "6"]
-    model: str = eqx.field(static=True)
+    model: str | cameras.CameraModel = eqx.field(static=True)
     domain: str = eqx.field(static=True)
 
 

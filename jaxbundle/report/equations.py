@@ -1,4 +1,9 @@
-"""The equations of the camera models, as a protocol prints them."""
+"""The equations of the camera models, as a protocol prints them; of an own model the docstring of
+its formula."""
+
+import inspect
+
+from jaxbundle.cameras import CameraModel
 
 _BROWN = (
     "Δx = x̄·ΣKᵢ·(r²ⁱ − r0²ⁱ) + P1·(r² + 2x̄²) + 2·P2·x̄·ȳ + b1·x̄ + b2·ȳ",
@@ -53,3 +58,11 @@ EQUATIONS: dict[str, tuple[str, ...]] = {
         "f in px, x right, y up from the image centre",
     ),
 }
+
+
+def equations(model: CameraModel) -> tuple[str, ...]:
+    """The lines that state a model's equations."""
+    if model.name in EQUATIONS:
+        return EQUATIONS[model.name]
+    said = (inspect.getdoc(model.formula) or "").splitlines()
+    return tuple(line for line in said if line.strip()) or ("of the user's own",)

@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 
+from jaxbundle.cameras import get_model
 from jaxbundle.leastsquares.distributions import normal_quantile, tau_quantile
 from jaxbundle.network.columns import count
 from jaxbundle.report.head import image_unit, span
@@ -179,7 +180,12 @@ def removals(adjustment) -> list[str]:
     if adjustment.eliminated:
         names = ", ".join(clean(name) for name in adjustment.eliminated)
         lines += heading("Eliminated parameters")
-        lines += paragraph(f"Held at 0 because they were not significant, in this order: {names}.")
+        defaults = {c.id: dict(get_model(c.model).defaults) for c in adjustment.network.cameras}
+        other = any(defaults.get(n.id, {}).get(n.parameter) for n in adjustment.eliminated)
+        lines += paragraph(
+            f"Held at {'their defaults' if other else '0'} because they were not significant, "
+            f"in this order: {names}."
+        )
     return lines
 
 

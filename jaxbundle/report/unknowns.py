@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from jaxbundle.cameras import get_model
+from jaxbundle.cameras import CameraModel, get_model
 from jaxbundle.network.columns import count
 from jaxbundle.network.tables import EXTERIOR
-from jaxbundle.report.equations import EQUATIONS
+from jaxbundle.report.equations import equations
 from jaxbundle.report.head import image_unit
 from jaxbundle.report.layout import (
     bar,
@@ -31,19 +31,24 @@ ROLE_WORDS = {"tie": "tie", "control": "ctrl", "fixed": "fix", "check": "check"}
 
 def cameras(adjustment) -> list[str]:
     """Every camera in full; many cameras as one table a model."""
-    tables = adjustment.cameras
+    tables, models = adjustment.cameras, _models(adjustment)
     lines = []
     if len(tables) > FEW_CAMERAS:
         return [*heading(f"Cameras ({len(tables)})"), *_many_cameras(adjustment)]
     for camera, entry in tables.items():
         lines += heading(f"Camera {clean(camera)}")
-        lines += _one_camera(entry)
+        lines += _one_camera(entry, models[entry["model"]])
         lines += ["", *paragraph(validity(adjustment, camera))]
     return lines
 
 
-def _one_camera(entry) -> list[str]:
-    lines = _equations(entry["model"])
+def _models(adjustment) -> dict[str, CameraModel]:
+    """The camera models by name."""
+    return {str(camera.model): get_model(camera.model) for camera in adjustment.network.cameras}
+
+
+def _one_camera(entry, model: CameraModel) -> list[str]:
+    lines = _equations(model)
     rows, held = [], []
     for name, found in entry["parameters"].items():
         if not found["free"]:
@@ -69,9 +74,9 @@ def _one_camera(entry) -> list[str]:
     return lines
 
 
-def _equations(model: str) -> list[str]:
-    first, *others = EQUATIONS.get(model, ("",))
-    rows = [(f"Model {model}", first), *(("", line) for line in others)]
+def _equations(model: CameraModel) -> list[str]:
+    first, *others = map(clean, equations(model))
+    rows = [(f"Model {clean(model.name)}", first), *(("", line) for line in others)]
     return facts(rows)
 
 
@@ -90,10 +95,10 @@ def _many_cameras(adjustment) -> list[str]:
     """Two lines a camera, value and σ; one table a model."""
     lines = []
     tables = adjustment.cameras
-    for model in dict.fromkeys(entry["model"] for entry in tables.values()):
-        chosen = {name: entry for name, entry in tables.items() if entry["model"] == model}
+    for name, model in _models(adjustment).items():
+        chosen = {id: entry for id, entry in tables.items() if entry["model"] == name}
         names = [
-            p for p in get_model(model).parameters
+            p for p in model.parameters
             if any(e["parameters"][p]["free"] for e in chosen.values())
         ]  # fmt: skip
         rows = []
@@ -120,7 +125,7 @@ def validity(adjustment, camera: str) -> str:
     if reach.message is not None:
         return reach.message
     where = "the image" if reach.of_image else "the measurements"
-    unit = get_model(adjustment.cameras[camera]["model"]).unit
+    unit = _models(adjustment)[adjustment.cameras[camera]["model"]].unit
     radius = significant(reach.radius, 4)
     return f"Distortion: one-to-one over {where}, as far as r = {radius} {unit}."
 

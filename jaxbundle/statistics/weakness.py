@@ -17,7 +17,6 @@ from jaxbundle.network.arrays import Values
 from jaxbundle.network.columns import count, some
 from jaxbundle.statistics.inspection import Inspection
 
-PRINCIPAL_POINT = ("x0", "y0", "cx", "cy")
 ADVICE_FOR = {
     "camera": "Free fewer camera parameters, or give them a prior σ; c needs depth or convergent "
     "images, x0 and y0 need images turned about their axis.",
@@ -87,7 +86,7 @@ def _extents(inspection: Inspection) -> Extents:
         moving = problem.system.table(table.name).space.moving
         at = [model.parameters.index(name) for name in model.principal_distance]
         judged = np.array([
-            model.parameters[j] in (*model.principal_distance, *PRINCIPAL_POINT) for j in moving
+            model.parameters[j] in model.core for j in moving
         ], bool)  # fmt: skip
         shortest = np.abs(np.asarray(values.camera)[table.cameras][:, at]).min(1)
         shortest = np.maximum(shortest, np.finfo(float).tiny)

@@ -13,7 +13,7 @@ from jaxbundle.calibration import Board, BoardViews, calibrate
 from jaxbundle.calibration.batch import calibrate_batch
 from jaxbundle.calibration.calibrate import board_network
 from jaxbundle.calibration.left_out import left_out
-from jaxbundle.calibration.start import default_free, start_values
+from jaxbundle.calibration.start import start_values
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.measure.views import measure_boards, photographs
@@ -106,7 +106,7 @@ def bent(board):
 
 
 def test_a_board_with_sigma_is_control():
-    start = start_values(simulated(), OPENCV, default_free(OPENCV))
+    start = start_values(simulated(), OPENCV, OPENCV.free)
     camera = Camera("cam", "opencv", start.parameters, ("fx",), image_size=(480, 360))
     network = board_network(start, camera, 0.1, board_sigma=2e-4)
     assert set(network.points.role) == {"control"} and (network.points.sigma == 2e-4).all()
@@ -213,7 +213,7 @@ def test_a_view_in_the_wrong_order_is_left_out():
     xy[4] = xy[4].reshape(6, 9, 2)[:, ::-1].reshape(54, 2)
     xy[6] = np.random.default_rng(0).permutation(xy[6])
     xy[7, 5:] = np.nan
-    start = start_values(dataclasses.replace(views, xy=xy), OPENCV, default_free(OPENCV))
+    start = start_values(dataclasses.replace(views, xy=xy), OPENCV, OPENCV.free)
     failed = dict(start.views.failed)
     assert set(failed) == {"view 4", "view 6", "view 7"}
     assert "as in a mirror" in failed["view 4"]
@@ -222,7 +222,7 @@ def test_a_view_in_the_wrong_order_is_left_out():
     assert start.parameters["fx"] == pytest.approx(620, abs=10)
     lines = np.where((np.arange(54) < 5)[:, None], views.xy, np.nan)
     with pytest.raises(NotSolvedError, match="determine no camera .too few points"):
-        start_values(dataclasses.replace(views, xy=lines), OPENCV, default_free(OPENCV))
+        start_values(dataclasses.replace(views, xy=lines), OPENCV, OPENCV.free)
     held = start_values(views, OPENCV, ("fx", "k1"), given={"fy": 621.0})
     assert held.parameters["fy"] == 621.0 and held.parameters["k2"] == 0
 

@@ -150,7 +150,8 @@ def poses_in_words(poses, **changes):
     M, X0 = map(np.array, zip(*poses))
     full = coverage(UV.repeat(60, 0) * [1, 1], (480, 360), (3, 3))
     given = dict(position=X0, rotation=M, middle=np.array([0.12, 0.075, 0]), unit="m",
-                 covered=full, rms=0.1, t={"fx": 500.0, "k1": 9.0})  # fmt: skip
+                 covered=full, rms=0.1, t={"fx": 500.0, "k1": 9.0},
+                 model=get_model("opencv"))  # fmt: skip
     return advice(**(given | changes))
 
 

@@ -1,0 +1,92 @@
+"""What a user's own camera model must satisfy, checked before anything is computed with it."""
+
+from collections.abc import Mapping
+from functools import lru_cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .inverse import value_and_derivative
+from .model import CameraModel
+
+ROUND_TRIP = 1e-9
+"""So much of the principal distance an inverse may miss the point."""
+SLANT = 0.05
+"""Of the principal distance: how far from the axis a given inverse is tried."""
+
+
+def check_own(model: CameraModel, values: Mapping[str, float] | None = None) -> None:
+    """Refuse a model whose formula cannot be used, with `values` one that cannot on the axis.
+
+    **Raises:** `ValueError`: the formula does not take the parameters and give two numbers, or not
+    element by element; it has no derivatives on the optical axis, or mirrors the image there; its
+    inverse is none.
+    """
+    _check_form(model)
+    if values is None:
+        return
+    where = f"camera model {model.name!r}: "
+    with jax.enable_x64(True):
+        p = np.array([values[name] for name in model.parameters], float)
+        found = [np.asarray(x) for x in _near_the_axis(model, p)]
+    image, (a, b, c, d), missed = found
+    if not (np.isfinite(image).all() and np.isfinite([a, b, c, d]).all()):
+        raise ValueError(
+            f"{where}its formula has no finite value and derivatives on the optical axis, with the "
+            "start values given; write it so that it has (x·√(x² + y²) has none at 0 in JAX, and "
+            "its series in x² + y² has)"
+        )
+    if not a * d - b * c > 0 or not a + d > 0:
+        raise ValueError(
+            f"{where}measured and ideal image are mirrored or turned against each other; are axes "
+            f"{model.axes!r} (x right, y {model.axes}) right, and the signs of the formula?"
+        )
+    size = max(abs(values[name]) for name in model.principal_distance)
+    if model.inverse is not None and not missed <= ROUND_TRIP * size:
+        raise ValueError(
+            f"{where}inverse is not the inverse of its formula: a point comes back {missed:.3g} "
+            f"{model.unit} beside itself; leave inverse out, and it is found by itself"
+        )
+
+
+@lru_cache(maxsize=64)
+def _check_form(model: CameraModel) -> None:
+    name = next(n for n in ("correct", "distort", "project") if getattr(model, n) is not None)
+    arguments = ("r, s, q", 3) if name == "project" else ("x, y", 2)
+    number, array = (jax.ShapeDtypeStruct(shape, jnp.result_type(float)) for shape in ((), (7, 11)))
+    p = (number,) * len(model.parameters)
+    for given in (number, array):
+        expected = (
+            f"Camera model {model.name!r}: {name}(p, {arguments[0]}) must take the parameters "
+            f"({', '.join(model.parameters)}) as a tuple p and return two numbers, or for arrays "
+            "two arrays, element by element"
+        )
+        try:
+            out = jax.eval_shape(model.formula, p, *(given,) * arguments[1])
+        except Exception as error:  # whatever a user's function raises
+            text = " ".join(str(error).split())
+            raise ValueError(f"{expected}; it raised {type(error).__name__}: {text:.160}") from None
+        shapes = [x.shape for x in out] if isinstance(out, tuple | list) and len(out) == 2 and all(
+            hasattr(x, "shape") for x in out) else None  # fmt: skip
+        if shapes != [given.shape] * 2:
+            raise ValueError(f"{expected}; for {given.shape or 'numbers'} it gave {out!r:.160}")
+
+
+@partial(jax.jit, static_argnums=0)
+def _near_the_axis(model: CameraModel, p):
+    """Image of the axis, derivative of the formula there, and by how much a point near it misses
+    itself through formula and inverse."""
+    p = tuple(p)
+    zero, formula = jnp.zeros(()), getattr(model, model.own_formula)
+    size = p[model.parameters.index(model.principal_distance[0])]
+    at = zero, zero
+    if model.own_formula == "to_ideal":
+        near = [-x for x in formula(p, *at)]  # where there is no inverse, something is wrong there
+        at = [jnp.where(jnp.isfinite(x), x, y) for x, y in zip(model.from_ideal(p, *at), near)]
+    value, derivative = value_and_derivative(formula, p, *at)
+    near = at[0] + SLANT * size, at[1] - 0.6 * SLANT * size
+    back = model.to_ideal if model.own_formula == "from_ideal" else model.from_ideal
+    again = back(p, *formula(p, *near))
+    missed = jnp.abs(again[0] - near[0]) + jnp.abs(again[1] - near[1])
+    return jnp.stack(value), derivative, missed

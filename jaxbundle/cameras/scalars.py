@@ -1,0 +1,13 @@
+"""What the functions of camera models take and return: unpacked scalars of ONE image point."""
+
+from collections.abc import Callable, Sequence
+
+from jaxtyping import Array, Float
+
+Scalar = float | Float[Array, ""]
+Pair = tuple[Scalar, Scalar]
+Triple = tuple[Scalar, Scalar, Scalar]
+Parameters = Sequence[Scalar]
+Formula = Callable[[Parameters, Scalar, Scalar], Pair]
+OfRay = Callable[[Parameters, Scalar, Scalar, Scalar], Pair]
+ToRay = Callable[[Parameters, Scalar, Scalar], Triple]
