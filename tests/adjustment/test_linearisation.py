@@ -1,6 +1,6 @@
 """Normal blocks, exact Hessian and steps against dense matrices of residuals ∘ retract."""
 
-from functools import cache, partial
+from functools import cache
 
 import equinox as eqx
 import jax
@@ -8,21 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from adjustment_checks import (
-    CAMERAS,
     DEFECTS,
     LINEARISED,
     bordered_inverse,
-    camera,
     flat,
-    free_parameters,
-    linearise,
     linearised,
     make,
     rows_of_change,
-    synthetic,
 )
 
-from jaxbundle.adjustment.problem import make_problem
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, quaternion_from_matrix
 from jaxbundle.leastsquares.elimination import damp, factorise, solve
 from jaxbundle.leastsquares.hessian import exact_equations
