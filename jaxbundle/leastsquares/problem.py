@@ -26,7 +26,8 @@ LARGE = 200_000
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """What is solved: declarations, plan and numbers. `rows`: the observations' residuals."""
+    """What is solved: declarations, plan and numbers. `sizes`: of the lists of the plan; `choices`:
+    what was chosen when it was made (`plan.make_plan`)."""
 
     tables: tuple[Table, ...]
     observations: tuple[Observations, ...]
@@ -34,6 +35,7 @@ class Problem:
     plan: Plan
     data: Data
     sizes: dict
+    choices: dict
     counts: "Counts"
     retraction: Callable
 
@@ -100,19 +102,24 @@ def make_problem(
     spaces = tuple((t.name, t.space) for t in tables)
     declared = Declared(tuple(o.kind for o in observations), spaces, motions)
     ways = REDUCTIONS if reduction is None else (reduction,)
-    plan, sizes = _make_plan(tables, observations, eliminate, ways)
+    planned = _make_plan(tables, observations, eliminate, ways)
     data = make_data(declared, tables, observations)
-    problem = Problem(tables, observations, declared, plan, data, sizes, count(tables, data),
-                      (retraction or Retraction)(declared))  # fmt: skip
+    problem = Problem(tables, observations, declared, planned[0], data, *planned[1:],
+                      count(tables, data), (retraction or Retraction)(declared))  # fmt: skip
     return problem if motions is None else _with_datum(problem, datum)
 
 
 def _make_plan(tables, observations, eliminate, ways):
-    """The plan on the device, and the sizes of its lists."""
-    host, sizes, _ = make_plan(tables, observations, eliminate, ways=ways)
-    number = sum(o.number for o in observations)
-    sizes = common([sizes], lambda key, n: n if number > LARGE else rounded(n))
-    return jax.device_put(finish(host, sizes)), sizes
+    """The plan on the device, the sizes of its lists, and the choices made."""
+    host, sizes, choices = make_plan(tables, observations, eliminate, ways=ways)
+    sizes = common([sizes], rounder(observations))
+    return jax.device_put(finish(host, sizes)), sizes, choices
+
+
+def rounder(observations) -> Callable:
+    """How the sizes of the plan of so many observations are rounded."""
+    large = sum(o.number for o in observations) > LARGE
+    return lambda key, n: n if large else rounded(n)
 
 
 def with_factor(problem: Problem) -> Problem:
@@ -121,11 +128,11 @@ def with_factor(problem: Problem) -> Problem:
     if problem.plan.reduction in FACTORS:
         return problem
     given = problem.tables, problem.observations, problem.plan.eliminated
-    plan, sizes = _make_plan(*given, FACTORS)
+    plan, sizes, choices = _make_plan(*given, FACTORS)
     if plan.reduction not in FACTORS:
         return problem
     plan = dataclasses.replace(plan, datum=problem.plan.datum)
-    return dataclasses.replace(problem, plan=plan, sizes=sizes)
+    return dataclasses.replace(problem, plan=plan, sizes=sizes, choices=choices)
 
 
 def _with_datum(problem: Problem, choose: Callable | None) -> Problem:
@@ -240,13 +247,18 @@ def _diagonal(weight):
 
 
 def pad_data(problem: Problem, data: Data) -> Data:
+    """The numbers filled to the sizes of the plan, on the device."""
+    return jax.device_put(fill_data(problem, data))
+
+
+def fill_data(problem: Problem, data: Data) -> Data:
     """The numbers filled to the sizes of the plan: weights are 0."""
     fill = lambda o: lambda x: _longer(x, problem.sizes["observations", o], "constant")
-    return jax.device_put(Data(
+    return Data(
         pad_values(problem, data.start),
         tuple(jax.tree.map(fill(o), m) for o, m in enumerate(data.measured)),
         tuple(fill(o)(w) for o, w in enumerate(data.weight)),
-    ))  # fmt: skip
+    )
 
 
 def pad_values(problem: Problem, values: Values) -> Values:

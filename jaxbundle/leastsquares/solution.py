@@ -38,10 +38,15 @@ from jaxbundle.leastsquares.rows import (
     prepare,
     residuals,
 )
+from jaxbundle.leastsquares.sharding import distribute, find_minimum_of_shards
 from jaxbundle.leastsquares.solver import Minimum, minimise
 
 HERE = "the plan"
 """Stands for it in a factor that leaves a compiled function."""
+
+TO_SHARE = 10_000
+"""Problems of so many observations are distributed over the devices, where there are several:
+with fewer, devices wait for each other longer than they compute."""
 
 Rows = dict[int, Float[np.ndarray, "n r"]]
 """By set of observations, in the order they were given."""
@@ -50,10 +55,20 @@ Rows = dict[int, Float[np.ndarray, "n r"]]
 def find_minimum(problem: Problem, start: Values | None = None, **options) -> Minimum:
     """Iterate from `start` (the problem's own if not given) and move the solution into the datum;
     `options`: of the solver (`make_solver`). What is held, and the datum, stay the problem's."""
+    solver = make_solver(problem, **options)
+    if _worth_sharing(problem, start):
+        return find_minimum_of_shards(distribute(problem), solver, start)
     data = pad_data(problem, problem.data)
     start = data.start if start is None else pad_values(problem, start)
-    minimum = _find(make_solver(problem, **options), data, start)
+    minimum = _find(solver, data, start)
     return dataclasses.replace(minimum, values=without_filling(problem, minimum.values))
+
+
+def _worth_sharing(problem: Problem, start: Values | None) -> bool:
+    if len(jax.devices()) == 1 or sum(o.number for o in problem.observations) < TO_SHARE:
+        return False
+    given = jax.tree.leaves((problem.data.start, start))
+    return all(np.isfinite(np.asarray(x)).all() for x in given)
 
 
 @eqx.filter_jit
