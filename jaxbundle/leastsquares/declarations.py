@@ -187,13 +187,16 @@ class Observations:
     def resolved(self, tables: Sequence[Table]) -> "Observations":
         """The same with row numbers for labels.
 
-        **Raises:** `InputError` for a label that its table does not have."""
+        **Raises:** `InputError` for a table that is not there, or a label that it does not have."""
         called = {t.name: t for t in tables}
+        unknown = next((name for name in self.kind.of if name not in called), None)
+        if unknown is not None:
+            known = ", ".join(called)
+            raise InputError(f"{self.kind.name}: there is no table {unknown!r}; known: {known}")
         rows = tuple(
-            called[name].rows_of(column, self.kind.name)
-            if column.dtype == object and name in called else column
+            called[name].rows_of(column, self.kind.name) if column.dtype == object else column
             for name, column in zip(self.kind.of, self.rows)
-        )  # fmt: skip
+        )
         return dataclasses.replace(self, rows=rows)
 
     def label(self, tables: Sequence[Table], row: int) -> str:
