@@ -154,6 +154,21 @@ def _with_datum(problem: Problem, choose: Callable | None) -> Problem:
     return dataclasses.replace(problem, plan=plan, counts=counts)
 
 
+def open_at(problem: Problem, values: Values) -> Problem:
+    """The problem with its open motions as they are at these values: those about a point that is
+    only weighted go with the point."""
+    datum, invariant = problem.plan.datum, (kind.invariant for kind in problem.declared.kinds)
+    if datum is None or all(invariant):
+        return problem
+    data = pad_data(problem, dataclasses.replace(problem.data, start=values))
+    real = {t.name: np.arange(problem.sizes["table", t.name]) < t.rows for t in problem.tables}
+    gauge = find_open_motions(problem.declared, problem.plan, data, real)
+    if gauge.shape != datum.gauge.shape:
+        return problem
+    datum = dataclasses.replace(datum, gauge=jax.device_put(gauge))
+    return dataclasses.replace(problem, plan=dataclasses.replace(problem.plan, datum=datum))
+
+
 def hold(problem: Problem, table: str, rows, columns=slice(None)) -> Problem:
     """The problem with some unknowns held at their start values; they hold no datum any more."""
     given = next(t for t in problem.tables if t.name == table)

@@ -61,7 +61,8 @@ def distribute(problem: Problem, devices=None) -> Shards:
     data = [fill_data(here, Data({}, take(host.measured, m), take(host.weight, m))) for m in seen]
     datum = problem.plan.datum  # What holds it is not asked before the end.
     datum = datum and jax.tree.map(np.asarray, Datum(datum.gauge, {}, datum.pins, {}))
-    plans = [dataclasses.replace(finish(plan, sizes), datum=datum, axis=AXIS) for plan, _ in planned]
+    finished = (finish(plan, sizes) for plan, _ in planned)
+    plans = [dataclasses.replace(plan, datum=datum, axis=AXIS) for plan in finished]
     mesh = Mesh(np.array(devices), (AXIS,))
     return Shards(problem, rows, sizes, _place(mesh, plans), _place(mesh, data), mesh)
 
