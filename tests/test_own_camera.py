@@ -131,7 +131,7 @@ def test_brown_said_again_has_the_figures_of_brown():
     camera = dataclasses.replace(network.cameras[0], model=again)
     problems = [make_problem(check_network(network.replace(cameras=(c,))))
                 for c in (network.cameras[0], camera)]  # fmt: skip
-    assert [p.structure.groups[0].model for p in problems] == ["brown", again]
+    assert [p.layout.cameras[0].model for p in problems] == ["brown", again]
     ours, own = (minimise(problem, problem.data.start) for problem in problems)
     assert own.iterations == ours.iterations
     assert_allclose(own.history.cost, ours.history.cost, rtol=2e-12)  # σ0 to 1e-12

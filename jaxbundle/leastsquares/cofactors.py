@@ -15,7 +15,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbundle.leastsquares.datum import contract, datum_directions, zeros_of_tables
+from jaxbundle.leastsquares.datum import (
+    contract,
+    datum_directions,
+    s_transform_transposed,
+    zeros_of_tables,
+)
 from jaxbundle.leastsquares.elimination import Factor, over_pairs, solve
 from jaxbundle.leastsquares.normal import Tangent
 from jaxbundle.leastsquares.plan import Plan
@@ -47,7 +52,7 @@ def cofactors(declared: Declared, values: Values, factor: Factor) -> Cofactors:
     own = dict(Q.own)
     if plan.eliminated is not None:
         K, L = _couplings(factor, Q), factor.lower_inverse
-        inner = jnp.eye(L.shape[1])
+        inner = jnp.broadcast_to(jnp.eye(L.shape[1]), L.shape)
         for g, k in K.items():
             at = plan.incidences[g].eliminated.ravel()
             rows = jnp.einsum("clij,clkj->clik", k, factor.Z[g]).reshape(-1, *L.shape[1:])
@@ -134,15 +139,6 @@ def propagate(declared: Declared, values: Values, factor: Factor, rows: Tangent)
     """F·Q·Fᵀ in the datum for any linear functions F of the unknowns (first axis of `rows`): one
     structured solve for each function."""
     plan = factor.plan
-    from_datum = jax.vmap(lambda r: datum_transposed(declared, plan, values, r))(rows)
+    from_datum = jax.vmap(lambda r: s_transform_transposed(declared, plan, values, r))(rows)
     solved = jax.vmap(lambda r: solve(factor, r))(from_datum)
     return sum(jnp.einsum("fni,gni->fg", from_datum[g], solved[g]) for g in from_datum)
-
-
-def datum_transposed(declared, plan, values, row):
-    """Sᵀ·f: f − B(GᵀB)⁻¹Gᵀf."""
-    if plan.datum is None:
-        return row
-    G, B = datum_directions(declared, plan, values)
-    along = jnp.linalg.solve(contract(plan, G, B), contract(plan, G, row))
-    return {g: f - B[g] @ along for g, f in row.items()}

@@ -34,6 +34,7 @@ from jaxbundle.leastsquares.hessian import exact_equations
 from jaxbundle.leastsquares.normal import Normal, Tangent, normal_equations, zero_tangent
 from jaxbundle.leastsquares.plan import Plan
 from jaxbundle.leastsquares.problem import Problem, given_data, make_solver, without_filling
+from jaxbundle.leastsquares.reduction import FACTORS
 from jaxbundle.leastsquares.retraction import retract
 from jaxbundle.leastsquares.rows import Data, Declared, Values, fill_places, lay_out_data, residuals
 from jaxbundle.leastsquares.solver import half_square, minimise
@@ -128,8 +129,10 @@ def attach_derivatives(
     values, fixed = jax.lax.stop_gradient((values, data))
     values = datum.move_to_datum(declared, plan, values, fixed.start)
     at = linearise(declared, plan, values, fixed, sensitivity == "exact")
-    step = elimination.solve(at.factor, _gradient(zero_tangent(plan), at, fixed))
-    step = jax.tree.map(jnp.negative, step)
+    # Along what is open the gradient is rounding.
+    gradient = _gradient(zero_tangent(plan), at, fixed)
+    gradient = datum.s_transform_transposed(declared, plan, values, gradient)
+    step = jax.tree.map(jnp.negative, elimination.solve(at.factor, gradient))
     if sensitivity == "gauss-newton":
         change = datum.s_transform(declared, plan, values, step)
         return at.moved(_propagated(change, at, data), data)
@@ -144,7 +147,9 @@ def linearise(
     equations = exact_equations if exact else normal_equations
     laid = lay_out_data(plan, data)
     normal = Normal(plan, equations(declared, plan, values, laid)[-1])
-    pins, own = {} if plan.datum is None else plan.datum.pins, normal.diagonal()
+    # Conjugate gradients do not mind that something is open.
+    open_ = plan.datum is not None and plan.reduction in FACTORS
+    pins, own = plan.datum.pins if open_ else {}, normal.diagonal()
     pins = {g: p * jnp.where(own[g] > 0, own[g], 1.0) for g, p in pins.items()}
     return Linearised(declared, plan, values, data, elimination.factorise(normal), pins)
 
@@ -165,7 +170,7 @@ def _solve_structured(times, at: Linearised, b: Tangent) -> Tangent:
     Improved once by what it leaves, found without N: as the seminormal equations corrected (Björck
     1987) it loses the condition of the Jacobian, not its square. Second derivatives need that: of
     the principal distance of four photographs (condition of N scaled: 1e7) they have 9 digits
-    with it, 5 without."""
+    with it, 5 without. Conjugate gradients have done so themselves."""
     # In one vector: what is transposed must be linear as a whole.
     right, unravel = ravel_pytree(b)
     flat = lambda tree: ravel_pytree(tree)[0]
@@ -173,7 +178,7 @@ def _solve_structured(times, at: Linearised, b: Tangent) -> Tangent:
 
     def improved(times, b):
         x = factor(b)
-        return x + factor(b - times(x))
+        return x + factor(b - times(x)) if at.plan.reduction in FACTORS else x
 
     product = lambda x: flat(times(unravel(x)))
     return unravel(jax.lax.custom_linear_solve(product, right, improved, symmetric=True))

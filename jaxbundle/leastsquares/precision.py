@@ -16,10 +16,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.cofactors import blocks_of_tables, cofactors, propagate
 from jaxbundle.leastsquares.elimination import factorise
 from jaxbundle.leastsquares.normal import Normal, normal_equations, zero_tangent
-from jaxbundle.leastsquares.problem import Problem, given_data, without_filling
+from jaxbundle.leastsquares.problem import Problem, given_data, with_factor, without_filling
+from jaxbundle.leastsquares.reduction import FACTORS
 from jaxbundle.leastsquares.retraction import retract
 from jaxbundle.leastsquares.rows import Data, Values, fill_places, lay_out_data
 
@@ -44,8 +46,11 @@ def precision(
 
     **Returns:** a `Precision`; NaN throughout where the design does not determine everything.
 
-    **Raises:** `InputError` for data of other shapes.
+    **Raises:** `InputError` for data of other shapes; where no factor fits into memory.
     """
+    problem = with_factor(problem)
+    if problem.plan.reduction not in FACTORS:
+        raise InputError("precision: the problem is too large for its covariance; take part of it")
     declared, plan, data = problem.declared, problem.plan, given_data(problem, data)
 
     def functions(change):

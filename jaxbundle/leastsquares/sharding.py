@@ -16,7 +16,6 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Int
 
 from jaxbundle.errors import NotSolvedError
-from jaxbundle.leastsquares.datum import move_to_datum
 from jaxbundle.leastsquares.declarations import Table
 from jaxbundle.leastsquares.indices import common, finish
 from jaxbundle.leastsquares.plan import Datum, Plan, make_plan
@@ -62,13 +61,14 @@ def distribute(problem: Problem, devices=None) -> Shards:
 def find_minimum_of_shards(
     shards: Shards, solver: LeastSquares, start: Values | None = None
 ) -> Minimum:
-    """As `solution.find_minimum`, with the solver of the whole problem; `start` must be finite:
-    devices that end at different steps would wait for each other for ever.
+    """As `solver.minimise`, with the solver of the whole problem; values are not moved into the
+    datum. `start` must be finite: devices that end at different steps would wait for each other
+    for ever.
 
     **Raises:** `NotSolvedError` where one of several processes is lost."""
     problem, e = shards.problem, shards.problem.plan.eliminated
-    known, here = problem.data.start, dataclasses.replace(problem, sizes=shards.sizes)
-    start = jax.tree.map(np.asarray, known if start is None else start)
+    here = dataclasses.replace(problem, sizes=shards.sizes)
+    start = jax.tree.map(np.asarray, problem.data.start if start is None else start)
     parts = [pad_values(here, start | {e: _take(start[e], rows)}) for rows in shards.rows]
     parts = _place(shards.mesh, parts)
     solver = dataclasses.replace(solver, plan=shards.plan)
@@ -84,12 +84,7 @@ def find_minimum_of_shards(
     _, back = np.unique(np.concatenate(shards.rows), return_index=True)
     own = lambda x: np.concatenate([x[d, : len(rows)] for d, rows in enumerate(shards.rows)])[back]
     values = minimum.values | {e: jax.tree.map(own, minimum.values[e])}
-    values = pad_values(problem, without_filling(problem, values))
-    values = _in_datum(problem.declared, problem.plan, values, pad_values(problem, known))
     return dataclasses.replace(minimum, values=without_filling(problem, values))
-
-
-_in_datum = eqx.filter_jit(move_to_datum)
 
 
 @eqx.filter_jit

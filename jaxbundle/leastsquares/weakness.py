@@ -20,8 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.leastsquares.cofactors import datum_transposed
-from jaxbundle.leastsquares.datum import s_transform
+from jaxbundle.leastsquares.datum import s_transform, s_transform_transposed
 from jaxbundle.leastsquares.elimination import Factor, factorise, lift, solve
 from jaxbundle.leastsquares.names import kept_unknowns, name_of
 from jaxbundle.leastsquares.normal import Normal, normal_equations
@@ -164,7 +163,7 @@ def _products(declared, values, factor: Factor, per_extent, directions):
 
     def product(direction):
         right = still | split(plan, plan.kept, direction * per_extent)
-        right = datum_transposed(declared, plan, values, right)
+        right = s_transform_transposed(declared, plan, values, right)
         change = s_transform(declared, plan, values, solve(factor, right))
         return flat(plan.kept, change) * per_extent
 

@@ -56,7 +56,7 @@ def turn_and_shift(motion, point):
 MOTIONS = Motions(("shift x", "shift y", "rotation"), (("point", turn_and_shift),), (2,))
 
 
-def trilateration(held):
+def trilateration(held, **options):
     random = np.random.default_rng(1)
     point = 100 * random.random((5, 2))
     i, j = np.triu_indices(len(point), 1)
@@ -72,7 +72,7 @@ def trilateration(held):
     return make_problem(
         [Table("point", start, free=free), devices],
         [DISTANCE((i, j, np.arange(len(i)) % 2), measured, sigma=sigma)],
-        motions=MOTIONS, datum=lambda gauge: ({"point": weight}, False),
+        motions=MOTIONS, datum=lambda gauge: ({"point": weight}, False), **options,
     )  # fmt: skip
 
 
@@ -127,6 +127,7 @@ def photographs():
 PROBLEMS = {
     "a point held": lambda: trilateration(True),
     "inner constraints": lambda: trilateration(False),
+    "conjugate gradients": lambda: trilateration(True, reduction="iterative"),
     "photographs": photographs,
 }
 
@@ -264,6 +265,19 @@ def test_first_and_second_derivatives_by_everything_that_was_given(name):
         moving |= {field} if abs(second) > 1e-8 else set()
     # Start values count where they are held or hold the datum.
     assert moving == set(found) - {"start: pose"}
+
+
+def test_conjugate_gradients_give_the_same_as_a_factor():
+    problem, other = made("a point held"), made("conjugate gradients")
+    data, by_both = problem.data, []
+    u = jax.tree.map(lambda *x: sum(x), *dict(directions(problem, 0.3)).values())
+    values = minimum(problem, data)
+    for p in (problem, other):
+        attach = lambda d, p=p: attach_derivatives(p.declared, p.plan, values, d)
+        along_u = jax.jit(lambda d, u, attach=attach: jax.jvp(attach, (d,), (u,))[1]["point"])
+        by_both.append(along_u(given_data(p, data), given_data(p, u)))
+    np.testing.assert_allclose(*by_both, atol=1e-9 * np.abs(by_both[0]).max())
+    np.testing.assert_allclose(*(precision(p).own["point"] for p in (problem, other)), atol=1e-14)
 
 
 def test_gradient_of_a_gradient_in_a_batch():
