@@ -40,7 +40,7 @@ from jaxbundle.leastsquares.rows import (
     residuals,
 )
 from jaxbundle.leastsquares.sharding import distribute, find_minimum_of_shards
-from jaxbundle.leastsquares.solver import Minimum, minimise
+from jaxbundle.leastsquares.solver import LeastSquares, Minimum, minimise
 from jaxbundle.leastsquares.stopping import converged
 
 HERE = "the plan"
@@ -60,15 +60,14 @@ Rows = dict[int, Float[np.ndarray, "n r"]]
 def find_minimum(problem: Problem, start: Values | None = None, **options) -> Minimum:
     """Iterate from `start` (the problem's own if not given) and move the solution into the datum;
     `options`: of the solver (`make_solver`). What is held, and the datum, stay the problem's."""
-    solver = make_solver(problem, **options)
-    if _worth_sharing(problem, start):
-        return find_minimum_of_shards(distribute(problem), solver, start)
-    data = pad_data(problem, problem.data)
-    start = data.start if start is None else pad_values(problem, start)
-    first = minimum = _minimise(solver, data, start)
+    given = pad_values(problem, problem.data.start)
+    start = given if start is None else pad_values(problem, start)
+    minimise_from = _on_all_devices if _worth_sharing(problem, start) else _on_one_device
+    minimise_from = minimise_from(problem, make_solver(problem, **options))
+    first = minimum = minimise_from(start)
     for _ in range(RETURNS):
         there = open_at(problem, without_filling(problem, minimum.values))
-        values = _move_to_datum(problem.declared, there.plan, minimum.values, data.start)
+        values = _move_to_datum(problem.declared, there.plan, minimum.values, given)
         if there is problem or not bool(converged(minimum.termination)):
             break
         # What leaves one height of a point open, say, is no group of motions: the way into the
@@ -78,16 +77,33 @@ def find_minimum(problem: Problem, start: Values | None = None, **options) -> Mi
         )
         if after <= before * (1 + SAME) + SAME:
             break
-        minimum = _minimise(solver, data, values)
+        minimum = minimise_from(values)
     values = without_filling(problem, values)
     return dataclasses.replace(first, termination=minimum.termination, values=values)
 
 
-def _worth_sharing(problem: Problem, start: Values | None) -> bool:
-    if len(jax.devices()) == 1 or sum(o.number for o in problem.observations) < TO_SHARE:
+def _on_one_device(problem: Problem, solver: LeastSquares):
+    data = pad_data(problem, problem.data)
+    return lambda start: _minimise(solver, data, start)
+
+
+def _on_all_devices(problem: Problem, solver: LeastSquares):
+    shards = distribute(problem)
+
+    def minimise_from(start):
+        found = find_minimum_of_shards(shards, solver, start)
+        return dataclasses.replace(found, values=pad_values(problem, found.values))
+
+    return minimise_from
+
+
+def _worth_sharing(problem: Problem, start: Values) -> bool:
+    """Whether there are devices to share a problem, and rows to distribute over them."""
+    if len(jax.devices()) == 1 or problem.plan.eliminated is None:
         return False
-    given = jax.tree.leaves((problem.data.start, start))
-    return all(np.isfinite(np.asarray(x)).all() for x in given)
+    if sum(o.number for o in problem.observations) < TO_SHARE:
+        return False
+    return all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(start))
 
 
 _minimise, _move_to_datum = eqx.filter_jit(minimise), eqx.filter_jit(move_to_datum)
