@@ -50,9 +50,8 @@ PROBLEMS = {
 }
 
 
-def solve(name):
+def solve(problem):
     """The minimum as lists."""
-    problem = PROBLEMS[name]()
     minimum = solution.find_minimum(problem, atol=1e-7)
     return {
         "termination": int(minimum.termination),
@@ -72,9 +71,11 @@ def main(names, processes=1, rank=0, port=0, signal=0):
     jax.monitoring.register_event_duration_secs_listener(
         lambda event, *_, **__: compiled.append(event) if "backend_compile" in event else None
     )
-    found = {name: solve(name) for name in names}
+    problems = {name: PROBLEMS[name]() for name in names}
+    found = {name: solve(problem) for name, problem in problems.items()}
     first = len(compiled)
-    solve(names[0])
+    if processes == 1:
+        solve(problems[names[0]])
     print(json.dumps(found | {"compiled": [first, len(compiled) - first]}))
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sharded_run import solve
+from sharded_run import PROBLEMS, solve
 
 SCRIPT = Path(__file__).with_name("sharded_run.py")
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("sharding")]  # one worker, one cache
@@ -42,7 +42,7 @@ def on_two_devices():
 
 
 def assert_same(found, name):
-    expected = solve(name)
+    expected = solve(PROBLEMS[name]())
     assert found["termination"] == expected["termination"]
     assert len(expected["cost"]) > 2
     same = min(len(found["cost"]), len(expected["cost"])) - 1  # the last is a step of rounding
