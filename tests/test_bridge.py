@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
+from jaxbundle.adjustment.bridge import SchurLinearSolver, stock_problem, values_of
 
 import jaxbundle
-from jaxbundle.adjustment.bridge import SchurLinearSolver, stock_problem, values_of
 from jaxbundle.adjustment.solve import find_minimum, make_solver
 
 pytestmark = pytest.mark.xdist_group("bridge")

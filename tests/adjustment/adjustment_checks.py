@@ -83,6 +83,7 @@ def synthetic(
     scene="ring",
     noise=1.0,
     disturbance=1.0,
+    twice=(),
     seed=0,
 ):
     """A network and the truth behind it.
@@ -92,7 +93,7 @@ def synthetic(
     `distances`: pairs of point indices; `held`: pairs (image, columns of its exterior orientation);
     `scene`: "ring", or two that determine too little: "vertical" images above flat ground, and
     images from "one centre"; `noise`: of all observations, in σ; `disturbance`: of the start
-    values.
+    values; `twice`: rows of image points that are measured again.
     """
     rng = np.random.default_rng(seed)
     truth = Truth(*SCENES[scene](images), _box(points, rng))
@@ -101,7 +102,8 @@ def synthetic(
     of_image = np.zeros(images, int) if of_image is None else np.asarray(of_image)
     image, point = np.divmod(np.arange(images * points), points)
     seen = (image + 2 * point) % 5 != 0
-    image, point = image[seen], point[seen]
+    rows = np.append(np.flatnonzero(seen), np.flatnonzero(seen)[list(twice)])
+    image, point = image[rows], point[rows]
     xy, sigma = _measure(cameras, of_image, truth, image, point, rng, noise)
 
     position = truth.position + 0.02 * disturbance * rng.normal(size=(images, 3))
@@ -227,6 +229,7 @@ NETWORKS = {
     "everything given": dict(
         cameras=tuple(camera(f"cam {i}", free=("c", "K1"), sigma=dict(c=0.01)) for i in range(4)),
         of_image=range(4), images=4, control=4, distances=((0, 5), (5, 6)), exterior_prior=True,
+        twice=(3, 3, 20),
     ),
     "held images, exterior priors": dict(
         cameras=(camera(free=()),), exterior_prior=True, held=((0, SIX), (4, (1,))),
