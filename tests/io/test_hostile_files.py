@@ -123,7 +123,7 @@ def test_a_valid_input_is_read(kind, valid):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@often(150)
+@often(100)
 @what_is_done
 def test_a_garbled_input_is_read_or_refused(kind, valid, **done):
     read_or_refused(partial(read, kind), valid(kind), **done)

@@ -82,11 +82,15 @@ def seen(pose, camera, point, xy):
 
 
 SEEN = Kind("image point", seen, of=("pose", "camera", "point"), scalars=True)
+IDEAL = Kind(
+    "image point", lambda pose, point, xy: seen(pose, (1.0, 0.02, 0.01), point, xy),
+    of=("pose", "point"), scalars=True,
+)  # fmt: skip
 CAMERA = Kind("camera", lambda camera, given: camera - given, of=("camera",))
 TIE = Kind("height difference", lambda a, b, d: b[2] - a[2] - d, of=("point", "point"))
 
 
-def photographs():
+def photographs(of_known_camera=False):
     random = np.random.default_rng(3)
     points, poses = 7, 3
     point = random.uniform(-1, 1, (points, 3)) * [2, 2, 0.7]
@@ -106,12 +110,12 @@ def photographs():
     a, b = np.array([0, 1]), np.array([1, 2])
     ties = point[b, 2] - point[a, 2] + 2e-3 * random.normal(size=2)
     A = 0.02 * (np.eye(3) + 0.3 * random.normal(size=(1, 3, 3)))
+    pose = Table("pose", PoseValue(centre + 0.02 * random.normal(size=(poses, 3)), q), Pose())
+    point = Table("point", start, free=free_points)
+    if of_known_camera:
+        return make_problem([pose, point], [IDEAL((i, p), xy, sigma=2e-3)], "point")
     return make_problem(
-        [
-            Table("pose", PoseValue(centre + 0.02 * random.normal(size=(poses, 3)), q), Pose()),
-            Table("camera", camera, free=free_cameras),
-            Table("point", start, free=free_points),
-        ],
+        [pose, Table("camera", camera, free=free_cameras), point],
         [
             SEEN((i, np.zeros_like(i), p), xy, sigma=2e-3),
             CAMERA((np.zeros(1, int),), camera + 0.01, covariance=A @ A.transpose(0, 2, 1)),
@@ -126,6 +130,7 @@ PROBLEMS = {
     "inner constraints": lambda: trilateration(False),
     "conjugate gradients": lambda: trilateration(True, reduction="iterative"),
     "photographs": photographs,
+    "of a known camera": lambda: photographs(True),
 }
 
 
@@ -243,7 +248,7 @@ def minimum(problem, data):
     return find_minimum(make_solver(problem, atol=1e-7), data, data.start).values
 
 
-@pytest.mark.parametrize("name", ["a point held", "photographs"])
+@pytest.mark.parametrize("name", ["a point held", "of a known camera"])
 def test_first_and_second_derivatives_by_everything_that_was_given(name):
     problem, of = made(name), program(name)
     found = dict(directions(problem, 0.3 if name == "a point held" else 2e-3))

@@ -30,6 +30,8 @@ from jaxbundle.refinement.freedom import make_form, names
 from jaxbundle.refinement.inspection import count_redundancy
 from jaxbundle.refinement.solver import normal, solve
 
+pytestmark = pytest.mark.xdist_group("refinement")
+
 BIAS, DRIFT = np.array([20.0, -30.0, 90.0]) * ARCSEC, np.array([5.0, -4.0, 30.0]) * ARCSEC
 AMPLITUDE = np.array([8.0, 5.0, 0.0]) * ARCSEC
 
@@ -91,7 +93,7 @@ def test_cofactors_and_tests_against_dense_numpy(refined):
 
 
 def test_sigma_is_honest():
-    """150 draws of jitter (from its prior), bias, drift and noise: errors as Q says."""
+    """60 draws of jitter (from its prior), bias, drift and noise: errors as Q says."""
     rng = np.random.default_rng(11)
     one = scanner()
     form, columns = make_form(one.image, one.earth, FREEDOM), make_columns([one], None)
@@ -102,7 +104,7 @@ def test_sigma_is_honest():
     rays, *_ = choose_rays(points, observations, None)
     system = make_system([one], points, observations, None, columns, rays)
     redundancy = jnp.asarray(float(count_redundancy(system)))
-    m, draws = len(columns.names), 150
+    m, draws = len(columns.names), 60
     squares, normed = [], []
     for _ in range(draws):
         truth = JITTER * rng.normal(size=m)

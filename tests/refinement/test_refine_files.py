@@ -3,6 +3,7 @@
 import json
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -29,6 +30,8 @@ from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable
 from jaxbundle.refinement import Freedom, refine
 from jaxbundle.refinement.freedom import change_of, changed, make_form, names
 from jaxbundle.refinement.refined import refined_image
+
+pytestmark = pytest.mark.xdist_group("refinement")
 
 TEXT = """
 [refine]
@@ -122,13 +125,18 @@ def test_a_refined_image_is_read_as_it_was(tmp_path, kind):
     new = refined_image(image, form, change)
     read = read_scanner(write_scanner_image(tmp_path, "new", new, WGS84)).image
     assert type(read.optics) is type(image.optics)
-    for t in (0.011, 1.234, 2.718):
-        wanted = changed(image, form, change, jnp.asarray(t))
-        for got, true in zip(pose_at(read, t), pose_at(wanted, jnp.asarray(t))):
-            assert np.allclose(got, true, rtol=2e-9, atol=2e-9)
-    for pixel in (0.0, 333.0, 799.0):
-        slopes = np.array(read.optics.slopes(jnp.asarray(pixel)))
-        assert np.allclose(slopes, wanted.optics.slopes(jnp.asarray(pixel)), atol=1e-12)
+    t, pixel = jnp.array([0.011, 1.234, 2.718]), jnp.array([0.0, 333.0, 799.0])
+
+    @jax.jit
+    @jax.vmap
+    def both(t, pixel):
+        of = read, changed(image, form, change, t)
+        return tuple(pose_at(one, t) for one in of), tuple(one.optics.slopes(pixel) for one in of)
+
+    (got, true), slopes = both(t, pixel)
+    for one, other in zip(got, true):
+        assert np.allclose(one, other, rtol=2e-9, atol=2e-9)
+    assert np.allclose(*slopes, atol=1e-12)
 
 
 WRONG = [

@@ -28,6 +28,8 @@ from jaxbundle.refinement.freedom import make_form
 from jaxbundle.refinement.inspection import layout_of
 from jaxbundle.refinement.solver import normal
 
+pytestmark = pytest.mark.xdist_group("refinement")
+
 POINTS, CONTROL = 24, 8
 TIE = 3 * (POINTS - CONTROL)
 FREEDOM = Freedom(
