@@ -42,8 +42,7 @@ class Shards:
 
 
 def distribute(problem: Problem, devices=None) -> Shards:
-    """Cut a problem with an eliminated table into as many parts as there are devices (all of JAX's
-    if not given)."""
+    """Cut a problem with an eliminated table into a part for every device (all of JAX's)."""
     devices = jax.devices() if devices is None else devices
     rows, seen = _cut(problem, len(devices))
     planned = [_plan_part(problem, *part) for part in zip(rows, seen)]
@@ -69,8 +68,8 @@ def find_minimum_of_shards(
     problem, e = shards.problem, shards.problem.plan.eliminated
     here = dataclasses.replace(problem, sizes=shards.sizes)
     start = jax.tree.map(np.asarray, problem.data.start if start is None else start)
-    parts = [pad_values(here, start | {e: _take(start[e], rows)}) for rows in shards.rows]
-    parts = _place(shards.mesh, parts)
+    part = lambda rows: pad_values(here, start | {e: _take(start[e], rows)})
+    parts = _place(shards.mesh, [part(rows) for rows in shards.rows])
     solver = dataclasses.replace(solver, plan=shards.plan)
     try:
         minimum = jax.tree.map(np.asarray, _minimise(shards.mesh, solver, shards.data, parts))

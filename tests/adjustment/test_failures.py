@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -83,3 +84,14 @@ def test_every_reason_has_words():
     reasons = (LIMIT, SETTLED, RELATIVE_COST, SINGULAR, STUCK, NOT_FINITE)
     assert reasons == tuple(range(len(TERMINATIONS)))
     assert [bool(converged(reason)) for reason in reasons] == [0, 1, 1, 0, 0, 0]
+
+
+def test_adjustment_needs_64_bits():
+    from jaxbundle.adjustment import require_x64
+
+    jax.config.update("jax_enable_x64", False)
+    try:
+        with pytest.raises(RuntimeError, match="enable_x64"):
+            require_x64()
+    finally:
+        jax.config.update("jax_enable_x64", True)
