@@ -10,7 +10,9 @@ import ctypes
 import gc
 import os
 import signal
+import sys
 from pathlib import Path
+from typing import NamedTuple
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "examples"
@@ -24,6 +26,7 @@ import jax  # noqa: E402
 import pytest  # noqa: E402
 
 import jaxbundle  # noqa: E402
+from jaxbundle import cli  # noqa: E402
 
 jaxbundle.enable_x64()
 
@@ -33,6 +36,13 @@ jaxbundle.enable_x64()
 for name in ("SIGINT", "SIGHUP"):
     if signal.getsignal(getattr(signal, name, signal.SIGTERM)) is signal.SIG_IGN:
         signal.signal(getattr(signal, name), lambda *_: None)
+
+def pytest_itemcollected(item):
+    """With several workers, the tests of a file go to one: its fixtures are made once, and the
+    programs it compiles are at hand. Notebooks are processes of their own."""
+    if not item.get_closest_marker("xdist_group") and item.path.name != "test_notebooks.py":
+        item.add_marker(pytest.mark.xdist_group(item.path.stem))
+
 
 MEMORY = Path("/proc/self/statm")
 MOST_GROWTH = 500e6
@@ -59,6 +69,28 @@ def drop_compiled_programs():
         if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
             trim(0)  # What was freed goes back to the system.
         held = memory()
+
+
+class Told(NamedTuple):
+    """What a command line said, and how it ended."""
+
+    status: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def command(monkeypatch, capsys):
+    """A command line in this process: importing JAX costs more than most of what is asked."""
+    monkeypatch.setattr(jaxbundle, "use_cores", lambda *_: None)  # JAX runs here already
+
+    def run(*arguments) -> Told:
+        monkeypatch.setattr(sys, "argv", ["jaxbundle", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        return Told(ended.value.code or 0, *capsys.readouterr())
+
+    return run
 
 
 @pytest.fixture(scope="session")

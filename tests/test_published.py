@@ -14,6 +14,8 @@ import pytest
 import jaxbundle
 from jaxbundle.bundle import adjust
 
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("convergent4")]
+
 EXAMPLES = Path(__file__).parent.parent / "examples"
 ALL_TEN = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2")
 
@@ -37,7 +39,6 @@ def network():
     return jaxbundle.read_network(EXAMPLES / "convergent4" / "project.toml")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("free, domain, redundancy, vtv, sigma0", SOLUTIONS)
 def test_the_solutions_of_the_four_photographs(network, free, domain, redundancy, vtv, sigma0):
     result = adjust(with_free(network, free, domain))
@@ -67,7 +68,6 @@ def test_all_ten_parameters(convergent4):
     assert insignificant == {"K2", "K3", "P1", "P2", "b1", "b2", "y0"}
 
 
-@pytest.mark.slow
 def test_four_parameters_correlations_and_redundancy_numbers(network):
     result = adjust(with_free(network, ("c", "x0", "y0", "K1")))
     table = result.cameras["cam"]
@@ -85,7 +85,6 @@ THESIS_ANSWER = {"c": 18.5504303825, "x0": -0.0675758561, "y0": 0.1276089300,
                  "K1": -1.978100683e-4}  # fmt: skip
 
 
-@pytest.mark.slow
 def test_from_the_answer_of_the_thesis_the_same_minimum(network, convergent4):
     """Its orientations and coordinates as printed, its camera: the same sum of squares."""
     exterior = np.array([
@@ -113,7 +112,6 @@ def test_from_the_answer_of_the_thesis_the_same_minimum(network, convergent4):
     assert result.vtpv == pytest.approx(convergent4.vtpv, rel=1e-9)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_from_disturbed_start_values_the_same_minimum(network, convergent4, seed):
     """10 % of the object's size, 10° on every angle."""
@@ -141,7 +139,6 @@ PRINTED_RESIDUALS = {  # point: v in mm, as printed
 }  # fmt: skip
 
 
-@pytest.mark.slow
 def test_the_resection_of_image_63():
     result = adjust(jaxbundle.read_network(EXAMPLES / "resection63" / "project.toml"))
     expected = {

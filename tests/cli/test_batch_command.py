@@ -16,17 +16,16 @@ from batch_cameras import images_of, write_cameras
 from jaxbundle.batches import run_batch
 from jaxbundle.errors import InputError
 
+pytestmark = pytest.mark.xdist_group("convergent4")
+
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "convergent4" / "project.toml"
 CAMERAS = 200
 
 
-def command(*arguments):
-    return [sys.executable, "-m", "jaxbundle", "batch", *map(str, arguments)]
-
-
-def run(*arguments):
-    return subprocess.run(command(*arguments), capture_output=True, text=True, cwd=ROOT)
+@pytest.fixture
+def run(command):
+    return lambda *arguments: command("batch", *arguments)
 
 
 def rows(path: Path):
@@ -65,18 +64,17 @@ def ended(process: subprocess.Popen, file: Path, lines: int, how: signal.Signals
 
 
 @pytest.mark.slow
-def test_ended_at_any_moment_a_run_goes_on_where_it_was(cameras, tmp_path):
+def test_ended_at_any_moment_a_run_goes_on_where_it_was(run, cameras, tmp_path):
     file = tmp_path / "results.jsonl"
     arguments = (cameras, "--json-lines", file, "--portion", "1", "--free", "fx,fy,k1")
     random = np.random.default_rng()
     before = b""
     for how, status in (
         (signal.SIGKILL, -signal.SIGKILL), (signal.SIGINT, 130), (signal.SIGTERM, 143),
-        (signal.SIGKILL, -signal.SIGKILL),
     ):  # fmt: skip
         process = subprocess.Popen(
-            command(*arguments), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
-            cwd=ROOT,
+            [sys.executable, "-m", "jaxbundle", "batch", *map(str, arguments)],
+            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, cwd=ROOT,
         )  # fmt: skip
         lines, wait = int(random.integers(1, 8)), random.uniform(0, 0.01)
         found, told = ended(process, file, lines, how, wait)
@@ -92,10 +90,10 @@ def test_ended_at_any_moment_a_run_goes_on_where_it_was(cameras, tmp_path):
             file.write_bytes(before)
 
     done = run(*arguments[:3], "--free", "fx,fy,k1")
-    assert done.returncode == 0, done.stderr
+    assert done.status == 0, done.err
     number = before.count(b"\n")
-    assert done.stderr == "" and f"{number} skipped" in done.stdout
-    assert f"{CAMERAS - 1} converged, 1 too few points" in done.stdout
+    assert done.err == "" and f"{number} skipped" in done.out
+    assert f"{CAMERAS - 1} converged, 1 too few points" in done.out
     assert file.read_bytes().startswith(before[: before.rindex(b"\n") + 1])
     result = rows(file)
     name = os.path.relpath(cameras, tmp_path)
@@ -109,20 +107,20 @@ def test_ended_at_any_moment_a_run_goes_on_where_it_was(cameras, tmp_path):
 
 
 @pytest.mark.slow
-def test_networks_and_one_that_is_bad(tmp_path):
+def test_networks_and_one_that_is_bad(run, tmp_path):
     bad = tmp_path / "bad.toml"
     bad.write_text("[project]\nname = 3\n")
     file = tmp_path / "results.jsonl"
     done = run(bad, EXAMPLE, "--json-lines", file)
-    assert done.returncode == 0, done.stderr
+    assert done.status == 0, done.err
     first, second = rows(file)
     assert first["key"] == "bad.toml" and first["status"] == "bad input"
-    assert "bad.toml" in first["error"] and "1 bad input, 1 converged" in done.stdout
+    assert "bad.toml" in first["error"] and "1 bad input, 1 converged" in done.out
     assert second["status"] == "converged" and second["redundancy"] == 23
     assert "points" not in second and second["cameras"]["cam"]["parameters"]["c"]["sigma"] > 0
 
 
-def test_bad_input_ends_with_one_line_and_writes_nothing(cameras, tmp_path):
+def test_bad_input_ends_with_one_line_and_writes_nothing(run, cameras, tmp_path):
     file, bad = tmp_path / "results.jsonl", tmp_path / "bad.npz"
     np.savez(bad, object_points=np.zeros((20, 3)), image_points=np.zeros((2, 3, 19, 2)),
              image_size=[9, 9])  # fmt: skip
@@ -137,6 +135,6 @@ def test_bad_input_ends_with_one_line_and_writes_nothing(cameras, tmp_path):
         ((cameras, "--json-lines", file, "--free", "fx,,fy"), "''"),
     ):
         done = run(*arguments)
-        assert done.returncode == 2, done.stderr
-        assert word in done.stderr and len(done.stderr.strip().splitlines()) == 1
+        assert done.status == 2, done.err
+        assert word in done.err and len(done.err.strip().splitlines()) == 1
         assert not file.exists() and other.read_text().startswith("a diary")

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import cv2
@@ -11,7 +10,6 @@ import pytest
 
 import jaxbundle.calibration.files
 import jaxbundle.calibration.quality
-from jaxbundle import cli
 
 pytestmark = pytest.mark.xdist_group("calibration")
 
@@ -28,24 +26,16 @@ def folder(tmp_path_factory):
     return folder
 
 
-def run(monkeypatch, capsys, *arguments):
-    monkeypatch.setattr(sys, "argv", ["jaxbundle", "calibrate", *map(str, arguments)])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    told = capsys.readouterr()
-    return ended.value.code or 0, told.out, told.err
-
-
 @pytest.fixture
-def command(monkeypatch, capsys):
-    return lambda *arguments: run(monkeypatch, capsys, *arguments)
+def calibrate(command):
+    return lambda *arguments: command("calibrate", *arguments)
 
 
-def test_photographs_to_camera(command, folder, tmp_path, monkeypatch):
+def test_photographs_to_camera(calibrate, folder, tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(jaxbundle.calibration.files, "save_plots", lambda *a: drawn.append(a))
     out, file = tmp_path / "out", tmp_path / "result.json"
-    code, told, error = command(
+    code, told, error = calibrate(
         folder, "--board", "9x6", "--square", 0.03, "--out", out, "--json", file
     )
     assert (code, error) == (0, "")
@@ -61,9 +51,9 @@ def test_photographs_to_camera(command, folder, tmp_path, monkeypatch):
     assert (out / "report.txt").read_text().strip() in told
 
 
-def test_two_cameras_and_brief_json_alone(command, folder, monkeypatch):
+def test_two_cameras_and_brief_json_alone(calibrate, folder, monkeypatch):
     monkeypatch.delattr(jaxbundle.calibration.quality, "cross_validation")
-    code, told, error = command(
+    code, told, error = calibrate(
         "--camera", f"a={folder}/photo_*.jpg", "--camera", f"b={folder}/photo_*.jpg",
         "--board", "9x6", "--square", 0.03, "--json", "-", "--brief",
         "--no-cross-validation",
@@ -92,18 +82,18 @@ def test_two_cameras_and_brief_json_alone(command, folder, monkeypatch):
     (["FOLDER", "--board", "9x6", "--square", "1", "--json", "FOLDER"], "is a folder"),
     (["FOLDER", "--board", "9x6", "--square", "1", "--json", "FOLDER/text.jpg"], "overwritten"),
 ])  # fmt: skip
-def test_bad_arguments_are_one_line(command, folder, arguments, said):
-    code, told, error = command(*(a.replace("FOLDER", str(folder)) for a in arguments))
+def test_bad_arguments_are_one_line(calibrate, folder, arguments, said):
+    code, told, error = calibrate(*(a.replace("FOLDER", str(folder)) for a in arguments))
     assert code == 2 and told == ""
     assert said in error and error.count("\n") == 1
 
 
-def test_photographs_that_show_no_board(command, folder, tmp_path):
+def test_photographs_that_show_no_board(calibrate, folder, tmp_path):
     cv2.imwrite(str(tmp_path / "grey.png"), np.full((360, 480), 99, np.uint8))
     out = tmp_path / "out"
-    code, _, error = command(tmp_path, "--board", "9x6", "--square", 0.03, "--out", out)
+    code, _, error = calibrate(tmp_path, "--board", "9x6", "--square", 0.03, "--out", out)
     assert code == 2
     assert f"no photograph of 1 shows the board: {tmp_path}/grey.png: no chessboard" in error
     assert not out.exists()
-    code, _, error = command(folder / "photo_01.jpg", "--board", "10x7", "--square", 0.03)
+    code, _, error = calibrate(folder / "photo_01.jpg", "--board", "10x7", "--square", 0.03)
     assert code == 2 and "give --board 9x6" in error

@@ -78,9 +78,7 @@ def trilateration(held, **options):
 
 def seen(pose, camera, point, xy):
     x, y, z = pose.ray(point)
-    u, v = x / z, y / z
-    bent = camera[0] * (1 + camera[1] * (u * u + v * v))
-    return bent * u + camera[2] - xy[0], bent * v - xy[1]
+    return camera[0] * x / z + camera[1] - xy[0], camera[0] * y / z + camera[2] - xy[1]
 
 
 SEEN = Kind("image point", seen, of=("pose", "camera", "point"), scalars=True)
@@ -95,13 +93,12 @@ def photographs():
     centre = np.array([[-1.5, 0.2, -5], [1.4, -0.3, -5.2], [0.1, 1.5, -4.6]])
     q = np.concatenate([np.ones((poses, 1)), 0.1 * random.normal(size=(poses, 3))], 1)
     q /= np.linalg.norm(q, axis=1, keepdims=True)
-    camera = np.array([[1.0, 0.02, 0.01]])
+    camera = np.array([[1.0, 0.02, 0.01]])  # c, x0 and, held, y0
     i, p = (x.ravel() for x in np.indices((poses, points)))
     M = np.asarray(jax.vmap(matrix_from_quaternion)(q))
     sight = np.einsum("nij,nj->ni", M[i], point[p] - centre[i])
     u, v = (sight[:, :2] / sight[:, 2:]).T
-    bent = camera[0, 0] * (1 + camera[0, 1] * (u * u + v * v))
-    xy = np.stack([bent * u + camera[0, 2], bent * v], 1) + 2e-3 * random.normal(size=(len(i), 2))
+    xy = np.stack([u, v], 1) + camera[0, 1:] + 2e-3 * random.normal(size=(len(i), 2))
     free_points = np.ones((points, 3))
     free_points[4:] = 0
     start = point + 0.02 * random.normal(size=point.shape) * free_points
