@@ -21,10 +21,11 @@ import equinox as eqx  # noqa: E402
 import numpy as np  # noqa: E402
 
 import jaxbundle  # noqa: E402
-from jaxbundle.adjustment.sharding import distribute, find_minimum_of_shards  # noqa: E402
-from jaxbundle.adjustment.solve import make_solver  # noqa: E402
-from jaxbundle.adjustment.solver import LIMIT, RELATIVE_COST, SETTLED, TERMINATIONS, minimise  # noqa: E402
-from jaxbundle.network.reduction import REDUCTIONS  # noqa: E402
+from jaxbundle.leastsquares.problem import make_solver, pad_data  # noqa: E402
+from jaxbundle.leastsquares.reduction import REDUCTIONS  # noqa: E402
+from jaxbundle.leastsquares.sharding import distribute, find_minimum_of_shards  # noqa: E402
+from jaxbundle.leastsquares.solver import minimise  # noqa: E402
+from jaxbundle.leastsquares.stopping import LIMIT, RELATIVE_COST, SETTLED, TERMINATIONS  # noqa: E402
 
 ATOL = 1e-5
 
@@ -32,13 +33,13 @@ ATOL = 1e-5
 def prepare(path: str, evaluations: int, reduction: str | None):
     """The problem, and the function that solves it."""
     network = jaxbundle.check_network(jaxbundle.read_network(path))
-    problem = jaxbundle.make_problem(network, reduction)
+    problem = jaxbundle.make_problem(network, reduction).system
     solver = make_solver(problem, max_steps=evaluations, atol=ATOL)
     if len(jax.devices()) > 1:
         shards = distribute(problem)
-        return problem, lambda: find_minimum_of_shards(solver, shards, problem.data.start)
-    compiled = eqx.filter_jit(minimise)
-    return problem, lambda: compiled(solver, problem.data, problem.data.start)
+        return problem, lambda: find_minimum_of_shards(shards, solver)
+    compiled, data = eqx.filter_jit(minimise), pad_data(problem, problem.data)
+    return problem, lambda: compiled(solver, data, data.start)
 
 
 def main() -> None:
@@ -67,8 +68,8 @@ def main() -> None:
     number, termination = int(minimum.iterations), int(minimum.termination)
     costs = np.fmin.accumulate(np.asarray(minimum.history.cost)[:number])
     json.dump({
-        "solver": f"jaxbundle, {problem.structure.reduction}",
-        "reduction": problem.structure.reduction,
+        "solver": f"jaxbundle, {problem.plan.reduction}",
+        "reduction": problem.plan.reduction,
         "cost": float(costs[-1]),
         "evaluations": number,
         "ended": TERMINATIONS[termination],

@@ -26,11 +26,12 @@ import machine
 import numpy as np
 
 import jaxbundle
-from jaxbundle.adjustment.datum import move_to_datum
-from jaxbundle.adjustment.solve import find_minimum, make_solver
+from jaxbundle.leastsquares.datum import move_to_datum
+from jaxbundle.leastsquares.problem import pad_values
 from jaxbundle.network.check import check_network
 from jaxbundle.network.simulate import Simulation, simulate_with_truth
 from jaxbundle.network.stations import aerial_block, cloud_of_targets
+from jaxbundle.solution import minimise
 
 FREE = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2")
 TRUE = {"c": 100.0, "x0": 0.02, "y0": -0.03, "K1": 1e-6, "K2": -1e-10, "K3": 2e-14, "P1": 1e-7,
@@ -94,12 +95,14 @@ def run(images: int, points: int, spacing: float, repeat: int) -> dict:
     )
     memory["preparation"] = machine.peak_mb()
 
-    solver = make_solver(problem)
-    minimum, first_s = timed(lambda: find_minimum(solver, problem.data))
+    solve = lambda: minimise(problem, problem.data.start)  # noqa: E731
+    minimum, first_s = timed(solve)
     memory["solution"] = machine.peak_mb()
-    solve_s = best(lambda: find_minimum(solver, problem.data), repeat)
-    compiled_move = eqx.filter_jit(move_to_datum)
-    move = lambda: compiled_move(problem.structure, minimum.values, problem.data.start)  # noqa: E731
+    solve_s = best(solve, repeat)
+    compiled_move, system = eqx.filter_jit(move_to_datum), problem.system
+    ends = problem.layout.tables(minimum.values), problem.layout.tables(problem.data.start)
+    values, start = (jax.device_put(pad_values(system, tables)) for tables in ends)
+    move = lambda: compiled_move(system.declared, system.plan, values, start)  # noqa: E731
     jax.block_until_ready(move())
     datum_s = best(move, repeat)
 

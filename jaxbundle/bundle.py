@@ -1,6 +1,6 @@
 """`adjust`: a network in, an `Adjustment` out."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import MappingProxyType
 
 import numpy as np
@@ -8,6 +8,7 @@ import numpy as np
 from jaxbundle.adjustment.problem import REDUCTIONS, Problem, make_problem
 from jaxbundle.arguments import at_least_zero, one_of, shown, truth, whole
 from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.leastsquares.declarations import Observations, Table
 from jaxbundle.leastsquares.robust import ESTIMATORS
 from jaxbundle.leastsquares.search import METHODS
 from jaxbundle.leastsquares.snooping import check_test
@@ -48,6 +49,7 @@ UNNAMED = ("a combination of unknowns that spreads over many of them",)
 def adjust(
     network: Network,
     *,
+    also: Sequence[Table | Observations] = (),
     method: str = "levenberg-marquardt",
     reduction: str | None = None,
     max_iterations: int = 100,
@@ -65,6 +67,10 @@ def adjust(
 
     - `network`: see `jaxbundle.make_network`, `jaxbundle.read_network`, `jaxbundle.simulate`. Start
       values it lacks are found first (`jaxbundle.orient`).
+    - `also`: observations of further kinds (`jaxbundle.leastsquares.Kind`), and tables of the
+      unknowns they bring. They touch the network's tables "image", "camera" and "point" by id, see
+      object coordinates as they are, and have a σ0 group, redundancy numbers and residuals of their
+      own (docs/engine.md).
     - `method`: `"levenberg-marquardt"` or `"gauss-newton"`.
     - `reduction`: how the reduced system of images and cameras is solved: `"dense"`, `"banded"` or
       `"iterative"`; chosen by its size and fill if not given.
@@ -103,7 +109,7 @@ def adjust(
     def begin(network, cameras=MappingProxyType({})):
         network, *check = split_check_points(check_network(network))
         try:
-            problem = make_problem(network, reduction)
+            problem = make_problem(network, reduction, also)
         except InputError as error:  # The datum, for want of the control points left out.
             raise InputError(f"{error} {finding}".strip()) from None
         return problem, again(problem, start_with(problem, cameras)), check

@@ -24,6 +24,7 @@ from jaxbundle.adjustment.unknowns import (
 from jaxbundle.arguments import at_least_zero
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import NotSolvedError
+from jaxbundle.leastsquares.adjust import TableResult, table_result
 from jaxbundle.leastsquares.components import Component, variance_components
 from jaxbundle.leastsquares.distributions import chi2_quantile
 from jaxbundle.leastsquares.names import Name
@@ -366,6 +367,14 @@ class Adjustment:
         """Per camera: model, and per parameter value, sigma, free, t, total_correlation; and the
         correlation matrix of the free ones."""
         return result_tables.cameras(self)
+
+    def unknowns(self, table: str) -> TableResult:
+        """Values, σ and covariances of a table of unknowns that came with further kinds of
+        observations (`also` of `jaxbundle.adjust`)."""
+        if table not in self.values.other:
+            known = ", ".join(self.values.other) or "none"
+            raise KeyError(f"there is no further table {table!r}; known: {known}")
+        return table_result(self.cofactors.solution, table, self.sigma0)
 
     @functools.cached_property
     def images(self) -> dict[str, np.ndarray]:

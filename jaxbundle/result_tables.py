@@ -118,11 +118,27 @@ def residuals(adjustment) -> dict[str, np.ndarray]:
         parts.append(("prior", cameras[[c]], blank(1), axes,
                       found.residual.interior[one], data.interior_weight[one],
                       found.redundancy.interior[one], found.w.interior[one]))  # fmt: skip
+    parts += _further(problem, found)
     a, b = (points[network.distances.points[:, i]] for i in range(2))
     parts.append(("distance", a, b, ("d",), found.residual.distance[:, None],
                   data.distance_weight[:, None], found.redundancy.distance[:, None],
                   found.w.distance[:, None]))  # fmt: skip
     return _concatenate([_residual_rows(adjustment, *part) for part in parts])
+
+
+def _further(problem, found):
+    """Observations of further kinds: what they touch stands where the point does."""
+    first = len(problem.layout.sets)
+    for k, given in enumerate(problem.system.observations[first:]):
+        weight = problem.system.weights(first + k)
+        touched = [given.label(problem.system.tables, row) for row in range(given.number)]
+        touched = [label.removeprefix(f"{given.kind.name} of ") for label in touched]
+        axes = given.kind.axes or tuple(str(i + 1) for i in range(weight.shape[1]))
+        blank = np.full(given.number, "", dtype=object)
+        yield (
+            given.kind.name, blank, np.array(touched, dtype=object), axes,
+            found.residual.other[k], weight, found.redundancy.other[k], found.w.other[k],
+        )  # fmt: skip
 
 
 def checks(adjustment) -> dict[str, np.ndarray]:

@@ -11,14 +11,17 @@ from scipy import integrate
 
 import jaxbundle
 from jaxbundle import Camera, InputError, bundle
-from jaxbundle.adjustment.solve import find_minimum, make_solver
 from jaxbundle.bundle import adjust
 from jaxbundle.cameras import get_model, residual
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.io.result_json import result_dict
+from jaxbundle.leastsquares import robust, snooping
+from jaxbundle.leastsquares.robust import residual_lengths, robust_scale
+from jaxbundle.leastsquares.snooping import Removed, _passing, _Touched, _worst, without
+from jaxbundle.leastsquares.solution import Solution, find_minimum
 from jaxbundle.report import text
-from jaxbundle.statistics import Inspection, readjusting, robust, robust_scale
-from jaxbundle.statistics.snooping import Removed, _passing, _worst, without
+from jaxbundle.solution import minimise
+from jaxbundle.statistics.inspection import Inspection
 
 pytestmark = pytest.mark.xdist_group("bundle")
 
@@ -93,34 +96,31 @@ def test_baarda_finds_them_too(network):
 def test_what_agrees_comes_back(network):
     """Removed observations pass that agree with an adjustment they took no part in."""
     spoilt, bad, _ = with_blunders(network, 1)
-    problem = jaxbundle.make_problem(jaxbundle.check_network(spoilt))
-    wrong = [Removed("image", int(problem.rays[k]), "wrong", 9.0) for k in np.flatnonzero(bad)]
-    right = [
-        Removed("image", int(problem.rays[k]), "right", 9.0) for k in np.flatnonzero(~bad)[::97]
-    ]
-    less = without(problem, *wrong, *right)
-    back = _passing(problem, Inspection(less, jaxbundle.solve(less)), wrong + right, 4.5)
-    assert all(("image", r.row) in back for r in right)
-    assert sum(("image", r.row) in back for r in wrong) <= 0.05 * len(wrong)
+    whole = jaxbundle.make_problem(jaxbundle.check_network(spoilt)).system
+    wrong, right = np.flatnonzero(bad), np.flatnonzero(~bad)[::97]
+    removed = [Removed(0, int(row), None, 9.0) for row in (*wrong, *right)]
+    less = without(whole, removed)
+    found = Solution(less, find_minimum(less, max_steps=101).values)
+    back = {row for _, row, _ in _passing(whole, found, _Touched(whole), removed, 4.5)}
+    assert back >= set(right)
+    assert len(back & set(wrong)) <= 0.05 * len(wrong)
 
 
 def test_predicted_test_of_an_observation(network):
     """v/√(1 + h) against the residual and its covariance, both from the formula of the camera."""
     problem = jaxbundle.make_problem(jaxbundle.check_network(network))
-    row = int(problem.rays[123])
-    less = without(problem, Removed("image", row, "", 0.0))
-    values = jaxbundle.solve(less)
-    predicted = np.asarray(Inspection(less, values).predicted_tests(problem.data).image)[row]
-
-    s, data = problem.structure, problem.data
-    i, p = int(s.image[row]), int(s.point[row])
+    row, data = 123, problem.data
+    less = problem.with_system(without(problem.system, [Removed(0, row, None, 0.0)]))
+    minimum = minimise(less, data.start, max_steps=101)
+    found = Inspection(less, minimum.values).solution
+    predicted = found.predicted_tests(problem.system.data)[0][row]
+    i, p = problem.image[row], problem.point[row]
     model = get_model("brown")
 
     def misclosure(v):
         ray = matrix_from_quaternion(v.rotation[i]) @ (v.point[p] - v.position[i])
         return jnp.stack(residual(model, "corrected", tuple(v.camera[0]), ray, data.image_xy[row]))
 
-    minimum = find_minimum(make_solver(less), less.data)
     result = jaxbundle.Adjustment(less.network, less, minimum)
     h = np.diagonal(result.covariance_of(misclosure)) / result.sigma0**2 / SIGMA**2
     expected = np.asarray(misclosure(result.values)) / SIGMA / np.sqrt(1 + h)
@@ -148,7 +148,8 @@ def test_huber_minimises_his_function(network):
     spoilt, _, _ = with_blunders(network, 3)
     found = adjust(spoilt, robust="huber")
     problem = jaxbundle.make_problem(jaxbundle.check_network(spoilt))
-    scale = robust_scale(problem, Inspection(problem, found.values).lengths)
+    lengths = residual_lengths(Inspection(problem, found.values).solution)
+    scale = robust_scale(problem.system, lengths)
 
     def total(step):
         moved = found.values.camera.at[0, 0].add(step)
@@ -201,12 +202,12 @@ def test_rays_that_cannot_mask_each_other_go_together(network):
     """More than one of an image at a time, but one of a point; and they are the blunders."""
     spoilt, bad, _ = with_blunders(network, 1)
     problem = jaxbundle.make_problem(jaxbundle.check_network(spoilt))
-    found = Inspection(problem, jaxbundle.solve(problem))
-    sigma0 = np.sqrt(found.vtpv / problem.counts.redundancy)
-    rows = np.array([r.row for r in _worst(found, sigma0, 4.5, 3.29)])
-    image, point = np.asarray(problem.structure.image)[rows], np.asarray(problem.structure.point)
-    assert np.bincount(image).max() > 1 and len(set(point[rows])) == len(rows)
-    assert np.isin(rows, problem.rays[bad]).all()
+    found = Solution(problem.system, find_minimum(problem.system, max_steps=101).values)
+    worst = _worst(found, _Touched(problem.system), found.sigma0, 4.5, 3.29)
+    rows = np.array([r.row for r in worst])
+    image, point = problem.image[rows], problem.point[rows]
+    assert np.bincount(image).max() > 1 and len(set(point)) == len(rows)
+    assert bad[rows].all()
 
 
 @pytest.mark.parametrize("options", [{"snooping": "pope"}, {"robust": "tukey"}])
@@ -214,7 +215,7 @@ def test_a_large_network_takes_single_steps(network, options, monkeypatch):
     """To the same end, with two whole adjustments after the first."""
     spoilt, _, _ = with_blunders(network, 1)
     usual = adjust(spoilt, **options)
-    monkeypatch.setattr(readjusting, "STEPPING", 0)
+    monkeypatch.setattr(snooping, "STEPPING", 0)
     calls, whole = [], bundle.minimise
     monkeypatch.setattr(bundle, "minimise", lambda *a, **k: calls.append(1) or whole(*a, **k))
     found = adjust(spoilt, **options)

@@ -8,14 +8,14 @@ import pytest
 
 import jaxbundle
 from jaxbundle import Camera
-from jaxbundle.adjustment.solve import find_minimum, make_solver
-from jaxbundle.adjustment.unknowns import undetermined
 from jaxbundle.bundle import adjust
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.io import csv_tables
 from jaxbundle.io.result_json import result_dict, result_text, without_nan
-from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.leastsquares.distributions import tau_quantile
+from jaxbundle.leastsquares.names import undetermined
+from jaxbundle.network.tables import EXTERIOR
+from jaxbundle.solution import minimise
 
 pytestmark = pytest.mark.xdist_group("bundle")
 
@@ -226,8 +226,7 @@ def test_gauss_newton_that_strays_is_not_taken_for_a_minimum(simulation):
         network = simulation.network.replace(points=dataclasses.replace(points, position=moved))
         found = adjust(network, method="gauss-newton", max_iterations=30)
         if found.converged:
-            solver = make_solver(found.problem, max_steps=101)
-            again = find_minimum(solver, found.problem.data, found.values)
+            again = minimise(found.problem, found.values, max_steps=101)
             lowest = 2 * np.nanmin(again.history.cost)
             assert found.vtpv == pytest.approx(lowest, rel=1e-8)
 
@@ -248,7 +247,8 @@ def test_a_wild_coordinate_ends_without_a_result(simulation):
 def test_numbers_that_overflow_have_no_names(result):
     problem = result.problem
     data = dataclasses.replace(problem.data, image_weight=1e200 * problem.data.image_weight)
-    assert undetermined(problem, data.start, data) == []
+    problem = problem.with_data(data)
+    assert undetermined(problem.system, problem.system.data.start) == []
 
 
 def test_an_undetermined_parameter_is_named():

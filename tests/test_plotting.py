@@ -134,8 +134,8 @@ def test_sigma_of_the_profile(convergent4):
     P = [names.index("P1"), names.index("P2")]
     sigma = np.sqrt(direction @ C[np.ix_(P, P)] @ direction)
     np.testing.assert_allclose(found.decentring_sigma, sigma * r**2, rtol=1e-7, atol=1e-15)
-    data, structure = convergent4.problem.data, convergent4.problem.structure
-    away = np.asarray(data.image_xy)[np.asarray(structure.camera) == 0] - [p["x0"], p["y0"]]
+    problem = convergent4.problem
+    away = np.asarray(problem.data.image_xy)[problem.camera == 0] - [p["x0"], p["y0"]]
     assert r[-1] == pytest.approx(np.hypot(*away.T).max())
 
 

@@ -11,16 +11,17 @@ import numpy as np
 import pytest
 
 from jaxbundle import report
-from jaxbundle.adjustment.solver import LIMIT, NOT_FINITE, STUCK
-from jaxbundle.adjustment.unknowns import Name
 from jaxbundle.cameras import MODEL_NAMES, get_model
 from jaxbundle.io.result_json import result_dict
+from jaxbundle.leastsquares.names import Name
+from jaxbundle.leastsquares.stopping import LIMIT, NOT_FINITE, STUCK
 from jaxbundle.network.columns import count
 from jaxbundle.network.tables import EXTERIOR, Camera
 from jaxbundle.report import head, layout, observations, unknowns
 from jaxbundle.report.equations import EQUATIONS
 from jaxbundle.result import Adjustment
-from jaxbundle.statistics import CheckPoints, Removed
+from jaxbundle.statistics.blunders import Removed
+from jaxbundle.statistics.check_points import CheckPoints
 from jaxbundle.targets import write_targets
 
 pytestmark = pytest.mark.xdist_group("convergent4")
@@ -338,14 +339,15 @@ def test_about_a_known_point_only_rotations_and_scale_are_open(convergent4):
     points = problem.network.points
     P = points.position[0] - problem.origin
     shifts = np.column_stack([*(-np.cross(axis, P) for axis in np.eye(3)), -P])
-    structure = eqx.tree_at(
-        lambda s: s.gauge, problem.structure, jnp.asarray(np.concatenate([shifts, np.eye(4)]))
-    )
+    system = problem.system
+    gauge = jnp.asarray(np.concatenate([shifts, np.eye(4)]))
+    plan = eqx.tree_at(lambda plan: plan.datum.gauge, system.plan, gauge)
+    system = dataclasses.replace(system, plan=plan)
     network = problem.network.replace(
         points=dataclasses.replace(points, role=("fixed", *points.role[1:]))
     )
     problem = dataclasses.replace(
-        problem, structure=structure, counts=dataclasses.replace(problem.counts, datum=4)
+        problem, system=system, counts=dataclasses.replace(problem.counts, datum=4)
     )
     text = head.datum(again(convergent4, network, problem))
     assert "leave open rotation X, rotation Y, rotation Z, scale;" in text

@@ -15,7 +15,7 @@ from jaxbundle.cli.adjust import _why_not
 from jaxbundle.network.repetitions import warn_of_repetitions
 from jaxbundle.network.stations import Stations
 from jaxbundle.orientation.one_place import name_one_place
-from jaxbundle.statistics import Inspection
+from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.statistics.weakness import VAGUE, Weakness, weakness, weakness_of_unsolved
 
 TARGETS = grid_of_targets(5, 5, 0.5, relief=0.2, seed=1)
@@ -175,7 +175,7 @@ def test_vertical_images_name_the_principal_distance(control, monkeypatch):
         assert VAGUE * c["sigma"] > c["value"]
         # The directions of a factor give what the cofactors give.
         given = result.weakness
-        monkeypatch.setattr("jaxbundle.statistics.weakness.SMALL", 0)
+        monkeypatch.setattr("jaxbundle.leastsquares.weakness.SMALL", 0)
         found = weakness(Inspection(result.problem, result.values), result.sigma0)
         assert found.unknowns == given.unknowns
         assert found.worst == pytest.approx(c["sigma"] / c["value"], rel=1e-3)

@@ -1,6 +1,7 @@
 """A network made ready for the engine: plan, arrays, datum and the count of its rows."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax
 import numpy as np
@@ -10,7 +11,7 @@ from jaxbundle.arguments import one_of
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares import problem as engine
 from jaxbundle.leastsquares.datum import CannotHold
-from jaxbundle.leastsquares.search import METHODS
+from jaxbundle.leastsquares.declarations import Observations, Table
 from jaxbundle.network.arrays import Data, Values
 from jaxbundle.network.datum_words import open_directions_in_words
 from jaxbundle.network.declare import Layout, declare, order_cameras
@@ -31,12 +32,13 @@ class Counts:
     exterior: int
     interior: int
     distances: int
+    other: int
     datum: int
     unknowns: int
 
     @property
     def pseudo_observations(self) -> int:
-        return self.control + self.exterior + self.interior + self.distances
+        return self.control + self.exterior + self.interior + self.distances + self.other
 
     @property
     def redundancy(self) -> int:
@@ -109,13 +111,16 @@ class Problem:
         return dataclasses.replace(self, system=system, data=data, counts=counts)
 
 
-def make_problem(network: Network, reduction: str | None = None) -> Problem:
+def make_problem(
+    network: Network, reduction: str | None = None, also: Sequence[Table | Observations] = ()
+) -> Problem:
     """Plan, arrays and datum of a checked network (see `jaxbundle.network.check_network`).
 
     Check points take no part: they and their rays are left out.
 
     `reduction`: how the reduced system is solved, "dense", "banded" or "iterative"; chosen by its
-    size and fill if not given.
+    size and fill if not given. `also`: observations of further kinds, and tables of the unknowns
+    they bring (see `jaxbundle.adjust`).
 
     **Raises:** `InputError` where the datum asked for cannot be had; `RuntimeError` without
     64-bit floats.
@@ -124,7 +129,7 @@ def make_problem(network: Network, reduction: str | None = None) -> Problem:
     one_of("reduction", reduction, REDUCTIONS, none=True)
     require_network(network)
     network = order_cameras(split_check_points(network)[0])
-    declared = declare(network)
+    declared = declare(network, also=also)
     chosen = _datum_points(network)
     try:
         system = engine.make_problem(
@@ -141,12 +146,6 @@ def make_problem(network: Network, reduction: str | None = None) -> Problem:
     data = jax.device_put(declared.data)
     counts = count_rows(declared.layout, system)
     return Problem(network, system, declared.layout, data, declared.origin, counts)
-
-
-def make_solver(problem: Problem, method: str = "levenberg-marquardt", **options):
-    """The solver of a problem; `options` are those of `leastsquares.solver.LeastSquares`."""
-    one_of("method", method, tuple(METHODS))
-    return engine.make_solver(problem.system, search=METHODS[method], **options)
 
 
 def require_x64() -> None:
@@ -188,7 +187,8 @@ def count_rows(layout: Layout, system: engine.Problem) -> Counts:
         number[s.field] += int((np.asarray(weight) > 0).sum())
     return Counts(
         observations=number["image"], control=number["control"], exterior=number["exterior"],
-        interior=number["interior"], distances=number["distance"], datum=system.counts.datum,
+        interior=number["interior"], distances=number["distance"],
+        other=system.counts.observations - sum(number.values()), datum=system.counts.datum,
         unknowns=system.counts.unknowns,
     )  # fmt: skip
 

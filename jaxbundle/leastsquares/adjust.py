@@ -49,6 +49,15 @@ class TableResult:
     covariance: Float[np.ndarray, "rows width width"]
 
 
+def table_result(found: Solution, table: str, sigma0: float) -> TableResult:
+    """A table of a solution."""
+    value = jax.tree.map(np.asarray, found.values[table])
+    covariance = sigma0**2 * found.cofactor(table)
+    sigma = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0, None))
+    numbers = isinstance(value, np.ndarray) and value.ndim == 1
+    return TableResult(value, sigma[:, 0] if numbers else sigma, covariance)
+
+
 class Result:
     """An adjusted problem; look at `converged` before anything else.
 
@@ -119,11 +128,7 @@ class Result:
     def __getitem__(self, table: str) -> TableResult:
         if table not in self.minimum.values:
             raise KeyError(f"there is no table {table!r}; known: {', '.join(self.minimum.values)}")
-        value = jax.tree.map(np.asarray, self.solution.values[table])
-        covariance = self.sigma0**2 * self.solution.cofactor(table)
-        sigma = np.sqrt(np.clip(np.diagonal(covariance, axis1=1, axis2=2), 0, None))
-        numbers = isinstance(value, np.ndarray) and value.ndim == 1
-        return TableResult(value, sigma[:, 0] if numbers else sigma, covariance)
+        return table_result(self.solution, table, self.sigma0)
 
     def redundancy(self, kind: str) -> Float[np.ndarray, "n *r"]:
         """The redundancy numbers of the observations of a kind, in the order they were given."""

@@ -22,14 +22,7 @@ from jaxtyping import Array, Float
 
 from jaxbundle.leastsquares.normal import Tangent
 from jaxbundle.leastsquares.plan import Plan
-from jaxbundle.leastsquares.reduced import (
-    Groups,
-    Reduced,
-    blocks_of,
-    cholesky_of_lower,
-    flat,
-    split,
-)
+from jaxbundle.leastsquares.reduced import Reduced, blocks_of, cholesky_of_lower, flat, split
 
 
 class BandFactor(eqx.Module):
@@ -105,20 +98,17 @@ def factorise_band(plan: Plan, S: Reduced) -> BandFactor:
     place, width, blocks = plan.band.place, plan.band.width, plan.band.blocks
     w = plan.groups[g].width
     m = width * w
-    empty = jnp.zeros((blocks, width, width, w, w))
-    D = empty.at[place // width, place % width, place % width].set(S.own[g])
-    E = empty
+    both = jnp.zeros((2, blocks, width, width, w, w))
+    both = both.at[0, place // width, place % width, place % width].set(S.own[g])
     if (g, g) in S.off:
         a, b = place[plan.blocks[g, g].row], place[plan.blocks[g, g].column]
         high, low = jnp.maximum(a, b), jnp.minimum(a, b)
         turned = jnp.where((a < b)[:, None, None], S.off[g, g].mT, S.off[g, g])
-        beside = high // width != low // width
-        at = lambda here: (jnp.where(here, low // width, blocks), high % width, low % width)
-        D = D.at[at(~beside)].add(turned, mode="drop")
-        E = E.at[at(beside)].add(turned, mode="drop")
-    matrices = lambda x: x.transpose(0, 1, 3, 2, 4).reshape(blocks, m, m)
+        beside = high // width - low // width
+        both = both.at[beside, low // width, high % width, low % width].add(turned)
+    D, E = both.transpose(0, 1, 2, 4, 3, 5).reshape(2, blocks, m, m)
     unused = 1.0 - _into_band(plan, jnp.ones(plan.groups[g].free.shape))
-    D = matrices(D) + unused[:, :, None] * jnp.eye(m)
+    D = D + unused[:, :, None] * jnp.eye(m)
     border = [S.between(plan, g, other) for other in others]
     border = jnp.concatenate([jnp.zeros((plan.groups[g].free.size, 0)), *border], 1)
     border = _into_band(plan, border.reshape(plan.groups[g].rows, w, border.shape[1]))
@@ -132,12 +122,12 @@ def factorise_band(plan: Plan, S: Reduced) -> BandFactor:
         return (C, X), (L, C, X)
 
     start = jnp.zeros((m, m)), jnp.zeros((m, border.shape[2]))
-    _, (L, C, X) = jax.lax.scan(step, start, (D, matrices(E), border))
+    _, (L, C, X) = jax.lax.scan(step, start, (D, E, border))
     corner = S.matrix(plan, others) - jnp.einsum("bmi,bmj->ij", X, X)
     return BandFactor(plan, L, C, X, cholesky_of_lower(corner))
 
 
-def _groups(plan: Plan) -> tuple[str, Groups]:
+def _groups(plan: Plan) -> tuple[str, tuple[str, ...]]:
     """The group of the band, and those of the border."""
     return plan.band.group, tuple(g for g in plan.kept if g != plan.band.group)
 
@@ -157,13 +147,8 @@ def _from_band(plan: Plan, x: Float[Array, "blocks m *q"]) -> Float[Array, "rows
 def _blocks(plan: Plan, D, E, row, column) -> Float[Array, "blocks w w"]:
     """The blocks of two rows each, from the blocks on (D) and above (E) the diagonal."""
     w, width = plan.groups[plan.band.group].width, plan.band.width
-    cut = lambda X: X.reshape(-1, width, w, width, w)
     a, b = plan.band.place[row], plan.band.place[column]
     low, high = jnp.minimum(a, b), jnp.maximum(a, b)
-    here = low // width
-    found = jnp.where(
-        (here == high // width)[:, None, None],
-        cut(D)[here, low % width, :, high % width, :],
-        cut(E)[here, low % width, :, high % width, :],
-    )
+    both, here = jnp.stack([D, E]).reshape(2, -1, width, w, width, w), low // width
+    found = both[high // width - here, here, low % width, :, high % width]
     return jnp.where((a > b)[:, None, None], found.mT, found)

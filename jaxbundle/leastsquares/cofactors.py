@@ -52,7 +52,7 @@ def cofactors(declared: Declared, values: Values, factor: Factor) -> Cofactors:
     own = dict(Q.own)
     if plan.eliminated is not None:
         K, L = _couplings(factor, Q), factor.lower_inverse
-        inner = jnp.eye(L.shape[1])
+        inner = jnp.broadcast_to(jnp.eye(L.shape[1]), L.shape)
         for g, k in K.items():
             at = plan.incidences[g].eliminated.ravel()
             rows = jnp.einsum("clij,clkj->clik", k, factor.Z[g]).reshape(-1, *L.shape[1:])

@@ -38,12 +38,13 @@ def _of_group(declared, group, values, blocks):
         at = slice(member.start, member.start + member.width)
         T = T.at[:, at, at].set(jnp.eye(member.width) if chart is None else chart)
 
-    def one(T, N):
+    def one(T, N, free):
         inverse = jnp.linalg.inv(T)
         D = T.T @ (jnp.diagonal(inverse.T @ N @ inverse)[:, None] * T)
+        D = D * free * free[:, None]  # What is held takes no part in what is not.
         return D + jnp.diag(jnp.where(jnp.diagonal(D) > 0, 0.0, 1.0))
 
-    return jax.vmap(one)(T, blocks)
+    return jax.vmap(one)(T, blocks, group.free)
 
 
 def _positive(diagonal):

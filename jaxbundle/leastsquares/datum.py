@@ -148,16 +148,12 @@ def _directional_products(declared: Declared, plan: Plan, data: Data, real):
         if declared.kinds[part.observations].invariant:
             continue
         _, touches, E = differentiate(declared, plan, number, prepared, laid)
-        found = [
-            jnp.einsum("clri,cim->clrm", J, everywhere[t.group][0][t.row, t.start : t.stop])
-            for t, J in zip(part.touches, touches)
-        ]
+        blocks = [(J, everywhere[t.group][0][t.row, t.start : t.stop][:, None])
+                  for t, J in zip(part.touches, touches)]  # fmt: skip
         if E is not None:
-            found.append(
-                jnp.einsum("clri,clim->clrm", E, everywhere[plan.eliminated][0][part.eliminated])
-            )
-        products.append(sum(found).reshape(-1, motions))
-        terms += [x.reshape(-1, motions) for x in found]
+            blocks.append((E, everywhere[plan.eliminated][0][part.eliminated]))
+        products.append(sum(J @ G for J, G in blocks).reshape(-1, motions))
+        terms.append(sum(abs(J) @ abs(G) for J, G in blocks).reshape(-1, motions))
     free = free_of_tables(plan, declared, data.start)
     held = [
         jnp.where((free[name] > 0)[..., None] | ~real[name][:, None, None], 0.0, rows)

@@ -74,6 +74,14 @@ class Table:
     def rows(self) -> int:
         return len(jax.tree.leaves(self.value)[0])
 
+    def rows_of(self, labels, kind: str) -> np.ndarray:
+        """The rows of these labels, which observations of a kind touch."""
+        place = {self.label(row): row for row in range(self.rows)}
+        missing = next((name for name in labels if name not in place), None)
+        if missing is not None:
+            raise InputError(f"{kind}: there is no {self.title} {missing!r}")
+        return np.array([place[name] for name in labels], np.int64)
+
     def label(self, row: int) -> str:
         """The name of a row; its number, counted from 1, if it has none."""
         return str(row + 1) if self.labels is None else str(self.labels[row])
@@ -140,7 +148,8 @@ class Motions:
 class Observations:
     """Observations of one kind.
 
-    **Arguments:** `rows`: for each touched table the row every observation touches, [n];
+    **Arguments:** `rows`: for each touched table the row (or the label of the row) every
+    observation touches, [n];
     `measured`: arrays of n rows; `sigma`: one number, [n] or [n, r] (1 if neither is given;
     infinite: a weight of 0), or `covariance` [n, r, r] of the residuals of an observation.
 
@@ -155,7 +164,7 @@ class Observations:
 
     def __post_init__(self):
         name, kind = self.kind.name, self.kind
-        rows = tuple(np.asarray(r, np.int64).ravel() for r in self.rows)
+        rows = tuple(_row_numbers(r) for r in self.rows)
         if len(rows) != len(kind.of):
             raise InputError(
                 f"{name}: rows of {len(kind.of)} tables are expected ({', '.join(kind.of)}), not "
@@ -174,6 +183,21 @@ class Observations:
     @property
     def number(self) -> int:
         return len(self.rows[0])
+
+    def resolved(self, tables: Sequence[Table]) -> "Observations":
+        """The same with row numbers for labels.
+
+        **Raises:** `InputError` for a table that is not there, or a label that it does not have."""
+        called = {t.name: t for t in tables}
+        unknown = next((name for name in self.kind.of if name not in called), None)
+        if unknown is not None:
+            known = ", ".join(called)
+            raise InputError(f"{self.kind.name}: there is no table {unknown!r}; known: {known}")
+        rows = tuple(
+            called[name].rows_of(column, self.kind.name) if column.dtype == object else column
+            for name, column in zip(self.kind.of, self.rows)
+        )
+        return dataclasses.replace(self, rows=rows)
 
     def label(self, tables: Sequence[Table], row: int) -> str:
         """An observation in words: its kind and what it touches."""
@@ -203,6 +227,14 @@ class Observations:
                 "positive number is expected"
             )
         return 1 / sigma
+
+
+def _row_numbers(rows) -> np.ndarray:
+    """Whole numbers, or labels as objects."""
+    rows = np.asarray(rows).ravel()
+    if rows.dtype.kind in "OUS":
+        return np.array([str(r) for r in rows], dtype=object)
+    return rows.astype(np.int64)
 
 
 def _whitening(name: str, covariance, residuals: int):

@@ -1,8 +1,14 @@
-"""Motions that observations may leave open: shifts, and similarities of places and poses."""
+"""Motions that observations may leave open: shifts, and similarities of places and poses.
+
+Those that leave a place where it is do so as finite motions too: shift, rotation and scale are
+made together, for a unit of time, not one after the other (canonical coordinates).
+"""
 
 from collections.abc import Sequence
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxbundle.geometry import transform_point, transform_pose
 from jaxbundle.leastsquares.declarations import Motions, Table
@@ -11,9 +17,13 @@ from jaxbundle.leastsquares.spaces import Pose, PoseValue, Vector
 SEVEN = ("shift X", "shift Y", "shift Z", "rotation X", "rotation Y", "rotation Z", "scale")
 
 
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(20)
+"""For integrals from −1 to 1."""
+
+
 def similarity(points: Sequence[str] = ("point",), poses: Sequence[str] = ()) -> Motions:
     """The seven parameters of space that move tables of points [n, 3] and of poses."""
-    moved = [(name, transform_point) for name in points] + [(name, _move_pose) for name in poses]
+    moved = [(name, _move_point) for name in points] + [(name, _move_pose) for name in poses]
     return Motions(SEVEN, tuple(moved), curved=(3, 4, 5, 6))
 
 
@@ -40,14 +50,31 @@ def likely_motions(tables: Sequence[Table]) -> Motions | None:
     return shift(vectors[0][0]) if vectors[0] else None
 
 
+def _move_point(motion, value):
+    return transform_point(_together(transform_point, motion, 3), value)
+
+
 def _move_pose(motion, value: PoseValue) -> PoseValue:
-    return PoseValue(*transform_pose(motion, *value))
+    return PoseValue(*transform_pose(_together(transform_point, motion, 3), *value))
 
 
 def _move_in_plane(motion, value):
+    return _transform_in_plane(_together(_transform_in_plane, motion, 2), value)
+
+
+def _transform_in_plane(motion, value):
     x, y, turn, log_scale = motion
     c, s = jnp.exp(log_scale) * jnp.cos(turn), jnp.exp(log_scale) * jnp.sin(turn)
     return jnp.stack([c * value[0] - s * value[1] + x, s * value[0] + c * value[1] + y])
+
+
+def _together(transform, motion, size: int):
+    """The motion whose shift comes after its rotation and scale, for one in which all are made
+    together: ∫₀¹ A(u)·t du, A(u) the rotation and scale after the time u (Gauss–Legendre, to
+    rounding up to two turns and a scale of e⁵)."""
+    still = motion.at[:size].set(0.0)
+    moved = jax.vmap(lambda u: transform(u * still, motion[:size]))((NODES + 1) / 2)
+    return still.at[:size].set(WEIGHTS / 2 @ moved)
 
 
 def _shift(motion, value):

@@ -199,7 +199,7 @@ class _Planner:
         self.ways = self.choose("ways", found=tuple(ways))
         self.tables = {t.name: t for t in tables}
         self.observations = observations
-        self.moving = [t.name for t in tables if t.free.any()]
+        self.moving = self.choose("moving", found=[t.name for t in tables if t.free.any()])
         self.eliminate = eliminate
         self.split_rows()
         self.split_observations()
@@ -224,7 +224,7 @@ class _Planner:
             slots = [s for s, name in enumerate(given.kind.of) if name == self.eliminate]
             for s in slots if len(slots) > 1 else ():
                 stays[given.rows[s]] = True
-        self.stays = stays & table.free.any(1)
+        self.stays = self.choose("stays", found=stays & table.free.any(1))
 
     def split_observations(self):
         """Observations of one kind, apart by which of their slots touches an eliminated row."""
@@ -250,6 +250,7 @@ class _Planner:
             if name == self.eliminate:
                 continue
             host = next((g for g in self.members if self._meet_always(g, name)), None)
+            host = self.choose("host", name, found=host)
             if host is None:
                 self.members[name] = [(name, 0, None)]
                 self.group_of[name] = name, 0, np.arange(table.rows)
@@ -329,7 +330,8 @@ class _Planner:
             index = None if rows is None else Index(rows, ("group", name), ("table", table))
             members.append(Member(table, start, given.space.width, index))
         free = np.concatenate(free, 1)
-        return Group(tuple(members), Column(free, ("group", name)), bool(free.all()))
+        all_free = self.choose("all free", name, found=bool(free.all()))
+        return Group(tuple(members), Column(free, ("group", name)), all_free)
 
     def part(self, k, part):
         """The part k: laid out in chunks, with its touches (couples and incidences come later)."""
@@ -348,11 +350,12 @@ class _Planner:
         large = self.choose("large", k, found=len(major) >= SMALL)
         order, used = lay_out(major, minor, length)
         chunk = lambda x: x[order].reshape(-1, length)
-        lookup, by_row = [], []
+        lookup, by_row, first = [], [], np.zeros(major.max(initial=0) + 1, np.int64)
+        first[major] = np.arange(len(major))  # An observation of every major.
         for s, name in enumerate(of):
             at = chunk(rows[s])
-            one = s != part.slot and bool((at == at[:, :1]).all())
-            one = self.choose("by chunk", k, s, found=one)
+            one = length == 1 or bool((rows[s] == rows[s][first[major]]).all())
+            one = self.choose("by chunk", k, s, found=one and s != part.slot)
             by_row.append(not one)
             lookup.append(Index(at[:, 0] if one else at, along, ("table", name)))
         touches = []

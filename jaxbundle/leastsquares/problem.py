@@ -16,7 +16,7 @@ from jaxbundle.leastsquares.indices import common, finish, rounded
 from jaxbundle.leastsquares.plan import Plan, make_plan
 from jaxbundle.leastsquares.reduction import FACTORS, REDUCTIONS
 from jaxbundle.leastsquares.retraction import retract
-from jaxbundle.leastsquares.rows import Data, Declared, Values
+from jaxbundle.leastsquares.rows import Data, Declared, Values, evaluate, scalars
 from jaxbundle.leastsquares.solver import LeastSquares
 from jaxbundle.leastsquares.stopping import Tolerance
 
@@ -26,7 +26,8 @@ LARGE = 200_000
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """What is solved: declarations, plan and numbers. `rows`: the observations' residuals."""
+    """What is solved: declarations, plan and numbers. `sizes`: of the lists of the plan; `choices`:
+    what was chosen when it was made (`plan.make_plan`)."""
 
     tables: tuple[Table, ...]
     observations: tuple[Observations, ...]
@@ -34,6 +35,7 @@ class Problem:
     plan: Plan
     data: Data
     sizes: dict
+    choices: dict
     counts: "Counts"
     retraction: Callable
 
@@ -94,24 +96,30 @@ def make_problem(
     the reduced system is solved, "dense", "banded" or "iterative"; chosen by its size and fill if
     not given."""
     one_of("reduction", reduction, REDUCTIONS, none=True)
-    tables, observations = tuple(tables), tuple(observations)
+    tables = tuple(tables)
+    observations = tuple(given.resolved(tables) for given in observations)
     check(tables, observations)
     spaces = tuple((t.name, t.space) for t in tables)
     declared = Declared(tuple(o.kind for o in observations), spaces, motions)
     ways = REDUCTIONS if reduction is None else (reduction,)
-    plan, sizes = _make_plan(tables, observations, eliminate, ways)
+    planned = _make_plan(tables, observations, eliminate, ways)
     data = make_data(declared, tables, observations)
-    problem = Problem(tables, observations, declared, plan, data, sizes, count(tables, data),
-                      (retraction or Retraction)(declared))  # fmt: skip
+    problem = Problem(tables, observations, declared, planned[0], data, *planned[1:],
+                      count(tables, data), (retraction or Retraction)(declared))  # fmt: skip
     return problem if motions is None else _with_datum(problem, datum)
 
 
 def _make_plan(tables, observations, eliminate, ways):
-    """The plan on the device, and the sizes of its lists."""
-    host, sizes, _ = make_plan(tables, observations, eliminate, ways=ways)
-    number = sum(o.number for o in observations)
-    sizes = common([sizes], lambda key, n: n if number > LARGE else rounded(n))
-    return jax.device_put(finish(host, sizes)), sizes
+    """The plan on the device, the sizes of its lists, and the choices made."""
+    host, sizes, choices = make_plan(tables, observations, eliminate, ways=ways)
+    sizes = common([sizes], rounder(observations))
+    return jax.device_put(finish(host, sizes)), sizes, choices
+
+
+def rounder(observations) -> Callable:
+    """How the sizes of the plan of so many observations are rounded."""
+    large = sum(o.number for o in observations) > LARGE
+    return lambda key, n: n if large else rounded(n)
 
 
 def with_factor(problem: Problem) -> Problem:
@@ -120,11 +128,11 @@ def with_factor(problem: Problem) -> Problem:
     if problem.plan.reduction in FACTORS:
         return problem
     given = problem.tables, problem.observations, problem.plan.eliminated
-    plan, sizes = _make_plan(*given, FACTORS)
+    plan, sizes, choices = _make_plan(*given, FACTORS)
     if plan.reduction not in FACTORS:
         return problem
     plan = dataclasses.replace(plan, datum=problem.plan.datum)
-    return dataclasses.replace(problem, plan=plan, sizes=sizes)
+    return dataclasses.replace(problem, plan=plan, sizes=sizes, choices=choices)
 
 
 def _with_datum(problem: Problem, choose: Callable | None) -> Problem:
@@ -144,6 +152,21 @@ def _with_datum(problem: Problem, choose: Callable | None) -> Problem:
     plan = dataclasses.replace(problem.plan, datum=jax.device_put(datum))
     counts = dataclasses.replace(problem.counts, datum=gauge.shape[1])
     return dataclasses.replace(problem, plan=plan, counts=counts)
+
+
+def open_at(problem: Problem, values: Values) -> Problem:
+    """The problem with its open motions as they are at these values: those about a point that is
+    only weighted go with the point."""
+    datum, invariant = problem.plan.datum, (kind.invariant for kind in problem.declared.kinds)
+    if datum is None or all(invariant):
+        return problem
+    data = pad_data(problem, dataclasses.replace(problem.data, start=values))
+    real = {t.name: np.arange(problem.sizes["table", t.name]) < t.rows for t in problem.tables}
+    gauge = find_open_motions(problem.declared, problem.plan, data, real)
+    if gauge.shape != datum.gauge.shape:
+        return problem
+    datum = dataclasses.replace(datum, gauge=jax.device_put(gauge))
+    return dataclasses.replace(problem, plan=dataclasses.replace(problem.plan, datum=datum))
 
 
 def hold(problem: Problem, table: str, rows, columns=slice(None)) -> Problem:
@@ -195,10 +218,6 @@ def check(tables, observations) -> None:
         known[table.name] = table
     for given in observations:
         for name, rows in zip(given.kind.of, given.rows):
-            if name not in known:
-                raise InputError(
-                    f"{given.kind.name}: there is no table {name!r}; known: {', '.join(known)}"
-                )
             bad = (rows < 0) | (rows >= known[name].rows)
             if bad.any():
                 row = int(np.argmax(bad))
@@ -211,26 +230,27 @@ def check(tables, observations) -> None:
 def make_data(declared: Declared, tables, observations) -> Data:
     """The numbers of a problem as arrays."""
     start = {t.name: jax.tree.map(lambda x: np.asarray(x, float), t.value) for t in tables}
-    weights = [o.weight(_number_of_residuals(declared, start, o)) for o in observations]
+    weights = observed_weights(tables, observations)
     return jax.device_put(Data(start, tuple(o.measured for o in observations), tuple(weights)))
 
 
-def _number_of_residuals(declared: Declared, start, given: Observations) -> int:
-    """How many residuals an observation of a kind has, from the shapes alone."""
-    from jaxbundle.leastsquares.rows import _evaluate, scalars
+def observed_weights(tables, observations) -> list[Float[np.ndarray, "n ..."]]:
+    """The weights of sets of observations; how many residuals a kind has is found from the shapes
+    alone."""
+    called = {t.name: t for t in tables}
+    one = lambda tree: jax.tree.map(lambda x: jax.ShapeDtypeStruct(np.shape(x)[1:], float), tree)
 
-    one = lambda tree: jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], float), tree)
+    def number(given: Observations) -> int:
+        def rows(values, measured):
+            spaces = [called[name].space for name in given.kind.of]
+            blocks = [space.moved(space.prepare(v), ()) for space, v in zip(spaces, values)]
+            first = scalars(jax.tree.map(lambda x: x[None], measured))
+            return evaluate(given.kind, blocks, jax.tree.map(lambda x: x[0], first))
 
-    def evaluate(values, measured):
-        blocks = []
-        for name in given.kind.of:
-            space = declared.spaces[name]
-            blocks.append(space.moved(space.prepare(values[name]), ()))
-        as_scalars = scalars(jax.tree.map(lambda x: x[None], measured))
-        as_scalars = jax.tree.map(lambda x: x[0], as_scalars)
-        return _evaluate(given.kind, blocks, as_scalars)
+        values = [called[name].value for name in given.kind.of]
+        return len(jax.eval_shape(rows, one(values), one(given.measured)))
 
-    return len(jax.eval_shape(evaluate, one(start), one(given.measured)))
+    return [given.weight(number(given)) for given in observations]
 
 
 def _diagonal(weight):
@@ -238,13 +258,18 @@ def _diagonal(weight):
 
 
 def pad_data(problem: Problem, data: Data) -> Data:
+    """The numbers filled to the sizes of the plan, on the device."""
+    return jax.device_put(fill_data(problem, data))
+
+
+def fill_data(problem: Problem, data: Data) -> Data:
     """The numbers filled to the sizes of the plan: weights are 0."""
     fill = lambda o: lambda x: _longer(x, problem.sizes["observations", o], "constant")
-    return jax.device_put(Data(
+    return Data(
         pad_values(problem, data.start),
         tuple(jax.tree.map(fill(o), m) for o, m in enumerate(data.measured)),
         tuple(fill(o)(w) for o, w in enumerate(data.weight)),
-    ))  # fmt: skip
+    )
 
 
 def pad_values(problem: Problem, values: Values) -> Values:

@@ -85,12 +85,13 @@ def residual_of(declared: Declared, part: Part):
 
     def residual(changes, blocks, measured, weight):
         moved = [s.moved(b, d) for s, b, d in zip(spaces, blocks, changes)]
-        return _weighted(_evaluate(kind, moved, measured), weight)
+        return _weighted(evaluate(kind, moved, measured), weight)
 
     return residual
 
 
-def _evaluate(kind: Kind, blocks, measured):
+def evaluate(kind: Kind, blocks, measured):
+    """The residuals of one observation as a tuple of scalars."""
     if not kind.scalars:
         blocks, measured = (_stacked(b) for b in blocks), _stacked(measured)
     found = kind.residual(*blocks, measured)

@@ -23,6 +23,7 @@ from jaxbundle.leastsquares.plan import Plan
 from jaxbundle.leastsquares.problem import (
     Problem,
     make_solver,
+    open_at,
     pad_data,
     pad_values,
     without_filling,
@@ -38,10 +39,19 @@ from jaxbundle.leastsquares.rows import (
     prepare,
     residuals,
 )
-from jaxbundle.leastsquares.solver import Minimum, minimise
+from jaxbundle.leastsquares.sharding import distribute, find_minimum_of_shards
+from jaxbundle.leastsquares.solver import LeastSquares, Minimum, minimise
+from jaxbundle.leastsquares.stopping import converged
 
 HERE = "the plan"
 """Stands for it in a factor that leaves a compiled function."""
+
+TO_SHARE = 10_000
+"""Problems of so many observations are distributed over the devices, where there are several:
+with fewer, devices wait for each other longer than they compute."""
+
+RETURNS, SAME = 10, 1e-12
+"""From the datum to the minimum, at most; vᵀPv that differ by less are the same."""
 
 Rows = dict[int, Float[np.ndarray, "n r"]]
 """By set of observations, in the order they were given."""
@@ -50,17 +60,53 @@ Rows = dict[int, Float[np.ndarray, "n r"]]
 def find_minimum(problem: Problem, start: Values | None = None, **options) -> Minimum:
     """Iterate from `start` (the problem's own if not given) and move the solution into the datum;
     `options`: of the solver (`make_solver`). What is held, and the datum, stay the problem's."""
+    given = pad_values(problem, problem.data.start)
+    start = given if start is None else pad_values(problem, start)
+    minimise_from = _on_all_devices if _worth_sharing(problem, start) else _on_one_device
+    minimise_from = minimise_from(problem, make_solver(problem, **options))
+    first = minimum = minimise_from(start)
+    for _ in range(RETURNS):
+        there = open_at(problem, without_filling(problem, minimum.values))
+        values = _move_to_datum(problem.declared, there.plan, minimum.values, given)
+        if there is problem or not bool(converged(minimum.termination)):
+            break
+        # What leaves one height of a point open, say, is no group of motions: the way into the
+        # datum may have left the minimum.
+        before, after = (
+            Solution(problem, without_filling(problem, v)).vtpv for v in (minimum.values, values)
+        )
+        if after <= before * (1 + SAME) + SAME:
+            break
+        minimum = minimise_from(values)
+    values = without_filling(problem, values)
+    return dataclasses.replace(first, termination=minimum.termination, values=values)
+
+
+def _on_one_device(problem: Problem, solver: LeastSquares):
     data = pad_data(problem, problem.data)
-    start = data.start if start is None else pad_values(problem, start)
-    minimum = _find(make_solver(problem, **options), data, start)
-    return dataclasses.replace(minimum, values=without_filling(problem, minimum.values))
+    return lambda start: _minimise(solver, data, start)
 
 
-@eqx.filter_jit
-def _find(solver, data: Data, start: Values) -> Minimum:
-    minimum = minimise(solver, data, start)
-    values = move_to_datum(solver.declared, solver.plan, minimum.values, data.start)
-    return dataclasses.replace(minimum, values=values)
+def _on_all_devices(problem: Problem, solver: LeastSquares):
+    shards = distribute(problem)
+
+    def minimise_from(start):
+        found = find_minimum_of_shards(shards, solver, start)
+        return dataclasses.replace(found, values=pad_values(problem, found.values))
+
+    return minimise_from
+
+
+def _worth_sharing(problem: Problem, start: Values) -> bool:
+    """Whether there are devices to share a problem, and rows to distribute over them."""
+    if len(jax.devices()) == 1 or problem.plan.eliminated is None:
+        return False
+    if sum(o.number for o in problem.observations) < TO_SHARE:
+        return False
+    return all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(start))
+
+
+_minimise, _move_to_datum = eqx.filter_jit(minimise), eqx.filter_jit(move_to_datum)
 
 
 def take_step(problem: Problem, values: Values) -> Values:
@@ -83,7 +129,7 @@ class Solution:
     """What statistics need of a problem at some `values`, which should be its adjusted ones."""
 
     def __init__(self, problem: Problem, values: Values):
-        self.problem, self.values = problem, values
+        self.problem, self.values = open_at(problem, values), values
         self._data, self._values = pad_data(problem, problem.data), pad_values(problem, values)
 
     @functools.cached_property

@@ -17,10 +17,12 @@ from jaxtyping import Float, Int
 from jaxbundle.cameras import CameraModel, default_parameters, get_model, key_of
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, quaternion_from_matrix
 from jaxbundle.leastsquares import declarations as ls
+from jaxbundle.leastsquares.problem import observed_weights
 from jaxbundle.leastsquares.rows import Data as EngineData
 from jaxbundle.leastsquares.rows import Values as Tables
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Vector
 from jaxbundle.network import kinds
+from jaxbundle.network.also import place, split
 from jaxbundle.network.arrays import Data, Values
 from jaxbundle.network.tables import EXTERIOR, Network
 
@@ -50,13 +52,14 @@ class Set:
         return x if self.rows is None else x[self.rows]
 
 
-    def put(self, whole, part) -> None:
-        """Writes this set's part [n, r] of an array of the field."""
+    def put(self, whole, part):
+        """An array of the field with this set's part [n, r] in it."""
         rows = slice(None) if self.rows is None else self.rows
-        if whole.ndim == 1:
-            whole[rows] = part[:, 0]
-        else:
-            whole[rows, : self.columns] = part
+        at, part = (rows, part[:, 0]) if whole.ndim == 1 else ((rows, np.s_[: self.columns]), part)
+        if isinstance(part, jax.core.Tracer) or isinstance(whole, jax.core.Tracer):
+            return jnp.asarray(whole).at[at].set(part)
+        whole[at] = part
+        return whole
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,8 +103,8 @@ class Layout:
         found = {}
         for s, w in zip(self.sets, weight):
             name = f"{s.field}_weight"
-            whole = found.setdefault(name, np.array(data.weight(s.field)))
-            s.put(whole, np.asarray(w))
+            whole = found.get(name, np.array(data.weight(s.field)))
+            found[name] = s.put(whole, np.asarray(w))
         other = tuple((m, w) for (m, _), w in zip(data.other, weight[len(self.sets) :]))
         return dataclasses.replace(data, other=other, **jax.device_put(found))
 
@@ -111,7 +114,7 @@ class Layout:
         for field in ("image", "control", "exterior", "interior", "distance"):
             found[field] = np.zeros(np.shape(data.weight(field)))
         for o, s in enumerate(self.sets):
-            s.put(found[s.field], np.asarray(by_set[o]))
+            found[s.field] = s.put(found[s.field], by_set[o])
         return Rows(**found, other=tuple(by_set[o] for o in range(len(self.sets), len(by_set))))
 
 
@@ -143,10 +146,13 @@ class Declared:
     origin: Float[np.ndarray, "3"]
 
 
-def declare(network: Network, origin=None) -> Declared:
-    """The tables and observations of a checked network (`check_network`) without check points;
-    `origin`: of its coordinates, the middle of its points if not given."""
+def declare(network: Network, origin=None, also=()) -> Declared:
+    """The tables and observations of a checked network (`check_network`) without check points.
+
+    `origin`: of its coordinates, the middle of its points if not given; `also`: further tables, and
+    observations of further kinds (`also.py`)."""
     data, origin, priors = _data(network, origin)
+    further, others = split(also)
     images, points, observations = network.images, network.points, network.observations
     cameras = _camera_tables(network)
     table_of = {int(c): (t, row) for t in cameras for row, c in enumerate(t.cameras)}
@@ -184,6 +190,14 @@ def declare(network: Network, origin=None) -> Declared:
         columns = len(t.parameters)
         observe(kind, (row_of_camera[priors["interior"][rows]],), "interior", rows, columns)
     observe(kinds.DISTANCES, tuple(network.distances.points.T), "distance")
+    tables += further
+    others = [place(one, origin).resolved(tables) for one in others]
+    start = dataclasses.replace(start, other={t.name: t.value for t in further})
+    weights = observed_weights(tables, others)
+    data = dataclasses.replace(
+        data, start=start, other=tuple((one.measured, w) for one, w in zip(others, weights))
+    )
+    given += others
     layout = Layout(cameras, tuple(sets), start.camera.shape[1], priors)
     return Declared(tuple(tables), tuple(given), layout, data, origin)
 

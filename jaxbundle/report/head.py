@@ -9,6 +9,7 @@ import numpy as np
 from jaxbundle.cameras import get_model
 from jaxbundle.leastsquares.stopping import LIMIT, NOT_FINITE, SINGULAR, STUCK
 from jaxbundle.network.columns import count, some
+from jaxbundle.network.datum_words import open_directions_in_words
 from jaxbundle.network.tables import ROLES
 from jaxbundle.report.layout import (
     WIDTH,

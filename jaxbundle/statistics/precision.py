@@ -23,7 +23,7 @@ from jaxbundle.adjustment.problem import Problem
 from jaxbundle.adjustment.solve import check_given
 from jaxbundle.adjustment.unknowns import angles_near, named, value_of
 from jaxbundle.errors import InputError
-from jaxbundle.leastsquares import precision as engine
+from jaxbundle.leastsquares.precision import precision as engine_precision
 from jaxbundle.leastsquares.reduction import FACTORS
 from jaxbundle.leastsquares.spaces import Pose, PoseValue
 from jaxbundle.network.arrays import Data, Values
@@ -82,7 +82,7 @@ def precision(
         values = problem.layout.values(tables)
         return jnp.stack([value_of(problem, name, values) for name in wanted])
 
-    found = engine.precision(
+    found = engine_precision(
         problem.system, problem.layout.data(_predicted(problem, data)), of if wanted else None
     )
     parts = Precision(

@@ -1,16 +1,15 @@
-"""What cannot be solved ends by its name, never as settled, and `solve` gives NaN."""
+"""What cannot be solved ends by its name, never as settled."""
 
 import dataclasses
 
-import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from adjustment_checks import adjusted, flat, solved, synthetic
+from adjustment_checks import solved, synthetic
 
 from jaxbundle.adjustment.problem import make_problem
-from jaxbundle.adjustment.solve import converged, solve
-from jaxbundle.adjustment.solver import (
+from jaxbundle.leastsquares.stopping import (
     LIMIT,
     NOT_FINITE,
     RELATIVE_COST,
@@ -18,6 +17,7 @@ from jaxbundle.adjustment.solver import (
     SINGULAR,
     STUCK,
     TERMINATIONS,
+    converged,
 )
 from jaxbundle.network import Camera
 
@@ -30,20 +30,9 @@ def problem_of(scene, *, hold_scale=True, hold_images=False, noise=1.0):
         cameras=(camera,), fixed=4, points=12, domain="measured", scene=scene, noise=noise
     )
     problem = make_problem(network)
-    structure = problem.structure
-    if hold_scale:
-        structure = eqx.tree_at(lambda s: s.camera_free, structure, jnp.asarray([[1.0, 0.0]]))
-    if hold_images:
-        structure = eqx.tree_at(
-            lambda s: (s.image_free, s.camera_free), structure,
-            (jnp.zeros_like(structure.image_free), jnp.zeros_like(structure.camera_free)),
-        )  # fmt: skip
-    return dataclasses.replace(problem, structure=structure)
-
-
-def assert_no_answer(problem, data=None, **options):
-    values = solve(problem, data, atol=1e-9, **options)
-    assert np.isnan(flat(values)).all()
+    columns = [0, 1] if hold_images else [1] if hold_scale else []
+    problem = problem.hold("camera", [0], np.array(columns, int))
+    return problem.hold("image", np.arange(6 if hold_images else 0))
 
 
 def test_the_same_network_is_solved_where_it_is_determined():
@@ -54,14 +43,12 @@ def test_two_parameters_that_do_the_same():
     # x = −c·r/q/(1 + K0): only c/(1 + K0) can be found, at any values of the unknowns.
     problem = problem_of("ring", hold_scale=False)
     assert int(solved(problem).termination) == SINGULAR
-    assert_no_answer(problem)
 
 
 def test_principal_distance_from_vertical_images_of_flat_ground():
     # c and the flying height do the same where all points have one height.
     problem = problem_of("vertical", noise=0.0)
     assert int(solved(problem).termination) == SINGULAR
-    assert_no_answer(problem)
 
 
 def test_points_seen_from_one_place():
@@ -71,38 +58,40 @@ def test_points_seen_from_one_place():
     start = dataclasses.replace(
         problem.data.start, position=jnp.broadcast_to(centre[0], centre.shape)
     )
-    problem = dataclasses.replace(problem, data=dataclasses.replace(problem.data, start=start))
-    assert int(solved(problem).termination) == SINGULAR
+    data = dataclasses.replace(problem.data, start=start)
+    assert int(solved(problem, data).termination) == SINGULAR
 
 
 @pytest.mark.parametrize("of", ["image", "point"])
 def test_an_unknown_that_nothing_observes(of):
-    problem, _ = adjusted("shared cameras of two models")
-    rays = getattr(problem.structure, of) == {"image": 2, "point": 8}[of]
+    problem = problem_of("ring")
+    rays = getattr(problem, of) == {"image": 2, "point": 8}[of]
     weight = jnp.where(rays[:, None], 0.0, problem.data.image_weight)
     data = dataclasses.replace(problem.data, image_weight=weight)
     assert int(solved(problem, data).termination) == SINGULAR
 
 
 def test_start_values_that_are_not_finite():
-    problem, _ = adjusted("shared cameras of two models")
+    problem = problem_of("ring")
     point = problem.data.start.point.at[7, 1].set(jnp.nan)
     data = dataclasses.replace(
         problem.data, start=dataclasses.replace(problem.data.start, point=point)
     )
     assert int(solved(problem, data).termination) == NOT_FINITE
-    assert_no_answer(problem, data)
-
-
-def test_too_few_iterations():
-    problem = problem_of("ring")
-    minimum = solved(problem, max_steps=2)
-    assert int(minimum.termination) == LIMIT and int(minimum.iterations) == 2
-    assert np.isfinite(flat(minimum.values)).all()
-    assert_no_answer(problem, max_iterations=2)
 
 
 def test_every_reason_has_words():
     reasons = (LIMIT, SETTLED, RELATIVE_COST, SINGULAR, STUCK, NOT_FINITE)
     assert reasons == tuple(range(len(TERMINATIONS)))
     assert [bool(converged(reason)) for reason in reasons] == [0, 1, 1, 0, 0, 0]
+
+
+def test_adjustment_needs_64_bits():
+    from jaxbundle.adjustment import require_x64
+
+    jax.config.update("jax_enable_x64", False)
+    try:
+        with pytest.raises(RuntimeError, match="enable_x64"):
+            require_x64()
+    finally:
+        jax.config.update("jax_enable_x64", True)

@@ -1,5 +1,7 @@
-"""Derivatives of the solution: against central differences of whole adjustments, in both modes,
-in batches; the Gauss–Newton form against dense least squares."""
+"""Derivatives of the solution of a network, first and second, by everything that was given: against
+central differences of whole adjustments, in both modes, in batches; the Gauss–Newton form against
+dense least squares. (The engine's own: tests/leastsquares/test_derivatives.py.)
+"""
 
 import dataclasses
 from functools import cache
@@ -10,21 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from adjustment_checks import (
-    adjusted,
-    bordered_inverse,
-    datum_matrices,
-    flat,
-    solved,
-)
-from jax.flatten_util import ravel_pytree
+from adjustment_checks import adjusted, camera, flat, linearise, solved, synthetic, vtpv
 
 import jaxbundle
-from jaxbundle.adjustment.jacobian import compiled_jacobian, free_tangent
-from jaxbundle.adjustment.residuals import residuals
-from jaxbundle.adjustment.sensitivity import attach_derivatives
+from jaxbundle.adjustment.problem import make_problem
 from jaxbundle.adjustment.solve import solve
-from jaxbundle.geometry import quaternion_conjugate, quaternion_multiply
+from jaxbundle.leastsquares.derivatives import attach_derivatives
+from jaxbundle.leastsquares.problem import given_data, pad_values, without_filling
 from jaxbundle.network.check import check_network
 
 pytestmark = pytest.mark.slow
@@ -36,266 +30,215 @@ STENCIL = ((1, 8 / 12), (-1, -8 / 12), (2, -1 / 12), (-2, 1 / 12))
 principal distance) they are exact to 1e-8, and the last digits of the solutions do not matter."""
 
 
-def with_xy(data, xy):
-    return dataclasses.replace(data, image_xy=xy)
+def attached(problem, values, data, sensitivity="exact"):
+    """The solution `values` for `data` as a function of them."""
+    system = problem.system
+    tables = pad_values(system, problem.layout.tables(values))
+    given = given_data(system, problem.layout.data(data))
+    found = attach_derivatives(system.declared, system.plan, tables, given, sensitivity)
+    return problem.layout.values(without_filling(system, found))
 
 
 @cache
-def all_derivatives(name, sensitivity):
-    """∂ values / ∂ image coordinates by forward mode: [values, coordinates], and the values."""
-    problem, _ = adjusted(name)
+def program():
+    """Of a network with everything that can be given: (data, u, w) → S, ∂S/∂u, ∂S/∂w, ∂²S/∂u∂w of a
+    scalar S of all values of the solution, along two directions. (Its points are tied by distances,
+    and so all kept: half of the program. Others are eliminated in what follows.)"""
+    network, _ = synthetic(
+        cameras=(camera(free=("c",), sigma=dict(c=0.01)),), images=3, points=5, control=4,
+        distances=((0, 1), (2, 3), (3, 4)), exterior_prior=True,
+    )  # fmt: skip
+    problem, random = make_problem(network), np.random.default_rng(5)
+    weight = jax.tree.map(lambda x: random.normal(size=x.shape), problem.data.start)
 
     @eqx.filter_jit
-    def forward(data):
-        def of_xy(xy):
-            values = solve(problem, with_xy(data, xy), sensitivity=sensitivity)
-            return ravel_pytree(values)[0]
+    def derivatives(values, data, u, w):
+        def scalar(data):
+            products = jax.tree.map(jnp.vdot, weight, attached(problem, values, data))
+            return sum(jax.tree.leaves(products))
 
-        return of_xy(data.image_xy), jax.jacfwd(of_xy)(data.image_xy)
+        along = lambda data: jax.jvp(scalar, (data,), (w,))
+        (value, by_w), (by_u, both) = jax.jvp(along, (data,), (u,))
+        return value, by_u, by_w, both
 
-    return forward
-
-
-def exactly(problem, data):
-    """With one more Newton step: the iterations stop where the cost, not the unknowns, is exact."""
-    return flat(attach_derivatives(problem.structure, solved(problem, data).values, data))
-
-
-def differences_by_image_coordinates(problem):
-    data = problem.data
-    columns = []
-    for row, axis in np.ndindex(data.image_xy.shape):
-        h = 0.3 / float(data.image_weight[row, axis])
-        total = 0
-        for step, factor in STENCIL:
-            xy = data.image_xy.at[row, axis].add(step * h)
-            total = total + factor / h * exactly(problem, with_xy(data, xy))
-        columns.append(total)
-    return np.stack(columns, 1)
-
-
-def test_all_values_by_all_image_coordinates():
-    problem, minimum = adjusted("free")
-    values, forward = all_derivatives("free", "exact")(problem.data)
-    np.testing.assert_allclose(values, flat(minimum.values), atol=1e-10)
-    forward = np.asarray(forward).reshape(values.size, -1)
-    difference = differences_by_image_coordinates(problem)
-    # Of the largest derivative of every value; fixed ones have none.
-    size = np.abs(difference).max(1)
-    assert (size > 0).sum() == flat(free_tangent(problem.structure)).sum() + len(
-        problem.network.images
-    )  # a quaternion has four elements for three unknowns
-    error = np.abs(forward - difference).max(1) / np.where(size > 0, size, 1)
-    assert error.max() <= 1e-6
-
-
-def weights_of_values(values):
-    """A scalar function of everything in a solution: random weights for all values."""
-    rng = np.random.default_rng(5)
-    return jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), values)
-
-
-@cache
-def gradient_of(name):
-    """The gradient of one scalar of the solution by every field of the data, by reverse mode."""
-    problem, minimum = adjusted(name)
-    weight = weights_of_values(minimum.values)
-
-    def scalar(data, sensitivity="exact"):
-        products = jax.tree.map(jnp.vdot, weight, solve(problem, data, sensitivity=sensitivity))
-        return sum(jax.tree.leaves(products))
-
-    return scalar
-
-
-def test_reverse_mode_in_batches_gives_the_same_as_forward_mode():
-    problem, minimum = adjusted("free")
-    rng = np.random.default_rng(8)
-    noise = rng.normal(size=(3, *problem.data.image_xy.shape)) / np.asarray(
-        problem.data.image_weight
+    return problem, lambda data, u, w: map(
+        float, derivatives(solved(problem, data).values, data, u, w)
     )
-    noise[0] = 0
-    xy = problem.data.image_xy + noise
-    scalar = gradient_of("free")
-    batched = eqx.filter_jit(
-        jax.vmap(jax.value_and_grad(lambda xy: scalar(with_xy(problem.data, xy))))
-    )
-    found, reverse = batched(xy)
-    weight = flat(weights_of_values(minimum.values))
-    for k in range(len(xy)):
-        values, forward = all_derivatives("free", "exact")(with_xy(problem.data, xy[k]))
-        assert float(found[k]) == pytest.approx(float(weight @ values), abs=1e-9)
-        expected = np.tensordot(weight, forward, 1)
-        np.testing.assert_allclose(
-            reverse[k], expected, rtol=1e-10, atol=1e-10 * np.abs(expected).max()
-        )
 
 
 FIELDS = ("image_xy", "image_weight", "control", "control_weight", "exterior", "exterior_weight",
           "interior", "interior_weight", "distance", "distance_weight")  # fmt: skip
 
 
-def direction_in(data, name, rng):
-    """A random change of one field: 0.05 σ of a value, 0.3 % of a weight."""
-    value = getattr(data, name)
-    if name.endswith("_weight"):
-        change = 0.003 * rng.normal(size=value.shape) * value
-    else:
-        weight = getattr(data, "image_weight" if name == "image_xy" else f"{name}_weight")
-        inverse = jnp.where(weight > 0, 1 / jnp.where(weight > 0, weight, 1), 0)
-        change = 0.05 * rng.normal(size=value.shape) * inverse
-    zero = jax.tree.map(jnp.zeros_like, data)
-    return eqx.tree_at(lambda d: getattr(d, name), zero, change)
-
-
-def directions(problem, rng):
-    """Changes of every kind of given quantity that the network has, by name."""
-    data = problem.data
+def directions(data, random):
+    """Random changes of one field each: 0.05 σ of a value, 0.3 % of a weight; start values."""
     zero = jax.tree.map(jnp.zeros_like, data)
     for name in FIELDS:
-        if getattr(data, name).size:
-            yield name, direction_in(data, name, rng)
-    start = data.start
-    moves = {
-        "position": 3e-4 * rng.normal(size=start.position.shape),
-        "point": 3e-4 * rng.normal(size=start.point.shape),
-        "camera": 3e-5 * rng.normal(size=start.camera.shape) * start.camera,
-        "rotation": 3e-5 * rng.normal(size=start.rotation.shape),
-    }
-    for name, move in moves.items():
-        at = lambda d, name=name: getattr(d.start, name)
-        yield f"start {name}", eqx.tree_at(at, zero, jnp.asarray(move))
+        value = getattr(data, name)
+        if name.endswith("_weight"):
+            change = 0.003 * random.normal(size=value.shape) * value
+        else:
+            weight = getattr(data, "image_weight" if name == "image_xy" else f"{name}_weight")
+            inverse = jnp.where(weight > 0, 1 / jnp.where(weight > 0, weight, 1), 0)
+            change = 0.05 * random.normal(size=value.shape) * inverse
+        yield name, eqx.tree_at(lambda d, n=name: getattr(d, n), zero, change)
+    camera = data.start.camera
+    change = 0.001 * random.normal(size=camera.shape) * camera  # fixed parameters, here
+    yield "start camera", eqx.tree_at(lambda d: d.start.camera, zero, change)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "shared cameras of two models",
-        "held images, exterior priors",
-        "minimal",
-    ],
-)
-def test_by_everything_that_was_given(name):
-    problem, minimum = adjusted(name)
-    weight = flat(weights_of_values(minimum.values))
-    gradient = reverse_gradient(name)
-    rng = np.random.default_rng(2)
-    seen = []
-    for field, direction in directions(problem, rng):
-        slope = flat(gradient) @ flat(direction)
-        difference = 0.0
+def test_first_and_second_derivatives_by_everything_that_was_given():
+    problem, of = program()
+    found = dict(directions(problem.data, np.random.default_rng(4)))
+    together = jax.tree.map(lambda *x: sum(x), *found.values())
+    for field, u in found.items():
+        _, first, _, second = of(problem.data, u, together)
+        *_, turned = of(problem.data, together, u)
+        differences = np.zeros(2)
         for step, factor in STENCIL:
-            data = jax.tree.map(lambda x, d: x + step * d, problem.data, direction)  # noqa: B023
-            difference += factor * (weight @ exactly(problem, data))
-        # Start values of what is neither held nor in the datum have no influence: 0 = 0.
-        assert slope == pytest.approx(difference, rel=1e-6, abs=3e-10), field
-        seen.append((field, abs(difference) > 1e-6))
-    influential = {field for field, counts in seen if counts}
-    assert influential >= {"image_xy", "image_weight"}
-    assert "start camera" in influential  # the fixed parameters
-    held = [problem.structure.image_free, problem.structure.point_free]
-    if problem.structure.defect or not flat(held).all():
-        assert {"start point", "start position"} & influential
+            data = jax.tree.map(lambda x, d: x + step * d, problem.data, u)  # noqa: B023
+            value, _, by_w, _ = of(data, u, together)
+            differences += factor * np.array([value, by_w])
+        assert first == pytest.approx(differences[0], rel=1e-6, abs=1e-10), field
+        # Symmetric, and what finite differences say.
+        assert second == pytest.approx(turned, rel=1e-7, abs=1e-14), field
+        assert second == pytest.approx(differences[1], rel=1e-6, abs=1e-12), field
+        assert abs(first) > 1e-7 and abs(second) > 1e-9, field
 
 
-@cache
-def reverse_gradient(name):
-    problem, _ = adjusted(name)
-    return eqx.filter_jit(jax.grad(gradient_of(name)))(problem.data)
+def test_a_fixed_point_takes_the_datum_with_it():
+    """Free but for a point that is held: where that goes, all goes, and the minimum stays. (The
+    rotations and the scale that are open are those about the point.)"""
+    problem, minimum = adjusted("one fixed point")
+    start, shift = problem.data.start, jnp.array([0.3, -0.2, 0.1])
+    moved = dataclasses.replace(start, point=start.point.at[0].add(shift))
+    only = dataclasses.replace(problem.data, start=moved)
+    found = solved(problem, only)
+    expected = vtpv(problem, minimum.values)
+    assert vtpv(problem.with_data(only), found.values) == pytest.approx(expected, rel=1e-9)
+    # A shift of everything moves no principal distance.
+    np.testing.assert_allclose(found.values.camera, minimum.values.camera, rtol=1e-8, atol=1e-11)
 
 
-def as_tangent(values, derivative):
-    """Derivatives of values as those of the free unknowns: quaternions as small rotations."""
-    turn = jax.vmap(lambda q, d: 2 * quaternion_multiply(d, quaternion_conjugate(q))[1:])
-    return derivative.position, turn(values.rotation, derivative.rotation)
+def test_the_gauss_newton_form_is_that_of_error_propagation():
+    """∂x/∂xy = −Q·Jᵀ·∂v/∂xy; ∂x/∂w = −2·Q·Jᵀ·v/w: twice the weight, P = w², not once."""
+    problem, minimum = adjusted("free")
+    data, values = problem.data, minimum.values
 
+    @jax.jit
+    def both(data):
+        def points(xy, weight):
+            given = dataclasses.replace(data, image_xy=xy, image_weight=weight)
+            return attached(problem, values, given, "gauss-newton").point.ravel()
 
-@pytest.mark.parametrize("name", ["free"])
-def test_gauss_newton_form_is_that_of_error_propagation(name):
-    problem, minimum = adjusted(name)
-    s, data, values = problem.structure, problem.data, minimum.values
-    found, forward = all_derivatives(name, "gauss-newton")(data)
-    np.testing.assert_allclose(found, flat(values), atol=1e-10)
-    forward = np.asarray(forward).reshape(found.size, -1)
-    unravel = ravel_pytree(values)[1]
-    columns = []
-    for column in forward.T:
-        d = unravel(jnp.asarray(column))
-        position, turn = as_tangent(values, d)
-        camera = d.camera[:, np.asarray(s.camera_columns[0])]
-        columns.append(np.concatenate([
-            np.concatenate([position, turn], 1).ravel(), np.ravel(camera), np.ravel(d.point)
-        ]))  # fmt: skip
-    found = np.stack(columns, 1)
+        return jax.jacfwd(points, (0, 1))(data.image_xy, data.image_weight)
 
-    J = np.asarray(compiled_jacobian(s, values, data).as_matrix())
-    _, B = datum_matrices(s, values)
-    Q = bordered_inverse(J.T @ J, B, np.ones(len(J.T)))
-    rows = lambda xy: ravel_pytree(residuals(s, values, with_xy(data, xy)))[0]
-    by_xy = np.asarray(jax.jit(jax.jacfwd(rows))(data.image_xy)).reshape(len(J), -1)
-    dense = -Q @ J.T @ by_xy
-    size = np.abs(dense).max(1, keepdims=True)
-    assert (np.abs(found - dense) / size).max() < 1e-9
+    by_xy, by_weight = (np.asarray(x).reshape(len(x), -1) for x in both(data))
+    dense = linearise(problem, values)
+    # Image coordinates are corrected in the "corrected" domain: ∂v/∂xy is not 1/σ.
+    h, slopes = 1e-6, []
+    for axis in (0, 1):
+        ends = [
+            linearise(problem, values, dataclasses.replace(
+                data, image_xy=data.image_xy.at[:, axis].add(step * h)
+            )).v for step, _ in STENCIL
+        ]  # fmt: skip
+        slopes.append(sum(factor / h * v for (_, factor), v in zip(STENCIL, ends)).reshape(-1, 2))
+    rays = len(data.image_xy)
+    by = np.zeros((rays, 2, rays, 2))
+    by[np.arange(rays), :, np.arange(rays)] = np.stack(slopes, 2)
+    QJ = (dense.Q @ dense.J.T)[dense.columns["point"].ravel()]
+    expected = -QJ @ by.reshape(2 * rays, -1)
+    size = np.abs(expected).max(1, keepdims=True)
+    assert (np.abs(by_xy - expected) / size).max() < 1e-7  # of the differences in `by`
+    expected = -2 * QJ * dense.v / np.ravel(data.image_weight)
+    assert np.abs(by_weight - expected).max() < 1e-8 * np.abs(expected).max()
     # It is not the exact one: they differ by the curvature, of the order of v/c.
-    exact = np.asarray(all_derivatives(name, "exact")(data)[1]).reshape(forward.shape)
-    apart = np.abs(exact - forward).max() / np.abs(exact).max()
-    assert 1e-6 < apart < 1e-1
+    h, exact = 0.3 / float(data.image_weight[0, 0]), 0.0
+    for step, factor in STENCIL:
+        xy = data.image_xy.at[0, 0].add(step * h)
+        found = solved(problem, dataclasses.replace(data, image_xy=xy))
+        exact = exact + factor / h * flat(found.values.point)
+    apart = np.abs(exact - by_xy[:, 0]).max() / np.abs(exact).max()
+    assert 1e-5 < apart < 1e-1
 
 
 # --- the four photographs -------------------------------------------------------------------
 
-DRAWS = 100
 NOISE = 0.65e-3
 """σ0 of the four photographs with four camera parameters, mm."""
 
 
 @pytest.fixture(scope="module")
-def photographs():
-    """The problem, and c with its derivatives by all image coordinates, by reverse and by forward
-    mode, for `DRAWS` sets of coordinates at once."""
+def problem():
     network = check_network(jaxbundle.read_network(EXAMPLES / "convergent4" / "project4.toml"))
-    problem = jaxbundle.make_problem(network)
-    distance = lambda xy: solve(problem, with_xy(problem.data, xy)).camera[0, 0]
+    return jaxbundle.make_problem(network)
 
+
+def test_principal_distance_of_the_photographs_by_all_image_coordinates(problem):
+    """By reverse and by forward mode, for many sets of coordinates at once: as differences say, and
+    as c itself changes from one noisy copy to the next."""
+
+    def distance(xy):
+        return solve(problem, dataclasses.replace(problem.data, image_xy=xy)).camera[0, 0]
+
+    @jax.jit
+    @jax.vmap
     def derivatives(xy):
         c, forward = jax.linearize(distance, xy)
         each = jnp.eye(xy.size).reshape(-1, *xy.shape)
-        reverse, = jax.linear_transpose(forward, xy)(jnp.ones_like(c))
+        (reverse,) = jax.linear_transpose(forward, xy)(jnp.ones_like(c))
         return c, reverse, jax.vmap(forward)(each).reshape(xy.shape)
 
-    batched = jax.jit(jax.vmap(derivatives))
-    return problem, lambda xy: map(np.asarray, batched(jnp.asarray(xy)))
-
-
-def test_principal_distance_of_the_photographs_by_all_image_coordinates(photographs):
-    problem, derivatives = photographs
-    xy = np.asarray(problem.data.image_xy)
+    xy, random = np.asarray(problem.data.image_xy), np.random.default_rng(3)
     assert xy.size == 80
-    h = 1e-3  # mm
-    steps = np.eye(xy.size).reshape(-1, *xy.shape)
-    shifts = np.concatenate([k * h * steps for k, _ in STENCIL] + [0 * steps])
-    batches = (xy + shifts).reshape(-1, DRAWS, *xy.shape)
-    c, reverse, _ = (np.concatenate(x) for x in zip(*map(derivatives, batches)))
-    c = c.reshape(-1, xy.size)
-    difference = sum(weight / h * moved for (_, weight), moved in zip(STENCIL, c))
-    difference = difference.reshape(xy.shape)
-    assert np.abs(reverse[-1] - difference).max() < 1e-6 * np.abs(difference).max()
-
-
-def test_gradients_of_a_hundred_noisy_copies_at_once(photographs):
-    """Forward and reverse mode agree in every one, and gradients carry the noise from one to the
-    next."""
-    problem, derivatives = photographs
-    xy = np.asarray(problem.data.image_xy)
-    noise = np.random.default_rng(3).normal(0, NOISE, (DRAWS, *xy.shape))
-    c, reverse, forward = derivatives(xy + noise)
+    along = random.normal(0, NOISE, (5, *xy.shape))
+    steps = np.array([step for step, _ in STENCIL])
+    noise = random.normal(0, NOISE, (12, *xy.shape))
+    every = np.concatenate([xy + step * along for step in steps] + [xy + noise, xy[None]])
+    c, reverse, forward = map(np.asarray, derivatives(every))
     size = np.abs(forward).max((1, 2), keepdims=True)
     assert (np.abs(reverse - forward) < 1e-10 * size).all()
-    # the trapezoidal rule: what is left is of third order in the noise
-    along = 0.5 * ((reverse[1:] + reverse[:-1]) * np.diff(noise, axis=0)).sum((1, 2))
-    np.testing.assert_allclose(np.diff(c), along, atol=0.01 * np.abs(along).max())
+    factors = np.array([factor for _, factor in STENCIL])
+    differences = factors @ c[:20].reshape(4, 5)
+    slopes = (along * reverse[-1]).sum((1, 2))
+    np.testing.assert_allclose(slopes, differences, atol=1e-6 * np.abs(slopes).max())
+    # The trapezoidal rule: what is left is of third order in the noise.
+    c, reverse = c[20:32], reverse[20:32]
+    between = 0.5 * ((reverse[1:] + reverse[:-1]) * np.diff(noise, axis=0)).sum((1, 2))
+    np.testing.assert_allclose(np.diff(c), between, atol=0.01 * np.abs(between).max())
 
 
-def test_check_gradients_of_an_adjustment(photographs):
-    found = jaxbundle.check_gradients(photographs[0], directions=3)
+def test_gradient_of_a_gradient_through_solve(problem):
+    """f = Σ(∂c/∂xy)², reverse over reverse, in a batch, whose other members give the differences;
+    and one that has no solution."""
+    data = problem.data
+
+    def c(xy, weight):
+        given = dataclasses.replace(data, image_xy=xy, image_weight=weight)
+        return solve(problem, given, atol=1e-10).camera[0, 0]
+
+    def f(xy, weight):
+        return jnp.sum(jax.grad(c)(xy, weight) ** 2)
+
+    at, h, k = (0, 0), 1e-3, 0.02 * float(data.image_weight[0, 0])
+    steps = np.array([step for step, _ in STENCIL])
+    xy = np.tile(data.image_xy, (2 * len(steps) + 2, 1, 1))
+    weight = np.tile(data.image_weight, (len(xy), 1, 1))
+    xy[(slice(1, 5), *at)] += h * steps
+    weight[(slice(5, 9), *at)] += k * steps
+    xy[(9, *at)] = np.nan
+    program = jax.jit(jax.vmap(jax.value_and_grad(f, (0, 1))))
+    value, (by_xy, by_weight) = (jax.tree.map(np.asarray, program(xy, weight)))
+    factors = np.array([factor for _, factor in STENCIL])
+    assert by_xy[(0, *at)] == pytest.approx(factors @ value[1:5] / h, rel=1e-4)
+    assert by_weight[(0, *at)] == pytest.approx(factors @ value[5:9] / k, rel=1e-4)
+    # No solution: no derivative, rather than 0.
+    assert np.isnan(value[9]) and np.isnan(by_xy[9]).all()
+
+
+def test_check_gradients_of_an_adjustment():
+    """Two images of fixed points: the smallest program."""
+    network, _ = synthetic(cameras=(camera(free=()),), images=2, points=7, fixed=7)
+    found = jaxbundle.check_gradients(make_problem(network), directions=3)
     assert found.passed, str(found)

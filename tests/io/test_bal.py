@@ -10,6 +10,7 @@ import pytest
 import jaxbundle
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, matrix_from_rotation_vector
+from jaxbundle.statistics.inspection import Inspection
 
 CAMERAS = np.array([
     [0.1, -0.2, 0.3, 0.5, 0.1, -9.0, 500.0, -0.1, 0.02],
@@ -56,9 +57,7 @@ def test_network(path):
 
 def test_exact_projections_have_no_residuals(path):
     problem = jaxbundle.make_problem(jaxbundle.read_network(path))
-    from jaxbundle.adjustment.residuals import residuals
-
-    rows = residuals(problem.structure, problem.data.start, problem.data).image
+    rows = Inspection(problem, problem.data.start).residuals.image
     np.testing.assert_allclose(rows, 0, atol=1e-10)
 
 

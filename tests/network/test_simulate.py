@@ -10,7 +10,6 @@ import pytest
 
 import jaxbundle
 from jaxbundle import Camera, InputError, cameras
-from jaxbundle.adjustment.residuals import compiled_residuals
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.network.simulate import simulate, simulate_with_truth
 from jaxbundle.network.stations import (
@@ -21,6 +20,7 @@ from jaxbundle.network.stations import (
     ring_of_stations,
     stations_looking_at,
 )
+from jaxbundle.statistics.inspection import Inspection
 
 CAMERAS = {
     "brown": ({"c": 20.0, "x0": 0.11, "y0": -0.07, "K1": 2e-4, "K2": -1e-6, "P1": 3e-5,
@@ -94,7 +94,7 @@ def test_the_adjustment_sees_no_residuals_either():
         control_sigma=0.01,
     )  # fmt: skip
     problem = jaxbundle.make_problem(made.truth)
-    r = compiled_residuals(problem.structure, problem.data.start, problem.data)
+    r = Inspection(problem, problem.data.start).residuals
     for rows in (r.image, r.control, r.distance):
         assert len(rows) and np.abs(rows).max() < 1e-9
 

@@ -1,6 +1,5 @@
 """Cofactors and reliability from blocks, against the dense inverse with the datum conditions."""
 
-import dataclasses
 from functools import cache
 
 import equinox as eqx
@@ -9,48 +8,31 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from adjustment_checks import (
-    LINEARISED,
-    NETWORKS,
-    bordered_inverse,
-    datum_matrices,
-    flat,
+    linearise,
     linearised,
+    make,
     solved,
+    standard_deviations,
     synthetic,
 )
 
-from jaxbundle.adjustment.jacobian import compiled_jacobian, free_tangent
-from jaxbundle.adjustment.problem import make_problem
-from jaxbundle.adjustment.residuals import residuals
-from jaxbundle.adjustment.solve import find_minimum, make_solver
-from jaxbundle.adjustment.solver import SETTLED
+from jaxbundle.adjustment.problem import make_problem, make_solver
 from jaxbundle.geometry import quaternion_difference
-from jaxbundle.network.arrays import Tangent
-from jaxbundle.statistics.cofactors import cofactors, propagate, undamped_factor
-from jaxbundle.statistics.reliability import (
-    external_reliability,
-    hat_diagonal,
-    minimal_detectable,
-    reliability,
-)
+from jaxbundle.leastsquares.datum import move_to_datum
+from jaxbundle.leastsquares.problem import pad_data
+from jaxbundle.leastsquares.reliability import external_reliability, minimal_detectable
+from jaxbundle.leastsquares.solver import minimise
+from jaxbundle.leastsquares.stopping import SETTLED
+from jaxbundle.statistics.inspection import Inspection
+
+NAMES = ("cameras of two models", "everything given", "free", "minimal")
 
 
 @cache
 def both(name):
-    """The cofactors in blocks and dense, and the hat matrix's diagonal from blocks."""
-    net = linearised(name)
-    s, values = net.problem.structure, net.problem.data.start
-    factor = undamped_factor(s, values, net.problem.data)
-    blocks = cofactors(s, values, factor)
-    hat = eqx.filter_jit(hat_diagonal)(net.jac, blocks)
-    _, B = datum_matrices(s, values)
-    return net, factor, blocks, bordered_inverse(net.N, B, flat(free_tangent(s))), hat
-
-
-def standard_deviations(Q):
-    """0 for what is held, in a minimal datum up to rounding of either sign."""
-    variance = np.diag(Q)
-    return np.sqrt(np.where(variance > 1e-14 * variance.max(), variance, 0))
+    """The start values looked at in blocks, and dense with the cofactors of all unknowns."""
+    dense = linearised(name)
+    return Inspection(make(name), make(name).data.start), dense, dense.Q
 
 
 def assert_close(found, dense, sigma_rows, sigma_columns, tolerance=1e-8):
@@ -60,88 +42,64 @@ def assert_close(found, dense, sigma_rows, sigma_columns, tolerance=1e-8):
     assert (np.abs(found - dense) / size).max() < tolerance
 
 
-@pytest.mark.parametrize("name", LINEARISED)
+@pytest.mark.parametrize("name", NAMES)
 def test_blocks(name):
-    net, _, blocks, Q, _ = both(name)
-    s = net.problem.structure
-    first = s.images * s.image_width + s.cameras * s.camera_width
-    at_point = lambda p: first + 3 * p + np.arange(3)
+    found, dense, Q = both(name)
     sigma = standard_deviations(Q)
-    blocks_at = [
-        *((blocks.image[i], i * s.image_width + np.arange(s.image_width)) for i in range(s.images)),
-        *((blocks.point[p], at_point(p)) for p in range(s.points)),
-    ]
-    if s.camera_width:
-        at_camera = s.images * s.image_width + np.arange(s.camera_width)
-        blocks_at += [
-            (blocks.camera[c], at_camera + c * s.camera_width) for c in range(s.cameras)
-        ]
-    for block, rows in blocks_at:
-        assert_close(block, Q[np.ix_(rows, rows)], sigma[rows], sigma[rows])
+    for table in found.problem.system.tables:
+        for block, rows in zip(found.solution.cofactor(table.name), dense.columns[table.name]):
+            assert_close(block, Q[np.ix_(rows, rows)], sigma[rows], sigma[rows])
 
 
-@pytest.mark.parametrize("name", LINEARISED)
+@pytest.mark.parametrize("name", ["everything given", "free"])
 def test_propagation_to_any_function(name):
-    net, factor, _, Q, _ = both(name)
-    s, values = net.problem.structure, net.problem.data.start
-    rng = np.random.default_rng(4)
+    found, dense, Q = both(name)
+    random, tables, F = np.random.default_rng(4), {}, np.zeros((5, len(Q)))
     sigma = standard_deviations(Q)
-    F = rng.normal(size=(5, len(Q))) * np.where(sigma > 0, 1 / np.where(sigma > 0, sigma, 1), 0)
-    F[:3, : s.images * s.image_width] = 0  # some of points and cameras alone
-    unravel = jax.flatten_util.ravel_pytree(free_tangent(s))[1]
-    rows = jax.vmap(unravel)(jnp.asarray(F))
-    found = propagate(s, values, factor, rows)
-    dense = F @ Q @ F.T
-    sigma = standard_deviations(dense)
-    assert_close(found, dense, sigma, sigma)
+    for table, columns in dense.columns.items():
+        size = np.where(sigma > 0, 1 / np.where(sigma > 0, sigma, 1), 0)[columns]
+        tables[table] = random.normal(size=(5, *columns.shape)) * size
+        if table == "image":
+            tables[table][:3] = 0  # some of points and cameras alone
+        np.add.at(F, (slice(None), columns.ravel()), tables[table].reshape(5, -1))
+    expected = F @ Q @ F.T
+    sigma = standard_deviations(expected)
+    assert_close(found.solution.propagate_rows(tables), expected, sigma, sigma)
 
 
-@pytest.mark.parametrize("name", LINEARISED)
+@pytest.mark.parametrize("name", NAMES)
 def test_redundancy_numbers(name):
-    net, _, _, Q, hat = both(name)
-    dense = ((net.J @ Q) * net.J).sum(1)
-    np.testing.assert_allclose(flat(hat), dense, atol=1e-9)
-    counts = net.problem.counts
-    rows = counts.observations + counts.pseudo_observations
-    assert rows - flat(hat).sum() == pytest.approx(counts.redundancy, abs=1e-9)
+    found, dense, Q = both(name)
+    r = np.concatenate([r.ravel() for r in found.solution.reliability.redundancy.values()])
+    used = np.concatenate([(w > 0).ravel() for w in weights(found.problem)])
+    hat = ((dense.J @ Q) * dense.J).sum(1)
+    np.testing.assert_allclose(r, np.where(used, 1 - hat, 0), atol=1e-9)
+    assert r.sum() == pytest.approx(found.problem.counts.redundancy, abs=1e-9)
 
 
-def test_points_measured_twice_in_an_image():
-    network, _ = synthetic(**NETWORKS["free"])
-    rows = np.concatenate([np.arange(len(network.observations)), [3, 3, 20]])
-    problem = make_problem(network.replace(observations=network.observations.take(rows)))
-    s, data = problem.structure, problem.data
-    jac = compiled_jacobian(s, data.start, data)
-    J = np.asarray(jac.as_matrix())
-    Q = bordered_inverse(J.T @ J, datum_matrices(s, data.start)[1], np.ones(len(J.T)))
-    blocks = cofactors(s, data.start, undamped_factor(s, data.start, data))
-    hat = flat(eqx.filter_jit(hat_diagonal)(jac, blocks))
-    np.testing.assert_allclose(hat, ((J @ Q) * J).sum(1), atol=1e-9)
-    sigma = standard_deviations(Q)
-    for i in range(s.images):
-        rows = i * s.image_width + np.arange(s.image_width)
-        assert_close(blocks.image[i], Q[np.ix_(rows, rows)], sigma[rows], sigma[rows])
+def weights(problem):
+    return [problem.system.weights(o) for o in range(len(problem.system.observations))]
 
 
-@pytest.mark.parametrize("name", ["shared cameras of two models", "own cameras of two models"])
-def test_reliability(name):
-    net, _, blocks, Q, _ = both(name)
-    s, data = net.problem.structure, net.problem.data
-    found = reliability(s, data.start, data, blocks)
-    r, v, w = flat(found.redundancy), flat(found.residual), flat(found.w)
-    np.testing.assert_allclose(v, flat(net.rows), rtol=1e-12, atol=1e-12)
-    assert r.sum() == pytest.approx(net.problem.counts.redundancy, abs=1e-9)
+def test_reliability():
+    found, dense, Q = both("cameras of two models")
+    tested = found.solution.reliability
+    r, v, w = (
+        np.concatenate([rows.ravel() for rows in of.values()])
+        for of in (tested.redundancy, tested.residual, tested.w)
+    )
+    np.testing.assert_allclose(v, dense.v, rtol=1e-12, atol=1e-12)
     controlled = r > 1e-8
     np.testing.assert_allclose(w[controlled], v[controlled] / np.sqrt(r[controlled]))
     assert np.isnan(w[~controlled]).all()
     # A blunder of the smallest size moves its own w by δ0, and no unknown by more than δ̄·σ.
     row, delta0 = int(np.argmax(r)), 4.13
     blunder = float(minimal_detectable(1.0, r[row], delta0))
-    change = -Q @ net.J.T[:, row] * blunder
-    residual = net.J[row] @ change + blunder
+    change = -Q @ dense.J.T[:, row] * blunder
+    residual = dense.J[row] @ change + blunder
     assert residual / np.sqrt(r[row]) == pytest.approx(delta0, rel=1e-8)
     effect = float(external_reliability(r[row], delta0))
-    assert np.sqrt(change @ net.N @ change) == pytest.approx(effect, rel=1e-7)
+    assert np.sqrt(change @ dense.N @ change) == pytest.approx(effect, rel=1e-7)
     sigma = standard_deviations(Q)
     assert (np.abs(change) / np.where(sigma > 0, sigma, np.inf)).max() <= effect * (1 + 1e-9)
 
@@ -167,34 +125,40 @@ def test_predicted_uncertainty_is_that_of_a_sample():
     """
     part = 1 / 3
     problem = make_problem(synthetic(datum="inner", noise=0.0)[0])
-    s, data = problem.structure, problem.data
-    rng = np.random.default_rng(12)
-    noise = rng.normal(size=(DRAWS, *data.image_xy.shape)) / np.asarray(data.image_weight)
+    system, data = problem.system, problem.data
+    random = np.random.default_rng(12)
+    noise = random.normal(size=(DRAWS, *data.image_xy.shape)) / np.asarray(data.image_weight)
     solver = make_solver(problem, max_steps=100)
 
     @eqx.filter_jit
-    def sample(xy):
+    def sample(solver, xy):
         def one(xy):
-            drawn = dataclasses.replace(data, image_xy=xy)
-            minimum = find_minimum(solver, drawn)
-            rows = residuals(s, minimum.values, drawn)
-            return minimum.termination, minimum.values, jnp.sum(rows.image**2) / part**2
+            drawn = eqx.tree_at(lambda d: d.image_xy, data, xy)
+            given = pad_data(system, problem.layout.data(drawn))
+            minimum = minimise(solver, given, given.start)
+            cost = minimum.history.cost[minimum.iterations - 1]
+            tables = move_to_datum(solver.declared, solver.plan, minimum.values, given.start)
+            return minimum.termination, tables, 2 * cost / part**2
 
         return jax.vmap(one)(xy)
 
-    termination, values, vtpv = sample(data.image_xy + part * noise)
+    termination, found, vtpv = sample(solver, data.image_xy + part * noise)
     assert (np.asarray(termination) == SETTLED).all()
     true = solved(problem).values
-
-    turn = jax.vmap(jax.vmap(quaternion_difference), (0, None))(values.rotation, true.rotation)
-    exterior = jnp.concatenate([values.position - true.position, turn], 2)
-    camera = (values.camera - true.camera)[:, :, np.asarray(s.camera_columns[0])]
-    change = Tangent(exterior, camera, values.point - true.point)
-    x = [np.asarray(block).reshape(DRAWS, -1) / part for block in jax.tree.leaves(change)]
-    x = np.concatenate(x, 1)
-
-    identity = jax.vmap(jax.flatten_util.ravel_pytree(free_tangent(s))[1])(jnp.eye(x.shape[1]))
-    Q = np.asarray(propagate(s, true, undamped_factor(s, true, data), identity))
+    at = lambda rows, name: rows[:, : system.table(name).rows]
+    position, rotation = (at(x, "image") for x in found["image"])
+    turn = jax.vmap(jax.vmap(quaternion_difference), (0, None))(rotation, true.rotation)
+    changes = {
+        "image": jnp.concatenate([position - true.position, turn], 2),
+        "camera": (at(found["camera"], "camera") - true.camera)[:, :, problem.interior(0)[1]],
+        "point": at(found["point"], "point") - true.point,
+    }
+    dense = linearise(problem, true)
+    Q, x = dense.Q, np.zeros((DRAWS, len(dense.free)))
+    for table, columns in dense.columns.items():
+        x[:, columns.ravel()] = np.asarray(changes[table]).reshape(DRAWS, -1) / part
+    at, x = dense.columns["camera"][0], x[:, dense.free]
+    at, Q = np.searchsorted(np.flatnonzero(dense.free), at), Q[np.ix_(dense.free, dense.free)]
     sigma = np.sqrt(np.diag(Q))
     # Every σ: 67 of them, each with a relative error of 1/√(2·300) = 4.1 %.
     ratio = np.sqrt((x**2).mean(0)) / sigma
@@ -204,8 +168,7 @@ def test_predicted_uncertainty_is_that_of_a_sample():
     # (Not of all unknowns: what is known 1000 times better shows the curvature of the rest.)
     mean = x.mean(0) / sigma * np.sqrt(DRAWS)
     assert np.abs(mean).max() < 4.5
-    at = slice(s.images * 6, s.images * 6 + 4)
-    weight = np.linalg.inv(Q[at, at])
+    weight = np.linalg.inv(Q[np.ix_(at, at)])
     square = np.einsum("di,ij,dj->d", x[:, at], weight, x[:, at])
     assert_between(square.mean(), 4, np.sqrt(2 * 4 / DRAWS))
     assert_between(mean[at] * sigma[at] @ weight @ (mean[at] * sigma[at]), 4, np.sqrt(2 * 4))

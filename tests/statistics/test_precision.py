@@ -8,16 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from adjustment_checks import (
-    bordered_inverse,
-    camera,
-    datum_matrices,
-    flat,
-    synthetic,
-)
+from adjustment_checks import camera, linearise, synthetic
 
 import jaxbundle
-from jaxbundle.adjustment.jacobian import compiled_jacobian, free_tangent
 from jaxbundle.errors import InputError
 
 NETWORK = dict(
@@ -45,21 +38,17 @@ def program(problem):
 
 def dense_covariance(problem, data):
     """Of the unknowns of `NAMES`, from the whole Jacobian at measurements made anew."""
-    s, values = problem.structure, data.start
-    rays = np.einsum(
-        "nij,nj->ni",
-        np.asarray(jax.vmap(jaxbundle.geometry.matrix_from_quaternion)(values.rotation))[s.image],
-        np.asarray(values.point)[s.point] - np.asarray(values.position)[s.image],
-    )
+    values = data.start
+    M = np.asarray(jax.vmap(jaxbundle.geometry.matrix_from_quaternion)(values.rotation))
+    away = np.asarray(values.point)[problem.point] - np.asarray(values.position)[problem.image]
+    rays = np.einsum("nij,nj->ni", M[problem.image], away)
     model = jaxbundle.cameras.get_model("brown")
     xy = np.stack(jaxbundle.cameras.project(model, tuple(values.camera[0]), *rays.T), 1)
     data = dataclasses.replace(data, image_xy=jnp.asarray(xy))
-    J = np.asarray(compiled_jacobian(s, values, data).as_matrix())
-    _, B = datum_matrices(s, values)
-    Q = bordered_inverse(J.T @ J, B, flat(free_tangent(s)))
-    at_camera = 6 * s.images
-    pick = [at_camera, at_camera + s.camera_width + 3 + 2, 6 * 2 + 1]
-    return Q[np.ix_(pick, pick)]
+    dense = linearise(problem, data=data)
+    columns = dense.columns
+    pick = [columns["camera"][0, 0], columns["point"][1, 2], columns["image"][2, 1]]
+    return dense.Q[np.ix_(pick, pick)]
 
 
 def moved(data, field, place, h):

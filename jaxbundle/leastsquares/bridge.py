@@ -1,0 +1,139 @@
+"""A bridge to the stock solvers of optimistix: their loop and damping, our elimination.
+
+    fn, y0, linear_solver = stock_problem(problem)
+    solver = optimistix.LevenbergMarquardt(1e-10, 1e-10, linear_solver=linear_solver)
+    result = optimistix.least_squares(fn, solver, y0, args=problem.data)
+    values = values_of(problem, result.value)
+
+The stock solvers add steps, so the unknowns y are changes of the start values, and damping is λ·1,
+so they are scaled by the columns of the Jacobian at the start. A linear solver is shown the
+Jacobian only as an operator, from which blocks cannot be read. So there is a *witness* beside the
+unknowns, always 0, and outputs witness·x beside the residuals, also 0, for everything x that N
+depends on: the derivative by the witness is x itself.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+
+from jaxbundle.leastsquares.datum import zeros_of_tables
+from jaxbundle.leastsquares.elimination import damp, factorise, solve
+from jaxbundle.leastsquares.normal import Normal, normal_equations, zero_tangent
+from jaxbundle.leastsquares.plan import Plan
+from jaxbundle.leastsquares.problem import Problem, pad_data, without_filling
+from jaxbundle.leastsquares.retraction import changes_of_tables
+from jaxbundle.leastsquares.rows import Data, Declared, Values, fill_places, lay_out_data, residuals
+from jaxbundle.leastsquares.spaces import Space
+
+
+@dataclasses.dataclass(frozen=True)
+class Chart:
+    """A space in which changes add: a value is (start, scale, y) and stands for the start changed
+    by scale·y."""
+
+    space: Space
+
+    @property
+    def width(self) -> int:
+        return self.space.width
+
+    def value(self, start, scale, y):
+        """The value of the space that is meant."""
+        return self.space.retract(start, scale * y)
+
+    def prepare(self, value):
+        here, (start, scale, y) = self.value(*value), value
+        change = lambda y: self.space.difference(self.value(start, scale, y), here)
+        return self.space.prepare(here), tuple(map(tuple, jax.jacfwd(change)(y)))
+
+    def moved(self, block, change):
+        here, slope = block
+        moves = tuple(sum(a * d for a, d in zip(row, change)) for row in slope) if change else ()
+        return self.space.moved(here, moves)
+
+    def chart(self, value):
+        return None
+
+
+def stock_problem(problem: Problem):
+    """Residual function fn(y, data), its start y0 = 0, and a linear solver for stock optimistix.
+
+    **Raises:** `ValueError` where the datum is open: the stock loop knows none."""
+    if problem.counts.datum:
+        raise ValueError("the stock solvers know no datum: fix it by what is held or observed")
+    declared, plan, scale = _charted(problem.declared), problem.plan, _scale(problem)
+
+    def fn(y, data: Data):
+        change, witness = y
+        data = pad_data(problem, data)
+        values, laid = _values(problem, data, scale, change), lay_out_data(plan, data)
+        places, measured = fill_places(plan, laid)
+        seen = jax.tree.map(lambda x: witness * x, (values, laid))
+        return {"residuals": residuals(declared, places, values, measured), "seen": seen}
+
+    return fn, (zero_tangent(plan), jnp.zeros(())), EliminationOfJacobian(declared, plan)
+
+
+def values_of(problem: Problem, y) -> Values:
+    """The tables that belong to a result y of the stock solver."""
+    values = _values(problem, pad_data(problem, problem.data), _scale(problem), y[0])
+    spaces = _charted(problem.declared).spaces
+    return without_filling(problem, {n: jax.vmap(spaces[n].value)(*v) for n, v in values.items()})
+
+
+def _charted(declared: Declared) -> Declared:
+    charts = tuple((name, Chart(space)) for name, space in declared.named_spaces)
+    return dataclasses.replace(declared, named_spaces=charts)
+
+
+def _values(problem: Problem, data: Data, scale, change):
+    """The tables as values of charts."""
+    y = zeros_of_tables(problem.declared, data.start)
+    y |= changes_of_tables(problem.plan, data.start, change)
+    return {name: (start, scale[name], y[name]) for name, start in data.start.items()}
+
+
+def _scale(problem: Problem):
+    """By table, the change of each unknown that counts as 1."""
+    return _columns(problem.declared, problem.plan, pad_data(problem, problem.data))
+
+
+@eqx.filter_jit
+def _columns(declared: Declared, plan: Plan, data: Data):
+    *_, blocks = normal_equations(declared, plan, data.start, lay_out_data(plan, data))
+    size = {g: jnp.where(d > 0, d, 1.0) ** -0.5 for g, d in Normal(plan, blocks).diagonal().items()}
+    return zeros_of_tables(declared, data.start) | changes_of_tables(plan, data.start, size)
+
+
+class EliminationOfJacobian(lx.AbstractLinearSolver):
+    """Solves least squares of the Jacobian of `stock_problem`, or of it stacked on √λ·1."""
+
+    declared: Declared = eqx.field(static=True)
+    plan: Plan
+
+    def init(self, operator, options):
+        found, damping = operator.mv((zero_tangent(self.plan), jnp.ones(()))), jnp.zeros(())
+        if isinstance(found, tuple):
+            found, (_, root) = found
+            damping = root**2
+        *_, blocks = normal_equations(self.declared, self.plan, *found["seen"])
+        ones = {g: jnp.ones(group.free.shape) for g, group in self.plan.groups.items()}
+        normal = Normal(self.plan, dataclasses.replace(blocks, metric=ones))
+        return factorise(damp(normal, damping)), operator
+
+    def compute(self, state, vector, options):
+        factor, operator = state
+        right, _ = operator.transpose().mv(vector)
+        return (solve(factor, right), jnp.zeros(())), lx.RESULTS.successful, {}
+
+    def transpose(self, state, options):
+        raise NotImplementedError("no derivatives of the stock solvers: use leastsquares.solve")
+
+    def conj(self, state, options):
+        return state, options
+
+    def assume_full_rank(self):
+        return True

@@ -1,0 +1,150 @@
+"""One minimum on several devices: eliminated rows distributed, with the observations of them.
+
+Every device eliminates its own rows. What is kept is on all of them: the sums over it, the reduced
+matrix and its right-hand side are added up over the devices (`normal.total`), and every device
+solves the reduced system and moves its rows. What touches no eliminated row belongs to the first
+device. The same program runs on the cores of a processor (`jax_num_cpu_devices`), on several GPUs,
+and in several processes after `jax.distributed.initialize`.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Int
+
+from jaxbundle.errors import NotSolvedError
+from jaxbundle.leastsquares.declarations import Table
+from jaxbundle.leastsquares.indices import common, finish
+from jaxbundle.leastsquares.plan import Datum, Plan, make_plan
+from jaxbundle.leastsquares.problem import Problem, fill_data, pad_values, rounder, without_filling
+from jaxbundle.leastsquares.rows import Data, Values
+from jaxbundle.leastsquares.solver import LeastSquares, Minimum, minimise
+
+AXIS = "devices"
+OBSERVATION = 3.0
+"""What an observation costs, in units of a pair of incidences."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Shards:
+    """A problem in parts; arrays of `plan` and `data` have the device as first axis. `rows`: those
+    of the eliminated table on every device, the kept ones on all; `sizes`: of each part."""
+
+    problem: Problem
+    rows: tuple[Int[np.ndarray, " n"], ...]
+    sizes: dict
+    plan: Plan
+    data: Data
+    mesh: Mesh
+
+
+def distribute(problem: Problem, devices=None) -> Shards:
+    """Cut a problem with an eliminated table into a part for every device (all of JAX's)."""
+    devices = jax.devices() if devices is None else devices
+    rows, seen = _cut(problem, len(devices))
+    planned = [_plan_part(problem, *part) for part in zip(rows, seen)]
+    sizes = common((sizes for _, sizes in planned), rounder(problem.observations))
+    here, host = dataclasses.replace(problem, sizes=sizes), jax.tree.map(np.asarray, problem.data)
+    take = lambda of_sets, at: tuple(_take(x, rows) for x, rows in zip(of_sets, at))
+    data = [fill_data(here, Data({}, take(host.measured, m), take(host.weight, m))) for m in seen]
+    datum = problem.plan.datum  # What holds it is not asked before the end.
+    datum = datum and jax.tree.map(np.asarray, Datum(datum.gauge, {}, datum.pins, {}))
+    whole = lambda plan: dataclasses.replace(finish(plan, sizes), datum=datum, axis=AXIS)
+    mesh, plans = Mesh(np.array(devices), (AXIS,)), [whole(plan) for plan, _ in planned]
+    return Shards(problem, rows, sizes, _place(mesh, plans), _place(mesh, data), mesh)
+
+
+def find_minimum_of_shards(
+    shards: Shards, solver: LeastSquares, start: Values | None = None
+) -> Minimum:
+    """As `solver.minimise`, with the solver of the whole problem; values are not moved into the
+    datum. `start` must be finite: devices that end at different steps would wait for each other
+    for ever.
+
+    **Raises:** `NotSolvedError` where one of several processes is lost."""
+    problem, e = shards.problem, shards.problem.plan.eliminated
+    here = dataclasses.replace(problem, sizes=shards.sizes)
+    start = jax.tree.map(np.asarray, problem.data.start if start is None else start)
+    part = lambda rows: pad_values(here, start | {e: _take(start[e], rows)})
+    parts = _place(shards.mesh, [part(rows) for rows in shards.rows])
+    solver = dataclasses.replace(solver, plan=shards.plan)
+    try:
+        minimum = jax.tree.map(np.asarray, _minimise(shards.mesh, solver, shards.data, parts))
+    except jax.errors.JaxRuntimeError as error:
+        number, why = jax.process_count(), " ".join(str(error).split())[:200]
+        if number == 1:
+            raise
+        raise NotSolvedError(
+            f"not solved: one of {number} processes ended, or cannot be reached ({why})"
+        ) from None
+    _, back = np.unique(np.concatenate(shards.rows), return_index=True)
+    own = lambda x: np.concatenate([x[d, : len(rows)] for d, rows in enumerate(shards.rows)])[back]
+    values = minimum.values | {e: jax.tree.map(own, minimum.values[e])}
+    return dataclasses.replace(minimum, values=without_filling(problem, values))
+
+
+@eqx.filter_jit
+def _minimise(mesh: Mesh, solver: LeastSquares, data: Data, start: Values) -> Minimum:
+    """What all devices find; eliminated rows [devices, rows, …]."""
+    arrays, static = eqx.partition((solver.plan, data, start), eqx.is_array)
+
+    def on_device(arrays):
+        plan, data, start = eqx.combine(jax.tree.map(lambda x: x[0], arrays), static)
+        minimum = minimise(dataclasses.replace(solver, plan=plan), data, start)
+        e, values = plan.eliminated, minimum.values  # Gathered, so that any process reads them.
+        values = values | {e: jax.lax.all_gather(values[e], AXIS)}
+        return dataclasses.replace(minimum, values=values)
+
+    specs = dict(in_specs=PartitionSpec(AXIS), out_specs=PartitionSpec())
+    return jax.shard_map(on_device, mesh=mesh, check_vma=False, **specs)(arrays)
+
+
+def _place(mesh: Mesh, parts):
+    """The arrays of all parts with the device as first axis; every device holds its own."""
+    spread = NamedSharding(mesh, PartitionSpec(AXIS))
+    make = lambda *x: jax.make_array_from_callback(
+        (len(x), *x[0].shape), spread, lambda at: x[at[0].start or 0][None]
+    )
+    return jax.tree.map(make, *parts)
+
+
+def _cut(problem: Problem, parts: int):
+    """For every device the eliminated rows, and the observations of every set: parts of equal work,
+    in their order. Kept rows, and rows that share an observation, are the first's."""
+    e, given = problem.plan.eliminated, problem.observations
+    touched = [[r for name, r in zip(o.kind.of, o.rows) if name == e] for o in given]
+    stays = problem.choices["stays",]
+    met, tied = np.zeros(len(stays)), stays.copy()
+    for slots in touched:
+        for rows in slots:
+            met += np.bincount(rows, minlength=len(stays))
+            tied[rows] |= len(slots) > 1
+    work = np.where(tied, 0.0, met * (met - 1) / 2 + OBSERVATION * met)
+    middle = (np.cumsum(work) - work / 2) / max(work.sum(), 1.0)
+    owner = np.where(tied, 0, np.minimum((parts * middle).astype(int), parts - 1))
+    of_sets = [owner[r[0]] if r else np.zeros(o.number, int) for o, r in zip(given, touched)]
+    found = [tuple(np.flatnonzero(of_set == d) for of_set in of_sets) for d in range(parts)]
+    return tuple(np.flatnonzero(stays | (owner == d)) for d in range(parts)), found
+
+
+def _plan_part(problem: Problem, rows, seen):
+    """The plan of some eliminated rows and observations, on the host, and its sizes."""
+    e, groups = problem.plan.eliminated, problem.plan.groups.items()
+    choices = problem.choices | {("all free", name): group.all_free for name, group in groups}
+    choices["stays",] = choices["stays",][rows]
+    row = np.full(problem.table(e).rows, -1)
+    row[rows] = np.arange(len(rows))
+    cut = lambda t: Table(t.name, _take(t.value, rows), t.space, t.free[rows])
+    tables = [cut(t) if t.name == e else t for t in problem.tables]
+    observations = [
+        o.kind([row[r[at]] if name == e else r[at] for name, r in zip(o.kind.of, o.rows)])
+        for o, at in zip(problem.observations, seen)
+    ]
+    return make_plan(tables, observations, e, choices)[:2]
+
+
+def _take(tree, rows):
+    return jax.tree.map(lambda x: np.asarray(x)[rows], tree)

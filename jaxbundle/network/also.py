@@ -1,0 +1,68 @@
+"""Observations of a user's own kinds, and the tables of unknowns they bring, for a network.
+
+They touch the network's rows by id ("image", "camera", "point") and see object coordinates as they
+are, not relative to the network's origin.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from jaxbundle.arguments import shown
+from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.declarations import Observations, Table
+from jaxbundle.leastsquares.spaces import Posed
+
+OWN = ("image", "camera", "point")
+
+
+@dataclasses.dataclass(frozen=True)
+class InObjectSpace:
+    """A residual whose blocks of points and poses (`of`) are moved from the network's origin to
+    where they are."""
+
+    residual: Callable
+    of: tuple[str, ...]
+    origin: tuple[float, float, float]
+
+    def __call__(self, *blocks_and_measured):
+        *blocks, measured = blocks_and_measured
+        return self.residual(*map(self._placed, self.of, blocks), measured)
+
+    def _placed(self, table, block):
+        if table == "image":
+            centre = tuple(c + o for c, o in zip(block.centre, self.origin))
+            return Posed(block.rotation, centre)
+        if table == "point":
+            if isinstance(block, tuple):
+                return tuple(x + o for x, o in zip(block, self.origin))
+            return block + np.array(self.origin)
+        return block
+
+
+def split(also: Sequence[Table | Observations]) -> tuple[list[Table], list[Observations]]:
+    """The tables and the observations of them.
+
+    **Raises:** `InputError` for anything else, and for a table that the network has itself."""
+    tables = [item for item in also if isinstance(item, Table)]
+    observations = [item for item in also if isinstance(item, Observations)]
+    for item in also:
+        if not isinstance(item, Table | Observations):
+            raise InputError(
+                "also: tables (leastsquares.Table) and observations (a Kind, called) are expected, "
+                f"but one is {shown(item)}"
+            )
+    for table in tables:
+        if table.name.split(",")[0] in OWN:
+            raise InputError(f"also: the network has a table {table.name!r} itself")
+    return tables, observations
+
+
+def place(given: Observations, origin) -> Observations:
+    """The observations in the coordinates of the arrays."""
+    kind, origin = given.kind, tuple(float(x) for x in origin)
+    if not {"image", "point"} & set(kind.of):
+        return given
+    residual = InObjectSpace(kind.residual, kind.of, origin)
+    return dataclasses.replace(given, kind=dataclasses.replace(kind, residual=residual))
