@@ -114,9 +114,9 @@ def _predicted(problem: Problem, data: Data) -> Data:
 
 
 def _root(variance):
-    """σ; where it is 0 its derivative is 0 too."""
-    good = variance > ROUNDING * jax.lax.stop_gradient(jnp.max(variance, initial=0.0))
-    return jnp.where(good, jnp.sqrt(jnp.where(good, variance, 1.0)), 0.0)
+    """σ; where it is 0 its derivative is 0 too. What is not known stays NaN."""
+    none = variance <= ROUNDING * jax.lax.stop_gradient(jnp.max(variance, initial=0.0))
+    return jnp.where(none, 0.0, jnp.sqrt(jnp.where(none, 1.0, variance)))
 
 
 def _image_variances(problem: Problem, values: Values, Q):
@@ -132,7 +132,7 @@ def _camera_sigma(problem: Problem, values: Values, own):
     sigma = jnp.zeros_like(values.camera)
     for table in problem.layout.cameras:
         variance = jnp.diagonal(own[table.name], axis1=1, axis2=2)
-        root = jnp.where(variance > 0, jnp.sqrt(jnp.where(variance > 0, variance, 1.0)), 0.0)
+        root = jnp.where(variance <= 0, 0.0, jnp.sqrt(jnp.where(variance <= 0, 1.0, variance)))
         moving = np.array(problem.system.table(table.name).space.moving, int)
         sigma = sigma.at[table.cameras[:, None], moving].set(root)
     return sigma

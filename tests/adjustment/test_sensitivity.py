@@ -192,7 +192,7 @@ def test_principal_distance_of_the_photographs_by_all_image_coordinates(problem)
 
     xy, random = np.asarray(problem.data.image_xy), np.random.default_rng(3)
     assert xy.size == 80
-    along = random.normal(0, NOISE, (5, *xy.shape))
+    along = random.normal(0, NOISE / 4, (5, *xy.shape))
     steps = np.array([step for step, _ in STENCIL])
     noise = random.normal(0, NOISE, (12, *xy.shape))
     every = np.concatenate([xy + step * along for step in steps] + [xy + noise, xy[None]])

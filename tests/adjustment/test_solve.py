@@ -16,7 +16,8 @@ from adjustment_checks import (
     vtpv,
 )
 
-from jaxbundle.adjustment.problem import make_problem, make_solver
+from jaxbundle.adjustment.problem import make_problem
+from jaxbundle.adjustment.solve import solve
 from jaxbundle.cameras import get_model
 from jaxbundle.geometry import (
     matrix_from_omega_phi_kappa,
@@ -97,7 +98,7 @@ def test_all_free_datums_have_the_same_residuals():
 
 def test_methods_are_named():
     with pytest.raises(ValueError, match="levenberg-marquardt, gauss-newton, not 'newton'"):
-        make_solver(adjusted("free")[0], "newton")
+        solve(adjusted("free")[0], method="newton")
 
 
 @pytest.mark.parametrize("name", [SHARED, "free"])

@@ -16,10 +16,10 @@ from adjustment_checks import (
     synthetic,
 )
 
-from jaxbundle.adjustment.problem import make_problem, make_solver
+from jaxbundle.adjustment.problem import make_problem
 from jaxbundle.geometry import quaternion_difference
 from jaxbundle.leastsquares.datum import move_to_datum
-from jaxbundle.leastsquares.problem import pad_data
+from jaxbundle.leastsquares.problem import make_solver, pad_data
 from jaxbundle.leastsquares.reliability import external_reliability, minimal_detectable
 from jaxbundle.leastsquares.solver import minimise
 from jaxbundle.leastsquares.stopping import SETTLED
@@ -128,7 +128,7 @@ def test_predicted_uncertainty_is_that_of_a_sample():
     system, data = problem.system, problem.data
     random = np.random.default_rng(12)
     noise = random.normal(size=(DRAWS, *data.image_xy.shape)) / np.asarray(data.image_weight)
-    solver = make_solver(problem, max_steps=100)
+    solver = make_solver(problem.system, max_steps=100)
 
     @eqx.filter_jit
     def sample(solver, xy):

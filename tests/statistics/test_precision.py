@@ -71,7 +71,7 @@ def test_derivatives_by_stations_targets_cameras_and_weights(problem, program):
     slopes, _ = program(problem.data)
     places = {
         "position": ((1, 2), 1e-3), "rotation": ((3, 1), 1e-4), "point": ((2, 0), 1e-3),
-        "camera": ((0, 0), 1e-2), "image_weight": ((5, 1), 1.0),
+        "camera": ((0, 0), 1e-2), "image_weight": ((5, 1), 4.0),
     }  # fmt: skip
     for field, (place, h) in places.items():
         at = lambda d, f=field: getattr(d.start, f) if hasattr(d.start, f) else getattr(d, f)
@@ -110,7 +110,9 @@ def test_a_design_that_determines_nothing_is_nan(problem):
     """All stations at one place."""
     same = jnp.tile(problem.data.start.position[:1], (4, 1))
     data = eqx.tree_at(lambda d: d.start.position, problem.data, same)
-    assert np.isnan(jaxbundle.precision(problem, data).points).all()
+    found = jaxbundle.precision(problem, data)
+    assert np.isnan(found.points).all() and np.isnan(found.images).all()
+    assert np.isnan(found.cameras[0, 0])
 
 
 def test_names_that_are_not_there(problem):
