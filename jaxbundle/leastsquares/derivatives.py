@@ -37,7 +37,7 @@ from jaxbundle.leastsquares.problem import Problem, given_data, make_solver, wit
 from jaxbundle.leastsquares.reduction import FACTORS
 from jaxbundle.leastsquares.retraction import retract
 from jaxbundle.leastsquares.rows import Data, Declared, Values, fill_places, lay_out_data, residuals
-from jaxbundle.leastsquares.solver import half_square, minimise
+from jaxbundle.leastsquares.solver import find, half_square
 from jaxbundle.leastsquares.stopping import converged
 
 Sensitivity = Literal["exact", "gauss-newton"]
@@ -79,15 +79,12 @@ def solve(
     data = given_data(problem, data)
     solver = make_solver(problem, atol=atol, max_steps=steps, **options)
     fixed = jax.lax.stop_gradient(data)
-    minimum = _minimise(solver, fixed, fixed.start)
+    minimum = find(solver, fixed, fixed.start)
     good = converged(minimum.termination)
     values = attach_derivatives(problem.declared, problem.plan, minimum.values, data, sensitivity)
     # A factor, not a choice: derivatives of what was not found are NaN as well, not 0.
     found = without_filling(problem, values)
     return jax.tree.map(lambda x: x * jnp.where(good, 1.0, jnp.nan), found)
-
-
-_minimise = eqx.filter_jit(minimise)
 
 
 class Linearised(eqx.Module):

@@ -309,7 +309,7 @@ def make_solver(problem: Problem, *, atol=1e-5, rtol=0.0, **options) -> LeastSqu
         if hasattr(m, "shape") and m.size == w.shape[0] * w.shape[1]
     )
     to_device = lambda x: jax.device_put(np.float64(x))
-    tolerance = Tolerance(to_device(problem.counts.redundancy), to_device(squares), atol, rtol)
+    tolerance = Tolerance(*map(to_device, (problem.counts.redundancy, squares, atol, rtol)))
     return LeastSquares(problem.declared, problem.plan, tolerance, problem.retraction, **options)
 
 

@@ -40,7 +40,7 @@ from jaxbundle.leastsquares.rows import (
     residuals,
 )
 from jaxbundle.leastsquares.sharding import distribute, find_minimum_of_shards
-from jaxbundle.leastsquares.solver import LeastSquares, Minimum, minimise
+from jaxbundle.leastsquares.solver import LeastSquares, Minimum, find
 from jaxbundle.leastsquares.stopping import converged
 
 HERE = "the plan"
@@ -84,7 +84,7 @@ def find_minimum(problem: Problem, start: Values | None = None, **options) -> Mi
 
 def _on_one_device(problem: Problem, solver: LeastSquares):
     data = pad_data(problem, problem.data)
-    return lambda start: _minimise(solver, data, start)
+    return lambda start: find(solver, data, start)
 
 
 def _on_all_devices(problem: Problem, solver: LeastSquares):
@@ -106,7 +106,7 @@ def _worth_sharing(problem: Problem, start: Values) -> bool:
     return all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(start))
 
 
-_minimise, _move_to_datum = eqx.filter_jit(minimise), eqx.filter_jit(move_to_datum)
+_move_to_datum = eqx.filter_jit(move_to_datum)
 
 
 def take_step(problem: Problem, values: Values) -> Values:

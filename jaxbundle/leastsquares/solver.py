@@ -204,6 +204,10 @@ def minimise(solver: LeastSquares, data: Data, start: Values) -> Minimum:
     return Minimum(solution.value, stats["termination"], stats["iterations"], stats["history"])
 
 
+find = eqx.filter_jit(minimise)
+"""`minimise`, compiled once and shared by all that call it."""
+
+
 def half_square(plan: Plan, residual) -> Float[Array, ""]:
     """½·vᵀPv of all devices."""
     return total(plan, 0.5 * sum(jnp.vdot(r, r) for r in residual))

@@ -52,8 +52,8 @@ class Tolerance(eqx.Module):
 
     redundancy: Float[Array, ""]
     squares: Float[Array, ""]
-    atol: float
-    rtol: float
+    atol: Float[Array, ""]
+    rtol: Float[Array, ""]
 
     def limit(self, cost):
         """The decrement d² below which a problem is settled."""
