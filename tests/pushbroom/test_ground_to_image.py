@@ -252,15 +252,17 @@ def test_derivatives_by_every_parameter():
         return jnp.stack(near(eqx.combine(arrays, static), X, places[0] + 3, places[1] - 2))
 
     change = jax.jit(lambda a, da: jax.jvp(at, a, da))
+    draw = np.random.default_rng(3)
     leaves, tree = jax.tree.flatten(jax.tree.map(np.asarray, (arrays, X)))
     for k, leaf in enumerate(leaves):
         direction = [np.zeros_like(a) for a in leaves]
-        direction[k] = rng.normal(size=leaf.shape)
+        direction[k] = draw.normal(size=leaf.shape)
         turn = jax.tree.unflatten(tree, direction)
         found, exact = (np.array(v) for v in change((arrays, X), turn))
         np.testing.assert_allclose(found, places, atol=1e-6)
-        step = min(1e-3 / max(np.abs(exact).max(), 1e-9), 1e3)
+        # A ten-thousandth of a pixel: the times of the knots act far from linearly.
+        step = min(1e-4 / max(np.abs(exact).max(), 1e-9), 1e3)
         ends = [leaves[:k] + [leaf + s * step * direction[k]] + leaves[k + 1 :] for s in (1, -1)]
         moved = [np.array(change(jax.tree.unflatten(tree, end), turn)[0]) for end in ends]
         difference = (moved[0] - moved[1]) / (2 * step)
-        np.testing.assert_allclose(exact, difference, atol=3e-5 * np.abs(exact).max() + 1e-8)
+        np.testing.assert_allclose(exact, difference, atol=1e-5 * np.abs(exact).max() + 1e-8)
