@@ -8,7 +8,7 @@ import numpy as np
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.errors import NotSolvedError
-from jaxbundle.leastsquares.components import Component, rescale, variance_components
+from jaxbundle.leastsquares.components import ROUNDS, Component, estimate, variance_components
 from jaxbundle.leastsquares.names import Name
 from jaxbundle.leastsquares.robust import residual_lengths, reweight, robust_scale
 from jaxbundle.leastsquares.snooping import Removed, snoop, without
@@ -20,9 +20,6 @@ from jaxbundle.statistics.blunders import name_removed
 from jaxbundle.statistics.components import groups
 from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.statistics.misfit import contradicts, doubt_of_baarda
-
-ROUNDS = 20
-"""Variance components are estimated at most so many times."""
 
 
 def snooped(found: Inspection, minimum, again, test: str, significance: float):
@@ -90,34 +87,23 @@ class _Repeat:
         return require_solved(problem, self.minimum, self.when).solution
 
 
-def with_components(problem, minimum, again, tolerance: float = 1e-3):
-    """Repeat Förstner's estimate until every component is 1 within `tolerance`.
-
-    Also returned: by group, what its σ have been multiplied by.
-    """
-    factors: dict[str, float] = {}
-    for done in range(ROUNDS + 1):
-        found = Inspection(problem, minimum.values).solution
-        components = variance_components(found, groups(problem), factors)
-        estimable = {name: c for name, c in components.items() if c.usable}
-        factors = {name: c.factor for name, c in estimable.items()} | factors
-        open_ones = [name for name, c in estimable.items() if abs(c.ratio - 1) >= tolerance]
-        if done == ROUNDS or not open_ones:
-            break
-        ratios = {name: c.ratio for name, c in estimable.items()}
-        problem = problem.with_system(rescale(problem.system, groups(problem), ratios))
-        minimum = again(problem, minimum.values)
-        require_solved(problem, minimum, "with the estimated variance components")
-        factors |= {name: c.sigma for name, c in estimable.items()}
-    network = problem.network.warn(*_doubts(components, open_ones))
-    return dataclasses.replace(problem, network=network), minimum, factors
+def with_components(problem: Problem, minimum, again):
+    """The problem with the σ of every group estimated, its minimum, and by group what the σ have
+    been multiplied by."""
+    repeat = _Repeat(problem, again, "with the estimated variance components", minimum)
+    whole, of = Inspection(problem, minimum.values).solution, groups(problem)
+    found, factors, unsettled = estimate(whole, of, repeat)
+    components = variance_components(found, of, factors)
+    network = problem.network.warn(*_doubts(components, unsettled))
+    problem = dataclasses.replace(problem.with_system(found.problem), network=network)
+    return problem, repeat.minimum, factors
 
 
-def _doubts(components: dict[str, Component], open_ones: list[str]):
+def _doubts(components: dict[str, Component], unsettled: list[str]):
     """What is to be said of an estimate of variance components."""
-    if open_ones:
+    if unsettled:
         yield (
-            f"the variance components did not settle in {ROUNDS} rounds ({', '.join(open_ones)}): "
+            f"the variance components did not settle in {ROUNDS} rounds ({', '.join(unsettled)}): "
             "their σ are not final"
         )
     for name, component in components.items():

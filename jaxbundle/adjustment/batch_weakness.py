@@ -12,9 +12,8 @@ from jaxtyping import Bool, Float
 
 from jaxbundle.adjustment.batch_camera import INDETERMINATE
 from jaxbundle.cameras import CameraModel
+from jaxbundle.leastsquares.weakness import VAGUE
 
-VAGUE = 50.0
-"""A principal distance whose σ is above a fiftieth of it is as good as unknown."""
 PART = 0.05
 """A parameter with this part of the square of a vanishing direction is named."""
 

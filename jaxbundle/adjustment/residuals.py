@@ -35,23 +35,9 @@ def image_residual(model, domain, free, rotation, centre, interior, point, xy, w
     return weight[0] * vx, weight[1] * vy
 
 
-def split_change(x, free: int, width: int):
-    """A vector of 9 + `width` changes as `image_residual` takes them: δX0, δθ, `free` parameters
-    (the rest of the width is not used), δX."""
-    return tuple(
-        tuple(x[i] for i in range(start, start + number))
-        for start, number in ((0, 3), (3, 3), (6, free), (6 + width, 3))
-    )
-
-
 def cross(a, b):
     """The vector product of two triples of scalars."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
-
-
-def control_residual(point, given, weight, d_point):
-    """A control point's coordinates against their given values [3]."""
-    return weight * (point + d_point - given)
 
 
 def exterior_residual(position, rotation, given, weight, d_image):
@@ -60,14 +46,3 @@ def exterior_residual(position, rotation, given, weight, d_image):
     angles = omega_phi_kappa_near(M, given[3:])
     change = jnp.concatenate([position + d_image[:3], angles]) - given
     return weight * change
-
-
-def interior_residual(parameters, given, weight, d_parameters):
-    """A camera's parameters against their prior [parameters]."""
-    return weight * (parameters + d_parameters - given)
-
-
-def distance_residual(a, b, given, weight, d_a, d_b):
-    """A distance between two points against its measured value."""
-    difference = (a + d_a) - (b + d_b)
-    return weight * (jnp.sqrt(jnp.sum(difference**2)) - given)

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.adjustment.batch_weakness import VAGUE
 from jaxbundle.calibration.quality import Coverage, CrossValidation
 from jaxbundle.cameras import CameraModel
+from jaxbundle.leastsquares.weakness import VAGUE
 
 FEW_VIEWS = 8
 TURNED = 60.0

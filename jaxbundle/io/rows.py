@@ -26,12 +26,6 @@ class Row:
         """A complaint about this line, to be raised."""
         return InputError(f"{self.path}, line {self.number}: {message}")
 
-    def number_at(self, k: int, what: str) -> float:
-        """The finite number that is the k-th word."""
-        if k >= len(self.words):
-            raise self.error(f"{what} is missing: the line has {len(self)} values")
-        return self._number(self.words[k], what)
-
     def numbers(
         self, what: Sequence[str], first: int = 0, more: bool = False
     ) -> Float[np.ndarray, " n"]:

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxbundle.arguments import one_of, truth, whole
 from jaxbundle.errors import InputError, NotSolvedError
-from jaxbundle.leastsquares.components import ROUNDS, Component, Group, rescale, variance_components
+from jaxbundle.leastsquares.components import Component, Group, estimate, variance_components
 from jaxbundle.leastsquares.declarations import Motions, Observations, Table
 from jaxbundle.leastsquares.motions import likely_motions
 from jaxbundle.leastsquares.names import undetermined
@@ -253,23 +253,8 @@ def adjust(
         found = Solution(problem, found.values)
         found, removed = snoop(found, again, test=snooping, significance=significance)
     if estimate_components:
-        found, factors = estimate(found, kinds_as_groups(problem), again)
+        found, factors, _ = estimate(found, kinds_as_groups(problem), again)
     return Result(found.problem, minima[-1], removed, suspects, factors)
-
-
-def estimate(found: Solution, groups: Sequence[Group], again: Callable, tolerance: float = 1e-3):
-    """Repeat Förstner's estimate until every component is 1 within `tolerance`: the solution, and
-    by group what its σ have been multiplied by."""
-    factors: dict[str, float] = {}
-    for _ in range(ROUNDS):
-        components = variance_components(found, groups, factors)
-        usable = {name: c for name, c in components.items() if c.usable}
-        if all(abs(c.ratio - 1) < tolerance for c in usable.values()):
-            break
-        problem = rescale(found.problem, groups, {name: c.ratio for name, c in usable.items()})
-        found = again(problem, found.values)
-        factors |= {name: c.sigma for name, c in usable.items()}
-    return found, factors
 
 
 def kinds_as_groups(problem: Problem) -> list[Group]:

@@ -8,7 +8,7 @@ scales is the *factor* of the group: what the σ it was given have been multipli
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,9 +18,10 @@ from jaxbundle.leastsquares.solution import Solution
 
 ROUNDS = 20
 """Variance components are estimated at most so many times."""
+SETTLED = 1e-3
+"""Components that differ less from 1 are not estimated again."""
 LEAST_REDUNDANCY = 1.0
 """A group with less redundancy than this has no usable component."""
-
 EXACT = 1e-9
 """Residuals below this fraction of their a priori σ are rounding: there is nothing to estimate."""
 
@@ -92,6 +93,31 @@ def variance_components(
                 (float(unit / used.max()), float(unit / used.min())), factor,
             )  # fmt: skip
     return components
+
+
+class Estimate(NamedTuple):
+    """Variance components when their estimation ends: the solution, by group what its σ have been
+    multiplied by, and the groups whose components have not settled."""
+
+    found: Solution
+    factors: dict[str, float]
+    unsettled: list[str]
+
+
+def estimate(found: Solution, groups: Sequence[Group], again: Callable) -> Estimate:
+    """Repeat Förstner's estimate until every component is 1; `again(problem, values)` adjusts."""
+    factors: dict[str, float] = {}
+    for done in range(ROUNDS + 1):
+        components = variance_components(found, groups, factors)
+        usable = {name: c for name, c in components.items() if c.usable}
+        factors = {name: c.factor for name, c in usable.items()} | factors
+        unsettled = [name for name, c in usable.items() if abs(c.ratio - 1) >= SETTLED]
+        if done == ROUNDS or not unsettled:
+            return Estimate(found, factors, unsettled)
+        ratios = {name: c.ratio for name, c in usable.items()}
+        found = again(rescale(found.problem, groups, ratios), found.values)
+        factors |= {name: c.sigma for name, c in usable.items()}
+    raise AssertionError("the last round returns")
 
 
 def rescale(problem: Problem, groups: Sequence[Group], factors: Mapping[str, float]) -> Problem:

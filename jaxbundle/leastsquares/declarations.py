@@ -15,6 +15,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int, PyTree
 
+from jaxbundle.arguments import numeric_array
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Space, Vector
 
@@ -44,6 +45,8 @@ class Table:
     title: str = ""
 
     def __post_init__(self):
+        what = f"table {self.name!r}: the start values"
+        object.__setattr__(self, "value", _arrays(what, self.value))
         leaves = jax.tree.leaves(self.value)
         if not leaves or any(np.ndim(x) == 0 for x in leaves):
             raise InputError(f"table {self.name!r}: the values must be arrays of rows")
@@ -58,7 +61,8 @@ class Table:
                     f"table {self.name!r}: values of this shape need a space, such as Pose()"
                 )
             object.__setattr__(self, "space", Vector(shape[1] if len(shape) == 2 else 0))
-        free = True if self.free is None else np.asarray(self.free)
+        free = True if self.free is None else self.free
+        free = numeric_array(f"table {self.name!r}: `free`", free, "truth values", truths=True)
         try:
             free = free if np.ndim(free) != 1 else np.asarray(free)[:, None]
             free = np.broadcast_to(free, (self.rows, self.space.width)).astype(float)
@@ -164,7 +168,7 @@ class Observations:
 
     def __post_init__(self):
         name, kind = self.kind.name, self.kind
-        rows = tuple(_row_numbers(r) for r in self.rows)
+        rows = tuple(_row_numbers(name, r) for r in self.rows)
         if len(rows) != len(kind.of):
             raise InputError(
                 f"{name}: rows of {len(kind.of)} tables are expected ({', '.join(kind.of)}), not "
@@ -173,8 +177,8 @@ class Observations:
         if len({len(r) for r in rows}) > 1:
             raise InputError(f"{name}: the columns of rows differ in length")
         object.__setattr__(self, "rows", rows)
-        measured = jax.tree.map(lambda x: np.asarray(x, float), self.measured)
-        if any(len(x) != self.number for x in jax.tree.leaves(measured)):
+        measured = _arrays(f"{name}: the measured values", self.measured)
+        if any(np.shape(x)[:1] != (self.number,) for x in jax.tree.leaves(measured)):
             raise InputError(f"{name}: {self.number} observations, but not as many measured values")
         object.__setattr__(self, "measured", measured)
         if self.sigma is not None and self.covariance is not None:
@@ -209,8 +213,9 @@ class Observations:
     def weight(self, residuals: int) -> Float[np.ndarray, "n ..."]:
         """The weights for so many residuals of an observation."""
         if self.covariance is not None:
-            return _whitening(self.kind.name, np.asarray(self.covariance, float), residuals)
-        sigma = np.asarray(1.0 if self.sigma is None else self.sigma, float)
+            return _whitening(self.kind.name, self.covariance, self.number, residuals)
+        sigma = 1.0 if self.sigma is None else self.sigma
+        sigma = numeric_array(f"{self.kind.name}: sigma", sigma, "positive numbers").astype(float)
         sigma = sigma[:, None] if sigma.ndim == 1 else sigma
         try:
             sigma = np.broadcast_to(sigma, (self.number, residuals))
@@ -229,20 +234,33 @@ class Observations:
         return 1 / sigma
 
 
-def _row_numbers(rows) -> np.ndarray:
+def _arrays(what: str, tree: PyTree) -> PyTree[np.ndarray]:
+    """A tree of arrays, or of lists of numbers, as arrays; what is masked is NaN."""
+    number = lambda x: numeric_array(what, x, "arrays of numbers").astype(float)
+    return jax.tree.map(number, tree, is_leaf=lambda x: isinstance(x, list))
+
+
+def _row_numbers(kind: str, rows) -> np.ndarray:
     """Whole numbers, or labels as objects."""
-    rows = np.asarray(rows).ravel()
-    if rows.dtype.kind in "OUS":
-        return np.array([str(r) for r in rows], dtype=object)
+    if np.asarray(rows).dtype.kind in "OUS":
+        return np.array([str(r) for r in np.ravel(rows)], dtype=object)
+    rows = numeric_array(f"{kind}: rows", rows, "row numbers or labels").ravel()
+    bad = rows != np.round(rows)
+    if bad.any():
+        raise InputError(f"{kind}: rows must be row numbers or labels, not {rows[bad][0]:g}")
     return rows.astype(np.int64)
 
 
-def _whitening(name: str, covariance, residuals: int):
-    if covariance.shape[1:] != (residuals, residuals):
+def _whitening(name: str, covariance, number: int, residuals: int):
+    covariance = numeric_array(f"{name}: covariance", covariance, "[n, r, r]").astype(float)
+    if covariance.shape != (number, residuals, residuals):
         raise InputError(
-            f"{name}: a covariance of an observation must be {residuals} by {residuals}, not "
-            f"{list(covariance.shape[1:])}"
+            f"{name}: covariance must be {[number, residuals, residuals]}, not "
+            f"{list(covariance.shape)}"
         )
+    size = np.sqrt(np.einsum("nii,njj->nij", covariance, covariance))
+    if not (np.abs(covariance - covariance.mT) <= 1e-9 * size).all():
+        raise InputError(f"{name}: a covariance is not symmetric or not finite")
     try:
         lower = np.linalg.cholesky(covariance)
     except np.linalg.LinAlgError:

@@ -22,15 +22,15 @@ from jaxbundle.leastsquares.banded import BandFactor, factorise_band
 from jaxbundle.leastsquares.damping import matrices
 from jaxbundle.leastsquares.iterative import ConjugateGradients, precondition
 from jaxbundle.leastsquares.normal import Normal, Tangent, agreed, gather, scatter, total
-from jaxbundle.leastsquares.plan import PAIR_ROWS_AT_ONCE, Pairs, Plan
+from jaxbundle.leastsquares.plan import Pairs, Plan
 from jaxbundle.leastsquares.reduced import DenseFactor, Reduced, factorise_dense
 
 EXACT = 1e-13
 """Relative residual of a reduced system solved by iteration, where it must be as good as exact."""
 PIVOT = 1e-13
 """A pivot below this fraction of its diagonal element is rounding: nothing determines it."""
-
-
+PAIR_ROWS_AT_ONCE = 8192
+"""Pairs whose products are held at the same time."""
 LIFT = 1e-10
 """Added to normal equations that cannot be solved, in parts of their diagonal."""
 

@@ -13,10 +13,11 @@ from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.datum import find_open_motions, make_datum
 from jaxbundle.leastsquares.declarations import Motions, Observations, Table
 from jaxbundle.leastsquares.indices import common, finish, rounded
-from jaxbundle.leastsquares.plan import Plan, make_plan
+from jaxbundle.leastsquares.plan import Plan
+from jaxbundle.leastsquares.planner import make_plan
 from jaxbundle.leastsquares.reduction import FACTORS, REDUCTIONS
 from jaxbundle.leastsquares.retraction import retract
-from jaxbundle.leastsquares.rows import Data, Declared, Values, evaluate, scalars
+from jaxbundle.leastsquares.rows import Data, Declared, Values, diagonal_of, evaluate, scalars
 from jaxbundle.leastsquares.solver import LeastSquares
 from jaxbundle.leastsquares.stopping import Tolerance
 
@@ -27,7 +28,7 @@ LARGE = 200_000
 @dataclasses.dataclass(frozen=True)
 class Problem:
     """What is solved: declarations, plan and numbers. `sizes`: of the lists of the plan; `choices`:
-    what was chosen when it was made (`plan.make_plan`)."""
+    what was chosen when it was made (`planner.make_plan`)."""
 
     tables: tuple[Table, ...]
     observations: tuple[Observations, ...]
@@ -46,7 +47,7 @@ class Problem:
     def weights(self, o: int, weight=None) -> Float[np.ndarray, "n r"]:
         """1/σ of the residuals of a set of observations, 0 where they do not count; of those with a
         covariance the diagonal of L⁻¹."""
-        return _diagonal(np.asarray(self.data.weight[o] if weight is None else weight))
+        return np.asarray(diagonal_of(self.data.weight[o] if weight is None else weight))
 
     @property
     def reduced_size(self) -> int:
@@ -204,7 +205,7 @@ def with_data(problem: Problem, data: Data) -> Problem:
 def count(tables, data: Data) -> Counts:
     """Rows that carry weight, and free unknowns."""
     return Counts(
-        sum(int((np.asarray(_diagonal(w)) > 0).sum()) for w in data.weight),
+        sum(int((np.asarray(diagonal_of(w)) > 0).sum()) for w in data.weight),
         sum(int((t.free > 0).sum()) for t in tables),
     )
 
@@ -227,10 +228,32 @@ def check(tables, observations) -> None:
                 )
 
 
+def check_numbers(tables, observations, weights) -> None:
+    """Refuse start values, and measured values that carry weight, that are no finite numbers."""
+    for table in tables:
+        for rows in jax.tree.leaves(table.value):
+            bad = ~np.isfinite(rows)
+            if bad.any():
+                row = table.label(int(np.argwhere(bad)[0][0]))
+                raise InputError(f"{table.title} {row}: a start value is not a finite number")
+    for given, weight in zip(observations, weights):
+        for rows in jax.tree.leaves(given.measured):
+            bad = ~np.isfinite(rows).reshape(given.number, -1)
+            counts = diagonal_of(weight) > 0
+            bad &= counts if counts.shape == bad.shape else counts.any(1, keepdims=True)
+            if bad.any():
+                row = int(np.argwhere(bad)[0][0])
+                raise InputError(
+                    f"observation {row + 1}, {given.label(tables, row)}: a measured value is not a "
+                    "finite number; an infinite sigma leaves an observation out"
+                )
+
+
 def make_data(declared: Declared, tables, observations) -> Data:
     """The numbers of a problem as arrays."""
     start = {t.name: jax.tree.map(lambda x: np.asarray(x, float), t.value) for t in tables}
     weights = observed_weights(tables, observations)
+    check_numbers(tables, observations, weights)
     return jax.device_put(Data(start, tuple(o.measured for o in observations), tuple(weights)))
 
 
@@ -251,10 +274,6 @@ def observed_weights(tables, observations) -> list[Float[np.ndarray, "n ..."]]:
         return len(jax.eval_shape(rows, one(values), one(given.measured)))
 
     return [given.weight(number(given)) for given in observations]
-
-
-def _diagonal(weight):
-    return weight if weight.ndim == 2 else np.diagonal(weight, axis1=1, axis2=2)
 
 
 def pad_data(problem: Problem, data: Data) -> Data:
@@ -303,8 +322,9 @@ def given_data(problem: Problem, data: Data | None) -> Data:
 
 def make_solver(problem: Problem, *, atol=1e-5, rtol=0.0, **options) -> LeastSquares:
     """The solver of a problem; `options` are those of `LeastSquares`."""
+    squared = lambda w, m: np.where(w > 0, w * m.reshape(w.shape), 0.0) ** 2
     squares = sum(
-        float(((np.asarray(_diagonal(w)) * np.asarray(m).reshape(w.shape[:2])) ** 2).sum())
+        float(squared(np.asarray(diagonal_of(w)), np.asarray(m)).sum())
         for w, m in zip(problem.data.weight, problem.data.measured)
         if hasattr(m, "shape") and m.size == w.shape[0] * w.shape[1]
     )

@@ -26,6 +26,7 @@ from jaxbundle.leastsquares.rows import (
     Declared,
     Laid,
     Values,
+    diagonal_of,
     in_given_order,
     lay_out_data,
     prepare,
@@ -55,13 +56,9 @@ def reliability(
     found = hat_diagonal(declared, plan, values, laid, Q)
     residual, hat, own = (in_given_order(plan, rows) for rows in found)
     number = lambda h, weight: jnp.where(weight > 0, jnp.clip(1.0 - h, 0.0, 1.0), 0.0)
-    r = {o: number(h, _diagonal(data.weight[o])) for o, h in hat.items()}
+    r = {o: number(h, diagonal_of(data.weight[o])) for o, h in hat.items()}
     test = lambda v, r: jnp.where(r > UNCONTROLLED, v / jnp.sqrt(jnp.maximum(r, 1e-300)), jnp.nan)
     return Reliability(residual, r, {o: test(residual[o], r[o]) for o in r}, own)
-
-
-def _diagonal(weight):
-    return weight if weight.ndim == 2 else jnp.diagonal(weight, axis1=1, axis2=2)
 
 
 def hat_diagonal(declared: Declared, plan: Plan, values: Values, laid: Laid, Q: Cofactors):

@@ -116,8 +116,11 @@ def _weighted(v, weight):
 
 
 def diagonal_of(weight):
-    """The weight of every residual of an observation, 0 where it does not count."""
-    return tuple(w[i] if isinstance(w, tuple) else w for i, w in enumerate(weight))
+    """The weight of every residual, 0 where it does not count: of observations [n, r] or [n, r, r],
+    or of one as scalars."""
+    if isinstance(weight, tuple):
+        return tuple(w[i] if isinstance(w, tuple) else w for i, w in enumerate(weight))
+    return weight if weight.ndim == 2 else weight.diagonal(axis1=1, axis2=2)
 
 
 def fill_places(plan: Plan, laid: Laid) -> tuple[Plan, Laid]:

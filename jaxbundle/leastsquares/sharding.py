@@ -18,7 +18,8 @@ from jaxtyping import Int
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.declarations import Table
 from jaxbundle.leastsquares.indices import common, finish
-from jaxbundle.leastsquares.plan import Datum, Plan, make_plan
+from jaxbundle.leastsquares.plan import Datum, Plan
+from jaxbundle.leastsquares.planner import make_plan
 from jaxbundle.leastsquares.problem import Problem, fill_data, pad_values, rounder, without_filling
 from jaxbundle.leastsquares.rows import Data, Values
 from jaxbundle.leastsquares.solver import LeastSquares, Minimum, minimise

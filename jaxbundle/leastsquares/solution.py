@@ -29,7 +29,6 @@ from jaxbundle.leastsquares.problem import (
     without_filling,
 )
 from jaxbundle.leastsquares.reliability import Reliability, hat_diagonal, reliability
-from jaxbundle.leastsquares.retraction import changes_of_tables
 from jaxbundle.leastsquares.rows import (
     Data,
     Declared,
@@ -273,9 +272,3 @@ def _by_eliminated(declared, plan, values, data):
 def _propagate(declared, values, factor, rows):
     plan = factor.plan
     return propagate(declared, values, factor, jax.vmap(lambda r: of_groups(plan, r))(rows))
-
-
-def table_changes(problem: Problem, change) -> dict[str, np.ndarray]:
-    """A change of groups as changes of tables."""
-    values = pad_values(problem, problem.data.start)
-    return changes_of_tables(problem.plan, values, change)

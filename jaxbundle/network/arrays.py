@@ -8,11 +8,7 @@ relative to the network's `origin`, so that a national grid of 10⁷ m loses no 
 import dataclasses
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
-
-from jaxbundle.geometry import matrix_from_quaternion, retract_quaternion
 
 
 class Values(eqx.Module):
@@ -60,69 +56,3 @@ class Data(eqx.Module):
     def weight(self, kind: str) -> Array:
         """The weights of a kind."""
         return getattr(self, f"{kind}_weight")
-
-
-class Tangent(eqx.Module):
-    """A small change of the free unknowns, as the adjustment orders them.
-
-    `image`: δX0, δY0, δZ0, δθ (3) and, where every image has its own camera, the free interior
-    orientation; `camera`: the free interior orientation where cameras are shared; `point`: δX,
-    δY, δZ.
-    """
-
-    image: Float[Array, "images image_block"]
-    camera: Float[Array, "cameras camera_block"]
-    point: Float[Array, "points 3"]
-
-
-def split_image_block(structure, tangent: Tangent):
-    """The exterior part [images, 6] and the interior part [cameras, k] of a change."""
-    if structure.own_camera:
-        return tangent.image[:, :6], tangent.image[:, 6:]
-    return tangent.image, tangent.camera
-
-
-def retract(structure, values: Values, tangent: Tangent) -> Values:
-    """The unknowns after a small change; what is fixed must have a zero change."""
-    exterior, interior = split_image_block(structure, tangent)
-    camera = values.camera
-    if interior.shape[1]:
-        rows = jnp.arange(camera.shape[0])[:, None]
-        camera = camera.at[rows, structure.camera_columns].add(interior * structure.camera_free)
-    return Values(
-        camera=camera,
-        position=values.position + exterior[:, :3],
-        rotation=jax.vmap(retract_quaternion)(values.rotation, exterior[:, 3:]),
-        point=values.point + tangent.point,
-    )
-
-
-def retract_about(structure, values: Values, tangent: Tangent) -> Values:
-    """`retract`, but every image turns about the middle of the points it sees.
-
-    To first order the same. A long step that turns an image and shifts it, so that it keeps its
-    points, keeps them only if the turn is about them: about its own projection centre they leave
-    the image by the second-order terms. (A problem of 16 images of close-up scenes: 12 steps to
-    the minimum instead of 21.) The middle is that of the points weighted by 1/distance², as much as
-    they say about the position; so far ones do not pull it away. Images whose position is held
-    turn about it.
-    """
-    s, moved = structure, retract(structure, values, tangent)
-    point = values.point[s.point]
-    square = jnp.sum((point - s.table.of_image(values.position)) ** 2, 1, keepdims=True)
-    weight = s.table.used[:, None] / jnp.maximum(square, 1e-300)
-    seen = jnp.concatenate([weight * point, weight], 1)
-    seen = s.total(s.table.sum_by_image(seen))
-    pivot = seen[:, :3] / jnp.where(seen[:, 3:] > 0, seen[:, 3:], 1.0)
-
-    def position(old, M, new_M, change, pivot):
-        Y = M @ (pivot - old)
-        return pivot - new_M.T @ (Y + jnp.cross(change[3:], Y) - M @ change[:3])
-
-    matrices = jax.vmap(matrix_from_quaternion)
-    exterior, _ = split_image_block(s, tangent)
-    turned = jax.vmap(position)(
-        values.position, matrices(values.rotation), matrices(moved.rotation), exterior, pivot
-    )
-    free = s.image_free[:, :3].all(1, keepdims=True)
-    return eqx.tree_at(lambda v: v.position, moved, jnp.where(free, turned, moved.position))
