@@ -10,8 +10,8 @@ from jaxtyping import Float, Int
 from jaxbundle.arguments import one_of
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares import problem as engine
-from jaxbundle.leastsquares.datum import CannotHold
 from jaxbundle.leastsquares.declarations import Observations, Table
+from jaxbundle.leastsquares.defect import CannotHold
 from jaxbundle.network.arrays import Data, Values
 from jaxbundle.network.datum_words import open_directions_in_words
 from jaxbundle.network.declare import Layout, declare, order_cameras

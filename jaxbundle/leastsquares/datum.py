@@ -17,38 +17,24 @@ depend on the path of the iterations.
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool
 
-from jaxbundle.errors import InputError
 from jaxbundle.implicit import implicit_root, solve_dense
-from jaxbundle.leastsquares.linearise import differentiate
 from jaxbundle.leastsquares.normal import Tangent, total
-from jaxbundle.leastsquares.plan import Datum, Plan
-from jaxbundle.leastsquares.rows import Data, Declared, Values, lay_out_data, prepare
+from jaxbundle.leastsquares.plan import Plan
+from jaxbundle.leastsquares.rows import Declared, Values
 
-OPEN = 1e-10
-"""Relative size of J·G below which a direction counts as open (rounding gives about 1e-14)."""
 HELD = 1e-7
 """Relative size of the least motion of datum unknowns that hold the datum."""
 NEAR = 1e-3
 """A motion into the datum by less than this fraction of the problem is near its end."""
 LONGEST = 1.0
 """Of a single motion into the datum: radians, or a factor of e."""
+THERE = 1e-12
+"""A motion into the datum by less than this fraction of the problem is its last."""
 MOST_MOTIONS = 50
-
-
-class CannotHold(InputError):
-    """The unknowns chosen cannot hold the datum; `defect` of its parameters are open."""
-
-    def __init__(self, defect: int):
-        super().__init__(
-            f"the chosen unknowns cannot hold the datum, of which {defect} parameters are open"
-        )
-        self.defect = defect
 
 
 def generators(declared: Declared, values: Values) -> Tangent:
@@ -107,128 +93,6 @@ def leave_held(declared: Declared, plan: Plan, values: Values) -> Plan:
     return dataclasses.replace(plan, datum=datum)
 
 
-def find_open_motions(
-    declared: Declared, plan: Plan, data: Data, real: dict[str, np.ndarray]
-) -> Float[np.ndarray, "motions defect"]:
-    """The combinations of the declared motions that change no observation and nothing held. `real`:
-    by table, which of its rows are not filled in.
-
-    Found at the start values from the singular values of J·G, its columns scaled by the size of
-    their terms, so that neither units nor the number of observations matter."""
-    products, terms, held = map(np.asarray, _directional_products(declared, plan, data, real))
-    # What cannot be computed from the start values says nothing; the solver will complain.
-    products, terms, held = (x[np.isfinite(x).all(1)] for x in (products, terms, held))
-    scale = np.sqrt((np.concatenate([terms, held]) ** 2).sum(0))
-    scale = np.where(scale > 0, scale, 1.0)
-    held = held / scale
-    size = np.linalg.norm(held, axis=1, keepdims=True)
-    held = held / np.where(size > 0, size, 1.0)
-    motions = len(declared.motions.names)
-    # Singular values of a QR, not of the Gram matrix, which would lose half of the digits.
-    rows = np.concatenate([products / scale, held, np.zeros((motions, motions))])
-    _, singular, directions = np.linalg.svd(np.linalg.qr(rows, mode="r"))
-    return directions[singular < OPEN].T / scale[:, None]
-
-
-@eqx.filter_jit
-def _directional_products(declared: Declared, plan: Plan, data: Data, real):
-    """J·G of all observations that are not invariant, the terms that cancel in it, and G on what is
-    held."""
-    laid, prepared = lay_out_data(plan, data), prepare(declared, data.start)
-    moves = generators(declared, data.start)
-    motions = len(declared.motions.names)
-    everywhere = {
-        name: (jnp.concatenate([
-            moves[m.table] if m.rows is None else moves[m.table][m.rows] for m in group.members
-        ], 1), group.free)
-        for name, group in plan.groups.items()
-    }  # fmt: skip
-    products, terms = [], []
-    for number, part in enumerate(plan.parts):
-        if declared.kinds[part.observations].invariant:
-            continue
-        _, touches, E = differentiate(declared, plan, number, prepared, laid)
-        blocks = [(J, everywhere[t.group][0][t.row, t.start : t.stop][:, None])
-                  for t, J in zip(part.touches, touches)]  # fmt: skip
-        if E is not None:
-            blocks.append((E, everywhere[plan.eliminated][0][part.eliminated]))
-        products.append(sum(J @ G for J, G in blocks).reshape(-1, motions))
-        terms.append(sum(abs(J) @ abs(G) for J, G in blocks).reshape(-1, motions))
-    free = free_of_tables(plan, declared, data.start)
-    held = [
-        jnp.where((free[name] > 0)[..., None] | ~real[name][:, None, None], 0.0, rows)
-        for name, rows in moves.items()
-    ]
-    flat = lambda rows: jnp.concatenate([jnp.zeros((0, motions)), *rows])
-    return flat(products), flat(terms), flat([rows.reshape(-1, motions) for rows in held])
-
-
-def make_datum(
-    declared: Declared, plan: Plan, data: Data, gauge, weight: dict[str, np.ndarray], minimal: bool,
-    real: dict[str, np.ndarray],
-) -> Datum:  # fmt: skip
-    """The datum held by the unknowns with a `weight` (by table, [rows, width]); `minimal`: by as
-    many of them as there are defects, chosen well spread. `real`: see `find_open_motions`.
-
-    **Raises:** `CannotHold`."""
-    moves = {name: np.asarray(g) @ gauge for name, g in _generators(declared, data.start).items()}
-    free = jax.tree.map(np.asarray, free_of_tables(plan, declared, data.start))
-    weight = {name: np.asarray(w) * free[name] for name, w in weight.items()}
-    defect = gauge.shape[1]
-    directions = np.concatenate([moves[t].reshape(-1, defect) for t in weight])
-    candidates = np.concatenate([w.ravel() for w in weight.values()])
-    chosen = directions * candidates[:, None]
-    if np.isfinite(chosen).all():  # otherwise the solver will complain
-        singular = np.linalg.svd(chosen / np.linalg.norm(directions, axis=0), compute_uv=False)
-        if len(singular) < defect or singular[-1] < HELD * singular[0]:
-            raise CannotHold(defect)
-    if minimal:
-        picked = _pick_rows(directions, candidates)
-        cuts = np.cumsum([w.size for w in weight.values()])[:-1]
-        weight = {
-            t: part.reshape(weight[t].shape) for t, part in zip(weight, np.split(picked, cuts))
-        }
-    pins = _choose_pins(plan, {n: np.asarray(x) for n, x in of_groups(plan, moves).items()})
-    held = {t: (1 - free[t]) * real[t][:, None] for t, _ in declared.motions.actions}
-    return Datum(gauge, weight, pins, {t: mask for t, mask in held.items() if mask.any()})
-
-
-_generators = eqx.filter_jit(generators)
-
-
-def _choose_pins(plan: Plan, G) -> dict[str, np.ndarray]:
-    """As many kept unknowns as there are defects, chosen well spread; every kind of direction
-    counts by its own size, unless that is rounding."""
-    rows, shapes = [], []
-    size = {name: np.sqrt((G[name] ** 2).mean((0, 2), keepdims=True)) for name in plan.kept}
-    least = max(1e-300, OPEN * max(x.max(initial=0) for x in size.values()))
-    for name in plan.kept:
-        sized = G[name] / np.maximum(size[name], least)
-        rows.append(sized.reshape(-1, sized.shape[2]))
-        shapes.append(G[name].shape[:2])
-    whole = np.concatenate(rows)
-    free = np.concatenate([np.asarray(plan.groups[g].free).ravel() for g in plan.kept])
-    picked = _pick_rows(whole, free)
-    cuts = np.cumsum([len(r) for r in rows])[:-1]
-    return {
-        name: part.reshape(shape)
-        for name, part, shape in zip(plan.kept, np.split(picked, cuts), shapes)
-    }
-
-
-def _pick_rows(G, candidates):
-    """1 for as many rows of G as it has columns, the independent ones, 0 for the others."""
-    q, _ = np.linalg.qr(G)
-    rows = q * candidates[:, None]
-    chosen = np.zeros(len(rows))
-    for _ in range(G.shape[1]):
-        pick = np.argmax((rows**2).sum(1))
-        direction = rows[pick] / np.linalg.norm(rows[pick])
-        rows = rows - np.outer(rows @ direction, direction)
-        chosen[pick] = 1.0
-    return chosen
-
-
 def s_transform(declared: Declared, plan: Plan, values: Values, change: Tangent) -> Tangent:
     """A change with the datum imposed: δ − G(BᵀG)⁻¹Bᵀδ; unchanged where nothing is open."""
     if plan.datum is None:
@@ -255,13 +119,17 @@ def datum_directions(declared: Declared, plan: Plan, values: Values) -> tuple[Ta
     return G, {name: g * weight[name][..., None] for name, g in G.items()}
 
 
-def move_to_datum(declared: Declared, plan: Plan, values: Values, start: Values) -> Values:
-    """The problem moved along its open motions to where Bᵀ(x − x_start) = 0.
+def move_to_datum(
+    declared: Declared, plan: Plan, values: Values, start: Values, newton: bool = True
+) -> tuple[Values, Bool[Array, ""]]:
+    """The problem moved along its open motions to where Bᵀ(x − x_start) = 0, and whether it is
+    there.
 
-    Gauss–Newton steps, of a radian and a factor e at most, until near; then Newton's. Until
-    rounding: no move at all, or a small one that is no smaller than the one before."""
+    Gauss–Newton steps, of a radian and a factor e at most; with `newton` Newton's when near, which
+    take long to compile, but reach what is deformed by half. Until rounding: no move at all, or a
+    small one that is no smaller than the one before."""
     if plan.datum is None:
-        return values
+        return values, jnp.asarray(True)
     plan, still = leave_held(declared, plan, values), jnp.zeros(plan.datum.gauge.shape[1])
     weighted = tuple(plan.datum.weight)
     size = max(jnp.abs(x).max() for name in weighted for x in jax.tree.leaves(start[name]))
@@ -269,14 +137,14 @@ def move_to_datum(declared: Declared, plan: Plan, values: Values, start: Values)
     def moving(state):
         _, distance, before, count = state
         falling = (distance > 1e-6 * size) | (distance < 0.5 * before)
-        return (distance > 1e-12 * size) & falling & (count < MOST_MOTIONS)
+        return (distance > THERE * size) & falling & (count < MOST_MOTIONS)
 
     def further(state):
         values, before, _, count = state
-        missing, gram = _datum_equations(declared, plan, values, start)
-        far = before > NEAR * size
-        newton = jax.jacfwd(_missing)(still, (declared, plan), (values, start))
-        slope = jnp.where(far, gram, newton)
+        missing, slope = _datum_equations(declared, plan, values, start)
+        if newton:
+            near = jax.jacfwd(_missing)(still, (declared, plan), (values, start))
+            slope = jnp.where(before > NEAR * size, slope, near)
         step = plan.datum.gauge @ -jnp.linalg.solve(slope, missing)
         curved = jnp.abs(step[jnp.array(declared.motions.curved, int)]).max(initial=0.0)
         moved = _moved(declared, plan, step / jnp.maximum(curved / LONGEST, 1.0), values)
@@ -287,7 +155,8 @@ def move_to_datum(declared: Declared, plan: Plan, values: Values, start: Values)
         return moved, distance, before, count + 1
 
     begin = values, jnp.asarray(1e300), jnp.asarray(jnp.inf), 0
-    return jax.lax.while_loop(moving, further, begin)[0]
+    values, distance, *_ = jax.lax.while_loop(moving, further, begin)
+    return values, distance <= THERE * size
 
 
 def _datum_equations(declared, plan, values, start):

@@ -124,7 +124,7 @@ def attach_derivatives(
 
     One more Newton step makes it exact: the iterations end before their last digits do."""
     values, fixed = jax.lax.stop_gradient((values, data))
-    values = datum.move_to_datum(declared, plan, values, fixed.start)
+    values, _ = datum.move_to_datum(declared, plan, values, fixed.start)
     at = linearise(declared, plan, values, fixed, sensitivity == "exact")
     # Along what is open the gradient is rounding.
     gradient = _gradient(zero_tangent(plan), at, fixed)

@@ -9,12 +9,10 @@ compile).
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
 
 from jaxbundle.leastsquares.plan import Part, Plan
 from jaxbundle.leastsquares.rows import Declared, Laid, diagonal_of, over, residual_of
-
-Jacobians = list[tuple[Float[Array, "chunks length r"], tuple, Float[Array, "chunks length r w"]]]
 
 
 def widths_of(declared: Declared, plan: Plan, part: Part) -> tuple[int, ...]:
@@ -37,16 +35,19 @@ def differentiate(declared: Declared, plan: Plan, number: int, prepared, laid: L
     kind, widths = declared.kinds[part.observations], widths_of(declared, plan, part)
     residual = residual_of(declared, part)
     rows = _reverse if part.large else _forward
-    r, columns = over(part, kind, prepared, laid, number, lambda *row: rows(residual, widths, row))
-    shape = r[0].shape
+    r, found = over(part, kind, prepared, laid, number, lambda *row: rows(residual, widths, row))
+    # Computed once, not once more in every loop that takes some of its columns.
+    r, found = (r, found) if part.large else jax.lax.optimization_barrier((r, found))
+    shape, starts = r[0].shape, np.cumsum((0, *widths))
 
     def block(slots, start, stop):
-        columns_used = columns_of(widths, slots, start, stop)
-        parts = [
-            jnp.zeros(shape) if at is None else columns[i][at[0]][at[1]]
-            for i in range(len(r)) for at in columns_used
-        ]  # fmt: skip
-        return jnp.stack(parts, -1).reshape(*shape, len(r), stop - start)
+        columns = columns_of(widths, slots, start, stop)
+        used = [starts[at[0]] + at[1] if at else -1 for at in columns]
+        if part.large:
+            nil = jnp.zeros(shape)
+            parts = [nil if c < 0 else columns[c] for columns in found for c in used]
+            return jnp.stack(parts, -1).reshape(*shape, len(r), stop - start)
+        return jnp.take(found, np.array(used, int), -1, mode="fill", fill_value=0.0)
 
     touches = []
     for touch in part.touches:
@@ -63,22 +64,23 @@ def differentiate(declared: Declared, plan: Plan, number: int, prepared, laid: L
 
 
 def _reverse(residual, widths, row):
-    """Residuals, and for each of them the derivatives by slot and direction."""
+    """Residuals, and for each of them its derivatives: tuples of scalars."""
     weight = row[2]
     nil = jnp.zeros_like(jax.tree.leaves(weight)[0])
     still = tuple((nil,) * w for w in widths)
     r, pull = jax.vjp(lambda d: residual(d, *row), still)
     unit = lambda i: tuple(jnp.ones_like(nil) if a == i else nil for a in range(len(r)))
-    return r, tuple(_where_weighted(weight, i, pull(unit(i))[0]) for i in range(len(r)))
+    columns = lambda i: [x for slot in pull(unit(i))[0] for x in slot]
+    return r, [_where_weighted(weight, i, columns(i)) for i in range(len(r))]
 
 
 def _forward(residual, widths, row):
-    ends = [sum(widths[:s]) for s in range(len(widths) + 1)]
+    """Residuals, a tuple of scalars, and their derivatives [r, directions]."""
+    ends = np.cumsum((0, *widths))
     split = lambda x: tuple(tuple(x[a:b]) for a, b in zip(ends, ends[1:]))
-    stacked = lambda x: jnp.stack(residual(split(x), *row))
-    J = jax.jacfwd(stacked)(jnp.zeros(ends[-1]))
+    J = jax.jacfwd(lambda x: jnp.stack(residual(split(x), *row)))(jnp.zeros(ends[-1]))
     r = residual(tuple(() for _ in widths), *row)
-    return r, tuple(_where_weighted(row[2], i, split(J[i])) for i in range(len(r)))
+    return r, jnp.stack([_where_weighted(row[2], i, J[i]) for i in range(len(r))])
 
 
 def _where_weighted(weight, i, columns):

@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float
 
 from jaxbundle.arguments import one_of
 from jaxbundle.errors import InputError
-from jaxbundle.leastsquares.datum import find_open_motions, make_datum
 from jaxbundle.leastsquares.declarations import Motions, Observations, Table
+from jaxbundle.leastsquares.defect import find_open_motions, make_datum, survey_motions
 from jaxbundle.leastsquares.indices import common, finish, rounded
 from jaxbundle.leastsquares.plan import Plan
 from jaxbundle.leastsquares.planner import make_plan
@@ -139,7 +139,8 @@ def with_factor(problem: Problem) -> Problem:
 def _with_datum(problem: Problem, choose: Callable | None) -> Problem:
     data = pad_data(problem, problem.data)
     real = {t.name: np.arange(problem.sizes["table", t.name]) < t.rows for t in problem.tables}
-    gauge = find_open_motions(problem.declared, problem.plan, data, real)
+    survey = survey_motions(problem.declared, problem.plan, data, real)
+    gauge = find_open_motions(survey)
     if not gauge.shape[1]:
         return problem
     if choose is None:
@@ -149,7 +150,7 @@ def _with_datum(problem: Problem, choose: Callable | None) -> Problem:
         t: _longer(np.asarray(w, float), problem.sizes["table", t], "constant")
         for t, w in weight.items()
     }
-    datum = make_datum(problem.declared, problem.plan, data, gauge, weight, minimal, real)
+    datum = make_datum(problem.plan, survey, gauge, weight, minimal, real)
     plan = dataclasses.replace(problem.plan, datum=jax.device_put(datum))
     counts = dataclasses.replace(problem.counts, datum=gauge.shape[1])
     return dataclasses.replace(problem, plan=plan, counts=counts)
@@ -163,7 +164,7 @@ def open_at(problem: Problem, values: Values) -> Problem:
         return problem
     data = pad_data(problem, dataclasses.replace(problem.data, start=values))
     real = {t.name: np.arange(problem.sizes["table", t.name]) < t.rows for t in problem.tables}
-    gauge = find_open_motions(problem.declared, problem.plan, data, real)
+    gauge = find_open_motions(survey_motions(problem.declared, problem.plan, data, real))
     if gauge.shape != datum.gauge.shape:
         return problem
     datum = dataclasses.replace(datum, gauge=jax.device_put(gauge))
@@ -299,7 +300,11 @@ def pad_values(problem: Problem, values: Values) -> Values:
 
 def without_filling(problem: Problem, values: Values) -> Values:
     """The tables in their own sizes."""
-    return {t.name: jax.tree.map(lambda x, n=t.rows: x[:n], values[t.name]) for t in problem.tables}
+    traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(values))
+    # On the host, where nothing is compiled for it.
+    cut = lambda x, n: x[:n] if traced else jax.device_put(np.asarray(x)[:n])
+    return {t.name: jax.tree.map(lambda x, n=t.rows: cut(x, n), values[t.name])
+            for t in problem.tables}  # fmt: skip
 
 
 def _longer(x, n: int, mode: str):

@@ -66,7 +66,7 @@ def find_minimum(problem: Problem, start: Values | None = None, **options) -> Mi
     first = minimum = minimise_from(start)
     for _ in range(RETURNS):
         there = open_at(problem, without_filling(problem, minimum.values))
-        values = _move_to_datum(problem.declared, there.plan, minimum.values, given)
+        values = _move_to_datum(there, minimum.values, given)
         if there is problem or not bool(converged(minimum.termination)):
             break
         # What leaves one height of a point open, say, is no group of motions: the way into the
@@ -105,7 +105,17 @@ def _worth_sharing(problem: Problem, start: Values) -> bool:
     return all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(start))
 
 
-_move_to_datum = eqx.filter_jit(move_to_datum)
+def _move_to_datum(problem: Problem, values: Values, start: Values) -> Values:
+    if problem.plan.datum is None:
+        return values
+    for newton in (False, True):
+        moved, there = _moved_to_datum(problem.declared, problem.plan, values, start, newton)
+        if there:
+            break
+    return moved
+
+
+_moved_to_datum = eqx.filter_jit(move_to_datum)
 
 
 def take_step(problem: Problem, values: Values) -> Values:

@@ -51,15 +51,11 @@ class Set:
         x = x if self.columns is None else x[:, : self.columns]
         return x if self.rows is None else x[self.rows]
 
-
     def put(self, whole, part):
         """An array of the field with this set's part [n, r] in it."""
         rows = slice(None) if self.rows is None else self.rows
         at, part = (rows, part[:, 0]) if whole.ndim == 1 else ((rows, np.s_[: self.columns]), part)
-        if isinstance(part, jax.core.Tracer) or isinstance(whole, jax.core.Tracer):
-            return jnp.asarray(whole).at[at].set(part)
-        whole[at] = part
-        return whole
+        return _put(whole, at, part)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,19 +71,23 @@ class Layout:
     def tables(self, values: Values) -> Tables:
         """The unknowns as the engine's tables."""
         found = {"image": PoseValue(values.position, values.rotation), "point": values.point}
+        camera = values.camera
+        # On the host, where nothing is compiled for it.
+        camera = camera if isinstance(camera, jax.core.Tracer) else np.asarray(camera)
         for table in self.cameras:
-            found[table.name] = values.camera[table.cameras, : len(table.parameters)]
+            found[table.name] = camera[table.cameras, : len(table.parameters)]
         return found | values.other
 
     def values(self, tables: Tables) -> Values:
         """The engine's tables as the arrays of the network."""
         cameras = sum(len(table.cameras) for table in self.cameras)
-        camera = jnp.zeros((cameras, self.width))
+        camera = np.zeros((cameras, self.width))
         for table in self.cameras:
             rows = tables[table.name]
-            camera = camera.at[table.cameras, : rows.shape[1]].set(rows)
+            camera = _put(camera, (table.cameras, np.s_[: rows.shape[1]]), rows)
         own = {"image", "point", *(table.name for table in self.cameras)}
         other = {name: rows for name, rows in tables.items() if name not in own}
+        camera = jax.device_put(camera)
         return Values(camera, *tables["image"], tables["point"], other)
 
     def data(self, data: Data) -> EngineData:
@@ -96,7 +96,6 @@ class Layout:
         weight = tuple(_of_rows(s.cut(data.weight(s.field))) for s in self.sets)
         other = tuple(zip(*data.other)) or ((), ())
         return EngineData(self.tables(data.start), measured + other[0], weight + other[1])
-
 
     def with_weights(self, data: Data, weight) -> Data:
         """The numbers with the weights of the engine's sets."""
@@ -127,6 +126,14 @@ class Rows(NamedTuple):
     interior: Float[np.ndarray, "interior parameters"]
     distance: Float[np.ndarray, " distances"]
     other: tuple[Float[np.ndarray, "n r"], ...]
+
+
+def _put(whole, at, part):
+    """The array with a part in it: on the host, where nothing is compiled for it, unless traced."""
+    if isinstance(part, jax.core.Tracer) or isinstance(whole, jax.core.Tracer):
+        return jnp.asarray(whole).at[at].set(part)
+    whole[at] = part
+    return whole
 
 
 def _of_rows(weight):

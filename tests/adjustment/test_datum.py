@@ -22,12 +22,8 @@ from adjustment_checks import (
 
 from jaxbundle.adjustment.problem import make_problem
 from jaxbundle.errors import InputError
-from jaxbundle.leastsquares.datum import (
-    find_open_motions,
-    generators,
-    move_to_datum,
-    s_transform,
-)
+from jaxbundle.leastsquares.datum import generators, move_to_datum, s_transform
+from jaxbundle.leastsquares.defect import find_open_motions, survey_motions
 from jaxbundle.leastsquares.normal import zero_tangent
 from jaxbundle.leastsquares.problem import pad_data, pad_values, without_filling
 from jaxbundle.network.datum_words import open_directions_in_words
@@ -155,7 +151,9 @@ def test_start_values_that_cannot_be_computed_are_left_to_the_solver():
     point = system.data.start["point"].at[0].set(jnp.nan)
     data = dataclasses.replace(system.data, start=system.data.start | {"point": point})
     real = {t.name: np.arange(system.sizes["table", t.name]) < t.rows for t in system.tables}
-    gauge = find_open_motions(system.declared, system.plan, pad_data(system, data), real)
+    gauge = find_open_motions(
+        survey_motions(system.declared, system.plan, pad_data(system, data), real)
+    )
     assert gauge.shape == (7, 7)
 
 
@@ -208,7 +206,8 @@ def test_moving_to_the_datum_changes_no_residual():
     elsewhere = start.point + 0.3 * random.normal(size=(1, 3)) + 0.05 * random.normal(size=shape)
     target = dataclasses.replace(start, point=jnp.asarray(elsewhere))
     tables = [pad_values(system, problem.layout.tables(v)) for v in (start, target)]
-    found = eqx.filter_jit(move_to_datum)(system.declared, system.plan, *tables)
+    found, there = eqx.filter_jit(move_to_datum)(system.declared, system.plan, *tables)
+    assert there
     values = problem.layout.values(without_filling(system, found))
     # Residuals are up to 100 σ, image coordinates 1000 σ: rounding of the coordinates.
     np.testing.assert_allclose(

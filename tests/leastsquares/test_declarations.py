@@ -34,7 +34,7 @@ def adjusted(start=START, rows=ENDS, rise=RISE, free=(False, True, True), labels
     (dict(covariance=np.eye(3)), r"covariance must be \[3, 1, 1\]"),
     (dict(covariance=-np.ones((3, 1, 1))), "not positive definite"),
     (dict(covariance=np.full((3, 1, 1), np.nan)), "not symmetric or not finite"),
-], ids=lambda x: "" if isinstance(x, dict) else x.translate({ord(c): None for c in r"\[]"}))  # fmt: skip
+])  # fmt: skip
 def test_refused(given, words):
     with pytest.raises(InputError, match=words):
         adjusted(**given)

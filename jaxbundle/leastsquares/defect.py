@@ -1,0 +1,165 @@
+"""The datum defect: which motions of a problem its observations leave open, and what holds them.
+
+Found once at the start values, on the host, from one compiled survey of how every table moves and
+what its motions change.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.datum import HELD, free_of_tables, generators, of_groups
+from jaxbundle.leastsquares.linearise import differentiate
+from jaxbundle.leastsquares.normal import Tangent
+from jaxbundle.leastsquares.plan import Datum, Plan
+from jaxbundle.leastsquares.rows import Data, Declared, lay_out_data, prepare
+
+OPEN = 1e-10
+"""Relative size of J·G below which a direction counts as open (rounding gives about 1e-14)."""
+
+
+class CannotHold(InputError):
+    """The unknowns chosen cannot hold the datum; `defect` of its parameters are open."""
+
+    def __init__(self, defect: int):
+        super().__init__(
+            f"the chosen unknowns cannot hold the datum, of which {defect} parameters are open"
+        )
+        self.defect = defect
+
+
+class Survey(NamedTuple):
+    """What the motions do at the start values, filled rows included.
+
+    `products`: J·G of all observations that are not invariant; `terms`: the size of what cancels in
+    it; `held`: G on what is held; `moves`, `free`: G and what is free by table, [rows, width, …];
+    `of_groups`: G by group, 0 where something is held."""
+
+    products: Float[Array, "rows motions"]
+    terms: Float[Array, "rows motions"]
+    held: Float[Array, "rows motions"]
+    moves: Tangent
+    free: Tangent
+    of_groups: Tangent
+
+
+@eqx.filter_jit
+def survey_motions(
+    declared: Declared, plan: Plan, data: Data, real: dict[str, Bool[np.ndarray, " rows"]]
+) -> Survey:
+    """See `Survey`; `real`: by table, which of its rows are not filled in."""
+    laid, prepared = lay_out_data(plan, data), prepare(declared, data.start)
+    moves = generators(declared, data.start)
+    motions = len(declared.motions.names)
+    everywhere = {
+        name: jnp.concatenate([
+            moves[m.table] if m.rows is None else moves[m.table][m.rows] for m in group.members
+        ], 1)
+        for name, group in plan.groups.items()
+    }  # fmt: skip
+    products, terms = [], []
+    for number, part in enumerate(plan.parts):
+        if declared.kinds[part.observations].invariant:
+            continue
+        _, touches, E = differentiate(declared, plan, number, prepared, laid)
+        blocks = [(J, everywhere[t.group][t.row, t.start : t.stop][:, None])
+                  for t, J in zip(part.touches, touches)]  # fmt: skip
+        if E is not None:
+            blocks.append((E, everywhere[plan.eliminated][part.eliminated]))
+        products.append(sum(J @ G for J, G in blocks).reshape(-1, motions))
+        terms.append(sum(abs(J) @ abs(G) for J, G in blocks).reshape(-1, motions))
+    free = free_of_tables(plan, declared, data.start)
+    held = [
+        jnp.where((free[name] > 0)[..., None] | ~real[name][:, None, None], 0.0, rows)
+        for name, rows in moves.items()
+    ]
+    flat = lambda rows: jnp.concatenate([jnp.zeros((0, motions)), *rows])
+    held = flat([rows.reshape(-1, motions) for rows in held])
+    return Survey(flat(products), flat(terms), held, moves, free, of_groups(plan, moves))
+
+
+def find_open_motions(survey: Survey) -> Float[np.ndarray, "motions defect"]:
+    """The combinations of the declared motions that change no observation and nothing held.
+
+    Found from the singular values of J·G, its columns scaled by the size of their terms, so that
+    neither units nor the number of observations matter."""
+    products, terms, held = (np.asarray(x) for x in survey[:3])
+    # What cannot be computed from the start values says nothing; the solver will complain.
+    products, terms, held = (x[np.isfinite(x).all(1)] for x in (products, terms, held))
+    scale = np.sqrt((np.concatenate([terms, held]) ** 2).sum(0))
+    scale = np.where(scale > 0, scale, 1.0)
+    held = held / scale
+    size = np.linalg.norm(held, axis=1, keepdims=True)
+    held = held / np.where(size > 0, size, 1.0)
+    motions = products.shape[1]
+    # Singular values of a QR, not of the Gram matrix, which would lose half of the digits.
+    rows = np.concatenate([products / scale, held, np.zeros((motions, motions))])
+    _, singular, directions = np.linalg.svd(np.linalg.qr(rows, mode="r"))
+    return directions[singular < OPEN].T / scale[:, None]
+
+
+def make_datum(
+    plan: Plan, survey: Survey, gauge: Float[np.ndarray, "motions defect"],
+    weight: dict[str, np.ndarray], minimal: bool, real: dict[str, Bool[np.ndarray, " rows"]],
+) -> Datum:  # fmt: skip
+    """The datum held by the unknowns with a `weight` (by table, [rows, width]); `minimal`: by as
+    many of them as there are defects, chosen well spread. `real`: see `survey_motions`.
+
+    **Raises:** `CannotHold`."""
+    along = lambda moves: {name: np.asarray(rows) @ gauge for name, rows in moves.items()}
+    moves, free = along(survey.moves), {t: np.asarray(f) for t, f in survey.free.items()}
+    weight = {name: np.asarray(w) * free[name] for name, w in weight.items()}
+    defect = gauge.shape[1]
+    directions = np.concatenate([moves[t].reshape(-1, defect) for t in weight])
+    candidates = np.concatenate([w.ravel() for w in weight.values()])
+    chosen = directions * candidates[:, None]
+    if np.isfinite(chosen).all():  # otherwise the solver will complain
+        singular = np.linalg.svd(chosen / np.linalg.norm(directions, axis=0), compute_uv=False)
+        if len(singular) < defect or singular[-1] < HELD * singular[0]:
+            raise CannotHold(defect)
+    if minimal:
+        picked = _pick_rows(directions, candidates)
+        cuts = np.cumsum([w.size for w in weight.values()])[:-1]
+        weight = {
+            t: part.reshape(weight[t].shape) for t, part in zip(weight, np.split(picked, cuts))
+        }
+    pins = _choose_pins(plan, along(survey.of_groups))
+    held = {t: (1 - free[t]) * real[t][:, None] for t, rows in moves.items() if rows.any()}
+    return Datum(gauge, weight, pins, {t: mask for t, mask in held.items() if mask.any()})
+
+
+def _choose_pins(plan: Plan, G) -> dict[str, np.ndarray]:
+    """As many kept unknowns as there are defects, chosen well spread; every kind of direction
+    counts by its own size, unless that is rounding."""
+    rows, shapes = [], []
+    size = {name: np.sqrt((G[name] ** 2).mean((0, 2), keepdims=True)) for name in plan.kept}
+    least = max(1e-300, OPEN * max(x.max(initial=0) for x in size.values()))
+    for name in plan.kept:
+        sized = G[name] / np.maximum(size[name], least)
+        rows.append(sized.reshape(-1, sized.shape[2]))
+        shapes.append(G[name].shape[:2])
+    whole = np.concatenate(rows)
+    free = np.concatenate([np.asarray(plan.groups[g].free).ravel() for g in plan.kept])
+    picked = _pick_rows(whole, free)
+    cuts = np.cumsum([len(r) for r in rows])[:-1]
+    return {
+        name: part.reshape(shape)
+        for name, part, shape in zip(plan.kept, np.split(picked, cuts), shapes)
+    }
+
+
+def _pick_rows(G, candidates):
+    """1 for as many rows of G as it has columns, the independent ones, 0 for the others."""
+    q, _ = np.linalg.qr(G)
+    rows = q * candidates[:, None]
+    chosen = np.zeros(len(rows))
+    for _ in range(G.shape[1]):
+        pick = np.argmax((rows**2).sum(1))
+        direction = rows[pick] / np.linalg.norm(rows[pick])
+        rows = rows - np.outer(rows @ direction, direction)
+        chosen[pick] = 1.0
+    return chosen
