@@ -87,8 +87,8 @@ def left_out(adjustment) -> LeftOut | None:
 def _slopes(problem, model, columns, values):
     """B [k, n] and v [n]."""
     of = lambda b: _residuals(problem, model, values, b, columns).ravel()
-    zero = jnp.zeros(len(columns))
-    return np.asarray(jax.jacfwd(of)(zero)).T, np.asarray(of(zero))
+    B, v = jax.jit(lambda b: (jax.jacfwd(of)(b), of(b)))(np.zeros(len(columns)))
+    return np.asarray(B).T, np.asarray(v)
 
 
 def _residuals(problem, model, values, b, columns):

@@ -202,18 +202,10 @@ class Solution:
         return self._rows(_by_eliminated(*self.given))
 
     def propagate(self, function: Callable[[Values], Array]) -> Float[np.ndarray, "n n"]:
-        """The cofactors of any differentiable function (`Values` → [n]) of the unknowns."""
-        declared, plan, values = self.given[:3]
-        spaces = declared.spaces
-
-        def of_change(change):
-            moved = dict(self.values)
-            for name, d in change.items():
-                moved[name] = jax.vmap(spaces[name].retract)(self.values[name], d)
-            return jnp.atleast_1d(function(moved))
-
-        still = {t.name: jnp.zeros((t.rows, t.space.width)) for t in self.problem.tables}
-        return self.propagate_rows(jax.jacrev(of_change)(still))
+        """The cofactors of any differentiable function (`Values` → [n]) of the unknowns; it is
+        compiled, once for the same function."""
+        still = {t.name: np.zeros((t.rows, t.space.width)) for t in self.problem.tables}
+        return self.propagate_rows(_rows_of(function, self.problem.declared, self.values, still))
 
     def propagate_rows(self, rows) -> Float[np.ndarray, "n n"]:
         """F·Q·Fᵀ of linear functions F of the changes of tables, [n, rows, width] each."""
@@ -276,6 +268,19 @@ def _by_eliminated(declared, plan, values, data):
         r, _, E = differentiate(declared, plan, number, prepared, laid)
         found.append(jnp.zeros((*r.shape, width)) if E is None else E)
     return in_given_order(plan, found)
+
+
+@eqx.filter_jit
+def _rows_of(function, declared, values, still):
+    """The derivatives of a function of the tables by their changes, [n, rows, width] each."""
+
+    def of_change(change):
+        moved = dict(values)
+        for name, d in change.items():
+            moved[name] = jax.vmap(declared.spaces[name].retract)(values[name], d)
+        return jnp.atleast_1d(function(moved))
+
+    return jax.jacrev(of_change)(still)
 
 
 @eqx.filter_jit

@@ -86,15 +86,12 @@ def images_through_scene(
     **Arguments:** `column`: the camera among those of the network; `views`: indices of its images;
     `distance` from the projection centre in the object unit; infinity as well.
     """
-    number = len(model.parameters)
-    views = jnp.asarray(views)
-    near = 1.0 / distance
-    p = tuple(estimate.camera[column, :number])
-    rays = jax.vmap(lambda xy: jnp.stack(image_ray(model, p, xy[0], xy[1])))(jnp.asarray(xy, float))
+    number, near = len(model.parameters), 1.0 / distance
+    camera, X0 = np.asarray(estimate.camera), np.asarray(estimate.position)[views]
     matrices = jax.vmap(matrix_from_quaternion)
-    M, X0 = matrices(estimate.rotation[views]), estimate.position[views]
-    # lines of sight in the object frame, and 1/d: homogeneous points, infinity included
-    directions = jnp.einsum("vji,nj->vni", M, rays)
+    directions = _directions(
+        model, camera[column, :number], np.asarray(estimate.rotation)[views], np.asarray(xy, float)
+    )
 
     def images(values: Values):
         q = tuple(values.camera[column, :number])
@@ -106,3 +103,11 @@ def images_through_scene(
         return jnp.mean(image, 0).ravel()
 
     return images
+
+
+@partial(jax.jit, static_argnums=0)
+def _directions(model, p, rotation, xy):
+    """Lines of sight in the object frame [views, n, 3]; with 1/d homogeneous points, infinity
+    included."""
+    rays = jax.vmap(lambda xy: jnp.stack(image_ray(model, tuple(p), xy[0], xy[1])))(xy)
+    return jnp.einsum("vji,nj->vni", jax.vmap(matrix_from_quaternion)(rotation), rays)
