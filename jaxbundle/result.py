@@ -36,7 +36,7 @@ from jaxbundle.leastsquares.stopping import SINGULAR, TERMINATIONS
 from jaxbundle.leastsquares.stopping import converged as reached_minimum
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.columns import some
-from jaxbundle.network.tables import Network
+from jaxbundle.network.tables import Network, units_of
 from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.orientation.exchanges import CONTRADICTION
@@ -361,6 +361,11 @@ class Adjustment:
     def angle_scale(self) -> float:
         """Factor from radians to the network's angle unit."""
         return 1 / ANGLE_UNITS[self.network.angle_unit]
+
+    @property
+    def image_unit(self) -> str:
+        """The unit of image coordinates inside the adjustment: that of the cameras' models."""
+        return units_of(self.problem.network.cameras)
 
     @functools.cached_property
     def cameras(self) -> dict[str, dict]:

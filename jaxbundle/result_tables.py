@@ -123,7 +123,7 @@ def residuals(adjustment) -> dict[str, np.ndarray]:
     parts.append(("distance", a, b, ("d",), found.residual.distance[:, None],
                   data.distance_weight[:, None], found.redundancy.distance[:, None],
                   found.w.distance[:, None]))  # fmt: skip
-    return _concatenate([_residual_rows(adjustment, *part) for part in parts])
+    return concatenate([residual_rows(adjustment, *part) for part in parts])
 
 
 def _further(problem, found):
@@ -155,7 +155,7 @@ def checks(adjustment) -> dict[str, np.ndarray]:
     return table | {"rays": found.rays}
 
 
-def _residual_rows(adjustment, kind, image, point, axes, v, weight, r, w):
+def residual_rows(adjustment, kind, image, point, axes, v, weight, r, w):
     """The rows of one kind of observation [things × axes] as columns; weightless rows left out."""
     v, weight, r, w = (np.asarray(x) for x in (v, weight, r, w))
     if kind == "prior" and axes == EXTERIOR:
@@ -192,5 +192,5 @@ def _significance(value: float, sigma: float) -> float:
     return abs(value) / float(sigma)
 
 
-def _concatenate(tables):
+def concatenate(tables):
     return {name: np.concatenate([t[name] for t in tables]) for name in tables[0]}

@@ -1,180 +1,158 @@
 """Several cameras on one rigid mounting, adjusted together from views of one object.
 
-    Y = M_e·X + t_e                  a point at the epoch e in the frame of the reference camera
+    Y = M_e·(X − X0_e)               a point at the epoch e in the frame of the reference camera
     ray = R_k·(Y − b_k)              camera k, its projection centre at b_k there
     v = image of the ray − measured  (by the camera's own model)
 
-Unknown are the pose of the object at every epoch (δt, δθ about its middle, the origin of X), the
-mounting b_k, R_k of every camera but the reference (6 each), the free parameters of every camera,
-and the points X, unless they are known: with a σ they are weighted, free ones carry inner
-constraints, Gᵀ·δX = 0 (7, scale included). The mounting is the same for all epochs; the adjustment
-of a network, where every image has a pose of its own, cannot say so: hence this one. The poses are
-eliminated (Schur),
-
-    S = N_ss − Σ_e N_es ᵀ·N_ee⁻¹·N_es
-
-and S has a few tens of unknowns, and three more for every unknown point. The damping is
-Marquardt's (1963); derivatives by automatic differentiation of the residual of one point
-(`rig_normal`).
+Unknown are the pose of the reference camera before the object at every epoch, the mounting b_k, R_k
+of every camera but the reference, the free parameters of every camera, and the points X, unless
+they are known: with a σ they are weighted, free ones hold the datum by inner constraints (7, scale
+included). The mounting is the same at all epochs. The poses of the epochs are eliminated; what is
+left has a few tens of unknowns, and three more for every unknown point.
 
 Source: Luhmann, Robson, Kyle and Boehm (2014), Close-Range Photogrammetry and 3D Imaging, section
 4.4; King (1994), Bundle adjustment of constrained stereo pairs, Geomatics Research Australasia.
 """
 
 import dataclasses
-from collections.abc import Sequence
 
-import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
-from jaxbundle.adjustment.rig_normal import (
-    POSE,
-    RigCamera,
-    RigObject,
-    RigValues,
-    System,
-    interior_columns,
-    mounting_columns,
-    normal_equations,
+from jaxbundle.leastsquares import Result, adjust
+from jaxbundle.leastsquares.declarations import Motions, Observations, Table
+from jaxbundle.leastsquares.motions import similarity
+from jaxbundle.leastsquares.problem import Problem
+from jaxbundle.leastsquares.snooping import Removed, snoop, without
+from jaxbundle.leastsquares.solution import Solution, find_minimum
+from jaxbundle.leastsquares.spaces import PoseValue
+from jaxbundle.network import kinds
+from jaxbundle.network.declare import CameraTable, camera_tables
+from jaxbundle.network.tables import EXTERIOR, Camera
+
+POSES = ("epoch", "mounting")
+
+
+def _scaled(motion, mounting: PoseValue) -> PoseValue:
+    """The bases grow with the object."""
+    return mounting._replace(position=jnp.exp(motion[6]) * mounting.position)
+
+
+_OF_OBJECT = similarity(("point",), ("epoch",))
+FLOATING = Motions(
+    _OF_OBJECT.names, (*_OF_OBJECT.actions, ("mounting", _scaled)), _OF_OBJECT.curved
 )
-from jaxbundle.geometry import matrix_from_rotation_vector
-
-TOLERANCE = 1e-5
-"""Converged: no unknown would move by more than this part of its σ."""
-FIRST_DAMPING, LARGEST_DAMPING = 1e-4, 1e8
-ROUNDING = 1e-14
-NEAR = 1e-3
-"""A step that lowers vᵀPv by less than this part is followed by an undamped one."""
+"""A similarity of the object, with which the poses and the bases go."""
 
 
 @dataclasses.dataclass(frozen=True)
-class RigSolution:
-    """The end of the iterations.
+class Rig:
+    """What is adjusted, with start values.
 
-    **Fields:** `values`; `converged`, `iterations`; `vtpv`, `redundancy`, `sigma0`; `cofactors` of
-    the shared unknowns: δb, δθ (6) of every camera but the first, then the free parameters camera
-    after camera, then the points, if they are unknown; `pose_cofactors` of (δt, δθ) of every epoch,
-    marginal; `residuals` by camera, NaN where there is no point.
+    **Fields:** `cameras`, the first is the reference; `mounting`: b_k and R_k, 0 and 1 of the
+    first; `epochs`: their names; `pose`: X0_e and M_e; `ids` and `points` of the object about their
+    middle (exact, unless `point_sigma` says how well they are known, or `points_free`); for every
+    image point the rows `epoch`, `camera`, `point` it belongs to, `xy` in the unit of the camera's
+    model and σ.
     """
 
-    values: RigValues
-    converged: bool
-    iterations: int
-    vtpv: float
-    redundancy: int
-    sigma0: float
-    cofactors: Float[np.ndarray, "s s"]
-    pose_cofactors: Float[np.ndarray, "epochs 6 6"]
-    residuals: tuple[Float[np.ndarray, "epochs points 2"], ...]
+    cameras: tuple[Camera, ...]
+    mounting: PoseValue
+    epochs: tuple[str, ...]
+    pose: PoseValue
+    ids: tuple[str, ...]
+    points: Float[np.ndarray, "points 3"]
+    epoch: Int[np.ndarray, " n"]
+    camera: Int[np.ndarray, " n"]
+    point: Int[np.ndarray, " n"]
+    xy: Float[np.ndarray, "n 2"]
+    sigma: Float[np.ndarray, "n 2"]
+    point_sigma: float | None = None
+    points_free: bool = False
+
+    @property
+    def sets(self) -> list[tuple[CameraTable, Int[np.ndarray, " rows"]]]:
+        """The cameras of one model each, and the rows of their image points."""
+        tables = camera_tables(self.cameras)
+        return [(t, np.flatnonzero(np.isin(self.camera, t.cameras))) for t in tables]
+
+    def place(self, k: int) -> tuple[str, int]:
+        """The table of a camera and its row there."""
+        table = next(t for t in camera_tables(self.cameras) if k in t.cameras)
+        return table.name, int(np.flatnonzero(table.cameras == k)[0])
+
+    def in_order(self, by_set) -> Float[np.ndarray, "n 2"]:
+        """What the engine has found for every set of image points, in the order of the rig's."""
+        found = np.zeros(self.xy.shape)
+        for o, (_, rows) in enumerate(self.sets):
+            found[rows] = by_set[o]
+        return found
 
 
-def adjust_rig(
-    rig: Sequence[RigCamera],
-    board: RigObject,
-    start: RigValues,
-    max_iterations: int = 50,
-) -> RigSolution:
-    """Adjust a rig from start values.
+def declare_rig(rig: Rig) -> tuple[list[Table], list[Observations]]:
+    """The tables of unknowns and the observations of a rig."""
+    # Free points that no camera sees keep their place.
+    seen = np.isin(np.arange(len(rig.points)), rig.point)
+    free = seen if rig.points_free else np.full(len(rig.points), rig.point_sigma is not None)
+    names = [camera.id for camera in rig.cameras]
+    tables = [
+        Table("epoch", rig.pose, labels=rig.epochs, parameters=EXTERIOR),
+        Table("mounting", rig.mounting, free=np.arange(len(names)) > 0, labels=names,
+              parameters=("bx", "by", "bz", "omega", "phi", "kappa")),
+        *(t.unknowns(rig.cameras) for t, _ in rig.sets),
+        Table("point", rig.points, free=free, labels=rig.ids, parameters=("X", "Y", "Z")),
+    ]  # fmt: skip
+    observations = []
+    for table, rows in rig.sets:
+        k = rig.camera[rows]
+        touched = rig.epoch[rows], k, np.searchsorted(table.cameras, k), rig.point[rows]
+        kind = kinds.image_points(table.model, "measured", table.name, POSES)
+        observations.append(kind(touched, rig.xy[rows], sigma=rig.sigma[rows]))
+    if rig.point_sigma is not None:
+        every = np.arange(len(rig.points))
+        observations.append(kinds.CONTROL((every,), rig.points, sigma=rig.point_sigma))
+    return tables, observations
 
-    **Arguments:** the first camera is the reference. Every epoch must be seen by a camera, every
-    camera by more than one point.
 
-    **Returns:** the solution; what is not determined, or did not settle, is not `converged`.
+def adjust_rig(rig: Rig, max_iterations: int = 50, **options) -> Result:
+    """Adjust a rig from its start values; `options` are those of the solver.
+
+    **Returns:** the result; what is not determined, or did not settle, is not `converged`.
     """
-    at, system = start, normal_equations(rig, start, board)
-    rows = 2 * sum(int(camera.seen.sum()) for camera in rig) + board.conditions
-    redundancy = rows - POSE * len(start.shift) - len(system.right)
-    damping, converged, steps = FIRST_DAMPING, False, 0
-    possible = np.isfinite(system.vtpv) and redundancy >= 0
-    while possible and steps < max_iterations and damping <= LARGEST_DAMPING:
-        steps += 1
-        try:
-            d_pose, d_shared, slope = _step(system, damping)
-        except np.linalg.LinAlgError:
-            damping = max(10 * damping, FIRST_DAMPING)
-            continue
-        trial = _moved(rig, at, d_pose, d_shared)
-        small = TOLERANCE**2 * system.vtpv / max(redundancy, 1) + ROUNDING * system.vtpv
-        if slope <= small and damping == 0:
-            at, converged = trial, True
-            break
-        tried = normal_equations(rig, trial, board)
-        if np.isfinite(tried.vtpv) and tried.vtpv <= system.vtpv * (1 + ROUNDING):
-            near = system.vtpv - tried.vtpv < NEAR * system.vtpv
-            at, system = trial, tried
-            damping = 0.0 if near else damping / 10
-        else:
-            damping = max(10 * damping, FIRST_DAMPING)
-    system = normal_equations(rig, at, board)
-    sigma0 = float(np.sqrt(system.vtpv / redundancy)) if redundancy > 0 else float("nan")
-    try:
-        Q, Q_pose = _cofactors(system)
-    except np.linalg.LinAlgError:
-        Q = np.full(system.shared.shape, np.inf)
-        Q_pose, converged = np.full(system.poses.shape, np.inf), False
-    return RigSolution(
-        at, converged, steps, system.vtpv, redundancy, sigma0, Q, Q_pose, system.residuals
-    )
+    free = {"datum": {"point": np.unique(rig.point)}, "motions": FLOATING}
+    return adjust(
+        *declare_rig(rig), eliminate="epoch", max_iterations=max_iterations,
+        **(free if rig.points_free else {}), **options,
+    )  # fmt: skip
 
 
-def _scaled(system: System, damping: float):
-    """The damped blocks, scaled so that their diagonals are 1 before; the scales."""
-    s = 1 / np.sqrt(np.maximum(np.diagonal(system.shared), 1e-300))
-    p = 1 / np.sqrt(np.maximum(np.diagonal(system.poses, axis1=1, axis2=2), 1e-300))
-    E = system.poses * p[:, :, None] * p[:, None] + damping * np.eye(POSE)
-    C = system.mixed * p[:, :, None] * s
-    N = system.shared * s[:, None] * s + damping * np.eye(len(s))
-    return E, C, N, p, s
+def used_rays(rig: Rig, problem: Problem) -> Bool[np.ndarray, " n"]:
+    """Which image points carry weight."""
+    return rig.in_order(problem.data.weight).all(1)
 
 
-def _step(system: System, damping: float):
-    """Changes of poses and shared unknowns, and what the step promises, −gᵀδ."""
-    E, C, N, p, s = _scaled(system, damping)
-    solved = np.linalg.solve(E, np.concatenate([C, (p * system.pose_right)[..., None]], 2))
-    through, own = solved[..., :-1], solved[..., -1]
-    S = N - np.tensordot(C, through, ((0, 1), (0, 1)))
-    L = np.linalg.cholesky(S)
-    g = s * system.right - np.einsum("eps,ep->s", C, own)
-    d_shared = -np.linalg.solve(L.T, np.linalg.solve(L, g))
-    d_pose = -own - through @ d_shared
-    d_pose, d_shared = p * d_pose, s * d_shared
-    slope = -(system.pose_right * d_pose).sum() - system.right @ d_shared
-    if not np.isfinite(slope):
-        raise np.linalg.LinAlgError("not finite")
-    return d_pose, d_shared, float(slope)
+def leave_out(rig: Rig, found: Result, rays, max_iterations: int = 50) -> Result:
+    """The rig adjusted again, from its start values, without some of its image points; epochs that
+    are left with too few are set aside."""
+    removed = [
+        Removed(o, row, None, 0.0)
+        for o, (_, of_set) in enumerate(rig.sets) for row in np.flatnonzero(rays[of_set]).tolist()
+    ]  # fmt: skip
+    problem = without(found.problem, removed)
+    return Result(problem, find_minimum(problem, max_steps=max_iterations + 1))
 
 
-def _cofactors(system: System):
-    """Q of the shared unknowns and, marginal, of every pose."""
-    E, C, N, p, s = _scaled(system, 0.0)
-    inverse = np.linalg.inv(E)
-    through = inverse @ C
-    S = N - np.tensordot(C, through, ((0, 1), (0, 1)))
-    np.linalg.cholesky(S)
-    Q = np.linalg.inv(S)
-    poses = inverse + through @ Q @ through.swapaxes(1, 2)
-    return Q * s[:, None] * s, poses * p[:, :, None] * p[:, None]
+def snoop_rig(found: Result, test: str, significance: float, max_iterations: int = 50) -> Result:
+    """The result without what a test calls blunders.
 
+    **Raises:** `NotSolvedError` where what is left determines no answer."""
+    minimum = found.minimum
 
-@jax.jit
-def _turned(theta, M):
-    return jax.vmap(lambda theta, M: matrix_from_rotation_vector(theta) @ M)(theta, M)
+    def again(problem, values) -> Solution:
+        nonlocal minimum
+        minimum = find_minimum(problem, values, max_steps=max_iterations + 1)
+        return Result(problem, minimum).solution
 
-
-def _moved(rig, at: RigValues, d_pose, d_shared) -> RigValues:
-    d_base, d_turn = np.zeros((len(rig), 3)), np.zeros((len(rig), 3))
-    interior = []
-    for k, camera in enumerate(rig):
-        if k:
-            change = d_shared[mounting_columns(rig, k)]
-            d_base[k], d_turn[k] = change[:3], change[3:]
-        p = np.array(at.interior[k], float)
-        p[list(camera.free)] += d_shared[interior_columns(rig, k)]
-        interior.append(p)
-    d_point = d_shared[interior_columns(rig, len(rig) - 1).stop :]
-    return RigValues(
-        tuple(interior), at.base + d_base, np.asarray(_turned(d_turn, at.turn)),
-        at.shift + d_pose[:, :3], np.asarray(_turned(d_pose[:, 3:], at.rotation)),
-        at.points + (d_point.reshape(-1, 3) if len(d_point) else 0.0),
-    )
+    solution, removed = snoop(found.solution, again, test=test, significance=significance)
+    return Result(solution.problem, minimum, removed)

@@ -153,7 +153,7 @@ def calibrations_dict(found, brief: bool = False) -> dict:
     parts = {name: one.to_dict(brief) for name, one in found.cameras.items()}
     document = {"converged": found.converged, "calibrations": parts}
     if found.rig is not None:
-        document["rig"] = rig_dict(found.rig)
+        document["rig"] = rig_dict(found.rig, brief)
     return document
 
 

@@ -2,7 +2,9 @@
 
 import numpy as np
 
+from jaxbundle.io.csv_tables import table_rows
 from jaxbundle.io.result_json import result_dict
+from jaxbundle.report import observations
 from jaxbundle.report.layout import (
     clean,
     estimate,
@@ -16,6 +18,8 @@ from jaxbundle.report.layout import (
 )
 
 MOST_FAILED = 50
+LIMIT = 3.0
+"""Residuals of a rig with a larger |τ| are listed."""
 
 
 def text(calibration) -> str:
@@ -168,8 +172,8 @@ def rig_text(rig) -> str:
         ("Epochs", f"{len(rig.epochs)} used, {len(rig.left_out)} left out"),
         ("σ0", f"{rig.sigma0:.4f}, redundancy {rig.redundancy}"),
         ("RMS", ", ".join(f"{clean(name)} {rms:.4f} px" for name, rms in rig.rms.items())),
-        ("Board", "exact" if rig.known.known else "its points estimated, inner constraints"
-         if rig.known.free else f"known with σ {rig.known.sigma:g} {unit}"),
+        ("Board", "its points estimated, inner constraints" if rig.rig.points_free else "exact"
+         if rig.rig.point_sigma is None else f"known with σ {rig.rig.point_sigma:g} {unit}"),
     ])  # fmt: skip
     odd = (*rig.left_out, *rig.contradicting)
     lines += facts((clean(epoch), clean(why)) for epoch, why in odd)
@@ -197,18 +201,26 @@ def rig_text(rig) -> str:
         rows = [(_held_in(m, unit), fixed(m.middle, 3), fixed(m.corners, 3))
                 for m in rig.reported_maps(name)]  # fmt: skip
         lines += table(("point held in", "middle", "corners"), rows, "lrr")
+    lines += observations.residuals(rig, LIMIT, "pope")
+    lines += [*observations.redundancy(rig), *observations.removals(rig)]
     return "\n".join(line.rstrip() for line in lines) + "\n"
 
 
-def rig_dict(rig) -> dict:
-    """The rig as plain dicts and numbers: object unit, degrees, pixels."""
+def rig_dict(rig, brief: bool = False) -> dict:
+    """The rig as plain dicts and numbers: object unit, degrees, pixels; residuals, in the unit of
+    the models, as of `adjust`; `brief` leaves them out."""
+    found = {} if brief else rig.residuals
+    residuals = [dict(zip(found, row)) for row in table_rows(found)]
     return {
         "reference": rig.names[0],
         "epochs": list(rig.epochs),
         "left_out": dict(rig.left_out),
         "contradicting": dict(rig.contradicting),
         "sigma0": rig.sigma0,
+        "observations": rig.result.counts.observations,
+        "unknowns": rig.result.counts.unknowns,
         "redundancy": rig.redundancy,
+        "removed": [{"kind": r.kind, "name": r.name, "test": r.test} for r in rig.removed],
         "rms": rig.rms,
         "mountings": {
             name: {
@@ -225,4 +237,4 @@ def rig_dict(rig) -> dict:
             for name in rig.names
         },
         "quality": {name: _rig_quality(rig, name) for name in rig.names},
-    }  # fmt: skip
+    } | ({} if brief else {"residuals": residuals})  # fmt: skip

@@ -7,22 +7,28 @@ else equal last numbers in them (left_017.jpg, right_017.jpg). Start values of t
 from the epochs two cameras share: M_k·Mᵣᵀ and Mᵣ·(X0_k − X0_r) should be the same in all of them,
 and the one nearest to all others is taken. Epochs that contradict the mounting (the board moved in
 between) are left out, or named where nothing is to be left out. The board is known, weighted or
-free, as in the calibration of one camera; gross errors were removed camera by camera.
+free, as in the calibration of one camera. Gross errors were removed camera by camera; what only the
+mounting shows is removed then.
 """
 
+import dataclasses
 import re
 from collections.abc import Mapping
 
+import jax
 import numpy as np
 
-from jaxbundle.adjustment.rig import adjust_rig
-from jaxbundle.adjustment.rig_normal import RigCamera, RigObject, RigValues
+from jaxbundle.adjustment.rig import Rig, adjust_rig, leave_out, snoop_rig, used_rays
 from jaxbundle.calibration.frames import unit_size
 from jaxbundle.calibration.quality import kept_rays
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.rig_result import RigCalibration
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.geometry import quaternion_from_matrix
+from jaxbundle.leastsquares import Result
+from jaxbundle.leastsquares.snooping import check_test
+from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.columns import some
 
 FEWEST = 3
@@ -31,7 +37,6 @@ CONTRADICTS, LEAST_CONTRADICTION = 3.0, 1.0
 """An epoch is left out whose RMS is above so many times the median of all, and so many pixels."""
 WORST = 0.5
 """In one round those go whose RMS is above this part of the largest: the worst spoil the others."""
-ROUNDS = 10
 
 
 def calibrate_rig(
@@ -39,18 +44,21 @@ def calibrate_rig(
     *,
     board_sigma: float | None = None,
     board_free: bool = False,
-    snooping: bool = True,
+    snooping: str | None = "pope",
+    significance: float = 0.001,
     max_iterations: int = 50,
 ) -> RigCalibration:
     """The common calibration of cameras that were calibrated by themselves, from photographs of one
     board taken in step; the first is the reference.
 
-    **Arguments:** `board_sigma` (object unit), `board_free`: as in `calibrate`; `snooping`: False:
-    epochs that contradict the mounting stay, and are named in `contradicting`.
+    **Arguments:** `board_sigma` (object unit), `board_free`, `snooping`, `significance`: as in
+    `calibrate`; without snooping, epochs that contradict the mounting stay as well, and are named
+    in `contradicting`.
 
     **Raises:** `InputError` where the photographs of two cameras cannot be paired;
     `NotSolvedError` where an adjustment does not settle.
     """
+    check_test(snooping, significance)
     if len(calibrations) < 2:
         raise InputError("a rig has two cameras or more: give --camera NAME=PATTERN for each")
     for name, one in calibrations.items():
@@ -61,31 +69,37 @@ def calibrate_rig(
     epochs = list(dict.fromkeys(key for name in calibrations for key in keys[name]))
     poses = _poses(calibrations, keys)
     base, turn = _start_of_mountings(list(calibrations), poses)
-    points = next(iter(calibrations.values())).views.board.points
-    middle = points.mean(0)
-    known = RigObject(points - middle, board_sigma, board_free)
-    left_out: list[tuple[str, str]] = []
-    for _ in range(ROUNDS):
-        rig = [_camera(one, keys[name], epochs) for name, one in calibrations.items()]
-        start = _start(calibrations, poses, base, turn, epochs, points)
-        solution = adjust_rig(rig, known, start, max_iterations)
-        bad = _contradictions(calibrations, rig, solution) if solution.converged else []
-        if not bad or not snooping:
-            break
-        left_out += [(epochs[e], f"does not fit the mounting (RMS {rms:.1f} px): photographs not "
-                      "of the same moment?") for e, rms in bad]  # fmt: skip
-        gone = {e for e, _ in bad}
-        epochs = [key for e, key in enumerate(epochs) if e not in gone]
-    if not solution.converged:
-        raise NotSolvedError(
-            "not solved: the rig did not settle; look for cameras that share too few epochs, or "
-            "photographs that are not of the same moment"
-        )
+    rig = _start(calibrations, keys, poses, base, turn, epochs)
+    rig = dataclasses.replace(rig, point_sigma=board_sigma, points_free=board_free)
+    size = {name: unit_size(get_model(one.camera.model), one.camera.pixel_size)
+            for name, one in calibrations.items()}  # fmt: skip
+    left_out, found = [], require_solved(adjust_rig(rig, max_iterations))
+    while (bad := _contradictions(rig, found, np.array([*size.values()]))) and snooping:
+        left_out += [(rig.epochs[e], f"does not fit the mounting (RMS {rms:.1f} px): photographs "
+                      "not of the same moment?") for e, rms in bad.items()]  # fmt: skip
+        found = require_solved(leave_out(rig, found, np.isin(rig.epoch, list(bad)), max_iterations))
+    if snooping:
+        found = snoop_rig(found, snooping, significance, max_iterations)
     return RigCalibration(
-        dict(calibrations), rig, known, tuple(epochs), tuple(left_out), solution,
-        tuple((epochs[e], f"kept, but does not fit the mounting (RMS {rms:.1f} px)")
-              for e, rms in bad),
+        dict(calibrations), rig, found, left_out,
+        [(rig.epochs[e], f"kept, but does not fit the mounting (RMS {rms:.1f} px)")
+         for e, rms in bad.items()],
     )  # fmt: skip
+
+
+def require_solved(found: Result) -> Result:
+    """The same.
+
+    **Raises:** `NotSolvedError` where it is not solved."""
+    if not found.converged:
+        names = found.undetermined
+        what = f"; not determined: {some(names, 8, str)}" if names else ""
+        raise NotSolvedError(
+            f"not solved: the rig did not settle ({found.termination}){what}; look for cameras "
+            "that share too few epochs, or photographs that are not of the same moment",
+            list(names),
+        )  # fmt: skip
+    return found
 
 
 def epoch_keys(names: Mapping[str, tuple[str, ...]]) -> dict[str, list[str]]:
@@ -158,60 +172,56 @@ def _start_of_mountings(names, poses):
     return base, turn
 
 
-def _start(calibrations, poses, base, turn, epochs, points) -> RigValues:
-    shift, rotation, middle = [], [], points.mean(0)
+def _start(calibrations, keys, poses, base, turn, epochs) -> Rig:
+    """The rig with start values, and the image points that the calibration of each camera kept."""
+    names, board = list(calibrations), next(iter(calibrations.values())).views.board
+    middle = board.points.mean(0)
+    rotation, centre = [], []
     for key in epochs:
-        name = next(name for name in calibrations if key in poses[name])
+        name = next(name for name in names if key in poses[name])
         M, X0 = poses[name][key]
         # ray = R·(Y − b) = M·(X − X0)
-        M_reference = turn[name].T @ M
-        rotation.append(M_reference)
-        shift.append(M_reference @ (middle - X0) + base[name])
-    interior = tuple(
-        np.array(list(one.parameters.values())) for one in calibrations.values()
-    )
-    names = list(calibrations)
-    return RigValues(
-        interior, np.array([base[n] for n in names]), np.array([turn[n] for n in names]),
-        np.array(shift), np.array(rotation), points - middle,
+        rotation.append(turn[name].T @ M)
+        centre.append(X0 - M.T @ turn[name] @ base[name] - middle)
+    place = lambda b, R: PoseValue(np.array(b), np.asarray(_quaternions(np.array(R))))
+    rays = [_rays(one, keys[name], epochs) for name, one in calibrations.items()]
+    epoch, point, xy, sigma = (np.concatenate(column) for column in zip(*rays))
+    free = {name: one.adjustment.problem.network.cameras[0].free
+            for name, one in calibrations.items()}  # fmt: skip
+    return Rig(
+        tuple(dataclasses.replace(one.camera, id=name, free=free[name])
+              for name, one in calibrations.items()),
+        place([base[n] for n in names], [turn[n] for n in names]), tuple(epochs),
+        place(centre, rotation), board.ids, board.points - middle, epoch,
+        np.repeat(np.arange(len(names)), [len(ray[0]) for ray in rays]), point, xy, sigma,
     )  # fmt: skip
 
 
-def _camera(calibration: Calibration, keys, epochs) -> RigCamera:
-    """The image points of a camera that its own calibration kept, by epoch."""
-    network = calibration.adjustment.problem.network
-    given = network.cameras[0]
-    model = get_model(given.model)
-    rays = network.observations
-    kept = kept_rays(calibration.adjustment)
-    board = calibration.views.board
-    xy = np.zeros((len(epochs), len(board.ids), 2))
-    seen = np.zeros(xy.shape[:2], bool)
-    row = {key: e for e, key in enumerate(epochs)}
-    epoch_of_view = np.array([row.get(key, -1) for key in keys])
-    point_of = {id: p for p, id in enumerate(board.ids)}
-    point = np.array([point_of[id] for id in network.points.id])[rays.point]
-    view_of = {name: v for v, name in enumerate(calibration.views.names)}
-    view = np.array([view_of[id] for id in network.images.id])[rays.image]
-    used = kept & (epoch_of_view[view] >= 0)
-    xy[epoch_of_view[view][used], point[used]] = rays.xy[used]
-    seen[epoch_of_view[view][used], point[used]] = True
-    weight = float(1 / calibration.adjustment.problem.network.observations.sigma.mean())
-    free = tuple(model.parameters.index(name) for name in given.free)
-    return RigCamera(model, free, xy, seen, weight)
+@jax.jit
+def _quaternions(matrices):
+    return jax.vmap(quaternion_from_matrix)(matrices)
 
 
-def _contradictions(calibrations, rig, solution):
-    """Epochs, of those several cameras saw, that do not fit; with their RMS in pixels."""
-    square, number = 0.0, 0
-    for one, v in zip(calibrations.values(), solution.residuals):
-        size = unit_size(get_model(one.camera.model), one.camera.pixel_size)
-        v = v / np.array(size)
-        square = square + np.nansum(v**2, axis=(1, 2))
-        number = number + np.isfinite(v[..., 0]).sum(1)
-    rms = np.sqrt(square / np.maximum(number, 1))
-    several = sum(camera.seen.any(1).astype(int) for camera in rig) > 1
-    limit = max(CONTRADICTS * float(np.median(rms)), LEAST_CONTRADICTION)
-    rms = np.where(several, rms, 0.0)
+def _rays(calibration: Calibration, keys, epochs):
+    """Epoch, point, xy and σ of the image points that the calibration of a camera kept."""
+    network, views = calibration.adjustment.problem.network, calibration.views
+    rays, kept = network.observations, kept_rays(calibration.adjustment)
+    row, point = ({key: i for i, key in enumerate(ids)} for ids in (epochs, views.board.ids))
+    epoch_of = {name: row[key] for name, key in zip(views.names, keys)}
+    epoch = np.array([epoch_of[id] for id in network.images.id])[rays.image[kept]]
+    return (epoch, np.array([point[id] for id in network.points.id])[rays.point[kept]],
+            rays.xy[kept], rays.sigma[kept])  # fmt: skip
+
+
+def _contradictions(rig: Rig, found, size):
+    """Epochs, of those several cameras saw, that do not fit, with their RMS in pixels; `size` of a
+    pixel, [cameras, 2]."""
+    v = rig.in_order(found.solution.residuals) * rig.sigma / size[rig.camera]
+    number = np.zeros((len(rig.epochs), len(size)))
+    np.add.at(number, (rig.epoch, rig.camera), used_rays(rig, found.problem))
+    rays = number.sum(1)
+    rms = np.sqrt(np.bincount(rig.epoch, (v**2).sum(1), len(rays)) / np.maximum(rays, 1))
+    limit = max(CONTRADICTS * float(np.median(rms[rays > 0])), LEAST_CONTRADICTION)
+    rms = np.where((number > 0).sum(1) > 1, rms, 0.0)
     bad = np.flatnonzero(rms > max(limit, WORST * rms.max()))
-    return [(int(e), float(rms[e])) for e in bad]
+    return {int(e): float(rms[e]) for e in bad}

@@ -17,11 +17,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbundle.adjustment.rig_normal import POSE, interior_columns, mounting_columns
 from jaxbundle.calibration.frames import in_model_units, in_pixels, unit_size
 from jaxbundle.calibration.quality import GRID, Coverage, UncertaintyMap, coverage, grid_of
 from jaxbundle.cameras import get_model, image_ray, project
 from jaxbundle.errors import InputError
+from jaxbundle.leastsquares import Pose, PoseValue
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.statistics.projection import interior_covariance_of_images
 
@@ -29,18 +29,21 @@ FRAMES = ("rig", "camera", "rotation")
 
 
 @partial(jax.jit, static_argnums=0)
-def _slopes(model, p, turn, xy, nearness):
+def _slopes(model, p, mounting: PoseValue, xy, nearness):
     """∂x/∂(δb, δθ, p) [n, 2, 6 + parameters] of points at the distance 1/nearness, whose images
     are `xy`."""
+    space = Pose()
+    # Seen from where the camera is, in units of the distance.
+    block = space.prepare(mounting._replace(position=jnp.zeros(3)))
 
     def one(xy):
-        ray = jnp.stack(image_ray(model, tuple(p), xy[0], xy[1]))
+        ray = block.rotation.apply_inverse(image_ray(model, tuple(p), xy[0], xy[1]))
 
         def image(change, p):
-            moved = ray - nearness * turn @ change[:3]
-            return jnp.stack(project(model, tuple(p), *(moved + jnp.cross(change[3:], moved))))
+            moved = space.moved(block, (*(nearness * change[:3]), *change[3:]))
+            return jnp.stack(project(model, tuple(p), *moved.ray(ray)))
 
-        return jnp.concatenate(jax.jacfwd(image, (0, 1))(jnp.zeros(POSE), p), 1)
+        return jnp.concatenate(jax.jacfwd(image, (0, 1))(jnp.zeros(space.width), p), 1)
 
     return jax.vmap(one)(xy)
 
@@ -60,21 +63,20 @@ def rig_uncertainty(
     if not distance > 0:
         raise InputError(f"distance {distance:g}: a positive distance is expected")
     k = _index(rig, name)
-    given, free = rig.camera(name), rig.measured[k].free
+    given, space = rig.camera(name), rig.result.problem.table(rig.rig.place(k)[0]).space
     model = get_model(given.model)
     p = np.array(list(given.parameters.values()))
     uv = grid_of(given.image_size, *grid)
     xy = in_model_units(uv.reshape(-1, 2), model, given.image_size, given.pixel_size)
-    own = np.arange(len(rig.solution.cofactors))[interior_columns(rig.measured, k)]
-    Q = rig.sigma0**2 * rig.solution.cofactors
+    C = rig.covariance(name)
     if frame == "rig":
-        mounted = np.arange(len(Q))[mounting_columns(rig.measured, k)] if k else []
-        columns = np.concatenate([mounted, own]).astype(int)
-        J = np.asarray(_slopes(model, p, rig.solution.values.turn[k], xy, 1 / distance))
-        J = J[:, :, [*(range(POSE) if k else ()), *(POSE + c for c in free)]]
-        C = J @ Q[np.ix_(columns, columns)] @ J.swapaxes(1, 2)
+        mounting = jax.tree.map(lambda x: x[k], rig.values("mounting"))
+        J = np.asarray(_slopes(model, p, mounting, xy, 1 / distance))
+        J = J[:, :, [*range(Pose.width), *(Pose.width + c for c in space.moving)]]
+        C = J @ C @ J.swapaxes(1, 2)
     else:
-        C = interior_covariance_of_images(model, p, free, Q[np.ix_(own, own)], xy, frame)
+        own = C[Pose.width :, Pose.width :]
+        C = interior_covariance_of_images(model, p, space.moving, own, xy, frame)
     per_unit = 1 / np.array(unit_size(model, given.pixel_size))
     C = C * per_unit[:, None] * per_unit
     return UncertaintyMap(frame, float(distance), uv, C.reshape(*uv.shape[:2], 2, 2))
@@ -82,9 +84,9 @@ def rig_uncertainty(
 
 def rig_points(rig, name: str):
     """The image points of a camera that the rig was adjusted from, pixels [n, 2]."""
-    used = rig.measured[_index(rig, name)]
-    given = rig.camera(name)
-    return in_pixels(used.xy[used.seen], used.model, given.image_size, given.pixel_size)
+    own, given = rig.used & (rig.rig.camera == _index(rig, name)), rig.camera(name)
+    model = get_model(given.model)
+    return in_pixels(rig.rig.xy[own], model, given.image_size, given.pixel_size)
 
 
 def rig_coverage(rig, name: str) -> Coverage:

@@ -2,28 +2,28 @@
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from jaxbundle import plotting
-from jaxbundle.adjustment.rig import RigSolution
-from jaxbundle.adjustment.rig_normal import (
-    RigCamera,
-    RigObject,
-    interior_columns,
-    mounting_columns,
-)
+from jaxbundle import plotting, result_tables
+from jaxbundle.adjustment.rig import Rig, used_rays
 from jaxbundle.calibration.frames import unit_size
 from jaxbundle.calibration.quality import DRAWN, GRID, Coverage, UncertaintyMap
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.rig_quality import rig_coverage, rig_points, rig_uncertainty
 from jaxbundle.cameras import get_model
-from jaxbundle.geometry import matrix_from_rotation_vector, omega_phi_kappa_near
-from jaxbundle.geometry import omega_phi_kappa_from_matrix as angles_of
-from jaxbundle.network.tables import Camera
+from jaxbundle.geometry import omega_phi_kappa_from_matrix
+from jaxbundle.leastsquares import Pose, PoseValue, Result
+from jaxbundle.network.kinds import exterior
+from jaxbundle.network.tables import Camera, units_of
+from jaxbundle.statistics.blunders import Removed, either_of
+
+POSE = Pose.width
+DEGREES = np.array([1, 1, 1, *[180 / np.pi] * 3])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,85 +52,163 @@ class RigCalibration:
     """Cameras of one mounting, calibrated together.
 
     **Attributes:** `cameras`: the calibrations of each by itself; `mountings`, `parameters`,
-    `sigma` of the common adjustment, by camera; `board`: its points [points, 3]; `epochs`;
-    `measured`: the image points used; `left_out`, and `contradicting` that were kept
-    all the same: epoch and reason; `rms` (pixels) by camera;
-    `sigma0`, `redundancy`, `converged`.
+    `sigma` of the common adjustment, by camera; `board`: its points [points, 3]; `epochs`; `rig`:
+    what was adjusted, `result`: the engine's (`jaxbundle.leastsquares.Result`); `left_out`, and
+    `contradicting` that were kept all the same: epoch and reason; `removed` by data snooping;
+    `residuals`: a table as of an `Adjustment`; `rms` (pixels) by camera; `sigma0`, `redundancy`,
+    `converged`.
     """
 
+    weights = None
+    eliminated = ()
+
     def __init__(
-        self, cameras, rig, known: RigObject, epochs, left_out, solution: RigSolution,
-        contradicting=(),
+        self, cameras: dict[str, Calibration], rig: Rig, result: Result,
+        left_out: Sequence[tuple[str, str]], contradicting: Sequence[tuple[str, str]] = (),
     ):  # fmt: skip
-        self.cameras: dict[str, Calibration] = cameras
-        self.measured: list[RigCamera] = rig
+        self.cameras, self.rig, self.result = cameras, rig, result
         self._maps: dict[tuple, UncertaintyMap] = {}
-        self.known = known
-        self.epochs: tuple[str, ...] = epochs
-        self.left_out: tuple[tuple[str, str], ...] = left_out
-        self.contradicting: tuple[tuple[str, str], ...] = contradicting
-        self.solution = solution
+        self._covariances: dict[str, np.ndarray] = {}
+        self.left_out, self.contradicting = tuple(left_out), tuple(contradicting)
 
     @property
     def names(self) -> list[str]:
         return list(self.cameras)
 
     @property
+    def epochs(self) -> tuple[str, ...]:
+        gone = dict(self.left_out)
+        return tuple(epoch for epoch in self.rig.epochs if epoch not in gone)
+
+    @property
     def converged(self) -> bool:
-        return self.solution.converged
+        return self.result.converged
 
     @property
     def sigma0(self) -> float:
-        return self.solution.sigma0
+        return self.result.sigma0
 
     @property
     def redundancy(self) -> int:
-        return self.solution.redundancy
+        return self.result.counts.redundancy
+
+    @property
+    def image_unit(self) -> str:
+        """The unit of image coordinates inside the adjustment: that of the cameras' models."""
+        return units_of(self.rig.cameras)
+
+    @functools.cached_property
+    def used(self) -> Bool[np.ndarray, " n"]:
+        """Which image points were not removed."""
+        return used_rays(self.rig, self.result.problem)
 
     @functools.cached_property
     def rms(self) -> dict[str, float]:
         """√(Σ|v|²/points) in pixels, by camera."""
-        found = {}
-        for name, v in zip(self.names, self.solution.residuals):
+        v, found = self.rig.in_order(self.result.solution.residuals) * self.rig.sigma, {}
+        for k, name in enumerate(self.names):
             given = self.cameras[name].camera
-            v = v / np.array(unit_size(get_model(given.model), given.pixel_size))
-            found[name] = float(np.sqrt(np.nanmean((v**2).sum(2))))
+            own = v[self.used & (self.rig.camera == k)]
+            own = own / np.array(unit_size(get_model(given.model), given.pixel_size))
+            found[name] = float(np.sqrt((own**2).sum(1).mean()))
+        return found
+
+    @functools.cached_property
+    def residuals(self) -> dict[str, np.ndarray]:
+        """One row an observation: kind, image (camera and epoch), point, axis, v, sigma (a priori),
+        r, w (Baarda), tau (Pope), mdb, external."""
+        rig, found, weight = self.rig, self.result.solution.reliability, self.result.problem.weights
+        ids = np.array(rig.ids, dtype=object)
+        photographs = [self._photograph(*row) for row in zip(rig.camera, rig.epoch)]
+        rows = rig.in_order
+        parts = [result_tables.residual_rows(
+            self, "image", np.array(photographs, dtype=object), ids[rig.point], ("x", "y"),
+            rows(found.residual), rows([weight(o) for o in range(len(rig.sets))]),
+            rows(found.redundancy), rows(found.w),
+        )]  # fmt: skip
+        if rig.point_sigma is not None:
+            o, blank = len(rig.sets), np.full(len(ids), "", dtype=object)
+            parts.append(result_tables.residual_rows(
+                self, "control", blank, ids, tuple("XYZ"), found.residual[o], weight(o),
+                found.redundancy[o], found.w[o],
+            ))  # fmt: skip
+        return result_tables.concatenate(parts)
+
+    def pope(self, w):
+        """τ = w/σ0."""
+        return w / self.sigma0
+
+    def _photograph(self, camera: int, epoch: int) -> str:
+        return f"{self.names[camera]} {self.rig.epochs[epoch]}"
+
+    @property
+    def removed(self) -> list[Removed]:
+        """What data snooping has removed."""
+        rig, found = self.rig, []
+        for item in self.result.removed:
+            if item.set == len(rig.sets):
+                name = f"{'XYZ'[item.residual]} of point {rig.ids[item.row]}"
+                found.append(Removed("control", 3 * item.row + item.residual, name, item.test))
+                continue
+            rows = rig.sets[item.set][1][list(item.rows)]
+            seen = zip(rig.point[rows], rig.camera[rows], rig.epoch[rows])
+            names = [f"point {rig.ids[p]} in image {self._photograph(k, e)}" for p, k, e in seen]
+            others = tuple(rows[1:].tolist())
+            found.append(Removed("image", int(rows[0]), either_of(names), item.test, others))
         return found
 
     @property
     def board(self) -> Float[np.ndarray, "points 3"]:
         """Adjusted coordinates of the board, object unit."""
         nominal = next(iter(self.cameras.values())).views.board.points
-        return self.solution.values.points + nominal.mean(0)
+        return self.values("point") + nominal.mean(0)
+
+    def values(self, table: str):
+        """The adjusted rows of a table of unknowns."""
+        return jax.tree.map(np.asarray, self.result.minimum.values[table])
 
     @functools.cached_property
     def parameters(self) -> dict[str, dict[str, float]]:
         """Parameters of every camera by name."""
-        return {
-            name: dict(zip(get_model(self.cameras[name].camera.model).parameters, p.tolist()))
-            for name, p in zip(self.names, self.solution.values.interior)
-        }
+        found = {}
+        for k, name in enumerate(self.names):
+            table, row = self.rig.place(k)
+            names = get_model(self.rig.cameras[k].model).parameters
+            found[name] = dict(zip(names, self.values(table)[row].tolist()))
+        return found
 
     @functools.cached_property
     def sigma(self) -> dict[str, dict[str, float]]:
         """σ of the free parameters of every camera, a posteriori."""
-        Q, found = self.solution.cofactors, {}
+        found = {}
         for k, name in enumerate(self.names):
-            own = interior_columns(self.measured, k)
-            sigma = self.sigma0 * np.sqrt(np.diagonal(Q)[own])
-            names = get_model(self.cameras[name].camera.model).parameters
-            found[name] = {names[c]: float(s) for c, s in zip(self.measured[k].free, sigma)}
+            table = self.result.problem.table(self.rig.place(k)[0])
+            sigma = np.sqrt(np.clip(np.diagonal(self.covariance(name))[POSE:], 0, None)).tolist()
+            free = self.rig.cameras[k].free
+            found[name] = {n: s for n, s in zip(table.parameters, sigma) if n in free}
         return found
+
+    def covariance(self, name: str) -> Float[np.ndarray, "k k"]:
+        """The joint covariance of the mounting of a camera (δb, δθ) and of its parameters that are
+        free in some camera of its model; zero where something is held."""
+        if name not in self._covariances:
+            problem, k = self.result.problem, self.names.index(name)
+            table, row = self.rig.place(k)
+            number = POSE + problem.table(table).space.width
+            rows = {t.name: np.zeros((number, t.rows, t.space.width)) for t in problem.tables}
+            rows["mounting"][:POSE, k] = np.eye(POSE)
+            rows[table][POSE:, row] = np.eye(number - POSE)
+            Q = self.result.solution.propagate_rows(rows)
+            self._covariances[name] = self.sigma0**2 * Q
+        return self._covariances[name]
 
     @functools.cached_property
     def mountings(self) -> dict[str, Mounting]:
         """The mounting of every camera but the reference, the first."""
         found = {}
         for k, name in enumerate(self.names[1:], 1):
-            own = mounting_columns(self.measured, k)
-            C = self.sigma0**2 * self.solution.cofactors[own, own]
-            at = self.solution.values
-            found[name] = _mounting(at.base[k], at.turn[k], C)
+            at = jax.tree.map(lambda x, k=k: x[k], self.values("mounting"))
+            found[name] = _mounting(at, self.covariance(name)[:POSE, :POSE])
         return found
 
     def camera(self, name: str) -> Camera:
@@ -140,7 +218,8 @@ class RigCalibration:
     @property
     def distance(self) -> float:
         """The median distance of the board from the reference camera, object unit."""
-        return float(np.median(np.linalg.norm(self.solution.values.shift, axis=1)))
+        stays = np.isin(self.rig.epochs, self.epochs)
+        return float(np.median(np.linalg.norm(self.values("epoch").position[stays], axis=1)))
 
     def coverage(self, name: str) -> Coverage:
         """Where in the image of a camera the rig has points."""
@@ -182,23 +261,20 @@ class RigCalibration:
 
 
 @jax.jit
-def _to_angles(base, turn):
-    """Length of the base, ω, φ, κ in degrees, and derivatives of base and angles by (δb, δθ)."""
-
-    def mounting(change):
-        R = matrix_from_rotation_vector(change[3:]) @ turn
-        angles = jnp.degrees(omega_phi_kappa_near(R, angles_of(turn)))
-        return jnp.concatenate([base + change[:3], angles])
-
-    zero = jnp.zeros(6)
-    return mounting(zero)[3:], jax.jacfwd(mounting)(zero)
+def _to_angles(mounting: PoseValue):
+    """R, ω, φ, κ, and derivatives of base and angles by (δb, δθ)."""
+    block = Pose().prepare(mounting)
+    R = block.rotation.matrix()
+    given = jnp.concatenate([mounting.position, omega_phi_kappa_from_matrix(R)])
+    change = lambda d: exterior(Pose().moved(block, tuple(d)), given)
+    return R, given[3:], jax.jacfwd(change)(jnp.zeros(POSE))
 
 
-def _mounting(base, turn, C) -> Mounting:
-    angles, J = map(np.asarray, _to_angles(base, turn))
-    length = float(np.linalg.norm(base))
-    along = base / length if length else np.zeros(3)
+def _mounting(at: PoseValue, C) -> Mounting:
+    R, angles, J = map(np.asarray, _to_angles(at))
+    J, length = DEGREES[:, None] * J, float(np.linalg.norm(at.position))
+    along = at.position / length if length else np.zeros(3)
     return Mounting(
-        np.asarray(base), np.asarray(turn), angles, J @ C @ J.T, length,
+        at.position, R, np.degrees(angles), J @ C @ J.T, length,
         float(np.sqrt(along @ C[:3, :3] @ along)),
     )  # fmt: skip

@@ -47,7 +47,8 @@ def calibrate_cameras(
 
     **Arguments:** `photographs` by the name of the camera; `rig`: the cameras are mounted rigidly
     and photographed in step (`jaxbundle.calibration.rig`), the first is the reference; epochs that
-    contradict the mounting are left out, but with `snooping=None` only named;
+    contradict the mounting are left out, and then single points (`snooping`, also where the cameras
+    were estimated robustly), but with `snooping=None` neither, and such epochs are only named;
     `progress()`: after every photograph; `options`: those of `calibrate`.
 
     **Raises:** `InputError`, `NotSolvedError`, naming the camera where there are several.
@@ -70,7 +71,9 @@ def calibrate_cameras(
             raise type(error)(f"camera {name}: {error}") from None
     together = None
     if rig and all(one.converged for one in found.values()):
-        known = {name: options[name] for name in ("board_sigma", "board_free") if name in options}
-        keep = options.get("snooping", "pope") is None and options.get("robust") is None
-        together = calibrate_rig(found, snooping=not keep, **known)
+        names = ("board_sigma", "board_free", "snooping", "significance")
+        given = {name: options[name] for name in names if name in options}
+        if options.get("robust") and not given.get("snooping"):
+            given["snooping"] = "pope"  # What counts less in a camera counts fully in the rig.
+        together = calibrate_rig(found, **given)
     return Calibrations(found, together)

@@ -244,7 +244,7 @@ def adjust(
     found, removed, suspects, factors = again(problem, problem.data.start), [], [], {}
     problem = with_factor(problem)
     first = Result(problem, minima[-1])
-    if not first.converged:
+    if not (first.converged and (robust or snooping or estimate_components)):
         return first
     if robust:
         reweighted = reweight(problem, found.values, again, robust)

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -265,16 +266,19 @@ def observed_weights(tables, observations) -> list[Float[np.ndarray, "n ..."]]:
     one = lambda tree: jax.tree.map(lambda x: jax.ShapeDtypeStruct(np.shape(x)[1:], float), tree)
 
     def number(given: Observations) -> int:
-        def rows(values, measured):
-            spaces = [called[name].space for name in given.kind.of]
-            blocks = [space.moved(space.prepare(v), ()) for space, v in zip(spaces, values)]
-            first = scalars(jax.tree.map(lambda x: x[None], measured))
-            return evaluate(given.kind, blocks, jax.tree.map(lambda x: x[0], first))
-
-        values = [called[name].value for name in given.kind.of]
-        return len(jax.eval_shape(rows, one(values), one(given.measured)))
+        touched = [called[name] for name in given.kind.of]
+        values, spaces = [t.value for t in touched], tuple(t.space for t in touched)
+        return len(_evaluate.eval_shape(given.kind, spaces, one(values), one(given.measured)))
 
     return [given.weight(number(given)) for given in observations]
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _evaluate(kind, spaces, values, measured):
+    """The residuals of one observation."""
+    blocks = [space.moved(space.prepare(v), ()) for space, v in zip(spaces, values)]
+    first = scalars(jax.tree.map(lambda x: x[None], measured))
+    return evaluate(kind, blocks, jax.tree.map(lambda x: x[0], first))
 
 
 def pad_data(problem: Problem, data: Data) -> Data:

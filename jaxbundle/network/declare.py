@@ -6,7 +6,7 @@ the engine's tables and sets.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -24,7 +24,7 @@ from jaxbundle.leastsquares.spaces import Pose, PoseValue, Vector
 from jaxbundle.network import kinds
 from jaxbundle.network.also import place, split
 from jaxbundle.network.arrays import Data, Values
-from jaxbundle.network.tables import EXTERIOR, Network
+from jaxbundle.network.tables import EXTERIOR, Camera, Network
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +36,17 @@ class CameraTable:
     model: str | CameraModel
     parameters: tuple[str, ...]
     cameras: Int[np.ndarray, " rows"]
+
+    def unknowns(self, cameras: Sequence[Camera]) -> ls.Table:
+        """The table; only parameters that are free in some camera of it move."""
+        own = [cameras[c] for c in self.cameras]
+        free = np.array([[name in camera.free for name in self.parameters] for camera in own])
+        moving = tuple(np.flatnonzero(free.any(0)).tolist())
+        value = np.array([_start_of(camera) for camera in own])
+        return ls.Table(
+            self.name, value, Vector(len(self.parameters), moving), free[:, moving],
+            [camera.id for camera in own], tuple(self.parameters[j] for j in moving), "camera",
+        )  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,13 +172,13 @@ def declare(network: Network, origin=None, also=()) -> Declared:
     data, origin, priors = _data(network, origin)
     further, others = split(also)
     images, points, observations = network.images, network.points, network.observations
-    cameras = _camera_tables(network)
+    cameras = camera_tables(network.cameras)
     table_of = {int(c): (t, row) for t in cameras for row, c in enumerate(t.cameras)}
     start = data.start
     tables = [
         ls.Table("image", PoseValue(start.position, start.rotation), Pose(), images.sigma != 0,
                  images.id, EXTERIOR),
-        *(_camera_table(network, t, start) for t in cameras),
+        *(t.unknowns(network.cameras) for t in cameras),
         ls.Table("point", start.point, free=~points.has_role("fixed"), labels=points.id,
                  parameters=("X", "Y", "Z")),
     ]
@@ -219,8 +230,9 @@ def order_cameras(network: Network) -> Network:
     return network
 
 
-def _camera_tables(network: Network) -> tuple[CameraTable, ...]:
-    models = [get_model(c.model) for c in network.cameras]
+def camera_tables(cameras: Sequence[Camera]) -> tuple[CameraTable, ...]:
+    """Which cameras share a table: those of one model."""
+    models = [get_model(c.model) for c in cameras]
     different = tuple(dict.fromkeys(models))
     return tuple(
         CameraTable(
@@ -231,23 +243,16 @@ def _camera_tables(network: Network) -> tuple[CameraTable, ...]:
     )  # fmt: skip
 
 
-def _camera_table(network: Network, table: CameraTable, start: Values) -> ls.Table:
-    """Only parameters that are free in some camera of the table move."""
-    free = np.array([
-        [name in network.cameras[c].free for name in table.parameters] for c in table.cameras
-    ])  # fmt: skip
-    moving = tuple(np.flatnonzero(free.any(0)).tolist())
-    value = start.camera[table.cameras, : len(table.parameters)]
-    return ls.Table(
-        table.name, value, Vector(len(table.parameters), moving), free[:, moving],
-        [network.cameras[c].id for c in table.cameras],
-        tuple(table.parameters[j] for j in moving), "camera",
-    )  # fmt: skip
-
-
 @jax.jit
 def _quaternions(angles):
     return jax.vmap(lambda a: quaternion_from_matrix(matrix_from_omega_phi_kappa(a)))(angles)
+
+
+def _start_of(camera: Camera) -> list[float]:
+    """The start values of all parameters of a camera."""
+    model = get_model(camera.model)
+    values = {**default_parameters(model), **camera.parameters}
+    return [values[name] for name in model.parameters]
 
 
 def _data(network: Network, origin):
@@ -260,9 +265,8 @@ def _data(network: Network, origin):
     camera = np.zeros((len(models), width))
     camera_sigma = np.full((len(models), width), np.inf)
     for c, (given, model) in enumerate(zip(network.cameras, models)):
-        values = {**default_parameters(model), **given.parameters}
+        camera[c, : len(model.parameters)] = _start_of(given)
         for j, name in enumerate(model.parameters):
-            camera[c, j] = values[name]
             if name in given.free:
                 camera_sigma[c, j] = given.sigma.get(name, np.inf)
     start = Values(

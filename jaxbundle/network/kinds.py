@@ -26,20 +26,25 @@ from jaxbundle.leastsquares.motions import similarity
 @dataclasses.dataclass(frozen=True)
 class ImagePoint:
     """The two residuals of an image point, in the unit of the camera model; of poses, cameras and
-    points it takes scalars."""
+    points it takes scalars. Each of the poses (of a network one) leads into the frame of the next,
+    the last into that of the camera."""
 
     model: str | cameras.CameraModel
     domain: str
 
-    def __call__(self, pose, interior, point, xy):
-        model = cameras.get_model(self.model)
-        return cameras.residual(model, self.domain, interior, pose.ray(point), xy)
+    def __call__(self, *touched):
+        *poses, interior, ray, xy = touched
+        for pose in poses:
+            ray = pose.ray(ray)
+        return cameras.residual(cameras.get_model(self.model), self.domain, interior, ray, xy)
 
 
-def image_points(model: str | cameras.CameraModel, domain: str, camera: str) -> Kind:
+def image_points(
+    model: str | cameras.CameraModel, domain: str, camera: str, poses: tuple[str, ...] = ("image",)
+) -> Kind:
     """Image points of the cameras of one model, whose table is `camera`; `domain`: "corrected" or
-    "measured"."""
-    of = ("image", camera, "point")
+    "measured"; `poses`: the tables of poses on the way from the object to the camera."""
+    of = (*poses, camera, "point")
     only = camera == "camera"
     name = "image coordinates" if only else f"image coordinates of {cameras.get_model(model).name}"
     return Kind(name, ImagePoint(model, domain), of, ("x", "y"), scalars=True, invariant=True)
@@ -49,7 +54,7 @@ def _difference(value, given):
     return value - given
 
 
-def _exterior(pose, given):
+def exterior(pose, given):
     """Projection centre and ω, φ, κ (on the branch of the given ones) less the given values [6]."""
     angles = omega_phi_kappa_near(pose.rotation.matrix(), given[3:])
     return jnp.concatenate([jnp.stack(pose.centre), angles]) - given
@@ -61,7 +66,7 @@ def _distance(a, b, given):
 
 CONTROL = Kind("control points", _difference, ("point",), ("X", "Y", "Z"), snooped="single")
 EXTERIOR = Kind(
-    "exterior orientation", _exterior, ("image",), ("X0", "Y0", "Z0", "omega", "phi", "kappa"),
+    "exterior orientation", exterior, ("image",), ("X0", "Y0", "Z0", "omega", "phi", "kappa"),
     snooped="",
 )  # fmt: skip
 DISTANCES = Kind("distances", _distance, ("point", "point"), ("d",), snooped="single")

@@ -14,13 +14,13 @@ are kept beside them for people.
 
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.arguments import shown
-from jaxbundle.cameras import CameraModel, key_of
+from jaxbundle.cameras import CameraModel, get_model, key_of
 from jaxbundle.errors import InputError
 
 ROLES = ("tie", "control", "fixed", "check")
@@ -69,6 +69,11 @@ class Camera:
 
     def __post_init__(self):
         object.__setattr__(self, "model", key_of(self.model))
+
+
+def units_of(cameras: Iterable[Camera]) -> str:
+    """The unit of image coordinates, that of the cameras' models."""
+    return "/".join(sorted({get_model(camera.model).unit for camera in cameras}))
 
 
 @dataclasses.dataclass(frozen=True)

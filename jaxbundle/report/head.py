@@ -6,7 +6,6 @@ precision of an image coordinate is σ0 times its a priori σ, in the unit of th
 
 import numpy as np
 
-from jaxbundle.cameras import get_model
 from jaxbundle.leastsquares.stopping import LIMIT, NOT_FINITE, SINGULAR, STUCK
 from jaxbundle.network.columns import count, some
 from jaxbundle.network.datum_words import open_directions_in_words
@@ -46,12 +45,6 @@ ADVICE = {
 }
 
 
-def image_unit(adjustment) -> str:
-    """The unit of image coordinates inside the adjustment: that of the cameras' models."""
-    units = {get_model(camera.model).unit for camera in adjustment.problem.network.cameras}
-    return "/".join(sorted(units))
-
-
 def title(adjustment, date: str | None) -> list[str]:
     """Name of the program, its version, the date, and what was adjusted."""
     from jaxbundle import __version__
@@ -75,7 +68,7 @@ def settings(adjustment) -> list[str]:
                 ("Residuals", f"v = computed − observed, {DOMAINS[network.residuals]}"),
                 (
                     "Units",
-                    f"object {clean(network.object_unit)}, image {image_unit(adjustment)}, "
+                    f"object {clean(network.object_unit)}, image {adjustment.image_unit}, "
                     f"angles {network.angle_unit}",
                 ),
             ]
@@ -212,12 +205,12 @@ def image_sigmas(adjustment) -> np.ndarray:
 def unit_weights(adjustment) -> bool:
     """Whether every image coordinate has σ 1 mm: no statement about its precision at all."""
     sigma = image_sigmas(adjustment)
-    return len(sigma) == 1 and sigma[0] == 1.0 and image_unit(adjustment) == "mm"
+    return len(sigma) == 1 and sigma[0] == 1.0 and adjustment.image_unit == "mm"
 
 
 def image_precision(adjustment) -> str:
     """σ0 times the a priori σ of image coordinates, in their unit, in µm and in pixels."""
-    sigma, unit = image_sigmas(adjustment), image_unit(adjustment)
+    sigma, unit = image_sigmas(adjustment), adjustment.image_unit
     if not len(sigma) or not np.isfinite(adjustment.sigma0):
         return "–"
     ends = sigma[[0, -1]]

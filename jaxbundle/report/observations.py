@@ -12,7 +12,7 @@ import numpy as np
 from jaxbundle.cameras import get_model
 from jaxbundle.leastsquares.distributions import normal_quantile, tau_quantile
 from jaxbundle.network.columns import count
-from jaxbundle.report.head import image_unit, span
+from jaxbundle.report.head import span
 from jaxbundle.report.layout import (
     bar,
     clean,
@@ -45,9 +45,9 @@ def residuals(adjustment, limit: float, test: str) -> list[str]:
     lines += paragraph(
         f"Test: {'Pope, τ = w/σ0, σ a posteriori' if test == 'pope' else 'Baarda, σ a priori'}; "
         f"critical value {significant(_critical(adjustment, test), 3)} for one observation at "
-        f"0.1 %. v and σ (a priori) of image coordinates in {image_unit(adjustment)}, of control "
+        f"0.1 %. v and σ (a priori) of image coordinates in {adjustment.image_unit}, of control "
         "points and distances in the object unit; r redundancy number; MDB the smallest blunder "
-        "that is found (α 0.1 %, power 80 %), σ a posteriori (σ0 times the MDB of residuals.csv); "
+        "that is found (α 0.1 %, power 80 %), σ a posteriori (σ0 times that of the tables); "
         "ext. (external reliability) its largest effect on an unknown, in σ of that unknown."
     )
     lines.append("")
@@ -55,7 +55,7 @@ def residuals(adjustment, limit: float, test: str) -> list[str]:
         lines += _rows(adjustment, over[:MOST_RESIDUALS])
         if len(over) > MOST_RESIDUALS:
             more = len(over) - MOST_RESIDUALS
-            lines.append(f"… and {more} more: all residuals are in residuals.csv.")
+            lines.append(f"… and {more} more: all residuals are in residuals.csv or the JSON.")
         lines += ["", f"{len(over)} of {len(size)} observations."]
     else:
         lines.append(f"None of {count(len(size), 'observation')}. The largest:")

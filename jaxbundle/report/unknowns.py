@@ -6,7 +6,6 @@ from jaxbundle.cameras import CameraModel, get_model
 from jaxbundle.network.columns import count
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.report.equations import equations
-from jaxbundle.report.head import image_unit
 from jaxbundle.report.layout import (
     bar,
     clean,
@@ -136,7 +135,7 @@ def validity(adjustment, camera: str) -> str:
 def images(adjustment, most: int) -> list[str]:
     """Exterior orientation, two lines an image: values, and σ under them."""
     found = adjustment.images
-    unit, angle = image_unit(adjustment), adjustment.network.angle_unit
+    unit, angle = adjustment.image_unit, adjustment.network.angle_unit
     places = [column_decimals(found[f"s{name}"]) for name in EXTERIOR]
     scale, rms_unit = (1e3, "µm") if unit == "mm" else (1.0, unit)
     rms_places = column_decimals(scale * found["rms"])

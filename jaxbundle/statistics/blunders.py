@@ -1,6 +1,7 @@
 """Blunders and suspects in the words of a network."""
 
 import dataclasses
+from collections.abc import Sequence
 
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.leastsquares import robust, snooping
@@ -39,12 +40,14 @@ def name_removed(problem: Problem, found: snooping.Removed) -> Removed:
     """What data snooping has removed, with its name."""
     kind, rows = _place(problem, found.set, found.rows)
     names = [_name(problem, found.set, row, found.residual) for row in found.rows]
-    name = names[0]
-    if len(names) > 1:
-        name = f"either of {', '.join(names[:-1])} or {names[-1]}"
     if kind == "control":
         rows = tuple(3 * row + found.residual for row in rows)
-    return Removed(kind, rows[0], name, found.test, rows[1:])
+    return Removed(kind, rows[0], either_of(names), found.test, rows[1:])
+
+
+def either_of(names: Sequence[str]) -> str:
+    """What was removed together because nothing says which of it is wrong."""
+    return names[0] if len(names) == 1 else f"either of {', '.join(names[:-1])} or {names[-1]}"
 
 
 def name_suspect(problem: Problem, found: robust.Suspect) -> Suspect:
