@@ -8,7 +8,6 @@ import dataclasses
 from collections.abc import Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -196,7 +195,10 @@ def _a_length(x: float) -> bool:
 
 def _angles(matrices: Float[np.ndarray, "images 3 3"]) -> Float[np.ndarray, "images 3"]:
     """ω, φ, κ of rotation matrices."""
-    return np.asarray(jax.vmap(omega_phi_kappa_from_matrix)(jnp.asarray(matrices)), float)
+    return np.asarray(_all_angles(matrices), float)
+
+
+_all_angles = jax.jit(jax.vmap(omega_phi_kappa_from_matrix))
 
 
 def grid_of_targets(
