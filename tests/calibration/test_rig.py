@@ -112,13 +112,24 @@ def test_mounting_and_cameras_are_the_truth(rig):
 
 
 def test_opencv_has_the_same_residuals():
-    """From the same numbers of 32 bits, which OpenCV takes."""
+    """From the same numbers of 32 bits, which OpenCV takes; ours from poor start values."""
     views, board = pair(), taken.BOARD.points.astype(np.float32)
     corners = {name: [xy.astype(np.float32) for xy in v.xy] for name, v in views.items()}
     given = {name: dataclasses.replace(v, xy=np.float64(corners[name]))
              for name, v in views.items()}  # fmt: skip
     points = np.float64(board) - taken.BOARD.points.mean(0)
-    found = adjust_rig(dataclasses.replace(as_rig(given), points=points))
+    rig = as_rig(given)
+    cameras = tuple(
+        dataclasses.replace(c, parameters={n: f * x for n, x in c.parameters.items()})
+        for c, f in zip(rig.cameras, (1.02, 0.97))
+    )
+    b = rig.mounting.position + [[0, 0, 0], [0.01, -0.01, 0.02]]
+    mounting = rig.mounting._replace(position=b)
+    pose = rig.pose._replace(position=rig.pose.position * 1.1)
+    found = adjust_rig(dataclasses.replace(
+        rig, cameras=cameras, mounting=mounting, pose=pose, points=points
+    ))  # fmt: skip
+    assert found.converged
     start = []
     for lens in (render.LENS, RIGHT):
         fx, fy, cx, cy, *distortion = lens.parameters[:9]
@@ -181,22 +192,6 @@ def test_maps_and_coverage_of_a_rig(rig, tmp_path):
             for what in ("coverage", "uncertainty", "uncertainty_far")} == {
         path.name for path in tmp_path.iterdir()
     }  # fmt: skip
-
-
-def test_exact_rays_from_poor_start_values():
-    rig = as_rig(pair(noise=0.0))
-    cameras = [
-        dataclasses.replace(c, parameters={n: f * x for n, x in c.parameters.items()})
-        for c, f in zip(rig.cameras, (1.02, 0.97))
-    ]
-    moved = rig.mounting.position + [[0, 0, 0], [0.01, -0.01, 0.02]]
-    mounting = rig.mounting._replace(position=moved)
-    pose = rig.pose._replace(position=rig.pose.position * 1.1)
-    found = adjust_rig(
-        dataclasses.replace(rig, cameras=tuple(cameras), mounting=mounting, pose=pose)
-    )
-    assert found.converged and found.vtpv < 1e-14
-    np.testing.assert_allclose(base_of(found)[0], BASE, atol=1e-9)
 
 
 def test_redundancy_numbers_say_how_much_of_an_error_a_residual_shows():
