@@ -19,9 +19,9 @@ import jax.numpy as jnp
 
 from jaxbundle import cameras
 from jaxbundle.adjustment.batch_normal import Calibration, Sightings, gram
-from jaxbundle.adjustment.residuals import cross
 from jaxbundle.adjustment.small_cholesky import backward, cholesky, forward, rows_of
 from jaxbundle.geometry import quaternion_from_matrix
+from jaxbundle.leastsquares.spaces import cross
 
 FLAT, SOLID = 4, 6
 """A view of fewer points is left out."""

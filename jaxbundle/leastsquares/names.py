@@ -3,6 +3,7 @@
 import dataclasses
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -31,14 +32,19 @@ class Name:
         return f"{self.parameter} of {self.kind} {self.id}"
 
 
-def name_of(problem: Problem, group: str, row: int, column: int) -> Name:
-    """The unknown in a column of a row of a group."""
+def place_of(problem: Problem, group: str, row: int, column: int) -> tuple[str, int, int]:
+    """Table, row and direction of what stands in a column of a row of a group."""
     for m in problem.plan.groups[group].members:
         if m.start <= column < m.start + m.width:
-            table = problem.table(m.table)
-            row = row if m.rows is None else int(m.rows[row])
-            return Name(table.title, table.label(row), table.parameter(column - m.start))
+            return m.table, row if m.rows is None else int(m.rows[row]), column - m.start
     raise IndexError(column)
+
+
+def name_of(problem: Problem, group: str, row: int, column: int) -> Name:
+    """The unknown in a column of a row of a group."""
+    name, row, direction = place_of(problem, group, row, column)
+    table = problem.table(name)
+    return Name(table.title, table.label(row), table.parameter(direction))
 
 
 def kept_unknowns(problem: Problem) -> list[tuple[str, int, int]]:
@@ -51,11 +57,8 @@ def kept_unknowns(problem: Problem) -> list[tuple[str, int, int]]:
 
 def undetermined(problem: Problem, values: Values) -> list[str]:
     """The unknowns that the observations do not determine, most affected first."""
-    plan, data = problem.plan, pad_data(problem, problem.data)
-    S, V, G = _scaled(problem.declared, plan, pad_values(problem, values), data)
-    rows = [] if V is None else _undetermined_rows(problem, np.asarray(V))
-    S, G = np.asarray(S), np.asarray(G)
-    S = np.tril(S) + np.tril(S, -1).T
+    S, V, G = scaled_system(problem, values)
+    rows = [] if V is None else _undetermined_rows(problem, V)
     if not np.isfinite(S).all():
         return rows
     if G.shape[1]:  # The datum is held otherwise.
@@ -66,6 +69,15 @@ def undetermined(problem: Problem, values: Values) -> list[str]:
     share, names = (null**2).sum(1), kept_unknowns(problem)
     order = np.argsort(-share, kind="stable")
     return [str(name_of(problem, *names[i])) for i in order if share[i] > SHARE] + rows
+
+
+def scaled_system(problem: Problem, values: Values):
+    """S scaled by the diagonal it has before anything is eliminated, in the order of
+    `kept_unknowns`; V of the eliminated rows (None: there are none); the open directions."""
+    plan, data = problem.plan, pad_data(problem, problem.data)
+    found = _scaled(problem.declared, plan, pad_values(problem, values), data)
+    S, V, G = jax.tree.map(np.asarray, found)
+    return np.tril(S) + np.tril(S, -1).T, V, G
 
 
 @eqx.filter_jit

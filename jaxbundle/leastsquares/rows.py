@@ -93,7 +93,8 @@ def residual_of(declared: Declared, part: Part):
 def evaluate(kind: Kind, blocks, measured):
     """The residuals of one observation as a tuple of scalars."""
     if not kind.scalars:
-        blocks, measured = (_stacked(b) for b in blocks), _stacked(measured)
+        blocks = (_stacked(b) for b in blocks)
+        measured = jax.tree.map(_stacked, measured, is_leaf=lambda x: type(x) is tuple)
     found = kind.residual(*blocks, measured)
     if isinstance(found, tuple):
         return found

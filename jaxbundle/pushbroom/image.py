@@ -118,9 +118,20 @@ def check_size(lines: float, pixels: float, where: str) -> None:
 
 def pose_at(image: PushbroomImage, t: Float[Array, ""]) -> Pose:
     """The pose at the time t, in seconds; NaN where the tables do not reach."""
-    dt, offsets = t - image.middle_time, image.offsets
+    return moved_pose(given_pose(image, t), t - image.middle_time, image.offsets, image.mounting)
+
+
+def given_pose(image: PushbroomImage, t: Float[Array, ""]) -> Pose:
+    """The pose of the platform as its tables have it, without offsets and mounting."""
+    of = image.trajectory
+    return Pose(position_at(of, t), rotation_at(of, t), velocity_at(of, t))
+
+
+def moved_pose(
+    given: Pose, dt: Float[Array, ""], offsets: Offsets, mounting: Float[Array, "3"]
+) -> Pose:
+    """The pose of the camera, `dt` seconds after the middle line."""
     turn = matrix_from_rotation_vector(offsets.attitude + dt * offsets.attitude_rate)
-    R = rotation_at(image.trajectory, t) @ turn @ matrix_from_pitch_roll_yaw(image.mounting)
-    P = position_at(image.trajectory, t) + offsets.position + dt * offsets.position_rate
-    V = velocity_at(image.trajectory, t) + offsets.position_rate
-    return Pose(P, R, V)
+    R = given.R @ turn @ matrix_from_pitch_roll_yaw(mounting)
+    P = given.P + offsets.position + dt * offsets.position_rate
+    return Pose(P, R, given.V + offsets.position_rate)

@@ -27,9 +27,9 @@ from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, normal
 from jaxbundle.geometry.vectors import Vector, difference, dot, turned_back
 from jaxbundle.implicit import implicit_root, solve_dense
 
-from .corrections import seen_point
+from .corrections import Corrections, seen_point
 from .footprint import Footprint, make_footprint
-from .image import PushbroomImage, pose_at
+from .image import Pose, PushbroomImage, pose_at
 from .newton import collected, first_of, refine, replaced
 from .passages import FINE_SEARCH, line_of_detectors, passages, sample, sample_times
 from .pieces import Pieces, make_pieces
@@ -168,10 +168,22 @@ def misclosure(
     earth: Ellipsoid | None,
 ) -> Float[Array, "2"]:
     """Slopes at which X is seen at the time t less those of the pixel u."""
-    P, R, V = pose_at(image, t)
-    X = seen_point(image.corrections, earth, tuple(P), tuple(V), tuple(X))
+    slopes = image.optics.slopes(u)
+    return misclosure_of(pose_at(image, t), slopes, X, image.corrections, earth)
+
+
+def misclosure_of(
+    pose: Pose,
+    slopes: tuple[Array, Array],
+    X: Float[Array, "3"],
+    corrections: Corrections,
+    earth: Ellipsoid | None,
+) -> Float[Array, "2"]:
+    """Slopes at which X is seen from a pose less others."""
+    P, R, V = pose
+    X = seen_point(corrections, earth, tuple(P), tuple(V), tuple(X))
     r, s, q = turned_back(R, difference(X, tuple(P)))
-    xi, eta = image.optics.slopes(u)
+    xi, eta = slopes
     return jnp.stack([-r / q - xi, -s / q - eta])
 
 

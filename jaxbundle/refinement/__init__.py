@@ -2,10 +2,6 @@
 
 from .adjusted import adjusted_photographs as adjusted_photographs
 from .adjusted import point_rows as point_rows
-from .equations import System as System
-from .equations import Unknowns as Unknowns
-from .equations import line_residual as line_residual
-from .equations import residuals as residuals
 from .freedom import FREE as FREE
 from .freedom import HELD as HELD
 from .freedom import Freedom as Freedom

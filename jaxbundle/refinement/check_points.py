@@ -4,8 +4,8 @@ At the given coordinates, a check point is projected: its residuals in lines and
 
     σ_v² = σ0²·(1/p + A·Q·Aᵀ).
 
-On the ground, the rays of two or more images give the point, δ = −(Σ BᵀB)⁻¹·Σ Bᵀv; one scanner
-image gives it at its given height, δ east and north only.
+On the ground, the rays of two or more images give the point (`leastsquares/checks.py`); one scanner
+image gives it at its given height, east and north only.
 """
 
 import dataclasses
@@ -16,17 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.refinement.equations import (
-    System,
-    Unknowns,
-    compiled_image_residuals,
-    compiled_rescaled,
-    residuals,
-)
+from jaxbundle.leastsquares.checks import determine
+from jaxbundle.leastsquares.rows import fill_places, in_given_order, lay_out_data, residuals
+from jaxbundle.leastsquares.solution import Solution
+from jaxbundle.refinement.declare import Rays, declare
 from jaxbundle.refinement.inspection import Inspection
-from jaxbundle.refinement.solver import jacobian
-
-STEPS = 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,49 +46,43 @@ class CheckPoints:
         return np.where(number > 0, np.sqrt(square.sum(0) / np.maximum(number, 1)), np.nan)
 
 
-def intersect(system: System, found: Inspection, ids: tuple[str, ...]) -> CheckPoints:
-    """The check points of a system of their own, with the refined images of another."""
-    shared = found.unknowns.shared
-    start = eqx.tree_at(lambda u: u.shared, system.start(), shared)
-    system = compiled_rescaled(system, start)
-    number = np.bincount(np.concatenate([r.point for r in system.rays]), minlength=len(ids))
-    free = np.where((number < 2)[:, None], [1.0, 1.0, 0.0], 1.0)
-    system = eqx.tree_at(
-        lambda s: (s.free, s.prior), system,
-        (jnp.asarray(free), jnp.zeros_like(system.prior)),
-    )  # fmt: skip
-    v0 = np.concatenate([np.asarray(v) for v in compiled_image_residuals(system, start)])
-    A, _, _, = _rows(system, start)[1:]
-    change = np.zeros((len(ids), 3))
-    for _ in range(STEPS):
-        v, A_now, B, of = _rows(system, Unknowns(shared, jnp.asarray(change)))
-        V, g = np.zeros((len(ids), 3, 3)), np.zeros((len(ids), 3))
-        W = np.zeros((len(ids), 3, len(shared)))
-        np.add.at(V, of, B[:, :, None] * B[:, None, :])
-        np.add.at(g, of, B * v[:, None])
-        np.add.at(W, of, B[:, :, None] * A_now[:, None, :])
-        inverse = np.linalg.pinv(V, 1e-13, hermitian=True)
-        change = change - np.einsum("pij,pj->pi", inverse, g)
-    G = inverse @ W
-    Q = inverse + G @ found.cofactor @ G.transpose(0, 2, 1)
-    known = free > 0
+def intersect(found: Inspection, rays: Rays) -> CheckPoints:
+    """The check points of these rays, with the refined images."""
+    given, adjusted = found.declared.given, found.solution.values
+    checks = declare(given, rays, given.points.X[rays.points], adjusted)
+    problem, start = checks.problem, checks.problem.data.start
+    values, Q = determine(found.solution, problem)
+    known, axes = problem.table("point").free > 0, start["point"].axes
+    change = np.asarray(values["point"].position - start["point"].position)
     sigma = found.sigma0 * np.sqrt(np.diagonal(Q, axis1=1, axis2=2))
-    weight = np.concatenate([np.asarray(r.weight) for r in system.rays])
-    spread = np.einsum("rm,mn,rn->r", A, found.cofactor, A).reshape(-1, 2)
+    here = Solution(problem, start)
+    A = _slopes(*here.given, found.changes_at, found.declared.problem.data.start, found.estimate)
+    real = lambda o: np.asarray(A[o])[: problem.observations[o].number]
+    spread = {o: np.einsum("nrk,kl,nrl->nr", real(o), found.cofactor, real(o)) for o in A}
+    weight = problem.data.weight
+    of_rays = lambda by_set: checks.image_by_image([np.asarray(x) for x in by_set])
     return CheckPoints(
-        ids, np.where(known, change, np.nan), np.where(known, sigma, np.nan), number, v0,
-        found.sigma0 * np.sqrt(1 + spread) / weight,
+        tuple(given.points.id[k] for k in rays.points),
+        np.where(known, np.einsum("pki,pi->pk", axes, change), np.nan),
+        np.where(known, sigma, np.nan), checks.number_of_rays,
+        of_rays(here.residuals[p.set] / weight[p.set] for p in checks.parts),
+        of_rays(found.sigma0 * np.sqrt(1 + spread[p.set]) / weight[p.set] for p in checks.parts),
     )  # fmt: skip
 
 
 @eqx.filter_jit
-def _linear(system, unknowns):
-    v, times = jax.linearize(lambda y: residuals(system, y), unknowns)
-    J = jacobian(times, system)
-    return v, J.shared, J.point, J.of
+def _slopes(declared, plan, values, data, at, start, estimate):
+    """The derivatives of all v/σ by the shared unknowns, [n, r, m], the points where they are."""
+    plan, laid = fill_places(plan, lay_out_data(plan, data))
+    spaces, padded = declared.spaces, values
 
+    def of_shared(estimate):
+        moved = dict(padded)
+        for t, (k, row, direction) in at.items():
+            rows = jax.tree.leaves(start[t])[0].shape[0]
+            change = jnp.zeros((rows, spaces[t].width)).at[row, direction].set(estimate[k])
+            now = jax.vmap(spaces[t].retract)(start[t], change)
+            moved[t] = jax.tree.map(lambda wide, x: wide.at[: len(x)].set(x), padded[t], now)
+        return in_given_order(plan, residuals(declared, plan, moved, laid))
 
-def _rows(system, unknowns):
-    """v, A, B and the points of the rows of image points."""
-    rows = 2 * sum(len(r.point) for r in system.rays)
-    return [np.asarray(x)[:rows] for x in _linear(system, unknowns)]
+    return jax.jacfwd(of_shared)(estimate)

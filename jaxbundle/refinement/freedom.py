@@ -77,6 +77,9 @@ class Change(NamedTuple):
     look_along: Float[Array, " b"]
 
 
+LEAST = Change(3, 3, 3, 3, 3, 1, 3, 1, 1)
+
+
 class ChangedOptics(Optics):
     """(ξ, η) of `base` divided by 1 + e, and polynomials added."""
 
@@ -85,8 +88,13 @@ class ChangedOptics(Optics):
     added: AnglePolynomial
 
     def slopes(self, u):
-        (xi, eta), (more_xi, more_eta) = self.base.slopes(u), self.added.slopes(u)
-        return xi / (1 + self.relative) + more_xi, eta / (1 + self.relative) + more_eta
+        return changed_slopes(self.base.slopes(u), self.relative, self.added.slopes(u))
+
+
+def changed_slopes(slopes, relative, added):
+    """(ξ, η)/(1 + e) and what is added."""
+    (xi, eta), (more_xi, more_eta) = slopes, added
+    return xi / (1 + relative) + more_xi, eta / (1 + relative) + more_eta
 
 
 class Name(NamedTuple):
@@ -105,12 +113,17 @@ class Name(NamedTuple):
 
 
 class Form(eqx.Module):
-    """What is fixed about the unknowns of an image: axes F, spline, numbers of coefficients."""
+    """What is fixed about the unknowns of an image: axes F, spline, and how many numbers each
+    unknown has in its vector, which may be more than it uses."""
 
     axes: Float[Array, "3 3"]
     spline: JitterSpline = eqx.field(static=True)
-    across: int = eqx.field(static=True)
-    along: int = eqx.field(static=True)
+    sizes: Change = eqx.field(static=True)
+
+    @property
+    def own(self) -> int:
+        """How many numbers are the image's own; those of its sensor follow."""
+        return sum(self.sizes) - sum(getattr(self.sizes, name) for name in OF_SENSOR)
 
 
 def make_form(image: PushbroomImage, earth: Ellipsoid | None, freedom: Freedom) -> Form:
@@ -119,23 +132,30 @@ def make_form(image: PushbroomImage, earth: Ellipsoid | None, freedom: Freedom) 
     if any(freedom.jitter):
         first, last = (float(image.times.time(line)) for line in (-0.5, image.lines - 0.5))
         spline = make_spline(first, last, freedom.knot_spacing)
-    t = image.middle_time
-    P, V = position_at(image.trajectory, t), velocity_at(image.trajectory, t)
-    axes = orbital_frame(P if earth is not None else jnp.array([0.0, 0.0, 1.0]), V)
-    return Form(axes, spline, len(freedom.look_across), len(freedom.look_along))
+    axes = _axes(image, earth is None)
+    across, along = len(freedom.look_across), len(freedom.look_along)
+    return Form(axes, spline, Change(3, 3, 3 * spline.unknowns, 3, 3, 1, 3, across, along))
 
 
-def sizes(form: Form) -> Change:
-    """How many numbers each unknown has."""
-    return Change(3, 3, 3 * form.spline.unknowns, 3, 3, 1, 3, form.across, form.along)
+@eqx.filter_jit
+def _axes(image: PushbroomImage, local: bool) -> Float[Array, "3 3"]:
+    """F: across, along, up at the middle line."""
+    t, of = image.middle_time, image.trajectory
+    up = jnp.array([0.0, 0.0, 1.0]) if local else position_at(of, t)
+    return orbital_frame(up, velocity_at(of, t))
 
 
-def change_of(form: Form, p: Float[Array, " n"]) -> Change:
+def of_one_size(forms: list[Form]) -> list[Form]:
+    """The forms with room for the most numbers that any of them has, and for one of each."""
+    sizes = Change(*map(max, zip(LEAST, *(form.sizes for form in forms))))
+    return [dataclasses.replace(form, sizes=sizes) for form in forms]
+
+
+def change_of(sizes: Change, p: Float[Array, " n"]) -> Change:
     """The unknowns of one image out of their vector."""
-    ends = np.cumsum(sizes(form))[:-1]
-    parts = Change(*jnp.split(p, ends))
+    parts = Change(*jnp.split(p, np.cumsum(sizes)[:-1]))
     return parts._replace(
-        jitter=parts.jitter.reshape(3, form.spline.unknowns), focal_length=parts.focal_length[0]
+        jitter=parts.jitter.reshape(3, -1), focal_length=parts.focal_length[0]
     )
 
 
@@ -143,44 +163,51 @@ def changed(
     image: PushbroomImage, form: Form, change: Change, t: Float[Array, ""]
 ) -> PushbroomImage:
     """The image as it is at the time t with its unknowns changed."""
-    old = image.offsets
     jitter = form.spline.at(change.jitter, t)
-    offsets = Offsets(
-        old.attitude + change.attitude + jitter,
-        old.attitude_rate + change.attitude_rate,
-        old.position + form.axes @ change.position,
-        old.position_rate + form.axes @ change.position_rate,
-    )
     return dataclasses.replace(
-        image, offsets=offsets, mounting=image.mounting + change.mounting,
-        optics=changed_optics(image, form, change),
+        image, offsets=changed_offsets(image.offsets, form.axes, change, jitter),
+        mounting=image.mounting + change.mounting, optics=changed_optics(image, change),
     )  # fmt: skip
 
 
-def changed_optics(image: PushbroomImage, form: Form, change: Change) -> Optics:
+def changed_offsets(old: Offsets, axes, change: Change, jitter: Float[Array, "3"]) -> Offsets:
+    """The offsets with attitude and position changed."""
+    return Offsets(
+        old.attitude + change.attitude + jitter,
+        old.attitude_rate + change.attitude_rate,
+        old.position + axes @ change.position,
+        old.position_rate + axes @ change.position_rate,
+    )
+
+
+def changed_optics(image: PushbroomImage, change: Change) -> Optics:
     """The optics with focal length and look angles changed."""
-    if not form.across and not form.along:
-        zero = jnp.zeros(1)
-        across = along = zero
-    else:
-        pad = lambda a: jnp.concatenate([a, jnp.zeros(1)])
-        across, along = pad(change.look_across), pad(change.look_along)
-    middle = jnp.asarray((image.pixels - 1) / 2)
-    added = AnglePolynomial(across, along, middle, jnp.asarray(image.pixels / 2))
+    pad = lambda a: jnp.concatenate([a, jnp.zeros(1)])
+    middle, half = middle_and_half(image)
+    added = AnglePolynomial(
+        pad(change.look_across), pad(change.look_along), jnp.asarray(middle), jnp.asarray(half)
+    )
     return ChangedOptics(image.optics, change.focal_length, added)
 
 
+def middle_and_half(image: PushbroomImage) -> tuple[float, float]:
+    """Of the line of detectors, in pixels."""
+    return (image.pixels - 1) / 2, image.pixels / 2
+
+
 def priors(form: Form, freedom: Freedom) -> Float[np.ndarray, " n"]:
-    """The σ of every number of an image's vector."""
-    one = freedom
-    jitter = np.repeat(one.jitter, form.spline.unknowns)
+    """The σ of every number of an image's vector; NaN where it has no such unknown."""
+    room = lambda sigma, n: np.r_[sigma, np.full(n - len(sigma), np.nan)]
+    one, sizes, knots = freedom, form.sizes, form.spline.unknowns
+    jitter = [room(np.repeat(s, knots), sizes.jitter // 3) for s in one.jitter]
     return np.concatenate([
-        one.attitude, one.attitude_rate, jitter, one.position, one.position_rate,
-        [one.focal_length], one.mounting, one.look_across, one.look_along,
+        one.attitude, one.attitude_rate, *jitter, one.position, one.position_rate,
+        [one.focal_length], one.mounting, room(one.look_across, sizes.look_across),
+        room(one.look_along, sizes.look_along),
     ])  # fmt: skip
 
 
-def names(form: Form, image: str, sensor: str) -> list[Name]:
+def names(sizes: Change, image: str, sensor: str) -> list[Name]:
     """The name of every number of an image's vector."""
     own, of = f"image {image}", f"sensor {sensor}"
     arcsec = math.degrees(1) * 3600
@@ -188,20 +215,15 @@ def names(form: Form, image: str, sensor: str) -> list[Name]:
     found += [Name(own, f"{x} drift", "arcsec/s", arcsec, f"{x} drift") for x in TURNS]
     found += [
         Name(own, f"{x} jitter {k + 1}", "arcsec", arcsec, f"{x} jitter")
-        for x in TURNS for k in range(form.spline.unknowns)
+        for x in TURNS for k in range(sizes.jitter // 3)
     ]  # fmt: skip
     found += [Name(own, f"position {x}", "m", 1.0, f"position {x}") for x in TRACK]
     found += [Name(own, f"velocity {x}", "m/s", 1.0, f"velocity {x}") for x in TRACK]
     found += [Name(of, "focal length (relative)", "ppm", 1e6, "focal length")]
     found += [Name(of, f"mounting {x}", "arcsec", arcsec, f"mounting {x}") for x in TURNS]
-    for word, number in (("across", form.across), ("along", form.along)):
+    for word, number in (("across", sizes.look_across), ("along", sizes.look_along)):
         found += [
             Name(of, f"look angle {word}, û^{k}", "1e-6", 1e6, f"look angle {word}, û^{k}")
             for k in range(number)
         ]
     return found
-
-
-def of_sensor(form: Form) -> np.ndarray:
-    """Which numbers of an image's vector belong to its sensor."""
-    return np.repeat([name in OF_SENSOR for name in Change._fields], sizes(form))

@@ -1,68 +1,65 @@
-"""Cofactors, redundancy numbers and tests of a refinement; data snooping.
+"""The solution of a refinement, and its statistics in the order of its unknowns and rays."""
 
-With a row of J split into a (shared unknowns) and b (its point), ã = a − b·V⁻¹·W, Q = S⁻¹:
+import functools
 
-    h = ã·Q·ãᵀ + b·V⁻¹·bᵀ,    r = 1 − h,    w = (v/σ)/√r                 (Baarda, 1968)
-    Q_pp = V⁻¹ + V⁻¹·W·Q·Wᵀ·V⁻¹                                          points
-
-Snooping removes the observation with the greatest |w| above its critical value, an image point
-with both coordinates, adjusts again, and so on: one at a time, since a blunder spoils its
-neighbours. It keeps its row with weight zero.
-"""
-
-import dataclasses
-from collections.abc import Callable
-
-import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxbundle.errors import NotSolvedError
-from jaxbundle.leastsquares.distributions import critical_w
-from jaxbundle.leastsquares.reliability import UNCONTROLLED
-from jaxbundle.refinement.equations import System, Unknowns, compiled_rescaled
-from jaxbundle.refinement.solver import Reduced, normal, polished, solve
+from jaxbundle.leastsquares.problem import Problem, with_data
+from jaxbundle.leastsquares.rows import Values
+from jaxbundle.leastsquares.snooping import snoop
+from jaxbundle.leastsquares.solution import Solution, find_minimum
+from jaxbundle.leastsquares.stopping import converged
+from jaxbundle.refinement.declare import Declared
+from jaxbundle.refinement.weakness import weaknesses
+from jaxbundle.statistics.blunders import Removed
 
-Weak = Callable[[System, Unknowns], list[str]]
-"""Sentences on what is not determined."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Layout:
-    """Where the kinds of rows begin: image points, control coordinates, priors, exterior."""
-
-    image: slice
-    control: slice
-    prior: slice
-    exterior: slice
+ROUNDS, SAME = 10, 1e-9
+"""Solutions, each with the S of the one before, at most; an S that changes by less is the same."""
 
 
-@dataclasses.dataclass(frozen=True)
 class Inspection:
-    """Statistics at a solution; cofactors are to be multiplied by σ0².
+    """Statistics at a solution of the engine; cofactors are to be multiplied by σ0²."""
 
-    `v` = v/σ, `r` and `w` of every row (NaN without weight or where r is 0); `hat` its 1 − r.
-    """
-
-    system: System
-    unknowns: Unknowns
-    steps: int
-    v: Float[np.ndarray, " rows"]
-    r: Float[np.ndarray, " rows"]
-    w: Float[np.ndarray, " rows"]
-    cofactor: Float[np.ndarray, "m m"]
-    point_cofactor: Float[np.ndarray, "points 3 3"]
-    redundancy: int
+    def __init__(self, declared: Declared, solution: Solution, steps: int, removed=()):
+        self.declared, self.solution, self.steps = declared, solution, steps
+        self.removed = tuple(_named(declared, one) for one in removed)
 
     @property
-    def layout(self) -> Layout:
-        return layout_of(self.system)
+    def redundancy(self) -> int:
+        return self.solution.problem.counts.redundancy
 
     @property
     def sigma0(self) -> float:
         """σ0 a posteriori; 1 without redundancy."""
-        return float(np.sqrt(self.v @ self.v / self.redundancy)) if self.redundancy > 0 else 1.0
+        return self.solution.sigma0 if self.redundancy > 0 else 1.0
+
+    @functools.cached_property
+    def estimate(self) -> Float[np.ndarray, " m"]:
+        """The changes of the shared unknowns."""
+        return np.asarray(self._changes(self.solution.values))
+
+    @functools.cached_property
+    def cofactor(self) -> Float[np.ndarray, "m m"]:
+        """Of the shared unknowns."""
+        return self.solution.propagate(self._changes)
+
+    @functools.cached_property
+    def changes_at(self) -> dict[str, tuple[np.ndarray, ...]]:
+        """By table the numbers of its shared unknowns, their rows and directions."""
+        columns = enumerate(self.declared.columns)
+        at = [(c.table, (k, c.row, c.direction)) for k, c in columns]
+        return {t: tuple(np.array([x for u, x in at if u == t]).T) for t in dict(at)}
+
+    def _changes(self, values: Values) -> Float[Array, " m"]:
+        problem, found = self.declared.problem, jnp.zeros(len(self.declared.columns))
+        for t, (k, row, direction) in self.changes_at.items():
+            change = jax.vmap(problem.table(t).space.difference)(values[t], problem.data.start[t])
+            found = found.at[k].set(change[row, direction])
+        return found
 
     @property
     def sigma(self) -> Float[np.ndarray, " m"]:
@@ -70,60 +67,73 @@ class Inspection:
         return self.sigma0 * np.sqrt(np.diagonal(self.cofactor))
 
     @property
+    def point_cofactor(self) -> Float[np.ndarray, "points 3 3"]:
+        """Of the points along their axes."""
+        return self.solution.cofactor("point")
+
+    @property
     def point_sigma(self) -> Float[np.ndarray, "points 3"]:
         """σ of the points along their axes."""
-        return self.sigma0 * np.sqrt(np.diagonal(self.point_cofactor, axis1=1, axis2=2))
+        variance = np.diagonal(self.point_cofactor, axis1=1, axis2=2)
+        return self.sigma0 * np.sqrt(np.maximum(variance, 0))
+
+    @property
+    def positions(self) -> Float[np.ndarray, "points 3"]:
+        """Adjusted coordinates of the points."""
+        return np.asarray(self.solution.values["point"].position) + self.declared.given.origin
+
+    @functools.cached_property
+    def residuals(self) -> dict[int, Float[np.ndarray, "n r"]]:
+        """v of every set of observations in its unit, of those that were removed, too."""
+        problem, weight = self.solution.problem, self.declared.problem.data.weight
+        data = type(problem.data)(problem.data.start, problem.data.measured, weight)
+        found = Solution(with_data(problem, data), self.solution.values).residuals
+        unit = lambda o: np.where(np.asarray(weight[o]) > 0, weight[o], 1.0)
+        return {o: v / unit(o) for o, v in found.items()}
+
+    @property
+    def used(self) -> list[np.ndarray]:
+        """Which residuals of every set carry weight."""
+        return [np.asarray(w) > 0 for w in self.solution.problem.data.weight]
+
+    def rows(self, o: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """v, r, w of a set of observations, NaN where there is none, and what is removed."""
+        used, found = self.used[o], self.solution.reliability
+        tell = lambda x: np.where(used, x[o], np.nan)
+        return self.residuals[o], tell(found.redundancy), tell(found.w), ~used.any(1)
 
 
-@dataclasses.dataclass(frozen=True)
-class Blunder:
-    """A removed observation: kind, "image" or "control", its row of such, its |w|."""
+def adjust(declared: Declared, snooping: str, significance: float) -> Inspection:
+    """Solve, remove blunders if asked for, and look at the solution.
 
-    kind: str
-    row: int
-    test: float
+    **Raises:** `NotSolvedError` that says what is not determined."""
+    steps = 0
 
+    def again(problem: Problem, values: Values) -> Solution:
+        nonlocal steps
+        problem, _ = declared.rescaled(problem, values)
+        for _ in range(ROUNDS):
+            minimum = find_minimum(problem, values)
+            values, steps = minimum.values, steps + int(minimum.iterations)
+            problem, change = declared.rescaled(problem, values)
+            if not change > SAME:
+                break
+        found = Solution(problem, values)
+        _require_solved(declared, found, minimum, steps)
+        return found
 
-def layout_of(system: System) -> Layout:
-    """Where the kinds of rows begin."""
-    sizes = [2 * sum(len(rays.point) for rays in system.rays), 3 * len(system.X),
-             len(system.prior), 6 * len(system.frames)]  # fmt: skip
-    ends = np.cumsum([0, *sizes]).tolist()
-    return Layout(*(slice(a, b) for a, b in zip(ends, ends[1:])))
-
-
-def weights(system: System) -> Float[np.ndarray, " rows"]:
-    """1/σ of every row."""
-    parts = [np.asarray(rays.weight).ravel() for rays in system.rays]
-    parts += [np.asarray(system.control).ravel(), np.asarray(system.prior)]
-    parts += [np.asarray(rays.prior_weight) for rays in system.frames]
-    return np.concatenate(parts)
-
-
-def count_redundancy(system: System) -> int:
-    """Rows with weight less free unknowns."""
-    free = np.asarray(system.free)
-    observed = np.zeros(len(free), bool)
-    for rays in system.rays:
-        observed[np.asarray(rays.point)] |= (np.asarray(rays.weight) > 0).any(1)
-    unknown = (free > 0) & (observed[:, None] | (np.asarray(system.control) > 0))
-    return int((weights(system) > 0).sum() - len(system.prior) - unknown.sum())
+    found, removed = again(declared.problem, declared.problem.data.start), []
+    if snooping != "none":
+        found, removed = snoop(found, again, test=snooping, significance=significance)
+    return Inspection(declared, found, steps, removed)
 
 
-def adjust(system: System, start: Unknowns, weak: Weak) -> Inspection:
-    """Solve and inspect.
-
-    **Raises:** `NotSolvedError` that says, by `weak(system, unknowns)`, what is not determined.
-    """
-    redundancy = count_redundancy(system)
-    first = solve(system, start, jnp.asarray(float(redundancy)))
-    system = compiled_rescaled(system, first.unknowns)
-    found = solve(system, first.unknowns, jnp.asarray(float(redundancy)))
-    steps = int(first.steps + found.steps)
-    system, unknowns = polished(system, found.unknowns)
-    reduced, v = normal(system, unknowns)
-    if not np.isfinite(np.asarray(reduced.lower)).all() or redundancy < 0:
-        reasons = weak(system, found.unknowns)
+def _require_solved(declared, found: Solution, minimum, steps: int) -> None:
+    settled = bool(converged(minimum.termination))
+    if settled and found.determined and found.problem.counts.redundancy >= 0:
+        return
+    reasons = [w.sentence for w in weaknesses(declared, found)] if not found.determined else []
+    if reasons or settled:
         told = reasons[0] if reasons else "more unknowns than observations"
         if reasons[1:]:
             told += f", and {len(reasons) - 1} more directions"
@@ -131,85 +141,28 @@ def adjust(system: System, start: Unknowns, weak: Weak) -> Inspection:
             f"the adjustment is singular: {told}; hold some, give them a prior σ, or add points",
             reasons,
         )
-    if not bool(found.settled):
-        raise NotSolvedError(
-            f"the adjustment did not settle in {steps} steps; look at start values and "
-            "blunders"
-        )
-    return _inspect(system, unknowns, steps, reduced, v, redundancy)
+    raise NotSolvedError(
+        f"the adjustment did not settle in {steps} steps; look at start values and blunders"
+    )
 
 
-def _inspect(system, unknowns, steps, reduced, v, redundancy) -> Inspection:
-    h, Q, Qp = (np.asarray(x) for x in _hat(reduced))
-    used = weights(system) > 0
-    r = np.where(used, np.clip(1 - h, 0, 1), np.nan)
-    v = np.asarray(v)
-    with np.errstate(invalid="ignore"):
-        w = np.where(r > UNCONTROLLED, v / np.sqrt(np.where(r > UNCONTROLLED, r, 1.0)), np.nan)
-    free = np.asarray(system.free)
-    Qp = Qp * free[:, :, None] * free[:, None, :]
-    return Inspection(system, unknowns, steps, v, r, w, Q, Qp, redundancy)
-
-
-@eqx.filter_jit
-def _hat(reduced: Reduced):
-    J, Q, Vi = reduced.jacobian, reduced.cofactor, reduced.point_cofactor
-    h = jnp.einsum("rm,mn,rn->r", reduced.tilde, Q, reduced.tilde)
-    h += jnp.einsum("ri,rij,rj->r", J.point, Vi[J.of], J.point)
-    G = jnp.einsum("pij,pjm->pim", Vi, reduced.coupling)
-    return h, Q, Vi + jnp.einsum("pim,mn,pjn->pij", G, Q, G)
-
-
-def critical_value(found: Inspection, test: str, significance: float) -> float:
-    """The greatest |w| that is no blunder."""
-    tested = int(np.isfinite(found.w[: found.layout.control.stop]).sum())
-    return critical_w(test, significance, tested, found.redundancy, found.sigma0)
-
-
-def snoop(
-    found: Inspection, test: str, significance: float, weak: Weak, limit: int | None = None
-) -> tuple[Inspection, list[Blunder]]:
-    """Remove blunders, the worst first, until none is left (or `limit` of them)."""
-    removed = []
-    while found.redundancy >= 2 and (limit is None or len(removed) < limit):
-        worst = _worst(found)
-        if not worst.test > critical_value(found, test, significance):
-            break
-        removed.append(worst)
-        found = adjust(without(found.system, worst), found.unknowns, weak)
-    return found, removed
-
-
-def _worst(found: Inspection) -> Blunder:
-    w, rows = np.nan_to_num(np.abs(found.w)), found.layout
-    image = w[rows.image].reshape(-1, 2).max(1, initial=0.0)
-    control = w[rows.control]
-    if control.max(initial=0.0) > image.max(initial=0.0):
-        return Blunder("control", int(control.argmax()), float(control.max()))
-    return Blunder("image", int(image.argmax()), float(image.max(initial=0.0)))
-
-
-def without(system: System, blunder: Blunder) -> System:
-    """The system with the weight of an observation zero; a tie point left with one ray goes."""
-    if blunder.kind == "control":
-        control = np.array(system.control)
-        control.ravel()[blunder.row] = 0.0
-        return eqx.tree_at(lambda s: s.control, system, jnp.asarray(control))
-    sizes = [len(rays.point) for rays in system.rays]
-    tables = [np.array(rays.weight) for rays in system.rays]
-    points = [np.asarray(rays.point) for rays in system.rays]
-    flat, of = np.concatenate(tables), np.concatenate(points)
-    flat[blunder.row] = 0.0
-    p = of[blunder.row]
-    left = (of == p) & (flat > 0).any(1)
-    free = np.array(system.free)
-    if left.sum() < 2 and ((free[p] > 0) & (np.asarray(system.control)[p] == 0)).any():
-        flat[of == p] = 0.0
-        free[p] = 0.0
-    tables = [jnp.asarray(part) for part in np.split(flat, np.cumsum(sizes)[:-1])]
-    rays = [eqx.tree_at(lambda r: r.weight, r, w) for r, w in zip(system.rays, tables)]
-    scanners = len(system.scanners)
-    return dataclasses.replace(
-        system, scanners=tuple(rays[:scanners]), frames=tuple(rays[scanners:]),
-        free=jnp.asarray(free),
-    )  # fmt: skip
+def _named(declared: Declared, one) -> Removed:
+    """What snooping has removed, in words; rows of image points as `Refinement.image_points`,
+    others as in their sets (of control three for a point)."""
+    given, chosen = declared.given, declared.rays.points
+    part = next((p for p in declared.parts if p.set == one.set), None)
+    points, set = given.points, declared.problem.observations[one.set]
+    if part is not None:
+        place = np.argsort(np.argsort(declared.image, kind="stable"))
+        before = sum(len(p.rows) for p in declared.parts if p.set < one.set)
+        told = [f"point {points.id[chosen[part.point[r]]]} in image {given.ids[part.image[r]]}"
+                for r in one.rows]  # fmt: skip
+        name = told[0] if not told[1:] else f"either of {', '.join(told[:-1])} or {told[-1]}"
+        rows = [int(place[before + r]) for r in one.rows]
+        return Removed("image", rows[0], name, one.test, tuple(rows[1:]))
+    if set.kind.name == "control points":
+        p = declared.control[one.row]
+        name = f"{points.axis_names[one.residual]} of control point {points.id[chosen[p]]}"
+        return Removed("control", 3 * int(p) + one.residual, name, one.test)
+    a, b = (points.id[chosen[r[one.row]]] for r in set.rows)
+    return Removed("distance", one.row, f"distance {a}–{b}", one.test)

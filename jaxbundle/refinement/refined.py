@@ -42,7 +42,7 @@ def refined_image(image: PushbroomImage, form: Form, change: Change) -> Pushbroo
     moved = changed(image, form, change._replace(jitter=0 * change.jitter), image.middle_time)
     return PushbroomImage(
         Trajectory(_position(moved), _attitude(image, form, change)), image.times,
-        _optics(image, form, change), moved.mounting, no_offsets(), image.corrections,
+        _optics(image, change), moved.mounting, no_offsets(), image.corrections,
         image.lines, image.pixels,
     )  # fmt: skip
 
@@ -136,9 +136,9 @@ def _padded(function, rows):
     return np.asarray(function(np.asarray(rows)[np.minimum(np.arange(size), n - 1)]))[:n]
 
 
-def _optics(image, form, change) -> Optics:
+def _optics(image, change) -> Optics:
     """Optics of the same kind where there are such, else a table of angles."""
-    wanted = changed_optics(image, form, change)
+    wanted = changed_optics(image, change)
     base, e = image.optics, change.focal_length
     if isinstance(base, FocalLine):
         parameters = base.parameters

@@ -15,22 +15,15 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
 from jaxbundle.network.tables import Network, Observations
 from jaxbundle.pushbroom.image import PushbroomImage
-from jaxbundle.refinement.build import (
-    Columns,
-    Rays,
-    check_input,
-    check_near,
-    choose_rays,
-    make_columns,
-    make_system,
-)
+from jaxbundle.refinement.build import check_input, choose_rays, start_points
 from jaxbundle.refinement.check_points import CheckPoints, intersect
-from jaxbundle.refinement.equations import compiled_image_residuals, positions, vector_of
-from jaxbundle.refinement.freedom import change_of
-from jaxbundle.refinement.inspection import Blunder, Inspection, adjust, snoop
+from jaxbundle.refinement.declare import IMAGE, SENSOR, declare, gather
+from jaxbundle.refinement.freedom import Name, change_of
+from jaxbundle.refinement.inspection import Inspection, adjust
 from jaxbundle.refinement.refined import refined_image
 from jaxbundle.refinement.tables import GroundPoints, ScannerImage, with_frames
 from jaxbundle.refinement.weakness import weaknesses
+from jaxbundle.statistics.blunders import Removed
 from jaxbundle.statistics.correlation import correlation_matrix
 
 TESTS = ("none", "baarda", "pope")
@@ -38,21 +31,46 @@ TESTS = ("none", "baarda", "pope")
 
 @dataclasses.dataclass(frozen=True)
 class Refinement:
-    """The result: `inspection` holds the numbers, `columns` the names of the shared unknowns.
+    """The result: `inspection` holds the numbers of it."""
 
-    `rays`: which measurements took part, image by image in the order of `inspection`'s rows.
-    """
-
-    images: tuple[ScannerImage, ...]
-    points: GroundPoints
-    observations: Observations
-    frames: Network | None
-    columns: Columns
-    rays: Rays
     inspection: Inspection
-    removed: tuple[Blunder, ...]
     check: CheckPoints | None
     warnings: tuple[str, ...]
+
+    @property
+    def images(self) -> list[ScannerImage]:
+        """The scanner images as they were given."""
+        return self.inspection.declared.given.images
+
+    @property
+    def frames(self) -> Network | None:
+        """The photographs as they were given."""
+        return self.inspection.declared.given.frames
+
+    @property
+    def points(self) -> GroundPoints:
+        """All points as they were given, those of the photographs with them."""
+        return self.inspection.declared.given.points
+
+    @property
+    def point_ids(self) -> list[str]:
+        """The points that took part."""
+        return [self.points.id[k] for k in self.inspection.declared.rays.points]
+
+    @property
+    def names(self) -> list[Name]:
+        """Of the unknowns that points share."""
+        return [column.name for column in self.inspection.declared.columns]
+
+    @property
+    def prior_sigma(self) -> Float[np.ndarray, " m"]:
+        """σ of the priors of these; infinite: none."""
+        return np.array([column.sigma for column in self.inspection.declared.columns])
+
+    @property
+    def removed(self) -> tuple[Removed, ...]:
+        """What data snooping has removed, in the order of removal."""
+        return self.inspection.removed
 
     @property
     def sigma0(self) -> float:
@@ -67,7 +85,7 @@ class Refinement:
     @property
     def estimate(self) -> Float[np.ndarray, " m"]:
         """The changes of the shared unknowns, in the units of `freedom`."""
-        return np.asarray(self.inspection.unknowns.shared)
+        return self.inspection.estimate
 
     @property
     def covariance(self) -> Float[np.ndarray, "m m"]:
@@ -81,37 +99,43 @@ class Refinement:
 
     @property
     def positions(self) -> Float[np.ndarray, "points 3"]:
-        """Adjusted coordinates of the points of `rays.points`."""
-        return np.asarray(positions(self.inspection.system, self.inspection.unknowns))
+        """Adjusted coordinates of the points that took part."""
+        return self.inspection.positions
 
     def image(self, id: str) -> PushbroomImage:
         """A refined scanner image, for `locate`, `project` and the correction."""
         at = {one.id: k for k, one in enumerate(self.images)}
         if id not in at:
             raise InputError(f"no scanner image {id!r}; there are {', '.join(at)}")
-        k = at[id]
-        rays, form = self.inspection.system.scanners[k], self.columns.forms[k]
-        change = change_of(form, vector_of(rays, self.inspection.unknowns.shared))
-        return refined_image(self.images[k].image, form, change)
+        k, given = at[id], self.inspection.declared.given
+        values, form = self.inspection.solution.values, given.forms[k]
+        p = np.concatenate([values[IMAGE][k], values[SENSOR][given.sensor[k]]])
+        return refined_image(self.images[k].image, form, change_of(form.sizes, p))
 
     def image_points(self) -> list[dict]:
-        """A row for every image point that took part: ids, v, σ of it, r and w of both
+        """A row for every image point that took part, image by image: ids, v, r and w of both
         coordinates, whether it was removed."""
+        declared, ids = self.inspection.declared, self.inspection.declared.given.ids
+        rows = [
+            {"image": ids[i], "point": self.point_ids[p], "v": v, "r": r, "w": w, "removed": gone}
+            for part in declared.parts
+            for i, p, v, r, w, gone in zip(
+                part.image, part.point, *self.inspection.rows(part.set)
+            )
+        ]
+        return [rows[k] for k in np.argsort(declared.image, kind="stable")]
+
+    def distances(self) -> list[dict]:
+        """A row for every distance that took part: ids of both points, v, r, w, whether it was
+        removed."""
         found, rows = self.inspection, []
-        v = compiled_image_residuals(found.system, found.unknowns)
-        ids = [one.id for one in self.images]
-        ids += [] if self.frames is None else list(self.frames.images.id)
-        start = 0
-        for id, rays, residual in zip(ids, found.system.rays, v):
-            end = start + 2 * len(rays.point)
-            r, w = (x[start:end].reshape(-1, 2) for x in (found.r, found.w))
-            used = (np.asarray(rays.weight) > 0).any(1)
-            for k, p in enumerate(np.asarray(rays.point)):
-                rows.append({
-                    "image": id, "point": self.points.id[self.rays.points[p]],
-                    "v": np.asarray(residual)[k], "r": r[k], "w": w[k], "removed": not used[k],
-                })  # fmt: skip
-            start = end
+        for o, given in enumerate(found.declared.problem.observations):
+            if given.kind.name == "distances":
+                rows += [
+                    {"from": self.point_ids[a], "to": self.point_ids[b], "v": float(v[0]),
+                     "r": float(r[0]), "w": float(w[0]), "removed": bool(gone)}
+                    for a, b, v, r, w, gone in zip(*given.rows, *found.rows(o))
+                ]  # fmt: skip
         return rows
 
 
@@ -144,29 +168,13 @@ def refine(
     points = with_frames(points, frames)
     check_input(images, points, observations, frames)
     points = _checks_upright(points, images[0].earth)
-    columns = make_columns(images, frames)
     rays, check_rays, warnings = choose_rays(points, observations, frames)
-    if frames is not None and len(frames.distances):
-        warnings.append("distances of the photographs' project take no part")
-    system = make_system(images, points, observations, frames, columns, rays)
-    check_near(system, images, points, observations, rays)
-    weak = lambda system, unknowns: [
-        w.sentence for w in weaknesses(system, unknowns, columns)
-    ]
-    found, removed = adjust(system, system.start(), weak), []
-    if snooping != "none":
-        found, removed = snoop(found, snooping, significance, weak)
-    for sentence in weak(found.system, found.unknowns):
-        warnings.append(f"{sentence}; what keeps them apart are priors, if any")
-    check = None
-    if len(check_rays.points):
-        other = make_system(images, points, observations, frames, columns, check_rays)
-        check_near(other, images, points, observations, check_rays)
-        check = intersect(other, found, tuple(points.id[k] for k in check_rays.points))
-    return Refinement(
-        tuple(images), points, observations, frames, columns, rays, found, tuple(removed), check,
-        tuple(warnings),
-    )  # fmt: skip
+    given = gather(images, points, observations, frames)
+    found = adjust(declare(given, rays, start_points(given, rays)), snooping, significance)
+    for weak in weaknesses(found.declared, found.solution):
+        warnings.append(f"{weak.sentence}; what keeps them apart are priors, if any")
+    check = intersect(found, check_rays) if len(check_rays.points) else None
+    return Refinement(found, check, tuple(warnings))
 
 
 def _checks_upright(points: GroundPoints, earth: Ellipsoid | None) -> GroundPoints:

@@ -3,7 +3,6 @@
 import numpy as np
 
 from jaxbundle.leastsquares.reliability import minimal_detectable
-from jaxbundle.refinement.inspection import Blunder
 from jaxbundle.refinement.refining import Refinement
 
 STRONG = 0.9
@@ -15,7 +14,7 @@ MOST = 12
 def to_json(result: Refinement) -> dict:
     """The result as plain values: unknowns, correlations, points, image points, checks."""
     found = result.inspection
-    names = result.columns.names
+    names, prior = result.names, result.prior_sigma
     factor = np.array([name.factor for name in names])
     sigma = found.sigma
     document = {
@@ -26,7 +25,7 @@ def to_json(result: Refinement) -> dict:
              "sigma": s, "prior_sigma": None if np.isinf(p) else p}
             for n, value, s, p in zip(
                 names, (factor * result.estimate).tolist(), (factor * sigma).tolist(),
-                (factor * result.columns.sigma).tolist(),
+                (factor * prior).tolist(),
             )
         ],
         "correlation": result.correlation.tolist(),
@@ -35,8 +34,10 @@ def to_json(result: Refinement) -> dict:
             {**row, "v": row["v"].tolist(), "r": row["r"].tolist(), "w": row["w"].tolist()}
             for row in result.image_points()
         ],
-        "removed": [{"observation": describe(result, b), "test": b.test} for b in result.removed],
+        "removed": [{"observation": b.name, "test": b.test} for b in result.removed],
     }  # fmt: skip
+    if result.distances():
+        document["distances"] = result.distances()
     if result.check is not None:
         c = result.check
         document["check_points"] = [
@@ -49,7 +50,7 @@ def to_json(result: Refinement) -> dict:
 
 def _points(result):
     rows, sigma = [], result.inspection.point_sigma.tolist()
-    for k, X, s in zip(result.rays.points, result.positions.tolist(), sigma):
+    for k, X, s in zip(result.inspection.declared.rays.points, result.positions.tolist(), sigma):
         rows.append({
             "id": result.points.id[k], "role": result.points.role[k], "X": X, "sigma": s,
             "axes": list(result.points.axis_names),
@@ -57,22 +58,12 @@ def _points(result):
     return rows
 
 
-def describe(result: Refinement, blunder: Blunder) -> str:
-    """A removed observation in words."""
-    if blunder.kind == "control":
-        point, axis = divmod(blunder.row, 3)
-        id = result.points.id[result.rays.points[point]]
-        return f"{result.points.axis_names[axis]} of control point {id}"
-    row = result.image_points()[blunder.row]
-    return f"point {row['point']} in image {row['image']}"
-
-
 def report(result: Refinement) -> str:
     """The report: what was adjusted, warnings, unknowns, correlations, blunders, checks."""
     found = result.inspection
     rows = result.image_points()
     used = [row for row in rows if not row["removed"]]
-    roles = [result.points.role[k] for k in result.rays.points]
+    roles = [result.points.role[k] for k in result.inspection.declared.rays.points]
     counts = ", ".join(f"{roles.count(role)} {role}" for role in ("control", "tie"))
     frames = 0 if result.frames is None else len(result.frames.images)
     lines = [
@@ -98,7 +89,7 @@ def report(result: Refinement) -> str:
     lines += ["", "Image points with the greatest tests", *_tests(used)]
     if result.removed:
         lines += ["", "Removed as blunders"]
-        lines += [f"  {describe(result, b)}: |w| = {b.test:.1f}" for b in result.removed]
+        lines += [f"  {b.name}: |w| = {b.test:.1f}" for b in result.removed]
     if result.check is not None:
         lines += ["", *_checks(result)]
     return "\n".join(lines) + "\n"
@@ -112,7 +103,7 @@ def _unknowns(result):
     sigma = result.inspection.sigma
     yield f"  {'':46s} {'change':>13s} {'sigma':>11s} {'prior':>10s}"
     for name, value, s, p in zip(
-        result.columns.names, result.estimate, sigma, result.columns.sigma
+        result.names, result.estimate, sigma, result.prior_sigma
     ):
         prior = "free" if np.isinf(p) else f"{p * name.factor:.4g}"
         yield (
@@ -122,7 +113,7 @@ def _unknowns(result):
 
 
 def _correlations(result):
-    C, names = result.correlation, result.columns.names
+    C, names = result.correlation, result.names
     i, j = np.nonzero(np.triu(np.abs(C) > STRONG, 1))
     order = np.argsort(-np.abs(C[i, j]), kind="stable")[:MOST]
     return [f"  {C[a, b]:8.4f}  {names[a]} — {names[b]}" for a, b in zip(i[order], j[order])]

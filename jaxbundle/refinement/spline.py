@@ -49,14 +49,18 @@ class JitterSpline:
         full = np.linalg.qr(np.stack([np.ones_like(k), k], 1).astype(float), mode="complete")[0]
         return full[:, 2:]
 
-    def at(self, z: Float[Array, "3 unknowns"], t: Float[Array, ""]) -> Float[Array, "3"]:
-        """s(t) of three axes."""
+    def at(self, z: Float[Array, "3 k"], t: Float[Array, ""]) -> Float[Array, "3"]:
+        """s(t) of three axes; z may have more columns than there are unknowns."""
+        return z[:, : self.unknowns] @ self.weights(t)
+
+    def weights(self, t: Float[Array, ""]) -> Float[Array, " unknowns"]:
+        """How much of every z is in s(t)."""
         if not self.intervals:
-            return jnp.zeros(3)
+            return jnp.zeros(0)
         x = jnp.abs((t - self.centres) / self.spacing)
         near = 2 / 3 - x**2 + x**3 / 2
         far = jnp.maximum(2 - x, 0.0) ** 3 / 6
-        return z @ (self.basis.T @ jnp.where(x < 1, near, far))
+        return self.basis.T @ jnp.where(x < 1, near, far)
 
 
 def make_spline(first: float, last: float, spacing: float) -> JitterSpline:

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -9,7 +10,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.network.tables import Network, Observations, Source
 from jaxbundle.pushbroom.image import PushbroomImage
-from jaxbundle.pushbroom.interpolation import Table, covers, interval
+from jaxbundle.pushbroom.interpolation import covers, interval
 from jaxbundle.refinement.freedom import Freedom
 
 ROLES = ("control", "tie", "check")
@@ -122,16 +123,21 @@ def check_observations(
             raise InputError(f"{where} is measured twice, also at "
                              f"{observations.source(seen[i, p])}; leave one")
         seen[i, p] = row
-        t = float(one.image.times.time(observations.xy[row, 0]))
-        _check_time(one.image.trajectory.position, t, "positions", where)
-        _check_time(one.image.trajectory.attitude.table, t, "attitude", where)
-
-
-def _check_time(table: Table, t: float, what: str, where: str) -> None:
-    if not bool(covers(table, interval(table, t), t)):
-        first, last = float(table.times[0]), float(table.times[-1])
-        wrong = "in a gap of" if first <= t <= last else "outside"
-        raise InputError(
-            f"{where}: its line is at {t:.9g} s, {wrong} the table of {what}, {first:.9g} to "
-            f"{last:.9g} s; give ancillary data for the whole image, or leave the point out"
-        )
+    for i, one in enumerate(images):
+        rows = np.flatnonzero(observations.image == i)
+        t = one.image.times.time(jnp.asarray(observations.xy[rows, 0]))
+        tables = ("positions", one.image.trajectory.position), (
+            "attitude", one.image.trajectory.attitude.table,
+        )  # fmt: skip
+        for what, table in tables:
+            out = ~np.asarray(covers(table, interval(table, t), t))
+            if out.any():
+                row, at = rows[out.argmax()], float(t[out.argmax()])
+                first, last = float(table.times[0]), float(table.times[-1])
+                wrong = "in a gap of" if first <= at <= last else "outside"
+                raise InputError(
+                    f"{observations.source(row)}: point {points.id[observations.point[row]]!r} in "
+                    f"image {one.id!r}: its line is at {at:.9g} s, {wrong} the table of {what}, "
+                    f"{first:.9g} to {last:.9g} s; give ancillary data for the whole image, or "
+                    "leave the point out"
+                )

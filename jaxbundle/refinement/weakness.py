@@ -1,19 +1,20 @@
 """What the points cannot determine, in words.
 
-The normal matrix of image points and control alone, without priors, reduced to the shared unknowns
-and scaled by its diagonal before the elimination of points, has the eigenvalue 1/k for a direction
+The normal matrix of all observations but the priors of the shared unknowns, reduced to these and
+scaled by its diagonal before the elimination of points, has the eigenvalue 1/k for a direction
 in which k times more is unknown than if every unknown were alone. Eigenvectors of small eigenvalues
 are named by the unknowns that have part in them: pitch bias against position along track.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxbundle.refinement.build import Columns
-from jaxbundle.refinement.equations import System, Unknowns
-from jaxbundle.refinement.inspection import layout_of
-from jaxbundle.refinement.solver import normal
+from jaxbundle.leastsquares.names import kept_unknowns, place_of, scaled_system, undetermined
+from jaxbundle.leastsquares.problem import with_data
+from jaxbundle.leastsquares.solution import Solution
+from jaxbundle.refinement.declare import Declared
 
 WEAK = 1e-2
 """Eigenvalues below this: a σ more than ten times greater than of the unknown alone."""
@@ -33,21 +34,25 @@ class Weakness(NamedTuple):
     sentence: str
 
 
-def weaknesses(system: System, unknowns: Unknowns, columns: Columns) -> list[Weakness]:
+def weaknesses(declared: Declared, found: Solution) -> list[Weakness]:
     """All weak directions, the weakest first; jitter is one for its axis."""
-    S = _observed(system, unknowns)
+    S, names = _observed(declared, found)
+    if not np.isfinite(S).all():
+        vague = undetermined(found.problem, found.values)
+        sentence = f"the points do not determine {', '.join(vague[:MOST])}"
+        return [Weakness(0.0, tuple(vague), sentence)]
     values, vectors = np.linalg.eigh(S)
-    found, jitter = [], set()
+    weak, jitter = [], set()
     for value, vector in zip(values, vectors.T):
         if value >= WEAK:
             break
-        shares = _shares(vector, columns)
+        shares = _shares(vector, names)
         named = [name for name, share in shares if share >= PART * shares[0][1]][:MOST]
         if " jitter of " in named[0]:
             # many directions of one spline: one sentence
             jitter.add((named[0], value < NULL))
             continue
-        found.append(Weakness(float(value), tuple(named), _sentence(named, value)))
+        weak.append(Weakness(float(value), tuple(named), _sentence(named, value)))
     for name in sorted({name for name, _ in jitter}):
         none = (name, True) in jitter
         value = 0.0 if none else float(values[0])
@@ -55,8 +60,8 @@ def weaknesses(system: System, unknowns: Unknowns, columns: Columns) -> list[Wea
             f"the points leave parts of the {name} undetermined; knots farther apart or more "
             "points would, its prior holds it meanwhile"
         )
-        found.append(Weakness(value, (name,), sentence))
-    return found
+        weak.append(Weakness(value, (name,), sentence))
+    return weak
 
 
 def _sentence(named, value):
@@ -69,29 +74,28 @@ def _sentence(named, value):
     return f"{text} (σ {1 / np.sqrt(value):.2g} times as large as of one alone)"
 
 
-def _shares(vector, columns):
+def _shares(vector, names):
     """Names of unknowns with the part of the vector they have, the largest first."""
     total = {}
-    for part, name in zip(vector, columns.names):
+    for part, name in zip(vector, names):
         word = f"{name.group} of {name.owner}"
         total[word] = total.get(word, 0.0) + part**2
     return sorted(((n, float(np.sqrt(s))) for n, s in total.items()), key=lambda x: -x[1])
 
 
-def _observed(system, unknowns):
-    """The scaled reduced normal matrix of image points, control and given orientations."""
-    reduced, _ = normal(system, unknowns)
-    A, B, of = (np.asarray(x) for x in (
-        reduced.jacobian.shared, reduced.jacobian.point, reduced.jacobian.of
-    ))
-    keep = np.ones(len(A), bool)
-    keep[layout_of(system).prior] = False
-    A, B, of = A[keep], B[keep], of[keep]
-    V, W = np.zeros((len(system.X), 3, 3)), np.zeros((len(system.X), 3, A.shape[1]))
-    np.add.at(V, of, B[:, :, None] * B[:, None, :])
-    np.add.at(W, of, B[:, :, None] * A[:, None, :])
-    N = A.T @ A
-    diagonal = np.diagonal(N)
-    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    S = N - np.einsum("pim,pij,pjn->mn", W, np.linalg.pinv(V, 1e-13, hermitian=True), W)
-    return S * scale * scale[:, None]
+def _observed(declared: Declared, found: Solution):
+    """The scaled reduced normal matrix without priors, of the shared unknowns, and their names;
+    points that distances keep in the engine's reduced system are eliminated here."""
+    priors = [given.kind.snooped == "" and given.kind.of != ("image",)
+              for given in found.problem.observations]  # fmt: skip
+    weight = tuple(0 * w if p else w for w, p in zip(found.problem.data.weight, priors))
+    data = dataclasses.replace(found.problem.data, weight=weight)
+    problem = with_data(found.problem, data)
+    S = scaled_system(problem, found.values)[0]
+    columns = {(c.table, c.row, c.direction): c.name for c in declared.columns}
+    places = [place_of(problem, *at) for at in kept_unknowns(problem)]
+    kept = np.array([place in columns for place in places])
+    points = np.array([place[0] == "point" for place in places])
+    cross = S[np.ix_(kept, points)]
+    less = cross @ np.linalg.pinv(S[np.ix_(points, points)], 1e-13, hermitian=True) @ cross.T
+    return S[np.ix_(kept, kept)] - less, [columns[p] for p, k in zip(places, kept) if k]

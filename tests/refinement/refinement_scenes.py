@@ -56,7 +56,7 @@ def ground(image, form, p, heights, places):
     """The ground points that places show, p the vector of the image's true changes."""
 
     def one(h, place):
-        moved = changed(image, form, change_of(form, p), image.times.time(place[0]))
+        moved = changed(image, form, change_of(form.sizes, p), image.times.time(place[0]))
         return jnp.stack(locate_point(moved, Height(h, WGS84), *place))
 
     return jax.vmap(one)(heights, places)

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,7 +10,6 @@ from refinement_scenes import (
     ARCSEC,
     COUNT,
     FREEDOM,
-    JITTER,
     SIGMA,
     control,
     ground,
@@ -24,11 +23,10 @@ from refinement_scenes import (
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.pushbroom.corrections import Corrections
-from jaxbundle.refinement import FREE, Freedom, line_residual, refine, report, to_json
-from jaxbundle.refinement.build import choose_rays, make_columns, make_system
-from jaxbundle.refinement.freedom import make_form, names
-from jaxbundle.refinement.inspection import count_redundancy
-from jaxbundle.refinement.solver import normal, solve
+from jaxbundle.pushbroom.project import misclosure
+from jaxbundle.refinement import FREE, Freedom, refine, report, to_json
+from jaxbundle.refinement.freedom import make_form, of_one_size
+from jaxbundle.refinement.kinds import ScannerPoint, lines_of
 
 pytestmark = pytest.mark.xdist_group("refinement")
 
@@ -66,61 +64,13 @@ def true_unknowns(form):
 
 
 def test_bias_drift_and_jitter_of_1_hz_come_back_within_3_sigma(refined):
-    truth = true_unknowns(refined.columns.forms[0])
+    truth = true_unknowns(refined.inspection.declared.given.forms[0])
     error = np.abs(refined.estimate - truth)
-    assert len(truth) == 6 + 2 * refined.columns.forms[0].spline.unknowns
+    assert len(truth) == 6 + 2 * refined.inspection.declared.given.forms[0].spline.unknowns
     assert (error < 3 * np.maximum(refined.inspection.sigma, 0)).all()
     # the biases are determined far better than they were wrong
     assert (refined.inspection.sigma[:2] < 0.1 * np.abs(BIAS[:2])).all()
     assert 0.75 < refined.sigma0 < 1.25
-
-
-def test_redundancy_numbers_sum_up_to_the_redundancy(refined):
-    found = refined.inspection
-    assert np.isclose(np.nansum(found.r), refined.redundancy, atol=1e-6)
-    jitter = len(refined.columns.names) - 6
-    assert refined.redundancy == 2 * COUNT + jitter - len(refined.columns.names)
-
-
-def test_cofactors_and_tests_against_dense_numpy(refined):
-    reduced, v = normal(refined.inspection.system, refined.inspection.unknowns)
-    A, v = np.asarray(reduced.jacobian.shared), np.asarray(v)
-    Q = np.linalg.inv(A.T @ A)
-    assert np.allclose(refined.inspection.cofactor, Q, rtol=1e-6, atol=1e-9 * Q.max())
-    used = np.isfinite(refined.inspection.w)
-    r = 1 - np.einsum("ri,ij,rj->r", A, Q, A)
-    assert np.allclose(refined.inspection.w[used], (v / np.sqrt(np.abs(r)))[used], rtol=1e-5)
-
-
-def test_sigma_is_honest():
-    """60 draws of jitter (from its prior), bias, drift and noise: errors as Q says."""
-    rng = np.random.default_rng(11)
-    one = scanner()
-    form, columns = make_form(one.image, one.earth, FREEDOM), make_columns([one], None)
-    places, heights = spread(rng)
-    X = np.asarray(ground(one.image, form, np.zeros(len(columns.scanners[0])), heights, places))
-    observations = measured(places, rng)
-    points = control(X)
-    rays, *_ = choose_rays(points, observations, None)
-    system = make_system([one], points, observations, None, columns, rays)
-    redundancy = jnp.asarray(float(count_redundancy(system)))
-    m, draws = len(columns.names), 60
-    squares, normed = [], []
-    for _ in range(draws):
-        truth = JITTER * rng.normal(size=m)
-        X = ground(one.image, form, np.r_[truth, 0][columns.scanners[0]], heights, places)
-        noisy = places + SIGMA * rng.normal(size=places.shape)
-        drawn = eqx.tree_at(lambda s: (s.X, s.scanners[0].place), system, (X, jnp.asarray(noisy)))
-        found = solve(drawn, drawn.start(), redundancy)
-        assert bool(found.settled)
-        error = np.asarray(found.unknowns.shared) - truth
-        Q = np.asarray(normal(drawn, found.unknowns)[0].cofactor)
-        squares.append(error @ np.linalg.solve(Q, error))
-        normed.append(error / np.sqrt(np.diagonal(Q)))
-    # the mean of χ² of m degrees of freedom: sampling error √(2/(m·draws)) of it
-    assert abs(np.mean(squares) / m - 1) < 3 * np.sqrt(2 / (m * draws))
-    rms = np.sqrt(np.mean(np.square(normed), 0))
-    assert (np.abs(rms - 1) < 4 / np.sqrt(2 * draws)).all()
 
 
 def test_blunders_are_found_and_nothing_else(with_jitter):
@@ -143,25 +93,26 @@ def test_the_refined_image_sees_the_points_where_they_are(with_jitter, refined):
     """The image as written, slerp and all, against the adjusted residuals."""
     X, observations = with_jitter
     image = refined.image("A")
-    still = make_form(image, WGS84, Freedom())
     v = np.array([row["v"] for row in refined.image_points()])
-    n = 3 * 4 + 4
     g = np.array([
-        line_residual(image, WGS84, still, jnp.zeros(n), jnp.asarray(x), jnp.asarray(place))
-        for x, place in zip(X[:6], observations.xy[:6])
+        misclosure(image, x, image.times.time(line), pixel, WGS84)
+        for x, (line, pixel) in zip(X[:6], observations.xy[:6])
     ])
-    scale = np.asarray(refined.inspection.system.scanners[0].scale)[:6]
+    scale = refined.inspection.solution.problem.data.measured[0].scale[:6]
     assert np.allclose(np.einsum("nij,nj->ni", scale, g), v[:6], atol=2e-3)
 
 
 @pytest.mark.parametrize("switch", [Corrections(), Corrections(True, True, True)])
 def test_the_residual_of_what_is_located_is_zero(switch):
     image = satellite(switch)
-    form = make_form(image, WGS84, FREEDOM)
-    p = 1e-4 * np.random.default_rng(3).normal(size=len(names(form, "A", "A")))
+    form, = of_one_size([make_form(image, WGS84, FREEDOM)])
+    p = 1e-4 * np.random.default_rng(3).normal(size=sum(form.sizes))
     places, heights = np.array([[120.3, 600.2]]), np.array([350.0])
     X = ground(image, form, p, heights, places)
-    g = eqx.filter_jit(line_residual)(image, WGS84, form, jnp.asarray(p), X[0], places[0])
+    kind, origin = ScannerPoint(switch, WGS84, form.sizes), np.zeros(3)
+    line, _ = lines_of(kind, image, form, origin, *np.split(p, [form.own]), X, places)
+    line = jax.tree.map(lambda x: jnp.asarray(x[0]), line)
+    g = kind.misclosure(*np.split(p, [form.own]), X[0], line)
     # a pixel is 4e-5
     assert np.abs(g).max() < (1e-9 if switch.any else 1e-13)
 

@@ -28,7 +28,7 @@ from jaxbundle.io.scanner_writing import write_scanner_image
 from jaxbundle.pushbroom.image import pose_at
 from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable
 from jaxbundle.refinement import Freedom, refine
-from jaxbundle.refinement.freedom import change_of, changed, make_form, names
+from jaxbundle.refinement.freedom import change_of, changed, make_form
 from jaxbundle.refinement.refined import refined_image
 
 pytestmark = pytest.mark.xdist_group("refinement")
@@ -120,8 +120,8 @@ def test_a_refined_image_is_read_as_it_was(tmp_path, kind):
     look = (1e-6,) * 3 if kind != "focal" else ()
     freedom = Freedom(jitter=FREEDOM.jitter, look_across=look, look_along=look)
     form = make_form(image, WGS84, freedom)
-    p = 1e-5 * np.random.default_rng(1).normal(size=len(names(form, "A", "A")))
-    change = change_of(form, jnp.asarray(p))
+    p = 1e-5 * np.random.default_rng(1).normal(size=sum(form.sizes))
+    change = change_of(form.sizes, jnp.asarray(p))
     new = refined_image(image, form, change)
     read = read_scanner(write_scanner_image(tmp_path, "new", new, WGS84)).image
     assert type(read.optics) is type(image.optics)

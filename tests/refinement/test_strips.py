@@ -78,19 +78,20 @@ def found(strips):
 
 def test_mounting_and_focal_length_of_both_strips_are_one(strips, found):
     X = strips[-1]
-    names = [str(name) for name in found.columns.names]
+    names = [str(name) for name in found.names]
     assert names.count("mounting pitch of sensor imager") == 1
     assert names.count("pitch bias of image north") == names.count("pitch bias of image south") == 1
-    sensor = [k for k, name in enumerate(found.columns.names) if name.owner == "sensor imager"]
+    sensor = [k for k, name in enumerate(found.names) if name.owner == "sensor imager"]
     truth = dict(zip(("mounting pitch", "mounting roll", "mounting yaw"), MOUNTING))
     truth["focal length (relative)"] = FOCAL
     for k in sensor:
-        error = found.estimate[k] - truth[found.columns.names[k].parameter]
+        error = found.estimate[k] - truth[found.names[k].parameter]
         assert abs(error) < 3.5 * found.inspection.sigma[k]
         assert found.inspection.sigma[k] < 2e-3
     assert 0.7 < found.sigma0 < 1.3
     # tie points had no coordinates: they began where their rays met
-    error = (found.positions - X[found.rays.points]) / found.inspection.point_sigma
+    chosen = found.inspection.declared.rays.points
+    error = (found.positions - X[chosen]) / found.inspection.point_sigma
     assert 0.7 < np.sqrt(np.mean(error**2)) < 1.4
 
 
@@ -98,7 +99,7 @@ def test_control_coordinates_with_sigma_are_tested_too(strips, found):
     X = strips[-1]
     removed = [(b.kind, b.row) for b in found.removed]
     assert removed == [("control", 3 * 2 + 1)]
-    at = int(np.flatnonzero(found.rays.points == 2)[0])
+    at = int(np.flatnonzero(found.inspection.declared.rays.points == 2)[0])
     assert abs(found.positions[at, 1] - X[2, 1]) < 1.0
     assert "Y of control point P2" in report(found)
 

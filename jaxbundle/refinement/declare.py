@@ -1,0 +1,332 @@
+"""A refinement as tables of unknowns and sets of observations for the engine.
+
+Corrections of scanner images are a table, those of what belongs to their sensors another; the
+photographs with their cameras, priors and distances are declared as in a network.
+"""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.declarations import Table
+from jaxbundle.leastsquares.problem import Problem, make_problem, with_data
+from jaxbundle.leastsquares.rows import Values
+from jaxbundle.leastsquares.spaces import Vector
+from jaxbundle.network.declare import declare as declare_network
+from jaxbundle.network.tables import EXTERIOR, Distances, Network, Observations, Points
+from jaxbundle.refinement import kinds
+from jaxbundle.refinement.freedom import Form, Name, make_form, names, of_one_size, priors
+from jaxbundle.refinement.tables import GroundPoints, ScannerImage
+
+ARCSEC = math.degrees(1) * 3600
+IMAGE, SENSOR = "scanner image", "sensor"
+FAR = 2.0
+"""A point farther from its measurement than this many images is in another place."""
+
+
+class Rays(NamedTuple):
+    """Which measurements an adjustment uses: rows of the two tables, and the points of them."""
+
+    scanner: Int[np.ndarray, " rows"]
+    frame: Int[np.ndarray, " rows"]
+    points: Int[np.ndarray, " points"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Given:
+    """What is refined: scanner images with the forms of their unknowns and the row of each one's
+    sensor; points, measurements, photographs, and the row of each point of theirs; the `origin`
+    [3] of all coordinates of the engine."""
+
+    images: list[ScannerImage]
+    points: GroundPoints
+    observations: Observations
+    frames: Network | None
+    forms: list[Form]
+    sensor: Int[np.ndarray, " images"]
+    frame_point: Int[np.ndarray, " points"]
+    origin: Float[np.ndarray, "3"]
+
+    @property
+    def ids(self) -> list[str]:
+        """Of all images, photographs after scanner images."""
+        frames = () if self.frames is None else self.frames.images.id
+        return [*(one.id for one in self.images), *frames]
+
+    def kind(self, i: int) -> kinds.ScannerPoint:
+        """The equations of an image."""
+        one = self.images[i]
+        return kinds.ScannerPoint(one.image.corrections, one.earth, self.forms[i].sizes)
+
+    def lines(self, i: int, values: Values, X, rows) -> tuple[kinds.Line, np.ndarray]:
+        """Of rows of the measurements in image i, of points X: what belongs to their places, and
+        v."""
+        p = values[IMAGE][i], values[SENSOR][self.sensor[i]]
+        one, places = self.images[i].image, self.observations.xy[rows]
+        return kinds.lines_of(self.kind(i), one, self.forms[i], self.origin, *p, X, places)
+
+
+def gather(images, points: GroundPoints, observations, frames: Network | None) -> Given:
+    """The forms of the unknowns, the sensors, the origin."""
+    forms = of_one_size([make_form(one.image, one.earth, one.freedom) for one in images])
+    sensors = list(dict.fromkeys(map(sensor_of, images)))
+    sensor = np.array([sensors.index(sensor_of(one)) for one in images])
+    at = {id: k for k, id in enumerate(points.id)}
+    of_frames = [] if frames is None else [at[id] for id in frames.points.id]
+    # Corrections are of Earth-fixed places.
+    absolute = any(one.image.corrections.any for one in images)
+    known = points.X[np.isfinite(points.X).all(1)]
+    origin = np.zeros(3) if absolute or not len(known) else np.round(known.mean(0))
+    return Given(images, points, observations, frames, forms, sensor,
+                 np.array(of_frames, int), origin)  # fmt: skip
+
+
+def sensor_of(one: ScannerImage) -> str:
+    """The name of the sensor of an image, its own if it shares none."""
+    return one.sensor or one.id
+
+
+class Part(NamedTuple):
+    """Image points: their set among the engine's; whether it is of scanner images; of each the row
+    in its table of measurements, the image (as in `Given.ids`), the point among those used."""
+
+    set: int
+    of_scanner: bool
+    rows: Int[np.ndarray, " n"]
+    image: Int[np.ndarray, " n"]
+    point: Int[np.ndarray, " n"]
+
+
+class Column(NamedTuple):
+    """An unknown that points share: its name, the σ of its prior (inf: none), and where it is among
+    the changes of the tables."""
+
+    name: Name
+    sigma: float
+    table: str
+    row: int
+    direction: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Declared:
+    """A refinement as the engine's problem, with the rays it uses. `control`: of the rows of
+    control points, the point among those used; `cameras`: by id, the table and row of each."""
+
+    given: Given
+    rays: Rays
+    problem: Problem
+    parts: tuple[Part, ...]
+    columns: tuple[Column, ...]
+    control: Int[np.ndarray, " control"]
+    cameras: dict[str, tuple[str, int]]
+
+    @property
+    def image(self) -> Int[np.ndarray, " rays"]:
+        """The images of all image points, set by set."""
+        return np.concatenate([part.image for part in self.parts])
+
+    def image_by_image(self, by_part) -> np.ndarray:
+        """What belongs to the image points of every part, in the order of the images."""
+        return np.concatenate(list(by_part))[np.argsort(self.image, kind="stable")]
+
+    @property
+    def number_of_rays(self) -> Int[np.ndarray, " points"]:
+        """Of the points used."""
+        points = np.concatenate([part.point for part in self.parts])
+        return np.bincount(points, minlength=len(self.rays.points))
+
+    def rescaled(self, problem: Problem, values: Values) -> tuple[Problem, float]:
+        """The problem with the S of these values, and the largest relative change of one."""
+        measured, X, change = list(problem.data.measured), np.asarray(values["point"].position), 0.0
+        for part in self.parts:
+            if part.of_scanner:
+                lines, _ = _lines(self.given, values, X, part.rows, part.image, part.point)
+                before, measured[part.set] = np.asarray(measured[part.set].scale), lines
+                size = np.abs(before).max((1, 2), keepdims=True)
+                change = max(change, float((np.abs(lines.scale - before) / size).max()))
+        data = dataclasses.replace(problem.data, measured=tuple(measured))
+        return with_data(problem, data), change
+
+
+def _lines(given: Given, values: Values, X, rows, image, point):
+    """`Given.lines` of rows that are sorted by their images."""
+    found = [
+        given.lines(i, values, X[point[image == i]], rows[image == i]) for i in np.unique(image)
+    ]
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *found)
+
+
+def declare(given: Given, rays: Rays, X, values: Values | None = None) -> Declared:
+    """The tables and observations of a refinement.
+
+    **Arguments:** `X`: start values of the points of the rays; `values`: of all other tables, where
+    these are adjusted already and points are to be compared with them: then there is no control and
+    no distance, and what has one ray keeps its height.
+
+    **Raises:** `InputError` for points far from where they are measured."""
+    points, chosen, n = given.points, rays.points, len(rays.points)
+    checking = values is not None
+    index = np.full(len(points), -1)
+    index[chosen] = np.arange(n)
+    X = X - given.origin
+    corrections, columns = _corrections(given)
+    tables = [table for table, _ in corrections]
+    values = values or {t.name: t.value for t in tables}
+    observed, parts, of_cameras = [], [], {}
+    measured, sigma = given.observations, given.observations.sigma
+    for kind in dict.fromkeys(map(given.kind, range(len(given.images)))):
+        mine = np.array([given.kind(i) == kind for i in range(len(given.images))])
+        rows = rays.scanner[mine[measured.image[rays.scanner]]]
+        rows = rows[np.argsort(measured.image[rows], kind="stable")]
+        if not len(rows):
+            continue
+        image, point = measured.image[rows], index[measured.point[rows]]
+        lines, v = _lines(given, values, X, rows, image, point)
+        _check_near(given, rows, v)
+        parts.append(Part(len(observed), True, rows, image, point))
+        touched = image, given.sensor[image], point
+        observed.append(kinds.scanner_points(kind)(touched, lines, sigma=sigma[rows]))
+    if given.frames is not None:
+        network = _network_of(given, rays, index, X + given.origin, checking)
+        photographs = declare_network(network, given.origin)
+        for k, s in enumerate(photographs.layout.sets):
+            if s.field == "image":
+                rows = np.arange(len(rays.frame)) if s.rows is None else s.rows
+                image, point = network.observations.image[rows], network.observations.point[rows]
+                image = image + len(given.images)
+                parts.append(Part(len(observed) + k, False, rays.frame[rows], image, point))
+        observed += photographs.observations
+        tables += [t for t in photographs.tables if t.name != "point"]
+        of_cameras = {
+            network.cameras[c].id: (t.name, row)
+            for t in photographs.layout.cameras for row, c in enumerate(t.cameras)
+        }  # fmt: skip
+        columns += _columns_of_photographs(network, tables, of_cameras)
+    seen = np.bincount(np.concatenate([part.point for part in parts]), minlength=n)
+    table, control, at = _points(given, chosen, X, seen)
+    if not checking:
+        observed += control
+        for t, prior in corrections:
+            if np.isfinite(prior).any():
+                observed.append(kinds.priors(t.name)((np.arange(t.rows),), sigma=prior))
+        if not columns:
+            raise InputError(
+                "refine: every unknown is held; free some, such as attitude = \"free\" in "
+                "[unknowns]"
+            )
+    tables = [dataclasses.replace(t, value=values.get(t.name, t.value)) for t in tables]
+    eliminate = "point" if table.free.any() else None
+    problem = make_problem([*tables, table], observed, eliminate)
+    return Declared(given, rays, problem, tuple(parts), tuple(columns), at, of_cameras)
+
+
+def _corrections(given: Given):
+    """The tables of corrections, each with the σ of its priors (inf: none), and their unknowns."""
+    images, own = given.images, given.forms[0].own
+    sigma = np.stack([priors(form, one.freedom) for form, one in zip(given.forms, images)])
+    first = np.unique(given.sensor, return_index=True)[1]
+    of_sensor = sigma[first, own:]
+    for i, row in enumerate(given.sensor):
+        absent = np.isnan(of_sensor[row])
+        of_sensor[row, absent] = sigma[i, own:][absent]
+    named = [names(f.sizes, one.id, sensor_of(one)) for f, one in zip(given.forms, images)]
+    tables, columns = [], [[] for _ in images]
+    own_part = (IMAGE, sigma[:, :own], range(len(images)), 0)
+    for title, sigma, of, start in (own_part, (SENSOR, of_sensor, first, own)):
+        sigma = np.nan_to_num(sigma, nan=0.0, posinf=np.inf)
+        moving = np.flatnonzero((sigma > 0).any(0)).tolist()
+        space, free = Vector(sigma.shape[1], tuple(moving)), sigma[:, moving] > 0
+        labels = [images[i].id if title == IMAGE else sensor_of(images[i]) for i in of]
+        words = tuple(named[0][start + k].parameter for k in moving)
+        table = Table(title, np.zeros(sigma.shape), space, free, labels, words)
+        tables.append((table, np.where(sigma > 0, sigma, np.inf)))
+        for row, i in enumerate(of):
+            columns[i] += [
+                Column(named[i][start + k], float(sigma[row, k]), title, row, d)
+                for d, k in enumerate(moving) if free[row, d]
+            ]  # fmt: skip
+    return tables, [column for of_image in columns for column in of_image]
+
+
+def _points(given: Given, chosen, X, seen):
+    """The table of points, observations of the controlled ones, and which these are."""
+    points, role = given.points, np.array(given.points.role, dtype=object)[chosen]
+    sigma = np.nan_to_num(points.sigma[chosen], nan=0.0, posinf=np.inf)
+    control = (role == "control")[:, None]
+    free = ~(control & (sigma == 0))
+    free[(role == "check") & (seen < 2), 2] = False
+    placed = kinds.Placed(X, points.axes[chosen])
+    labels = [points.id[k] for k in chosen]
+    table = Table("point", placed, kinds.AlongAxes(), free, labels, points.axis_names)
+    weighted = control & (sigma > 0) & np.isfinite(sigma)
+    at = np.flatnonzero(weighted.any(1))
+    if not len(at):
+        return table, [], at
+    sigma = np.where(weighted, sigma, np.inf)[at]
+    measured = kinds.Placed(*(x[at] for x in placed))
+    return table, [kinds.control(points.axis_names)((at,), measured, sigma=sigma)], at
+
+
+def _network_of(given: Given, rays: Rays, index, X, checking: bool) -> Network:
+    """The photographs with the points and rays used; control is declared here (`_points`)."""
+    frames, n = given.frames, len(X)
+    used = list(dict.fromkeys(frames.images.camera.tolist()))
+    camera = np.array([used.index(c) for c in frames.images.camera], int)
+    seen, d = frames.observations.take(rays.frame), frames.distances
+    ends = index[given.frame_point[d.points]]
+    kept = (ends >= 0).all(1) & (not checking)
+    ids = tuple(given.points.id[k] for k in rays.points)
+    return frames.replace(
+        cameras=tuple(frames.cameras[c] for c in used),
+        images=dataclasses.replace(frames.images, camera=camera),
+        points=Points(ids, ("tie",) * n, X, np.full((n, 3), np.nan)),
+        observations=dataclasses.replace(seen, point=index[given.frame_point[seen.point]]),
+        distances=Distances(ends[kept], d.value[kept], d.sigma[kept]),
+    )
+
+
+def _columns_of_photographs(network: Network, tables, of_cameras) -> list[Column]:
+    """Their unknowns: of every image, and of its camera where it is the first."""
+    columns, called = [], {t.name: t for t in tables}
+    words = dict(zip(EXTERIOR[:3], ("X0", "Y0", "Z0")))
+    for i, id in enumerate(network.images.id):
+        for k in np.flatnonzero(called["image"].free[i]).tolist():
+            word = words.get(EXTERIOR[k], EXTERIOR[k])
+            unit = ("m", 1.0) if k < 3 else ("arcsec", ARCSEC)
+            name = Name(f"photograph {id}", word, *unit, word)
+            columns.append(Column(name, math.inf, "image", i, k))
+        c = network.images.camera[i]
+        camera, (title, row) = network.cameras[c], of_cameras[network.cameras[c].id]
+        if c in network.images.camera[:i]:
+            continue
+        for d in np.flatnonzero(called[title].free[row]).tolist():
+            word = called[title].parameters[d]
+            name = Name(f"camera {camera.id}", word, "", 1.0, word)
+            columns.append(Column(name, camera.sigma.get(word, math.inf), title, row, d))
+    return columns
+
+
+def _check_near(given: Given, rows, v) -> None:
+    """Refuse points that lie far from where they are measured: swapped or in error."""
+    points, observations = given.points, given.observations
+    size = np.array([(one.image.lines, one.image.pixels) for one in given.images])
+    far = (~(np.abs(v) <= FAR * size[observations.image[rows]])).any(1)
+    if not far.any():
+        return
+    row, away = rows[far.argmax()], v[far.argmax()]
+    p, id = observations.point[row], given.images[observations.image[row]].id
+    said = (
+        f"{away[0]:.0f} lines and {away[1]:.0f} pixels away" if np.isfinite(away).all()
+        else "where the camera does not look"
+    )
+    raise InputError(
+        f"{observations.source(row)}: {points.role[p]} point {points.id[p]!r} of "
+        f"{points.source(p)} is off image {id!r}: its coordinates are {said}; look at "
+        "their order, frame and units, and at the id"
+    )

@@ -1,0 +1,188 @@
+"""The kinds of observations of a refinement, beside those of photographs (`network/kinds.py`).
+
+| kind | residuals | touches |
+|---|---|---|
+| scanner coordinates | line, pixel | scanner image, sensor, point |
+| control points | along the axes of the point | point |
+| priors of corrections | every correction | scanner image, or sensor |
+
+**Scanner.** The pose at the time t(l) of the measured line is known, so the condition is explicit
+(`jaxbundle.pushbroom.project.misclosure`): the slopes at which the point is seen, less those at
+which the measured pixel looks,
+
+    g = [−r/q − ξ(u), −s/q − η(u)],        [r, s, q] = Rᵀ(t)·(X̃ − P(t)),
+
+with X̃ the point where corrections let X appear. In lines and pixels,
+
+    v = S·g,        S = −(∂g/∂(l, u))⁻¹,
+
+the first of Newton's steps from the measured place to where the point is projected: computed −
+observed but for terms of v². S is taken at the start values and again at the solution, and held
+while the equations are solved. All that they need of trajectory and optics belongs to the measured
+line and pixel: it is computed once and goes with the measurement (`Line`).
+
+**Points.** X = X₀ + Aᵀ·δ with the axes A of the point (rows: east, north, up; or X, Y, Z), along
+each of which it may be held, controlled with σ, or free.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbundle.geometry.ellipsoid import Ellipsoid
+from jaxbundle.leastsquares.declarations import Kind
+from jaxbundle.leastsquares.indices import rounded
+from jaxbundle.pushbroom.corrections import Corrections
+from jaxbundle.pushbroom.image import Offsets, Pose, PushbroomImage, given_pose, moved_pose
+from jaxbundle.pushbroom.project import misclosure_of
+from jaxbundle.refinement.freedom import (
+    Change,
+    Form,
+    change_of,
+    changed_offsets,
+    changed_slopes,
+    middle_and_half,
+)
+
+
+class Placed(NamedTuple):
+    """Points, and the axes (rows) along which each of them moves."""
+
+    position: Float[Array, "*rows 3"]
+    axes: Float[Array, "*rows 3 3"]
+
+
+@dataclasses.dataclass(frozen=True)
+class AlongAxes:
+    """The space of `Placed`: a change is one along the axes, which are orthonormal."""
+
+    width = 3
+
+    def prepare(self, value):
+        return tuple(value.position), tuple(map(tuple, value.axes))
+
+    def moved(self, block, change):
+        X, axes = block
+        steps = [tuple(d * x for x in axis) for d, axis in zip(change, axes)]
+        return tuple(sum(parts) for parts in zip(X, *steps))
+
+    def retract(self, value, change):
+        return value._replace(position=value.position + change @ value.axes)
+
+    def difference(self, value, origin):
+        return origin.axes @ (value.position - origin.position)
+
+    def hold(self, value, given, free):
+        return self.retract(given, free * self.difference(value, given))
+
+    def chart(self, value):
+        return None
+
+
+class Line(NamedTuple):
+    """What belongs to a measured line and pixel: the pose that the tables give, seconds from the
+    middle line, offsets, mounting and axes F of the image; how much of every unknown of the spline
+    is in the jitter; the slopes (ξ, η); 1, û, û², … by the coefficients across and along; S."""
+
+    pose: Pose
+    dt: Float[Array, "*n"]
+    offsets: Offsets
+    mounting: Float[Array, "*n 3"]
+    axes: Float[Array, "*n 3 3"]
+    jitter: Float[Array, "*n k"]
+    slopes: Float[Array, "*n 2"]
+    across: Float[Array, "*n a"]
+    along: Float[Array, "*n b"]
+    scale: Float[Array, "*n 2 2"]
+
+
+@dataclasses.dataclass(frozen=True)
+class ScannerPoint:
+    """v of a measured line and pixel; `sizes`: of the unknowns of an image and its sensor."""
+
+    corrections: Corrections
+    earth: Ellipsoid | None
+    sizes: Change
+
+    def __call__(self, own, sensor, X, line: Line):
+        return line.scale @ self.misclosure(own, sensor, X, line)
+
+    def misclosure(self, own, sensor, X, line: Line) -> Float[Array, "2"]:
+        """g: the slopes of the point less those of the pixel."""
+        change = change_of(self.sizes, jnp.concatenate([own, sensor]))
+        jitter = change.jitter @ line.jitter
+        offsets = changed_offsets(line.offsets, line.axes, change, jitter)
+        pose = moved_pose(line.pose, line.dt, offsets, line.mounting + change.mounting)
+        added = line.across @ change.look_across, line.along @ change.look_along
+        slopes = changed_slopes(line.slopes, change.focal_length, added)
+        return misclosure_of(pose, slopes, X, self.corrections, self.earth)
+
+
+def line_of(image: PushbroomImage, form: Form, origin, place: Float[Array, "2"]) -> Line:
+    """What belongs to a measured (line, pixel), in coordinates relative to an origin; without S."""
+    t = image.times.time(place[0])
+    pose, (middle, half) = given_pose(image, t), middle_and_half(image)
+    weights = form.spline.weights(t)
+    powers = lambda n: jnp.array([((place[1] - middle) / half) ** k for k in range(n)])
+    return Line(
+        pose._replace(P=pose.P - origin), t - image.middle_time, image.offsets, image.mounting,
+        form.axes, jnp.pad(weights, (0, form.sizes.jitter // 3 - len(weights))),
+        jnp.stack(image.optics.slopes(place[1])), powers(form.sizes.look_across),
+        powers(form.sizes.look_along), jnp.eye(2),
+    )  # fmt: skip
+
+
+def lines_of(
+    kind: ScannerPoint, image: PushbroomImage, form: Form, origin, own, sensor, X, places
+) -> tuple[Line, Float[np.ndarray, "n 2"]]:
+    """What belongs to the measured places of points X [n, 3] of an image, S where its corrections
+    are `own` and `sensor`; and v."""
+    n = len(places)
+    wide = np.minimum(np.arange(rounded(n)), n - 1)
+    given = np.asarray(X)[wide], np.asarray(places)[wide]
+    found = _lines_of(kind, image, form, origin, own, sensor, *given)
+    return jax.tree.map(lambda x: np.asarray(x)[:n], found)
+
+
+@eqx.filter_jit
+def _lines_of(kind, image, form, origin, own, sensor, X, places):
+    def one(X, place):
+        def misclosure(place):
+            line = line_of(image, form, origin, place)
+            g = kind.misclosure(own, sensor, X, line)
+            return g, (g, line)
+
+        slope, (g, line) = jax.jacfwd(misclosure, has_aux=True)(place)
+        line = line._replace(scale=-jnp.linalg.inv(slope))
+        return line, line.scale @ g
+
+    return jax.vmap(one)(X, places)
+
+
+def _along_axes(X, given: Placed):
+    return given.axes @ (X - given.position)
+
+
+def _itself(correction, _):
+    return correction
+
+
+def scanner_points(residual: ScannerPoint) -> Kind:
+    """Image points of scanner images with the same equations."""
+    of = ("scanner image", "sensor", "point")
+    return Kind("scanner coordinates", residual, of, ("line", "pixel"))
+
+
+def control(axes: tuple[str, str, str]) -> Kind:
+    """Given coordinates along the axes of points."""
+    return Kind("control points", _along_axes, ("point",), axes, snooped="single")
+
+
+def priors(table: str) -> Kind:
+    """Corrections of a table that are known to be small."""
+    return Kind(f"corrections of every {table}", _itself, (table,), snooped="")
