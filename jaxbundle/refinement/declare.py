@@ -16,7 +16,6 @@ from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.declarations import Table
 from jaxbundle.leastsquares.problem import Problem, make_problem, with_data
 from jaxbundle.leastsquares.rows import Values
-from jaxbundle.leastsquares.spaces import Vector
 from jaxbundle.network.declare import declare as declare_network
 from jaxbundle.network.tables import EXTERIOR, Distances, Network, Observations, Points
 from jaxbundle.refinement import kinds
@@ -241,7 +240,7 @@ def _corrections(given: Given):
     for title, sigma, of, start in (own_part, (SENSOR, of_sensor, first, own)):
         sigma = np.nan_to_num(sigma, nan=0.0, posinf=np.inf)
         moving = np.flatnonzero((sigma > 0).any(0)).tolist()
-        space, free = Vector(sigma.shape[1], tuple(moving)), sigma[:, moving] > 0
+        space, free = kinds.Row(sigma.shape[1], tuple(moving)), sigma[:, moving] > 0
         labels = [images[i].id if title == IMAGE else sensor_of(images[i]) for i in of]
         words = tuple(named[0][start + k].parameter for k in moving)
         table = Table(title, np.zeros(sigma.shape), space, free, labels, words)

@@ -37,6 +37,7 @@ from jaxtyping import Array, Float
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.leastsquares.indices import rounded
+from jaxbundle.leastsquares.spaces import Vector
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.image import Offsets, Pose, PushbroomImage, given_pose, moved_pose
 from jaxbundle.pushbroom.project import misclosure_of
@@ -82,6 +83,17 @@ class AlongAxes:
 
     def chart(self, value):
         return None
+
+
+@dataclasses.dataclass(frozen=True)
+class Row(Vector):
+    """Many numbers that add, seen as an array: one operation where scalars are as many."""
+
+    def prepare(self, value):
+        return value
+
+    def moved(self, block, change):
+        return block.at[jnp.array(self.moving)].add(jnp.stack(change)) if change else block
 
 
 class Line(NamedTuple):
