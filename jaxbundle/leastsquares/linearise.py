@@ -42,10 +42,10 @@ def differentiate(declared: Declared, plan: Plan, number: int, prepared, laid: L
 
     def block(slots, start, stop):
         columns = columns_of(widths, slots, start, stop)
-        used = [starts[at[0]] + at[1] if at else -1 for at in columns]
+        used = [starts[at[0]] + at[1] if at else starts[-1] for at in columns]
         if part.large:
             nil = jnp.zeros(shape)
-            parts = [nil if c < 0 else columns[c] for columns in found for c in used]
+            parts = [[*columns, nil][c] for columns in found for c in used]
             return jnp.stack(parts, -1).reshape(*shape, len(r), stop - start)
         return jnp.take(found, np.array(used, int), -1, mode="fill", fill_value=0.0)
 

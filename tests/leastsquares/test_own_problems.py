@@ -145,3 +145,31 @@ def test_hand_eye_calibration_of_a_robot():
         ))  # fmt: skip
         assert (np.abs(change) < 4 * found.sigma[0]).all()
         assert (found.sigma[0] > 0).all() and (found.sigma[0] < 10 * place).all()
+
+
+def test_tables_that_share_a_block_and_an_observation_of_the_first_and_last():
+    """Three tables whose rows always meet a point together are one block row; what touches only the
+    first and the last has no derivative by the one between."""
+    random = np.random.default_rng(3)
+    sets, points = 4, 20
+    of, point = np.repeat(np.arange(sets), points), np.tile(np.arange(points), sets)
+    seen = ls.Kind("seen", lambda a, b, c, x, d: a + b * d[0] + c * d[0] ** 2 + x - d[1],
+                   of=("a", "b", "c", "x"))  # fmt: skip
+    both = ls.Kind("sum", lambda a, c, d: a + 2 * c - d, of=("a", "c"))
+    size = random.normal(size=len(of))
+    measured = np.stack([size, random.normal(size=len(of))], 1)
+    tables = [ls.Table(name, np.zeros(n)) for name, n in zip("abcx", (sets,) * 3 + (points,))]
+    observations = [
+        seen((of, of, of, point), measured), both((np.arange(sets),) * 2, random.normal(size=sets)),
+    ]  # fmt: skip
+    rows = len(of) + sets
+    A = np.zeros((rows, 3 * sets + points))
+    every, own = np.arange(len(of)), np.arange(sets)
+    for k in range(3):
+        A[every, k * sets + of] = size**k
+    A[every, 3 * sets + point] = 1
+    A[len(of) + own, own], A[len(of) + own, 2 * sets + own] = 1, 2
+    x = np.linalg.lstsq(A, np.r_[measured[:, 1], observations[1].measured], rcond=None)[0]
+    result = ls.adjust(tables, observations, eliminate="x")
+    found = np.concatenate([result[name].value for name in "abcx"])
+    np.testing.assert_allclose(found, x, atol=1e-9)
