@@ -116,7 +116,7 @@ def adjust(declared: Declared, snooping: str, significance: float) -> Inspection
             minimum = find_minimum(problem, values)
             values, steps = minimum.values, steps + int(minimum.iterations)
             problem, change = declared.rescaled(problem, values)
-            if not change > SAME:
+            if not (change > SAME and converged(minimum.termination)):
                 break
         found = Solution(problem, values)
         _require_solved(declared, found, minimum, steps)

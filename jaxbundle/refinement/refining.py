@@ -1,7 +1,7 @@
 """Refinement of scanner images by control and tie points, with photographs in the same equations.
 
 `refine` puts tables in and a `Refinement` out: least squares with the unknowns of `freedom`, the
-equations of `equations`, statistics, blunders, check points, warnings, and the refined images.
+equations of `kinds`, statistics, blunders, check points, warnings, and the refined images.
 """
 
 import dataclasses
@@ -115,9 +115,10 @@ class Refinement:
     def image_points(self) -> list[dict]:
         """A row for every image point that took part, image by image: ids, v, r and w of both
         coordinates, whether it was removed."""
-        declared, ids = self.inspection.declared, self.inspection.declared.given.ids
+        declared, points = self.inspection.declared, self.point_ids
+        images = declared.given.ids
         rows = [
-            {"image": ids[i], "point": self.point_ids[p], "v": v, "r": r, "w": w, "removed": gone}
+            {"image": images[i], "point": points[p], "v": v, "r": r, "w": w, "removed": bool(gone)}
             for part in declared.parts
             for i, p, v, r, w, gone in zip(
                 part.image, part.point, *self.inspection.rows(part.set)
