@@ -12,7 +12,6 @@ import dataclasses
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -20,7 +19,7 @@ from jaxbundle.leastsquares.checks import determine
 from jaxbundle.leastsquares.rows import fill_places, in_given_order, lay_out_data, residuals
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.refinement.declare import Rays, declare
-from jaxbundle.refinement.inspection import Inspection
+from jaxbundle.refinement.inspection import Inspection, Shared
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +55,7 @@ def intersect(found: Inspection, rays: Rays) -> CheckPoints:
     change = np.asarray(values["point"].position - start["point"].position)
     sigma = found.sigma0 * np.sqrt(np.diagonal(Q, axis1=1, axis2=2))
     here = Solution(problem, start)
-    A = _slopes(*here.given, found.changes_at, found.declared.problem.data.start, found.estimate)
+    A = _slopes(*here.given, found.shared, found.estimate)
     real = lambda o: np.asarray(A[o])[: problem.observations[o].number]
     spread = {o: np.einsum("nrk,kl,nrl->nr", real(o), found.cofactor, real(o)) for o in A}
     weight = problem.data.weight
@@ -71,18 +70,14 @@ def intersect(found: Inspection, rays: Rays) -> CheckPoints:
 
 
 @eqx.filter_jit
-def _slopes(declared, plan, values, data, at, start, estimate):
+def _slopes(declared, plan, values, data, shared: Shared, estimate):
     """The derivatives of all v/σ by the shared unknowns, [n, r, m], the points where they are."""
     plan, laid = fill_places(plan, lay_out_data(plan, data))
-    spaces, padded = declared.spaces, values
+    put = lambda wide, x: wide.at[: len(x)].set(x)
 
     def of_shared(estimate):
-        moved = dict(padded)
-        for t, (k, row, direction) in at.items():
-            rows = jax.tree.leaves(start[t])[0].shape[0]
-            change = jnp.zeros((rows, spaces[t].width)).at[row, direction].set(estimate[k])
-            now = jax.vmap(spaces[t].retract)(start[t], change)
-            moved[t] = jax.tree.map(lambda wide, x: wide.at[: len(x)].set(x), padded[t], now)
+        now = shared.tables(estimate)
+        moved = {t: jax.tree.map(put, values[t], now[t]) if t in now else values[t] for t in values}
         return in_given_order(plan, residuals(declared, plan, moved, laid))
 
     return jax.jacfwd(of_shared)(estimate)

@@ -2,6 +2,7 @@
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +13,7 @@ from jaxbundle.leastsquares.problem import Problem, with_data
 from jaxbundle.leastsquares.rows import Values
 from jaxbundle.leastsquares.snooping import snoop
 from jaxbundle.leastsquares.solution import Solution, find_minimum
+from jaxbundle.leastsquares.spaces import Space
 from jaxbundle.leastsquares.stopping import converged
 from jaxbundle.refinement.declare import Declared
 from jaxbundle.refinement.weakness import weaknesses
@@ -19,6 +21,34 @@ from jaxbundle.statistics.blunders import Removed
 
 ROUNDS, SAME = 10, 1e-9
 """Solutions, each with the S of the one before, at most; an S that changes by less is the same."""
+
+
+class Shared(eqx.Module):
+    """The changes of the unknowns that points share, as a function of the tables. `at`: by table,
+    their numbers, rows and directions; `start`: of these tables."""
+
+    at: dict[str, tuple[np.ndarray, ...]]
+    start: Values
+    spaces: tuple[tuple[str, Space], ...] = eqx.field(static=True)
+
+    def __call__(self, values: Values) -> Float[Array, " m"]:
+        spaces, found = dict(self.spaces), jnp.zeros(sum(len(k) for k, *_ in self.at.values()))
+        for t, (k, row, direction) in self.at.items():
+            change = jax.vmap(spaces[t].difference)(values[t], self.start[t])
+            found = found.at[k].set(change[row, direction])
+        return found
+
+    def tables(self, changes: Float[Array, " m"]) -> Values:
+        """The tables after these changes."""
+        spaces, moved = dict(self.spaces), {}
+        for t, (k, row, direction) in self.at.items():
+            rows = jax.tree.leaves(self.start[t])[0].shape[0]
+            change = jnp.zeros((rows, spaces[t].width)).at[row, direction].set(changes[k])
+            moved[t] = jax.vmap(spaces[t].retract)(self.start[t], change)
+        return moved
+
+
+_estimate = eqx.filter_jit(lambda shared, values: shared(values))
 
 
 class Inspection:
@@ -38,28 +68,24 @@ class Inspection:
         return self.solution.sigma0 if self.redundancy > 0 else 1.0
 
     @functools.cached_property
+    def shared(self) -> Shared:
+        """Where the shared unknowns are."""
+        problem, at = self.declared.problem, {}
+        for k, column in enumerate(self.declared.columns):
+            at.setdefault(column.table, []).append((k, column.row, column.direction))
+        at = {t: tuple(np.array(rows).T) for t, rows in at.items()}
+        start = {t: jax.device_get(problem.data.start[t]) for t in at}
+        return Shared(at, start, problem.declared.named_spaces)
+
+    @functools.cached_property
     def estimate(self) -> Float[np.ndarray, " m"]:
         """The changes of the shared unknowns."""
-        return np.asarray(self._changes(self.solution.values))
+        return np.asarray(_estimate(self.shared, self.solution.values))
 
     @functools.cached_property
     def cofactor(self) -> Float[np.ndarray, "m m"]:
         """Of the shared unknowns."""
-        return self.solution.propagate(self._changes)
-
-    @functools.cached_property
-    def changes_at(self) -> dict[str, tuple[np.ndarray, ...]]:
-        """By table the numbers of its shared unknowns, their rows and directions."""
-        columns = enumerate(self.declared.columns)
-        at = [(c.table, (k, c.row, c.direction)) for k, c in columns]
-        return {t: tuple(np.array([x for u, x in at if u == t]).T) for t in dict(at)}
-
-    def _changes(self, values: Values) -> Float[Array, " m"]:
-        problem, found = self.declared.problem, jnp.zeros(len(self.declared.columns))
-        for t, (k, row, direction) in self.changes_at.items():
-            change = jax.vmap(problem.table(t).space.difference)(values[t], problem.data.start[t])
-            found = found.at[k].set(change[row, direction])
-        return found
+        return self.solution.propagate(self.shared)
 
     @property
     def sigma(self) -> Float[np.ndarray, " m"]:
