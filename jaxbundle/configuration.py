@@ -32,6 +32,19 @@ def enable_x64() -> None:
     jax.config.update("jax_enable_x64", True)
 
 
+def require_x64() -> None:
+    """64-bit floats, without which nothing is adjusted.
+
+    **Raises:** `RuntimeError` that says how to get them."""
+    import jax
+
+    if not jax.config.jax_enable_x64:
+        raise RuntimeError(
+            "jaxbundle computes in 64-bit floating point. Call jaxbundle.enable_x64() before the "
+            "first JAX computation, or set the environment variable JAX_ENABLE_X64=1."
+        )
+
+
 def use_cores(number: int | None = None) -> None:
     """Let the cores of the processor (all, or so many) share the work on big networks, as devices
     of JAX; call it before the first JAX computation."""

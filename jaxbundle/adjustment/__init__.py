@@ -9,5 +9,4 @@ from jaxbundle.adjustment.equations import residuals as residuals
 from jaxbundle.adjustment.problem import Counts as Counts
 from jaxbundle.adjustment.problem import Problem as Problem
 from jaxbundle.adjustment.problem import make_problem as make_problem
-from jaxbundle.adjustment.problem import require_x64 as require_x64
 from jaxbundle.adjustment.solve import solve as solve

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbundle.arguments import one_of
+from jaxbundle.configuration import require_x64
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares import problem as engine
 from jaxbundle.leastsquares.declarations import Observations, Table
@@ -146,15 +147,6 @@ def make_problem(
     data = jax.device_put(declared.data)
     counts = count_rows(declared.layout, system)
     return Problem(network, system, declared.layout, data, declared.origin, counts)
-
-
-def require_x64() -> None:
-    """Adjustment needs 64-bit floats, and says how to get them."""
-    if not jax.config.jax_enable_x64:
-        raise RuntimeError(
-            "jaxbundle computes in 64-bit floating point. Call jaxbundle.enable_x64() before the "
-            "first JAX computation, or set the environment variable JAX_ENABLE_X64=1."
-        )
 
 
 def _datum_points(network: Network):

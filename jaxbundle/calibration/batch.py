@@ -36,13 +36,12 @@ from jaxbundle.adjustment.batch_normal import POSE, Calibration, Sightings, resi
 from jaxbundle.adjustment.batch_start import start_values
 from jaxbundle.adjustment.batch_tests import point_tests
 from jaxbundle.adjustment.batch_weakness import vague, vanishing
-from jaxbundle.adjustment.problem import require_x64
 from jaxbundle.arguments import one_of, whole
 from jaxbundle.calibration.batch_misfit import far_outside, misfits, remarks
 from jaxbundle.calibration.batch_result import BatchCalibration as BatchCalibration
 from jaxbundle.calibration.batch_snooping import ROUNDS, TESTS, Snooping
 from jaxbundle.cameras import CameraModel, get_model, key_of
-from jaxbundle.configuration import available_cores
+from jaxbundle.configuration import available_cores, require_x64
 from jaxbundle.geometry import (
     matrix_from_quaternion,
     matrix_from_rotation_vector,

@@ -22,13 +22,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbundle.adjustment.problem import require_x64
 from jaxbundle.arguments import number, positive, shown, text, vector
 from jaxbundle.bundle import adjust, check_options
 from jaxbundle.calibration.frames import in_model_units, in_pixels, unit_size
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.start import Start, start_values
 from jaxbundle.cameras import CameraModel, check_own, get_model, is_own
+from jaxbundle.configuration import require_x64
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.leastsquares.snooping import check_test

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbundle.arguments import one_of
+from jaxbundle.configuration import require_x64
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.declarations import Motions, Observations, Table
 from jaxbundle.leastsquares.defect import find_open_motions, make_datum, survey_motions
@@ -97,6 +98,7 @@ def make_problem(
     `(plan, values, change)` that says where a change leads, if not `Retraction`. `reduction`: how
     the reduced system is solved, "dense", "banded" or "iterative"; chosen by its size and fill if
     not given."""
+    require_x64()
     one_of("reduction", reduction, REDUCTIONS, none=True)
     tables = tuple(tables)
     observations = tuple(given.resolved(tables) for given in observations)

@@ -24,6 +24,7 @@ from jaxtyping import Float, Int
 
 from jaxbundle.arguments import numeric_array, positive, shown, text, whole
 from jaxbundle.cameras import default_parameters, get_model, image_ray, project
+from jaxbundle.configuration import require_x64
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.network.build import make_cameras
@@ -134,11 +135,7 @@ def simulate_with_truth(
 
     **Raises:** `InputError` for impossible arguments, and where no target is imaged.
     """
-    if not jax.config.jax_enable_x64:
-        raise RuntimeError(
-            "simulation needs 64-bit floating point; call jaxbundle.enable_x64() first, or set "
-            "JAX_ENABLE_X64=1"
-        )
+    require_x64()
     check_choice("datum", datum, CHOICES["datum"])
     check_choice("residuals", residuals, CHOICES["residuals"])
     if not isinstance(stations, Stations):

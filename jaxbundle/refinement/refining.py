@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.configuration import enable_x64
+from jaxbundle.configuration import require_x64
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
 from jaxbundle.network.tables import Network, Observations
@@ -162,7 +162,7 @@ def refine(
     **Raises:** `InputError` for what cannot be used, with its row; `NotSolvedError` where the
     unknowns are not determined, with their names.
     """
-    enable_x64()
+    require_x64()
     if snooping not in TESTS:
         raise InputError(f"snooping {snooping!r}; one of {', '.join(TESTS)} is expected")
     images = list(images)

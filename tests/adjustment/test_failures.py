@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from adjustment_checks import solved, synthetic
 
+from jaxbundle import leastsquares as ls
 from jaxbundle.adjustment.problem import make_problem
 from jaxbundle.leastsquares.stopping import (
     LIMIT,
@@ -87,11 +88,12 @@ def test_every_reason_has_words():
 
 
 def test_adjustment_needs_64_bits():
-    from jaxbundle.adjustment import require_x64
-
+    network, height = synthetic()[0], ls.Table("height", np.zeros(2))
     jax.config.update("jax_enable_x64", False)
     try:
         with pytest.raises(RuntimeError, match="enable_x64"):
-            require_x64()
+            ls.adjust([height], [])
+        with pytest.raises(RuntimeError, match="enable_x64"):
+            make_problem(network)
     finally:
         jax.config.update("jax_enable_x64", True)
