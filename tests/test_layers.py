@@ -1,6 +1,7 @@
 """The layout is the architecture: a module imports only from packages above it in this list."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -104,3 +105,13 @@ def test_geometry_and_cameras_know_no_solver(path):
     if layer_of(path) in LIGHT:
         for module, _ in imports(path):
             assert module.split(".")[0] not in {"optimistix", "lineax"}, f"{path} imports {module}"
+
+
+def test_the_page_of_the_architecture_names_files_that_are_there():
+    root = PACKAGE.parent
+    page = (root / "docs" / "architecture.md").read_text()
+    named = set(re.findall(r"[\w/]+\.(?:py|md)\b", page))
+    there = [f"/{p.relative_to(root)}" for room in ("jaxbundle", "tests", "docs")
+             for p in (root / room).rglob("*.*")]  # fmt: skip
+    assert len(named) > 30
+    assert {name for name in named if not any(path.endswith(f"/{name}") for path in there)} == set()
