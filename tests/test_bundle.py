@@ -194,7 +194,8 @@ def test_check_points_have_the_sigma_of_the_estimated_weights(estimated):
 
 
 def test_components_that_do_not_settle_are_told(simulation, monkeypatch):
-    monkeypatch.setattr("jaxbundle.repeated.ROUNDS", 1)
+    for module in ("leastsquares.components", "repeated"):
+        monkeypatch.setattr(f"jaxbundle.{module}.ROUNDS", 1)
     network = simulation.network
     observations = dataclasses.replace(
         network.observations, sigma=2 * network.observations.sigma

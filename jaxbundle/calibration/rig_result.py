@@ -68,7 +68,7 @@ class RigCalibration:
     ):  # fmt: skip
         self.cameras, self.rig, self.result = cameras, rig, result
         self._maps: dict[tuple, UncertaintyMap] = {}
-        self._covariances: dict[str, np.ndarray] = {}
+        self._covariances: dict[tuple[str, ...], np.ndarray] = {}
         self.left_out, self.contradicting = tuple(left_out), tuple(contradicting)
 
     @property
@@ -188,19 +188,22 @@ class RigCalibration:
             found[name] = {n: s for n, s in zip(table.parameters, sigma) if n in free}
         return found
 
-    def covariance(self, name: str) -> Float[np.ndarray, "k k"]:
-        """The joint covariance of the mounting of a camera (δb, δθ) and of its parameters that are
-        free in some camera of its model; zero where something is held."""
-        if name not in self._covariances:
-            problem, k = self.result.problem, self.names.index(name)
-            table, row = self.rig.place(k)
-            number = POSE + problem.table(table).space.width
+    def covariance(self, *names: str) -> Float[np.ndarray, "k k"]:
+        """The joint covariance of cameras: of each the mounting (δb, δθ) and its parameters that
+        are free in some camera of its model; zero where something is held."""
+        if names not in self._covariances:
+            problem = self.result.problem
+            places = [(self.names.index(name), *self.rig.place(self.names.index(name)))
+                      for name in names]  # fmt: skip
+            widths = [POSE + problem.table(table).space.width for _, table, _ in places]
+            number, starts = sum(widths), np.cumsum([0, *widths])
             rows = {t.name: np.zeros((number, t.rows, t.space.width)) for t in problem.tables}
-            rows["mounting"][:POSE, k] = np.eye(POSE)
-            rows[table][POSE:, row] = np.eye(number - POSE)
+            for start, width, (k, table, row) in zip(starts, widths, places):
+                rows["mounting"][start : start + POSE, k] = np.eye(POSE)
+                rows[table][start + POSE : start + width, row] = np.eye(width - POSE)
             Q = self.result.solution.propagate_rows(rows)
-            self._covariances[name] = self.sigma0**2 * Q
-        return self._covariances[name]
+            self._covariances[names] = self.sigma0**2 * Q
+        return self._covariances[names]
 
     @functools.cached_property
     def mountings(self) -> dict[str, Mounting]:

@@ -137,7 +137,7 @@ def test_predicted_uncertainty_is_that_of_a_sample():
             given = pad_data(system, problem.layout.data(drawn))
             minimum = minimise(solver, given, given.start)
             cost = minimum.history.cost[minimum.iterations - 1]
-            tables = move_to_datum(solver.declared, solver.plan, minimum.values, given.start)
+            tables, _ = move_to_datum(solver.declared, solver.plan, minimum.values, given.start)
             return minimum.termination, tables, 2 * cost / part**2
 
         return jax.vmap(one)(xy)
