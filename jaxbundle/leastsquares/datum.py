@@ -47,6 +47,7 @@ def generators(declared: Declared, values: Values) -> Tangent:
         if act is None:
             rows = jax.tree.leaves(values[name])[0].shape[0]
             return jnp.zeros((rows, space.width, motions))
+        act = getattr(act, "near", act)
         change = lambda value, m: space.difference(act(m, value), value)
         return jax.vmap(jax.jacfwd(change, 1), (0, None))(values[name], jnp.zeros(motions))
 

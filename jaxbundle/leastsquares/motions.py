@@ -4,7 +4,8 @@ Those that leave a place where it is do so as finite motions too: shift, rotatio
 made together, for a unit of time, not one after the other (canonical coordinates).
 """
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -50,22 +51,37 @@ def likely_motions(tables: Sequence[Table]) -> Motions | None:
     return shift(vectors[0][0]) if vectors[0] else None
 
 
-def _move_point(motion, value):
-    return transform_point(_together(transform_point, motion, 3), value)
+@dataclasses.dataclass(frozen=True)
+class Together:
+    """`move(motion, value)` for motions whose shift comes after their rotation and scale, with all
+    of a motion made together; `transform(motion, place)` for the shifts, which are the first `size`
+    numbers."""
+
+    move: Callable
+    transform: Callable
+    size: int
+
+    def __call__(self, motion, value):
+        return self.move(_together(self.transform, motion, self.size), value)
+
+    def near(self, motion, value):
+        """The same to first order, for the directions of the motions."""
+        return self.move(motion, value)
 
 
-def _move_pose(motion, value: PoseValue) -> PoseValue:
-    return PoseValue(*transform_pose(_together(transform_point, motion, 3), *value))
-
-
-def _move_in_plane(motion, value):
-    return _transform_in_plane(_together(_transform_in_plane, motion, 2), value)
+def _transform_pose(motion, value: PoseValue) -> PoseValue:
+    return PoseValue(*transform_pose(motion, *value))
 
 
 def _transform_in_plane(motion, value):
     x, y, turn, log_scale = motion
     c, s = jnp.exp(log_scale) * jnp.cos(turn), jnp.exp(log_scale) * jnp.sin(turn)
     return jnp.stack([c * value[0] - s * value[1] + x, s * value[0] + c * value[1] + y])
+
+
+_move_point = Together(transform_point, transform_point, 3)
+_move_pose = Together(_transform_pose, transform_point, 3)
+_move_in_plane = Together(_transform_in_plane, _transform_in_plane, 2)
 
 
 def _together(transform, motion, size: int):
