@@ -30,6 +30,11 @@ from jaxbundle import cli  # noqa: E402
 
 jaxbundle.enable_x64()
 
+# Tracing makes objects by the million that all stay: looking through them all the time for what can
+# go took a sixth of the processor.
+gc.freeze()
+gc.set_threshold(50_000, 20, 100)
+
 
 # Where signals are ignored (in the background, under nohup), the programs that tests start would
 # ignore them too; a handler is not inherited.
