@@ -12,8 +12,8 @@ import warnings
 from jaxbundle.interrupts import handle_interrupts, set_status
 
 SELDOM = 50_000, 20, 100
-"""New objects after which Python looks for what can go. Tracing makes them by the million, and all
-stay: looking after every 700 takes a sixth of a short run."""
+"""Thresholds of Python's garbage collector. Tracing makes objects by the million, and nearly all of
+them stay: with the usual thresholds, looking for those that go takes a sixth of the tracing."""
 
 
 def main() -> None:

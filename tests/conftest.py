@@ -27,13 +27,12 @@ import pytest  # noqa: E402
 
 import jaxbundle  # noqa: E402
 from jaxbundle import cli  # noqa: E402
+from jaxbundle.__main__ import SELDOM  # noqa: E402
 
 jaxbundle.enable_x64()
 
-# Tracing makes objects by the million that all stay: looking through them all the time for what can
-# go took a sixth of the processor.
 gc.freeze()
-gc.set_threshold(50_000, 20, 100)
+gc.set_threshold(*SELDOM)
 
 
 # Where signals are ignored (in the background, under nohup), the programs that tests start would
