@@ -33,7 +33,7 @@ demo: install
 
 test: install
 	$(BIN)/python -m ruff check jaxbundle tests benchmarks
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 $(VENV)/compared: $(VENV)/installed
 	@if command -v uv >/dev/null 2>&1; then \

@@ -41,11 +41,31 @@ for name in ("SIGINT", "SIGHUP"):
     if signal.getsignal(getattr(signal, name, signal.SIGTERM)) is signal.SIG_IGN:
         signal.signal(getattr(signal, name), lambda *_: None)
 
-def pytest_itemcollected(item):
-    """With several workers, the tests of a file go to one: its fixtures are made once, and the
-    programs it compiles are at hand. Notebooks are processes of their own."""
-    if not item.get_closest_marker("xdist_group") and item.path.name != "test_notebooks.py":
-        item.add_marker(pytest.mark.xdist_group(item.path.stem))
+
+TOGETHER, APART = ("tests/calibration/", "tests/refinement/"), ("tests/test_notebooks.py",)
+"""Folders that go to one worker, and files of which every test goes to any."""
+
+
+def work_unit(nodeid: str) -> str:
+    """What goes to one worker: a file, so that its fixtures are made once, and the programs it
+    compiles are at hand; a folder that shares more; a notebook, a process of its own."""
+    path = nodeid.split("::")[0]
+    if path in APART:
+        return nodeid
+    return next((folder for folder in TOGETHER if path.startswith(folder)), path)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """By node ids: the groups of `--dist loadgroup` are lost by xdist 3.8 under pytest 9.2, which
+    no longer lets a plugin rename a test."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByWorkUnit(LoadScopeScheduling):
+        def _split_scope(self, nodeid):
+            return work_unit(nodeid)
+
+    return ByWorkUnit(config, log)
 
 
 MEMORY = Path("/proc/self/statm")
