@@ -1,9 +1,9 @@
-"""Normal blocks, exact Hessian and steps against dense matrices of residuals ∘ retract."""
+"""Normal blocks and steps against dense matrices of residuals ∘ retract. (The exact Hessian:
+tests/leastsquares/test_derivatives.py.)"""
 
 from functools import cache
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,12 +14,10 @@ from adjustment_checks import (
     flat,
     linearised,
     make,
-    rows_of_change,
 )
 
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, quaternion_from_matrix
 from jaxbundle.leastsquares.elimination import damp, factorise, solve
-from jaxbundle.leastsquares.hessian import exact_equations
 from jaxbundle.leastsquares.normal import Normal, normal_equations
 from jaxbundle.leastsquares.problem import pad_data
 from jaxbundle.leastsquares.rows import lay_out_data
@@ -97,25 +95,6 @@ def test_undamped_step(name):
     step = flat(blocks_of(name)[-1])
     along = np.linalg.lstsq(dense.G, step - expected, rcond=None)[0]
     assert_same(step - dense.G @ along, expected, size, 1e-9)
-
-
-def test_exact_hessian():
-    name = "everything given"
-    system, dense = make(name).system, linearised(name)
-
-    @eqx.filter_jit
-    def both(declared, plan, data):
-        exact = exact_equations(declared, plan, data.start, lay_out_data(plan, data))
-        function, zero = rows_of_change(declared, plan, data.start, data)
-        cost = lambda change: 0.5 * sum(jnp.sum(v**2) for v in function(change).values())
-        return Normal(plan, exact[-1]).as_matrix(), jax.hessian(cost)(zero)
-
-    H, expected = map(np.asarray, both(system.declared, system.plan, pad_data(system, system.data)))
-    size = np.linalg.norm(dense.J, axis=0)
-    assert_same(H, expected, size, 1e-11)
-    # The residuals of the start values make the curvature visible.
-    size = np.where(size > 0, size, 1.0)
-    assert np.abs((H - dense.N) / size / size[:, None]).max() > 1e-3
 
 
 def test_a_prior_of_angles_counts_from_the_representation_it_is_given_in():

@@ -52,7 +52,7 @@ def assert_same_values(a, b, tolerance=SAME):
     np.testing.assert_allclose(a.camera, b.camera, atol=tolerance, rtol=tolerance)
 
 
-@pytest.mark.parametrize("name", [SHARED, "everything given", "free"])
+@pytest.mark.parametrize("name", [SHARED, "free"])
 def test_the_minimum_is_one(name):
     problem, minimum = adjusted(name)
     assert int(minimum.termination) == SETTLED
