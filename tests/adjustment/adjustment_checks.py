@@ -181,7 +181,10 @@ def _box(count, rng):
 
 
 def _angles(matrix):
-    return np.asarray(jax.vmap(omega_phi_kappa_from_matrix)(jnp.asarray(matrix)))
+    return np.asarray(_angles_of(matrix))
+
+
+_angles_of = jax.jit(jax.vmap(omega_phi_kappa_from_matrix))
 
 
 def _measure(given, of_image, truth, image, point, rng, noise):
@@ -274,7 +277,7 @@ def vtpv(problem, values):
 
 def flat(tree):
     """Values, residuals, … as one numpy vector."""
-    return np.asarray(ravel_pytree(tree)[0])
+    return np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)])
 
 
 def residuals_of(problem, values):
@@ -328,12 +331,10 @@ def linearise(problem: Problem, values=None, data=None) -> Dense:
     given = pad_data(system, problem.layout.data(data))
     tables = pad_values(system, problem.layout.tables(values))
     plan, number = system.plan, [given.number for given in system.observations]
-    v, J, G, B = _linearise(system.declared, plan, tables, given)
+    v, J, G, B, index = _linearise(system.declared, plan, tables, given)
     tall = lambda rows: np.concatenate([
         np.asarray(rows[o])[:n].reshape(-1, *rows[o].shape[2:]) for o, n in enumerate(number)
     ])  # fmt: skip
-    zero, unravel = ravel_pytree(zero_tangent(plan))
-    index = changes_of_tables(plan, tables, unravel(jnp.arange(1.0, zero.size + 1)))
     columns = {t.name: np.asarray(index[t.name], int)[: t.rows] - 1
                for t in system.tables if t.name in index}  # fmt: skip
     free = flat({g: group.free for g, group in plan.groups.items()}) > 0
@@ -352,7 +353,9 @@ def _linearise(declared, plan, values, data):
     G = B = {g: jnp.zeros((*group.free.shape, 0)) for g, group in plan.groups.items()}
     if plan.datum is not None:
         G, B = datum_directions(declared, plan, values)
-    return function(zero), jax.jacfwd(function)(zero), G, B
+    unravel = ravel_pytree(zero_tangent(plan))[1]
+    index = changes_of_tables(plan, values, unravel(jnp.arange(1.0, zero.size + 1)))
+    return function(zero), jax.jacfwd(function)(zero), G, B, index
 
 
 def _columns(tangent):

@@ -66,17 +66,15 @@ def table_optics():
 
 
 LINEAR = "linear, normalised, a table of angles"
+CORRECTED = "hermite, angles in the orbit by splines, uneven times, light time, aberration"
 # lagrange with slerp, there and back: test_csm, test_scanner_file
 CASES = {
     LINEAR: satellite("linear", "linear", 4, table_optics()),
-    "spline, angles in the orbit, uneven times": satellite("spline", "angles", 4, times=LineTimes(
+    # refraction, slow to compile here, is undone by `seen_point` alike: test_locate
+    CORRECTED: satellite("hermite", "angles", 4, times=LineTimes(
         jnp.float64(0), jnp.float64(0),
         jnp.asarray(PERIOD * (np.arange(LINES) + rng.uniform(-0.2, 0.2, LINES))),
-    )),
-    # refraction, slow to compile here, is undone by `seen_point` alike: test_locate
-    "hermite, spline, light time, aberration": satellite(
-        "hermite", "spline", corrections=Corrections(True, True, False)
-    ),
+    ), corrections=Corrections(True, True, False)),
 }  # fmt: skip
 
 
@@ -206,7 +204,7 @@ def test_nothing_is_seen_through_the_earth():
 
 def test_the_footprint_changes_nothing():
     """With it and without, on points in the image, beside it, and above all heights it knows."""
-    image = CASES["spline, angles in the orbit, uneven times"]
+    image = CASES[CORRECTED]
     search = make_search(image)
     assert search.footprint is not None
     lines = rng.uniform(-0.5, LINES - 0.5, SIZE // 5)

@@ -10,7 +10,6 @@ from refinement_scenes import (
     ARCSEC,
     COUNT,
     FREEDOM,
-    SIGMA,
     control,
     ground,
     ground_with_sine,
@@ -22,6 +21,7 @@ from refinement_scenes import (
 
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.geometry.ellipsoid import WGS84
+from jaxbundle.network.tables import Observations
 from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.project import misclosure
 from jaxbundle.refinement import FREE, Freedom, refine, report, to_json
@@ -34,19 +34,28 @@ BIAS, DRIFT = np.array([20.0, -30.0, 90.0]) * ARCSEC, np.array([5.0, -4.0, 30.0]
 AMPLITUDE = np.array([8.0, 5.0, 0.0]) * ARCSEC
 
 
+CHECK = range(COUNT, 2 * COUNT)
+"""As many check points as control points."""
+
+
 @pytest.fixture(scope="module")
 def with_jitter():
-    """Control points of an image with bias, drift and a jitter of 1 Hz."""
-    rng = np.random.default_rng(5)
-    places, heights = spread(rng)
-    X = np.asarray(ground_with_sine(satellite(), BIAS, DRIFT, AMPLITUDE, heights, places))
-    return X, measured(places, rng)
+    """Points, as they are and measured, of an image with bias, drift and a jitter of 1 Hz."""
+    X, measurements = [], []
+    for seed in (5, 8):
+        rng = np.random.default_rng(seed)
+        places, heights = spread(rng)
+        X.append(ground_with_sine(satellite(), BIAS, DRIFT, AMPLITUDE, heights, places))
+        measurements.append(measured(places, rng))
+    n = 2 * COUNT
+    xy, sigma = (np.concatenate([getattr(m, f) for m in measurements]) for f in ("xy", "sigma"))
+    return np.concatenate(X), Observations(np.zeros(n, int), np.arange(n), xy, sigma)
 
 
 @pytest.fixture(scope="module")
 def refined(with_jitter):
     X, observations = with_jitter
-    return refine([scanner()], control(X), observations)
+    return refine([scanner()], control(X, CHECK), observations)
 
 
 def true_unknowns(form):
@@ -80,7 +89,7 @@ def test_blunders_are_found_and_nothing_else(with_jitter):
     for row, (axis, size) in wrong.items():
         xy[row, axis] += size
     spoilt = dataclasses.replace(observations, xy=xy)
-    found = refine([scanner()], control(X), spoilt, snooping="pope")
+    found = refine([scanner()], control(X, CHECK), spoilt, snooping="pope")
     removed = {f"P{k}" for k in wrong}
     assert {r["point"] for r in found.image_points() if r["removed"]} == removed
     assert 0.7 < found.sigma0 < 1.3
@@ -117,25 +126,17 @@ def test_the_residual_of_what_is_located_is_zero():
     assert np.abs(g).max() < 1e-9
 
 
-def test_check_points_and_their_sigma(with_jitter):
-    """As many check points as control points, in one image: their σ holds east and north."""
-    X, observations = with_jitter
-    rng = np.random.default_rng(8)
-    places, heights = spread(rng)
-    others = ground_with_sine(satellite(), BIAS, DRIFT, AMPLITUDE, heights, places)
-    both = measured(np.concatenate([observations.xy, places]), rng, sigma=0.0)
-    both.xy[COUNT:] += SIGMA * rng.normal(size=places.shape)
-    check = set(range(COUNT, 2 * COUNT))
-    result = refine([scanner()], control(np.concatenate([X, others]), check), both)
-    found = result.check
-    assert found.id == tuple(f"P{k}" for k in sorted(check))
+def test_check_points_and_their_sigma(refined):
+    """In one image: their σ holds east and north."""
+    found = refined.check
+    assert found.id == tuple(f"P{k}" for k in CHECK)
     assert np.isnan(found.difference[:, 2]).all()
     for normed in (
         found.difference[:, :2] / found.sigma[:, :2], found.residual / found.residual_sigma
     ):  # fmt: skip
         assert 0.7 < np.sqrt(np.mean(normed**2)) < 1.3
-    assert "Check points" in report(result)
-    assert len(to_json(result)["check_points"]) == COUNT
+    assert "Check points" in report(refined)
+    assert len(to_json(refined)["check_points"]) == COUNT
 
 
 def test_what_flat_ground_does_not_determine_is_named():
