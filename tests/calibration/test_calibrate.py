@@ -19,8 +19,6 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.measure.views import measure_boards, photographs
 from jaxbundle.network.tables import Camera
 
-pytestmark = pytest.mark.xdist_group("calibration")
-
 VIEWS, NOISE = 12, 0.05
 OPENCV = get_model("opencv")
 TRUTH = dict(zip(OPENCV.parameters, render.LENS.parameters))

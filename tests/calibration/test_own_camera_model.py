@@ -16,8 +16,6 @@ from jaxbundle.calibration.start import start_values
 from jaxbundle.cameras import opencv
 from jaxbundle.errors import InputError
 
-pytestmark = pytest.mark.xdist_group("calibration")
-
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 AGAIN = CameraModel(
     "again", NAMES, distort=lambda p, x, y: opencv.distort((*p, *[0.0] * 7), x, y), unit="px"

@@ -25,8 +25,6 @@ from jaxbundle.io.calibrated import read_calibrated
 from jaxbundle.plotting import write_figures
 from jaxbundle.statistics.difference import expected_difference
 
-pytestmark = pytest.mark.xdist_group("calibration")
-
 DRAWS = 400
 GRID = (3, 3)
 UV = grid_of((480, 360), *GRID).reshape(-1, 2)

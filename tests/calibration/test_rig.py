@@ -27,8 +27,6 @@ from jaxbundle.geometry import (
 from jaxbundle.leastsquares import Pose, PoseValue
 from jaxbundle.network.tables import Camera
 
-pytestmark = pytest.mark.xdist_group("calibration")
-
 NOISE = 0.05
 RIGHT = render.Lens.of(fx=600.0, fy=602.0, cx=236.0, cy=181.0, k1=-0.1, k2=0.03, p1=-2e-4, p2=1e-4)
 ANGLES = np.array([1.0, 6.0, -2.0])

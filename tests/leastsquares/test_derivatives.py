@@ -199,15 +199,15 @@ STENCIL = ((1, 8 / 12), (-1, -8 / 12), (2, -1 / 12), (-2, 1 / 12))
 
 def directions(problem, size):
     """Random changes of the start values, of what was measured, of the weights, each by itself."""
-    random, data = np.random.default_rng(4), problem.data
-    zero = jax.tree.map(jnp.zeros_like, data)
-    noise = lambda x, scale: jnp.asarray(scale * random.normal(size=x.shape))
+    random, data = np.random.default_rng(4), jax.tree.map(np.asarray, problem.data)
+    zero = jax.tree.map(np.zeros_like, data)
+    noise = lambda x, scale: scale * random.normal(size=x.shape)
     for o, weight in enumerate(data.weight):
         name = problem.observations[o].kind.name
         sigma = 1 / np.abs(weight).max()
         change = noise(data.measured[o], 0.3 * sigma)
         yield f"{name}: measured", eqx.tree_at(lambda d, o=o: d.measured[o], zero, change)
-        lower = weight if weight.ndim == 2 else jnp.tril(weight)
+        lower = weight if weight.ndim == 2 else np.tril(weight)
         change = lower * noise(weight, 0.01)
         yield f"{name}: weight", eqx.tree_at(lambda d, o=o: d.weight[o], zero, change)
     for name, value in data.start.items():
@@ -219,7 +219,7 @@ def directions(problem, size):
 
 
 def along(data, u, step):
-    return jax.tree.map(lambda x, d: x + step * d, data, u)
+    return jax.tree.map(lambda x, d: np.asarray(x) + step * d, data, u)
 
 
 @cache
@@ -279,7 +279,8 @@ def test_conjugate_gradients_give_the_same_as_a_factor():
         along_u = jax.jit(lambda d, u, attach=attach: jax.jvp(attach, (d,), (u,))[1]["point"])
         by_both.append(along_u(given_data(p, data), given_data(p, u)))
     np.testing.assert_allclose(*by_both, atol=1e-9 * np.abs(by_both[0]).max())
-    np.testing.assert_allclose(*(precision(p).own["point"] for p in (problem, other)), atol=1e-14)
+    own = [jax.jit(lambda d, p=p: precision(p, d).own["point"])(p.data) for p in (problem, other)]
+    np.testing.assert_allclose(*own, atol=1e-14)
 
 
 def test_gradient_of_a_gradient_in_a_batch():
@@ -318,15 +319,21 @@ def test_gradient_of_a_gradient_in_a_batch():
 def dense(problem, values, data):
     """J of the free unknowns and the directions of the datum, G and B, at these values."""
     moved, zero, free = after(problem, values)
-    J = jax.jacfwd(lambda x: residuals(problem, moved(x), data))(zero)
+    J = jax.jit(jax.jacfwd(lambda x: residuals(problem, moved(x), data)))(zero)
     J = np.asarray(J)[:, free]
     if problem.plan.datum is None:
         return J, np.zeros((J.shape[1], 0))
     padded = given_data(problem, dataclasses.replace(data, start=values)).start
-    gauge = leave_held(problem.declared, problem.plan, padded).datum.gauge
-    flat = lambda tree: np.asarray(ravel_pytree(tree)[0])
-    moves = of_groups(problem.plan, generators(problem.declared, padded))
-    G = np.stack([flat({g: x @ k for g, x in moves.items()}) for k in gauge.T], 1)
+    flat = lambda tree: np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)])
+
+    @jax.jit
+    def open_motions(values):
+        gauge = leave_held(problem.declared, problem.plan, values).datum.gauge
+        moves = of_groups(problem.plan, generators(problem.declared, values))
+        return gauge, {g: x @ gauge for g, x in moves.items()}
+
+    gauge, moves = open_motions(padded)
+    G = np.stack([flat({g: x[..., k] for g, x in moves.items()}) for k in range(gauge.shape[1])], 1)
     zeros = zeros_of_tables(problem.declared, padded)
     weight = flat(of_groups(problem.plan, zeros | problem.plan.datum.weight))
     return J, (G * weight[:, None])[free]
@@ -355,18 +362,18 @@ def test_precision_is_that_of_the_dense_inverse_and_its_derivative():
     Q, _ = bordered(J, B)
     fields = dict(directions(problem, 2e-3))
     u = jax.tree.map(lambda *x: sum(x), *fields.values())
-    u = eqx.tree_at(lambda u: u.measured, u, jax.tree.map(jnp.zeros_like, u.measured))
+    u = eqx.tree_at(lambda u: u.measured, u, jax.tree.map(np.zeros_like, u.measured))
     (_, found), gradient = program(data)
     moved, zero, free = after(problem, data.start)
-    F = np.asarray(jax.jacfwd(lambda x: chosen(moved(x)))(zero))[:, free]
+    both = jax.jit(jax.jacfwd(lambda x: (chosen(moved(x)), moved(x)["point"])))(zero)
+    F, of_points = (np.asarray(x)[..., free] for x in both)
     C = 4 * F @ Q @ F.T
     np.testing.assert_allclose(found.covariance, C, atol=1e-8 * np.abs(C).max())
-    F = jax.jacfwd(lambda x: moved(x)["point"])(zero)[..., free]
-    own = 4 * np.einsum("nif,fg,njg->nij", F, Q, F)
+    own = 4 * np.einsum("nif,fg,njg->nij", of_points, Q, of_points)
     np.testing.assert_allclose(found.own["point"], own, atol=1e-8 * np.abs(own).max())
     h = 0.03
     differences = sum(f / h * program(along(data, u, h * step))[0][0] for step, f in STENCIL)
-    slope = sum(jax.tree.leaves(jax.tree.map(jnp.vdot, gradient, u)))
+    slope = sum(jax.tree.leaves(jax.tree.map(np.vdot, gradient, u)))
     assert float(slope) == pytest.approx(float(differences), rel=1e-6)
 
 
@@ -378,21 +385,23 @@ def test_gauss_newton_is_error_propagation_and_has_no_second_derivative():
         given = dataclasses.replace(data, measured=(measured,), start=data.start | {"point": start})
         given = given_data(problem, given), "gauss-newton"
         moved = attach_derivatives(problem.declared, problem.plan, solution, *given)
-        return without_filling(problem, moved)["point"].ravel()
+        return (without_filling(problem, moved)["point"].ravel(),) * 2
 
-    by = jax.jit(jax.jacfwd(points, (0, 1)))(data.measured[0], data.start["point"])
-    values = data.start | {"point": points(data.measured[0], data.start["point"]).reshape(-1, 2)}
+    by_both = jax.jit(jax.jacfwd(points, (0, 1), has_aux=True))
+    by, value = by_both(data.measured[0], data.start["point"])
+    values = data.start | {"point": value.reshape(-1, 2)}
     values["device"] = solution["device"][:2]
     J, B = dense(problem, values, data)
     Q, into = bordered(J, B)
     free = np.flatnonzero(problem.tables[0].free)
     # ∂v/∂measured = −1/σ; the datum follows its start values. The first unknown is the device's.
     expected = (Q @ (J.T * np.asarray(data.weight[0]).T))[1:]
+    by = [np.asarray(x) for x in by]
     np.testing.assert_allclose(by[0][free], expected, atol=1e-8 * np.abs(expected).max())
     expected, found = (into @ B.T)[1:, 1:], by[1].reshape(10, 10)[np.ix_(free, free)]
     np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
     with pytest.raises(InputError, match="first derivatives only"):
-        jax.jacfwd(jax.grad(lambda m: points(m, data.start["point"])[0]))(data.measured[0])
+        jax.jacfwd(jax.grad(lambda m: points(m, data.start["point"])[0][0]))(data.measured[0])
 
 
 def test_data_of_another_shape_are_refused():

@@ -14,7 +14,7 @@ import pytest
 from sharded_run import PROBLEMS, solve
 
 SCRIPT = Path(__file__).with_name("sharded_run.py")
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("sharding")]  # one worker, one cache
+pytestmark = pytest.mark.slow
 
 
 def start(*arguments):

@@ -28,8 +28,6 @@ from jaxbundle.refinement import FREE, Freedom, refine, report, to_json
 from jaxbundle.refinement.freedom import make_form, of_one_size
 from jaxbundle.refinement.kinds import ScannerPoint, lines_of
 
-pytestmark = pytest.mark.xdist_group("refinement")
-
 BIAS, DRIFT = np.array([20.0, -30.0, 90.0]) * ARCSEC, np.array([5.0, -4.0, 30.0]) * ARCSEC
 AMPLITUDE = np.array([8.0, 5.0, 0.0]) * ARCSEC
 

@@ -31,8 +31,6 @@ from jaxbundle.refinement import Freedom, refine
 from jaxbundle.refinement.freedom import change_of, changed, make_form
 from jaxbundle.refinement.refined import refined_image
 
-pytestmark = pytest.mark.xdist_group("refinement")
-
 TEXT = """
 [refine]
 points = "points.csv"

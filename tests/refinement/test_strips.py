@@ -15,8 +15,6 @@ from jaxbundle.pushbroom.scanner import FocalLine, LineTimes
 from jaxbundle.pushbroom.trajectory import Trajectory
 from jaxbundle.refinement import FREE, Freedom, ScannerImage, local_points, refine, report
 
-pytestmark = pytest.mark.xdist_group("refinement")
-
 LINES, PIXELS, SIGMA = 600, 400, 0.2
 MOUNTING, FOCAL = np.array([2e-3, -1.5e-3, 3e-3]), 5e-4
 FREEDOM = Freedom(mounting=FREE, focal_length=1e-2, attitude=3 * (2e-5,), position=3 * (0.02,))

@@ -23,8 +23,6 @@ from jaxbundle.pushbroom.project import misclosure
 from jaxbundle.refinement import FREE, Freedom, adjusted_photographs, point_rows, refine
 from jaxbundle.refinement.freedom import change_of, changed, make_form, names
 
-pytestmark = pytest.mark.xdist_group("refinement")
-
 POINTS, CONTROL = 24, 8
 TIE = 3 * (POINTS - CONTROL)
 FREEDOM = Freedom(
