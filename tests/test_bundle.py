@@ -222,10 +222,10 @@ def test_gauss_newton_that_strays_is_not_taken_for_a_minimum(simulation):
     """It may end in another minimum, or not at all, but never where vᵀPv could still fall."""
     rng = np.random.default_rng(0)
     points = simulation.network.points
-    for size in (0.1, 0.3, 1.0):
+    for size in (0.3, 1.0):
         moved = points.position + size * rng.uniform(-1, 1, points.position.shape)
         network = simulation.network.replace(points=dataclasses.replace(points, position=moved))
-        found = adjust(network, method="gauss-newton", max_iterations=30)
+        found = adjust(network, method="gauss-newton")
         if found.converged:
             again = minimise(found.problem, found.values, max_steps=101)
             lowest = 2 * np.nanmin(again.history.cost)

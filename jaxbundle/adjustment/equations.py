@@ -52,7 +52,7 @@ def design_matrix(
     order = {name: i for i, name in enumerate(sorted(t.name for t in system.tables))}
     places.sort(key=lambda place: order[place[0].name])
     names = [Name(t.title, t.label(int(r)), t.parameter(int(c))) for t, r, c in places]
-    return jax.jacfwd(rows)(jnp.zeros(len(free))), names
+    return jax.jit(jax.jacfwd(rows))(jnp.zeros(len(free))), names
 
 
 def _by_set(problem: Problem, tables, data: Data):

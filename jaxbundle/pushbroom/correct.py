@@ -79,7 +79,7 @@ def block_places(
     """
     level = np.asarray(_level(surface))
     raised = nodes.X + level * nodes.up
-    found = project_points(image, search, jnp.asarray(raised.reshape(3, -1)), margin=BESIDE)
+    found = project_points(image, search, raised.reshape(3, -1), margin=BESIDE)
     starts = np.stack([found.line[0], found.pixel[0]])
     seen = np.isfinite(starts[0])
     if not seen.any():
@@ -89,16 +89,25 @@ def block_places(
     lost = np.isnan(line)
     if lost.any():
         # on a rough trajectory the way from between the nodes may not lead there
-        found = project_points(image, search, jnp.asarray(ground.reshape(3, -1)))
-        line, pixel = (
-            np.where(lost, np.asarray(a[0]).reshape(lost.shape), b)
-            for a, b in ((found.line, line), (found.pixel, pixel))
-        )
+        line, pixel = line.copy(), pixel.copy()
+        line[lost], pixel[lost] = _searched(image, search, ground[:, lost], starts[0].size)
     inside = (line >= -0.5) & (line < image.lines - 0.5)
     inside &= (pixel >= -0.5) & (pixel < image.pixels - 0.5)
     if occlusion and isinstance(surface, Terrain):
         inside &= ~np.asarray(_occluded(image, search, surface, line, pixel, ground))
     return Places(np.where(inside, line, np.nan), np.where(inside, pixel, np.nan))
+
+
+def _searched(image, search, X, portion):
+    """Lines and pixels of points [3, n] by a search of the image, so many points at a time."""
+    places = np.empty((2, X.shape[1]))
+    for k in range(0, X.shape[1], portion):
+        few = X[:, k : k + portion]
+        n = few.shape[1]
+        full = np.pad(few, ((0, 0), (0, portion - n)), mode="edge")
+        found = project_points(image, search, full, margin=0.0)
+        places[:, k : k + n] = np.asarray(found.line)[0, :n], np.asarray(found.pixel)[0, :n]
+    return places
 
 
 def block_errors(
