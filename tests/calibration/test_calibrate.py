@@ -79,11 +79,11 @@ def test_opencv_has_the_same_residuals(calibration):
 
 
 def test_sigma_is_honest():
-    """σ of `calibrate` are those of `calibrate_batch`, and 200 of its calibrations follow them."""
+    """σ of `calibrate` are those of `calibrate_batch`, and 224 of its calibrations follow them."""
     first = simulated()
     one = calibrate(first, snooping=None)
     exact = simulated(noise=0.0).xy
-    draws = exact + NOISE * np.random.default_rng(1).normal(size=(200, *exact.shape))
+    draws = exact + NOISE * np.random.default_rng(1).normal(size=(224, *exact.shape))
     draws[0] = first.xy
     batch = calibrate_batch(taken.BOARD.points, draws, first.image_size)
     assert batch.converged.all()

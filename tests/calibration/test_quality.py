@@ -25,7 +25,7 @@ from jaxbundle.io.calibrated import read_calibrated
 from jaxbundle.plotting import write_figures
 from jaxbundle.statistics.difference import expected_difference
 
-DRAWS = 400
+DRAWS = 416
 GRID = (3, 3)
 UV = grid_of((480, 360), *GRID).reshape(-1, 2)
 
@@ -48,7 +48,7 @@ def image_of(p, rays):
 
 @pytest.fixture(scope="module")
 def sample():
-    """One calibration, and 400 others of the same views under other noise."""
+    """One calibration, and 416 others of the same views under other noise."""
     views = simulated()
     exact = simulated(noise=0.0).xy
     draws = exact + NOISE * np.random.default_rng(11).normal(size=(DRAWS, *exact.shape))
