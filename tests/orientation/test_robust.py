@@ -43,11 +43,10 @@ def test_resection(threshold):
     assert (np.abs(result.pose.X0 - X0) / sigma).max() < 6
 
 
-@pytest.mark.parametrize("threshold", [3 * SIGMA, None])
-def test_relative_orientation(threshold):
+def test_relative_orientation():
     xy1, xy2, M, b = pairs(N, n, SIGMA)
     keys = jax.random.split(jax.random.key(1), N)
-    robust = batch(partial(robust_relative_orientation, threshold=threshold))
+    robust = batch(robust_relative_orientation)
     result, good = robust(keys, spoilt(xy1), xy2)
     # a false point that happens to lie on its epipolar line, in front, cannot be found
     assert good[:, :GROSS].mean() < 0.03
@@ -89,12 +88,11 @@ def test_absolute_orientation():
     assert (np.abs(np.exp(result.tau[:, 6]) - 2.5) / (2.5 * sigma[:, 6])).max() < 6
 
 
-@pytest.mark.parametrize("threshold", [None, 4 * SIGMA])
-def test_direct_linear_transformation(threshold):
+def test_direct_linear_transformation():
     """The matrix of the good points alone, found among all."""
     xy, X, _, _ = images(N, n, SIGMA)
     keys = jax.random.split(jax.random.key(4), N)
-    robust = batch(partial(robust_direct_linear_transformation, threshold=threshold))
+    robust = batch(partial(robust_direct_linear_transformation, threshold=4 * SIGMA))
     (P, status), good = robust(keys, spoilt(xy), X)
     assert (status == Status.SOUND).all()
     assert not good[:, :GROSS].any() and good[:, GROSS:].mean() > 0.9
