@@ -382,6 +382,12 @@ class Adjustment:
         return table_result(self.cofactors.solution, table, self.sigma0)
 
     @functools.cached_property
+    def further_unknowns(self) -> dict[str, dict[str, dict[str, dict[str, float]]]]:
+        """By table, row and name: value and sigma of the unknowns that came with further kinds of
+        observations (angles in the network's unit)."""
+        return result_tables.further_unknowns(self)
+
+    @functools.cached_property
     def images(self) -> dict[str, np.ndarray]:
         """Columns id, X0 … kappa, sX0 … skappa (angles in the network's unit), rays, rms (of v,
         image unit)."""

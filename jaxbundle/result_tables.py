@@ -7,8 +7,10 @@ import numpy as np
 
 from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.leastsquares.reliability import external_reliability, minimal_detectable
+from jaxbundle.network.further import attitudes, differences
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.statistics.correlation import correlation_matrix, total_correlation
+from jaxbundle.statistics.further import estimates
 
 
 def cameras(adjustment) -> dict[str, dict]:
@@ -141,6 +143,19 @@ def _further(problem, found):
         )  # fmt: skip
 
 
+def further_unknowns(adjustment) -> dict[str, dict]:
+    """By table, row and name: value and sigma, as `Adjustment.further_unknowns`."""
+    found: dict[str, dict] = {}
+    names, origin = set(adjustment.values.other), adjustment.problem.origin
+    if not names:
+        return found
+    for one in estimates(adjustment.cofactors.solution, names, adjustment.sigma0, origin):
+        unit = adjustment.angle_scale if one.angle else 1.0
+        row = found.setdefault(one.table, {}).setdefault(one.row, {})
+        row[one.name] = {"value": one.value * unit, "sigma": one.sigma * unit}
+    return found
+
+
 def checks(adjustment) -> dict[str, np.ndarray]:
     """Of the check points, if there are any: columns id, X, Y, Z, dX, dY, dZ (against the given
     coordinates), sX, sY, sZ, rays."""
@@ -158,10 +173,9 @@ def checks(adjustment) -> dict[str, np.ndarray]:
 def residual_rows(adjustment, kind, image, point, axes, v, weight, r, w):
     """The rows of one kind of observation [things × axes] as columns; weightless rows left out."""
     v, weight, r, w = (np.asarray(x) for x in (v, weight, r, w))
-    if kind == "prior" and axes == EXTERIOR:
-        unit = np.array([1, 1, 1, *[adjustment.angle_scale] * 3])
-    else:
-        unit = np.ones(weight.shape[1])
+    unit = np.ones(weight.shape[1])
+    if kind in OF_ANGLES and tuple(axes) in OF_ANGLES[kind]:
+        unit[-3:] = adjustment.angle_scale
     used = weight > 0
     sigma = np.where(used, unit / np.where(used, weight, 1), np.nan)
     repeat = lambda ids: np.repeat(ids, len(axes))
@@ -182,6 +196,13 @@ def residual_rows(adjustment, kind, image, point, axes, v, weight, r, w):
         factor = adjustment.weights if kind == "image" else np.ones(len(image))
         columns["weight"] = repeat(factor)
     return {name: column[used.ravel()] for name, column in columns.items()}
+
+
+OF_ANGLES = {
+    "prior": (EXTERIOR,), attitudes.ATTITUDE.name: (attitudes.ANGLES,),
+    attitudes.PRIOR.name: (attitudes.ANGLES,), differences.ANGLE.name: (("angle",),),
+}  # fmt: skip
+"""Kinds and axes whose last three residuals, or fewer, are angles."""
 
 
 def _significance(value: float, sigma: float) -> float:

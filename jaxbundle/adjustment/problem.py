@@ -16,7 +16,6 @@ from jaxbundle.leastsquares.defect import CannotHold
 from jaxbundle.network.arrays import Data, Values
 from jaxbundle.network.datum_words import open_directions_in_words
 from jaxbundle.network.declare import Layout, declare, order_cameras
-from jaxbundle.network.kinds import SIMILARITY
 from jaxbundle.network.retraction import TurnAboutSeen
 from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.tables import Network, require_network
@@ -134,7 +133,7 @@ def make_problem(
     chosen = _datum_points(network)
     try:
         system = engine.make_problem(
-            declared.tables, declared.observations, "point", motions=SIMILARITY,
+            declared.tables, declared.observations, "point", motions=declared.motions,
             datum=lambda gauge: _datum(network, gauge, declared.origin, chosen),
             reduction=reduction, retraction=TurnAboutSeen,
         )  # fmt: skip
@@ -188,7 +187,7 @@ def count_rows(layout: Layout, system: engine.Problem) -> Counts:
 def shifted_problem(network: Network, like: Problem, values: Values) -> Problem:
     """Other points of a network with the orientations and cameras of `values`, without priors and
     datum: for points that took no part."""
-    declared = declare(network, like.origin)
+    declared = declare(network.replace(further=()), like.origin)
     layout = declared.layout
     start = dataclasses.replace(values, point=declared.data.start.point)
     start = layout.tables(jax.tree.map(np.asarray, start))

@@ -176,7 +176,8 @@ def _check_output(output: Path, kind: str) -> None:
 
 def _keep_input(input: Path, network: Network, output: Path, kind: str, control=None) -> None:
     """Refuse to replace what is read."""
-    tables = (network.images, network.points, network.observations, network.distances)
+    tables = (network.images, network.points, network.observations, network.distances,
+              *network.further)  # fmt: skip
     read = {os.path.realpath(p) for p in (input, *(table.source.name for table in tables))}
     folders = {os.path.realpath(Path(p).parent) for p in read}
     written = {os.path.realpath(p) for p in (output, output / FILE_NAME)}

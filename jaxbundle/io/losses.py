@@ -42,6 +42,7 @@ def what_is_lost(
         "prior σ of exterior orientations": not np.isnan(images.sigma).all(),
         "σ of image points": len(np.unique(network.observations.sigma)) > 1,
         "distances": len(network.distances) > 0,
+        **{one.TABLE: True for one in network.further},
         "that images share a camera": shared_cameras and len(network.cameras) < len(images),
         "names of images and points, which are numbered from 0":
             names and not _numbered(images.id, points.id),

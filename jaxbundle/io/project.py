@@ -42,7 +42,14 @@ from jaxbundle.errors import InputError
 from jaxbundle.file_content import check_plain
 from jaxbundle.io.csv_tables import read_csv, read_toml, write_csv, write_text
 from jaxbundle.io.folders import replaced_folder
-from jaxbundle.io.settings import SETTINGS, TABLES, Document, apply_overrides, network_of
+from jaxbundle.io.settings import (
+    NEEDED,
+    SETTINGS,
+    TABLES,
+    Document,
+    apply_overrides,
+    network_of,
+)
 from jaxbundle.io.toml_text import assignments
 from jaxbundle.network.build import (
     DISTANCE_COLUMNS,
@@ -54,6 +61,8 @@ from jaxbundle.network.build import (
     POINT_SIGMAS,
 )
 from jaxbundle.network.columns import Columns, as_columns, did_you_mean
+from jaxbundle.network.further import SECTIONS, Further
+from jaxbundle.network.further.base import among
 from jaxbundle.network.tables import Camera, Network, Source, require_network
 from jaxbundle.network.units import ANGLE_UNITS, to_image_unit
 
@@ -62,7 +71,9 @@ ADJUSTED = "network"
 """The folder of the adjusted network beside the tables of a result."""
 FILES = (FILE_NAME, *(f"{table}.csv" for table in TABLES))
 """What a project consists of."""
-INLINE = {table: table.removesuffix("s") for table in TABLES}
+INLINE = {
+    table: table.removesuffix("s") for table in TABLES if table.removesuffix("s") not in SECTIONS
+}
 """The tables and the name of one of their rows in the TOML file."""
 
 
@@ -97,11 +108,13 @@ def project_file(path: Path) -> Path:
 
 def _read_document(path: Path) -> Document:
     document = read_toml(path)
-    known = ("project", "camera", *INLINE.values())
+    known = ("project", "camera", *INLINE.values(), *SECTIONS)
     for key, value in document.items():
         if key not in known:
             raise InputError(f"{path}: unknown key {key!r}{did_you_mean(key, known)}")
-        if key != "project" and not (
+        if key in SECTIONS and not isinstance(value, dict):
+            raise InputError(f"{path}: write [{key}] in single brackets; its rows are {key}s.csv")
+        if key not in ("project", *SECTIONS) and not (
             isinstance(value, list) and all(isinstance(row, dict) for row in value)
         ):
             raise InputError(f"{path}: write [[{key}]] in double brackets, one for each {key}")
@@ -111,15 +124,16 @@ def _read_document(path: Path) -> Document:
 
 
 def _read_table(document: Document, table: str, path: Path) -> Columns | None:
-    """A table from its CSV file or from the document itself; None for distances not given."""
-    inline, file = document.get(INLINE[table]), document["project"].get(table)
+    """A table from its CSV file or from the document itself; None where it is not needed and not
+    given."""
+    inline, file = document.get(INLINE.get(table)), document["project"].get(table)
     if inline is not None and file is not None:
         raise InputError(f"{path}: give either {table} = {file!r} or [[{INLINE[table]}]], not both")
     if inline is not None:
         columns = as_columns(inline, table)
         return Columns(columns.values, Source(f"{path} [[{INLINE[table]}]]", None, "entry"))
     if file is None:
-        if table == "distances":
+        if table not in NEEDED:
             return None
         raise InputError(
             f"{path}, [project]: {table} is missing; give {table} = \"{table}.csv\" or "
@@ -182,6 +196,8 @@ def fill_project(network: Network, folder: Path) -> None:
         ends = [[points.id[p] for p in column] for column in distances.points.T]
         values = np.stack([distances.value, distances.sigma], 1)
         _write_table(folder / "distances.csv", DISTANCE_COLUMNS, ends, values, (), values, {})
+    for further in among(network):
+        _write_further(folder, further, radians)
     write_text(folder / FILE_NAME, _document_text(network))
 
 
@@ -195,6 +211,16 @@ def _write_table(path, header, ids, values, sigma_header, sigma, words):
     write_csv(path, (*header, *(sigma_header if with_sigma else ())), rows)
 
 
+def _write_further(folder: Path, further: Further, radians: float) -> None:
+    """The table of a further kind."""
+    columns = {
+        name: column if isinstance(column, tuple) else [
+            x if isinstance(x, str) else "" if x != x else repr(float(x)) for x in column
+        ] for name, column in further.columns(radians).items()
+    }  # fmt: skip
+    write_csv(folder / f"{further.TABLE}.csv", tuple(columns), zip(*columns.values()))
+
+
 def _cells(numbers, words=MappingProxyType({})):
     return (words[x] if x in words else "" if x != x else repr(x) for x in numbers)
 
@@ -202,12 +228,15 @@ def _cells(numbers, words=MappingProxyType({})):
 def _document_text(network: Network) -> str:
     lines = [f"# {' '.join(warning.split())}" for warning in network.warnings]
     settings = {key: getattr(network, key) for key in SETTINGS if key != "sigma_image"}
-    settings |= {table: f"{table}.csv" for table in TABLES}
-    if not len(network.distances):
-        del settings["distances"]
+    further = among(network)
+    tables = [*NEEDED, *["distances"] * (len(network.distances) > 0), *(f.TABLE for f in further)]
+    settings |= {table: f"{table}.csv" for table in tables}
     if not network.datum_points:
         del settings["datum_points"]
     lines += ["[project]", *assignments(settings)]
+    for one in further:
+        if one.SECTION and one.settings:
+            lines += ["", f"[{one.SECTION}]", *assignments(one.settings)]
     return "\n".join(lines) + "\n\n" + cameras_text(network.cameras)
 
 

@@ -49,6 +49,7 @@ def result_dict(adjustment, brief: bool = False) -> dict:
     head |= {
         "cameras": {name: _camera(table) for name, table in adjustment.cameras.items()},
         "images": _images(adjustment),
+        "further_unknowns": adjustment.further_unknowns,
         "removed": [
             {"kind": r.kind, "name": r.name, "test": r.test} for r in adjustment.removed
         ],

@@ -11,10 +11,11 @@ def adjusted_network(adjustment) -> Network:
     """The network of a solved `Adjustment` at its solution.
 
     Cameras, orientations and points have their adjusted values; observations that data snooping has
-    removed are gone. Control points with σ are tie points here and priors are dropped: what they
-    said has been used, and around the adjusted values they would say it twice. So the datum is
-    inner; adjusted again, the network stays as it is. σ of image coordinates are those given, also
-    where variance components were estimated. Check points are not in it.
+    removed are gone. Control points with σ are tie points here; priors and observations of further
+    kinds are dropped: what they said has been used, and around the adjusted values they would say
+    it twice. So the datum is inner; adjusted again, the network stays as it is. σ of image
+    coordinates are those given, also where variance components were estimated. Check points are
+    not in it.
     """
     problem = adjustment.problem
     network = problem.network
@@ -38,5 +39,5 @@ def adjusted_network(adjustment) -> Network:
                       np.full_like(points.sigma, np.nan), points.source),
         observations=Observations(rays.image, rays.point, rays.xy, rays.sigma,
                                   rays.source).take(used),
-        datum="inner", datum_points=(), warnings=("the adjusted network",),
+        datum="inner", datum_points=(), further=(), warnings=("the adjusted network",),
     )  # fmt: skip

@@ -12,10 +12,12 @@ from jaxbundle.cameras import CameraModel
 from jaxbundle.errors import InputError
 from jaxbundle.network.build import CAMERA_FIELDS, make_cameras, make_network
 from jaxbundle.network.columns import Columns, did_you_mean, shown, some
+from jaxbundle.network.further import KINDS, SECTIONS
 from jaxbundle.network.rules import CHOICES, check_choice, check_sigma_image
 from jaxbundle.network.tables import Network
 
-TABLES = ("images", "points", "observations", "distances")
+NEEDED = ("images", "points", "observations")
+TABLES = (*NEEDED, "distances", *KINDS)
 TEXT = ("name", "object_unit", "image_unit", "angle_unit", "datum", "residuals")
 SETTINGS = (*TEXT, "sigma_image", "datum_points")
 CAMERA_KEYS = ("camera.ID.PARAMETER", "camera.ID.sigma.PARAMETER") + tuple(
@@ -33,7 +35,8 @@ def apply_overrides(
     """The document with `KEY=VALUE` settings of the command line put in.
 
     Keys are those of `[project]` in `keys`, `camera.ID.…` of a camera, `camera.*.…` of all
-    cameras, and `free`, which is `camera.*.free`.
+    cameras, `free`, which is `camera.*.free`, and `SECTION.…` of a further kind of
+    observations.
     """
     document = copy.deepcopy(document)
     for override in overrides:
@@ -44,10 +47,12 @@ def apply_overrides(
             _override_cameras(document["camera"], f"camera.{ALL}.free", text)
         elif key.startswith("camera."):
             _override_cameras(document["camera"], key, text)
+        elif key.partition(".")[0] in SECTIONS:
+            _override_section(document, key, text)
         elif key in keys:
             document["project"][key] = _project_value(key, text)
         else:
-            known = (*keys, "free", *CAMERA_KEYS)
+            known = (*keys, "free", *CAMERA_KEYS, *(f"{name}.KEY" for name in SECTIONS))
             raise InputError(f"--set {key}: unknown key; known: {', '.join(known)}")
     return document
 
@@ -96,6 +101,22 @@ def _override_camera(camera: dict, key: str, field: str, text: str) -> None:
         camera[field] = _number(key, text)
 
 
+def _override_section(document: Document, key: str, text: str) -> None:
+    """Put a setting, words or numbers, into a section: `antenna.free`, `antenna.sigma.ax`."""
+    *sections, name = key.split(".")
+    settings = document
+    for section in sections:
+        settings = settings.setdefault(section, {})
+        if not isinstance(settings, dict):
+            raise InputError(f"--set {key}: {section} is {shown(settings)}; a table is expected")
+    words = _words(text)
+    if name == "free":
+        settings[name] = words
+    else:
+        values = [_number(key, word) for word in words]
+        settings[name] = values if text.strip().startswith("[") or len(values) != 1 else values[0]
+
+
 def _words(text: str) -> list[str]:
     return [word.strip() for word in text.strip("[]").split(",") if word.strip()]
 
@@ -118,7 +139,8 @@ def network_of(
     settings = {key: project[key] for key in SETTINGS if key in project}
     settings.setdefault("sigma_image", None)
     cameras = make_cameras(document["camera"], f"{where}, ", models)
-    return make_network(cameras, **tables, **settings)
+    sections = {name: document[name] for name in SECTIONS if name in document}
+    return make_network(cameras, **tables, **sections, **settings)
 
 
 def check_settings(project: Mapping[str, Any], where: str) -> None:

@@ -1,6 +1,7 @@
 """Values as the text of a TOML file."""
 
 import json
+import re
 from collections.abc import Iterable, Mapping
 
 import numpy as np
@@ -8,7 +9,12 @@ import numpy as np
 
 def assignments(table: Mapping) -> Iterable[str]:
     """The lines `key = value` of a table."""
-    return (f"{key} = {toml_value(value)}" for key, value in table.items())
+    return (f"{_key(key)} = {toml_value(value)}" for key, value in table.items())
+
+
+def _key(key: str) -> str:
+    """A key, in quotes where it has to be."""
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else toml_value(str(key))
 
 
 def toml_value(value) -> str:

@@ -221,6 +221,47 @@ class Pose:
 
 
 @dataclasses.dataclass(frozen=True)
+class Frame:
+    """A pose, `PoseValue`, that moves along and about its own axes, δ = (shift along x, y, z, turn
+    about x, y, z), of which `columns` count: a figure that is the same when it is shifted or turned
+    in another way (a plane along itself, a cylinder about its axis)."""
+
+    columns: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
+
+    @property
+    def width(self) -> int:
+        return len(self.columns)
+
+    def prepare(self, value):
+        return Pose().prepare(value)
+
+    def moved(self, block, change):
+        if not change:
+            return block
+        every = [0.0] * 6
+        for column, d in zip(self.columns, change):
+            every[column] = d
+        return Posed(block.rotation._replace(turn=tuple(every[3:])), block.place(every[:3]))
+
+    def retract(self, value, change):
+        every = jnp.zeros(6).at[jnp.array(self.columns, int)].set(change)
+        shift = matrix_from_quaternion(value.rotation).T @ every[:3]
+        return PoseValue(value.position + shift, retract_quaternion(value.rotation, every[3:]))
+
+    def difference(self, value, origin):
+        shift = matrix_from_quaternion(origin.rotation) @ (value.position - origin.position)
+        turn = quaternion_difference(value.rotation, origin.rotation)
+        return jnp.concatenate([shift, turn])[jnp.array(self.columns, int)]
+
+    def hold(self, value, given, free):
+        held = self.retract(given, jnp.where(free > 0, self.difference(value, given), 0.0))
+        return jax.tree.map(lambda x, y: jnp.where(free.min() > 0, x, y), value, held)
+
+    def chart(self, value):
+        return None
+
+
+@dataclasses.dataclass(frozen=True)
 class Direction:
     """Unit vectors of `size` numbers; a change is one in the tangent plane, in an orthonormal basis
     of it (of the Householder reflection that takes the vector to an axis)."""

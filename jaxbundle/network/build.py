@@ -9,6 +9,7 @@ The columns are those of the project format:
 | points | id, role (tie, control, fixed, check), X, Y, Z, and σ: sX, sY, sZ |
 | observations | image, point, x, y, and σ: sx, sy |
 | distances | from, to, value, sigma |
+| antennas, attitudes, differences, angles, figures, shapes | `jaxbundle.network.further` |
 
 The columns X0, Y0, Z0 of images, and omega, phi, kappa, may be left out, all three together.
 Missing values (None, NaN, empty text) mean: no start value, no σ. A σ of an image may be "fixed"
@@ -32,6 +33,7 @@ from jaxbundle.network.columns import (
     is_missing,
     shown,
 )
+from jaxbundle.network.further import KINDS, SECTIONS, Further
 from jaxbundle.network.rules import (
     AXES,
     CHOICES,
@@ -83,6 +85,7 @@ def make_network(
     image_unit: str = "mm",
     object_unit: str = "m",
     name: str = "network",
+    **further: Any,
 ) -> Network:
     """A network from plain tables (see the module's docstring for their columns).
 
@@ -96,6 +99,8 @@ def make_network(
       coordinate that is NaN or masked is refused with its row, while in the arrays of
       `calibrate_batch`, where every view has a place for every point, it was not measured.
     - `sigma_image`: σ of image coordinates without their own (None: 1, with a warning).
+    - `further`: tables of further kinds of observations, and the settings of their sections, by
+      name: `antennas=table, antenna={"lever_arm": [0.1, 0, 0.3], "free": ["shift"]}`.
 
     **Raises:** `InputError` naming table, row and column. `check_network` does the rest.
     """
@@ -132,13 +137,34 @@ def make_network(
         datum_points=tuple(str(id) for id in datum_points),
         object_unit=object_unit,
         name=name,
+        further=make_further(further, ANGLE_UNITS[angle_unit]),
         **given,
     )
+    for one in network.further:
+        one.check(network)
     if sigma_image is None and unweighted:
         network = network.warn(
             f"sigma_image is not given: image coordinates without σ have σ = 1 {image_unit}"
         )
     return network
+
+
+def make_further(given: Mapping[str, Any], radians: float, where: str = "") -> tuple[Further, ...]:
+    """Observations of further kinds from their tables and the settings of their sections.
+
+    **Raises:** `InputError`, also for a name of neither, and for settings without a table."""
+    known = (*KINDS, *SECTIONS)
+    for name in given:
+        if name not in known:
+            raise InputError(f"{where}unknown table {name!r}{did_you_mean(name, known)}")
+    made = []
+    for name, kind in KINDS.items():
+        settings = given.get(kind.SECTION, {})
+        if given.get(name) is not None:
+            made.append(kind.of(as_columns(given[name], name), settings, radians))
+        elif settings:
+            raise InputError(f"{where}[{kind.SECTION}] is given, but no table {name}")
+    return tuple(made)
 
 
 def make_cameras(

@@ -24,6 +24,7 @@ from jaxbundle.leastsquares.spaces import Pose, PoseValue, Vector
 from jaxbundle.network import kinds
 from jaxbundle.network.also import place, split
 from jaxbundle.network.arrays import Data, Values
+from jaxbundle.network.further.base import among
 from jaxbundle.network.tables import EXTERIOR, Camera, Network
 
 
@@ -162,6 +163,7 @@ class Declared:
     layout: Layout
     data: Data
     origin: Float[np.ndarray, "3"]
+    motions: ls.Motions
 
 
 def declare(network: Network, origin=None, also=()) -> Declared:
@@ -208,8 +210,13 @@ def declare(network: Network, origin=None, also=()) -> Declared:
         columns = len(t.parameters)
         observe(kind, (row_of_camera[priors["interior"][rows]],), "interior", rows, columns)
     observe(kinds.DISTANCES, tuple(network.distances.points.T), "distance")
+    declared = [f.declare(network, origin) for f in among(network)]
+    further += [table for one in declared for table in one.tables]
     tables += further
     others = [place(one, origin).resolved(tables) for one in others]
+    others += [one for of_kind in declared for one in of_kind.observations]
+    similarity = kinds.SIMILARITY
+    actions = (*similarity.actions, *(action for one in declared for action in one.actions))
     start = dataclasses.replace(start, other={t.name: t.value for t in further})
     weights = observed_weights(tables, others)
     data = dataclasses.replace(
@@ -217,7 +224,8 @@ def declare(network: Network, origin=None, also=()) -> Declared:
     )
     given += others
     layout = Layout(cameras, tuple(sets), start.camera.shape[1], priors)
-    return Declared(tuple(tables), tuple(given), layout, data, origin)
+    motions = dataclasses.replace(similarity, actions=actions)
+    return Declared(tuple(tables), tuple(given), layout, data, origin, motions)
 
 
 def order_cameras(network: Network) -> Network:

@@ -8,10 +8,11 @@ common point connects each need a datum of their own.
 import dataclasses
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.columns import count, some
+from jaxbundle.network.further.base import among
 from jaxbundle.network.tables import EXTERIOR, Distances, Network, Observations, Points
 
 
@@ -85,12 +86,23 @@ def controlled_axes(points: Points):
     )
 
 
+def equations_of(network: Network, things: str) -> Int[np.ndarray, " things"]:
+    """How many equations of further kinds touch every image ("IMAGES") or point ("POINTS")."""
+    table = network.images if things == "IMAGES" else network.points
+    row, number = {id: i for i, id in enumerate(table.id)}, np.zeros(len(table), int)
+    for one in among(network):
+        for field in getattr(one, things):
+            at = np.array([row[id] for id in getattr(one, field)], int)
+            np.add.at(number, at, one.number_of_equations())
+    return number
+
+
 def leave_out_undetermined(network: Network) -> Network:
     """The network without points that too few rays determine, with warnings that name them."""
     points, distances = network.points, network.distances
     fixed, check = points.has_role("fixed"), points.has_role("check")
     rays = np.bincount(network.observations.point, minlength=len(points))
-    known = controlled_axes(points)
+    known = controlled_axes(points) + equations_of(network, "POINTS")
     keep = np.ones(len(points), bool)
     while True:
         ends = distances.points[keep[distances.points].all(1)]
@@ -111,6 +123,10 @@ def leave_out_undetermined(network: Network) -> Network:
         )
         if mask.any()
     ]
+    for one in network.further:
+        gone = len(one) - len(one.among(keep_points(network, keep)))
+        if gone:
+            messages.append(f"{one.TABLE}: left out {count(gone, 'row')} of what was left out")
     lost = (~keep[distances.points].all(1)).sum()
     if lost:
         messages.append(f"left out {count(lost, 'distance')} to a point that was left out")
@@ -132,7 +148,7 @@ def check_images(before: Network, network: Network) -> None:
     taking_part = ~network.points.has_role("check")[network.observations.point]
     rays = np.bincount(network.observations.image[taking_part], minlength=len(images))
     measured = np.bincount(before.observations.image, minlength=len(images))
-    equations = 2 * rays + (~np.isnan(images.sigma)).sum(1)
+    equations = 2 * rays + (~np.isnan(images.sigma)).sum(1) + equations_of(network, "IMAGES")
     for row in np.flatnonzero((rays == 0) | (equations < 6))[:1]:
         place = f"{images.source(row)}: image {images.id[row]!r}: "
         if measured[row] == 0:
@@ -168,7 +184,8 @@ def check_parts(network: Network) -> None:
         return
     datum = np.unique(np.stack([part[rays.image], rays.point])[:, known[rays.point]], axis=1)
     known_points = np.bincount(datum[0], minlength=len(labels))
-    priors = np.bincount(part, (~np.isnan(images.sigma)).sum(1), minlength=len(labels))
+    priors = (~np.isnan(images.sigma)).sum(1) + equations_of(network, "IMAGES")
+    priors = np.bincount(part, priors, minlength=len(labels))
     loose = np.flatnonzero((known_points < 3) & (priors < 6))
     if len(loose):
         size = np.bincount(part)
@@ -202,7 +219,10 @@ def connected_parts(image, point, images: int, points: int):
 
 
 def check_redundancy(network: Network) -> None:
-    """Refuse fewer observations, priors and datum conditions than unknowns."""
+    """Refuse fewer observations, priors and datum conditions than unknowns; with observations of
+    further kinds, which bring unknowns of their own, the adjustment finds that out."""
+    if network.further:
+        return
     images, points = network.images, network.points
     points = points.take(~points.has_role("check"))
     taking_part = ~network.points.has_role("check")[network.observations.point]

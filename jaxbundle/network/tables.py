@@ -15,6 +15,7 @@ are kept beside them for people.
 import dataclasses
 import os
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -171,7 +172,8 @@ class Network:
     `datum` is "control" (given by control points, priors), "inner" (inner constraints on
     `datum_points`, all tie points if empty) or "minimal" (as many coordinates held as the network
     has datum defects). `residuals` names the domain in which v = computed − observed is formed.
-    `warnings` tell what was left out and why; they end up in the report.
+    `further`: observations of further kinds (`network/further`), which name images and points by
+    id. `warnings` tell what was left out and why; they end up in the report.
     """
 
     cameras: tuple[Camera, ...]
@@ -186,6 +188,7 @@ class Network:
     object_unit: str = "m"
     image_unit: str = "mm"
     angle_unit: str = "rad"
+    further: tuple[Any, ...] = ()
     warnings: tuple[str, ...] = ()
 
     def replace(self, **changes) -> "Network":

@@ -106,6 +106,8 @@ def find_start_values(network: Network, improve: Callable | None = None) -> Orie
     Returns and raises what `jaxbundle.orient` does, which is this with an adjustment on the way.
     """
     network = check_tables(network)
+    for one in network.further:
+        network = one.begin(network)
     seen = sights(network)
     model, frame = _model(network, seen, improve and partial(improve, network))
     if not model.placed.any():

@@ -247,3 +247,22 @@ def _list_of_points(adjustment, most) -> list[str]:
         *table(header, rows, "llrrrrrrr"),
         *_left_out(total, most, "point", "points.csv"),
     ]
+
+
+# --- further kinds of observations ----------------------------------------------------------
+
+
+def further(adjustment, most: int) -> list[str]:
+    """The unknowns of further kinds of observations, a line each."""
+    lines = []
+    for name, found in adjustment.further_unknowns.items():
+        rows = [
+            (row, parameter, *estimate(one["value"], one["sigma"]))
+            for row, parameters in found.items()
+            for parameter, one in parameters.items()
+        ]
+        lines += heading(clean(name[0].upper() + name[1:]))
+        lines += table(("of", "unknown", "value", "σ"), rows[:most], "llrr")
+        if len(rows) > most:
+            lines += _left_out(len(rows), most, "unknown", "result.json")
+    return lines

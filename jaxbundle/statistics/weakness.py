@@ -15,6 +15,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.leastsquares.weakness import FAR, VAGUE, Extents, find_weak, find_weak_unsolved
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.columns import count, some
+from jaxbundle.network.further.base import ANGLES, LENGTHS
 from jaxbundle.statistics.inspection import Inspection
 
 ADVICE_FOR = {
@@ -23,6 +24,10 @@ ADVICE_FOR = {
     "image": "An image needs three or more well spread points whose coordinates are determined.",
     "point": "A point needs rays from two directions or more.",
 }
+FURTHER = (
+    "Hold what cannot be told apart, or give it a prior σ: a lever arm from the shifts of strips, "
+    "a tilt that its points do not show."
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +51,8 @@ class Weakness:
             found.append(
                 f"poorly determined: {some(self.unknowns, 8, str)}; a σ {worst} the "
                 f"principal distance, the distance to the object, or a radian, and above "
-                f"{1 / VAGUE:g} of it the solution is one in name only. {ADVICE_FOR[kinds[0]]}"
+                f"{1 / VAGUE:g} of it the solution is one in name only. "
+                f"{ADVICE_FOR[kinds[0]] if kinds else FURTHER}"
             )
         if self.points:
             most = 2 * len(self.points) > self.of
@@ -91,6 +97,12 @@ def _extents(inspection: Inspection) -> Extents:
         shortest = np.abs(np.asarray(values.camera)[table.cameras][:, at]).min(1)
         shortest = np.maximum(shortest, np.finfo(float).tiny)
         found[table.name] = judged / shortest[:, None]
+    mean = float(of_image[of_image > 0].mean()) if (of_image > 0).any() else 1.0
+    for name in values.other:
+        given = problem.system.table(name)
+        judged = [(p in LENGTHS) / mean + (p in ANGLES) for p in given.parameters]
+        if any(judged):
+            found[name] = np.tile(judged, (given.rows, 1))
     return found | {"point": of_point}
 
 

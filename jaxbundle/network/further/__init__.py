@@ -1,0 +1,14 @@
+"""Observations of further kinds that a network carries: one file a kind, all alike to the rest of
+the package (`base.Further`)."""
+
+from jaxbundle.network.further.antennas import Antennas as Antennas
+from jaxbundle.network.further.attitudes import Attitudes as Attitudes
+from jaxbundle.network.further.base import Further as Further
+from jaxbundle.network.further.differences import Angles as Angles
+from jaxbundle.network.further.differences import Differences as Differences
+from jaxbundle.network.further.figures import Figures as Figures
+from jaxbundle.network.further.figures import Shapes as Shapes
+
+KINDS = {kind.TABLE: kind for kind in (Antennas, Attitudes, Differences, Angles, Figures, Shapes)}
+"""By the name of their table."""
+SECTIONS = tuple(kind.SECTION for kind in KINDS.values() if kind.SECTION)

@@ -1,0 +1,180 @@
+"""Projection centres measured by GNSS: table `antennas`, section `[antenna]`.
+
+The antenna stands at the lever arm a from the projection centre, told in the camera frame; every
+strip may have a shift s and a drift d, and the clock of the exposures may differ from that of GNSS
+by δt (Ackermann and Schade 1993; Kraus 2007, 5.2):
+
+    X_A = X0 + Mᵀ·a + s + d·(t − ts) + V·δt − measured
+
+ts: the mean time of the strip; V: the velocity, from the measured positions before and after.
+
+| column | meaning |
+|---|---|
+| `image`, `X`, `Y`, `Z` | position of the antenna at the exposure, object unit |
+| `sX`, `sY`, `sZ` | its σ; `rXY`, `rXZ`, `rYZ` its correlations, 0 if not given |
+| `strip` | any text; without it all are one strip |
+| `t` | seconds, for drifts and a time offset |
+
+Section: `lever_arm = [ax, ay, az]` (0 if not given), or by camera `{ left = [...], … }`;
+`free`: of `ax`, `ay`, `az`, `shift`, `drift`, `time_offset`; `sigma`: a table of their prior σ.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.declarations import Kind, Table
+from jaxbundle.leastsquares.spaces import Vector
+from jaxbundle.network.columns import Columns
+from jaxbundle.network.further.base import (
+    Declared,
+    Further,
+    Parameters,
+    check_settings,
+    numbers,
+    positive_sigma,
+)
+
+ARM = ("ax", "ay", "az")
+FREE = (*ARM, "shift", "drift", "time_offset")
+AXES = ("X", "Y", "Z")
+PAIRS = ((0, 1), (0, 2), (1, 2))
+SECTION = "antenna"
+
+
+def antenna(pose, arm, strip, clock, given):
+    """The position of an antenna less the measured one; `given`: it, the time since the middle of
+    the strip, the velocity."""
+    measured, since, velocity = given
+    return tuple(
+        x + strip[k] + strip[3 + k] * since + velocity[k] * clock[0] - measured[k]
+        for k, x in enumerate(pose.place(arm))
+    )
+
+
+POSITION = Kind(
+    "antenna positions", antenna, ("image", "lever arm", "GNSS strip", "GNSS clock"), AXES,
+    scalars=True, snooped="whole",
+)  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Antennas(Further):
+    """Positions of antennas; `covariance` in the square of the object unit."""
+
+    image: tuple[str, ...]
+    position: Float[np.ndarray, "n 3"]
+    covariance: Float[np.ndarray, "n 3 3"]
+    strip: tuple[str, ...]
+    time: Float[np.ndarray, " n"]
+
+    TABLE, SECTION, IMAGES = "antennas", SECTION, ("image",)
+
+    @classmethod
+    def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Antennas":
+        sigmas, pairs = [f"s{a}" for a in AXES], [f"r{AXES[i]}{AXES[j]}" for i, j in PAIRS]
+        table.check_names(("image", *AXES, *sigmas), (*pairs, "strip", "t"))
+        check_settings(SECTION, settings, ("lever_arm", "free", "sigma"))
+        chosen = Parameters.of(SECTION, settings, FREE)
+        position = np.stack([table.numbers(a, required=True) for a in AXES], 1)
+        sigma = np.stack([positive_sigma(table, s) for s in sigmas], 1)
+        R = np.tile(np.eye(3), (len(table), 1, 1))
+        for (i, j), name in zip(PAIRS, pairs):
+            R[:, i, j] = R[:, j, i] = np.nan_to_num(table.numbers(name))
+        for row in np.flatnonzero(~(np.linalg.eigvalsh(R).min(1) > 1e-12))[:1]:
+            raise InputError(f"{table.source(row)}: the correlations {', '.join(pairs)} are "
+                             "impossible together")  # fmt: skip
+        time = table.numbers("t")
+        if {"drift", "time_offset"} & {*chosen.free} and np.isnan(time).any():
+            row = int(np.isnan(time).argmax())
+            raise InputError(f"{table.source(row)}: t is missing; drift and time_offset need it")
+        strip = table.ids("strip") if "strip" in table.values else ("all",) * len(table)
+        return cls(
+            image=table.ids("image"), position=position, strip=strip, time=time,
+            covariance=R * sigma[:, :, None] * sigma[:, None, :], settings=dict(settings),
+            source=table.source,
+        )  # fmt: skip
+
+    def columns(self, radians: float) -> dict:
+        sigma = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+        R = self.covariance / sigma[:, :, None] / sigma[:, None, :]
+        columns = {"image": self.image}
+        columns |= {a: self.position[:, k] for k, a in enumerate(AXES)}
+        columns |= {f"s{a}": sigma[:, k] for k, a in enumerate(AXES)}
+        columns |= {f"r{AXES[i]}{AXES[j]}": R[:, i, j] for i, j in PAIRS}
+        return columns | {"strip": self.strip} | ({} if np.isnan(self.time).any() else
+                                                  {"t": self.time})  # fmt: skip
+
+    def begin(self, network):
+        """The places of antennas stand for projection centres without start values."""
+        images = network.images
+        row = {id: k for k, id in enumerate(self.image)}
+        position = images.position.copy()
+        for i, id in enumerate(images.id):
+            if id in row and np.isnan(position[i]).any():
+                position[i] = self.position[row[id]]
+        return network.replace(images=dataclasses.replace(images, position=position))
+
+    def number_of_equations(self) -> int:
+        return 3
+
+    def declare(self, network, origin) -> Declared:
+        images = network.images
+        row = {id: i for i, id in enumerate(images.id)}
+        image = np.array([row[id] for id in self.image], int)
+        camera, of_camera = np.unique(images.camera[image], return_inverse=True)
+        strips, strip = np.unique(np.array(self.strip, dtype=object), return_inverse=True)
+        parameters = Parameters.of(SECTION, self.settings, FREE)
+        cameras = [network.cameras[c].id for c in camera]
+        arm = Table(
+            "lever arm", _lever_arms(self.settings, cameras), Vector(3), parameters.mask(ARM),
+            cameras, ARM, "lever arm of camera",
+        )  # fmt: skip
+        since, velocity = _track(self.position, strip, self.time)
+        if "time_offset" in parameters.free and not velocity.any():
+            raise InputError(f"{self.source.name}: time_offset needs three positions in a strip")
+        groups = np.repeat(["shift", "drift"], 3)
+        names = ("shift X", "shift Y", "shift Z", "drift X", "drift Y", "drift Z")
+        shift = Table("GNSS strip", np.zeros((len(strips), 6)), Vector(6), parameters.mask(groups),
+                      list(strips), names)  # fmt: skip
+        clock = Table("GNSS clock", np.zeros((1, 1)), Vector(1),
+                      parameters.mask(["time_offset"]), ["offset"], ("seconds",))  # fmt: skip
+        seen = POSITION(
+            (image, of_camera, strip, np.zeros(len(self), int)),
+            (self.position - origin, since, velocity), covariance=self.covariance,
+        )  # fmt: skip
+        priors = (
+            *parameters.priors(arm, ARM),
+            *parameters.priors(shift, groups),
+            *parameters.priors(clock, ["time_offset"]),
+        )
+        return Declared((arm, shift, clock), (seen, *priors))
+
+
+def _lever_arms(settings, cameras) -> Float[np.ndarray, "cameras 3"]:
+    given = settings.get("lever_arm", [0.0, 0.0, 0.0])
+    if not isinstance(given, Mapping):
+        return np.tile(numbers(SECTION, "lever_arm", given, 3), (len(cameras), 1))
+    for camera in cameras:
+        if camera not in given:
+            raise InputError(f"[{SECTION}]: lever_arm of camera {camera!r} is missing")
+    return np.array([numbers(SECTION, f"lever_arm of {c}", given[c], 3) for c in cameras])
+
+
+def _track(position, strip, time):
+    """The time since the middle of its strip of every position, and the velocity there (0 where a
+    strip has fewer than three)."""
+    since, velocity = np.zeros(len(time)), np.zeros_like(position)
+    if np.isnan(time).any():
+        return since, velocity
+    for s in range(strip.max() + 1 if len(strip) else 0):
+        rows = np.flatnonzero(strip == s)
+        since[rows] = time[rows] - time[rows].mean()
+        if len(np.unique(time[rows])) == len(rows) >= 3:
+            order = rows[np.argsort(time[rows])]
+            velocity[order] = np.gradient(position[order], time[order], axis=0)
+    return since, velocity

@@ -1,0 +1,118 @@
+"""Attitudes measured by an INS: table `attitudes`, section `[attitude]`.
+
+The camera is turned against the INS by a boresight ΔM that is the same for all images of a camera,
+M = ΔM·M_INS (Cramer and Stallmann 2002). Residuals are ω, φ, κ of ΔMᵀ·M less the measured ones.
+
+Columns: `image`, `omega`, `phi`, `kappa` and their σ `somega`, `sphi`, `skappa`, in the project's
+unit of angles. Section: `boresight = [omega, phi, kappa]` of ΔM, start values in that unit (0 if
+not given), or by camera; `free = ["boresight"]`; `sigma = { boresight = … }` of its three angles.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry import (
+    matrix_from_omega_phi_kappa,
+    omega_phi_kappa_near,
+    quaternion_from_matrix,
+)
+from jaxbundle.leastsquares.declarations import Kind, Table
+from jaxbundle.leastsquares.spaces import Rotation
+from jaxbundle.network.columns import Columns
+from jaxbundle.network.further.base import (
+    Declared,
+    Further,
+    Parameters,
+    check_settings,
+    numbers,
+    positive_sigma,
+)
+from jaxbundle.network.units import ANGLE_UNITS
+
+ANGLES = ("omega", "phi", "kappa")
+SECTION = "attitude"
+
+
+def attitude(pose, boresight, measured):
+    """ω, φ, κ of ΔMᵀ·M, next to the measured ones, less these."""
+    M = boresight.matrix().T @ pose.rotation.matrix()
+    return omega_phi_kappa_near(M, measured) - measured
+
+
+def turned(boresight, given):
+    """The rotation vector of a boresight against the given one [3, 3], for small differences."""
+    R = boresight.matrix() @ given.T
+    return 0.5 * jnp.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+
+
+ATTITUDE = Kind("attitudes", attitude, ("image", "boresight"), ANGLES)
+PRIOR = Kind("prior of boresight", turned, ("boresight",), ANGLES, snooped="")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Attitudes(Further):
+    """Attitudes and their σ, radians; `settings` in the unit of the table."""
+
+    image: tuple[str, ...]
+    angles: Float[np.ndarray, "n 3"]
+    sigma: Float[np.ndarray, "n 3"]
+
+    TABLE, SECTION, IMAGES = "attitudes", SECTION, ("image",)
+
+    @classmethod
+    def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Attitudes":
+        sigmas = [f"s{a}" for a in ANGLES]
+        table.check_names(("image", *ANGLES, *sigmas))
+        check_settings(SECTION, settings, ("boresight", "free", "sigma"))
+        Parameters.of(SECTION, settings, ("boresight",))
+        angles = np.stack([table.numbers(a, required=True) for a in ANGLES], 1)
+        sigma = np.stack([positive_sigma(table, s) for s in sigmas], 1)
+        return cls(image=table.ids("image"), angles=radians * angles, sigma=radians * sigma,
+                   settings=dict(settings), source=table.source)  # fmt: skip
+
+    def columns(self, radians: float) -> dict:
+        columns = {"image": self.image}
+        columns |= {a: self.angles[:, k] / radians for k, a in enumerate(ANGLES)}
+        return columns | {f"s{a}": self.sigma[:, k] / radians for k, a in enumerate(ANGLES)}
+
+    def number_of_equations(self) -> int:
+        return 3
+
+    def declare(self, network, origin) -> Declared:
+        images = network.images
+        row = {id: i for i, id in enumerate(images.id)}
+        image = np.array([row[id] for id in self.image], int)
+        camera, of_camera = np.unique(images.camera[image], return_inverse=True)
+        cameras = [network.cameras[c].id for c in camera]
+        radians = ANGLE_UNITS[network.angle_unit]
+        parameters = Parameters.of(SECTION, self.settings, ("boresight",))
+        M = np.stack([
+            np.asarray(matrix_from_omega_phi_kappa(radians * angles))
+            for angles in _boresights(self.settings, cameras)
+        ])  # fmt: skip
+        boresight = Table(
+            "boresight", np.asarray(jax.vmap(quaternion_from_matrix)(M)), Rotation(),
+            "boresight" in parameters.free, cameras, ANGLES, "boresight of camera",
+        )  # fmt: skip
+        found = [ATTITUDE((image, of_camera), self.angles, sigma=self.sigma)]
+        if "boresight" in parameters.sigma:
+            sigma = radians * parameters.sigma["boresight"]
+            found.append(PRIOR((np.arange(len(M)),), M, sigma=sigma))
+        return Declared((boresight,), found)
+
+
+def _boresights(settings, cameras) -> Float[np.ndarray, "cameras 3"]:
+    given = settings.get("boresight", [0.0, 0.0, 0.0])
+    if not isinstance(given, Mapping):
+        return np.tile(numbers(SECTION, "boresight", given, 3), (len(cameras), 1))
+    for camera in cameras:
+        if camera not in given:
+            raise InputError(f"[{SECTION}]: boresight of camera {camera!r} is missing")
+    return np.array([numbers(SECTION, f"boresight of {c}", given[c], 3) for c in cameras])

@@ -1,0 +1,193 @@
+"""What observations of a further kind have in common: tables of rows that touch things by id."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple, Self
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxbundle.arguments import shown
+from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.declarations import Kind, Observations, Table
+from jaxbundle.network.columns import Columns, did_you_mean
+from jaxbundle.network.tables import Source
+
+LENGTHS = frozenset((
+    "ax", "ay", "az", "shift X", "shift Y", "shift Z", "shift x", "shift y", "shift z", "R",
+))  # fmt: skip
+ANGLES = frozenset(("omega", "phi", "kappa", "turn x", "turn y", "turn z"))
+"""Unknowns of further tables that are lengths of object space, and angles: their σ are compared
+with the distance of the points and with a radian."""
+
+
+class Declared(NamedTuple):
+    """For the engine: tables of unknowns, sets of observations (object coordinates relative to the
+    origin), and how a similarity of object space moves the tables, (name, function) each."""
+
+    tables: Sequence[Table] = ()
+    observations: Sequence[Observations] = ()
+    actions: Sequence[tuple[str, Callable]] = ()
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Further:
+    """Rows of one further kind. A subclass has a column (a tuple or an array) for each field but
+    `settings` and `source`, and says what its columns of ids touch.
+
+    `settings`: of the section `SECTION` of a project."""
+
+    TABLE: ClassVar[str]
+    """What `make_network` and a project call the table."""
+    SECTION: ClassVar[str] = ""
+    IMAGES: ClassVar[tuple[str, ...]] = ()
+    POINTS: ClassVar[tuple[str, ...]] = ()
+    """The fields that hold ids of images, of points."""
+
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    source: Source = Source("table")
+
+    @classmethod
+    def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> Self:
+        """From the columns of a table; `radians` in one unit of angle."""
+        raise NotImplementedError
+
+    def columns(self, radians: float) -> dict[str, Sequence[Any]]:
+        """The columns of the table, as `of` takes them."""
+        raise NotImplementedError
+
+    def declare(self, network, origin: Float[np.ndarray, "3"]) -> Declared:
+        """The tables and observations for a network, of which all rows are (`among`)."""
+        raise NotImplementedError
+
+    def __len__(self) -> int:
+        return len(getattr(self, (*self.IMAGES, *self.POINTS)[0]))
+
+    def take(self, rows) -> Self:
+        """The chosen rows (a mask or indices)."""
+        rows = np.flatnonzero(rows) if np.asarray(rows).dtype == bool else np.asarray(rows)
+        names = [f.name for f in dataclasses.fields(self) if f.name not in ("settings", "source")]
+        cut = lambda x: x[rows] if isinstance(x, np.ndarray) else tuple(x[row] for row in rows)
+        chosen = {name: cut(getattr(self, name)) for name in names}
+        return dataclasses.replace(self, source=self.source.take(rows), **chosen)
+
+    def among(self, network) -> Self:
+        """The rows of which the network has all images and points."""
+        return self.take(self._present(network))
+
+    def _present(self, network) -> np.ndarray:
+        keep = np.ones(len(self), bool)
+        for fields, known in ((self.IMAGES, network.images.id), (self.POINTS, network.points.id)):
+            known = set(known)
+            for field in fields:
+                keep &= np.array([id in known for id in getattr(self, field)], bool)
+        return keep
+
+    def check(self, network) -> None:
+        """Refuse rows about images and points that are not there.
+
+        **Raises:** `InputError`."""
+        for fields, table, thing in (
+            (self.IMAGES, network.images, "image"), (self.POINTS, network.points, "point"),
+        ):  # fmt: skip
+            known = set(table.id)
+            for field in fields:
+                for row, id in enumerate(getattr(self, field)):
+                    if id not in known:
+                        raise InputError(
+                            f"{self.source(row)}: {thing} {id!r} is unknown: no such {thing} in "
+                            f"{table.source.name}{did_you_mean(id, known, listing=False)}"
+                        )
+
+    def begin(self, network):
+        """The network with start values that these rows give, where it has none."""
+        return network
+
+    def number_of_equations(self) -> int:
+        """How many a row is; they help to determine every image and point it touches."""
+        return 1
+
+
+def among(network) -> list[Further]:
+    """The observations of further kinds of a network whose images and points all take part."""
+    present = (one.among(network) for one in network.further)
+    return [one for one in present if len(one)]
+
+
+def positive_sigma(
+    table: Columns, name: str, *, required: bool = True, words: Mapping[str, float] | None = None
+) -> Float[np.ndarray, " rows"]:
+    """A column of σ; NaN where there is none.
+
+    **Raises:** `InputError` for one that is not positive, or is missing but needed."""
+    sigma = table.numbers(name, required=required, words=words)
+    for row in np.flatnonzero(~(sigma > 0) & ~np.isnan(sigma))[:1]:
+        raise InputError(f"{table.source(row)}: {name} is {sigma[row]:g}; it must be positive")
+    return sigma
+
+
+def check_settings(section: str, given: Mapping[str, Any], known: Sequence[str]) -> None:
+    """Refuse settings of a section that are not known."""
+    if not isinstance(given, Mapping):
+        raise InputError(f"[{section}]: a section of settings is expected, not {shown(given)}")
+    for key in given:
+        if key not in known:
+            raise InputError(f"[{section}]: unknown key {key!r}{did_you_mean(key, known)}")
+
+
+def numbers(section: str, key: str, value: Any, length: int) -> Float[np.ndarray, " length"]:
+    """So many numbers of a setting.
+
+    **Raises:** `InputError`."""
+    try:
+        found = np.array(value, float)
+    except (TypeError, ValueError):
+        found = np.zeros(0)
+    if found.shape != (length,) or not np.isfinite(found).all():
+        raise InputError(f"[{section}]: {key} is {shown(value)}; {length} numbers are expected")
+    return found
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameters:
+    """Parameters a section may free: their names, which are free, their prior σ (NaN: none)."""
+
+    names: tuple[str, ...]
+    free: tuple[str, ...]
+    sigma: Mapping[str, float]
+
+    @staticmethod
+    def of(section: str, settings: Mapping[str, Any], names: tuple[str, ...]) -> "Parameters":
+        """From the keys `free` and `sigma` of a section.
+
+        **Raises:** `InputError`."""
+        free, sigma = settings.get("free", ()), settings.get("sigma", {})
+        if isinstance(free, str):
+            free = [name.strip() for name in free.strip("[]").split(",") if name.strip()]
+        for name in (*free, *sigma):
+            if name not in names:
+                raise InputError(f"[{section}]: unknown {name!r}{did_you_mean(name, names)}")
+        for name, value in sigma.items():
+            if name not in free:
+                raise InputError(f"[{section}]: sigma is given for {name!r}, which is not free")
+            if not (isinstance(value, int | float) and value > 0):
+                raise InputError(f"[{section}]: sigma of {name} is {shown(value)}; a positive "
+                                 "number is expected")  # fmt: skip
+        return Parameters(names, tuple(free), dict(sigma))
+
+    def mask(self, names: Sequence[str]) -> Bool[np.ndarray, "1 n"]:
+        """Which of these are free, in every row."""
+        return np.array([[name in self.free for name in names]])
+
+    def priors(self, table: Table, names: Sequence[str]) -> list[Observations]:
+        """Pseudo-observations of the start values of a table of vectors with these columns."""
+        sigma = np.array([self.sigma.get(name, np.inf) for name in names])
+        if not np.isfinite(sigma).any():
+            return []
+        kind = Kind(f"prior of {table.title}", _less, (table.name,), tuple(names), snooped="")
+        sigma = np.tile(sigma, (table.rows, 1))
+        return [kind((np.arange(table.rows),), table.value, sigma=sigma)]
+
+
+def _less(value, given):
+    return value - given

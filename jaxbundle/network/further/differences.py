@@ -1,0 +1,110 @@
+"""Differences of coordinates and angles between points: tables `differences`, `angles`.
+
+`differences`: `from`, `to`, and of `dX`, `dY`, `dZ` with `sdX`, `sdY`, `sdZ` those measured (a
+levelled height difference has dZ alone). `angles`: `from`, `at`, `to`, `value`, `sigma`: the angle
+at a point between the directions to two others, 0 to π, in the project's unit of angles.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.declarations import Kind
+from jaxbundle.network.columns import Columns
+from jaxbundle.network.further.base import Declared, Further, positive_sigma
+
+AXES = ("dX", "dY", "dZ")
+
+
+def difference(a, b, measured):
+    """b − a less the measured difference."""
+    return b - a - measured
+
+
+def angle(a, at, b, measured):
+    """The angle at a point between two others less the measured one, radians."""
+    u, v = a - at, b - at
+    sine = jnp.sqrt(jnp.sum(jnp.cross(u, v) ** 2))
+    return jnp.arctan2(sine, u @ v) - measured
+
+
+DIFFERENCE = Kind("coordinate differences", difference, ("point", "point"), AXES, snooped="single")
+ANGLE = Kind("angles", angle, ("point", "point", "point"), ("angle",))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Differences(Further):
+    """Coordinates of `to` less those of `start`; σ infinite where nothing was measured."""
+
+    start: tuple[str, ...]
+    to: tuple[str, ...]
+    value: Float[np.ndarray, "n 3"]
+    sigma: Float[np.ndarray, "n 3"]
+
+    TABLE, POINTS = "differences", ("start", "to")
+
+    @classmethod
+    def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Differences":
+        table.check_names(("from", "to"), (*AXES, *(f"s{a}" for a in AXES)))
+        value = np.stack([table.numbers(a) for a in AXES], 1)
+        sigma = np.stack([positive_sigma(table, f"s{a}", required=False) for a in AXES], 1)
+        given = ~np.isnan(value)
+        for row in np.flatnonzero((given != ~np.isnan(sigma)).any(1) | ~given.any(1))[:1]:
+            raise InputError(f"{table.source(row)}: a difference dX, dY or dZ with its σ sdX, sdY "
+                             "or sdZ is expected, both or neither")  # fmt: skip
+        return cls(start=table.ids("from"), to=table.ids("to"), value=np.where(given, value, 0.0),
+                   sigma=np.where(given, sigma, np.inf), source=table.source)  # fmt: skip
+
+    def columns(self, radians: float) -> dict:
+        given = np.isfinite(self.sigma)
+        value, sigma = (np.where(given, x, np.nan) for x in (self.value, self.sigma))
+        columns = {"from": self.start, "to": self.to}
+        columns |= {a: value[:, k] for k, a in enumerate(AXES)}
+        return columns | {f"s{a}": sigma[:, k] for k, a in enumerate(AXES)}
+
+    def declare(self, network, origin) -> Declared:
+        row = {id: i for i, id in enumerate(network.points.id)}
+        ends = tuple(np.array([row[id] for id in ids], int) for ids in (self.start, self.to))
+        return Declared((), (DIFFERENCE(ends, self.value, sigma=self.sigma),))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Angles(Further):
+    """Angles and their σ, radians."""
+
+    start: tuple[str, ...]
+    at: tuple[str, ...]
+    to: tuple[str, ...]
+    value: Float[np.ndarray, " n"]
+    sigma: Float[np.ndarray, " n"]
+
+    TABLE, POINTS = "angles", ("start", "at", "to")
+
+    @classmethod
+    def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Angles":
+        table.check_names(("from", "at", "to", "value", "sigma"))
+        value = radians * table.numbers("value", required=True)
+        for row in np.flatnonzero(~((value > 0) & (value < np.pi)))[:1]:
+            raise InputError(f"{table.source(row)}: an angle between 0 and half a turn is "
+                             f"expected, not {value[row] / radians:g}")  # fmt: skip
+        start, at, to = (table.ids(name) for name in ("from", "at", "to"))
+        for row, ids in enumerate(zip(start, at, to)):
+            if len({*ids}) < 3:
+                raise InputError(f"{table.source(row)}: three different points are expected")
+        return cls(start=start, at=at, to=to, value=value,
+                   sigma=radians * positive_sigma(table, "sigma"), source=table.source)  # fmt: skip
+
+    def columns(self, radians: float) -> dict:
+        return {"from": self.start, "at": self.at, "to": self.to, "value": self.value / radians,
+                "sigma": self.sigma / radians}  # fmt: skip
+
+    def declare(self, network, origin) -> Declared:
+        row = {id: i for i, id in enumerate(network.points.id)}
+        ends = tuple(np.array([row[id] for id in ids], int)
+                     for ids in (self.start, self.at, self.to))  # fmt: skip
+        return Declared((), (ANGLE(ends, self.value, sigma=self.sigma),))

@@ -1,0 +1,263 @@
+"""Points that lie on figures (`figures`), and groups of points whose shape is known (`shapes`).
+
+A figure is a frame whose z axis is the normal of a plane or a circle, the axis of a line or a
+cylinder, and a radius; residuals are signed distances (Luhmann et al. 2014, 2.3):
+
+| figure | residuals of a point (x, y, z) of its frame | what moves |
+|---|---|---|
+| plane | z | a shift along z, turns about x and y |
+| line | x, y | shifts along and turns about x and y |
+| circle | √(x² + y²) − R, z | three shifts, turns about x and y, R |
+| sphere | √(x² + y² + z²) − R | three shifts, R |
+| cylinder | √(x² + y²) − R | shifts along and turns about x and y, R |
+
+Table `figures`, a row a point: `figure` (its name), `type`, `point`; `sigma` of the distance of the
+point, "exact" or nothing: a thousandth of the σ that a ray gives; `radius` where it is
+known.
+
+Table `shapes`, a row a point: `shape` (the name of one place of it), `point`, its coordinates `x`,
+`y`, `z` in the frame of the shape, and `sigma` likewise: a board, a scale cross, in as many places
+as there are names.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.arguments import shown
+from jaxbundle.cameras import get_model
+from jaxbundle.errors import InputError
+from jaxbundle.geometry import quaternion_from_matrix, transform_pose
+from jaxbundle.leastsquares.declarations import Kind, Table
+from jaxbundle.leastsquares.spaces import Frame, PoseValue
+from jaxbundle.network.columns import Columns, did_you_mean
+from jaxbundle.network.further.base import Declared, Further, positive_sigma
+from jaxbundle.network.further.fit_figures import FEWEST, TYPES, fit
+
+EXACT = 1e-3
+"""The σ of what is exact, in σ of a point across a ray: it changes results by 1e-6 of their σ, and
+the normal equations stay far from singular."""
+SHIFTS, TILTS = (0, 1, 2), (3, 4)
+MOVES = {
+    "plane": (2, *TILTS), "line": (0, 1, *TILTS), "circle": (*SHIFTS, *TILTS), "sphere": SHIFTS,
+    "cylinder": (0, 1, *TILTS),
+}  # fmt: skip
+DIRECTIONS = ("shift x", "shift y", "shift z", "turn x", "turn y", "turn z")
+ROUND = ("circle", "sphere", "cylinder")
+
+
+def on_plane(frame, point, given):
+    return frame.ray(point)[2] - given
+
+
+def on_line(frame, point, given):
+    return jnp.stack(frame.ray(point)[:2]) - given
+
+
+def on_circle(frame, radius, point, given):
+    x, y, z = frame.ray(point)
+    return jnp.stack([jnp.sqrt(x * x + y * y) - radius, z]) - given
+
+
+def on_sphere(frame, radius, point, given):
+    return jnp.sqrt(sum(x * x for x in frame.ray(point))) - radius - given
+
+
+def on_cylinder(frame, radius, point, given):
+    x, y, _ = frame.ray(point)
+    return jnp.sqrt(x * x + y * y) - radius - given
+
+
+def in_shape(frame, point, given):
+    """A point in the frame of a shape of known coordinates."""
+    return jnp.stack(frame.ray(point)) - given
+
+
+RESIDUALS = {"plane": (on_plane, ("distance",)), "line": (on_line, ("x", "y")),
+             "circle": (on_circle, ("radial", "z")), "sphere": (on_sphere, ("distance",)),
+             "cylinder": (on_cylinder, ("distance",))}  # fmt: skip
+
+
+def _move_frame(motion, value: PoseValue) -> PoseValue:
+    return PoseValue(*transform_pose(motion, *value))
+
+
+def _move_radius(motion, radius):
+    return jnp.exp(motion[6]) * radius
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Figures(Further):
+    """Points of planes, lines, circles, spheres, cylinders; σ 0: exact; `radius` NaN: unknown."""
+
+    figure: tuple[str, ...]
+    type: tuple[str, ...]
+    point: tuple[str, ...]
+    sigma: Float[np.ndarray, " n"]
+    radius: Float[np.ndarray, " n"]
+
+    TABLE, POINTS = "figures", ("point",)
+
+    @classmethod
+    def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Figures":
+        table.check_names(("figure", "type", "point"), ("sigma", "radius"))
+        made = cls(
+            figure=table.ids("figure"), type=table.ids("type"), point=table.ids("point"),
+            sigma=_sigma(table), radius=positive_sigma(table, "radius", required=False),
+            source=table.source,
+        )  # fmt: skip
+        for row, word in enumerate(made.type):
+            if word not in TYPES:
+                raise InputError(f"{table.source(row)}: type is {shown(word)}"
+                                 f"{did_you_mean(word, TYPES)}")  # fmt: skip
+        first: dict[str, int] = {}
+        for row, name in enumerate(made.figure):
+            other = first.setdefault(name, row)
+            if made.type[row] != made.type[other]:
+                raise InputError(
+                    f"{table.source(row)}: {name!r} is a {made.type[row]} here, but a "
+                    f"{made.type[other]} in {table.source(other)}"
+                )
+            if made.type[row] not in ROUND and not np.isnan(made.radius[row]):
+                raise InputError(f"{table.source(row)}: a {made.type[row]} has no radius")
+        return made
+
+    def columns(self, radians: float) -> dict:
+        sigma = ["exact" if s == 0 else s for s in self.sigma.tolist()]
+        return {"figure": self.figure, "type": self.type, "point": self.point, "sigma": sigma,
+                "radius": self.radius}  # fmt: skip
+
+    def declare(self, network, origin) -> Declared:
+        row = {id: i for i, id in enumerate(network.points.id)}
+        point = np.array([row[id] for id in self.point], int)
+        place = network.points.position - origin
+        exact = EXACT * _across_rays(network)
+        declared = [
+            self._of_type(type, point, place, exact) for type in TYPES if type in self.type
+        ]
+        return Declared(*(sum(parts, ()) for parts in zip(*declared)))
+
+    def _of_type(self, type, point, place, exact) -> Declared:
+        rows = np.flatnonzero(np.array(self.type, dtype=object) == type)
+        names, figure = np.unique(np.array(self.figure, dtype=object)[rows], return_inverse=True)
+        fitted = []
+        for k, name in enumerate(names):
+            own = rows[figure == k]
+            if len(np.unique(point[own])) < FEWEST[type]:
+                raise InputError(
+                    f"{self.source(own[0])}: {type} {name!r} has {len(own)} points that take part; "
+                    f"at least {FEWEST[type]} are needed"
+                )
+            fitted.append(fit(type, place[point[own]]))
+        centre, M, radius = (np.array(x) for x in zip(*fitted))
+        q = np.array([np.asarray(quaternion_from_matrix(m)) for m in M])
+        columns = MOVES[type]
+        frame = Table(type, PoseValue(centre, q), Frame(columns), labels=list(names),
+                      parameters=tuple(DIRECTIONS[c] for c in columns))  # fmt: skip
+        sigma = np.where(self.sigma[rows] > 0, self.sigma[rows], exact)
+        if type not in ROUND:
+            seen = self._seen(type, (type,), (figure,), point[rows], sigma)
+            return Declared((frame,), (seen,), ((type, _move_frame),))
+        known = np.array([np.nanmax([*self.radius[rows[figure == k]], -1.0])
+                          for k in range(len(names))])  # fmt: skip
+        size = Table(f"radius of {type}", np.where(known > 0, known, radius), free=known <= 0,
+                     labels=list(names), parameters=("R",))  # fmt: skip
+        seen = []
+        for given in (False, True):
+            those = np.flatnonzero((known > 0)[figure] == given)
+            if len(those):
+                touched = (figure[those],) * 2
+                seen.append(self._seen(type, (type, size.name), touched, point[rows[those]],
+                                       sigma[those], not given))  # fmt: skip
+        actions = (type, _move_frame), (size.name, _move_radius)
+        return Declared((frame, size), tuple(seen), actions)
+
+    @staticmethod
+    def _seen(type, tables, figure, point, sigma, invariant=True):
+        """The conditions of points on figures. Where nothing says how large a figure is, it moves
+        with its points: what is left of that, as long as they are not on it, is not to be taken
+        for an observation of scale or rotation (`invariant`)."""
+        residual, axes = RESIDUALS[type]
+        kind = Kind(f"{type}s", residual, (*tables, "point"), axes, invariant=invariant)
+        zero = np.zeros((len(point), len(axes))[: len(axes)])
+        return kind((*figure, point), zero, sigma=sigma)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Shapes(Further):
+    """Points of shapes that are known, each in its place; σ 0: exact."""
+
+    shape: tuple[str, ...]
+    point: tuple[str, ...]
+    place: Float[np.ndarray, "n 3"]
+    sigma: Float[np.ndarray, " n"]
+
+    TABLE, POINTS = "shapes", ("point",)
+
+    @classmethod
+    def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Shapes":
+        table.check_names(("shape", "point", "x", "y", "z"), ("sigma",))
+        place = np.stack([table.numbers(a, required=True) for a in "xyz"], 1)
+        return cls(shape=table.ids("shape"), point=table.ids("point"), place=place,
+                   sigma=_sigma(table), source=table.source)  # fmt: skip
+
+    def columns(self, radians: float) -> dict:
+        columns = {"shape": self.shape, "point": self.point}
+        columns |= {a: self.place[:, k] for k, a in enumerate("xyz")}
+        return columns | {"sigma": ["exact" if s == 0 else s for s in self.sigma.tolist()]}
+
+    def number_of_equations(self) -> int:
+        return 3
+
+    def declare(self, network, origin) -> Declared:
+        row = {id: i for i, id in enumerate(network.points.id)}
+        point = np.array([row[id] for id in self.point], int)
+        names, shape = np.unique(np.array(self.shape, dtype=object), return_inverse=True)
+        places = network.points.position - origin
+        centre, rotation = [], []
+        for k, name in enumerate(names):
+            own = np.flatnonzero(shape == k)
+            if len(own) < 3:
+                raise InputError(f"{self.source(own[0])}: shape {name!r} has {len(own)} points "
+                                 "that take part; at least 3 are needed")  # fmt: skip
+            X0, M = _placed(self.place[own], places[point[own]])
+            centre.append(X0)
+            rotation.append(np.asarray(quaternion_from_matrix(M)))
+        frame = Table("shape", PoseValue(np.array(centre), np.array(rotation)), Frame(),
+                      labels=list(names), parameters=DIRECTIONS)  # fmt: skip
+        sigma = np.where(self.sigma > 0, self.sigma, EXACT * _across_rays(network))
+        kind = Kind("known shapes", in_shape, ("shape", "point"), ("x", "y", "z"))
+        seen = kind((shape, point), self.place, sigma=sigma)
+        return Declared((frame,), (seen,), (("shape", _move_frame),))
+
+
+def _placed(x, X):
+    """X0 and M of x = M·(X − X0), by Kabsch (1976)."""
+    a, b = x.mean(0), X.mean(0)
+    U, _, Vt = np.linalg.svd((x - a).T @ (X - b))
+    M = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+    return b - M.T @ a, M
+
+
+def _across_rays(network) -> float:
+    """The σ of a point across a ray, σ·s/c, in the middle of all rays."""
+    rays, images = network.observations, network.images
+    shortest = []
+    for camera in network.cameras:
+        model = get_model(camera.model)
+        shortest.append(min(abs(camera.parameters.get(p, 0.0)) for p in model.principal_distance))
+    away = network.points.position[rays.point] - images.position[rays.image]
+    c = np.array(shortest)[images.camera[rays.image]]
+    return float(np.median(np.linalg.norm(away, axis=1) * rays.sigma.min(1) / c))
+
+
+def _sigma(table: Columns):
+    """σ of distances; 0 where they are exact."""
+    sigma = table.numbers("sigma", words={"exact": 0.0})
+    for row in np.flatnonzero(sigma < 0)[:1]:
+        raise InputError(f"{table.source(row)}: sigma is {sigma[row]:g}; it must be positive")
+    return np.nan_to_num(sigma)

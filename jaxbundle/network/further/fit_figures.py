@@ -1,0 +1,60 @@
+"""Planes, lines, circles, spheres and cylinders near given points, in closed form: start values."""
+
+import numpy as np
+from jaxtyping import Float
+
+TYPES = ("plane", "line", "circle", "sphere", "cylinder")
+FEWEST = {"plane": 3, "line": 2, "circle": 3, "sphere": 4, "cylinder": 5}
+DIRECTIONS = 400
+"""Axes tried for a cylinder."""
+
+
+def fit(type: str, X: Float[np.ndarray, "n 3"]):
+    """Origin [3], rotation M [3, 3] from space into the frame of the figure (its z axis the normal
+    or the axis), and radius (NaN of a plane or a line)."""
+    middle = X.mean(0)
+    Vt = np.linalg.svd(X - middle)[2]
+    if type == "plane":
+        return middle, _frame(Vt[2]), np.nan
+    if type == "line":
+        return middle, _frame(Vt[0]), np.nan
+    if type == "sphere":
+        centre, radius, _ = _circle(X - middle)
+        return middle + centre, np.eye(3), radius
+    if type == "circle":
+        return _about(Vt[2], X)[:3]
+    every = (*Vt, *_hemisphere(DIRECTIONS))
+    axis = min(every, key=lambda n: _about(n, X)[3])
+    return _about(axis, X)[:3]
+
+
+def _about(axis, X):
+    """The circle of points projected along an axis: origin, M, radius, RMS of its distances."""
+    middle, M = X.mean(0), _frame(axis)
+    centre, radius, rms = _circle(((X - middle) @ M.T)[:, :2])
+    return middle + M[:2].T @ centre, M, radius, rms
+
+
+def _circle(x):
+    """Centre, radius of a circle or a sphere (Kåsa 1976), and the RMS of the distances from it."""
+    A = np.concatenate([2 * x, np.ones((len(x), 1))], 1)
+    *centre, rest = np.linalg.lstsq(A, (x**2).sum(1), rcond=None)[0]
+    centre = np.array(centre)
+    radius = np.sqrt(max(rest + centre @ centre, 0.0))
+    away = np.linalg.norm(x - centre, axis=1) - radius
+    return centre, radius, float(np.sqrt((away**2).mean()))
+
+
+def _frame(z):
+    """A rotation whose last row is this direction."""
+    x = np.cross(z, np.eye(3)[np.abs(z).argmin()])
+    x = x / np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])
+
+
+def _hemisphere(n: int):
+    """Directions spread over half a sphere (a spiral of the golden angle)."""
+    z = (np.arange(n) + 0.5) / n
+    turn = np.arange(n) * np.pi * (3 - np.sqrt(5))
+    r = np.sqrt(1 - z**2)
+    return np.stack([r * np.cos(turn), r * np.sin(turn), z], 1)

@@ -1,0 +1,84 @@
+"""What every further kind of observations is asked: Jacobians against differences, σ against a
+sample."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbundle.leastsquares.rows import evaluate
+from jaxbundle.leastsquares.spaces import Vector
+from jaxbundle.solution import minimise
+
+STENCIL = ((1, 8 / 12), (-1, -8 / 12), (2, -1 / 12), (-2, 1 / 12))
+
+
+def check_jacobians(problem, values, skip=("image coordinates",)):
+    """∂v/∂δ of one observation of every kind, as the engine differentiates it and by differences of
+    finite changes of what it touches."""
+    system, tables = problem.system, problem.layout.tables(values)
+    random = np.random.default_rng(3)
+    for given in system.observations:
+        kind, row = given.kind, given.number // 2
+        if kind.name in skip:
+            continue
+        spaces = [system.declared.spaces[name] for name in kind.of]
+        touched = [jax.tree.map(lambda x, r=rows[row]: jnp.asarray(x)[r], tables[name])
+                   for name, rows in zip(kind.of, given.rows)]  # fmt: skip
+        measured = jax.tree.map(lambda x, row=row: _scalars(x[row]), given.measured)
+        along = [random.normal(size=s.width) for s in spaces]
+
+        def moved(step, spaces=spaces, touched=touched, along=along, kind=kind, measured=measured):
+            blocks = [s.moved(s.prepare(x), tuple(step * d))
+                      for s, x, d in zip(spaces, touched, along)]  # fmt: skip
+            return jnp.stack(evaluate(kind, blocks, measured))
+
+        def retracted(step, spaces=spaces, touched=touched, along=along, kind=kind,
+                      measured=measured):  # fmt: skip
+            blocks = [s.prepare(s.retract(x, jnp.asarray(step * d)))
+                      for s, x, d in zip(spaces, touched, along)]  # fmt: skip
+            return np.asarray(jnp.stack(evaluate(kind, blocks, measured)))
+
+        slope = np.asarray(jax.jacfwd(moved)(0.0))
+        h = 1e-3
+        differences = sum(factor / h * retracted(h * step) for step, factor in STENCIL)
+        assert np.abs(slope).max() > 1e-6, kind.name
+        np.testing.assert_allclose(slope, differences, rtol=1e-7, atol=1e-7, err_msg=kind.name)
+
+
+def _scalars(x):
+    return x if np.ndim(x) == 0 else tuple(map(_scalars, x))
+
+
+def sample(problem, values, tables, draws=120):
+    """Values of tables of vectors, and positions of frames, from that many draws of everything that
+    was measured, solved from the values; all by the program that is compiled already."""
+    random, data = np.random.default_rng(8), problem.data
+    noisy = lambda x, w: np.asarray(x) + random.normal(size=np.shape(w)) * np.where(
+        np.asarray(w) > 0, 1 / np.where(np.asarray(w) > 0, w, 1), 0
+    )  # fmt: skip
+    found = {name: [] for name in tables}
+    for _ in range(draws):
+        change = {"image_xy": noisy(data.image_xy, data.image_weight),
+                  "control": noisy(data.control, data.control_weight)}  # fmt: skip
+        change["other"] = tuple((_noisy_other(random, m, w), w) for m, w in data.other)
+        minimum = minimise(problem.with_data(dataclasses.replace(data, **change)), values)
+        for name in tables:
+            value = minimum.values.other[name]
+            value = value if isinstance(problem.system.table(name).space, Vector) else value[0]
+            found[name].append(np.asarray(value))
+    return {name: np.array(x) for name, x in found.items()}
+
+
+def _noisy_other(random, measured, weight):
+    """The first of the arrays measured with noise of its weights (1/σ, or L⁻¹)."""
+    leaves, tree = jax.tree.flatten(measured)
+    weight, first = np.asarray(weight), np.asarray(leaves[0])
+    noise = random.normal(size=weight.shape[:2])
+    if weight.ndim == 3:
+        noise = np.linalg.solve(weight, noise[..., None])[..., 0]
+    else:
+        noise = np.where(weight > 0, noise / np.where(weight > 0, weight, 1), 0)
+    leaves[0] = first + noise.reshape(first.shape)
+    return jax.tree.unflatten(tree, leaves)
