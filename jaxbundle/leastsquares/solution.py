@@ -138,13 +138,26 @@ class Solution:
     """What statistics need of a problem at some `values`, which should be its adjusted ones."""
 
     def __init__(self, problem: Problem, values: Values):
-        self.problem, self.values = open_at(problem, values), values
-        self._data, self._values = pad_data(problem, problem.data), pad_values(problem, values)
+        self._as_given, self.values = problem, values
+
+    @functools.cached_property
+    def problem(self) -> Problem:
+        """The problem with its open motions as they are here."""
+        return open_at(self._as_given, self.values)
+
+    @functools.cached_property
+    def _data(self) -> Data:
+        return pad_data(self._as_given, self._as_given.data)
+
+    @functools.cached_property
+    def _values(self) -> Values:
+        return pad_values(self._as_given, self.values)
 
     @functools.cached_property
     def residuals(self) -> Rows:
         """All residuals divided by their σ."""
-        return self._rows(_residuals(*self.given))
+        declared, plan = self._as_given.declared, self._as_given.plan
+        return self._rows(_residuals(declared, plan, self._values, self._data))
 
     @functools.cached_property
     def vtpv(self) -> float:
@@ -223,7 +236,7 @@ class Solution:
         return problem.declared, problem.plan, self._values, self._data
 
     def _rows(self, by_set) -> Rows:
-        sets = self.problem.observations
+        sets = self._as_given.observations
         return {o: np.asarray(x)[: sets[o].number] for o, x in by_set.items()}
 
 
