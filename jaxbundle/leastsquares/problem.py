@@ -331,8 +331,15 @@ def given_data(problem: Problem, data: Data | None) -> Data:
     return pad_data(problem, data)
 
 
-def make_solver(problem: Problem, *, atol=1e-5, rtol=0.0, **options) -> LeastSquares:
-    """The solver of a problem; `options` are those of `LeastSquares`."""
+LEAST_ROWS, MOST_ROWS = 128, 10_000
+"""Of the history of a solver; later steps are not recorded."""
+
+
+def make_solver(
+    problem: Problem, *, atol=1e-5, rtol=0.0, max_steps: int = 100, **options
+) -> LeastSquares:
+    """The solver of a problem; `options` are those of `LeastSquares`. Other limits of steps share
+    its program."""
     squared = lambda w, m: np.where(w > 0, w * m.reshape(w.shape), 0.0) ** 2
     squares = sum(
         float(squared(np.asarray(diagonal_of(w)), np.asarray(m)).sum())
@@ -341,7 +348,11 @@ def make_solver(problem: Problem, *, atol=1e-5, rtol=0.0, **options) -> LeastSqu
     )
     to_device = lambda x: jax.device_put(np.float64(x))
     tolerance = Tolerance(*map(to_device, (problem.counts.redundancy, squares, atol, rtol)))
-    return LeastSquares(problem.declared, problem.plan, tolerance, problem.retraction, **options)
+    rows = rounded(min(max(max_steps + 1, LEAST_ROWS), MOST_ROWS))
+    return LeastSquares(
+        problem.declared, problem.plan, tolerance, problem.retraction, rows=rows,
+        max_steps=jax.device_put(np.int64(max_steps)), **options,
+    )  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)

@@ -77,6 +77,7 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
 
     **Arguments:** `descent` and `search`: optimistix's interfaces, ours or its own (those that keep
     no memory of earlier points); `retract(plan, values, change)`: where a change leads;
+    `max_steps`: evaluations at most, and `rows` of the history, which are compiled in;
     `progress(step, cost, λ)` is called on the host after every evaluation.
     """
 
@@ -86,7 +87,8 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
     retract: Callable = eqx.field(static=True)
     descent: optx.AbstractDescent = MarquardtDescent()
     search: optx.AbstractSearch = NielsenTrustRegion()
-    max_steps: int = eqx.field(static=True, default=100)
+    max_steps: int | Int[Array, ""] = 100
+    rows: int = eqx.field(static=True, default=128)
     progress: Callable | None = eqx.field(static=True, default=None)
     rtol: ClassVar[float] = 0.0
     atol: ClassVar[float] = 0.0
@@ -95,7 +97,7 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> State:
         struct = eqx.filter_eval_shape(self._linearise, y, args)
         info = eqx.filter_eval_shape(self._info, struct)
-        zero, rows = zero_tangent(self.plan), self.max_steps + 1
+        zero, rows = zero_tangent(self.plan), self.rows
         return State(
             first=jnp.asarray(True), known=_zeros(struct), change=zero, trial=y,
             step_size=jnp.asarray(jnp.inf), descent=self.descent.init(zero, info),
@@ -132,7 +134,8 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
         ), aux  # fmt: skip
 
     def terminate(self, fn, y, args, options, state: State, tags):
-        return state.termination != LIMIT, optx.RESULTS.successful
+        ended = (state.termination != LIMIT) | (state.steps >= self.max_steps)
+        return ended, optx.RESULTS.successful
 
     def postprocess(self, fn, y, aux, args, options, state: State, tags, result):
         # optimistix itself ends the loop where unknowns are not finite, before any step.
@@ -175,11 +178,7 @@ class NoAdjoint(optx.AbstractAdjoint):
     """Run the loop without derivatives: they are attached to its result (`derivatives.py`)."""
 
     def apply(self, primal_fn, rewrite_fn, inputs, tags):
-        def loop(cond, body, init, max_steps):
-            count = lambda carry: cond(carry[0]) & (carry[1] < max_steps)
-            step = lambda carry: (body(carry[0]), carry[1] + 1)
-            return jax.lax.while_loop(count, step, (init, 0))[0]
-
+        loop = lambda cond, body, init, max_steps: jax.lax.while_loop(cond, body, init)
         return primal_fn((*inputs, loop))
 
 
@@ -198,7 +197,7 @@ def minimise(solver: LeastSquares, data: Data, start: Values) -> Minimum:
     laid = lay_out_data(solver.plan, data)
     fn = lambda values, laid: residuals(solver.declared, solver.plan, values, laid)
     solution = optx.least_squares(
-        fn, solver, start, laid, max_steps=solver.max_steps, adjoint=NoAdjoint(), throw=False
+        fn, solver, start, laid, max_steps=None, adjoint=NoAdjoint(), throw=False
     )
     stats = solution.stats
     return Minimum(solution.value, stats["termination"], stats["iterations"], stats["history"])
