@@ -134,8 +134,10 @@ def _without_parameter(problem: Problem, values: Values, name: Name):
     c = [camera.id for camera in problem.network.cameras].index(name.id)
     model = get_model(problem.network.cameras[c].model)
     column = model.parameters.index(name.parameter)
+    tied = next((g for g in problem.network.cameras[c].tie if name.parameter in g), ())
+    columns = np.array([model.parameters.index(n) for n in tied or (name.parameter,)])
     value = default_parameters(model)[name.parameter]
-    reset = lambda v: eqx.tree_at(lambda v: v.camera, v, v.camera.at[c, column].set(value))
+    reset = lambda v: eqx.tree_at(lambda v: v.camera, v, v.camera.at[c, columns].set(value))
     data = dataclasses.replace(problem.data, start=reset(problem.data.start))
     row = np.flatnonzero(problem.layout.given["interior"] == c)
     if len(row):

@@ -333,7 +333,7 @@ class Adjustment:
             (entry["t"], Name("camera", camera, parameter))
             for camera, table in self.cameras.items()
             for parameter, entry in table["parameters"].items()
-            if entry["free"] and entry["t"] < critical
+            if parameter in table["free"] and entry["t"] < critical
         ]
         return sorted(found, key=lambda item: item[0])
 

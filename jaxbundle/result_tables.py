@@ -22,6 +22,10 @@ def cameras(adjustment) -> dict[str, dict]:
         free, Q = adjustment.camera_cofactor(given.id)
         sigma = dict(zip(free, adjustment.sigma0 * np.sqrt(np.diagonal(Q))))
         total = dict(zip(free, total_correlation(Q))) if free else {}
+        for first, *others in given.tie:
+            if first in sigma:
+                sigma |= dict.fromkeys(others, sigma[first])
+                total |= dict.fromkeys(others, total[first])
         default = default_parameters(get_model(given.model))
         tables[given.id] = {
             "model": str(given.model),
@@ -37,6 +41,7 @@ def cameras(adjustment) -> dict[str, dict]:
                 for name, value in values.items()
             },
             "free": free,
+            "tied": [list(group) for group in given.tie],
             "correlations": correlation_matrix(Q),
         }
     return tables

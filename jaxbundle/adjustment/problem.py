@@ -13,14 +13,19 @@ from jaxbundle.errors import InputError
 from jaxbundle.leastsquares import problem as engine
 from jaxbundle.leastsquares.declarations import Observations, Table
 from jaxbundle.leastsquares.defect import CannotHold
+from jaxbundle.leastsquares.motions import SEVEN
 from jaxbundle.network.arrays import Data, Values
 from jaxbundle.network.datum_words import open_directions_in_words
 from jaxbundle.network.declare import Layout, declare, order_cameras
+from jaxbundle.network.further.base import among
+from jaxbundle.network.further.rolling_shutter import RollingShutter
 from jaxbundle.network.retraction import TurnAboutSeen
 from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.tables import Network, require_network
 
 REDUCTIONS = ("dense", "banded", "iterative")
+HELD = 1e-6
+"""Of a datum's directions, the part of a motion that is none."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,6 +173,12 @@ def _datum(network: Network, gauge, origin, chosen):
             f" ({gauge.shape[1]} of 7). Give control points or distances, or choose datum = "
             "\"inner\" or \"minimal\"."
         )
+    sized = [one for one in among(network) if one.has_size]
+    if sized and np.abs(gauge[SEVEN.index("scale")]).max() > HELD:
+        raise InputError(
+            f"{sized[0].source.name}: a σ of {sized[0].TABLE} is a length, but nothing gives the "
+            "network a scale: measure a distance or control points, or say \"exact\" (no σ)"
+        )
     return {"point": np.repeat(chosen[:, None].astype(float), 3, 1)}, network.datum == "minimal"
 
 
@@ -187,7 +198,8 @@ def count_rows(layout: Layout, system: engine.Problem) -> Counts:
 def shifted_problem(network: Network, like: Problem, values: Values) -> Problem:
     """Other points of a network with the orientations and cameras of `values`, without priors and
     datum: for points that took no part."""
-    declared = declare(network.replace(further=()), like.origin)
+    moving = tuple(f for f in network.further if isinstance(f, RollingShutter))
+    declared = declare(network.replace(further=moving), like.origin)
     layout = declared.layout
     start = dataclasses.replace(values, point=declared.data.start.point)
     start = layout.tables(jax.tree.map(np.asarray, start))

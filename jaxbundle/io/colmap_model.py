@@ -128,7 +128,8 @@ def _with_place(path: Path, model: ColmapModel) -> tuple[ColmapModel, list[str]]
 
 def _entry(camera: Camera) -> dict:
     sizes = {"image_size": camera.image_size, "pixel_size": camera.pixel_size}
-    return {"id": camera.id, "model": camera.model, **sizes, **camera.parameters}
+    tie = {"tie": camera.tie} if camera.tie else {}
+    return {"id": camera.id, "model": camera.model, **sizes, **tie, **camera.parameters}
 
 
 def _observations(path: Path, model: ColmapModel):

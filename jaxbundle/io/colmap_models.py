@@ -2,7 +2,7 @@
 
 | COLMAP | parameters | ours |
 |---|---|---|
-| SIMPLE_PINHOLE, SIMPLE_RADIAL, RADIAL | f, cx, cy, k1, k2 | `opencv` with fx = fy |
+| SIMPLE_PINHOLE, SIMPLE_RADIAL, RADIAL | f, cx, cy, k1, k2 | `opencv` with fx and fy tied |
 | PINHOLE, OPENCV, FULL_OPENCV | fx, fy, cx, cy, k1, k2, p1, p2, k3 … k6 | `opencv` |
 | SIMPLE_FISHEYE, SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE | f, cx, cy, k1, k2 | `kannala-brandt` |
 | FISHEYE, OPENCV_FISHEYE | fx, fy, cx, cy, k1 … k4 | `kannala-brandt` |
@@ -107,7 +107,8 @@ def from_colmap(
             start |= {"fx": p["fx"] * wide, "fy": p["fy"] * wide}
         foreign = Foreign(FORMULAS[model], p, start, size, fisheye=True)
         return fitted_camera(id, foreign, f"{where}camera {id!r}", f"is of COLMAP's model {model}")
-    return Camera(id, ours, exact, image_size=(int(size[0]), int(size[1])))
+    tie = (("fx", "fy"),) if f is not None else ()
+    return Camera(id, ours, exact, image_size=(int(size[0]), int(size[1])), tie=tie)
 
 
 def camera_or_why_not(*camera) -> Camera | NoPlaceError:

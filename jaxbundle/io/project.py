@@ -61,7 +61,7 @@ from jaxbundle.network.build import (
     POINT_SIGMAS,
 )
 from jaxbundle.network.columns import Columns, as_columns, did_you_mean
-from jaxbundle.network.further import SECTIONS, Further
+from jaxbundle.network.further import KINDS, SECTIONS, Further
 from jaxbundle.network.further.base import among
 from jaxbundle.network.tables import Camera, Network, Source, require_network
 from jaxbundle.network.units import ANGLE_UNITS, to_image_unit
@@ -72,8 +72,9 @@ ADJUSTED = "network"
 FILES = (FILE_NAME, *(f"{table}.csv" for table in TABLES))
 """What a project consists of."""
 INLINE = {
-    table: table.removesuffix("s") for table in TABLES if table.removesuffix("s") not in SECTIONS
-}
+    table: table.removesuffix("s") for table in TABLES
+    if table not in KINDS or not KINDS[table].SECTION
+}  # fmt: skip
 """The tables and the name of one of their rows in the TOML file."""
 
 
@@ -262,6 +263,8 @@ def _camera_entry(camera: Camera) -> dict:
             entry[name] = getattr(camera, name)
     entry |= {name: float(value) for name, value in camera.parameters.items()}
     entry["free"] = camera.free
+    if camera.tie:
+        entry["tie"] = camera.tie
     if camera.sigma:
         entry["sigma"] = {name: float(value) for name, value in camera.sigma.items()}
     return entry

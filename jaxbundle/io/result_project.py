@@ -25,7 +25,7 @@ def adjusted_network(adjustment) -> Network:
     cameras = tuple(
         dataclasses.replace(
             camera, parameters=adjustment.camera_parameters(camera.id), sigma={},
-            free=tuple(name for name in camera.free if (camera.id, name) not in gone),
+            free=tuple(name for name in camera.unknowns if (camera.id, name) not in gone),
         )
         for camera in network.cameras
     )  # fmt: skip

@@ -83,6 +83,8 @@ def _override_cameras(cameras: list[dict], key: str, text: str) -> None:
 def _override_camera(camera: dict, key: str, field: str, text: str) -> None:
     if field == "free":
         camera["free"] = _words(text)
+    elif field == "tie":
+        camera["tie"] = [[name.strip() for name in word.split("+")] for word in _words(text)]
     elif field in ("image_size", "pixel_size"):
         camera[field] = [_number(key, word) for word in _words(text)]
     elif field == "model":

@@ -343,8 +343,8 @@ def make_solver(
     squared = lambda w, m: np.where(w > 0, w * m.reshape(w.shape), 0.0) ** 2
     squares = sum(
         float(squared(np.asarray(diagonal_of(w)), np.asarray(m)).sum())
-        for w, m in zip(problem.data.weight, problem.data.measured)
-        if hasattr(m, "shape") and m.size == w.shape[0] * w.shape[1]
+        for w, measured in zip(problem.data.weight, problem.data.measured)
+        for m in jax.tree.leaves(measured)[:1] if m.size == w.shape[0] * w.shape[1]
     )
     to_device = lambda x: jax.device_put(np.float64(x))
     tolerance = Tolerance(*map(to_device, (problem.counts.redundancy, squares, atol, rtol)))

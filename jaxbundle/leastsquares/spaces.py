@@ -51,10 +51,12 @@ class Space(Protocol):
 @dataclasses.dataclass(frozen=True)
 class Vector:
     """Numbers that add. `size`: how many (0: a single number, not in a tuple); `columns`: those of
-    them that move (None: all)."""
+    them that move (None: all); `tied`: further ones that move as one of these does, (column, which
+    of `columns`) each."""
 
     size: int
     columns: tuple[int, ...] | None = None
+    tied: tuple[tuple[int, int], ...] = ()
 
     @property
     def moving(self) -> tuple[int, ...]:
@@ -64,21 +66,30 @@ class Vector:
     def width(self) -> int:
         return len(self.moving)
 
+    @property
+    def moves(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """The columns that move, and which number of a change moves each."""
+        pairs = (*((column, k) for k, column in enumerate(self.moving)), *self.tied)
+        return tuple(zip(*pairs)) or ((), ())
+
     def prepare(self, value):
         return tuple(value) if self.size else value
 
     def moved(self, block, change):
         if not self.size:
             return block + change[0] if change else block
+        if not change:
+            return block
         block = list(block)
-        for column, d in zip(self.moving, change):
-            block[column] = block[column] + d
+        for column, k in zip(*self.moves):
+            block[column] = block[column] + change[k]
         return tuple(block)
 
     def retract(self, value, change):
         if not self.size:
             return value + change[0] if change.shape[0] else value
-        return value.at[jnp.array(self.moving, int)].add(change)
+        columns, of = (jnp.array(x, int) for x in self.moves)
+        return value.at[columns].add(change[of])
 
     def difference(self, value, origin):
         change = value - origin
@@ -87,7 +98,8 @@ class Vector:
     def hold(self, value, given, free):
         if not self.size:
             return jnp.where(free[0] > 0, value, given) if self.width else given
-        moves = jnp.zeros(self.size).at[jnp.array(self.moving, int)].set(free)
+        columns, of = (jnp.array(x, int) for x in self.moves)
+        moves = jnp.zeros(self.size).at[columns].set(free[of])
         return jnp.where(moves > 0, value, given)
 
     def chart(self, value):
@@ -306,6 +318,17 @@ def _tangent_basis(value: Float[Array, " n"]) -> Float[Array, "n n-1"]:
     axis = value.at[-1].add(sign)
     reflection = jnp.eye(len(value)) - 2 * jnp.outer(axis, axis) / (axis @ axis)
     return reflection[:, :-1]
+
+
+def turn_by(angle, x):
+    """exp([angle]×)·x for turns below a third of a radian, by series: exact to rounding, with
+    derivatives at 0."""
+    square = sum(a * a for a in angle)
+    sine = 1 - square / 6 * (1 - square / 20 * (1 - square / 42 * (1 - square / 72)))
+    cosine = 0.5 - square / 24 * (1 - square / 30 * (1 - square / 56 * (1 - square / 90)))
+    first = cross(angle, x)
+    second = cross(angle, first)
+    return tuple(a + sine * b + cosine * c for a, b, c in zip(x, first, second))
 
 
 def cross(a, b):

@@ -56,7 +56,7 @@ from jaxbundle.network.tables import (
 )
 from jaxbundle.network.units import ANGLE_UNITS, from_image_unit
 
-CAMERA_FIELDS = ("id", "model", "image_size", "pixel_size", "free", "sigma")
+CAMERA_FIELDS = ("id", "model", "image_size", "pixel_size", "free", "sigma", "tie")
 IMAGE_COLUMNS = ("id", "camera", *EXTERIOR)
 GROUPS = EXTERIOR[:3], EXTERIOR[3:]
 """Columns of images that may be left out, together."""
@@ -231,7 +231,18 @@ def _camera(row: Mapping[str, Any], number: int, where: str, models) -> Camera:
         sigma={k: _number(where, f"sigma of {k}", v) for k, v in sigma.items()},
         image_size=_pair(where, "image_size", row.get("image_size"), int),
         pixel_size=_pair(where, "pixel_size", row.get("pixel_size"), float),
+        tie=_ties(where, row.get("tie", ())),
     )
+
+
+def _ties(where: str, given: Any) -> tuple[tuple[str, ...], ...]:
+    """Groups of names of parameters."""
+    groups = given if isinstance(given, Sequence) and not isinstance(given, str) else (None,)
+    if any(isinstance(g, str) or not isinstance(g, Sequence) or len(g) < 2 for g in groups):
+        raise InputError(
+            f'{where}tie is {shown(given)}; expected groups of names such as [["fx", "fy"]]'
+        )
+    return tuple(tuple(map(str, group)) for group in groups)
 
 
 def _number(where: str, key: str, value: Any) -> float:

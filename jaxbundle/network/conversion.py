@@ -98,6 +98,7 @@ def _converted(camera: Camera, model: str | CameraModel, r0: float, xy, measured
     made = dataclasses.replace(
         camera, model=model, parameters=conversion.parameters, sigma={},
         free=_counterparts(camera.free, source, target),
+        tie=camera.tie if source == target else (),
     )  # fmt: skip
     return made, conversion, shift - step * centre, step
 

@@ -25,38 +25,53 @@ from jaxbundle.network import kinds
 from jaxbundle.network.also import place, split
 from jaxbundle.network.arrays import Data, Values
 from jaxbundle.network.further.base import among
+from jaxbundle.network.further.rolling_shutter import RollingShutter
 from jaxbundle.network.tables import EXTERIOR, Camera, Network
 
 
 @dataclasses.dataclass(frozen=True)
 class CameraTable:
-    """The cameras of one model: the name of their table, the model, how many parameters, and which
-    of the network's cameras they are."""
+    """The cameras of one model, and of one way in which its parameters are tied: the name of their
+    table, the model, its parameters, and which of the network's cameras they are."""
 
     name: str
     model: str | CameraModel
     parameters: tuple[str, ...]
     cameras: Int[np.ndarray, " rows"]
+    tie: tuple[tuple[str, ...], ...] = ()
 
     def unknowns(self, cameras: Sequence[Camera]) -> ls.Table:
         """The table; only parameters that are free in some camera of it move."""
         own = [cameras[c] for c in self.cameras]
-        free = np.array([[name in camera.free for name in self.parameters] for camera in own])
+        unknowns = [camera.unknowns for camera in own]
+        free = np.array([[name in names for name in self.parameters] for names in unknowns])
         moving = tuple(np.flatnonzero(free.any(0)).tolist())
         value = np.array([_start_of(camera) for camera in own])
+        at = self.parameters.index
+        tied = tuple(
+            (at(name), moving.index(at(group[0])))
+            for group in self.tie if at(group[0]) in moving for name in group[1:]
+        )  # fmt: skip
         return ls.Table(
-            self.name, value, Vector(len(self.parameters), moving), free[:, moving],
+            self.name, value, Vector(len(self.parameters), moving, tied), free[:, moving],
             [camera.id for camera in own], tuple(self.parameters[j] for j in moving), "camera",
         )  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
 class Set:
-    """A set of observations: the field of `Data`, its rows and columns there (None: all)."""
+    """A set of observations: the field of `Data`, its rows and columns there (None: all);
+    `constant`: what its kind is told of every row besides what was measured."""
 
     field: str
     rows: Int[np.ndarray, " n"] | None = None
     columns: int | None = None
+    constant: Float[np.ndarray, " n"] | None = None
+
+    def measured(self, data: Data):
+        """What was measured, as the kind takes it."""
+        xy = self.cut(data.measured(self.field))
+        return xy if self.constant is None else (xy, self.constant)
 
     def cut(self, x):
         """The part of an array of the field that belongs to this set."""
@@ -104,7 +119,7 @@ class Layout:
 
     def data(self, data: Data) -> EngineData:
         """The numbers of a network as the engine's."""
-        measured = tuple(s.cut(data.measured(s.field)) for s in self.sets)
+        measured = tuple(s.measured(data) for s in self.sets)
         weight = tuple(_of_rows(s.cut(data.weight(s.field))) for s in self.sets)
         other = tuple(zip(*data.other)) or ((), ())
         return EngineData(self.tables(data.start), measured + other[0], weight + other[1])
@@ -192,16 +207,19 @@ def declare(network: Network, origin=None, also=()) -> Declared:
             sets.append(s)
             weight = s.cut(data.weight(s.field))
             sigma = np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0), np.inf)
-            given.append(kind(rows, s.cut(data.measured(s.field)), sigma=sigma))
+            given.append(kind(rows, s.measured(data), sigma=sigma))
 
+    shutter = next((f for f in network.further if isinstance(f, RollingShutter)), None)
+    lines = None if shutter is None else shutter.lines(network)
     row_of_camera = np.array([table_of[c][1] for c in range(len(network.cameras))], np.int64)
     camera = images.camera[observations.image]
     for t in cameras:
-        kind = kinds.image_points(t.model, network.residuals, t.name)
+        kind = kinds.image_points(t.model, network.residuals, t.name, moving=lines is not None)
         rows = None if len(cameras) == 1 else np.flatnonzero(np.isin(camera, t.cameras))
-        take = lambda x, rows=rows: x if rows is None else x[rows]
-        touched = observations.image, row_of_camera[camera], observations.point
-        observe(kind, tuple(map(take, touched)), "image", rows)
+        take = lambda x, rows=rows: x if rows is None or x is None else x[rows]
+        motion = () if lines is None else (observations.image, camera)
+        touched = observations.image, *motion, row_of_camera[camera], observations.point
+        observe(kind, tuple(map(take, touched)), "image", rows, None, take(lines))
     observe(kinds.CONTROL, (priors["control"],), "control")
     observe(kinds.EXTERIOR, (priors["exterior"],), "exterior")
     for t in cameras:
@@ -210,7 +228,9 @@ def declare(network: Network, origin=None, also=()) -> Declared:
         columns = len(t.parameters)
         observe(kind, (row_of_camera[priors["interior"][rows]],), "interior", rows, columns)
     observe(kinds.DISTANCES, tuple(network.distances.points.T), "distance")
-    declared = [f.declare(network, origin) for f in among(network)]
+    taking_part = [f for f in network.further if isinstance(f, RollingShutter)]
+    taking_part += [f for f in among(network) if not isinstance(f, RollingShutter)]
+    declared = [f.among(network).declare(network, origin) for f in taking_part]
     further += [table for one in declared for table in one.tables]
     tables += further
     others = [place(one, origin).resolved(tables) for one in others]
@@ -239,15 +259,16 @@ def order_cameras(network: Network) -> Network:
 
 
 def camera_tables(cameras: Sequence[Camera]) -> tuple[CameraTable, ...]:
-    """Which cameras share a table: those of one model."""
-    models = [get_model(c.model) for c in cameras]
-    different = tuple(dict.fromkeys(models))
+    """Which cameras share a table: those of one model and the same ties."""
+    sorts = [(get_model(c.model), c.tie) for c in cameras]
+    different = tuple(dict.fromkeys(sorts))
+    named = lambda model, tie: ", ".join(["camera", model.name, *(" = ".join(g) for g in tie)])
     return tuple(
         CameraTable(
-            "camera" if len(different) == 1 else f"camera, {model.name}", key_of(model),
-            model.parameters, np.array([c for c, m in enumerate(models) if m == model]),
+            "camera" if len(different) == 1 else named(model, tie), key_of(model),
+            model.parameters, np.array([c for c, s in enumerate(sorts) if s == (model, tie)]), tie,
         )
-        for model in different
+        for model, tie in different
     )  # fmt: skip
 
 

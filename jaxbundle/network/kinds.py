@@ -21,6 +21,8 @@ from jaxbundle import cameras
 from jaxbundle.geometry import omega_phi_kappa_near
 from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.leastsquares.motions import similarity
+from jaxbundle.leastsquares.spaces import Posed, turn_by
+from jaxbundle.network.further.rolling_shutter import READ_OUT, VELOCITIES
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,15 +41,32 @@ class ImagePoint:
         return cameras.residual(cameras.get_model(self.model), self.domain, interior, ray, xy)
 
 
+@dataclasses.dataclass(frozen=True)
+class MovingImagePoint(ImagePoint):
+    """The same of a camera that moves while its lines are exposed (`further.rolling_shutter`)."""
+
+    def __call__(self, pose, velocity, read_out, interior, point, measured):
+        xy, line = measured
+        time = read_out[0] * line
+        centre = tuple(c + v * time for c, v in zip(pose.centre, velocity[:3]))
+        ray = Posed(pose.rotation, centre).ray(point)
+        turned = turn_by(tuple(w * time for w in velocity[3:]), ray)
+        return cameras.residual(cameras.get_model(self.model), self.domain, interior, turned, xy)
+
+
 def image_points(
-    model: str | cameras.CameraModel, domain: str, camera: str, poses: tuple[str, ...] = ("image",)
-) -> Kind:
+    model: str | cameras.CameraModel, domain: str, camera: str, poses: tuple[str, ...] = ("image",),
+    moving: bool = False,
+) -> Kind:  # fmt: skip
     """Image points of the cameras of one model, whose table is `camera`; `domain`: "corrected" or
-    "measured"; `poses`: the tables of poses on the way from the object to the camera."""
-    of = (*poses, camera, "point")
+    "measured"; `poses`: the tables of poses on the way from the object to the camera; `moving`: of
+    cameras with a rolling shutter."""
+    between = (VELOCITIES, READ_OUT) if moving else ()
+    of = (*poses, *between, camera, "point")
     only = camera == "camera"
     name = "image coordinates" if only else f"image coordinates of {cameras.get_model(model).name}"
-    return Kind(name, ImagePoint(model, domain), of, ("x", "y"), scalars=True, invariant=True)
+    residual = (MovingImagePoint if moving else ImagePoint)(model, domain)
+    return Kind(name, residual, of, ("x", "y"), scalars=True, invariant=True)
 
 
 def _difference(value, given):

@@ -53,9 +53,9 @@ class TurnAboutSeen:
         for part in plan.parts:
             if not isinstance(self.declared.kinds[part.observations].residual, ImagePoint):
                 continue
-            image, point = part.lookup[0], points[part.lookup[2]]
+            image, point = part.lookup[0], points[part.lookup[-1]]
             centre = position[image] if part.by_row[0] else position[image][:, None]
-            point = point if part.by_row[2] else point[:, None]
+            point = point if part.by_row[-1] else point[:, None]
             used = part.source != part.place.shape[0] - 1
             square = jnp.sum((point - centre) ** 2, -1)
             weight = jnp.where(used, 1 / jnp.maximum(square, 1e-300), 0.0)[..., None]

@@ -109,8 +109,26 @@ def check_camera(camera: Camera, where: str = "") -> None:
             )
         if not _positive(sigma):
             raise InputError(f"{where}sigma of {name} is {sigma}; it must be finite and positive")
+    _check_ties(camera, values, where)
     _check_pair(where, "image_size", camera.image_size, "[columns, rows]")
     _check_pair(where, "pixel_size", camera.pixel_size, "[width, height] in mm")
+
+
+def _check_ties(camera: Camera, values, where: str) -> None:
+    """Refuse ties of unknown parameters, of one in two groups, of different start values."""
+    names = [name for group in camera.tie for name in group]
+    for name in names:
+        if name not in get_model(camera.model).parameters:
+            known = get_model(camera.model).parameters
+            raise InputError(f"{where}tie names the unknown parameter {name!r}"
+                             f"{did_you_mean(name, known)}")  # fmt: skip
+        if names.count(name) > 1:
+            raise InputError(f"{where}tie names {name} twice")
+    for group in camera.tie:
+        if len({values.get(name, 0.0) for name in group}) > 1:
+            start = ", ".join(f"{name} {values.get(name, 0.0):g}" for name in group)
+            raise InputError(f"{where}tied parameters are one unknown, but start with different "
+                             f"values: {start}")  # fmt: skip
 
 
 def _check_pair(where, name, pair, meaning):

@@ -234,7 +234,7 @@ def check_redundancy(network: Network) -> None:
         + len(network.distances)
     )  # fmt: skip
     unknowns = (
-        (images.sigma != 0).sum() + sum(len(camera.free) for camera in network.cameras)
+        (images.sigma != 0).sum() + sum(len(camera.unknowns) for camera in network.cameras)
         + 3 * (~points.has_role("fixed")).sum()
     )  # fmt: skip
     conditions = 0

@@ -57,7 +57,8 @@ class Camera:
 
     `model` is the name of a built-in model, or a `CameraModel`, one's own. `parameters` not given
     start at 0 (or the model's own default); `sigma` gives a parameter a prior: a pseudo-observation
-    of its start value. `image_size` is (columns, rows), `pixel_size` (width, height) in mm.
+    of its start value. `image_size` is (columns, rows), `pixel_size` (width, height) in mm. `tie`:
+    groups of parameters that are one unknown, such as `(("fx", "fy"),)`.
     """
 
     id: str
@@ -67,9 +68,16 @@ class Camera:
     sigma: Mapping[str, float] = dataclasses.field(default_factory=dict)
     image_size: tuple[int, int] | None = None
     pixel_size: tuple[float, float] | None = None
+    tie: tuple[tuple[str, ...], ...] = ()
 
     def __post_init__(self):
         object.__setattr__(self, "model", key_of(self.model))
+
+    @property
+    def unknowns(self) -> tuple[str, ...]:
+        """The names of what is free, of tied parameters the first."""
+        first = {name: group[0] for group in self.tie for name in group}
+        return tuple(dict.fromkeys(first.get(name, name) for name in self.free))
 
 
 def units_of(cameras: Iterable[Camera]) -> str:

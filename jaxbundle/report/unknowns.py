@@ -62,6 +62,8 @@ def _one_camera(entry, model: CameraModel) -> list[str]:
         lines += ["", *table(header, rows, "lrrrrr")]
     if held:
         lines += ["", *facts([("Held", ", ".join(held))])]
+    if entry["tied"]:
+        lines += ["", *facts([("Tied", ", ".join(" = ".join(group) for group in entry["tied"]))])]
     if rows:
         lines += paragraph(
             f"t = |value|/σ; no: t < {CRITICAL_T:g}, not different from 0 at about 95 %. Total "

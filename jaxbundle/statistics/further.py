@@ -9,6 +9,7 @@ import numpy as np
 from jaxbundle.geometry import matrix_from_quaternion, omega_phi_kappa_near
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.leastsquares.spaces import PoseValue, Rotation
+from jaxbundle.network.further.rigs import MOUNTING
 
 ANGLES = ("omega", "phi", "kappa")
 
@@ -26,7 +27,8 @@ class Estimate(NamedTuple):
 
 
 def estimates(found: Solution, names, sigma0: float, origin) -> list[Estimate]:
-    """All unknowns of some tables. Of frames and poses X0, Y0, Z0 in object space, ω, φ, κ."""
+    """All unknowns of some tables. Of frames and poses X0, Y0, Z0 in object space (of mountings in
+    the reference camera), ω, φ, κ."""
     every = []
     for table in (t for t in found.problem.tables if t.name in names):
         values, Q = found.values[table.name], np.asarray(found.cofactor(table.name))
@@ -37,7 +39,7 @@ def estimates(found: Solution, names, sigma0: float, origin) -> list[Estimate]:
             A = np.asarray(jax.jacfwd(lambda d: readable(table.space.retract(value, d)))(zero))  # noqa: B023
             sigma = sigma0 * np.sqrt(np.clip(np.diag(A @ Q[row] @ A.T), 0, None))
             shown = np.array(readable(value))
-            if isinstance(value, PoseValue):
+            if isinstance(value, PoseValue) and table.name != MOUNTING:
                 shown[:3] += origin
             every += [
                 Estimate(table.name, table.label(row), label, float(x), float(s), angle)

@@ -133,6 +133,6 @@ def _camera_sigma(problem: Problem, values: Values, own):
     for table in problem.layout.cameras:
         variance = jnp.diagonal(own[table.name], axis1=1, axis2=2)
         root = jnp.where(variance <= 0, 0.0, jnp.sqrt(jnp.where(variance <= 0, 1.0, variance)))
-        moving = np.array(problem.system.table(table.name).space.moving, int)
-        sigma = sigma.at[table.cameras[:, None], moving].set(root)
+        columns, of = map(list, problem.system.table(table.name).space.moves)
+        sigma = sigma.at[table.cameras[:, None], columns].set(root[:, of])
     return sigma

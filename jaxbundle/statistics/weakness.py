@@ -16,6 +16,7 @@ from jaxbundle.leastsquares.weakness import FAR, VAGUE, Extents, find_weak, find
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.columns import count, some
 from jaxbundle.network.further.base import ANGLES, LENGTHS
+from jaxbundle.network.further.rolling_shutter import READ_OUT
 from jaxbundle.statistics.inspection import Inspection
 
 ADVICE_FOR = {
@@ -103,6 +104,8 @@ def _extents(inspection: Inspection) -> Extents:
         judged = [(p in LENGTHS) / mean + (p in ANGLES) for p in given.parameters]
         if any(judged):
             found[name] = np.tile(judged, (given.rows, 1))
+        if name == READ_OUT:
+            found[name] = 1 / np.maximum(np.abs(given.value), np.finfo(float).tiny)
     return found | {"point": of_point}
 
 

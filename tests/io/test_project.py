@@ -410,7 +410,7 @@ DOCS = ROOT / "docs" / "project.md"
 def test_the_project_of_the_documentation(tmp_path):
     """Its files can be adjusted as they stand there; its row of a table can be added to them."""
     text = DOCS.read_text(encoding="utf-8")
-    first, row = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
+    first, row, _ = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
     (tmp_path / "project.toml").write_text(first, encoding="utf-8")
     for name, content in re.findall(r"`(\w+\.csv)`:\n\n```\n(.*?)```", text, re.DOTALL):
         (tmp_path / name).write_text(content, encoding="utf-8")

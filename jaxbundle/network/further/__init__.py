@@ -8,7 +8,14 @@ from jaxbundle.network.further.differences import Angles as Angles
 from jaxbundle.network.further.differences import Differences as Differences
 from jaxbundle.network.further.figures import Figures as Figures
 from jaxbundle.network.further.figures import Shapes as Shapes
+from jaxbundle.network.further.rigs import Rigs as Rigs
+from jaxbundle.network.further.rolling_shutter import RollingShutter as RollingShutter
 
-KINDS = {kind.TABLE: kind for kind in (Antennas, Attitudes, Differences, Angles, Figures, Shapes)}
+KINDS = {
+    kind.TABLE: kind
+    for kind in (
+        Antennas, Attitudes, Rigs, RollingShutter, Differences, Angles, Figures, Shapes,
+    )  # fmt: skip
+}
 """By the name of their table."""
 SECTIONS = tuple(kind.SECTION for kind in KINDS.values() if kind.SECTION)

@@ -103,6 +103,12 @@ class Further:
         """The network with start values that these rows give, where it has none."""
         return network
 
+    @property
+    def has_size(self) -> bool:
+        """Whether a σ is a length, while nothing else has one: as the network shrinks its residuals
+        do, so that its scale must be known."""
+        return False
+
     def number_of_equations(self) -> int:
         """How many a row is; they help to determine every image and point it touches."""
         return 1
@@ -184,10 +190,11 @@ class Parameters:
         sigma = np.array([self.sigma.get(name, np.inf) for name in names])
         if not np.isfinite(sigma).any():
             return []
-        kind = Kind(f"prior of {table.title}", _less, (table.name,), tuple(names), snooped="")
+        kind = Kind(f"prior of {table.title}", less, (table.name,), tuple(names), snooped="")
         sigma = np.tile(sigma, (table.rows, 1))
         return [kind((np.arange(table.rows),), table.value, sigma=sigma)]
 
 
-def _less(value, given):
+def less(value, given):
+    """Computed minus given."""
     return value - given

@@ -126,6 +126,10 @@ class Figures(Further):
                 raise InputError(f"{table.source(row)}: a {made.type[row]} has no radius")
         return made
 
+    @property
+    def has_size(self) -> bool:
+        return bool((self.sigma > 0).any())
+
     def columns(self, radians: float) -> dict:
         sigma = ["exact" if s == 0 else s for s in self.sigma.tolist()]
         return {"figure": self.figure, "type": self.type, "point": self.point, "sigma": sigma,
@@ -135,7 +139,7 @@ class Figures(Further):
         row = {id: i for i, id in enumerate(network.points.id)}
         point = np.array([row[id] for id in self.point], int)
         place = network.points.position - origin
-        exact = EXACT * _across_rays(network)
+        exact = EXACT * across_rays(network)
         declared = [
             self._of_type(type, point, place, exact) for type in TYPES if type in self.type
         ]
@@ -229,7 +233,7 @@ class Shapes(Further):
             rotation.append(np.asarray(quaternion_from_matrix(M)))
         frame = Table("shape", PoseValue(np.array(centre), np.array(rotation)), Frame(),
                       labels=list(names), parameters=DIRECTIONS)  # fmt: skip
-        sigma = np.where(self.sigma > 0, self.sigma, EXACT * _across_rays(network))
+        sigma = np.where(self.sigma > 0, self.sigma, EXACT * across_rays(network))
         kind = Kind("known shapes", in_shape, ("shape", "point"), ("x", "y", "z"))
         seen = kind((shape, point), self.place, sigma=sigma)
         return Declared((frame,), (seen,), (("shape", _move_frame),))
@@ -243,7 +247,7 @@ def _placed(x, X):
     return b - M.T @ a, M
 
 
-def _across_rays(network) -> float:
+def across_rays(network) -> float:
     """The σ of a point across a ray, σ·s/c, in the middle of all rays."""
     rays, images = network.observations, network.images
     shortest = []

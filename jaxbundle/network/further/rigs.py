@@ -1,0 +1,174 @@
+"""Cameras mounted together: table `rigs`, section `[rig]`.
+
+Images taken at one epoch of a rig; every camera has one mounting to the reference camera, at all
+epochs the same, exactly or within a σ (a mounting that works loose):
+
+    t = M_ref·(X0 − X0_ref) = t_mounting        M·M_refᵀ = R_mounting
+
+Columns: `rig`, `epoch`, `image`. The reference of a rig is the camera that most of its epochs have,
+or the one the section names: `reference = "left"`. Section: `sigma_position` (object unit) and
+`sigma_angle` (unit of angles) of one epoch, exact where not given. An epoch without an image of the
+reference leaves its images as they are, unless they are several: then the first is tied to the
+others by both mountings.
+"""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbundle.arguments import positive
+from jaxbundle.errors import InputError
+from jaxbundle.geometry import quaternion_from_matrix
+from jaxbundle.geometry.rotations import matrix_from_omega_phi_kappa
+from jaxbundle.leastsquares.declarations import Kind, Table
+from jaxbundle.leastsquares.spaces import Pose, PoseValue
+from jaxbundle.network.columns import Columns
+from jaxbundle.network.further.base import Declared, Further, check_settings
+from jaxbundle.network.further.figures import EXACT, across_rays
+from jaxbundle.network.units import ANGLE_UNITS
+
+SECTION, MOUNTING = "rig", "mounting"
+AXES = ("X", "Y", "Z", "turn x", "turn y", "turn z")
+
+
+def mounted(one, other, mounting_of_one, mounting_of_other, given):
+    """Place and turn of the reference camera by two of its images' cameras, their difference in the
+    frame of the first; the turn a vector, for small ones. Of the reference the mounting is none.
+    """
+    R1, R2 = mounting_of_one.rotation.matrix(), mounting_of_other.rotation.matrix()
+    M1, M2 = one.rotation.matrix(), other.rotation.matrix()
+    base1, base2 = R1.T @ M1, R2.T @ M2  # of the reference camera
+    apart = jnp.stack(other.centre) - jnp.stack(one.centre)
+    t1, t2 = jnp.stack(mounting_of_one.centre), jnp.stack(mounting_of_other.centre)
+    shift = base1 @ apart - (t2 - t1)
+    D = base2 @ base1.T
+    turn = 0.5 * jnp.stack([D[1, 2] - D[2, 1], D[2, 0] - D[0, 2], D[0, 1] - D[1, 0]])
+    return jnp.concatenate([shift, turn]) - given
+
+
+# Invariant: what is left of a condition at the start grows with the network, but is no scale.
+MOUNTED = Kind(
+    "mountings", mounted, ("image", "image", MOUNTING, MOUNTING), AXES, invariant=True
+)  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Rigs(Further):
+    """Which images were taken together."""
+
+    rig: tuple[str, ...]
+    epoch: tuple[str, ...]
+    image: tuple[str, ...]
+
+    TABLE, SECTION, IMAGES = "rigs", SECTION, ("image",)
+
+    @classmethod
+    def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Rigs":
+        table.check_names(("rig", "epoch", "image"))
+        check_settings(SECTION, settings, ("reference", "sigma_position", "sigma_angle"))
+        for name in ("sigma_position", "sigma_angle"):
+            if name in settings:
+                positive(f"[{SECTION}]: {name}", settings[name])
+        return cls(rig=table.ids("rig"), epoch=table.ids("epoch"), image=table.ids("image"),
+                   settings=dict(settings), source=table.source)  # fmt: skip
+
+    def columns(self, radians: float) -> dict:
+        return {"rig": self.rig, "epoch": self.epoch, "image": self.image}
+
+    @property
+    def has_size(self) -> bool:
+        return "sigma_position" in self.settings
+
+    def number_of_equations(self) -> int:
+        return 6
+
+    def check(self, network) -> None:
+        super().check(network)
+        images = network.images
+        camera = {id: network.cameras[c].id for id, c in zip(images.id, images.camera)}
+        seen: dict[tuple[str, ...], int] = {}
+        for row, key in enumerate(zip(self.rig, self.epoch, map(camera.get, self.image))):
+            if seen.setdefault(key, row) != row:
+                raise InputError(
+                    f"{self.source(row)}: camera {key[2]!r} has two images at epoch {key[1]!r} of "
+                    f"rig {key[0]!r}; the other stands in {self.source(seen[key])}"
+                )
+
+    def declare(self, network, origin) -> Declared:
+        images, radians = network.images, ANGLE_UNITS[network.angle_unit]
+        row = {id: i for i, id in enumerate(images.id)}
+        M = np.array([np.asarray(matrix_from_omega_phi_kappa(a)) for a in images.angles])
+        labels, places, turns, held, pairs = [], [], [], [], []
+        for rig in dict.fromkeys(self.rig):
+            epochs = self._epochs(rig, row, images.camera)
+            reference = self._reference(rig, epochs, network)
+            first = len(labels)
+            cameras = sorted({c for epoch in epochs for c in epoch}, key=lambda c: c != reference)
+            at = {c: first + k for k, c in enumerate(cameras)}
+            for c in cameras:
+                t, R = _mounting(epochs, reference, c, images.position, M)
+                labels.append(f"{network.cameras[c].id} of {rig}")
+                places.append(t)
+                turns.append(np.asarray(quaternion_from_matrix(R)))
+                held.append(c == reference)
+            for epoch in epochs:
+                one = reference if reference in epoch else min(epoch)
+                pairs += [(epoch[one], i, at[one], at[c]) for c, i in epoch.items() if c != one]
+        if not pairs:
+            raise InputError(f"{self.source.name}: no epoch has images of two cameras")
+        free = ~np.array(held)[:, None] * np.ones(6, bool)
+        mounting = Table(
+            MOUNTING, PoseValue(np.array(places), np.array(turns)), Pose(), free, labels, AXES,
+            "mounting of",
+        )  # fmt: skip
+        across = across_rays(network)
+        length = self.settings.get("sigma_position", EXACT * across)
+        depth = np.median(np.linalg.norm(
+            network.points.position[network.observations.point]
+            - images.position[network.observations.image], axis=1,
+        ))  # fmt: skip
+        angle = self.settings.get("sigma_angle", EXACT * across / depth / radians) * radians
+        sigma = np.repeat([length, angle], 3) * np.ones((len(pairs), 1))
+        seen = MOUNTED(tuple(np.array(pairs).T), np.zeros((len(pairs), 6)), sigma=sigma)
+        return Declared((mounting,), (seen,), ((MOUNTING, _move_mounting),))
+
+    def _epochs(self, rig, row, camera):
+        """By epoch, camera → image."""
+        epochs: dict[str, dict[int, int]] = {}
+        for name, epoch, id in zip(self.rig, self.epoch, self.image):
+            if name == rig:
+                epochs.setdefault(epoch, {})[int(camera[row[id]])] = row[id]
+        return [epoch for epoch in epochs.values() if len(epoch) > 1]
+
+    def _reference(self, rig, epochs, network) -> int:
+        ids = [camera.id for camera in network.cameras]
+        cameras = Counter(c for epoch in epochs for c in epoch)
+        named = self.settings.get("reference")
+        if named in ids and ids.index(named) in cameras:
+            return ids.index(named)
+        if named is not None and named not in ids:
+            raise InputError(f"[{SECTION}]: reference is {named!r}, but there is no such camera")
+        return max(sorted(cameras), key=cameras.get, default=0)
+
+
+def _mounting(epochs, reference, camera, position, M):
+    """Start values: those of the epoch whose place is the middle one."""
+    found = [
+        (M[e[reference]] @ (position[e[camera]] - position[e[reference]]),
+         M[e[camera]] @ M[e[reference]].T)
+        for e in epochs if reference in e and camera in e
+    ]  # fmt: skip
+    if camera == reference or not found:
+        return np.zeros(3), np.eye(3)
+    t = np.array([t for t, _ in found])
+    k = np.linalg.norm(t - np.median(t, axis=0), axis=1).argmin()
+    return found[k]
+
+
+def _move_mounting(motion, value: PoseValue) -> PoseValue:
+    """Only its size changes with object space."""
+    return PoseValue(jnp.exp(motion[6]) * value.position, value.rotation)

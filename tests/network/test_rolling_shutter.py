@@ -1,0 +1,148 @@
+"""Cameras whose lines are exposed one after the other."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from further_checks import check_jacobians, sample
+from scipy.spatial.transform import Rotation
+
+import jaxbundle
+from jaxbundle.cameras import get_model, project
+from jaxbundle.errors import InputError
+from jaxbundle.geometry import matrix_from_omega_phi_kappa
+from jaxbundle.network.build import make_further
+
+LINE = 3e-5
+CAMERA = jaxbundle.Camera(
+    "cam", "opencv", {"fx": 3000.0, "fy": 3000.0, "cx": 2000.0, "cy": 1500.0}, (),
+    image_size=(4000, 3000),
+)  # fmt: skip
+SIGMA = 0.3
+
+
+@pytest.fixture(scope="module")
+def flown():
+    """Six photographs of a moving camera, a hundred points, eight of them control; the truth, and
+    the true velocities."""
+    random = np.random.default_rng(6)
+    stations = jaxbundle.aerial_block(
+        strips=2, images_per_strip=3, height=50.0, footprint=(66.0, 50.0), forward_overlap=0.7,
+        side_overlap=0.5,
+    )  # fmt: skip
+    turns = random.uniform(-0.1, 0.1, (6, 3))
+    stations = dataclasses.replace(stations, angles=stations.angles + turns)
+    X = random.uniform([-50, -45, -5], [50, 45, 5], (100, 3))
+    made = jaxbundle.simulate_with_truth(
+        stations, X, CAMERA, noise=SIGMA, seed=3, datum="control", control=list(range(8)),
+        control_sigma=0.01, disturb=(0.2, 0.002, 0.2),
+    )  # fmt: skip
+    velocity = np.concatenate(
+        [random.normal(size=(6, 3)) * [12, 3, 1], random.normal(size=(6, 3)) * 0.2], 1
+    )
+    return made, velocity
+
+
+def seen(truth, velocity):
+    """The image coordinates of a moving camera, by iteration of the line, turned by
+    scipy."""
+    rays, images = truth.observations, truth.images
+    M = np.array([np.asarray(matrix_from_omega_phi_kappa(a)) for a in images.angles])
+    model, xy = get_model("opencv"), rays.xy.copy()
+    parameters = tuple(CAMERA.parameters.get(name, 0.0) for name in model.parameters)
+    for _ in range(30):
+        t = (LINE * (xy[:, 1] - 1499.5))[:, None]
+        v = velocity[rays.image]
+        away = truth.points.position[rays.point] - images.position[rays.image] - v[:, :3] * t
+        ray = np.einsum("nij,nj->ni", M[rays.image], away)
+        ray = Rotation.from_rotvec(v[:, 3:] * t).apply(ray)
+        xy = np.stack(project(model, parameters, *ray.T), 1)
+    return xy
+
+
+def moving(network, xy, **section):
+    section = {"line_time": LINE, "free": ["vX", "vY", "vZ", "wx", "wy", "wz"]} | section
+    further = make_further(
+        {"velocities": {"image": list(network.images.id)}, "rolling_shutter": section}, 1.0
+    )
+    rays = dataclasses.replace(network.observations, xy=xy)
+    return network.replace(observations=rays, further=further)
+
+
+def noisy(flown):
+    made, velocity = flown
+    random = np.random.default_rng(9)
+    xy = seen(made.truth, velocity)
+    return moving(made.network, xy + SIGMA * random.normal(size=xy.shape))
+
+
+@pytest.fixture(scope="module")
+def result(flown):
+    return jaxbundle.adjust(noisy(flown))
+
+
+def test_at_rest_it_is_the_camera_of_always(flown):
+    made, velocity = flown
+    np.testing.assert_allclose(seen(made.truth, 0 * velocity), made.truth.observations.xy,
+                               atol=1e-8)  # fmt: skip
+
+
+def test_velocities_are_found(flown, result):
+    _, velocity = flown
+    assert result.converged and 0.8 < result.sigma0 < 1.2
+    found = result.unknowns("velocity")
+    assert (found.sigma > 0).all()
+    assert (np.abs(found.value - velocity) < 4 * found.sigma).all()
+    assert np.abs(velocity / found.sigma).max() > 20  # they are seen
+    assert result.residuals["r"].sum() == pytest.approx(result.redundancy, abs=1e-5)
+    assert "Velocity" in result.report() and "wz" in result.report()
+
+
+def test_exact_image_points_lead_to_the_truth(flown):
+    made, velocity = flown
+    found = jaxbundle.adjust(moving(made.truth, seen(made.truth, velocity)))
+    assert found.vtpv < 1e-10
+    np.testing.assert_allclose(found.unknowns("velocity").value, velocity, atol=1e-5)
+
+
+def test_jacobians(result):
+    check_jacobians(result.problem, result.values, skip=("control points",))
+
+
+def test_sigma_is_that_of_a_sample(flown, result):
+    made, velocity = flown
+    problem = jaxbundle.make_problem(moving(made.truth, seen(made.truth, velocity)))
+    found = sample(problem, result.values, ("velocity",))
+    ratio = found["velocity"].std(0) / (result.unknowns("velocity").sigma / result.sigma0)
+    assert (np.abs(ratio - 1) < 5 / np.sqrt(2 * len(found["velocity"]))).all(), ratio
+
+
+def test_a_still_camera_does_not_know_its_line_time(flown):
+    """Velocities of 0 known to 1 mm/s, the line time free: only their product would show."""
+    made, velocity = flown
+    sigma = dict.fromkeys(("vX", "vY", "vZ", "wx", "wy", "wz"), 1e-3)
+    network = moving(made.network, made.network.observations.xy, sigma=sigma,
+                     free=["vX", "vY", "vZ", "wx", "wy", "wz", "line_time"])  # fmt: skip
+    found = jaxbundle.adjust(network)
+    words = " ".join(map(str, found.undetermined)) + " ".join(found.warnings)
+    assert not found.converged or "line_time" in words
+    assert "line_time of read-out of camera cam" in words
+
+
+def test_a_project_keeps_them(flown, result, tmp_path):
+    network = noisy(flown)
+    path = jaxbundle.write_project(network, tmp_path / "moving")
+    again = jaxbundle.read_network(path, overrides=["rolling_shutter.line_time=2e-5"])
+    assert again.further[0].settings["line_time"] == 2e-5
+    assert list(again.further[0].settings["free"]) == ["vX", "vY", "vZ", "wx", "wy", "wz"]
+    assert again.further[0].image == network.further[0].image
+
+
+def test_the_line_is_needed(flown):
+    made, _ = flown
+    network = moving(made.network, made.network.observations.xy)
+    camera = dataclasses.replace(network.cameras[0], image_size=None)
+    with pytest.raises(InputError, match="camera 'cam': image_size is needed to know when a line"):
+        jaxbundle.make_problem(network.replace(cameras=(camera,)))
+    with pytest.raises(InputError, match=r"\[rolling_shutter\]: line_time is missing"):
+        make_further({"velocities": {"image": ["IMG 1"]}}, 1.0)

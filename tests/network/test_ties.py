@@ -1,0 +1,96 @@
+"""Parameters that are one unknown: as the model with one focal length, and refused by name."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxbundle
+from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.spaces import Vector
+from jaxbundle.statistics.inspection import Inspection
+
+FREE = ("fx", "fy", "cx", "cy", "k1")
+SIZE = {"image_size": (1000, 800), "pixel_size": (0.01, 0.01)}
+
+
+def network(tie=(("fx", "fy"),), fy=900.0):
+    """Ten photographs of a camera of OpenCV's model whose true fx and fy are the same."""
+    true = {"fx": 900.0, "fy": fy, "cx": 500.0, "cy": 400.0, "k1": -0.1}
+    return jaxbundle.simulate_with_truth(
+        jaxbundle.ring_of_stations(6, radius=4.0, height=2.0, roll_every=2),
+        jaxbundle.cloud_of_targets(24, 1.5, seed=2),
+        jaxbundle.Camera("cam", "opencv", true, FREE, tie=tie, **SIZE),
+        noise=0.2, seed=3, disturb=(0.02, 0.002, 0.02),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def both():
+    """The network with its focal lengths tied, and apart."""
+    tied = network()
+    return tied, jaxbundle.adjust(tied.network), jaxbundle.adjust(network(()).network)
+
+
+def test_one_unknown_less(both):
+    truth, tied, apart = both
+    assert tied.converged and apart.converged
+    assert tied.counts.unknowns == apart.counts.unknowns - 1
+    assert tied.redundancy == apart.redundancy + 1
+    found = tied.cameras["cam"]
+    fx, fy = (found["parameters"][name] for name in ("fx", "fy"))
+    assert fx == fy and fx["free"] and fx["sigma"] > 0
+    assert found["free"] == ["fx", "cx", "cy", "k1"]
+    assert "fx = fy" in tied.report()
+    assert abs(fx["value"] - 900.0) < 3.5 * fx["sigma"]
+
+
+def test_it_is_the_condition_fx_minus_fy(both):
+    """At the same values: cofactors Q − Q·B·(Bᵀ·Q·B)⁻¹·Bᵀ·Q of the network with both free, B of the
+    condition fx − fy = 0; and vᵀPv grows by (fx − fy)²/q, to first order."""
+    _, tied, apart = both
+    pick = lambda values: values.camera[0, :5]
+    of = lambda result: Inspection(result.problem, tied.values).propagate(pick)
+    Q, B = of(apart), np.array([1.0, -1.0, 0, 0, 0])
+    expected = Q - np.outer(Q @ B, B @ Q) / (B @ Q @ B)
+    size = np.sqrt(np.diag(Q))
+    assert np.abs((of(tied) - expected) / np.outer(size, size)).max() < 1e-8
+    apart_by = B @ [apart.camera_parameters("cam")[p] for p in FREE]
+    more = apart_by**2 / (B @ Q @ B)
+    assert more > 0.01
+    assert tied.vtpv - apart.vtpv == pytest.approx(more, rel=0.05)
+
+
+def test_a_project_keeps_the_tie(tmp_path):
+    path = jaxbundle.write_project(network().network, tmp_path / "tied")
+    again = jaxbundle.read_network(path)
+    assert again.cameras[0].tie == (("fx", "fy"),)
+    apart = jaxbundle.read_network(path, overrides=["camera.cam.tie="])
+    assert apart.cameras[0].tie == ()
+    other = jaxbundle.read_network(path, overrides=["camera.cam.tie=fx+fy"])
+    assert other.cameras[0].tie == (("fx", "fy"),)
+
+
+@pytest.mark.parametrize("tie, message", [
+    ([["fx", "fz"]], "tie names the unknown parameter 'fz'"),
+    ([["fx", "fy"], ["fy", "cx"]], "tie names fy twice"),
+    ([["fx", "cx"]], "start with different values: fx 900, cx 500"),
+    (["fx", "fy"], "expected groups of names"),
+    ([["fx"]], "expected groups of names"),
+])  # fmt: skip
+def test_what_is_wrong_is_named(tie, message):
+    row = {"id": "cam", "model": "opencv", "fx": 900.0, "fy": 900.0, "cx": 500.0, "tie": tie}
+    with pytest.raises(InputError, match=message):
+        jaxbundle.make_network([row], [{"id": "a", "camera": "cam"}],
+                               [{"id": "1", "role": "tie", "X": 0.0, "Y": 0.0, "Z": 0.0}],
+                               [{"image": "a", "point": "1", "x": 0.0, "y": 0.0}])  # fmt: skip
+
+
+def test_the_space_of_tied_numbers():
+    space = Vector(4, (0, 2), ((1, 0),))
+    value, change = np.array([5.0, 5.0, 1.0, 7.0]), np.array([0.5, -0.25])
+    moved = np.asarray(space.retract(jnp.asarray(value), change))
+    np.testing.assert_array_equal(moved, [5.5, 5.5, 0.75, 7.0])
+    np.testing.assert_array_equal(space.moved(tuple(value), tuple(change)), moved)
+    np.testing.assert_array_equal(space.difference(moved, value), change)
+    held = space.hold(jnp.asarray(moved), value, np.array([0.0, 1.0]))
+    np.testing.assert_array_equal(held, [5.0, 5.0, 0.75, 7.0])
