@@ -98,7 +98,7 @@ def test_sigma_is_that_of_a_sample(simulated, result):
 def test_a_mounting_that_works_loose(simulated):
     """With a σ the epochs may differ: their residuals have it."""
     section = {"sigma_position": 1e-3, "sigma_angle": 1e-3}
-    with pytest.raises(InputError, match="a σ of rigs is a length, but nothing gives the network a"):
+    with pytest.raises(InputError, match="a σ of rigs is a length, but nothing gives the"):
         jaxbundle.adjust(mounted(simulated.network, **section))
     X = simulated.truth.points.position
     length = np.linalg.norm(X[:1] - X[1:2], axis=1)
