@@ -151,7 +151,7 @@ def test_exact_conditions_hold(simulated):
 def test_a_plane_through_collinear_points_is_named(simulated):
     """The points of the line as a plane: its turn about them is open."""
     line = [r["point"] for r in tables(SIGMA)["figures"] if r["type"] == "line"]
-    plane = [{"figure": "sheet", "type": "plane", "point": p, "sigma": SIGMA} for p in line]
+    plane = [{"figure": "sheet", "type": "plane", "point": p, "sigma": "exact"} for p in line]
     network = conditioned(simulated.network, SIGMA, figures=plane, shapes=None)
     result = jaxbundle.adjust(network)
     words = " ".join(map(str, result.undetermined)) + " ".join(result.warnings)
