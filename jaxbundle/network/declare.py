@@ -6,7 +6,7 @@ the engine's tables and sets.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
@@ -14,48 +14,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbundle.cameras import CameraModel, default_parameters, get_model, key_of
+from jaxbundle.cameras import get_model
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, quaternion_from_matrix
 from jaxbundle.leastsquares import declarations as ls
 from jaxbundle.leastsquares.problem import observed_weights
 from jaxbundle.leastsquares.rows import Data as EngineData
 from jaxbundle.leastsquares.rows import Values as Tables
-from jaxbundle.leastsquares.spaces import Pose, PoseValue, Vector
+from jaxbundle.leastsquares.spaces import Pose, PoseValue
 from jaxbundle.network import kinds
 from jaxbundle.network.also import place, split
 from jaxbundle.network.arrays import Data, Values
+from jaxbundle.network.camera_tables import CameraTable, camera_tables, start_of
 from jaxbundle.network.further.base import among
 from jaxbundle.network.further.rolling_shutter import RollingShutter
-from jaxbundle.network.tables import EXTERIOR, Camera, Network
-
-
-@dataclasses.dataclass(frozen=True)
-class CameraTable:
-    """The cameras of one model, and of one way in which its parameters are tied: the name of their
-    table, the model, its parameters, and which of the network's cameras they are."""
-
-    name: str
-    model: str | CameraModel
-    parameters: tuple[str, ...]
-    cameras: Int[np.ndarray, " rows"]
-    tie: tuple[tuple[str, ...], ...] = ()
-
-    def unknowns(self, cameras: Sequence[Camera]) -> ls.Table:
-        """The table; only parameters that are free in some camera of it move."""
-        own = [cameras[c] for c in self.cameras]
-        unknowns = [camera.unknowns for camera in own]
-        free = np.array([[name in names for name in self.parameters] for names in unknowns])
-        moving = tuple(np.flatnonzero(free.any(0)).tolist())
-        value = np.array([_start_of(camera) for camera in own])
-        at = self.parameters.index
-        tied = tuple(
-            (at(name), moving.index(at(group[0])))
-            for group in self.tie if at(group[0]) in moving for name in group[1:]
-        )  # fmt: skip
-        return ls.Table(
-            self.name, value, Vector(len(self.parameters), moving, tied), free[:, moving],
-            [camera.id for camera in own], tuple(self.parameters[j] for j in moving), "camera",
-        )  # fmt: skip
+from jaxbundle.network.tables import EXTERIOR, Network
 
 
 @dataclasses.dataclass(frozen=True)
@@ -258,30 +230,9 @@ def order_cameras(network: Network) -> Network:
     return network
 
 
-def camera_tables(cameras: Sequence[Camera]) -> tuple[CameraTable, ...]:
-    """Which cameras share a table: those of one model and the same ties."""
-    sorts = [(get_model(c.model), c.tie) for c in cameras]
-    different = tuple(dict.fromkeys(sorts))
-    named = lambda model, tie: ", ".join(["camera", model.name, *(" = ".join(g) for g in tie)])
-    return tuple(
-        CameraTable(
-            "camera" if len(different) == 1 else named(model, tie), key_of(model),
-            model.parameters, np.array([c for c, s in enumerate(sorts) if s == (model, tie)]), tie,
-        )
-        for model, tie in different
-    )  # fmt: skip
-
-
 @jax.jit
 def _quaternions(angles):
     return jax.vmap(lambda a: quaternion_from_matrix(matrix_from_omega_phi_kappa(a)))(angles)
-
-
-def _start_of(camera: Camera) -> list[float]:
-    """The start values of all parameters of a camera."""
-    model = get_model(camera.model)
-    values = {**default_parameters(model), **camera.parameters}
-    return [values[name] for name in model.parameters]
 
 
 def _data(network: Network, origin):
@@ -294,7 +245,7 @@ def _data(network: Network, origin):
     camera = np.zeros((len(models), width))
     camera_sigma = np.full((len(models), width), np.inf)
     for c, (given, model) in enumerate(zip(network.cameras, models)):
-        camera[c, : len(model.parameters)] = _start_of(given)
+        camera[c, : len(model.parameters)] = start_of(given)
         for j, name in enumerate(model.parameters):
             if name in given.free:
                 camera_sigma[c, j] = given.sigma.get(name, np.inf)

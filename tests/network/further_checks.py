@@ -75,7 +75,8 @@ def _noisy_other(random, measured, weight):
     """The first of the arrays measured with noise of its weights (1/σ, or L⁻¹)."""
     leaves, tree = jax.tree.flatten(measured)
     weight, first = np.asarray(weight), np.asarray(leaves[0])
-    noise = random.normal(size=weight.shape[:2])
+    # Of image points on lines both coordinates, of which the residual takes one direction.
+    noise = random.normal(size=first.reshape(len(first), -1).shape)
     if weight.ndim == 3:
         noise = np.linalg.solve(weight, noise[..., None])[..., 0]
     else:

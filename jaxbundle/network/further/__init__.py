@@ -8,13 +8,14 @@ from jaxbundle.network.further.differences import Angles as Angles
 from jaxbundle.network.further.differences import Differences as Differences
 from jaxbundle.network.further.figures import Figures as Figures
 from jaxbundle.network.further.figures import Shapes as Shapes
+from jaxbundle.network.further.lines import Edges as Edges
 from jaxbundle.network.further.rigs import Rigs as Rigs
 from jaxbundle.network.further.rolling_shutter import RollingShutter as RollingShutter
 
 KINDS = {
     kind.TABLE: kind
     for kind in (
-        Antennas, Attitudes, Rigs, RollingShutter, Differences, Angles, Figures, Shapes,
+        Antennas, Attitudes, Rigs, RollingShutter, Differences, Angles, Figures, Shapes, Edges,
     )  # fmt: skip
 }
 """By the name of their table."""

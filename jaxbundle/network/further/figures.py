@@ -82,7 +82,8 @@ RESIDUALS = {"plane": (on_plane, ("distance",)), "line": (on_line, ("x", "y")),
              "cylinder": (on_cylinder, ("distance",))}  # fmt: skip
 
 
-def _move_frame(motion, value: PoseValue) -> PoseValue:
+def move_frame(motion, value: PoseValue) -> PoseValue:
+    """A frame that moves with object space."""
     return PoseValue(*transform_pose(motion, *value))
 
 
@@ -165,7 +166,7 @@ class Figures(Further):
         sigma = np.where(self.sigma[rows] > 0, self.sigma[rows], exact)
         if type not in ROUND:
             seen = self._seen(type, (type,), (figure,), point[rows], sigma)
-            return Declared((frame,), (seen,), ((type, _move_frame),))
+            return Declared((frame,), (seen,), ((type, move_frame),))
         known = np.array([np.nanmax([*self.radius[rows[figure == k]], -1.0])
                           for k in range(len(names))])  # fmt: skip
         size = Table(f"radius of {type}", np.where(known > 0, known, radius), free=known <= 0,
@@ -177,7 +178,7 @@ class Figures(Further):
                 touched = (figure[those],) * 2
                 seen.append(self._seen(type, (type, size.name), touched, point[rows[those]],
                                        sigma[those], not given))  # fmt: skip
-        actions = (type, _move_frame), (size.name, _move_radius)
+        actions = (type, move_frame), (size.name, _move_radius)
         return Declared((frame, size), tuple(seen), actions)
 
     @staticmethod
@@ -236,7 +237,7 @@ class Shapes(Further):
         sigma = np.where(self.sigma > 0, self.sigma, EXACT * across_rays(network))
         kind = Kind("known shapes", in_shape, ("shape", "point"), ("x", "y", "z"))
         seen = kind((shape, point), self.place, sigma=sigma)
-        return Declared((frame,), (seen,), (("shape", _move_frame),))
+        return Declared((frame,), (seen,), (("shape", move_frame),))
 
 
 def _placed(x, X):

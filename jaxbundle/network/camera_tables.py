@@ -1,0 +1,62 @@
+"""The cameras of a network as tables of unknowns: those of one model share one."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Int
+
+from jaxbundle.cameras import CameraModel, default_parameters, get_model, key_of
+from jaxbundle.leastsquares import declarations as ls
+from jaxbundle.leastsquares.spaces import Vector
+from jaxbundle.network.tables import Camera
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraTable:
+    """The cameras of one model, and of one way in which its parameters are tied: the name of their
+    table, the model, its parameters, and which of the network's cameras they are."""
+
+    name: str
+    model: str | CameraModel
+    parameters: tuple[str, ...]
+    cameras: Int[np.ndarray, " rows"]
+    tie: tuple[tuple[str, ...], ...] = ()
+
+    def unknowns(self, cameras: Sequence[Camera]) -> ls.Table:
+        """The table; only parameters that are free in some camera of it move."""
+        own = [cameras[c] for c in self.cameras]
+        unknowns = [camera.unknowns for camera in own]
+        free = np.array([[name in names for name in self.parameters] for names in unknowns])
+        moving = tuple(np.flatnonzero(free.any(0)).tolist())
+        value = np.array([start_of(camera) for camera in own])
+        at = self.parameters.index
+        tied = tuple(
+            (at(name), moving.index(at(group[0])))
+            for group in self.tie if at(group[0]) in moving for name in group[1:]
+        )  # fmt: skip
+        return ls.Table(
+            self.name, value, Vector(len(self.parameters), moving, tied), free[:, moving],
+            [camera.id for camera in own], tuple(self.parameters[j] for j in moving), "camera",
+        )  # fmt: skip
+
+
+def camera_tables(cameras: Sequence[Camera]) -> tuple[CameraTable, ...]:
+    """Which cameras share a table: those of one model and the same ties."""
+    sorts = [(get_model(c.model), c.tie) for c in cameras]
+    different = tuple(dict.fromkeys(sorts))
+    named = lambda model, tie: ", ".join(["camera", model.name, *(" = ".join(g) for g in tie)])
+    return tuple(
+        CameraTable(
+            "camera" if len(different) == 1 else named(model, tie), key_of(model),
+            model.parameters, np.array([c for c, s in enumerate(sorts) if s == (model, tie)]), tie,
+        )
+        for model, tie in different
+    )  # fmt: skip
+
+
+def start_of(camera: Camera) -> list[float]:
+    """The start values of all parameters of a camera."""
+    model = get_model(camera.model)
+    values = {**default_parameters(model), **camera.parameters}
+    return [values[name] for name in model.parameters]

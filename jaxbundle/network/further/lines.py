@@ -1,0 +1,137 @@
+"""Image points on straight lines of object space: table `edges`.
+
+A measured point lies anywhere on the image of a line; no point of another image corresponds to it.
+The residual is the distance of the corrected image point from the projected line, in the plane of
+the ideal image, in the unit of the image coordinates (Mulawa and Mikhail 1988; Schmid and Zisserman
+1997):
+
+    n = (M·(A − X0)) × (M·d)        v = c·(n·r)/(r_z·√(n_x² + n_y²))
+
+A a point of the line, d its direction, r the ray of the image point without distortion.
+
+Columns: `line` (its name), `image`, `x`, `y` in the image unit, `sigma` of the distance (that of
+image points if absent). Start values: the line in which the planes through the points of two or
+more images meet best.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle import cameras
+from jaxbundle.errors import InputError
+from jaxbundle.geometry import quaternion_from_matrix
+from jaxbundle.geometry.rotations import matrix_from_omega_phi_kappa
+from jaxbundle.leastsquares.declarations import Kind, Table
+from jaxbundle.leastsquares.spaces import Frame, PoseValue, cross
+from jaxbundle.network.camera_tables import camera_tables, start_of
+from jaxbundle.network.columns import Columns
+from jaxbundle.network.further.base import Declared, Further, positive_sigma
+from jaxbundle.network.further.figures import move_frame
+from jaxbundle.network.units import from_image_unit
+
+LINE = "object line"
+LEAST_ANGLE = 1e-3
+"""Between the planes in which two images see a line, radians, at least."""
+
+
+@dataclasses.dataclass(frozen=True)
+class OnLine:
+    """The residual of an image point of a camera of this model."""
+
+    model: str | cameras.CameraModel
+
+    def __call__(self, pose, interior, line, xy):
+        model = cameras.get_model(self.model)
+        along = pose.rotation.apply(line.rotation.apply_inverse((0.0, 0.0, 1.0)))
+        n = cross(pose.ray(line.centre), along)
+        r = cameras.image_ray(model, interior, *xy)
+        c = interior[model.parameters.index(model.principal_distance[0])]
+        across = (n[0] ** 2 + n[1] ** 2) ** 0.5
+        return (c * sum(a * b for a, b in zip(n, r)) / (r[2] * across),)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Edges(Further):
+    """Image points of lines, in the unit of the network's image coordinates; σ NaN: that of image
+    points."""
+
+    line: tuple[str, ...]
+    image: tuple[str, ...]
+    xy: Float[np.ndarray, "n 2"]
+    sigma: Float[np.ndarray, " n"]
+
+    TABLE, IMAGES = "edges", ("image",)
+
+    @classmethod
+    def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Edges":
+        table.check_names(("line", "image", "x", "y"), ("sigma",))
+        xy = np.stack([table.numbers(name, required=True) for name in "xy"], 1)
+        return cls(line=table.ids("line"), image=table.ids("image"), xy=xy,
+                   sigma=positive_sigma(table, "sigma", required=False),
+                   source=table.source)  # fmt: skip
+
+    def columns(self, radians: float) -> dict:
+        return {"line": self.line, "image": self.image, "x": self.xy[:, 0], "y": self.xy[:, 1],
+                "sigma": self.sigma}  # fmt: skip
+
+    def declare(self, network, origin) -> Declared:
+        images = network.images
+        row = {id: i for i, id in enumerate(images.id)}
+        image = np.array([row[id] for id in self.image], int)
+        camera = images.camera[image]
+        sigma = np.where(np.isnan(self.sigma), np.median(network.observations.sigma), self.sigma)
+        unit = network.image_unit if network.image_unit in ("mm", "px") else "mm"
+        both = np.stack([self.sigma] * 2, 1)
+        xy, own = from_image_unit(network.cameras, camera, self.xy, both, unit)
+        sigma = np.where(np.isnan(self.sigma), sigma, own[:, 0])
+        names, line = np.unique(np.array(self.line, dtype=object), return_inverse=True)
+        start = [self._start(network, origin, np.flatnonzero(line == k), image, xy)
+                 for k in range(len(names))]  # fmt: skip
+        centre, rotation = (np.array(x) for x in zip(*start))
+        lines = Table(
+            LINE, PoseValue(centre, rotation), Frame((0, 1, 3, 4)), labels=list(names),
+            parameters=("shift x", "shift y", "turn x", "turn y"), title="line",
+        )  # fmt: skip
+        observed = []
+        for table in camera_tables(network.cameras):
+            rows = np.flatnonzero(np.isin(camera, table.cameras))
+            if not len(rows):
+                continue
+            place = {int(c): k for k, c in enumerate(table.cameras)}
+            of_camera = np.array([place[int(c)] for c in camera[rows]], int)
+            kind = Kind("edges", OnLine(table.model), ("image", table.name, LINE), ("across",),
+                        scalars=True, invariant=True)  # fmt: skip
+            observed.append(kind((image[rows], of_camera, line[rows]), xy[rows], sigma=sigma[rows]))
+        return Declared((lines,), observed, ((LINE, move_frame),))
+
+    def _start(self, network, origin, rows, image, xy):
+        """Where the planes of the images meet: a point, and a rotation whose last row is the
+        direction."""
+        normals, through = [], []
+        for i in np.unique(image[rows]):
+            own = rows[image[rows] == i]
+            if len(own) < 2:
+                continue
+            c = network.images.camera[i]
+            table = next(t for t in camera_tables(network.cameras) if c in t.cameras)
+            p = tuple(start_of(network.cameras[c]))
+            r = np.stack([np.asarray(x) for x in cameras.image_ray(
+                cameras.get_model(table.model), p, *xy[own].T
+            )], 1)  # fmt: skip
+            M = np.asarray(matrix_from_omega_phi_kappa(network.images.angles[i]))
+            normals.append(np.linalg.svd(r @ M)[2][-1])
+            through.append(normals[-1] @ (network.images.position[i] - origin))
+        n = np.array(normals).reshape(-1, 3)
+        _, size, Vt = np.linalg.svd(n) if len(n) else (0, np.zeros(3), 0)
+        if len(n) < 2 or size[1] < LEAST_ANGLE:
+            raise InputError(
+                f"{self.source(rows[0])}: line {self.line[rows[0]]!r} needs two points in each of "
+                "two images that do not see it in one plane"
+            )
+        A = np.linalg.lstsq(n, np.array(through), rcond=LEAST_ANGLE)[0]
+        y = np.cross(Vt[2], Vt[0])
+        return A, np.asarray(quaternion_from_matrix(np.stack([Vt[0], y, Vt[2]])))
