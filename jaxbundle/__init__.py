@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from jaxbundle.network.check import check_network as check_network
     from jaxbundle.network.simulate import simulate as simulate
     from jaxbundle.network.simulate import simulate_with_truth as simulate_with_truth
+    from jaxbundle.network.simulate_further import simulate_further as simulate_further
     from jaxbundle.network.stations import aerial_block as aerial_block
     from jaxbundle.network.stations import cloud_of_targets as cloud_of_targets
     from jaxbundle.network.stations import grid_of_targets as grid_of_targets
@@ -74,6 +75,7 @@ _HOME = {
     "jaxbundle.network.build": ("make_network",),
     "jaxbundle.network.check": ("check_network",),
     "jaxbundle.network.simulate": ("simulate", "simulate_with_truth"),
+    "jaxbundle.network.simulate_further": ("simulate_further",),
     "jaxbundle.network.stations": (
         "aerial_block", "cloud_of_targets", "grid_of_targets", "ring_of_stations",
         "stations_looking_at",

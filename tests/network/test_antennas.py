@@ -123,6 +123,28 @@ def test_residuals_at_the_truth_are_those_of_the_formula(flight):
         np.testing.assert_allclose(v, 0, atol=1e-9)
 
 
+def test_they_are_simulated_as_the_formula_says(flight):
+    """Measured anew of the truth: what `measured` computes by hand, and with noise of their σ."""
+    antennas, attitudes = measured(flight.truth, noise=0.0)
+    by_hand = with_sensors(
+        flight.network, antennas, attitudes, attitude={"boresight": list(TURN)},
+        antenna={"lever_arm": list(ARM), "free": ["shift", "drift"]},
+    )  # fmt: skip
+    shifts = np.array([[*SHIFT[s], *DRIFT[s]] for s in ("north", "south")])
+    unknowns, off = {"GNSS strip": shifts}, []
+    for seed in range(8):
+        made = jaxbundle.simulate_further(by_hand, flight.truth, unknowns=unknowns, seed=seed)
+        off.append([(one.position - other.position) / SIGMA if k == 0 else
+                    (one.angles - other.angles) / ANGLE_SIGMA
+                    for k, (one, other) in enumerate(zip(made.further, by_hand.further))
+                    ])  # fmt: skip
+    off = np.array(off)
+    assert np.abs(off.mean((0, 2, 3))).max() < 4 / np.sqrt(240)
+    np.testing.assert_allclose(off.std((0, 2, 3)), 1, atol=4 / np.sqrt(480))
+    with pytest.raises(InputError, match="there is no table 'GNSS'"):
+        jaxbundle.simulate_further(by_hand, flight.truth, unknowns={"GNSS": shifts})
+
+
 def test_jacobians(result):
     check_jacobians(result.problem, result.values)
 

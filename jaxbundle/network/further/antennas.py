@@ -73,6 +73,7 @@ class Antennas(Further):
     time: Float[np.ndarray, " n"]
 
     TABLE, SECTION, IMAGES = "antennas", SECTION, ("image",)
+    MEASURED = "position"
 
     @classmethod
     def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Antennas":

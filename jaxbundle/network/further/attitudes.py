@@ -65,6 +65,7 @@ class Attitudes(Further):
     sigma: Float[np.ndarray, "n 3"]
 
     TABLE, SECTION, IMAGES = "attitudes", SECTION, ("image",)
+    MEASURED = "angles"
 
     @classmethod
     def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Attitudes":

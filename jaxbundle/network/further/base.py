@@ -43,6 +43,8 @@ class Further:
     IMAGES: ClassVar[tuple[str, ...]] = ()
     POINTS: ClassVar[tuple[str, ...]] = ()
     """The fields that hold ids of images, of points."""
+    MEASURED: ClassVar[str] = ""
+    """The field that holds what was measured; none of conditions."""
 
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     source: Source = Source("table")

@@ -46,7 +46,7 @@ class Differences(Further):
     value: Float[np.ndarray, "n 3"]
     sigma: Float[np.ndarray, "n 3"]
 
-    TABLE, POINTS = "differences", ("start", "to")
+    TABLE, POINTS, MEASURED = "differences", ("start", "to"), "value"
 
     @classmethod
     def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Differences":
@@ -83,7 +83,7 @@ class Angles(Further):
     value: Float[np.ndarray, " n"]
     sigma: Float[np.ndarray, " n"]
 
-    TABLE, POINTS = "angles", ("start", "at", "to")
+    TABLE, POINTS, MEASURED = "angles", ("start", "at", "to"), "value"
 
     @classmethod
     def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Angles":
