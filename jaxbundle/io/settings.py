@@ -112,11 +112,12 @@ def _override_section(document: Document, key: str, text: str) -> None:
         if not isinstance(settings, dict):
             raise InputError(f"--set {key}: {section} is {shown(settings)}; a table is expected")
     words = _words(text)
-    if name == "free":
-        settings[name] = words
-    else:
-        values = [_number(key, word) for word in words]
-        settings[name] = values if text.strip().startswith("[") or len(values) != 1 else values[0]
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        values = words
+    several = name == "free" or text.startswith("[") or len(values) != 1
+    settings[name] = values if several else values[0]
 
 
 def _words(text: str) -> list[str]:

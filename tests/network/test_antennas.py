@@ -235,3 +235,18 @@ def test_unknown_settings_are_refused(flight):
     antennas, _ = measured(flight.truth)
     with pytest.raises(InputError, match=r"\[antenna\]: unknown key 'leverarm'; did you mean"):
         with_sensors(flight.network, antennas, None, antenna={"leverarm": [0, 0, 0]})
+
+
+@pytest.mark.parametrize("setting, message", [
+    ("antenna.fre=shift", "unknown key 'fre'; did you mean 'free'"),
+    ("antenna.sigma=3", "sigma is 3.0; a table of names and numbers"),
+    ("antenna.free=3", "unknown 3.0"),
+    ("antenna.sigma.shift=abc", "sigma of shift must be a positive number, but is 'abc'"),
+    ("antenna.lever_arm=abc", "lever_arm is 'abc'; 3 numbers are expected"),
+    ("rolling_shutter.line_time=1e-5", "given, but no table velocities"),
+])  # fmt: skip
+def test_settings_that_cannot_be_end_in_a_line(flight, tmp_path, setting, message):
+    network = with_sensors(flight.network, *measured(flight.truth))
+    path = jaxbundle.write_project(network, tmp_path / "flight")
+    with pytest.raises(InputError, match=message):
+        jaxbundle.make_problem(jaxbundle.read_network(path, overrides=[setting]))

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbundle.arguments import shown
+from jaxbundle.arguments import positive, shown
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.declarations import Kind, Observations, Table
 from jaxbundle.network.columns import Columns, did_you_mean
@@ -170,17 +170,19 @@ class Parameters:
 
         **Raises:** `InputError`."""
         free, sigma = settings.get("free", ()), settings.get("sigma", {})
-        if isinstance(free, str):
-            free = [name.strip() for name in free.strip("[]").split(",") if name.strip()]
+        if isinstance(free, str) or not isinstance(free, Sequence):
+            raise InputError(f"[{section}]: free is {shown(free)}; a list of names is expected")
+        if not isinstance(sigma, Mapping):
+            raise InputError(
+                f"[{section}]: sigma is {shown(sigma)}; a table of names and numbers is expected"
+            )
         for name in (*free, *sigma):
             if name not in names:
                 raise InputError(f"[{section}]: unknown {name!r}{did_you_mean(name, names)}")
         for name, value in sigma.items():
             if name not in free:
                 raise InputError(f"[{section}]: sigma is given for {name!r}, which is not free")
-            if not (isinstance(value, int | float) and value > 0):
-                raise InputError(f"[{section}]: sigma of {name} is {shown(value)}; a positive "
-                                 "number is expected")  # fmt: skip
+            positive(f"[{section}]: sigma of {name}", value)
         return Parameters(names, tuple(free), dict(sigma))
 
     def mask(self, names: Sequence[str]) -> Bool[np.ndarray, "1 n"]:
