@@ -100,7 +100,6 @@ def make_search(image: PushbroomImage, earth: Ellipsoid | None = WGS84) -> Searc
     return Search(pieces, footprint, samples, along, earth)
 
 
-@partial(jax.jit, static_argnames="most")
 def project_points(
     image: PushbroomImage,
     search: Search,
@@ -114,6 +113,12 @@ def project_points(
     what is beside the image by up to `margin` lines and pixels is taken as in it. Points inside
     the image are found some ten times as fast as those outside, which must be searched for.
     """
+    return _project_points(image, search, X, most, margin)
+
+
+@partial(jax.jit, static_argnames="most")
+def _project_points(image, search, X, most, margin):
+    """One program for every margin: a default left out would be a constant of it."""
     find = lambda X: _found(image, search, X, most, margin)
     return _in_chunks(find, tuple(X))
 
