@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.leastsquares.reliability import external_reliability, minimal_detectable
-from jaxbundle.network.further import attitudes, differences
+from jaxbundle.network.further import OF_ANGLES
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.statistics.correlation import correlation_matrix, total_correlation
 from jaxbundle.statistics.further import estimates
@@ -179,7 +179,7 @@ def residual_rows(adjustment, kind, image, point, axes, v, weight, r, w):
     """The rows of one kind of observation [things × axes] as columns; weightless rows left out."""
     v, weight, r, w = (np.asarray(x) for x in (v, weight, r, w))
     unit = np.ones(weight.shape[1])
-    if kind in OF_ANGLES and tuple(axes) in OF_ANGLES[kind]:
+    if kind in OF_ANGLES or (kind == "prior" and axes == EXTERIOR):
         unit[-3:] = adjustment.angle_scale
     used = weight > 0
     sigma = np.where(used, unit / np.where(used, weight, 1), np.nan)
@@ -201,13 +201,6 @@ def residual_rows(adjustment, kind, image, point, axes, v, weight, r, w):
         factor = adjustment.weights if kind == "image" else np.ones(len(image))
         columns["weight"] = repeat(factor)
     return {name: column[used.ravel()] for name, column in columns.items()}
-
-
-OF_ANGLES = {
-    "prior": (EXTERIOR,), attitudes.ATTITUDE.name: (attitudes.ANGLES,),
-    attitudes.PRIOR.name: (attitudes.ANGLES,), differences.ANGLE.name: (("angle",),),
-}  # fmt: skip
-"""Kinds and axes whose last three residuals, or fewer, are angles."""
 
 
 def _significance(value: float, sigma: float) -> float:

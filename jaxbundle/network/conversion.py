@@ -15,6 +15,7 @@ import numpy as np
 from jaxbundle.cameras import CameraModel, Conversion, convert_camera, get_model, is_own, key_of
 from jaxbundle.cameras.frames import between_frames
 from jaxbundle.errors import InputError
+from jaxbundle.network.further import Edges
 from jaxbundle.network.rules import model_of
 from jaxbundle.network.tables import Camera, Network, Observations
 
@@ -59,6 +60,11 @@ def convert_cameras(
         observations=Observations(rays.image, rays.point, xy, sigma, rays.source),
         image_unit=units.pop() if done and len(units) == 1 else network.image_unit,
     )
+    kept = tuple(one for one in network.further if not isinstance(one, Edges))
+    if done and len(kept) < len(network.further):
+        converted = converted.replace(further=kept).warn(
+            "edges are left out: their image points belong to the models before the conversion"
+        )
     dropped = [c.id for c in network.cameras if c.id in done and c.sigma]
     if dropped:
         converted = converted.warn(

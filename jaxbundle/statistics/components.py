@@ -4,6 +4,7 @@ import numpy as np
 
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.leastsquares.components import Group
+from jaxbundle.network.further import OF_ANGLES
 from jaxbundle.network.units import ANGLE_UNITS
 
 
@@ -33,5 +34,8 @@ def groups(problem: Problem) -> list[Group]:
         Group("interior orientation", every("interior"), np.nan),
         Group("distances", every("distance")),
     ]
-    further = enumerate(problem.system.observations[len(layout.sets) :], len(layout.sets))
-    return found + [Group(given.kind.name, [(o, np.s_[:])]) for o, given in further]
+    further: dict[str, list] = {}
+    for o, given in enumerate(problem.system.observations[len(layout.sets) :], len(layout.sets)):
+        further.setdefault(given.kind.name, []).append((o, np.s_[:]))
+    unit = lambda name: angle if name in OF_ANGLES else 1.0
+    return found + [Group(name, parts, unit(name)) for name, parts in further.items()]

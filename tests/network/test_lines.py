@@ -1,5 +1,7 @@
 """Image points on straight lines of object space."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from further_checks import check_jacobians, sample
@@ -9,6 +11,7 @@ from jaxbundle.cameras import get_model, project
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.network.build import make_further
+from jaxbundle.network.conversion import convert_cameras
 
 LINES = {
     "edge": ([0.8, 0.6, 0.1], [0.1, 0.2, 1.0]), "ridge": ([-0.5, 0.9, 0.4], [1.0, -0.3, 0.1]),
@@ -106,3 +109,11 @@ def test_a_project_keeps_them(simulated, tmp_path):
     again = jaxbundle.read_network(jaxbundle.write_project(network, tmp_path / "lines"))
     np.testing.assert_allclose(again.further[0].xy, network.further[0].xy, rtol=1e-14)
     assert again.further[0].line == network.further[0].line
+
+
+def test_a_conversion_of_the_camera_leaves_them_out(simulated):
+    network = with_lines(simulated.network, seen(simulated.truth, 0.0))
+    camera = dataclasses.replace(network.cameras[0], image_size=(3000, 2000),
+                                 pixel_size=(0.012, 0.012))  # fmt: skip
+    converted, _ = convert_cameras(network.replace(cameras=(camera,)), "opencv")
+    assert converted.further == () and "edges are left out" in " ".join(converted.warnings)

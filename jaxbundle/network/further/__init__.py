@@ -1,6 +1,7 @@
 """Observations of further kinds that a network carries: one file a kind, all alike to the rest of
 the package (`base.Further`)."""
 
+from jaxbundle.network.further import attitudes, differences
 from jaxbundle.network.further.antennas import Antennas as Antennas
 from jaxbundle.network.further.attitudes import Attitudes as Attitudes
 from jaxbundle.network.further.base import Further as Further
@@ -19,4 +20,6 @@ KINDS = {
     )  # fmt: skip
 }
 """By the name of their table."""
+OF_ANGLES = {kind.name for kind in (attitudes.ATTITUDE, attitudes.PRIOR, differences.ANGLE)}
+"""The kinds whose residuals are angles, radians."""
 SECTIONS = tuple(kind.SECTION for kind in KINDS.values() if kind.SECTION)
