@@ -159,6 +159,24 @@ def test_sigma_is_that_of_a_sample(flight, result):
         assert (np.abs(ratio - 1) < 4 / np.sqrt(2 * len(values))).all(), (table, ratio)
 
 
+def test_free_shifts_leave_the_place_of_a_network_open(flight):
+    """No control, every strip with a shift: the scale and the turns are those of GNSS, the place is
+    given by inner constraints; with a prior of the shifts nothing is open."""
+    points = flight.network.points
+    network = flight.network.replace(
+        points=dataclasses.replace(points, role=("tie",) * len(points)), datum="inner"
+    )  # fmt: skip
+    antenna = {"lever_arm": list(ARM), "free": ["shift"]}  # drifts would take scale and turns
+    found = jaxbundle.adjust(with_sensors(network, *measured(flight.truth), antenna=antenna))
+    assert found.converged and found.counts.datum == 3
+    assert found.residuals["r"].sum() == pytest.approx(found.redundancy, abs=1e-6)
+    antenna |= {"sigma": {"shift": 1.0}}
+    known = jaxbundle.make_problem(
+        with_sensors(network, *measured(flight.truth), antenna=antenna)
+    )  # fmt: skip
+    assert known.counts.datum == 0
+
+
 def test_a_lever_arm_that_never_turns_is_named(flight, result):
     """Positions of one image: its lever arm is a shift of the strip, exactly."""
     antennas, attitudes = measured(flight.truth)

@@ -153,7 +153,12 @@ class Antennas(Further):
             *parameters.priors(shift, groups),
             *parameters.priors(clock, ["time_offset"]),
         )
-        return Declared((arm, shift, clock), (seen, *priors))
+        return Declared((arm, shift, clock), (seen, *priors), (("GNSS strip", _shift_back),))
+
+
+def _shift_back(motion, strip):
+    """The shifts of strips that make up for one of object space: where all are free, it is open."""
+    return strip.at[:3].add(-motion[:3])
 
 
 def _lever_arms(settings, cameras) -> Float[np.ndarray, "cameras 3"]:
