@@ -48,7 +48,7 @@ TOGETHER, APART = ("tests/calibration/", "tests/refinement/"), ("tests/test_note
 
 def work_unit(nodeid: str) -> str:
     """What goes to one worker: a file, so that its fixtures are made once, and the programs it
-    compiles are at hand; a folder that shares more; a notebook, a process of its own."""
+    compiles are at hand; a folder that shares more; a notebook, which is long."""
     path = nodeid.split("::")[0]
     if path in APART:
         return nodeid

@@ -14,7 +14,6 @@ import jaxbundle
 from jaxbundle.arguments import numeric_array, one_of
 from jaxbundle.network.columns import as_columns
 
-pytestmark = pytest.mark.xdist_group("convergent4")
 NAN, EXAMPLE = float("nan"), Path(__file__).parents[1] / "examples" / "convergent4"
 BOARD = jaxbundle.Board(4, 3, 0.1)
 XY = np.random.default_rng(0).uniform(0, 100, (3, 12, 2))

@@ -17,8 +17,6 @@ from jaxbundle.leastsquares.names import undetermined
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.solution import minimise
 
-pytestmark = pytest.mark.xdist_group("bundle")
-
 SIGMA = 0.002
 TRUE = {"c": 24.0, "x0": 0.05, "y0": -0.03, "K1": 1.2e-4}
 CONTROL = (0, 4, 20, 24, 62, 100, 124)

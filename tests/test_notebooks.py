@@ -1,11 +1,15 @@
 """The notebooks run from their first cell to their last, open with a question, show a picture."""
 
+import sys
 from pathlib import Path
 
-import nbclient
+import matplotlib
 import nbformat
 import pytest
-from ipykernel import kernelspec
+from IPython.core.interactiveshell import InteractiveShell
+from IPython.utils.capture import capture_output
+from matplotlib import pyplot as plt
+from traitlets.config import Config
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
@@ -53,24 +57,42 @@ def test_is_stored_with_clean_outputs(path):
     assert not any(cell.metadata for cell in notebook.cells)
 
 
+class Shell(InteractiveShell):
+    def enable_gui(self, gui=None):
+        """None: pictures are drawn inline."""
+
+
+@pytest.fixture(scope="module")
+def only_shell(tmp_path_factory):
+    """IPython in this process: a kernel for each notebook would import and trace all again."""
+    with pytest.MonkeyPatch.context() as patch, matplotlib.rc_context():
+        patch.setenv("IPYTHONDIR", str(tmp_path_factory.mktemp("ipython")))
+        patch.setitem(sys.modules, "__main__", sys.modules["__main__"])  # IPython puts its own
+        shell = Shell.instance(config=Config({"HistoryManager": {"enabled": False}}))
+        shell.enable_matplotlib("inline")
+        yield shell
+        plt.switch_backend("agg")
+        Shell.clear_instance()
+
+
+@pytest.fixture
+def shell(only_shell):
+    """With no names but its own; figures that a test before has left are not the notebook's."""
+    plt.close("all")
+    with matplotlib.rc_context():
+        yield only_shell
+    only_shell.reset()
+
+
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:Jupyter is migrating its paths:DeprecationWarning")
 @each_notebook
-def test_runs(path, tmp_path, monkeypatch):
-    # a kernel of this very interpreter, whatever else is installed for the user
-    kernelspec.write_kernel_spec(tmp_path / "kernels" / "python3")
-    monkeypatch.setenv("JUPYTER_PATH", str(tmp_path))
-    notebook = nbformat.read(path, as_version=4)
-    for cell in notebook.cells:
-        cell.pop("outputs", None)
+def test_runs(path, shell, monkeypatch):
+    monkeypatch.chdir(path.parent)
+    figures = 0
+    for cell in nbformat.read(path, as_version=4).cells:
         if cell.cell_type == "code":
-            cell.outputs = []
-    client = nbclient.NotebookClient(
-        notebook,
-        kernel_name="python3",
-        timeout=900,
-        resources={"metadata": {"path": str(path.parent)}},
-    )
-    client.execute()
-    assert not [output for output in outputs(notebook) if output.output_type == "error"]
-    assert pictures(notebook)
+            with capture_output() as captured:
+                result = shell.run_cell(cell.source, store_history=True)
+            result.raise_error()
+            figures += sum("image/png" in output.data for output in captured.outputs)
+    assert figures

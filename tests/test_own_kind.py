@@ -62,15 +62,25 @@ def test_levelling_in_a_network(network, alone):
 
 
 def test_heights_are_those_of_object_space(network, alone):
-    """One height that is known: the datum shifts to it, wherever the origin of the arrays is."""
+    """One height that is known: the datum shifts to it, wherever the origin of the arrays is. And
+    the plumb line in the frame of every image, measured: the pose is seen as it is."""
     height = ls.Kind("height", lambda p, Z: p[2] - Z, of=("point",))
+    plumb = ls.Kind(
+        "plumb line", lambda pose, xy: jnp.stack(pose.rotation.apply((0.0, 0.0, 1.0))[:2]) - xy,
+        of=("image",), axes=("x", "y"),
+    )  # fmt: skip
     moved = network.replace(points=_shifted(network.points), images=_shifted(network.images))
-    ids, Z = moved.points.id, alone.point_values[:, 2] + 5e6
-    result = jaxbundle.adjust(
-        moved, also=[height(rows=([ids[3]],), measured=np.array([Z[3] + 0.25]), sigma=1e-3)]
-    )
-    assert result.counts.datum == alone.counts.datum - 1
-    assert result.point_values[3, 2] == pytest.approx(Z[3] + 0.25, abs=1e-6)
+    points, images = moved.points.id, moved.images.id
+    Z = alone.point_values[3, 2] + 5e6 + 0.25
+    M = np.stack([np.asarray(matrix_from_quaternion(q)) for q in alone.values.rotation])
+    result = jaxbundle.adjust(moved, also=[
+        height(rows=([points[3]],), measured=np.array([Z]), sigma=1e-3),
+        plumb(rows=(images,), measured=M[:, :2, 2], sigma=1e-3),
+    ])  # fmt: skip
+    assert result.counts.datum == alone.counts.datum - 1 - 2
+    assert result.redundancy == alone.redundancy + 2 * len(images) - 2
+    assert result.vtpv == pytest.approx(alone.vtpv, rel=1e-9)
+    assert result.point_values[3, 2] == pytest.approx(Z, abs=1e-6)
 
 
 def _shifted(table):
@@ -88,17 +98,3 @@ def test_what_does_not_fit_is_told(network, alone):
         jaxbundle.adjust(network, also=[ls.Table("point", np.zeros((2, 3)))])
     with pytest.raises(jaxbundle.InputError, match="also: tables .* are expected"):
         jaxbundle.adjust(network, also=[3.0])
-
-
-def test_inclination_of_the_camera(network, alone):
-    """The plumb line in the frame of every image, measured: the pose is seen as it is."""
-    kind = ls.Kind(
-        "plumb line", lambda pose, xy: jnp.stack(pose.rotation.apply((0.0, 0.0, 1.0))[:2]) - xy,
-        of=("image",), axes=("x", "y"),
-    )  # fmt: skip
-    M = np.stack([np.asarray(matrix_from_quaternion(q)) for q in alone.values.rotation])
-    ids = alone.problem.network.images.id
-    result = jaxbundle.adjust(network, also=[kind(rows=(ids,), measured=M[:, :2, 2], sigma=1e-3)])
-    assert result.counts.datum == 5
-    assert result.redundancy == alone.redundancy + 2 * len(ids) - 2
-    assert result.vtpv == pytest.approx(alone.vtpv, rel=1e-9)

@@ -18,7 +18,7 @@ from jaxbundle.leastsquares.stopping import converged
 from jaxbundle.network.check import check_network
 from jaxbundle.solution import minimise
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("convergent4")]
+pytestmark = pytest.mark.slow
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 ALL_TEN = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2")

@@ -24,8 +24,6 @@ from jaxbundle.statistics.blunders import Removed
 from jaxbundle.statistics.check_points import CheckPoints
 from jaxbundle.targets import write_targets
 
-pytestmark = pytest.mark.xdist_group("convergent4")
-
 SECTIONS = (
     "Counts",
     "Convergence",

@@ -11,8 +11,6 @@ import pytest
 import jaxbundle.calibration.files
 import jaxbundle.calibration.quality
 
-pytestmark = pytest.mark.xdist_group("calibration")
-
 EXAMPLE = Path(__file__).parents[2] / "examples" / "board"
 VIEWS = 12
 

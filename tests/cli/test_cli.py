@@ -13,8 +13,6 @@ import jaxbundle
 from jaxbundle.__main__ import _tell_once_of_damage as tell_once_of_damage
 from jaxbundle.cli import convert
 
-pytestmark = pytest.mark.xdist_group("convergent4")
-
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "convergent4"
 

@@ -13,8 +13,6 @@ from jaxbundle.io.csv_tables import write_text
 from jaxbundle.io.folders import MARKER
 from jaxbundle.targets import check_targets, write_targets
 
-pytestmark = pytest.mark.xdist_group("convergent4")
-
 EXAMPLE = Path(__file__).parents[2] / "examples" / "convergent4" / "project.toml"
 REASON = NotSolvedError("not solved: too few images", ["X0 of image 7"])
 

@@ -10,8 +10,6 @@ import jaxbundle
 from jaxbundle.io import adjusted_network, read_network, write_project
 from jaxbundle.targets import NETWORK_FILES, check_targets, write_targets
 
-pytestmark = pytest.mark.xdist_group("convergent4")
-
 
 def test_it_is_a_fixed_point(convergent4, tmp_path):
     network = adjusted_network(convergent4)
