@@ -381,14 +381,15 @@ def test_gauss_newton_is_error_propagation_and_has_no_second_derivative():
     problem = made("a point held")
     data, solution = problem.data, minimum(problem, problem.data)
 
-    def points(measured, start):
-        given = dataclasses.replace(data, measured=(measured,), start=data.start | {"point": start})
+    def points(measured, start, weight):
+        start = data.start | {"point": start}
+        given = dataclasses.replace(data, measured=(measured,), weight=(weight,), start=start)
         given = given_data(problem, given), "gauss-newton"
         moved = attach_derivatives(problem.declared, problem.plan, solution, *given)
         return (without_filling(problem, moved)["point"].ravel(),) * 2
 
-    by_both = jax.jit(jax.jacfwd(points, (0, 1), has_aux=True))
-    by, value = by_both(data.measured[0], data.start["point"])
+    by_all = jax.jit(jax.jacfwd(points, (0, 1, 2), has_aux=True))
+    by, value = by_all(data.measured[0], data.start["point"], data.weight[0])
     values = data.start | {"point": value.reshape(-1, 2)}
     values["device"] = solution["device"][:2]
     J, B = dense(problem, values, data)
@@ -400,8 +401,21 @@ def test_gauss_newton_is_error_propagation_and_has_no_second_derivative():
     np.testing.assert_allclose(by[0][free], expected, atol=1e-8 * np.abs(expected).max())
     expected, found = (into @ B.T)[1:, 1:], by[1].reshape(10, 10)[np.ix_(free, free)]
     np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
+    # Twice the weight, P = w², not once.
+    v, weight = (np.ravel(x) for x in (residuals(problem, values, data), data.weight[0]))
+    expected = -2 * (Q @ J.T)[1:] * v / weight
+    found = by[2].reshape(10, -1)[free]
+    np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
+    # It is not the exact one: they differ by the curvature.
+    u, exact = jax.tree.map(np.zeros_like, jax.tree.map(np.asarray, data)), 0.0
+    u.measured[0][0] = 0.2
+    for step, factor in STENCIL:
+        exact = exact + factor / 0.2 * minimum(problem, along(data, u, step))["point"][:5].ravel()
+    apart = np.abs(exact - by[0][:, 0].ravel()).max() / np.abs(exact).max()
+    assert 1e-5 < apart < 0.5  # a net of the plane, with residuals of 0.3 in 50
     with pytest.raises(InputError, match="first derivatives only"):
-        jax.jacfwd(jax.grad(lambda m: points(m, data.start["point"])[0][0]))(data.measured[0])
+        given = data.start["point"], data.weight[0]
+        jax.jacfwd(jax.grad(lambda m: points(m, *given)[0][0]))(data.measured[0])
 
 
 def test_data_of_another_shape_are_refused():
