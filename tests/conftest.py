@@ -1,9 +1,10 @@
 """All tests run in float64, which the package itself never switches on.
 
 Compiled programs are kept in .cache/jax, so that test processes, the command line and notebooks
-share them; a process drops its own whenever they have grown by `MOST_GROWTH`: a worker then stays
-under 2 GB, and far from the 65 530 memory maps that Linux allows a process. Programs are compiled
-with little optimisation: here compiling takes longer than running.
+share them; a process drops its own when it holds more than `MOST` after a test, or `MOST_AT_END`
+after a file, whose programs serve few others: a worker then stays under 2 GB, and far from the
+65 530 memory maps that Linux allows a process. Programs are compiled with little optimisation: here
+compiling takes longer than running.
 """
 
 import ctypes
@@ -69,8 +70,10 @@ def pytest_xdist_make_scheduler(config, log):
 
 
 MEMORY = Path("/proc/self/statm")
-MOST_GROWTH = 500e6
-"""Bytes; a test may hold as much again before it ends."""
+MOST, MOST_AT_END = 1.1e9, 0.7e9
+"""Bytes; a single test may add 0.8e9 before it ends."""
+WORTH = 150e6
+"""Bytes that have come since the last time, for another to be worth it."""
 
 
 def memory() -> float:
@@ -83,16 +86,27 @@ def memory() -> float:
 held = memory()
 
 
-@pytest.fixture(autouse=True)
-def drop_compiled_programs():
-    yield
+def drop_compiled_programs(most: float) -> None:
+    """If more than this is held."""
     global held
-    if memory() - held > MOST_GROWTH:
+    if memory() > max(most, held + WORTH):
         jax.clear_caches()
         gc.collect()
         if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
             trim(0)  # What was freed goes back to the system.
         held = memory()
+
+
+@pytest.fixture(autouse=True)
+def drop_after_test():
+    yield
+    drop_compiled_programs(MOST)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def drop_after_file():
+    yield
+    drop_compiled_programs(MOST_AT_END)
 
 
 class Told(NamedTuple):

@@ -434,7 +434,7 @@ def test_bad_input_is_refused_with_what_is_expected(case):
 ODD = [np.nan, np.inf, -np.inf, 1e308, -1e200, 1e99, 1e16, 1e-308, 0.0, -1.0]
 
 
-@often(150)
+@often(60)
 @given(
     name=st.sampled_from(["object_points", "image_points", "visible", "image_size"]),
     odd=st.sampled_from(ODD), part=st.integers(0, 3), seed=st.integers(0, 99),

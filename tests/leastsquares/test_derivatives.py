@@ -222,20 +222,24 @@ def along(data, u, step):
     return jax.tree.map(lambda x, d: np.asarray(x) + step * d, data, u)
 
 
+def scalar_of(problem, values, data):
+    """S, a scalar of all values of the solution."""
+    random = np.random.default_rng(5)
+    factors = jax.tree.map(lambda x: random.normal(size=x.shape), problem.data.start)
+    padded = given_data(problem, data)
+    solution = attach_derivatives(problem.declared, problem.plan, values, padded)
+    found = without_filling(problem, solution)
+    return sum(jax.tree.leaves(jax.tree.map(jnp.vdot, factors, found)))
+
+
 @cache
 def program(name):
-    """(data, u, w) → S, ∂S/∂u, ∂S/∂w, ∂²S/∂u∂w of a scalar S of all values of the solution."""
-    problem, random = made(name), np.random.default_rng(5)
-    factors = jax.tree.map(lambda x: random.normal(size=x.shape), problem.data.start)
+    """(data, u, w) → S, ∂S/∂u, ∂S/∂w, ∂²S/∂u∂w."""
+    problem = made(name)
 
     @jax.jit
     def derivatives(values, data, u, w):
-        def scalar(data):
-            padded = given_data(problem, data)
-            solution = attach_derivatives(problem.declared, problem.plan, values, padded)
-            found = without_filling(problem, solution)
-            return sum(jax.tree.leaves(jax.tree.map(jnp.vdot, factors, found)))
-
+        scalar = lambda data: scalar_of(problem, values, data)
         by_w = lambda data: jax.jvp(scalar, (data,), (w,))
         (value, by_w), (by_u, both) = jax.jvp(by_w, (data,), (u,))
         return value, by_u, by_w, both
@@ -270,16 +274,15 @@ def test_first_and_second_derivatives_by_everything_that_was_given(name):
 
 
 def test_conjugate_gradients_give_the_same_as_a_factor():
-    problem, other = made("a point held"), made("conjugate gradients")
-    data, by_both = problem.data, []
+    """S and its derivative by everything, as above; the precision of points."""
+    problem = made("a point held")
     u = jax.tree.map(lambda *x: sum(x), *dict(directions(problem, 0.3)).values())
+    data, other = problem.data, made("conjugate gradients")
+    _, expected, *_ = program("a point held")(data, u, u)
     values = minimum(problem, data)
-    for p in (problem, other):
-        attach = lambda d, p=p: attach_derivatives(p.declared, p.plan, values, d)
-        along_u = jax.jit(lambda d, u, attach=attach: jax.jvp(attach, (d,), (u,))[1]["point"])
-        by_both.append(along_u(given_data(p, data), given_data(p, u)))
-    np.testing.assert_allclose(*by_both, atol=1e-9 * np.abs(by_both[0]).max())
-    own = [jax.jit(lambda d, p=p: precision(p, d).own["point"])(p.data) for p in (problem, other)]
+    scalar = jax.jit(lambda d, u: jax.jvp(lambda d: scalar_of(other, values, d), (d,), (u,)))
+    assert float(scalar(data, u)[1]) == pytest.approx(float(expected), rel=1e-9)
+    own = [jax.jit(lambda d, p=p: precision(p, d).own["point"])(data) for p in (problem, other)]
     np.testing.assert_allclose(*own, atol=1e-14)
 
 

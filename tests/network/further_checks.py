@@ -51,7 +51,7 @@ def _scalars(x):
     return x if np.ndim(x) == 0 else tuple(map(_scalars, x))
 
 
-def sample(problem, values, tables, draws=120):
+def sample(problem, values, tables, draws=60):
     """Values of tables of vectors, and positions of frames, from that many draws of everything that
     was measured, solved from the values; all by the program that is compiled already."""
     random, data = np.random.default_rng(8), problem.data
