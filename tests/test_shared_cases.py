@@ -27,7 +27,6 @@ pytestmark = [
 
 
 # All tests of a project on one worker, which adjusts it once.
-EACH = [pytest.param(name, marks=pytest.mark.xdist_group(name)) for name in PROJECTS]
 
 
 @pytest.fixture(scope="module", params=EACH)
@@ -90,7 +89,6 @@ def test_images_and_points(case):
                 assert np.all(np.abs(found - value)[free] < 0.002 * sigma[free])
 
 
-@pytest.mark.xdist_group("camcal/project")
 def test_camcal_with_blunders():
     """5 % of 5 to 50 σ (a posteriori): those above 8 σ with redundancy numbers above 0.3 are found,
     1 % of the good ones may go; Huber's estimate stays within its σ of the clean one."""

@@ -264,13 +264,15 @@ def test_control_seen_once_gives_the_frame():
     assert found.frame == "in the frame given"
     off = found.network.images.position - network.images.position
     assert np.abs(off).max() < 0.5 * scale
+    assert_same_answer(network, found.network)
 
 
 # --- and the adjustment from them
 
 
-def test_an_example_needs_no_start_values():
-    network = jaxbundle.read_network(EXAMPLES / "resection63" / "project.toml")
+@pytest.mark.parametrize("name", ["convergent4", "resection63"])
+def test_examples_need_no_start_values(name):
+    network = jaxbundle.read_network(EXAMPLES / name / "project.toml")
     without = bare(network)
     assert lacks_start_values(without) and not lacks_start_values(network)
     assert_same_answer(network, without)
