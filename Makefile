@@ -11,7 +11,7 @@ WORKERS ?= 2
 export OPENBLAS_NUM_THREADS ?= 1
 
 BENCHES = block batch bal first
-MORE_BENCHES = large pushbroom orientation measuring
+MORE_BENCHES = large pushbroom orientation measuring blunders
 BAL ?=
 PEERS ?=
 
@@ -64,7 +64,7 @@ bench-large: $(VENV)/compared
 	$(BIN)/python benchmarks/bal.py --street 1723 156502 --solver sparse_schur $(ONCE) $(PEERS)
 	$(BIN)/python benchmarks/bal.py --arc 356 226730 --solver iterative_schur $(ONCE) $(PEERS)
 
-bench-pushbroom bench-orientation bench-measuring: bench-%: $(VENV)/compared
+bench-pushbroom bench-orientation bench-measuring bench-blunders: bench-%: $(VENV)/compared
 	$(BIN)/python benchmarks/$*.py
 
 clean:
