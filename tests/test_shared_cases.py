@@ -26,10 +26,7 @@ pytestmark = [
 ]
 
 
-# All tests of a project on one worker, which adjusts it once.
-
-
-@pytest.fixture(scope="module", params=EACH)
+@pytest.fixture(scope="module", params=PROJECTS)
 def case(request):
     """(adjustment, reference, whether object coordinates are comparable as they are)."""
     path = CASES / f"{request.param}.toml"
