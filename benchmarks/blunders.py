@@ -2,11 +2,11 @@
 
     python benchmarks/blunders.py [--images N] [--points N] [--share X] [--size X] [--json FILE]
 
-The block of `big_block.py`; a share of its image points (0.5 %) is moved by half to twice `size` σ
+The block of `big_block.py`; a share of its image points (1 %) is moved by half to twice `size` σ
 in a random direction. It is adjusted as it is, with data snooping (Pope's test) and with Tukey's
 estimator, each called once: compilation is in the time. Told are the time on the clock and of the
 processor, and which blunders, and good points, were removed or suspected. The exit status is 1
-where one of both finds less than 98 % of them.
+where one of both finds less than 90 % of them (some lie where nothing controls them).
 """
 
 import dataclasses
@@ -40,7 +40,7 @@ def main() -> int:
     parser = machine.parser_of(__doc__)
     parser.add_argument("--images", type=machine.positive, default=60)
     parser.add_argument("--points", type=machine.positive, default=26_000)
-    parser.add_argument("--share", type=float, default=0.005)
+    parser.add_argument("--share", type=float, default=0.01)
     parser.add_argument("--size", type=float, default=20.0)
     parser.add_argument("--json", type=machine.target)
     given = parser.parse_args()
@@ -64,7 +64,7 @@ def main() -> int:
                          "found": share, "good": len(named - {*rows})}  # fmt: skip
         what = f"; {share:.1%} of the blunders, {len(named - {*rows})} good ones" if told else ""
         print(f"{name:14} {clock:6.1f} s, processor {cpu:6.1f} s, sigma0 {result.sigma0:.4f}{what}")
-        if options and share < 0.98:
+        if options and share < 0.9:
             wrong.append(f"{name} found {share:.1%} of the blunders")
     machine.write_json(figures, given.json)
     return machine.verdict(wrong)
