@@ -114,7 +114,10 @@ def _read_document(path: Path) -> Document:
         if key not in known:
             raise InputError(f"{path}: unknown key {key!r}{did_you_mean(key, known)}")
         if key in SECTIONS and not isinstance(value, dict):
-            raise InputError(f"{path}: write [{key}] in single brackets; its rows are {key}s.csv")
+            table = next(table for table, kind in KINDS.items() if kind.SECTION == key)
+            raise InputError(
+                f"{path}: write [{key}] in single brackets; its rows stand in {table}.csv"
+            )
         if key not in ("project", *SECTIONS) and not (
             isinstance(value, list) and all(isinstance(row, dict) for row in value)
         ):

@@ -24,7 +24,7 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(20)
 
 def similarity(points: Sequence[str] = ("point",), poses: Sequence[str] = ()) -> Motions:
     """The seven parameters of space that move tables of points [n, 3] and of poses."""
-    moved = [(name, _move_point) for name in points] + [(name, _move_pose) for name in poses]
+    moved = [(name, _move_point) for name in points] + [(name, move_pose) for name in poses]
     return Motions(SEVEN, tuple(moved), curved=(3, 4, 5, 6))
 
 
@@ -80,7 +80,8 @@ def _transform_in_plane(motion, value):
 
 
 _move_point = Together(transform_point, transform_point, 3)
-_move_pose = Together(_transform_pose, transform_point, 3)
+move_pose = Together(_transform_pose, transform_point, 3)
+"""A pose, or a frame, that moves with the places of space."""
 _move_in_plane = Together(_transform_in_plane, _transform_in_plane, 2)
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Int
 
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.columns import count, some
-from jaxbundle.network.further.base import among
+from jaxbundle.network.further.base import among, rows_of
 from jaxbundle.network.tables import EXTERIOR, Distances, Network, Observations, Points
 
 
@@ -89,11 +89,10 @@ def controlled_axes(points: Points):
 def equations_of(network: Network, things: str) -> Int[np.ndarray, " things"]:
     """How many equations of further kinds touch every image ("IMAGES") or point ("POINTS")."""
     table = network.images if things == "IMAGES" else network.points
-    row, number = {id: i for i, id in enumerate(table.id)}, np.zeros(len(table), int)
+    number = np.zeros(len(table), int)
     for one in among(network):
         for field in getattr(one, things):
-            at = np.array([row[id] for id in getattr(one, field)], int)
-            np.add.at(number, at, one.number_of_equations())
+            np.add.at(number, rows_of(getattr(one, field), table), one.number_of_equations())
     return number
 
 

@@ -112,6 +112,7 @@ def test_a_mounting_that_works_loose(simulated):
 @pytest.mark.parametrize("rows, section, message", [
     ([("a", "1", 0), ("a", "1", 1)], {}, "camera 'left' has two images at epoch '1'"),
     ([("a", "1", 0), ("a", "2", EPOCHS)], {}, "no epoch has images of two cameras"),
+    ([("a", "1", 0), ("a", "1", EPOCHS), ("b", "1", 0)], {}, "row 3: .*image .* row 1"),
     ([("a", "1", 0), ("a", "1", EPOCHS)], {"reference": "middle"}, "there is no such camera"),
     ([("a", "1", 0), ("a", "1", EPOCHS)], {"sigma_angle": 0}, "sigma_angle"),
 ])  # fmt: skip

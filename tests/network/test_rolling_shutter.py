@@ -146,3 +146,14 @@ def test_the_line_is_needed(flown):
         jaxbundle.make_problem(network.replace(cameras=(camera,)))
     with pytest.raises(InputError, match=r"\[rolling_shutter\]: line_time is missing"):
         make_further({"velocities": {"image": ["IMG 1"]}}, 1.0)
+
+
+@pytest.mark.parametrize("images, line_time, message", [
+    (["1", "2", "1"], LINE, "row 3: .*image '1'.* row 1"),
+    (["1"], {"cam": LINE, "carn": LINE}, "line_time names no camera 'carn'; known: cam"),
+])  # fmt: skip
+def test_what_is_wrong_is_named(flown, images, line_time, message):
+    section = {"line_time": line_time}
+    (further,) = make_further({"velocities": {"image": images}, "rolling_shutter": section}, 1.0)
+    with pytest.raises(InputError, match=message):
+        further.check(flown[0].network)

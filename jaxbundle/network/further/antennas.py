@@ -35,8 +35,9 @@ from jaxbundle.network.further.base import (
     Further,
     Parameters,
     check_settings,
-    numbers,
     positive_sigma,
+    rows_of,
+    three_by_camera,
 )
 
 ARM = ("ax", "ay", "az")
@@ -125,15 +126,15 @@ class Antennas(Further):
 
     def declare(self, network, origin) -> Declared:
         images = network.images
-        row = {id: i for i, id in enumerate(images.id)}
-        image = np.array([row[id] for id in self.image], int)
+        image = rows_of(self.image, images)
         camera, of_camera = np.unique(images.camera[image], return_inverse=True)
         strips, strip = np.unique(np.array(self.strip, dtype=object), return_inverse=True)
         parameters = Parameters.of(SECTION, self.settings, FREE)
         cameras = [network.cameras[c].id for c in camera]
+        given = self.settings.get("lever_arm", [0.0, 0.0, 0.0])
         arm = Table(
-            "lever arm", _lever_arms(self.settings, cameras), Vector(3), parameters.mask(ARM),
-            cameras, ARM, "lever arm of camera",
+            "lever arm", three_by_camera(SECTION, "lever_arm", given, cameras), Vector(3),
+            parameters.mask(ARM), cameras, ARM, "lever arm of camera",
         )  # fmt: skip
         since, velocity = _track(self.position, strip, self.time)
         if "time_offset" in parameters.free and not velocity.any():
@@ -159,16 +160,6 @@ class Antennas(Further):
 def _shift_back(motion, strip):
     """The shifts of strips that make up for one of object space: where all are free, it is open."""
     return strip.at[:3].add(-motion[:3])
-
-
-def _lever_arms(settings, cameras) -> Float[np.ndarray, "cameras 3"]:
-    given = settings.get("lever_arm", [0.0, 0.0, 0.0])
-    if not isinstance(given, Mapping):
-        return np.tile(numbers(SECTION, "lever_arm", given, 3), (len(cameras), 1))
-    for camera in cameras:
-        if camera not in given:
-            raise InputError(f"[{SECTION}]: lever_arm of camera {camera!r} is missing")
-    return np.array([numbers(SECTION, f"lever_arm of {c}", given[c], 3) for c in cameras])
 
 
 def _track(position, strip, time):

@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.errors import InputError
 from jaxbundle.geometry import (
     matrix_from_omega_phi_kappa,
     omega_phi_kappa_near,
@@ -31,8 +30,9 @@ from jaxbundle.network.further.base import (
     Further,
     Parameters,
     check_settings,
-    numbers,
     positive_sigma,
+    rows_of,
+    three_by_camera,
 )
 from jaxbundle.network.units import ANGLE_UNITS
 
@@ -88,15 +88,15 @@ class Attitudes(Further):
 
     def declare(self, network, origin) -> Declared:
         images = network.images
-        row = {id: i for i, id in enumerate(images.id)}
-        image = np.array([row[id] for id in self.image], int)
+        image = rows_of(self.image, images)
         camera, of_camera = np.unique(images.camera[image], return_inverse=True)
         cameras = [network.cameras[c].id for c in camera]
         radians = ANGLE_UNITS[network.angle_unit]
         parameters = Parameters.of(SECTION, self.settings, ("boresight",))
+        given = self.settings.get("boresight", [0.0, 0.0, 0.0])
         M = np.stack([
             np.asarray(matrix_from_omega_phi_kappa(radians * angles))
-            for angles in _boresights(self.settings, cameras)
+            for angles in three_by_camera(SECTION, "boresight", given, cameras)
         ])  # fmt: skip
         boresight = Table(
             "boresight", np.asarray(jax.vmap(quaternion_from_matrix)(M)), Rotation(),
@@ -107,13 +107,3 @@ class Attitudes(Further):
             sigma = radians * parameters.sigma["boresight"]
             found.append(PRIOR((np.arange(len(M)),), M, sigma=sigma))
         return Declared((boresight,), found)
-
-
-def _boresights(settings, cameras) -> Float[np.ndarray, "cameras 3"]:
-    given = settings.get("boresight", [0.0, 0.0, 0.0])
-    if not isinstance(given, Mapping):
-        return np.tile(numbers(SECTION, "boresight", given, 3), (len(cameras), 1))
-    for camera in cameras:
-        if camera not in given:
-            raise InputError(f"[{SECTION}]: boresight of camera {camera!r} is missing")
-    return np.array([numbers(SECTION, f"boresight of {c}", given[c], 3) for c in cameras])

@@ -1,17 +1,18 @@
 """What observations of a further kind have in common: tables of rows that touch things by id."""
 
+import abc
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.arguments import positive, shown
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.declarations import Kind, Observations, Table
 from jaxbundle.network.columns import Columns, did_you_mean
-from jaxbundle.network.tables import Source
+from jaxbundle.network.tables import Images, Points, Source
 
 LENGTHS = frozenset((
     "ax", "ay", "az", "shift X", "shift Y", "shift Z", "shift x", "shift y", "shift z", "R",
@@ -31,7 +32,7 @@ class Declared(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Further:
+class Further(abc.ABC):
     """Rows of one further kind. A subclass has a column (a tuple or an array) for each field but
     `settings` and `source`, and says what its columns of ids touch.
 
@@ -50,17 +51,17 @@ class Further:
     source: Source = Source("table")
 
     @classmethod
+    @abc.abstractmethod
     def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> Self:
         """From the columns of a table; `radians` in one unit of angle."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def columns(self, radians: float) -> dict[str, Sequence[Any]]:
         """The columns of the table, as `of` takes them."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def declare(self, network, origin: Float[np.ndarray, "3"]) -> Declared:
         """The tables and observations for a network, of which all rows are (`among`)."""
-        raise NotImplementedError
 
     def __len__(self) -> int:
         return len(getattr(self, (*self.IMAGES, *self.POINTS)[0]))
@@ -116,6 +117,12 @@ class Further:
         return 1
 
 
+def rows_of(ids: Sequence[str], table: Images | Points) -> Int[np.ndarray, " n"]:
+    """The rows of a table that have these ids, all of which are there."""
+    row = {id: k for k, id in enumerate(table.id)}
+    return np.array([row[id] for id in ids], int)
+
+
 def among(network) -> list[Further]:
     """The observations of further kinds of a network whose images and points all take part."""
     present = (one.among(network) for one in network.further)
@@ -156,9 +163,23 @@ def numbers(section: str, key: str, value: Any, length: int) -> Float[np.ndarray
     return found
 
 
+def three_by_camera(
+    section: str, key: str, given: Any, cameras: Sequence[str]
+) -> Float[np.ndarray, "cameras 3"]:
+    """Three numbers of a setting, the same for all cameras or a table by camera.
+
+    **Raises:** `InputError`, also for a camera that the table lacks."""
+    if not isinstance(given, Mapping):
+        return np.tile(numbers(section, key, given, 3), (len(cameras), 1))
+    for camera in cameras:
+        if camera not in given:
+            raise InputError(f"[{section}]: {key} of camera {camera!r} is missing")
+    return np.array([numbers(section, f"{key} of {c}", given[c], 3) for c in cameras])
+
+
 @dataclasses.dataclass(frozen=True)
 class Parameters:
-    """Parameters a section may free: their names, which are free, their prior σ (NaN: none)."""
+    """Parameters a section may free: their names, which are free, their prior σ by name."""
 
     names: tuple[str, ...]
     free: tuple[str, ...]

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.network.columns import Columns
-from jaxbundle.network.further.base import Declared, Further, positive_sigma
+from jaxbundle.network.further.base import Declared, Further, positive_sigma, rows_of
 
 AXES = ("dX", "dY", "dZ")
 
@@ -68,8 +68,7 @@ class Differences(Further):
         return columns | {f"s{a}": sigma[:, k] for k, a in enumerate(AXES)}
 
     def declare(self, network, origin) -> Declared:
-        row = {id: i for i, id in enumerate(network.points.id)}
-        ends = tuple(np.array([row[id] for id in ids], int) for ids in (self.start, self.to))
+        ends = tuple(rows_of(ids, network.points) for ids in (self.start, self.to))
         return Declared((), (DIFFERENCE(ends, self.value, sigma=self.sigma),))
 
 
@@ -104,7 +103,5 @@ class Angles(Further):
                 "sigma": self.sigma / radians}  # fmt: skip
 
     def declare(self, network, origin) -> Declared:
-        row = {id: i for i, id in enumerate(network.points.id)}
-        ends = tuple(np.array([row[id] for id in ids], int)
-                     for ids in (self.start, self.at, self.to))  # fmt: skip
+        ends = tuple(rows_of(ids, network.points) for ids in (self.start, self.at, self.to))
         return Declared((), (ANGLE(ends, self.value, sigma=self.sigma),))

@@ -31,16 +31,17 @@ from jaxtyping import Float
 from jaxbundle.arguments import shown
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
-from jaxbundle.geometry import quaternion_from_matrix, transform_pose
+from jaxbundle.geometry import quaternion_from_matrix
 from jaxbundle.leastsquares.declarations import Kind, Table
+from jaxbundle.leastsquares.motions import move_pose
 from jaxbundle.leastsquares.spaces import Frame, PoseValue
 from jaxbundle.network.columns import Columns, did_you_mean
-from jaxbundle.network.further.base import Declared, Further, positive_sigma
+from jaxbundle.network.further.base import Declared, Further, positive_sigma, rows_of
 from jaxbundle.network.further.fit_figures import FEWEST, TYPES, fit
 
 EXACT = 1e-3
-"""The σ of what is exact, in σ of a point across a ray: it changes results by 1e-6 of their σ, and
-the normal equations stay far from singular."""
+"""The σ of what is exact, in σ of a point across a ray: the error falls with its square (points move
+by 1e-5 of their σ here, by 1e-3 with 1e-2), and the normal equations stay far from singular."""
 SHIFTS, TILTS = (0, 1, 2), (3, 4)
 MOVES = {
     "plane": (2, *TILTS), "line": (0, 1, *TILTS), "circle": (*SHIFTS, *TILTS), "sphere": SHIFTS,
@@ -80,11 +81,6 @@ def in_shape(frame, point, given):
 RESIDUALS = {"plane": (on_plane, ("distance",)), "line": (on_line, ("x", "y")),
              "circle": (on_circle, ("radial", "z")), "sphere": (on_sphere, ("distance",)),
              "cylinder": (on_cylinder, ("distance",))}  # fmt: skip
-
-
-def move_frame(motion, value: PoseValue) -> PoseValue:
-    """A frame that moves with object space."""
-    return PoseValue(*transform_pose(motion, *value))
 
 
 def _move_radius(motion, radius):
@@ -137,8 +133,7 @@ class Figures(Further):
                 "radius": self.radius}  # fmt: skip
 
     def declare(self, network, origin) -> Declared:
-        row = {id: i for i, id in enumerate(network.points.id)}
-        point = np.array([row[id] for id in self.point], int)
+        point = rows_of(self.point, network.points)
         place = network.points.position - origin
         exact = EXACT * across_rays(network)
         declared = [
@@ -166,7 +161,7 @@ class Figures(Further):
         sigma = np.where(self.sigma[rows] > 0, self.sigma[rows], exact)
         if type not in ROUND:
             seen = self._seen(type, (type,), (figure,), point[rows], sigma)
-            return Declared((frame,), (seen,), ((type, move_frame),))
+            return Declared((frame,), (seen,), ((type, move_pose),))
         known = np.array([np.nanmax([*self.radius[rows[figure == k]], -1.0])
                           for k in range(len(names))])  # fmt: skip
         size = Table(f"radius of {type}", np.where(known > 0, known, radius), free=known <= 0,
@@ -178,7 +173,7 @@ class Figures(Further):
                 touched = (figure[those],) * 2
                 seen.append(self._seen(type, (type, size.name), touched, point[rows[those]],
                                        sigma[those], not given))  # fmt: skip
-        actions = (type, move_frame), (size.name, _move_radius)
+        actions = (type, move_pose), (size.name, _move_radius)
         return Declared((frame, size), tuple(seen), actions)
 
     @staticmethod
@@ -219,8 +214,7 @@ class Shapes(Further):
         return 3
 
     def declare(self, network, origin) -> Declared:
-        row = {id: i for i, id in enumerate(network.points.id)}
-        point = np.array([row[id] for id in self.point], int)
+        point = rows_of(self.point, network.points)
         names, shape = np.unique(np.array(self.shape, dtype=object), return_inverse=True)
         places = network.points.position - origin
         centre, rotation = [], []
@@ -237,7 +231,7 @@ class Shapes(Further):
         sigma = np.where(self.sigma > 0, self.sigma, EXACT * across_rays(network))
         kind = Kind("known shapes", in_shape, ("shape", "point"), ("x", "y", "z"))
         seen = kind((shape, point), self.place, sigma=sigma)
-        return Declared((frame,), (seen,), (("shape", move_frame),))
+        return Declared((frame,), (seen,), (("shape", move_pose),))
 
 
 def _placed(x, X):

@@ -26,11 +26,11 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry import quaternion_from_matrix
 from jaxbundle.geometry.rotations import matrix_from_omega_phi_kappa
 from jaxbundle.leastsquares.declarations import Kind, Table
+from jaxbundle.leastsquares.motions import move_pose
 from jaxbundle.leastsquares.spaces import Frame, PoseValue, cross
 from jaxbundle.network.camera_tables import camera_tables, start_of
 from jaxbundle.network.columns import Columns
-from jaxbundle.network.further.base import Declared, Further, positive_sigma
-from jaxbundle.network.further.figures import move_frame
+from jaxbundle.network.further.base import Declared, Further, positive_sigma, rows_of
 from jaxbundle.network.units import from_image_unit
 
 LINE = "object line"
@@ -80,8 +80,7 @@ class Edges(Further):
 
     def declare(self, network, origin) -> Declared:
         images = network.images
-        row = {id: i for i, id in enumerate(images.id)}
-        image = np.array([row[id] for id in self.image], int)
+        image = rows_of(self.image, images)
         camera = images.camera[image]
         sigma = np.where(np.isnan(self.sigma), np.median(network.observations.sigma), self.sigma)
         unit = network.image_unit if network.image_unit in ("mm", "px") else "mm"
@@ -106,7 +105,7 @@ class Edges(Further):
             kind = Kind("edges", OnLine(table.model), ("image", table.name, LINE), ("across",),
                         scalars=True, invariant=True)  # fmt: skip
             observed.append(kind((image[rows], of_camera, line[rows]), xy[rows], sigma=sigma[rows]))
-        return Declared((lines,), observed, ((LINE, move_frame),))
+        return Declared((lines,), observed, ((LINE, move_pose),))
 
     def _start(self, network, origin, rows, image, xy):
         """Where the planes of the images meet: a point, and a rotation whose last row is the

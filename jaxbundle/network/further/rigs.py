@@ -29,6 +29,7 @@ from jaxbundle.leastsquares.spaces import Pose, PoseValue
 from jaxbundle.network.columns import Columns
 from jaxbundle.network.further.base import Declared, Further, check_settings
 from jaxbundle.network.further.figures import EXACT, across_rays
+from jaxbundle.network.rules import check_unique
 from jaxbundle.network.units import ANGLE_UNITS
 
 SECTION, MOUNTING = "rig", "mounting"
@@ -88,6 +89,7 @@ class Rigs(Further):
 
     def check(self, network) -> None:
         super().check(network)
+        check_unique(self.image, self.source, "image")
         images = network.images
         camera = {id: network.cameras[c].id for id, c in zip(images.id, images.camera)}
         seen: dict[tuple[str, ...], int] = {}

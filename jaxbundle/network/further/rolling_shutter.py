@@ -32,7 +32,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_rotation_vector
 from jaxbundle.leastsquares.declarations import Kind, Table
 from jaxbundle.leastsquares.spaces import Vector
-from jaxbundle.network.columns import Columns
+from jaxbundle.network.columns import Columns, did_you_mean
 from jaxbundle.network.further.base import (
     Declared,
     Further,
@@ -40,7 +40,9 @@ from jaxbundle.network.further.base import (
     check_settings,
     less,
     positive_sigma,
+    rows_of,
 )
+from jaxbundle.network.rules import check_unique
 from jaxbundle.network.units import to_image_unit
 
 VELOCITY = ("vX", "vY", "vZ", "wx", "wy", "wz")
@@ -83,6 +85,15 @@ class RollingShutter(Further):
     def number_of_equations(self) -> int:
         return 0
 
+    def check(self, network) -> None:
+        super().check(network)
+        check_unique(self.image, self.source, "image")
+        given, ids = self.settings["line_time"], [camera.id for camera in network.cameras]
+        for id in given if isinstance(given, Mapping) else ():
+            if id not in ids:
+                raise InputError(f"[{SECTION}]: line_time names no camera {id!r}"
+                                 f"{did_you_mean(id, ids)}")  # fmt: skip
+
     def line_times(self, network) -> Float[np.ndarray, " cameras"]:
         """Seconds a line of every camera, 0 of those that expose all at once."""
         given = self.settings["line_time"]
@@ -113,8 +124,7 @@ class RollingShutter(Further):
         images, parameters = network.images, Parameters.of(SECTION, self.settings, FREE)
         times = self.line_times(network)
         velocity, sigma = np.zeros((len(images), 6)), np.full((len(images), 6), np.nan)
-        row = {id: i for i, id in enumerate(images.id)}
-        given = np.array([row[id] for id in self.image], int)
+        given = rows_of(self.image, images)
         velocity[given], sigma[given] = self.velocity, self.sigma
         common = np.array([parameters.sigma.get(name, np.inf) for name in VELOCITY])
         sigma = np.where(np.isnan(sigma), common, sigma)
