@@ -40,8 +40,8 @@ from jaxbundle.network.further.base import Declared, Further, positive_sigma, ro
 from jaxbundle.network.further.fit_figures import FEWEST, TYPES, fit
 
 EXACT = 1e-3
-"""The σ of what is exact, in σ of a point across a ray: the error falls with its square (points move
-by 1e-5 of their σ here, by 1e-3 with 1e-2), and the normal equations stay far from singular."""
+"""The σ of what is exact, in σ of a point across a ray: the error falls with its square (points
+move by 1e-5 of their σ here, by 1e-3 with 1e-2); the normal equations stay far from singular."""
 SHIFTS, TILTS = (0, 1, 2), (3, 4)
 MOVES = {
     "plane": (2, *TILTS), "line": (0, 1, *TILTS), "circle": (*SHIFTS, *TILTS), "sphere": SHIFTS,
