@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     from jaxbundle.calibration.batch import BatchCalibration as BatchCalibration
     from jaxbundle.calibration.batch import calibrate_batch as calibrate_batch
     from jaxbundle.cameras import CameraModel as CameraModel
-    from jaxbundle.configuration import enable_x64 as enable_x64
     from jaxbundle.configuration import join_processes as join_processes
     from jaxbundle.configuration import keep_programs as keep_programs
     from jaxbundle.configuration import use_cores as use_cores
     from jaxbundle.errors import InputError as InputError
     from jaxbundle.errors import NotSolvedError as NotSolvedError
+    from jaxbundle.float64 import enable_x64 as enable_x64
     from jaxbundle.gradients import check_gradients as check_gradients
     from jaxbundle.io import convert as convert
     from jaxbundle.io import read_network as read_network
@@ -66,8 +66,9 @@ _HOME = {
         "Board", "BoardViews", "Calibration", "calibrate", "calibrate_cameras",
     ),
     "jaxbundle.cameras": ("CameraModel",),
-    "jaxbundle.configuration": ("enable_x64", "join_processes", "keep_programs", "use_cores"),
+    "jaxbundle.configuration": ("join_processes", "keep_programs", "use_cores"),
     "jaxbundle.errors": ("InputError", "NotSolvedError"),
+    "jaxbundle.float64": ("enable_x64",),
     "jaxbundle.gradients": ("check_gradients",),
     "jaxbundle.io": ("convert", "read_network", "write_project"),
     "jaxbundle.network": ("Camera", "Network"),

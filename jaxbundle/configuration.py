@@ -1,48 +1,18 @@
-"""How JAX is to work: 64-bit floats, cores, the compiler; only when it is asked for."""
+"""How JAX is to work: cores, kept programs, processes; only when it is asked for."""
 
 import os
 import re
 import socket
 import sys
 import time
-from importlib.metadata import version
 from typing import NoReturn
 
 from jaxbundle.errors import InputError
+from jaxbundle.float64 import require_x64 as require_x64  # until every module has it from there
 from jaxbundle.temporaries import watch_cache
-
-QUICK_LOOPS = "--xla_cpu_use_fusion_emitters=false"
-"""XLA writes loops in the older of its two ways: compiled in half the time and memory, as fast."""
 
 WORTH_KEEPING = 0.02
 """Programs that took so many seconds to compile are kept; a small network has a dozen of them."""
-
-
-def enable_x64() -> None:
-    """Switch JAX to the 64-bit floats adjustment needs; call it before the first JAX computation.
-
-    The compiler is set up for the processor, too, where it still has the choice (jaxlib 0.10):
-    `QUICK_LOOPS` is put into the environment variable XLA_FLAGS, unless that speaks of it.
-    """
-    import jax
-
-    flags = os.environ.get("XLA_FLAGS", "")
-    if version("jaxlib").startswith("0.10.") and "fusion_emitters" not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} {QUICK_LOOPS}".strip()
-    jax.config.update("jax_enable_x64", True)
-
-
-def require_x64() -> None:
-    """64-bit floats, without which nothing is adjusted.
-
-    **Raises:** `RuntimeError` that says how to get them."""
-    import jax
-
-    if not jax.config.jax_enable_x64:
-        raise RuntimeError(
-            "jaxbundle computes in 64-bit floating point. Call jaxbundle.enable_x64() before the "
-            "first JAX computation, or set the environment variable JAX_ENABLE_X64=1."
-        )
 
 
 def use_cores(number: int | None = None) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxbundle.adjustment.problem import make_problem
 from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.float64 import require_x64
 from jaxbundle.network.check import check_network
 from jaxbundle.network.sightings import keep_images, keep_points
 from jaxbundle.network.tables import Camera, Distances, Network
@@ -32,6 +33,7 @@ def orient(network: Network) -> Oriented:
 
     **Raises:** `InputError` for bad tables; `NotSolvedError` where no image could be placed.
     """
+    require_x64()
     return find_start_values(network, _adjusted)
 
 

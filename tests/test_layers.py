@@ -12,6 +12,7 @@ LAYERS = (
     "arguments",
     "temporaries",
     "interrupts",
+    "float64",
     "configuration",
     "implicit",
     "geometry",

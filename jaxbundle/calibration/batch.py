@@ -41,7 +41,8 @@ from jaxbundle.calibration.batch_misfit import far_outside, misfits, remarks
 from jaxbundle.calibration.batch_result import BatchCalibration as BatchCalibration
 from jaxbundle.calibration.batch_snooping import ROUNDS, TESTS, Snooping
 from jaxbundle.cameras import CameraModel, get_model, key_of
-from jaxbundle.configuration import available_cores, require_x64
+from jaxbundle.configuration import available_cores
+from jaxbundle.float64 import require_x64
 from jaxbundle.geometry import (
     matrix_from_quaternion,
     matrix_from_rotation_vector,

@@ -28,8 +28,8 @@ from jaxbundle.calibration.frames import in_model_units, in_pixels, unit_size
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.start import Start, start_values
 from jaxbundle.cameras import CameraModel, check_own, get_model, is_own
-from jaxbundle.configuration import require_x64
 from jaxbundle.errors import InputError
+from jaxbundle.float64 import require_x64
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.leastsquares.snooping import check_test
 from jaxbundle.measure.boards import Board, require_board

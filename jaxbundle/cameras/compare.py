@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.float64 import local_x64
 from jaxbundle.geometry import matrix_from_rotation_vector
 
 from .convert import image_area
@@ -104,7 +105,7 @@ def compare_cameras(
         raise ValueError(f"a radius of {radius:g} {source.unit} holds too few points to fit")
     p = np.array([others[name] for name in other.parameters], float)
     rotation = np.zeros(3)
-    with jax.enable_x64(True):
+    with local_x64():
         for _ in range(ITERATIONS if rotate else 0):
             there, slopes = (np.array(part) for part in _turned(other, p, rotation, rays))
             d = ((shift + step * there) - xy)[near]

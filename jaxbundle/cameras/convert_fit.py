@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.float64 import local_x64
+
 from .convert_exact import (
     CORRECTIONS,
     DISTORTIONS,
@@ -48,13 +50,13 @@ def image_grid(low: Sequence[float], high: Sequence[float]) -> Float[np.ndarray,
 
 def rays_of(model: CameraModel, values: Values, xy) -> Float[np.ndarray, "points 3"]:
     """Rays of measured image points; NaN where there are none."""
-    with jax.enable_x64(True):
+    with local_x64():
         return np.asarray(_rays(model, _ordered(model, values), np.asarray(xy, float)))
 
 
 def images_of(model: CameraModel, values: Values, rays) -> Float[np.ndarray, "points 2"]:
     """Measured images of rays; NaN where there are none."""
-    with jax.enable_x64(True):
+    with local_x64():
         return np.asarray(_images(model, _ordered(model, values), np.asarray(rays, float)))
 
 
@@ -76,7 +78,7 @@ def fit_parameters(
 
     chosen = [model.parameters.index(name) for name in free or fitted(model)]
     cost = lambda p: float(np.square(_images(model, p, rays) - xy).sum())
-    with jax.enable_x64(True):
+    with local_x64():
         start = min((_ordered(model, values) for values in starts), key=lambda p: _finite(cost(p)))
         if not np.isfinite(cost(start)):
             raise ValueError("no start of the fit has an image of the whole area")

@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbundle.float64 import local_x64
+
 from .model import CameraModel
 from .parameters import default_parameters
 
@@ -44,7 +46,7 @@ def distortion_table(
     radius = step * np.arange(1, int(largest / step * (1 + 1e-12)) + 1)
     azimuth = 2 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS
     out = np.stack([np.cos(azimuth), np.sin(azimuth)], 1)
-    with jax.enable_x64(True):
+    with local_x64():
         centre = np.asarray(_of_ideal(model, p, np.zeros((1, 2))))[0]
         point = np.array([values[name] for name in model.principal_point] or [0.0, 0.0])
         begin = centre if about == "principal point" else np.zeros(2)

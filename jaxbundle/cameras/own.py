@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbundle.float64 import local_x64
+
 from .inverse import value_and_derivative
 from .model import CameraModel
 
@@ -27,7 +29,7 @@ def check_own(model: CameraModel, values: Mapping[str, float] | None = None) -> 
     if values is None:
         return
     where = f"camera model {model.name!r}: "
-    with jax.enable_x64(True):
+    with local_x64():
         p = np.array([values[name] for name in model.parameters], float)
         found = [np.asarray(x) for x in _near_the_axis(model, p)]
     image, (a, b, c, d), missed = found

@@ -73,7 +73,6 @@ def adjust(
     ] = False,
 ) -> None:
     """Adjust a network and report it."""
-    jaxbundle.enable_x64()
     jaxbundle.use_cores(cores)
     if join or cluster:
         if join and cluster:

@@ -54,6 +54,7 @@ def _main(
     if context.invoked_subcommand is None:
         print(context.get_help())
         raise typer.Exit(BAD_INPUT)
+    jaxbundle.enable_x64()
 
 
 def run() -> None:

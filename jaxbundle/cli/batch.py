@@ -41,7 +41,6 @@ def batch(
     Exit status: 0 every input has its line, whatever its status; 2 bad input,
     or another run is writing the file; 130, 143 interrupted.
     """
-    jaxbundle.enable_x64()
     one_of("--snooping", snooping, ("none", *TESTS))
     if not all(map(is_camera_stack, inputs)):
         # Cameras fill the cores by threads of their own, and gain nothing.

@@ -6,7 +6,6 @@ from typing import Annotated
 
 import typer
 
-import jaxbundle
 from jaxbundle.calibration import Board, calibrate_cameras
 from jaxbundle.calibration.files import (
     COMMAND,
@@ -86,7 +85,6 @@ def calibrate(
     plots: Annotated[bool, typer.Option(help="plots in the folder of --out")] = True,
 ) -> None:
     """Calibrate cameras from photographs of a board, and say how far to trust them."""
-    jaxbundle.enable_x64()
     test = None if snooping == "none" else snooping
     check_test(test, significance, "--")
     columns, rows = _size(board)

@@ -6,7 +6,6 @@ from typing import Annotated
 import numpy as np
 import typer
 
-import jaxbundle
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.distortion_table import distortion_table
 from jaxbundle.cameras.field_of_view import (
@@ -42,7 +41,6 @@ def camera(
     plot: Annotated[Path | None, typer.Option(help="PNG file for the curves of all")] = None,
 ) -> None:
     """Field of view, 35 mm equivalent, and the distortion in steps of the radius."""
-    jaxbundle.enable_x64()
     sizes = pair("--image-size", image_size), pair("--pixel-size", pixel_size)
     tables, curves, units = [], {}, set()
     for file in files:

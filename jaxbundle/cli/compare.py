@@ -8,7 +8,6 @@ from typing import Annotated
 import numpy as np
 import typer
 
-import jaxbundle
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.compare import compare_cameras, difference_rings
 from jaxbundle.cli.app import app
@@ -36,7 +35,6 @@ def compare(
     plot: Annotated[Path | None, typer.Option(help="PNG file for the map")] = None,
 ) -> None:
     """Compare two calibrations: parameters, and how far images are apart over the image."""
-    jaxbundle.enable_x64()
     (first, C_first), (second, C_second) = calibration_given(a), calibration_given(b)
     if None not in (first.image_size, second.image_size) and first.image_size != second.image_size:
         raise InputError(

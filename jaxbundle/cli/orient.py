@@ -26,7 +26,6 @@ def orient(
     quiet: Quiet = False,
 ) -> None:
     """Find the start values of images and points; what cannot be placed is named, with why."""
-    jaxbundle.enable_x64()
     network = read_network(input, format, tuple(set or ()), control)
     if out is not None:
         check_folder(out, "orient", FILES, network_files(input, network, control), force)

@@ -6,7 +6,6 @@ from typing import Annotated
 import numpy as np
 import typer
 
-import jaxbundle
 from jaxbundle.cameras.field_of_view import angle_class, equivalent_35mm, field_of_view
 from jaxbundle.cli.app import Force, app
 from jaxbundle.cli.cameras_given import pair
@@ -43,7 +42,6 @@ def plan(
     force: Force = False,
 ) -> None:
     """Design a block of vertical photographs: strips, photographs, and expected precision."""
-    jaxbundle.enable_x64()
     if out is not None:
         check_folder(out, "plan", FILES, force=force)
     image_format, extent = _needed("--image", image), _needed("--area", area)

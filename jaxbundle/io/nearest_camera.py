@@ -27,6 +27,7 @@ from jaxbundle.cameras.convert_fit import (
 )
 from jaxbundle.cameras.frames import pixel_frame
 from jaxbundle.errors import InputError
+from jaxbundle.float64 import local_x64
 from jaxbundle.network.tables import Camera
 
 Formula = Callable[..., Float[Array, "2"]]
@@ -151,7 +152,7 @@ def _rays(camera: Foreign, uv) -> tuple[Float[np.ndarray, "n 3"], np.ndarray]:
     at = (uv - [p["cx"], p["cy"]]) / [p["fx"], p["fy"]]
     r = np.linalg.norm(at, axis=1, keepdims=True)
     m = at if camera.fisheye else at * np.arctan(r) / np.where(r > 0, r, 1)
-    with jax.enable_x64(True):
+    with local_x64():
         newton = partial(_newton, camera.formula, camera.parameters, uv)
         for _ in range(ROUNDS):
             step = np.nan_to_num(newton(m)[0], posinf=0.0, neginf=0.0)

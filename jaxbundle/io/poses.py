@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle import geometry
+from jaxbundle.float64 import local_x64
 
 AT_ONCE = 256
 
@@ -60,7 +61,7 @@ def batched(function, rows, shape, result_shape):
     """
     rows = np.reshape(rows, (-1, *shape))
     results = np.zeros((len(rows), *result_shape))
-    with jax.enable_x64(True):
+    with local_x64():
         for begin in range(0, len(rows), AT_ONCE):
             part = rows[begin : begin + AT_ONCE]
             batch = np.concatenate([part, np.zeros((AT_ONCE - len(part), *shape))])

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbundle.arguments import one_of
-from jaxbundle.configuration import require_x64
 from jaxbundle.errors import InputError
+from jaxbundle.float64 import require_x64
 from jaxbundle.leastsquares.declarations import Motions, Observations, Table
 from jaxbundle.leastsquares.defect import find_open_motions, make_datum, survey_motions
 from jaxbundle.leastsquares.indices import common, finish, rounded

@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.cameras.model import project
+from jaxbundle.float64 import local_x64
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.network.tables import Network
 
@@ -53,7 +54,7 @@ def _projected(model, network: Network, rows, values) -> Float[np.ndarray, "n 2"
     """The images of the points of some rays, a portion at a time."""
     images, rays = network.images, network.observations
     found = np.zeros((len(rows), 2))
-    with jax.enable_x64(True):
+    with local_x64():
         for first in range(0, len(rows), AT_ONCE):
             mine = rows[first : first + AT_ONCE]
             all = np.pad(mine, (0, AT_ONCE - len(mine)), mode="edge")

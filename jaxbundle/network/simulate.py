@@ -24,8 +24,8 @@ from jaxtyping import Float, Int
 
 from jaxbundle.arguments import numeric_array, positive, shown, text, whole
 from jaxbundle.cameras import default_parameters, get_model, image_ray, project
-from jaxbundle.configuration import require_x64
 from jaxbundle.errors import InputError
+from jaxbundle.float64 import require_x64
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.network.build import make_cameras
 from jaxbundle.network.rules import CHOICES, check_choice

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import PyTree
 
 from jaxbundle.arguments import whole
-from jaxbundle.configuration import require_x64
 from jaxbundle.errors import InputError
+from jaxbundle.float64 import require_x64
 from jaxbundle.leastsquares.rows import evaluate, scalars
 from jaxbundle.network.declare import declare
 from jaxbundle.network.stations import LARGEST_SEED

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbundle.errors import InputError
+from jaxbundle.float64 import require_x64
 from jaxbundle.geometry import matrix_from_rotation_vector
 from jaxbundle.network.tables import Source
 
@@ -95,6 +96,7 @@ def make_image(
     **Raises:** `InputError` that names the line at a time outside a table or in a gap; for a size
     that no image has.
     """
+    require_x64()
     check_size(lines, pixels, "image")
     mounting = jnp.zeros(3) if mounting is None else jnp.asarray(mounting, float)
     image = PushbroomImage(

@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbundle.errors import InputError
+from jaxbundle.float64 import require_x64
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, earth_fixed, geodetic
 from jaxbundle.geometry.vectors import along
 from jaxbundle.network.tables import Source
@@ -91,6 +92,7 @@ def fit_bias(
     **Raises:** `InputError` for an unknown model, too few points, points on one line, what is not a
     number, and points or measurements outside the domain of the coefficients.
     """
+    require_x64()
     if model not in MODELS:
         raise InputError(f"unknown bias {model!r}; 'shift' or 'affine' is expected")
     control = RpcTable(*(np.asarray(column, float) for column in control))

@@ -31,6 +31,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.errors import InputError
+from jaxbundle.float64 import require_x64
 from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
 from jaxbundle.network.tables import Source
 
@@ -111,6 +112,7 @@ def fit_rpc(
 
     **Raises:** `InputError` for fewer than 40 points, what is not a number, points of one height.
     """
+    require_x64()
     table = RpcTable(*(np.asarray(column, float) for column in table))
     _check(table, source)
     offsets = _offsets(table)

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.configuration import require_x64
 from jaxbundle.errors import InputError
+from jaxbundle.float64 import require_x64
 from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
 from jaxbundle.network.tables import Network, Observations
 from jaxbundle.pushbroom.image import PushbroomImage

@@ -2,13 +2,11 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from adjustment_checks import solved, synthetic
 
-from jaxbundle import leastsquares as ls
 from jaxbundle.adjustment.problem import make_problem
 from jaxbundle.leastsquares.stopping import (
     LIMIT,
@@ -85,15 +83,3 @@ def test_every_reason_has_words():
     reasons = (LIMIT, SETTLED, RELATIVE_COST, SINGULAR, STUCK, NOT_FINITE)
     assert reasons == tuple(range(len(TERMINATIONS)))
     assert [bool(converged(reason)) for reason in reasons] == [0, 1, 1, 0, 0, 0]
-
-
-def test_adjustment_needs_64_bits():
-    network, height = synthetic()[0], ls.Table("height", np.zeros(2))
-    jax.config.update("jax_enable_x64", False)
-    try:
-        with pytest.raises(RuntimeError, match="enable_x64"):
-            ls.adjust([height], [])
-        with pytest.raises(RuntimeError, match="enable_x64"):
-            make_problem(network)
-    finally:
-        jax.config.update("jax_enable_x64", True)

@@ -6,7 +6,6 @@ from typing import Annotated
 import numpy as np
 import typer
 
-import jaxbundle
 from jaxbundle.cli.pushbroom.accuracy_table import table_of, write_table
 from jaxbundle.cli.pushbroom.app import (
     Csv,
@@ -63,7 +62,6 @@ def accuracy(
     json: Json = "",
 ) -> None:
     """RMS and CE90 on the ground of errors with given σ; or the errors against a known truth."""
-    jaxbundle.enable_x64()
     keep_inputs([scanner, truth, dem], csv=csv, json=json, map=map_)
     if 0 < draws < FEWEST_DRAWS:
         raise InputError(

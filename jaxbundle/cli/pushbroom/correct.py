@@ -5,7 +5,6 @@ from typing import Annotated
 
 import typer
 
-import jaxbundle
 from jaxbundle.cli.app import Quiet
 from jaxbundle.cli.progress import counting
 from jaxbundle.cli.pushbroom.app import (
@@ -53,7 +52,6 @@ def correct(
     quiet: Quiet = False,
 ) -> None:
     """Correct an image to a map, in blocks."""
-    jaxbundle.enable_x64()
     keep_inputs([scanner, image, dem, truth], out=out, error_map=error_map)
     check_resampling(resampling)
     if spacing is not None and not spacing > 0:

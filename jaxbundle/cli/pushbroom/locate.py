@@ -8,7 +8,6 @@ import jax
 import numpy as np
 import typer
 
-import jaxbundle
 from jaxbundle.cli.pushbroom.app import (
     Csv,
     Dem,
@@ -51,7 +50,6 @@ def locate(
     json: Json = "",
 ) -> None:
     """Where on the ground places of the image are; (0, 0) is the centre of the first pixel."""
-    jaxbundle.enable_x64()
     keep_inputs([scanner, points, dem, geoid], csv=csv, json=json)
     file = open_scanner(scanner)
     surface = surface_of(file.earth, height, dem, file.image, geoid)

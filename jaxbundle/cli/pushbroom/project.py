@@ -6,7 +6,6 @@ from typing import Annotated
 import numpy as np
 import typer
 
-import jaxbundle
 from jaxbundle.cli.pushbroom.app import (
     Csv,
     Json,
@@ -42,7 +41,6 @@ def project(
     json: Json = "",
 ) -> None:
     """Where in the image points of the ground are: a row for every line that sees one."""
-    jaxbundle.enable_x64()
     keep_inputs([scanner, points], csv=csv, json=json)
     file = open_scanner(scanner)
     table = _with_points(read_csv(points))

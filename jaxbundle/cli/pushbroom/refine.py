@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 
-import jaxbundle
 from jaxbundle.cli.app import Force
 from jaxbundle.cli.pushbroom.app import pushbroom, warn
 from jaxbundle.io.csv_tables import write_csv, write_text
@@ -33,7 +32,6 @@ def refine(
     json: Annotated[str, typer.Option(help="write the result as JSON; - for stdout alone")] = "",
 ) -> None:
     """Refine attitude, position and optics of scanner images by points; report what they tell."""
-    jaxbundle.enable_x64()
     file = read_refinement(input)
     names = [REPORT, RESULT, "points.csv", *(f"{PHOTOGRAPHS}/{name}" for name in FILES)]
     names += [name for one in file.images for name in names_of(one.id)]

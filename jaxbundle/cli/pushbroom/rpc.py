@@ -6,7 +6,6 @@ from typing import Annotated
 import numpy as np
 import typer
 
-import jaxbundle
 from jaxbundle.cli.pushbroom.app import (
     Csv,
     Dem,
@@ -65,7 +64,6 @@ def fit(
     json: Figures = "",
 ) -> None:
     """Fit coefficients to a scanner, or to a table; tell what they leave, in pixels."""
-    jaxbundle.enable_x64()
     keep_inputs([source], out=out, json=json)
     head = {}
     if source.suffix.lower() == ".csv":
@@ -112,7 +110,6 @@ def apply(
     json: Json = "",
 ) -> None:
     """Points of the ground to the image; places in the image to a surface."""
-    jaxbundle.enable_x64()
     keep_inputs([coefficients, points, dem], csv=csv, json=json)
     given, table = read_rpc(coefficients), read_csv(points)
     ids = table.ids("id") if "id" in table.values else [str(k + 1) for k in range(len(table))]
@@ -156,7 +153,6 @@ def compensate(
     json: Figures = "",
 ) -> None:
     """Remove the bias that control points tell of; residuals, redundancy numbers and w of each."""
-    jaxbundle.enable_x64()
     # the tags of a raster may be replaced in it
     keep_inputs([control], out=out, csv=csv, json=json)
     keep_inputs([coefficients], csv=csv, json=json, out=None if out.suffix in RASTERS else out)

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import typer
 
-import jaxbundle
 from jaxbundle.cli.app import Force, Quiet
 from jaxbundle.cli.progress import counting
 from jaxbundle.cli.pushbroom.app import (
@@ -41,7 +40,6 @@ def simulate(
     quiet: Quiet = False,
 ) -> None:
     """Simulate a flight: what its instruments tell, the truth, and the image of a scene."""
-    jaxbundle.enable_x64()
     check_resampling(resampling)
     given = read_flight(flight)
     names = [IMAGE, *(f"{place}{n}" for place in ("", f"{TRUTH}/") for n in names_of(NAME, ""))]

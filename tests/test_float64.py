@@ -1,0 +1,89 @@
+"""One rule for 64-bit floats: who refuses without them, and who brings them along."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from adjustment_checks import synthetic
+
+import jaxbundle
+from jaxbundle import leastsquares as ls
+from jaxbundle.adjustment.problem import make_problem
+from jaxbundle.cameras import get_model
+from jaxbundle.cameras.compare import compare_cameras
+from jaxbundle.cameras.distortion_table import distortion_table
+from jaxbundle.network import Camera
+from jaxbundle.network.reprojection import point_errors
+from jaxbundle.pushbroom import (
+    AnglePolynomial,
+    LineTimes,
+    RpcTable,
+    Trajectory,
+    attitude_table,
+    fit_rpc,
+    make_image,
+    position_table,
+)
+
+PACKAGE = Path(jaxbundle.__file__).parent
+NETWORK = synthetic()[0]
+TARGETS = np.random.default_rng(1).uniform(-1, 1, (20, 3))
+
+
+def scanner_image():
+    t = np.array([-1.0, 100.0])
+    rows = position_table(t, np.array([[0, 0, 1e3], [0, 5e3, 1e3]]), method="linear")
+    level = attitude_table(t, np.zeros((2, 3)), method="linear")
+    optics = AnglePolynomial(jnp.zeros(1), jnp.ones(2), jnp.ones(()), jnp.ones(()))
+    return make_image(
+        Trajectory(rows, level), LineTimes(jnp.zeros(()), jnp.ones(())), optics, 5, 5
+    )
+
+
+ENDS_IN_COORDINATES = {
+    "adjust tables": lambda: ls.adjust([ls.Table("height", np.zeros(2))], []),
+    "make_problem": lambda: make_problem(NETWORK),
+    "adjust": lambda: jaxbundle.adjust(NETWORK),
+    "orient": lambda: jaxbundle.orient(NETWORK),
+    "simulate": lambda: jaxbundle.simulate(
+        jaxbundle.ring_of_stations(4, 5.0, 2.0), TARGETS, Camera("cam", "brown", {"c": 30.0}),
+        noise=0.01,
+    ),
+    "make_image": scanner_image,
+    "fit_rpc": lambda: fit_rpc(RpcTable(*np.random.default_rng(2).uniform(size=(5, 60)))),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ENDS_IN_COORDINATES)
+def test_what_ends_in_coordinates_refuses_32_bits(name):
+    with jax.enable_x64(False), pytest.raises(RuntimeError, match=r"Call jaxbundle\.enable_x64"):
+        ENDS_IN_COORDINATES[name]()
+
+
+def brown(**parameters):
+    return get_model("brown"), {"c": 50.0, "x0": 0.1, "K1": -2e-5, "P1": 1e-6} | parameters
+
+
+NUMPY_IN_NUMPY_OUT = {
+    "compare": lambda: compare_cameras(
+        brown(), brown(c=50.1, K2=1e-9), area=((-12.0, -8.0), (12.0, 8.0))
+    ).difference,
+    "distortion_table": lambda: np.stack(list(distortion_table(*brown(), 2.0, 12.0).values())),
+    "point_errors": lambda: point_errors(NETWORK)[0],
+}
+
+
+@pytest.mark.parametrize("name", NUMPY_IN_NUMPY_OUT)
+def test_conversions_bring_64_bits_along(name):
+    with jax.enable_x64(False):
+        without = NUMPY_IN_NUMPY_OUT[name]()
+    assert without.dtype == np.float64
+    np.testing.assert_array_equal(without, NUMPY_IN_NUMPY_OUT[name]())
+
+
+def test_the_policy_is_in_one_module():
+    words = "jax_enable_x64", "jax.enable_x64"
+    texts = {p.name: p.read_text() for p in PACKAGE.rglob("*.py")}
+    assert [f for f, text in texts.items() if any(w in text for w in words)] == ["float64.py"]
