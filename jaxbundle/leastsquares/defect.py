@@ -13,11 +13,14 @@ from jaxtyping import Array, Bool, Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.datum import HELD, free_of_tables, generators, of_groups
+from jaxbundle.leastsquares.declarations import Motions
 from jaxbundle.leastsquares.linearise import differentiate
 from jaxbundle.leastsquares.normal import Tangent
 from jaxbundle.leastsquares.plan import Datum, Plan
 from jaxbundle.leastsquares.rows import Data, Declared, lay_out_data, prepare
 
+HERE = "table"
+"""The name of a table that is looked at alone."""
 OPEN = 1e-10
 """Relative size of J·G below which a direction counts as open (rounding gives about 1e-14)."""
 
@@ -47,13 +50,26 @@ class Survey(NamedTuple):
     of_groups: Tangent
 
 
-@eqx.filter_jit
 def survey_motions(
     declared: Declared, plan: Plan, data: Data, real: dict[str, Bool[np.ndarray, " rows"]]
 ) -> Survey:
     """See `Survey`; `real`: by table, which of its rows are not filled in."""
+    moves = {}
+    for name, value in data.start.items():
+        action = tuple((HERE, act) for table, act in declared.motions.actions if table == name)
+        motions = Motions(declared.motions.names, action)
+        one = Declared((), ((HERE, declared.spaces[name]),), motions)
+        moves[name] = _generators(one, {HERE: value})[HERE]
+    return _survey(declared, plan, data, real, moves)
+
+
+_generators = eqx.filter_jit(generators)
+"""Of one table at a time: those of one space and size share the program."""
+
+
+@eqx.filter_jit
+def _survey(declared, plan, data, real, moves) -> Survey:
     laid, prepared = lay_out_data(plan, data), prepare(declared, data.start)
-    moves = generators(declared, data.start)
     motions = len(declared.motions.names)
     everywhere = {
         name: jnp.concatenate([

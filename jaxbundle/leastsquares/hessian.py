@@ -6,6 +6,8 @@ the function of one observation, forward over reverse, and go where those of Gau
 (`normal.Sums`).
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +18,7 @@ from jaxbundle.leastsquares.plan import Plan
 from jaxbundle.leastsquares.rows import (
     Declared,
     Laid,
+    Residual,
     Values,
     fill_places,
     over,
@@ -40,13 +43,23 @@ def _derivatives(declared: Declared, plan: Plan, number: int, prepared, laid: La
     slots, with a column of zeros at the end."""
     part = plan.parts[number]
     kind, widths = declared.kinds[part.observations], widths_of(declared, plan, part)
-    ends = [sum(widths[:s]) for s in range(len(widths) + 1)]
-    residual = residual_of(declared, part)
+    one = _HalfSquare(residual_of(declared, part), widths)
+    return over(part, kind, prepared, laid, number, one)
 
-    def one(*row):
+
+@dataclasses.dataclass(frozen=True)
+class _HalfSquare:
+    """½|v|² of one observation, its gradient and Hessian by the changes of its slots."""
+
+    residual: Residual
+    widths: tuple[int, ...]
+
+    def __call__(self, *row):
+        ends = [sum(self.widths[:s]) for s in range(len(self.widths) + 1)]
+
         def half_square(x):
             changes = tuple(tuple(x[a:b]) for a, b in zip(ends, ends[1:]))
-            return 0.5 * sum(r * r for r in residual(changes, *row))
+            return 0.5 * sum(r * r for r in self.residual(*row, changes))
 
         def gradient(x):
             cost, g = jax.value_and_grad(half_square)(x)
@@ -54,8 +67,6 @@ def _derivatives(declared: Declared, plan: Plan, number: int, prepared, laid: La
 
         hessian, (cost, g) = jax.jacfwd(gradient, has_aux=True)(jnp.zeros(ends[-1]))
         return cost, jnp.pad(g, (0, 1)), jnp.pad(hessian, (0, 1))
-
-    return over(part, kind, prepared, laid, number, one)
 
 
 def _blocks(declared: Declared, plan: Plan, part, g, H):

@@ -7,12 +7,14 @@ mode), by forward mode along all directions at once where there are few (a tenth
 compile).
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.leastsquares.plan import Part, Plan
-from jaxbundle.leastsquares.rows import Declared, Laid, diagonal_of, over, residual_of
+from jaxbundle.leastsquares.rows import Declared, Laid, Residual, diagonal_of, over, residual_of
 
 
 def widths_of(declared: Declared, plan: Plan, part: Part) -> tuple[int, ...]:
@@ -33,9 +35,8 @@ def differentiate(declared: Declared, plan: Plan, number: int, prepared, laid: L
     each, and of its eliminated rows (None where it has none). Columns of what is held are zero."""
     part = plan.parts[number]
     kind, widths = declared.kinds[part.observations], widths_of(declared, plan, part)
-    residual = residual_of(declared, part)
-    rows = _reverse if part.large else _forward
-    r, found = over(part, kind, prepared, laid, number, lambda *row: rows(residual, widths, row))
+    rows = _Rows(residual_of(declared, part), widths, part.large)
+    r, found = over(part, kind, prepared, laid, number, rows)
     # Computed once, not once more in every loop that takes some of its columns.
     r, found = (r, found) if part.large else jax.lax.optimization_barrier((r, found))
     shape, starts = r[0].shape, np.cumsum((0, *widths))
@@ -63,12 +64,24 @@ def differentiate(declared: Declared, plan: Plan, number: int, prepared, laid: L
     return jnp.stack(r, -1), tuple(touches), E
 
 
+@dataclasses.dataclass(frozen=True)
+class _Rows:
+    """The residuals of one observation and their derivatives by the changes of its slots."""
+
+    residual: Residual
+    widths: tuple[int, ...]
+    large: bool
+
+    def __call__(self, *row):
+        return (_reverse if self.large else _forward)(self.residual, self.widths, row)
+
+
 def _reverse(residual, widths, row):
     """Residuals, and for each of them its derivatives: tuples of scalars."""
     weight = row[2]
     nil = jnp.zeros_like(jax.tree.leaves(weight)[0])
     still = tuple((nil,) * w for w in widths)
-    r, pull = jax.vjp(lambda d: residual(d, *row), still)
+    r, pull = jax.vjp(lambda d: residual(*row, d), still)
     unit = lambda i: tuple(jnp.ones_like(nil) if a == i else nil for a in range(len(r)))
     columns = lambda i: [x for slot in pull(unit(i))[0] for x in slot]
     return r, [_where_weighted(weight, i, columns(i)) for i in range(len(r))]
@@ -78,8 +91,12 @@ def _forward(residual, widths, row):
     """Residuals, a tuple of scalars, and their derivatives [r, directions]."""
     ends = np.cumsum((0, *widths))
     split = lambda x: tuple(tuple(x[a:b]) for a, b in zip(ends, ends[1:]))
-    J = jax.jacfwd(lambda x: jnp.stack(residual(split(x), *row)))(jnp.zeros(ends[-1]))
-    r = residual(tuple(() for _ in widths), *row)
+
+    def stacked(x):
+        r = residual(*row, split(x))
+        return jnp.stack(r), r
+
+    J, r = jax.jacfwd(stacked, has_aux=True)(jnp.zeros(ends[-1]))
     return r, jnp.stack([_where_weighted(row[2], i, J[i]) for i in range(len(r))])
 
 

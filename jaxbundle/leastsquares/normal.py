@@ -7,7 +7,7 @@ They are filled either from the Jacobian (N = JᵀPJ, Gauss–Newton) or from se
 every observation (the exact Hessian, `hessian.py`); everything after that is the same.
 """
 
-import functools
+from functools import partial, reduce
 
 import equinox as eqx
 import jax
@@ -138,10 +138,13 @@ def _tall(blocks):
     return blocks.reshape(blocks.shape[0], -1, blocks.shape[-1])
 
 
+@partial(jax.jit, static_argnums=0, inline=True)
 def normal_equations(
     declared: Declared, plan: Plan, values: Values, laid: Laid
 ) -> tuple[Float[Array, ""], Tangent, NormalBlocks]:
-    """½·vᵀPv, its gradient g = Jᵀr and N = JᵀJ at these values (the weights are in r and J)."""
+    """½·vᵀPv, its gradient g = Jᵀr and N = JᵀJ at these values (the weights are in r and J).
+
+    Traced once for a plan: the solver needs the shapes of what it returns before the values."""
     prepared, sums = prepare(declared, values), Sums(plan)
     for number, part in enumerate(plan.parts):
         r, touches, E = differentiate(declared, plan, number, prepared, laid)
@@ -242,7 +245,7 @@ class Sums:
 
 def products(a, b):
     """aᵀb of every row, written out: a batched product of tiny matrices takes thrice the time."""
-    return functools.reduce(
+    return reduce(
         jnp.add, (a[:, i, :, None] * b[:, i, None, :] for i in range(a.shape[1]))
     )
 

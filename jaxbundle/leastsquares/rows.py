@@ -6,11 +6,12 @@ Everything is a structure of arrays: one array for each scalar of a block.
 """
 
 import dataclasses
+from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from jaxbundle.leastsquares.declarations import Kind, Motions
 from jaxbundle.leastsquares.plan import Part, Plan
@@ -55,10 +56,10 @@ class Declared:
 
 def lay_out_data(plan: Plan, data: Data) -> Laid:
     """The measurements, looked up once a solution."""
-    look_up = lambda rows, source: jax.tree.map(lambda x: x[source], scalars(rows))
+    of = lambda rows, part: look_up(scalars(rows), part.source)
     return Laid(
-        tuple(look_up(data.measured[p.observations], p.source) for p in plan.parts),
-        tuple(look_up(data.weight[p.observations], p.source) for p in plan.parts),
+        tuple(of(data.measured[part.observations], part) for part in plan.parts),
+        tuple(of(data.weight[part.observations], part) for part in plan.parts),
     )
 
 
@@ -77,17 +78,24 @@ def prepare(declared: Declared, values: Values) -> dict[str, PyTree[Float[Array,
     return {name: jax.vmap(declared.spaces[name].prepare)(rows) for name, rows in values.items()}
 
 
-def residual_of(declared: Declared, part: Part):
-    """`(changes, blocks, measured, weight) -> residuals / σ`, tuples of scalars, of one observation
-    of a part; `changes` has one tuple for each slot, empty where the table is held."""
+@dataclasses.dataclass(frozen=True)
+class Residual:
+    """`(blocks, measured, weight) -> residuals / σ`, tuples of scalars, of one observation of a
+    kind; `changes` has one tuple for each slot, empty where the table is held."""
+
+    kind: Kind
+    spaces: tuple[Space, ...]
+
+    def __call__(self, blocks, measured, weight, changes=None):
+        changes = ((),) * len(self.spaces) if changes is None else changes
+        moved = [s.moved(b, d) for s, b, d in zip(self.spaces, blocks, changes)]
+        return _weighted(evaluate(self.kind, moved, measured), weight)
+
+
+def residual_of(declared: Declared, part: Part) -> Residual:
+    """The residuals of one observation of a part."""
     kind = declared.kinds[part.observations]
-    spaces = [declared.spaces[name] for name in kind.of]
-
-    def residual(changes, blocks, measured, weight):
-        moved = [s.moved(b, d) for s, b, d in zip(spaces, blocks, changes)]
-        return _weighted(evaluate(kind, moved, measured), weight)
-
-    return residual
+    return Residual(kind, tuple(declared.spaces[name] for name in kind.of))
 
 
 def evaluate(kind: Kind, blocks, measured):
@@ -142,15 +150,21 @@ def fill_places(plan: Plan, laid: Laid) -> tuple[Plan, Laid]:
 
 def over(part: Part, kind: Kind, prepared, laid: Laid, number: int, function):
     """`function(blocks, measured, weight)` of every observation of a part; its scalars get the
-    axes [chunks, length]."""
-    blocks = tuple(
-        jax.tree.map(lambda column, at=at: column[at], prepared[name])
-        for name, at in zip(kind.of, part.lookup)
-    )
-    axes = tuple(0 if by_row else None for by_row in part.by_row)
-    return jax.vmap(jax.vmap(function, (axes, 0, 0)))(
-        blocks, laid.measured[number], laid.weight[number]
-    )
+    axes [chunks, length]. Functions that are equal are traced once for columns of one size."""
+    blocks = tuple(look_up(prepared[name], at) for name, at in zip(kind.of, part.lookup))
+    return _over_rows(function, part.by_row, blocks, laid.measured[number], laid.weight[number])
+
+
+@partial(jax.jit, static_argnums=(0, 1), inline=True)
+def _over_rows(function, by_row, blocks, measured, weight):
+    axes = tuple(0 if one else None for one in by_row)
+    return jax.vmap(jax.vmap(function, (axes, 0, 0)))(blocks, measured, weight)
+
+
+def look_up(columns: PyTree[Float[Array, " rows"]], at: Int[Array, "..."]):
+    """The elements of every column at these places of a plan, none of which is negative."""
+    there = {"mode": "promise_in_bounds", "wrap_negative_indices": False}
+    return jax.tree.map(lambda column: column.at[at].get(**there), columns)
 
 
 def residuals(declared: Declared, plan: Plan, values: Values, laid: Laid):
@@ -158,10 +172,7 @@ def residuals(declared: Declared, plan: Plan, values: Values, laid: Laid):
     prepared, found = prepare(declared, values), []
     for number, part in enumerate(plan.parts):
         kind = declared.kinds[part.observations]
-        residual, still = residual_of(declared, part), ((),) * len(kind.of)
-        rows = over(
-            part, kind, prepared, laid, number, lambda *row, f=residual, d=still: f(d, *row)
-        )
+        rows = over(part, kind, prepared, laid, number, residual_of(declared, part))
         found.append(jnp.stack(rows, -1))
     return tuple(found)
 
