@@ -12,7 +12,7 @@ Source: the differencing of mrcal (Kogan), here at infinity, by least squares ov
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 
 import jax
@@ -22,8 +22,9 @@ from jaxtyping import Float
 
 from jaxbundle.float64 import local_x64
 from jaxbundle.geometry import matrix_from_rotation_vector
+from jaxbundle.types import Numbers
 
-from .convert import image_area
+from .convert import Area, image_area
 from .convert_fit import GRID, image_grid, images_of, rays_of
 from .frames import between_frames
 from .model import CameraModel, project
@@ -69,9 +70,9 @@ def compare_cameras(
     a: tuple[CameraModel, Mapping[str, float]],
     b: tuple[CameraModel, Mapping[str, float]],
     *,
-    image_size: Sequence[float] | None = None,
-    pixel_size: Sequence[float] | None = None,
-    area: tuple[Sequence[float], Sequence[float]] | None = None,
+    image_size: Numbers | None = None,
+    pixel_size: Numbers | None = None,
+    area: Area | None = None,
     rotate: bool = True,
     radius: float = np.inf,
 ) -> Comparison:

@@ -8,6 +8,9 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.types import Numbers
 
 from .convert_exact import NotExact, exact_parameters
 from .convert_fit import fit_parameters, image_grid, images_of, rays_of, start_values
@@ -15,7 +18,7 @@ from .frames import between_frames
 from .model import CameraModel
 from .parameters import default_parameters
 
-Area = tuple[Sequence[float], Sequence[float]]
+Area = tuple[Numbers, Numbers]
 MEASURABLE = 0.5
 """The part of the image that must have rays, or a fit would mean nothing."""
 SAME_POINT = 1e-9
@@ -58,8 +61,8 @@ def convert_camera(
     parameters: Mapping[str, float],
     target: CameraModel,
     *,
-    image_size: Sequence[float] | None = None,
-    pixel_size: Sequence[float] | None = None,
+    image_size: Numbers | None = None,
+    pixel_size: Numbers | None = None,
     area: Area | None = None,
     r0: float = 0.0,
     free: Sequence[str] = (),
@@ -107,11 +110,13 @@ def convert_camera(
     return Conversion(
         target.name, {name: float(v) for name, v in found.items()}, not reason,
         float(length[worst]), float(np.sqrt(np.mean(length**2))), target.unit,
-        tuple(wanted[worst].tolist()), float(there.mean()), reason,
+        (float(wanted[worst, 0]), float(wanted[worst, 1])), float(there.mean()), reason,
     )  # fmt: skip
 
 
-def image_area(source: CameraModel, image_size, pixel_size) -> Area:
+def image_area(
+    source: CameraModel, image_size: Numbers | None, pixel_size: Numbers | None
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """The corners of the whole image, in the model's coordinates."""
     if image_size is None:
         raise ValueError("image_size is needed to know the area of the image")

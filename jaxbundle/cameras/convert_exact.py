@@ -34,6 +34,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from jaxbundle.types import Numbers
+
 from .frames import pixel_frame
 from .model import CameraModel
 
@@ -43,7 +45,7 @@ EQUAL = 1e-12
 """Two numbers this close, relatively, are the same."""
 
 Values = Mapping[str, float]
-Sizes = tuple[Sequence[float] | None, Sequence[float] | None]
+Sizes = tuple[Numbers | None, Numbers | None]
 
 
 class NotExact(Exception):
@@ -153,7 +155,7 @@ def with_distortion(
     }  # fmt: skip
 
 
-def _balance(k: Sequence[float], rho: float) -> float:
+def _balance(k: Numbers, rho: float) -> float:
     """s with s = 1 − Σk_i·s^(2i+1)·ρ^2i, by Newton's method from 1."""
     terms = [k[i - 1] * rho ** (2 * i) for i in (1, 2, 3)]
     s = 1.0
@@ -185,7 +187,7 @@ def normalised_correction(values: Values) -> dict[str, float]:
     return {**k, "p1": -c * values["P2"], "p2": c * values["P1"]}
 
 
-def inverted_radial(q: Sequence[float]) -> tuple[float, float, float]:
+def inverted_radial(q: Numbers) -> tuple[float, float, float]:
     """The first terms of the inverse of r·(1 + q1·r² + q2·r⁴ + q3·r⁶): a start, never the answer.
 
         k1 = −q1     k2 = 3·q1² − q2     k3 = −12·q1³ + 8·q1·q2 − q3

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.float64 import local_x64
+from jaxbundle.types import Numbers
 
 from .convert_exact import (
     CORRECTIONS,
@@ -42,7 +43,7 @@ def fitted(model: CameraModel) -> tuple[str, ...]:
     return (*model.free, *MORE_FITTED.get(model.name, ()))
 
 
-def image_grid(low: Sequence[float], high: Sequence[float]) -> Float[np.ndarray, "points 2"]:
+def image_grid(low: Numbers, high: Numbers) -> Float[np.ndarray, "points 2"]:
     """Points of a rectangle, its edges among them."""
     columns, rows = (np.linspace(a, b, n) for a, b, n in zip(low, high, GRID))
     return np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)

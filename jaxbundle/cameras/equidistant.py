@@ -13,12 +13,12 @@ import jax.numpy as jnp
 from .scalars import OfRay, Pair, Parameters, Scalar, ToRay, Triple
 
 
-def equidistant(columns: Sequence[int], axes: str) -> tuple[OfRay, ToRay]:
+def equidistant(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
     """The ideal image of a ray, and the ray of an ideal image, NaN beyond θ = 180°.
 
     **Arguments:** as of `perspective.perspective`.
     """
-    first, last, up = columns[0], columns[-1], axes == "up"
+    first, last = columns[0], columns[-1]
 
     def ideal(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
         scale = _angle_over_sine(r * r + s * s, q)

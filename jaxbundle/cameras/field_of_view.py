@@ -19,6 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxbundle.types import Numbers
+
 from .convert import image_area
 from .convert_fit import rays_of
 from .model import CameraModel
@@ -48,7 +50,7 @@ def field_of_view_of_rays(
     model: CameraModel,
     parameters: Mapping[str, float],
     image_size: Sequence[float],
-    pixel_size: Sequence[float] | None = None,
+    pixel_size: Numbers | None = None,
 ) -> FieldOfView:
     """The angles between the rays through the middles of the edges, and the corners, of the image.
 

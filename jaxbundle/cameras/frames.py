@@ -14,18 +14,19 @@ A pixel (u, v) counts from the centre of the upper-left pixel, u right, v down. 
 with the image size (w, h) in pixels and the pixel size (p_x, p_y) in mm.
 """
 
-from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
+
+from jaxbundle.types import Numbers
 
 from .model import CameraModel
 
 
 def pixel_frame(
     model: CameraModel,
-    image_size: Sequence[float] | None = None,
-    pixel_size: Sequence[float] | None = None,
+    image_size: Numbers | None = None,
+    pixel_size: Numbers | None = None,
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """Origin (u_o, v_o) and step (a, b) of a model's image coordinates, in pixels.
 
@@ -46,8 +47,8 @@ def pixel_frame(
 def between_frames(
     source: CameraModel,
     target: CameraModel,
-    image_size: Sequence[float] | None = None,
-    pixel_size: Sequence[float] | None = None,
+    image_size: Numbers | None = None,
+    pixel_size: Numbers | None = None,
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """Shift d and factor s with (x, y)_target = d + s·(x, y)_source.
 

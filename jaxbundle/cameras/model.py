@@ -95,10 +95,8 @@ class CameraModel:
         for name, value in _completed(self).items():
             object.__setattr__(self, name, value)
         columns = [self.parameters.index(name) for name in self.principal_distance]
-        ideal, ray = IMAGES[self.image](columns, self.axes)
-        formula = self.formula
-        if self.project is not None:
-            formula = lambda p, xi, yi: self.project(p, *ray(p, xi, yi))
+        ideal, ray = IMAGES[self.image](columns, self.axes == "up")
+        formula = self.correct or self.distort or _of_the_ideal_image(self.project, ray)
         back = self.inverse or implicit_inverse(
             formula, self.start or _less_its_origin(formula), self.iterations
         )
@@ -110,7 +108,9 @@ class CameraModel:
     @property
     def formula(self) -> Formula | OfRay:
         """The one function the model states."""
-        return self.correct or self.distort or self.project
+        given = self.correct or self.distort or self.project
+        assert given is not None, "checked when the model is made"
+        return given
 
     @property
     def wide(self) -> bool:
@@ -178,6 +178,12 @@ def _completed(model: CameraModel) -> dict:
             "principal_point two or none; c, fx and fy, f, x0 and y0, cx and cy need no naming."
         )
     return kept
+
+
+def _of_the_ideal_image(project: OfRay | None, ray: ToRay) -> Formula:
+    """The image of the ray of an ideal coordinate."""
+    assert project is not None, "the one formula that is left"
+    return lambda p, xi, yi: project(p, *ray(p, xi, yi))
 
 
 def _less_its_origin(formula: Formula) -> Formula:

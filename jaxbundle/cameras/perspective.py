@@ -13,13 +13,13 @@ import jax.numpy as jnp
 from .scalars import OfRay, Pair, Parameters, Scalar, ToRay, Triple
 
 
-def perspective(columns: Sequence[int], axes: str) -> tuple[OfRay, ToRay]:
+def perspective(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
     """The ideal image of a ray, and the ray of an ideal image.
 
     **Arguments:** `columns` of the principal distance among the parameters, or of the two, along
-    and across; `axes`: "up" or "down".
+    and across; `up`: whether y points up.
     """
-    first, last, up = columns[0], columns[-1], axes == "up"
+    first, last = columns[0], columns[-1]
 
     def ideal(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
         return -p[first] * r / q, -p[last] * s / q if up else p[last] * s / q

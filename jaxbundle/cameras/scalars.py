@@ -2,9 +2,8 @@
 
 from collections.abc import Callable, Sequence
 
-from jaxtyping import Array, Float
+from jaxbundle.types import Scalar as Scalar
 
-Scalar = float | Float[Array, ""]
 Pair = tuple[Scalar, Scalar]
 Triple = tuple[Scalar, Scalar, Scalar]
 Parameters = Sequence[Scalar]

@@ -17,32 +17,34 @@ from jax import Array
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Float
 
+from jaxbundle.types import AnyArray
 
-def apply(params: Float[Array, "6"], point: Float[Array, "2"]) -> Float[Array, "2"]:
+
+def apply(params: Float[AnyArray, "6"], point: Float[AnyArray, "2"]) -> Float[Array, "2"]:
     """(X, Y), in the target's unit, of a point (x, y) in the source's unit."""
     a, b, c, d, e, f = params
     x, y = point
     return jnp.stack([a * x + b * y + c, d * x + e * y + f])
 
 
-def inverse(params: Float[Array, "6"]) -> Float[Array, "6"]:
+def inverse(params: Float[AnyArray, "6"]) -> Float[Array, "6"]:
     """The parameters (a', b', c', d', e', f') that lead back from (X, Y) to (x, y)."""
     a, b, c, d, e, f = params
     determinant = a * e - b * d
     return jnp.stack([e, -b, b * f - c * e, -d, a, c * d - a * f]) / determinant
 
 
-def compose(outer: Float[Array, "6"], inner: Float[Array, "6"]) -> Float[Array, "6"]:
+def compose(outer: Float[AnyArray, "6"], inner: Float[AnyArray, "6"]) -> Float[Array, "6"]:
     """The parameters of `inner` followed by `outer`: (X, Y) = outer(inner(x, y))."""
     bottom = jnp.array([0, 0, 1], outer.dtype)
     matrix = jnp.vstack([inner.reshape(2, 3), bottom])
-    return (outer.reshape(2, 3) @ matrix).reshape(6)
+    return (jnp.reshape(outer, (2, 3)) @ matrix).reshape(6)
 
 
 def fit(
-    source: Float[Array, "n 2"],
-    target: Float[Array, "n 2"],
-    weights: Float[Array, "n"] | None = None,
+    source: Float[AnyArray, "n 2"],
+    target: Float[AnyArray, "n 2"],
+    weights: Float[AnyArray, "n"] | None = None,
 ) -> Float[Array, "6"]:
     """The parameters that take `source` to `target` with the least weighted sum of squares.
 

@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from .vectors import Scalar, Vector, along, dot, unit
+from .vectors import Scalar, Triple, Vector, along, dot, unit
 
 
 class Ellipsoid(NamedTuple):
@@ -55,8 +55,7 @@ def ray_to_ellipsoid(ellipsoid: Ellipsoid, o: Vector, d: Vector) -> Scalar:
 
     NaN for a ray that misses.
     """
-    p = tuple(x / axis for x, axis in zip(o, ellipsoid))
-    u = tuple(x / axis for x, axis in zip(d, ellipsoid))
+    p, u = _on_axes(ellipsoid, o), _on_axes(ellipsoid, d)
     A, B, C = dot(u, u), dot(p, u), dot(p, p) - 1
     discriminant = B * B - A * C
     real = discriminant >= 0
@@ -81,18 +80,19 @@ def ray_to_height(ellipsoid: Ellipsoid, h: Scalar, o: Vector, d: Vector) -> Scal
     return s
 
 
-def normal(ellipsoid: Ellipsoid, X: Vector) -> Vector:
+def normal(ellipsoid: Ellipsoid, X: Vector) -> Triple:
     """The outward unit normal at a point of the ellipsoid."""
-    return unit(tuple(x / axis**2 for x, axis in zip(X, ellipsoid)))
+    x, y, z = (component / axis**2 for component, axis in zip(X, ellipsoid))
+    return unit((x, y, z))
 
 
 def residual(ellipsoid: Ellipsoid, X: Vector) -> Scalar:
     """x²/a² + y²/b² + z²/c² − 1: zero on the ellipsoid, 2/a times the height near it."""
-    p = tuple(x / axis for x, axis in zip(X, ellipsoid))
+    p = _on_axes(ellipsoid, X)
     return dot(p, p) - 1
 
 
-def geodetic(ellipsoid: Ellipsoid, X: Vector) -> Vector:
+def geodetic(ellipsoid: Ellipsoid, X: Vector) -> Triple:
     """(λ, φ, h): longitude and latitude in radians, height in metres, of an Earth-fixed point.
 
     The ellipsoid is one of revolution, a = b. At a pole the longitude is 0.
@@ -104,7 +104,7 @@ def geodetic(ellipsoid: Ellipsoid, X: Vector) -> Vector:
     return longitude, jnp.arctan2(*tangent), h
 
 
-def earth_fixed(ellipsoid: Ellipsoid, geodetic: Vector) -> Vector:
+def earth_fixed(ellipsoid: Ellipsoid, geodetic: Vector) -> Triple:
     """(x, y, z) in metres of (λ, φ, h), radians and metres; a = b."""
     longitude, latitude, h = geodetic
     squeeze = (ellipsoid.c / ellipsoid.a) ** 2
@@ -114,11 +114,17 @@ def earth_fixed(ellipsoid: Ellipsoid, geodetic: Vector) -> Vector:
     return across * jnp.cos(longitude), across * jnp.sin(longitude), (N * squeeze + h) * sine
 
 
-def up(geodetic: Vector) -> Vector:
+def up(geodetic: Vector) -> Triple:
     """The unit vector of increasing height at (λ, φ, h)."""
     longitude, latitude, _ = geodetic
     cosine = jnp.cos(latitude)
     return cosine * jnp.cos(longitude), cosine * jnp.sin(longitude), jnp.sin(latitude)
+
+
+def _on_axes(ellipsoid: Ellipsoid, v: Vector) -> Triple:
+    """(x/a, y/b, z/c): the ellipsoid as the unit sphere."""
+    x, y, z = (component / axis for component, axis in zip(v, ellipsoid))
+    return x, y, z
 
 
 def _foot(ellipsoid, X):

@@ -32,12 +32,14 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
+from jaxbundle.types import AnyArray
+
 traced_once = partial(jax.jit, inline=True)
 """Traced once for all callers, and compiled as a part of each."""
 
 
 @traced_once
-def quaternion_multiply(a: Float[Array, "4"], b: Float[Array, "4"]) -> Float[Array, "4"]:
+def quaternion_multiply(a: Float[AnyArray, "4"], b: Float[AnyArray, "4"]) -> Float[Array, "4"]:
     """The product a∘b, of which the rotation is M(a)·M(b): b acts first (Hamilton, 1844)."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
@@ -51,13 +53,13 @@ def quaternion_multiply(a: Float[Array, "4"], b: Float[Array, "4"]) -> Float[Arr
     )
 
 
-def quaternion_conjugate(q: Float[Array, "4"]) -> Float[Array, "4"]:
+def quaternion_conjugate(q: Float[AnyArray, "4"]) -> Float[Array, "4"]:
     """The inverse rotation (w, −x, −y, −z) of a unit quaternion: M(q*) = M(q)ᵀ."""
     return jnp.concatenate([q[:1], -q[1:]])
 
 
 @traced_once
-def matrix_from_quaternion(q: Float[Array, "4"]) -> Float[Array, "3 3"]:
+def matrix_from_quaternion(q: Float[AnyArray, "4"]) -> Float[Array, "3 3"]:
     """The rotation matrix M(q) of q = (w, x, y, z).
 
     Divided by q·q, so that a quaternion of any length but zero gives a true rotation.
@@ -72,7 +74,7 @@ def matrix_from_quaternion(q: Float[Array, "4"]) -> Float[Array, "3 3"]:
     return jnp.array(rows) / (ww + xx + yy + zz)
 
 
-def quaternion_from_matrix(M: Float[Array, "3 3"]) -> Float[Array, "4"]:
+def quaternion_from_matrix(M: Float[AnyArray, "3 3"]) -> Float[Array, "4"]:
     """The unit quaternion (w, x, y, z), w ≥ 0, of a rotation matrix.
 
     The elements of M give all ten products in 4qqᵀ. The row with the largest diagonal element is
@@ -93,7 +95,7 @@ def quaternion_from_matrix(M: Float[Array, "3 3"]) -> Float[Array, "4"]:
 
 
 @traced_once
-def quaternion_from_rotation_vector(v: Float[Array, "3"]) -> Float[Array, "4"]:
+def quaternion_from_rotation_vector(v: Float[AnyArray, "3"]) -> Float[Array, "4"]:
     """The unit quaternion of exp([v]×), v in radians (Solà, 2017, Exp)."""
     half = v / 2
     square = jnp.sum(half * half)
@@ -102,7 +104,7 @@ def quaternion_from_rotation_vector(v: Float[Array, "3"]) -> Float[Array, "4"]:
 
 
 @traced_once
-def rotation_vector_from_quaternion(q: Float[Array, "4"]) -> Float[Array, "3"]:
+def rotation_vector_from_quaternion(q: Float[AnyArray, "4"]) -> Float[Array, "3"]:
     """The rotation vector v, |v| ≤ π, in radians: 2 arctan(|u|/w)·u/|u| (Solà, 2017, Log).
 
     The length and the sign of q do not matter. A rotation by 180° has two logarithms, v and −v,
@@ -118,23 +120,23 @@ def rotation_vector_from_quaternion(q: Float[Array, "4"]) -> Float[Array, "3"]:
     return 2 * jnp.where(small, series, jnp.arctan2(root, w) / root) * u
 
 
-def matrix_from_rotation_vector(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
+def matrix_from_rotation_vector(v: Float[AnyArray, "3"]) -> Float[Array, "3 3"]:
     """The rotation matrix exp([v]×) = I + [v]× + ½[v]×² + …, v in radians."""
     return matrix_from_quaternion(quaternion_from_rotation_vector(v))
 
 
-def rotation_vector_from_matrix(M: Float[Array, "3 3"]) -> Float[Array, "3"]:
+def rotation_vector_from_matrix(M: Float[AnyArray, "3 3"]) -> Float[Array, "3"]:
     """The rotation vector v, |v| ≤ π, in radians, of a rotation matrix M = exp([v]×)."""
     return rotation_vector_from_quaternion(quaternion_from_matrix(M))
 
 
 @traced_once
-def retract_quaternion(q: Float[Array, "4"], delta: Float[Array, "3"]) -> Float[Array, "4"]:
+def retract_quaternion(q: Float[AnyArray, "4"], delta: Float[AnyArray, "3"]) -> Float[Array, "4"]:
     """The unit quaternion q ⊞ δ of exp([δ]×)·M(q): q turned by δ, radians, in the camera frame."""
     return _normalise(quaternion_multiply(quaternion_from_rotation_vector(delta), q))
 
 
-def quaternion_difference(q1: Float[Array, "4"], q0: Float[Array, "4"]) -> Float[Array, "3"]:
+def quaternion_difference(q1: Float[AnyArray, "4"], q0: Float[AnyArray, "4"]) -> Float[Array, "3"]:
     """The rotation q₁ ⊟ q₀ = δ, in radians, in the camera frame, that leads from q₀ to q₁.
 
     The inverse of the retraction: q₀ ⊞ δ = ±q₁.
@@ -147,7 +149,8 @@ def _normalise(q: Array) -> Array:
 
 
 def _horner(coefficients: list[float], x: Array) -> Array:
-    return reduce(lambda total, coefficient: total * x + coefficient, reversed(coefficients), 0.0)
+    zero = jnp.zeros_like(x)
+    return reduce(lambda total, coefficient: total * x + coefficient, reversed(coefficients), zero)
 
 
 # Enough terms for float64, and a switch far enough from zero that the closed forms, and their

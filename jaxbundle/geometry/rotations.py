@@ -36,31 +36,33 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
+from jaxbundle.types import AnyArray, Scalar
+
 from .quaternions import matrix_from_quaternion, quaternion_from_matrix
 
 
-def R1(omega: Float[Array, ""]) -> Float[Array, "3 3"]:
+def R1(omega: Scalar) -> Float[Array, "3 3"]:
     """Rotation of the axes about the first axis, x, by ω in radians."""
     c, s = jnp.cos(omega), jnp.sin(omega)
     one, zero = jnp.ones_like(c), jnp.zeros_like(c)
     return jnp.array([[one, zero, zero], [zero, c, s], [zero, -s, c]])
 
 
-def R2(phi: Float[Array, ""]) -> Float[Array, "3 3"]:
+def R2(phi: Scalar) -> Float[Array, "3 3"]:
     """Rotation of the axes about the second axis, y, by φ in radians."""
     c, s = jnp.cos(phi), jnp.sin(phi)
     one, zero = jnp.ones_like(c), jnp.zeros_like(c)
     return jnp.array([[c, zero, -s], [zero, one, zero], [s, zero, c]])
 
 
-def R3(kappa: Float[Array, ""]) -> Float[Array, "3 3"]:
+def R3(kappa: Scalar) -> Float[Array, "3 3"]:
     """Rotation of the axes about the third axis, z, by κ in radians."""
     c, s = jnp.cos(kappa), jnp.sin(kappa)
     one, zero = jnp.ones_like(c), jnp.zeros_like(c)
     return jnp.array([[c, s, zero], [-s, c, zero], [zero, zero, one]])
 
 
-def matrix_from_omega_phi_kappa(angles: Float[Array, "3"]) -> Float[Array, "3 3"]:
+def matrix_from_omega_phi_kappa(angles: Float[AnyArray, "3"]) -> Float[Array, "3 3"]:
     """M = R3(κ)·R2(φ)·R1(ω) of (ω, φ, κ) in radians (Wolf and Dewitt, 2000, appendix C).
 
     ⎡ cos φ cos κ   cos ω sin κ + sin ω sin φ cos κ   sin ω sin κ − cos ω sin φ cos κ⎤
@@ -71,7 +73,7 @@ def matrix_from_omega_phi_kappa(angles: Float[Array, "3"]) -> Float[Array, "3 3"
     return R3(kappa) @ R2(phi) @ R1(omega)
 
 
-def omega_phi_kappa_from_matrix(M: Float[Array, "3 3"]) -> Float[Array, "3"]:
+def omega_phi_kappa_from_matrix(M: Float[AnyArray, "3 3"]) -> Float[Array, "3"]:
     """(ω, φ, κ) in radians, ω and κ in (−π, π], φ in [−π/2, π/2]; ω = 0 at φ = ±90°."""
     (_, m12, m13), (_, m22, m23), (m31, m32, m33) = M
     omega = _angle(-m32, m33)
@@ -81,7 +83,9 @@ def omega_phi_kappa_from_matrix(M: Float[Array, "3 3"]) -> Float[Array, "3"]:
     return jnp.stack([omega, phi, kappa])
 
 
-def omega_phi_kappa_near(M: Float[Array, "3 3"], given: Float[Array, "3"]) -> Float[Array, "3"]:
+def omega_phi_kappa_near(
+    M: Float[AnyArray, "3 3"], given: Float[AnyArray, "3"]
+) -> Float[Array, "3"]:
     """(ω, φ, κ) of M in radians, of all its representations the one nearest to the given angles.
 
     (ω, φ, κ) and (ω + π, π − φ, κ + π) are one rotation, and so are whole turns of each.
@@ -94,7 +98,7 @@ def omega_phi_kappa_near(M: Float[Array, "3 3"], given: Float[Array, "3"]) -> Fl
     return jnp.where(distance(other) < distance(angles), other, angles)
 
 
-def matrix_from_phi_omega_kappa(angles: Float[Array, "3"]) -> Float[Array, "3 3"]:
+def matrix_from_phi_omega_kappa(angles: Float[AnyArray, "3"]) -> Float[Array, "3 3"]:
     """M = R3(κ)·R1(ω)·R2(φ) of (φ, ω, κ), in this order, in radians.
 
     The third row is (cos ω sin φ, −sin ω, cos ω cos φ).
@@ -103,7 +107,7 @@ def matrix_from_phi_omega_kappa(angles: Float[Array, "3"]) -> Float[Array, "3 3"
     return R3(kappa) @ R1(omega) @ R2(phi)
 
 
-def phi_omega_kappa_from_matrix(M: Float[Array, "3 3"]) -> Float[Array, "3"]:
+def phi_omega_kappa_from_matrix(M: Float[AnyArray, "3 3"]) -> Float[Array, "3"]:
     """(φ, ω, κ) in radians, φ and κ in (−π, π], ω in [−π/2, π/2]; φ = 0 at ω = ±90°."""
     (m11, _, m13), (m21, _, m23), (m31, m32, m33) = M
     phi = _angle(m31, m33)
@@ -113,7 +117,7 @@ def phi_omega_kappa_from_matrix(M: Float[Array, "3 3"]) -> Float[Array, "3"]:
     return jnp.stack([phi, omega, kappa])
 
 
-def matrix_from_azimuth_tilt_swing(angles: Float[Array, "3"]) -> Float[Array, "3 3"]:
+def matrix_from_azimuth_tilt_swing(angles: Float[AnyArray, "3"]) -> Float[Array, "3 3"]:
     """M = R3(s − π)·R1(t)·R3(−α) of (α, t, s) in radians (Wolf and Dewitt, 2000, appendix C).
 
     The azimuth α of the principal plane counts clockwise from +Y, the tilt t is the angle between
@@ -127,7 +131,7 @@ def matrix_from_azimuth_tilt_swing(angles: Float[Array, "3"]) -> Float[Array, "3
     return R3(swing - jnp.pi) @ R1(tilt) @ R3(-azimuth)
 
 
-def azimuth_tilt_swing_from_matrix(M: Float[Array, "3 3"]) -> Float[Array, "3"]:
+def azimuth_tilt_swing_from_matrix(M: Float[AnyArray, "3 3"]) -> Float[Array, "3"]:
     """(α, t, s) in radians, α and s in (−π, π], t in [0, π]; α = 0 for a vertical photograph."""
     (m11, m12, _), (m21, m22, _), (m31, m32, m33) = M
     azimuth = _angle(-m31, -m32)
@@ -137,7 +141,7 @@ def azimuth_tilt_swing_from_matrix(M: Float[Array, "3 3"]) -> Float[Array, "3"]:
     return jnp.stack([azimuth, tilt, swing])
 
 
-def matrix_from_rodrigues(p: Float[Array, "3"]) -> Float[Array, "3 3"]:
+def matrix_from_rodrigues(p: Float[AnyArray, "3"]) -> Float[Array, "3 3"]:
     """The Rodrigues matrix of (a, b, c) = 2n·tan(θ/2), without unit (Schut, 1959; Faig, 1984).
 
     M is the matrix of the quaternion (1, a/2, b/2, c/2), whose squared length is Δ:
@@ -147,7 +151,7 @@ def matrix_from_rodrigues(p: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return matrix_from_quaternion(jnp.concatenate([jnp.ones_like(p[:1]), p / 2]))
 
 
-def rodrigues_from_matrix(M: Float[Array, "3 3"]) -> Float[Array, "3"]:
+def rodrigues_from_matrix(M: Float[AnyArray, "3 3"]) -> Float[Array, "3"]:
     """Rodrigues' parameters (a, b, c) = 2n·tan(θ/2), without unit.
 
     Undefined, not finite or meaninglessly large, where M turns by 180°.
@@ -156,7 +160,7 @@ def rodrigues_from_matrix(M: Float[Array, "3 3"]) -> Float[Array, "3"]:
     return 2 * q[1:] / q[0]
 
 
-def _angle(sine: Array, cosine: Array) -> Array:
+def _angle(sine: Scalar, cosine: Scalar) -> Array:
     """arctan2, but constant zero where both arguments vanish: an angle lost at a lock."""
-    lost = sine**2 + cosine**2 < (8 * jnp.finfo(sine.dtype).eps) ** 2
+    lost = sine**2 + cosine**2 < (8 * jnp.finfo(jnp.result_type(sine)).eps) ** 2
     return jnp.where(lost, 0, jnp.arctan2(sine, jnp.where(lost, 1, cosine)))

@@ -22,6 +22,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
+from jaxbundle.types import AnyArray
+
 from .quaternions import (
     matrix_from_quaternion,
     matrix_from_rotation_vector,
@@ -34,13 +36,13 @@ from .quaternions import (
 
 
 @traced_once
-def transform_point(tau: Float[Array, "7"], X: Float[Array, "3"]) -> Float[Array, "3"]:
+def transform_point(tau: Float[AnyArray, "7"], X: Float[AnyArray, "3"]) -> Float[Array, "3"]:
     """X' = exp(s)·Rs·X + t, in the object unit."""
     return jnp.exp(tau[6]) * matrix_from_rotation_vector(tau[3:6]) @ X + tau[:3]
 
 
 def transform_pose(
-    tau: Float[Array, "7"], X0: Float[Array, "3"], q: Float[Array, "4"]
+    tau: Float[AnyArray, "7"], X0: Float[AnyArray, "3"], q: Float[AnyArray, "4"]
 ) -> tuple[Float[Array, "3"], Float[Array, "4"]]:
     """Projection centre (object unit) and camera rotation M(q) that move with the object.
 
@@ -51,13 +53,13 @@ def transform_pose(
     return transform_point(tau, X0), quaternion_multiply(q, quaternion_conjugate(rotation))
 
 
-def inverse(tau: Float[Array, "7"]) -> Float[Array, "7"]:
+def inverse(tau: Float[AnyArray, "7"]) -> Float[Array, "7"]:
     """The parameters of X = exp(−s)·Rsᵀ·(X' − t)."""
     turn_back = jnp.concatenate([jnp.zeros_like(tau[:3]), -tau[3:]])
     return jnp.concatenate([transform_point(turn_back, -tau[:3]), turn_back[3:]])
 
 
-def compose(outer: Float[Array, "7"], inner: Float[Array, "7"]) -> Float[Array, "7"]:
+def compose(outer: Float[AnyArray, "7"], inner: Float[AnyArray, "7"]) -> Float[Array, "7"]:
     """The parameters of `inner` followed by `outer`: X' = outer(inner(X))."""
     rotation = quaternion_multiply(
         quaternion_from_rotation_vector(outer[3:6]), quaternion_from_rotation_vector(inner[3:6])
@@ -71,13 +73,13 @@ def compose(outer: Float[Array, "7"], inner: Float[Array, "7"]) -> Float[Array, 
     )
 
 
-def displacement(tau: Float[Array, "7"], X: Float[Array, "3"]) -> Float[Array, "3"]:
+def displacement(tau: Float[AnyArray, "7"], X: Float[AnyArray, "3"]) -> Float[Array, "3"]:
     """How X moves, to first order: t + ω×X + s·X, in the object unit."""
-    return tau[:3] + jnp.cross(tau[3:6], X) + tau[6] * X
+    return jnp.asarray(tau[:3]) + jnp.cross(tau[3:6], X) + tau[6] * X
 
 
 @traced_once
-def helmert_point(X: Float[Array, "3"]) -> Float[Array, "3 7"]:
+def helmert_point(X: Float[AnyArray, "3"]) -> Float[Array, "3 7"]:
     """The rows of the Helmert matrix of a point, ∂X'/∂τ = [I, −[X]×, X] at τ = 0.
 
     Columns in the order of τ: per object unit, per radian, per unit of log scale.
@@ -85,7 +87,7 @@ def helmert_point(X: Float[Array, "3"]) -> Float[Array, "3 7"]:
     return jax.jacfwd(displacement)(jnp.zeros(7, X.dtype), X)
 
 
-def helmert_pose(X0: Float[Array, "3"], q: Float[Array, "4"]) -> Float[Array, "6 7"]:
+def helmert_pose(X0: Float[AnyArray, "3"], q: Float[AnyArray, "4"]) -> Float[Array, "6 7"]:
     """The rows of the Helmert matrix of a pose, ∂(δX0, δθ)/∂τ at τ = 0.
 
     δX0 in the object unit; δθ in radians in the camera frame, as in `retract_quaternion`: there a

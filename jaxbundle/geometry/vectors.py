@@ -6,11 +6,19 @@ a batch of products of 3×3 matrices costs several times more.
 """
 
 import jax.numpy as jnp
-from jax import Array
 from jaxtyping import Float
 
-Scalar = float | Float[Array, ""]
-Vector = tuple[Scalar, Scalar, Scalar]
+from jaxbundle.types import AnyArray, Scalar
+
+Triple = tuple[Scalar, Scalar, Scalar]
+Vector = Triple | Float[AnyArray, "3 ..."]
+"""What unpacks into three components; functions return a `Triple`."""
+
+
+def unpacked(v: Vector | tuple[Scalar, ...]) -> Triple:
+    """The three components, read once."""
+    x, y, z = v
+    return x, y, z
 
 
 def dot(u: Vector, v: Vector) -> Scalar:
@@ -18,22 +26,22 @@ def dot(u: Vector, v: Vector) -> Scalar:
     return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
 
 
-def cross(u: Vector, v: Vector) -> Vector:
+def cross(u: Vector, v: Vector) -> Triple:
     """u × v."""
     return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
 
 
-def along(o: Vector, d: Vector, s: Scalar) -> Vector:
+def along(o: Vector, d: Vector, s: Scalar) -> Triple:
     """o + s·d, the point of a ray."""
     return o[0] + s * d[0], o[1] + s * d[1], o[2] + s * d[2]
 
 
-def difference(u: Vector, v: Vector) -> Vector:
+def difference(u: Vector, v: Vector) -> Triple:
     """u − v."""
     return u[0] - v[0], u[1] - v[1], u[2] - v[2]
 
 
-def scaled(s: Scalar, v: Vector) -> Vector:
+def scaled(s: Scalar, v: Vector) -> Triple:
     """s·v."""
     return s * v[0], s * v[1], s * v[2]
 
@@ -43,16 +51,17 @@ def length(v: Vector) -> Scalar:
     return jnp.sqrt(dot(v, v))
 
 
-def unit(v: Vector) -> Vector:
+def unit(v: Vector) -> Triple:
     """v/|v|."""
     return scaled(1 / length(v), v)
 
 
-def turned(M: Float[Array, "3 3"], v: Vector) -> Vector:
+def turned(M: Float[AnyArray, "3 3"], v: Vector) -> Triple:
     """M·v."""
     return dot(M[0], v), dot(M[1], v), dot(M[2], v)
 
 
-def turned_back(M: Float[Array, "3 3"], v: Vector) -> Vector:
+def turned_back(M: Float[AnyArray, "3 3"], v: Vector) -> Triple:
     """Mᵀ·v."""
-    return tuple(M[0][k] * v[0] + M[1][k] * v[1] + M[2][k] * v[2] for k in range(3))
+    x, y, z = (M[0][k] * v[0] + M[1][k] * v[1] + M[2][k] * v[2] for k in range(3))
+    return x, y, z

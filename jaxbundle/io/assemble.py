@@ -27,7 +27,7 @@ from jaxbundle.network.tables import (
 )
 
 
-def foreign_document(name: str, cameras: Sequence[Mapping], **project) -> Document:
+def foreign_document(name: str, cameras: Iterable[Mapping], **project) -> Document:
     """What a project file would say of a network of another program: measured in pixels, free."""
     settings = {"name": name, "datum": "inner", "image_unit": "px", "residuals": "measured",
                 "object_unit": "model", "sigma_image": 1.0}  # fmt: skip

@@ -181,7 +181,7 @@ def write_bundler(network: Network, path: str | Path) -> tuple[str, ...]:
     if not numbered:
         if any(character.isspace() for id in images.id for character in id):
             raise InputError(f"{path.parent / LIST}: names of images cannot have blanks")
-    content = {path: lines}
+    content: dict[Path, Sequence[str]] = {path: lines}
     if not numbered or names.is_file():  # a list that is there would name the images
         content[names] = images.id
     with replaced_files(*content) as temporary:

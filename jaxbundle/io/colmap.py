@@ -58,11 +58,12 @@ def read_colmap_cameras(path: str | Path) -> tuple[Camera, ...]:
     """
     path = Path(path)
     read = read_binary_cameras if path.suffix.lower() == ".bin" else read_text_cameras
-    cameras = tuple(read(path).values())
-    for camera in cameras:
+    cameras = []
+    for camera in read(path).values():
         if isinstance(camera, NoPlaceError):
             raise camera
-    return cameras
+        cameras.append(camera)
+    return tuple(cameras)
 
 
 def write_colmap_cameras(cameras: Sequence[Camera], path: str | Path) -> None:

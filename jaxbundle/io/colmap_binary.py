@@ -17,8 +17,22 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.file_content import read_content
-from jaxbundle.io.colmap_model import ColmapImage, ColmapModel, check_unique, tracks
-from jaxbundle.io.colmap_models import MODELS, NAMES, camera_or_why_not, parameter_names, to_colmap
+from jaxbundle.io.colmap_model import (
+    ColmapImage,
+    ColmapModel,
+    check_unique,
+    model_of,
+    rows_of_points,
+    tracks,
+)
+from jaxbundle.io.colmap_models import (
+    MODELS,
+    NAMES,
+    camera_or_why_not,
+    parameter_names,
+    size_of,
+    to_colmap,
+)
 from jaxbundle.io.colmap_text import GREY
 from jaxbundle.io.nearest_camera import NoPlaceError
 from jaxbundle.network.tables import Camera, Source
@@ -85,7 +99,7 @@ def read_binary_model(folder: Path) -> ColmapModel:
     cameras = read_binary_cameras(folder / "cameras.bin")
     images = _images(folder / "images.bin")
     ids, points, source = _points(folder / "points3D.bin", {image.id for image in images})
-    return ColmapModel(cameras, images, ids, points, source)
+    return model_of(cameras, images, ids, points, source)
 
 
 def read_binary_cameras(path: Path) -> dict[int, Camera | NoPlaceError]:
@@ -154,8 +168,8 @@ def binary_files(model: ColmapModel) -> dict[str, bytes]:
     """The three binary files by name."""
     cameras = [struct.pack("<Q", len(model.cameras))]
     for number, camera in model.cameras.items():
-        name, values = to_colmap(camera)
-        head = struct.pack("<IiQQ", number, MODELS[name][0], *camera.image_size)
+        (name, values), (width, height) = to_colmap(camera), size_of(camera)
+        head = struct.pack("<IiQQ", number, MODELS[name][0], width, height)
         cameras.append(head + np.array(values, "<f8").tobytes())
     images = [struct.pack("<Q", len(model.images))]
     for image in model.images:
@@ -167,7 +181,7 @@ def binary_files(model: ColmapModel) -> dict[str, bytes]:
         ]  # fmt: skip
     points = [struct.pack("<Q", len(model.points))]
     of_point = tracks(model)
-    for id, position, error in zip(model.point_ids.tolist(), model.points, model.errors.tolist()):
+    for id, position, error in rows_of_points(model):
         track = np.array(of_point[id], "<u4")
         head = struct.pack("<Q3d3BdQ", id, *position, *GREY, error, len(track))
         points += [head, track.tobytes()]

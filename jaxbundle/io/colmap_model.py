@@ -7,7 +7,7 @@ whole pose in `images`; without them COLMAP makes trivial ones.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -47,15 +47,29 @@ class ColmapImage:
 class ColmapModel:
     """The contents of `cameras`, `images` and `points3D`; `errors` of points: only written.
 
-    For a camera that has no place here, `cameras` has the error that says why.
+    `no_place` says why of the cameras that have none here.
     """
 
-    cameras: dict[int, Camera | NoPlaceError]
+    cameras: dict[int, Camera]
     images: Sequence[ColmapImage]
     point_ids: Int[np.ndarray, " points"]
     points: Float[np.ndarray, "points 3"]
     points_source: Source
     errors: Float[np.ndarray, " points"] | None = None
+    no_place: Mapping[int, NoPlaceError] = dataclasses.field(default_factory=dict)
+
+
+def model_of(cameras: Mapping[int, Camera | NoPlaceError], *rest) -> ColmapModel:
+    """The contents of the three files, with what was read of the cameras."""
+    known = {k: c for k, c in cameras.items() if not isinstance(c, NoPlaceError)}
+    lost = {k: c for k, c in cameras.items() if isinstance(c, NoPlaceError)}
+    return ColmapModel(known, *rest, no_place=lost)
+
+
+def rows_of_points(model: ColmapModel) -> Iterator[tuple[int, np.ndarray, float]]:
+    """Number, coordinates and error of every point of a model to be written."""
+    assert model.errors is not None, "of a model to be written"
+    return zip(model.point_ids.tolist(), model.points, model.errors.tolist())
 
 
 def check_unique(ids: Sequence[int], place, thing: str) -> None:
@@ -78,7 +92,7 @@ def to_network(path: Path, model: ColmapModel, overrides: Sequence[str]) -> Netw
     if not images:
         raise InputError(f"{path}: the model has no images")
     for image in images:
-        if image.camera not in model.cameras:
+        if image.camera not in model.cameras and image.camera not in model.no_place:
             raise InputError(
                 f"{image.place}: image {image.name!r} has the camera {image.camera}, which is "
                 "not in cameras"
@@ -112,18 +126,15 @@ def to_network(path: Path, model: ColmapModel, overrides: Sequence[str]) -> Netw
 
 def _with_place(path: Path, model: ColmapModel) -> tuple[ColmapModel, list[str]]:
     """The model without cameras that have no place here and their images, and what to tell."""
-    cameras = {k: c for k, c in model.cameras.items() if not isinstance(c, NoPlaceError)}
-    images = [image for image in model.images if image.camera in cameras]
+    images = [image for image in model.images if image.camera in model.cameras]
     told = []
-    for number, error in model.cameras.items():
-        if number in cameras:
-            continue
+    for number, error in model.no_place.items():
         if not images:
             raise error
         lost = [image.name for image in model.images if image.camera == number]
         why = str(error).removeprefix(f"{path}/")
         told.append(f"{why}; left out {count(len(lost), 'image')}: {some(lost)}")
-    return dataclasses.replace(model, cameras=cameras, images=images), told
+    return dataclasses.replace(model, images=images), told
 
 
 def _entry(camera: Camera) -> dict:

@@ -174,6 +174,15 @@ def _rad_tan(p: dict, x, y):
     return xd, yd
 
 
+def size_of(camera: Camera) -> tuple[int, int]:
+    """The size of its images.
+
+    **Raises:** `InputError` without one."""
+    if camera.image_size is None:
+        raise InputError(f"camera {camera.id!r}: COLMAP needs the image size; give image_size")
+    return camera.image_size
+
+
 def to_colmap(camera: Camera) -> tuple[str, list[float]]:
     """The smallest of COLMAP's models that holds a camera exactly, and its parameters.
 
@@ -186,8 +195,7 @@ def to_colmap(camera: Camera) -> tuple[str, list[float]]:
         raise InputError(
             f"{where}: COLMAP has no model {str(camera.model)!r}; convert it with --model opencv"
         )
-    if camera.image_size is None:
-        raise InputError(f"{where}: COLMAP needs the image size; give image_size")
+    size_of(camera)
     p = all_parameters(camera)
     p["cx"], p["cy"] = p["cx"] + HALF, p["cy"] + HALF
     given = {name for name, value in p.items() if value != 0 or name in ("cx", "cy")}

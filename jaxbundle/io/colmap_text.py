@@ -14,8 +14,15 @@ from pathlib import Path
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.colmap_model import ColmapImage, ColmapModel, check_unique, tracks
-from jaxbundle.io.colmap_models import camera_or_why_not, parameter_names, to_colmap
+from jaxbundle.io.colmap_model import (
+    ColmapImage,
+    ColmapModel,
+    check_unique,
+    model_of,
+    rows_of_points,
+    tracks,
+)
+from jaxbundle.io.colmap_models import camera_or_why_not, parameter_names, size_of, to_colmap
 from jaxbundle.io.nearest_camera import NoPlaceError
 from jaxbundle.io.rows import Row, Rows
 from jaxbundle.network.tables import Camera, Source
@@ -29,7 +36,7 @@ def read_text_model(folder: Path) -> ColmapModel:
     cameras = read_text_cameras(folder / "cameras.txt")
     images = _images(folder / "images.txt")
     ids, points, source = _points(folder / "points3D.txt", {image.id for image in images})
-    return ColmapModel(cameras, images, ids, points, source)
+    return model_of(cameras, images, ids, points, source)
 
 
 def read_text_cameras(path: Path) -> dict[int, Camera | NoPlaceError]:
@@ -109,7 +116,7 @@ def text_files(model: ColmapModel) -> dict[str, bytes]:
         ))  # fmt: skip
     points = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"]
     of_point = tracks(model)
-    for id, position, error in zip(model.point_ids.tolist(), model.points, model.errors.tolist()):
+    for id, position, error in rows_of_points(model):
         track = " ".join(f"{image} {k}" for image, k in of_point[id])
         colour = " ".join(map(str, GREY))
         points.append(f"{id} {_join(position)} {colour} {error!r} {track}".rstrip())
@@ -122,8 +129,7 @@ def camera_lines(cameras: Mapping[int, Camera]) -> list[str]:
     """The lines of a cameras.txt."""
     lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     for number, camera in cameras.items():
-        name, values = to_colmap(camera)
-        width, height = camera.image_size
+        (name, values), (width, height) = to_colmap(camera), size_of(camera)
         lines.append(f"{number} {name} {width} {height} {_join(values)}")
     return lines
 

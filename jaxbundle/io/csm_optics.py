@@ -43,8 +43,8 @@ def optics_of(
         model = get_model("usgs")
         given = {"c": f, **{f"K{k}": value for k, value in enumerate(K)}}
         parameters = jnp.asarray([given.get(name, 0.0) for name in model.parameters])
-        place = (jnp.asarray(v) for v in (pitch, -X[0] / pitch, Y[0]))
-        return FocalLine(parameters, *place, "usgs"), frame.turn
+        pitch, middle, row = (jnp.asarray(v) for v in (pitch, -X[0] / pitch, Y[0]))
+        return FocalLine(parameters, pitch, middle, row, "usgs"), frame.turn
     psi = np.arctan(frame.slopes(*undistorted) / f)
     return AngleTable(*map(jnp.asarray, psi)), frame.turn
 

@@ -15,6 +15,7 @@
 The attitude contains aberration and light time: no correction is set.
 """
 
+import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -52,7 +53,7 @@ def read_dimap2(file: XmlFields) -> Scanner:
     lines, pixels = int(lines), int(pixels)
     epoch = file.time(f"{MODEL}/Time/Time_Range/START")
     period = _period(file, lines, epoch)
-    times = LineTimes(np.zeros(()), np.asarray(period))
+    times = LineTimes(jnp.zeros(()), jnp.asarray(period))
     points = f"{MODEL}/Ephemeris/Point_List/Point"
     t = file.times(points, epoch)
     P = np.array([_triple(file, e, k) for k, e in enumerate(file.elements(points), 1)])

@@ -30,10 +30,11 @@ def write_dxf(network: Network, path: str | Path) -> tuple[str, ...]:
     """
     try:
         import ezdxf
+        import ezdxf.filemanagement
     except ImportError:
         raise InputError("DXF needs ezdxf: pip install 'jaxbundle[files]'") from None
     need_values(network, points=False)
-    drawing = ezdxf.new("R2010")
+    drawing = ezdxf.filemanagement.new("R2010")
     for role in ROLES:
         drawing.layers.add(f"POINTS_{role.upper()}", color=COLOURS[role])
     for layer in ("POINT_NAMES", "CAMERAS", "CAMERA_NAMES"):

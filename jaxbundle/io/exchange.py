@@ -95,7 +95,8 @@ def convert(
     input, output = Path(given_path("input", input)), Path(given_path("output", output))
     kind = _kind(output, to)
     _check_output(output, kind)
-    model, models = key_of(model), check_own_models(models)
+    model = None if model is None else key_of(model)
+    models = check_own_models(models)
     if format in (None, *CAMERA_KINDS) and is_camera_file(input):
         _keep_camera_file(input, output)
         _keep_others(output, kind, force)

@@ -43,7 +43,9 @@ class Extent(NamedTuple):
 def image_extent(image: PushbroomImage, earth: Ellipsoid) -> Extent | None:
     """What an image can see; None if it sees the horizon or the pole."""
     lines, pixels = (np.linspace(0, n - 1, PLACES) for n in (image.lines, image.pixels))
-    low, high = (np.asarray(_locate(image, Height(h, earth), lines, pixels)) for h in HEIGHTS)
+    low, high = (
+        np.asarray(_locate(image, Height(level=h, earth=earth), lines, pixels)) for h in HEIGHTS
+    )
     if not np.isfinite(low).all():
         return None
     # a camera below the highest height sees from where it is

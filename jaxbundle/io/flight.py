@@ -99,7 +99,7 @@ def read_flight(path: str | Path) -> FlightFile:
         scanner.whole("lines"), pixels, period, optics_of(file, pixels), _track(file, earth),
         {k: _signal(v, file.radians, f"{path}, [angles], {k}: ")
          for k, v in file.section("angles").values.items()},
-        tuple(mounting_of(file)), noise=_noise(file),
+        mounting_of(file), noise=_noise(file),
         seed=int(file.section("simulation").number("seed", 0)), **options,
     )  # fmt: skip
     return FlightFile(file, flight, earth)

@@ -67,7 +67,7 @@ def check_folder(
     real = Path(os.path.realpath(folder))
     recover(folder)
     marker = read_marker(real)
-    for path in map(Path, map(os.path.realpath, inputs)):
+    for path in (Path(os.path.realpath(file)) for file in inputs):
         name = path.relative_to(real).as_posix() if path.is_relative_to(real) else ""
         known = marker is not None and name in marker.files
         if known or any(fnmatch.fnmatchcase(name, pattern) for pattern in names):

@@ -74,7 +74,8 @@ def _bilinear(values, row, column):
 
 def _of_proj(name, longitude, latitude):
     try:
-        import pyproj
+        import pyproj.datadir
+        import pyproj.exceptions
     except ImportError:
         raise InputError("PROJ's grids need pyproj: pip install 'jaxbundle[geo]'") from None
     try:
@@ -83,9 +84,11 @@ def _of_proj(name, longitude, latitude):
             f"+grids={name} +multiplier=1 +step +proj=unitconvert +xy_in=rad +xy_out=deg"
         )
     except pyproj.exceptions.ProjError:
+        # public by its documentation, though its stub does not say so
+        folder = pyproj.datadir.get_user_data_dir()  # pyright: ignore[reportPrivateImportUsage]
         raise InputError(
             f"--geoid {name}: there is no such file, and PROJ has no grid of this name (its folder "
-            f"is {pyproj.datadir.get_user_data_dir()}); give a raster of the geoid, or fetch the "
+            f"is {folder}); give a raster of the geoid, or fetch the "
             "grid with projsync"
         ) from None
     x, y = np.meshgrid(longitude, latitude)

@@ -73,9 +73,9 @@ class JsonLines:
         """Rewrite the file with the first line of each of these keys alone."""
         left, kept = set(keys), []
         for line in self._lines():
-            key = _row(line)["key"]
-            if key in left:
-                left.discard(key)
+            row = _row(line)
+            if row is not None and row["key"] in left:
+                left.discard(row["key"])
                 kept.append(line)
         write_bytes(self._file, kept)
 

@@ -17,11 +17,11 @@ def need_values(network: Network, model: str = "", format: str = "", points: boo
                 f"camera {camera.id!r}: {format} has no model {str(camera.model)!r}; convert it "
                 f"with --model {model}"
             )
-    tables = [(network.images, network.images.position, "image", "orientation"),
-              (network.images, network.images.angles, "image", "orientation")]  # fmt: skip
-    if points:
-        tables.append((network.points, network.points.position, "point", "coordinates"))
-    for table, values, thing, what in tables:
+    images, given = network.images, network.points
+    tables = [(images, images.position, "image", "orientation"),
+              (images, images.angles, "image", "orientation"),
+              (given, given.position, "point", "coordinates")]  # fmt: skip
+    for table, values, thing, what in tables[: 3 if points else 2]:
         for row, *_ in np.argwhere(~np.isfinite(values))[:1]:
             raise InputError(
                 f"{table.source(row)}: {thing} {table.id[row]!r} has no {what} to be written"

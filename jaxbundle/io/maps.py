@@ -107,7 +107,7 @@ def contiguous(system: MapSystem, x: Float[np.ndarray, "r c"]) -> Float[np.ndarr
     if not len(seen):
         return x
     middle = x.ravel()[seen[np.abs(seen - x.size // 2).argmin()]]
-    x = system.around(x, middle)
+    x = system.around(x, float(middle))
     if system.transformer and system.turn is None:
         steps = [np.abs(np.diff(x, axis=axis)).ravel() for axis in (0, 1)]
         longest = np.nanmax(np.concatenate([np.zeros(1), *steps]))
@@ -139,7 +139,7 @@ def grid_around(x: np.ndarray, y: np.ndarray, size: float, most: float = np.inf)
 def _transformer(crs):
     """From degrees to a system, and what x gains in a turn there."""
     try:
-        import pyproj
+        import pyproj.exceptions
     except ImportError:
         raise InputError("coordinate systems need pyproj: pip install 'jaxbundle[geo]'") from None
     try:

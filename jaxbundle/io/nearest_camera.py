@@ -112,11 +112,13 @@ def nearest_camera(camera: Foreign, where: str) -> tuple[dict, str]:
     if not found or not np.isfinite(min(found, key=lambda one: one[0])[0]):
         raise NoPlaceError(f"{where}: none of our models comes near it; {problem}")
     largest, rms, target, values = min(found, key=lambda one: one[0])
-    entry = {"model": target.name, **values}
+    entry: dict[str, Any] = {"model": target.name, **values}
     told = f"fitted as {target.name}, largest difference {largest:.2g} px, RMS {rms:.2g} px"
     if there.mean() < 1:
         told += f"; {100 * (1 - there.mean()):.1f} % of the image has no ray"
-    return entry | ({"pixel_size": list(camera.pixel_size)} if target.unit == "mm" else {}), told
+    if target.unit == "mm" and camera.pixel_size is not None:
+        entry["pixel_size"] = list(camera.pixel_size)
+    return entry, told
 
 
 @dataclasses.dataclass(frozen=True)

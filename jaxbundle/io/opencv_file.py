@@ -118,7 +118,7 @@ def _fitted(path: Path, camera: Camera, skew: float, tilt: Sequence[float]) -> F
     parameters = {"camera": p, "skew": skew, "H": _tilted(*tilt) if tilt else np.eye(3)}
     has = [f"skew {skew:g}"] if skew else []
     has += [f"tilt τx {tilt[0]:g}, τy {tilt[1]:g}"] if any(tilt) else []
-    foreign = Foreign(FORMULAS[camera.model], parameters, p, camera.image_size,
+    foreign = Foreign(FORMULAS[str(camera.model)], parameters, p, camera.image_size,
                       fisheye=camera.model == "kannala-brandt")  # fmt: skip
     return fitted_camera(camera.id, foreign, str(path), f"has {' and '.join(has)}")
 
@@ -206,7 +206,7 @@ def _from_json(path: Path, text: str) -> dict[str, Any]:
 def _from_yaml(path: Path, text: str) -> dict[str, Any]:
     """Entries of the first two levels: words, numbers, and lists of numbers."""
     entries: dict[str, Any] = {}
-    top, lines = None, iter(enumerate(text.splitlines(), 1))
+    top, lines = "", iter(enumerate(text.splitlines(), 1))
     for number, line in lines:
         if outer := _TOP.fullmatch(line.rstrip()):
             top, value = outer.groups()
@@ -252,7 +252,8 @@ def _matrix(path: Path, entries: Mapping, names, shape):
     if isinstance(value, Mapping):
         given = tuple(_whole(value.get(key)) for key in ("rows", "cols"))
         data = value.get("data")
-        if None in given or not isinstance(data, list) or len(data) != given[0] * given[1]:
+        whole = [n for n in given if n is not None]
+        if len(whole) < 2 or not isinstance(data, list) or len(data) != whole[0] * whole[1]:
             size = len(data) if isinstance(data, list) else "no"
             raise InputError(
                 f"{path}: {name} has {size} numbers for {shown(value.get('rows'))} rows and "
@@ -283,17 +284,17 @@ def _coefficients(path: Path, entries: Mapping) -> list[float]:
     return values
 
 
-def _image_size(path: Path, entries: Mapping):
+def _image_size(path: Path, entries: Mapping) -> tuple[int, int] | None:
     given = [entries.get(name) for name in ("image_width", "image_height")]
     if given == [None, None]:
         size = entries.get("image_size", entries.get("image_Size"))
         if size is None:
             return None
         given = size if isinstance(size, list) and len(size) == 2 else [None, None]
-    size = tuple(_whole(x) for x in given)
-    if None in size:
+    width, height = (_whole(x) for x in given)
+    if width is None or height is None:
         raise InputError(f"{path}: the image size is {shown(given)}; two whole numbers expected")
-    return size
+    return width, height
 
 
 def _whole(value) -> int | None:

@@ -38,8 +38,9 @@ def photo_camera(row: Row, header: tuple[Inner, Inner] | None) -> tuple[Inner, I
     """The camera of a photograph (number, then ten values), and half a unit of its last decimals:
     the header's if it is the same."""
     own, half = row.numbers(INNER, 1), _half_units(row.words[1:])
-    same = header is not None and (abs(header[0] - own) <= (1 + 1e-9) * half).all()
-    return header if same else (own, half)
+    if header is not None and (abs(header[0] - own) <= (1 + 1e-9) * half).all():
+        return header
+    return own, half
 
 
 def _half_units(words: Sequence[str]) -> Inner:

@@ -104,7 +104,7 @@ def point_table(path: Path, control: Block, objects: Block, marked: list[str]) -
     other = [k for k, id in enumerate(objects.id) if id not in taken]
     known = taken | set(objects.id)
     lost = [id for id in dict.fromkeys(marked) if id not in known]
-    weighted = (control.values[:, 3:] > 0).all(1)
+    weighted = np.all(control.values[:, 3:] > 0, axis=1)
     rest = np.full((len(other) + len(lost), 3), np.nan)
     position = np.concatenate(
         [control.values[:, :3], objects.values[other, :3], rest[len(other) :]]

@@ -28,7 +28,7 @@ def write_ply(network: Network, path: str | Path) -> tuple[str, ...]:
     **Returns:** what is lost, in words.
     """
     need_values(network, points=False)
-    known = np.isfinite(network.points.position).all(1)
+    known = np.all(np.isfinite(network.points.position), axis=1)
     corners, edges = pyramids(network)
     vertices = np.zeros(known.sum() + 5 * len(corners), VERTEX)
     first = int(known.sum())

@@ -33,6 +33,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -130,12 +131,12 @@ def _read_document(path: Path) -> Document:
 def _read_table(document: Document, table: str, path: Path) -> Columns | None:
     """A table from its CSV file or from the document itself; None where it is not needed and not
     given."""
-    inline, file = document.get(INLINE.get(table)), document["project"].get(table)
-    if inline is not None and file is not None:
-        raise InputError(f"{path}: give either {table} = {file!r} or [[{INLINE[table]}]], not both")
-    if inline is not None:
-        columns = as_columns(inline, table)
-        return Columns(columns.values, Source(f"{path} [[{INLINE[table]}]]", None, "entry"))
+    key, file = INLINE.get(table), document["project"].get(table)
+    if key is not None and document.get(key) is not None:
+        if file is not None:
+            raise InputError(f"{path}: give either {table} = {file!r} or [[{key}]], not both")
+        columns = as_columns(document[key], table)
+        return Columns(columns.values, Source(f"{path} [[{key}]]", None, "entry"))
     if file is None:
         if table not in NEEDED:
             return None
@@ -260,7 +261,7 @@ def _of_own(camera: Camera) -> Sequence[str]:
 
 
 def _camera_entry(camera: Camera) -> dict:
-    entry = {"id": camera.id, "model": str(camera.model)}
+    entry: dict[str, Any] = {"id": camera.id, "model": str(camera.model)}
     for name in ("image_size", "pixel_size"):
         if getattr(camera, name) is not None:
             entry[name] = getattr(camera, name)

@@ -18,6 +18,9 @@ def rasterio():
     """The package, or an error that names the extra."""
     try:
         import rasterio
+        import rasterio.enums
+        import rasterio.errors
+        import rasterio.transform
     except ImportError:
         raise InputError("rasters need rasterio: pip install 'jaxbundle[geo]'") from None
     return rasterio
@@ -101,13 +104,11 @@ def _terrain(source, earth, path, extent):
     else:
         heights, first = _cut(source, path, extent)
     unit = 1.0 if earth is None else np.pi / 180
-    centre = transform.c + (first[1] + 0.5) * step[0], transform.f + (first[0] + 0.5) * step[1]
+    x, y = transform.c + (first[1] + 0.5) * step[0], transform.f + (first[0] + 0.5) * step[1]
     if not np.isfinite(heights).any():
         there = "" if extent is None else f" where the image looks, {extent}"
         raise InputError(f"{path}: no height{there}; give a model that covers the image")
-    return make_terrain(
-        heights, [unit * v for v in centre], [unit * v for v in step], earth
-    )  # fmt: skip
+    return make_terrain(heights, (unit * x, unit * y), (unit * step[0], unit * step[1]), earth)
 
 
 def _cut(source, path, extent):

@@ -180,7 +180,7 @@ def _epoch(file: TomlFile) -> str:
 
 def _options(section: Section, method: str) -> dict[str, Any]:
     """Interpolation, order, gap, extrapolation."""
-    options = {"method": section.text("interpolation", method)}
+    options: dict[str, Any] = {"method": section.text("interpolation", method)}
     if "order" in section:
         options["order"] = int(section.number("order"))
     if "gap" in section:
@@ -195,10 +195,11 @@ def _options(section: Section, method: str) -> dict[str, Any]:
     return options
 
 
-def mounting_of(file: TomlFile) -> list[float]:
+def mounting_of(file: TomlFile) -> tuple[float, float, float]:
     """Pitch, roll, yaw of the mounting in radians."""
     section = file.section("mounting")
-    return [file.radians * section.number(name, 0.0) for name in ANGLES]
+    pitch, roll, yaw = (file.radians * section.number(name, 0.0) for name in ANGLES)
+    return pitch, roll, yaw
 
 
 def earth_of(scanner: Section) -> Ellipsoid | None:
@@ -286,14 +287,15 @@ def _orbit(
         lines = section.values["tle"]
         if not (isinstance(lines, list) and len(lines) == 2):
             raise InputError(f"{section.where}tle: a list of the two lines is expected")
-        P, V = frames.two_line_orbit(*lines, _epoch(file), t, _orientation(file))
+        first, second = lines
+        P, V = frames.two_line_orbit(first, second, _epoch(file), t, _orientation(file))
     elif kind == "state":
         frame = _frame(section, earth, frames.FRAMES)
         at = section.number("at", 0.0)
         state = section.numbers("state", 6)[None]
         P, V = state[:, :3], state[:, 3:]
         if frame != "ITRF":
-            R = frames.to_earth(frame, _epoch(file), [at], _orientation(file))
+            R = frames.to_earth(frame, _epoch(file), np.array([at]), _orientation(file))
             P, V = frames.turn_positions(R, P, V, _orientation(file))
         try:
             P, V = state_orbit(t, P[0], V[0], at, section.switch("j2") or "j2" not in section)

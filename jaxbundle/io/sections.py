@@ -72,7 +72,7 @@ class Section:
     def __contains__(self, key: str) -> bool:
         return key in self.values
 
-    def _given(self, key, default, expected, kinds):
+    def _given(self, key, default, expected, kinds) -> Any:
         value = self.values.get(key, default)
         if value is None:
             raise InputError(f"{self.where}{key} is missing; {expected} is expected")
@@ -120,6 +120,8 @@ class Section:
     def table(self) -> Columns:
         """The CSV table of a name, beside the file."""
         name = self.text("table")
+        if self.file is None:
+            raise InputError(f"{self.where}table = {name!r}: not in a file")
         path = self.file.path.parent / name
         if not os.path.isfile(path):
             raise InputError(f"{self.where}table = {name!r}: no such file {path}")

@@ -119,13 +119,14 @@ def number_in(text: str, where: str) -> float:
 
 def time_in(text: str, where: str) -> np.datetime64:
     """A time of a text, to the nanosecond."""
-    match = TIME.fullmatch(text.strip())
     try:
-        return np.datetime64("T".join(match.groups()), "ns")
-    except (ValueError, AttributeError):
-        raise InputError(
-            f"{where} is {shown(text)}; a time such as 2008-03-04T12:31:03.081912 is expected"
-        ) from None
+        if match := TIME.fullmatch(text.strip()):
+            return np.datetime64("T".join(match.groups()), "ns")
+    except ValueError:  # a 13th month
+        pass
+    raise InputError(
+        f"{where} is {shown(text)}; a time such as 2008-03-04T12:31:03.081912 is expected"
+    )
 
 
 def seconds(time: np.datetime64, epoch: np.datetime64) -> float:

@@ -271,8 +271,9 @@ def choose_eliminated(tables: Sequence[Table], observations: Sequence[Observatio
     twice = {t for given in observations for t in given.kind.of if given.kind.of.count(t) > 1}
     size = {t.name: int(t.free.sum()) for t in tables if t.name not in twice}
     total = sum(int(t.free.sum()) for t in tables)
-    largest = max(size, key=size.get, default=None)
-    return largest if total >= FEW and size.get(largest, 0) > total / 4 else None
+    largest = max(size, key=size.__getitem__, default=None)
+    worth = largest is not None and total >= FEW and size[largest] > total / 4
+    return largest if worth else None
 
 
 def _motions(tables, datum, motions):

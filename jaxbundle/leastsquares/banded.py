@@ -23,6 +23,7 @@ from jaxtyping import Array, Float
 from jaxbundle.leastsquares.normal import Tangent
 from jaxbundle.leastsquares.plan import Plan
 from jaxbundle.leastsquares.reduced import Reduced, blocks_of, cholesky_of_lower, flat, split
+from jaxbundle.types import present
 
 
 class BandFactor(eqx.Module):
@@ -95,7 +96,8 @@ class BandFactor(eqx.Module):
 def factorise_band(plan: Plan, S: Reduced) -> BandFactor:
     """The factor of a banded S; NaN where it is not positive definite."""
     g, others = _groups(plan)
-    place, width, blocks = plan.band.place, plan.band.width, plan.band.blocks
+    band = present(plan.band)
+    place, width, blocks = band.place, band.width, band.blocks
     w = plan.groups[g].width
     m = width * w
     both = jnp.zeros((2, blocks, width, width, w, w))
@@ -129,25 +131,28 @@ def factorise_band(plan: Plan, S: Reduced) -> BandFactor:
 
 def _groups(plan: Plan) -> tuple[str, tuple[str, ...]]:
     """The group of the band, and those of the border."""
-    return plan.band.group, tuple(g for g in plan.kept if g != plan.band.group)
+    group = present(plan.band).group
+    return group, tuple(g for g in plan.kept if g != group)
 
 
 def _into_band(plan: Plan, rows: Float[Array, "rows w *q"]) -> Float[Array, "blocks m *q"]:
     """Rows of the group at their places in the band; zero where it is filled."""
-    band, (_, w, *q) = plan.band, rows.shape
+    band, (_, w, *q) = present(plan.band), rows.shape
     whole = jnp.zeros((band.blocks * band.width, w, *q)).at[band.place].set(rows)
     return whole.reshape(band.blocks, band.width * w, *q)
 
 
 def _from_band(plan: Plan, x: Float[Array, "blocks m *q"]) -> Float[Array, "rows w *q"]:
-    band, w = plan.band, plan.groups[plan.band.group].width
+    band = present(plan.band)
+    w = plan.groups[band.group].width
     return x.reshape(band.blocks * band.width, w, *x.shape[2:])[band.place]
 
 
 def _blocks(plan: Plan, D, E, row, column) -> Float[Array, "blocks w w"]:
     """The blocks of two rows each, from the blocks on (D) and above (E) the diagonal."""
-    w, width = plan.groups[plan.band.group].width, plan.band.width
-    a, b = plan.band.place[row], plan.band.place[column]
+    band = present(plan.band)
+    w, width = plan.groups[band.group].width, band.width
+    a, b = band.place[row], band.place[column]
     low, high = jnp.minimum(a, b), jnp.maximum(a, b)
     both, here = jnp.stack([D, E]).reshape(2, -1, width, w, width, w), low // width
     found = both[high // width - here, here, low % width, :, high % width]

@@ -80,8 +80,8 @@ def stock_problem(problem: Problem):
 def values_of(problem: Problem, y) -> Values:
     """The tables that belong to a result y of the stock solver."""
     values = _values(problem, pad_data(problem, problem.data), _scale(problem), y[0])
-    spaces = _charted(problem.declared).spaces
-    return without_filling(problem, {n: jax.vmap(spaces[n].value)(*v) for n, v in values.items()})
+    charts = {name: Chart(space) for name, space in problem.declared.named_spaces}
+    return without_filling(problem, {n: jax.vmap(charts[n].value)(*v) for n, v in values.items()})
 
 
 def _charted(declared: Declared) -> Declared:

@@ -16,6 +16,7 @@ from jaxbundle.leastsquares.problem import Problem, pad_data, pad_values, withou
 from jaxbundle.leastsquares.retraction import changes_of_tables
 from jaxbundle.leastsquares.rows import Data, Values, lay_out_data
 from jaxbundle.leastsquares.solution import Solution
+from jaxbundle.types import present
 
 STEPS = 20
 
@@ -29,7 +30,7 @@ def determine(
     **Arguments:** `problem`: with the kept tables of the solution's problem, at their adjusted
     values and as free as they are there.
     """
-    plan, e = problem.plan, problem.plan.eliminated
+    plan, e = problem.plan, present(problem.plan.eliminated)
     data = pad_data(problem, problem.data)
     values, inverse, spread = _intersect(problem.declared, plan, data)
     number, cofactors = problem.table(e).rows, []
@@ -61,7 +62,7 @@ def _by_row(at, W):
 
 @eqx.filter_jit
 def _intersect(declared, plan, data: Data):
-    laid, e = lay_out_data(plan, data), plan.eliminated
+    laid, e = lay_out_data(plan, data), present(plan.eliminated)
     group = plan.groups[e]
     held = (1.0 - group.free)[:, :, None] * jnp.eye(group.width)
     space = declared.spaces[e]

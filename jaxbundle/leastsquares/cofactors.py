@@ -26,6 +26,7 @@ from jaxbundle.leastsquares.normal import Tangent
 from jaxbundle.leastsquares.plan import Plan
 from jaxbundle.leastsquares.reduced import Reduced
 from jaxbundle.leastsquares.rows import Declared, Values
+from jaxbundle.types import present
 
 
 class Cofactors(eqx.Module):
@@ -51,7 +52,7 @@ def cofactors(declared: Declared, values: Values, factor: Factor) -> Cofactors:
     eliminated, coupled = None, {}
     own = dict(Q.own)
     if plan.eliminated is not None:
-        K, L = _couplings(factor, Q), factor.lower_inverse
+        K, L = _couplings(factor, Q), present(factor.lower_inverse)
         inner = jnp.broadcast_to(jnp.eye(L.shape[1]), L.shape)
         for g, k in K.items():
             at = plan.incidences[g].eliminated.ravel()
@@ -103,7 +104,7 @@ def _spread(pairs, a, b, Q, to_first, to_second, within: bool):
 
     totals = over_pairs(pairs, add, totals)
     # What stands for nothing has collected what the fillings of chunks have in common.
-    return (totals[0], totals[0]) if within else totals
+    return totals[0], totals[0 if within else 1]
 
 
 def _in_datum(declared, values, factor, own):
@@ -135,10 +136,13 @@ def blocks_of_tables(declared: Declared, plan: Plan, own, values: Values):
     return found
 
 
-def propagate(declared: Declared, values: Values, factor: Factor, rows: Tangent):
+def propagate(
+    declared: Declared, values: Values, factor: Factor, rows: Tangent
+) -> Float[Array, "f f"]:
     """F·Q·Fᵀ in the datum for any linear functions F of the unknowns (first axis of `rows`): one
     structured solve for each function."""
     plan = factor.plan
     from_datum = jax.vmap(lambda r: s_transform_transposed(declared, plan, values, r))(rows)
     solved = jax.vmap(lambda r: solve(factor, r))(from_datum)
-    return sum(jnp.einsum("fni,gni->fg", from_datum[g], solved[g]) for g in from_datum)
+    products = (jnp.einsum("fni,gni->fg", from_datum[g], solved[g]) for g in from_datum)
+    return sum(products, jnp.zeros(()))

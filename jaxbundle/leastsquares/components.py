@@ -64,7 +64,8 @@ class Component:
     @property
     def estimated(self) -> tuple[float, float]:
         """The smallest and the largest σ of the group as they are estimated."""
-        return tuple(self.sigma * sigma for sigma in self.given)
+        smallest, largest = self.given
+        return self.sigma * smallest, self.sigma * largest
 
     @property
     def usable(self) -> bool:

@@ -19,6 +19,9 @@ from jaxbundle.arguments import numeric_array
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Space, Vector
 
+OF_THE_VALUES: Any = None
+"""Stands for a space until a table is made: the one that its values suggest."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Table:
@@ -38,7 +41,7 @@ class Table:
 
     name: str
     value: PyTree[np.ndarray]
-    space: Space | None = None
+    space: Space = OF_THE_VALUES
     free: Any = None
     labels: Sequence[str] | None = None
     parameters: tuple[str, ...] = ()
@@ -61,7 +64,7 @@ class Table:
                     f"table {self.name!r}: values of this shape need a space, such as Pose()"
                 )
             object.__setattr__(self, "space", Vector(shape[1] if len(shape) == 2 else 0))
-        free = True if self.free is None else self.free
+        shape, free = np.shape(self.free), True if self.free is None else self.free
         free = numeric_array(f"table {self.name!r}: `free`", free, "truth values", truths=True)
         try:
             free = free if np.ndim(free) != 1 else np.asarray(free)[:, None]
@@ -69,7 +72,7 @@ class Table:
         except ValueError:
             raise InputError(
                 f"table {self.name!r}: `free` must be [rows, {self.space.width}] or [rows], not "
-                f"{list(np.shape(self.free))}"
+                f"{list(shape)}"
             ) from None
         object.__setattr__(self, "free", free)
         object.__setattr__(self, "title", self.title or self.name)
@@ -214,7 +217,7 @@ class Observations:
         """The weights for so many residuals of an observation."""
         if self.covariance is not None:
             return _whitening(self.kind.name, self.covariance, self.number, residuals)
-        sigma = 1.0 if self.sigma is None else self.sigma
+        shape, sigma = np.shape(self.sigma), 1.0 if self.sigma is None else self.sigma
         sigma = numeric_array(f"{self.kind.name}: sigma", sigma, "positive numbers").astype(float)
         sigma = sigma[:, None] if sigma.ndim == 1 else sigma
         try:
@@ -222,7 +225,7 @@ class Observations:
         except ValueError:
             raise InputError(
                 f"{self.kind.name}: sigma must be one number, [{self.number}] or "
-                f"[{self.number}, {residuals}], not {list(np.shape(self.sigma))}"
+                f"[{self.number}, {residuals}], not {list(shape)}"
             ) from None
         bad = ~(sigma > 0)
         if bad.any():

@@ -4,9 +4,11 @@ Found once at the start values, on the host, from one compiled survey of how eve
 what its motions change.
 """
 
+from functools import reduce
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -18,6 +20,7 @@ from jaxbundle.leastsquares.linearise import differentiate
 from jaxbundle.leastsquares.normal import Tangent
 from jaxbundle.leastsquares.plan import Datum, Plan
 from jaxbundle.leastsquares.rows import Data, Declared, lay_out_data, prepare
+from jaxbundle.types import present
 
 HERE = "table"
 """The name of a table that is looked at alone."""
@@ -54,10 +57,10 @@ def survey_motions(
     declared: Declared, plan: Plan, data: Data, real: dict[str, Bool[np.ndarray, " rows"]]
 ) -> Survey:
     """See `Survey`; `real`: by table, which of its rows are not filled in."""
-    moves = {}
+    moves, given = {}, present(declared.motions)
     for name, value in data.start.items():
-        action = tuple((HERE, act) for table, act in declared.motions.actions if table == name)
-        motions = Motions(declared.motions.names, action)
+        action = tuple((HERE, act) for table, act in given.actions if table == name)
+        motions = Motions(given.names, action)
         one = Declared((), ((HERE, declared.spaces[name]),), motions)
         moves[name] = _generators(one, {HERE: value})[HERE]
     return _survey(declared, plan, data, real, moves)
@@ -70,7 +73,7 @@ _generators = eqx.filter_jit(generators)
 @eqx.filter_jit
 def _survey(declared, plan, data, real, moves) -> Survey:
     laid, prepared = lay_out_data(plan, data), prepare(declared, data.start)
-    motions = len(declared.motions.names)
+    motions = len(present(declared.motions).names)
     everywhere = {
         name: jnp.concatenate([
             moves[m.table] if m.rows is None else moves[m.table][m.rows] for m in group.members
@@ -85,9 +88,10 @@ def _survey(declared, plan, data, real, moves) -> Survey:
         blocks = [(J, everywhere[t.group][t.row, t.start : t.stop][:, None])
                   for t, J in zip(part.touches, touches)]  # fmt: skip
         if E is not None:
-            blocks.append((E, everywhere[plan.eliminated][part.eliminated]))
-        products.append(sum(J @ G for J, G in blocks).reshape(-1, motions))
-        terms.append(sum(abs(J) @ abs(G) for J, G in blocks).reshape(-1, motions))
+            blocks.append((E, everywhere[present(plan.eliminated)][part.eliminated]))
+        total = lambda rows: reduce(jnp.add, rows).reshape(-1, motions)
+        products.append(total([J @ G for J, G in blocks]))
+        terms.append(total([abs(J) @ abs(G) for J, G in blocks]))
     free = free_of_tables(plan, declared, data.start)
     held = [
         jnp.where((free[name] > 0)[..., None] | ~real[name][:, None, None], 0.0, rows)
@@ -145,7 +149,8 @@ def make_datum(
         }
     pins = _choose_pins(plan, along(survey.of_groups))
     held = {t: (1 - free[t]) * real[t][:, None] for t, rows in moves.items() if rows.any()}
-    return Datum(gauge, weight, pins, {t: mask for t, mask in held.items() if mask.any()})
+    held = {t: mask for t, mask in held.items() if mask.any()}
+    return Datum(*jax.device_put((gauge, weight, pins, held)))
 
 
 def _choose_pins(plan: Plan, G) -> dict[str, np.ndarray]:

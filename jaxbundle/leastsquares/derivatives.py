@@ -145,8 +145,8 @@ def linearise(
     laid = lay_out_data(plan, data)
     normal = Normal(plan, equations(declared, plan, values, laid)[-1])
     # Conjugate gradients do not mind that something is open.
-    open_ = plan.datum is not None and plan.reduction in FACTORS
-    pins, own = plan.datum.pins if open_ else {}, normal.diagonal()
+    datum = plan.datum if plan.reduction in FACTORS else None
+    pins, own = {} if datum is None else datum.pins, normal.diagonal()
     pins = {g: p * jnp.where(own[g] > 0, own[g], 1.0) for g, p in pins.items()}
     return Linearised(declared, plan, values, data, elimination.factorise(normal), pins)
 

@@ -24,6 +24,7 @@ from jaxbundle.leastsquares.iterative import ConjugateGradients, precondition
 from jaxbundle.leastsquares.normal import Normal, Tangent, agreed, gather, scatter, total
 from jaxbundle.leastsquares.plan import Pairs, Plan
 from jaxbundle.leastsquares.reduced import DenseFactor, Reduced, factorise_dense
+from jaxbundle.types import present
 
 EXACT = 1e-13
 """Relative residual of a reduced system solved by iteration, where it must be as good as exact."""
@@ -55,7 +56,7 @@ def damp(normal: Normal, damping: Float[Array, ""]) -> Normal:
     N, e = normal.blocks, normal.plan.eliminated
     more = {name: damping * d for name, d in matrices(N.metric).items()}
     own = {name: B + more[name] for name, B in N.own.items()}
-    eliminated = None if e is None else N.eliminated + more[e]
+    eliminated = None if e is None else present(N.eliminated) + more[e]
     return Normal(normal.plan, dataclasses.replace(N, own=own, eliminated=eliminated))
 
 
@@ -111,7 +112,7 @@ def eliminate(normal: Normal):
     if e is None:
         return Reduced(own, off), None, {}
     held = (1.0 - plan.groups[e].free)[:, :, None] * jnp.eye(plan.groups[e].width)
-    L = inverse_cholesky(N.eliminated + held)
+    L = inverse_cholesky(present(N.eliminated) + held)
     Z, less, less_off = {}, {}, {}
     for g, W in N.W.items():
         at = plan.incidences[g]

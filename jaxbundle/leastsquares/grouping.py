@@ -4,13 +4,15 @@ See `plan.py` for the words."""
 
 import dataclasses
 from collections.abc import Hashable, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int
 
 from jaxbundle.leastsquares.declarations import Observations, Table
-from jaxbundle.leastsquares.indices import Column, Index
+from jaxbundle.leastsquares.indices import as_column, as_index
 from jaxbundle.leastsquares.plan import Group, Member
+from jaxbundle.types import present
 
 
 @dataclasses.dataclass
@@ -18,10 +20,10 @@ class Choices:
     """What a plan may be free to choose (lengths of chunks, who shares a group): made once for a
     large problem, and again for every part of it."""
 
-    before: dict[Hashable, object]
-    made: dict[Hashable, object] = dataclasses.field(default_factory=dict)
+    before: dict[Hashable, Any]
+    made: dict[Hashable, Any] = dataclasses.field(default_factory=dict)
 
-    def __call__(self, *key, found):
+    def __call__(self, *key, found) -> Any:
         """What was found, or what was chosen before."""
         self.made[key] = self.before.get(key, found)
         return self.made[key]
@@ -76,7 +78,7 @@ class Grouping:
             slots = [s for s, name in enumerate(given.kind.of) if name == self.eliminate]
             slot_of = np.full(given.number, -1)
             for s in slots:
-                slot_of[~self.stays[given.rows[s]]] = s
+                slot_of[~present(self.stays)[given.rows[s]]] = s
             # Two rows of the table that are both held may meet: the last is called eliminated.
             for slot in self.choose("slots", o, found=np.unique(slot_of).tolist()):
                 rows = np.flatnonzero(slot_of == slot)
@@ -103,7 +105,7 @@ class Grouping:
                 self.group_of[name] = host, start, np.arange(table.rows)
         self.row_in, name = {}, self.eliminate
         if name is not None:
-            stays = self.stays
+            stays = present(self.stays)
             place = lambda mask: np.where(mask, np.cumsum(mask) - 1, -1)
             if stays.any():
                 kept = f"{name} (kept)"
@@ -142,11 +144,11 @@ class Grouping:
         for table, start, rows in self.members[name]:
             given = self.tables[table]
             free.append(given.free if rows is None else given.free[rows])
-            index = None if rows is None else Index(rows, ("group", name), ("table", table))
+            index = None if rows is None else as_index(rows, ("group", name), ("table", table))
             members.append(Member(table, start, given.space.width, index))
         free = np.concatenate(free, 1)
         all_free = self.choose("all free", name, found=bool(free.all()))
-        return Group(tuple(members), Column(free, ("group", name)), all_free)
+        return Group(tuple(members), as_column(free, ("group", name)), all_free)
 
     def touched_groups(self, share: Share, of):
         """The kept groups that a share touches, in order, with their slots and first columns; a

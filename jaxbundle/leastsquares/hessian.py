@@ -25,6 +25,7 @@ from jaxbundle.leastsquares.rows import (
     prepare,
     residual_of,
 )
+from jaxbundle.types import present
 
 
 def exact_equations(declared: Declared, plan: Plan, values: Values, laid: Laid):
@@ -54,12 +55,12 @@ class _HalfSquare:
     residual: Residual
     widths: tuple[int, ...]
 
-    def __call__(self, *row):
+    def __call__(self, blocks, measured, weight):
         ends = [sum(self.widths[:s]) for s in range(len(self.widths) + 1)]
 
         def half_square(x):
             changes = tuple(tuple(x[a:b]) for a, b in zip(ends, ends[1:]))
-            return 0.5 * sum(r * r for r in self.residual(*row, changes))
+            return 0.5 * sum(r * r for r in self.residual(blocks, measured, weight, changes))
 
         def gradient(x):
             cost, g = jax.value_and_grad(half_square)(x)
@@ -87,7 +88,7 @@ def _blocks(declared: Declared, plan: Plan, part, g, H):
     summed, right, eliminated, W = H.sum(1), g.sum(1), None, []
     if part.slot is not None:
         e = columns(((part.slot, 0),), 0, widths[part.slot])
-        own = e, plan.groups[plan.eliminated].free[part.eliminated]
+        own = e, plan.groups[present(plan.eliminated)].free[part.eliminated]
         flat = lambda x: x.reshape(-1, *x.shape[2:])
         beside = (g[..., e] * own[1])[..., None]
         eliminated = flat(jnp.concatenate([block(H, own, own), beside], -1))

@@ -11,6 +11,7 @@ Three rules serve all of them:
 
 import dataclasses
 from collections.abc import Callable, Hashable, Iterable
+from typing import Any
 
 import jax
 import numpy as np
@@ -36,6 +37,16 @@ class Column:
     rows: np.ndarray
     along: Hashable
     fill: float = 0.0
+
+
+def as_index(rows: np.ndarray, along: Hashable, into: Hashable, times: int = 1) -> Any:
+    """An `Index`, which stands in a plan for the array that `finish` makes of it."""
+    return Index(rows, along, into, times)
+
+
+def as_column(rows: np.ndarray, along: Hashable, fill: float = 0.0) -> Any:
+    """A `Column`, likewise."""
+    return Column(rows, along, fill)
 
 
 Sizes = dict[Hashable, int]

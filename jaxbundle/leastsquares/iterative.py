@@ -11,6 +11,8 @@ where every element of y is a change in units of its conditional σ, so that one
 A problem that may float is singular but consistent, which conjugate gradients do not mind.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -45,7 +47,8 @@ class ConjugateGradients(eqx.Module):
         right, tag = divided(b), lx.positive_semidefinite_tag
         product = lambda y: divided(self._times(back(y)))
         operator = lx.FunctionLinearOperator(product, jax.eval_shape(lambda: right), tag)
-        limit = jnp.maximum(self.tolerance * optx.two_norm(right), LEAST)
+        # lineax asks for a float, and takes an array
+        limit: Any = jnp.maximum(self.tolerance * optx.two_norm(right), LEAST)
         method = lx.CG(rtol=0.0, atol=limit, norm=optx.two_norm, max_steps=MOST_STEPS)
         return back(lx.linear_solve(operator, right, method, throw=False).value)
 

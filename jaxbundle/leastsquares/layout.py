@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Int
 
-from jaxbundle.leastsquares.indices import Index
+from jaxbundle.leastsquares.indices import as_index
 from jaxbundle.leastsquares.plan import Key, Pairs
 
 CHUNK_LENGTHS = (256, 64, 16)
@@ -68,9 +68,9 @@ def chunk_pairs(i, j, block, into, along, key: Key, lengths: tuple[int, ...]) ->
         valid = at < (start + left)[chunk][:, None]
         at = np.where(valid, at, 0)
         own = ("pairs", *key, length)
-        first.append(Index(np.where(valid, i[at], -1), own, *into[0]))
-        second.append(Index(np.where(valid, j[at], -1), own, *into[1]))
-        of.append(Index(blocks[chunk], own, along))
+        first.append(as_index(np.where(valid, i[at], -1), own, *into[0]))
+        second.append(as_index(np.where(valid, j[at], -1), own, *into[1]))
+        of.append(as_index(blocks[chunk], own, along))
         taken = np.minimum(number * length, left)
         start, left = start + taken, left - taken
     return Pairs(tuple(first), tuple(second), tuple(of))

@@ -56,9 +56,9 @@ def differentiate(declared: Declared, plan: Plan, number: int, prepared, laid: L
         if not group.all_free:
             J = J * group.free[touch.row, touch.start : touch.stop][:, None, None, :]
         touches.append(J)
-    E = None
-    if part.slot is not None:
-        E, group = block(((part.slot, 0),), 0, widths[part.slot]), plan.groups[plan.eliminated]
+    E, e = None, plan.eliminated
+    if e is not None and part.slot is not None:
+        E, group = block(((part.slot, 0),), 0, widths[part.slot]), plan.groups[e]
         if not group.all_free:
             E = E * group.free[part.eliminated][:, :, None, :]
     return jnp.stack(r, -1), tuple(touches), E

@@ -13,6 +13,7 @@ from jaxbundle.leastsquares.normal import Normal, normal_equations
 from jaxbundle.leastsquares.plan import Plan
 from jaxbundle.leastsquares.problem import Problem, pad_data, pad_values
 from jaxbundle.leastsquares.rows import Data, Declared, Values, lay_out_data
+from jaxbundle.types import present
 
 INDETERMINATE = 1e-12
 """Scaled eigenvalues of the normal matrix below this are rounding: nothing determines them."""
@@ -94,7 +95,7 @@ def _scaled(declared: Declared, plan: Plan, values: Values, data: Data):
 
 def _undetermined_rows(problem: Problem, V) -> list[str]:
     """Eliminated rows that are not determined even with everything else given."""
-    e = problem.plan.eliminated
+    e = present(problem.plan.eliminated)
     group, table = problem.plan.groups[e], problem.table(e)
     finite = np.isfinite(V).all((1, 2))
     V = np.where(finite[:, None, None], V, np.eye(V.shape[1]))

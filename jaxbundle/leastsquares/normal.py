@@ -7,21 +7,26 @@ They are filled either from the Jacobian (N = JᵀPJ, Gauss–Newton) or from se
 every observation (the exact Hessian, `hessian.py`); everything after that is the same.
 """
 
+from collections.abc import Mapping
 from functools import partial, reduce
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jaxbundle.leastsquares.damping import measure
 from jaxbundle.leastsquares.linearise import differentiate
 from jaxbundle.leastsquares.plan import Key, Part, Plan
 from jaxbundle.leastsquares.rows import Declared, Laid, Values, prepare
+from jaxbundle.types import AnyArray, present
 
 Tangent = dict[str, Float[Array, "rows width"]]
 """A small change of all groups, the eliminated rows among them."""
+Rows = Float[AnyArray, "rows width"]
+AnyTangent = Mapping[str, Rows]
 
 
 class NormalBlocks(eqx.Module):
@@ -55,14 +60,14 @@ class Normal(lx.AbstractLinearOperator):
     def diagonal(self) -> Tangent:
         """The diagonal of N."""
         N, e = self.blocks, self.plan.eliminated
-        blocks = N.own if e is None else N.own | {e: N.eliminated}
+        blocks = N.own if e is None else N.own | {e: present(N.eliminated)}
         return {g: jnp.diagonal(B, axis1=1, axis2=2) for g, B in blocks.items()}
 
     def as_matrix(self) -> Float[Array, "n n"]:
         """The dense matrix, groups in the order of their names; for small problems and tests."""
         zero = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), self.in_structure())
-        flat, unravel = jax.flatten_util.ravel_pytree(zero)
-        column = lambda e: jax.flatten_util.ravel_pytree(self.mv(unravel(e)))[0]
+        flat, unravel = ravel_pytree(zero)
+        column = lambda e: ravel_pytree(self.mv(unravel(e)))[0]
         return jax.vmap(column, out_axes=1)(jnp.eye(flat.size))
 
     def transpose(self) -> "Normal":
@@ -120,15 +125,15 @@ def gather(plan: Plan, W: dict[str, Array], h: Float[Array, "rows w"]) -> Tangen
     return total(plan, found)
 
 
-def scatter(plan: Plan, W: dict[str, Array], x: Tangent):
+def scatter(plan: Plan, W: dict[str, Array], x: Tangent) -> Float[Array, "..."]:
     """W·x."""
-    found = 0.0
+    found = jnp.zeros(())
     for g, blocks in W.items():
         at = plan.incidences[g]
         moved = jnp.einsum("cki,ci->ck", _tall(blocks), x[g][at.row])
         found = found + jax.ops.segment_sum(
             moved.reshape(-1, blocks.shape[-2]), at.eliminated.ravel(),
-            plan.groups[plan.eliminated].rows,
+            plan.groups[present(plan.eliminated)].rows,
         )  # fmt: skip
     return found
 
@@ -177,7 +182,7 @@ class Sums:
         self.own = {name: jnp.zeros((g.rows, g.width, g.width)) for name, g in plan.groups.items()}
         self.off = {}
         self.W = {}
-        self.cost = 0.0
+        self.cost = jnp.zeros(())
 
     def add_part(self, part: Part, cost, own, gradient, couples, eliminated, W):
         """What a part adds: `own` [chunks, w, w] and `gradient` [chunks, w] of each of its touches,
@@ -191,7 +196,7 @@ class Sums:
         for couple, N in zip(part.couples, couples):
             self._add_couple(part, couple, N)
         if eliminated is not None:
-            at, e = part.eliminated.ravel(), self.plan.eliminated
+            at, e = present(part.eliminated).ravel(), present(self.plan.eliminated)
             both = jax.ops.segment_sum(eliminated, at, self.own[e].shape[0])
             self.own[e] += both[..., :-1]
             self.gradient[e] += both[..., -1]
@@ -253,7 +258,7 @@ def products(a, b):
 def dot(plan: Plan, a: Tangent, b: Tangent) -> Float[Array, ""]:
     """aᵀb, the eliminated rows of all devices."""
     e = plan.eliminated
-    kept = sum(jnp.vdot(a[g], b[g]) for g in plan.kept)
+    kept = sum((jnp.vdot(a[g], b[g]) for g in plan.kept), jnp.zeros(()))
     return kept if e is None else kept + total(plan, jnp.vdot(a[e], b[e]))
 
 

@@ -73,7 +73,7 @@ class Couple(eqx.Module):
 
     first: int = eqx.field(static=True)
     second: int = eqx.field(static=True)
-    block: Int[Array, " chunks"]
+    block: Int[Array, " chunks"] | None
     turned: Float[Array, " chunks"] | None
     same: Float[Array, " chunks"] | None
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Int
 
 from jaxbundle.leastsquares.declarations import Observations, Table
 from jaxbundle.leastsquares.grouping import Choices, Grouping, Share
-from jaxbundle.leastsquares.indices import Column, Index, Sizes, count
+from jaxbundle.leastsquares.indices import Sizes, as_column, as_index, count
 from jaxbundle.leastsquares.layout import (
     SMALL,
     chunk_length,
@@ -119,14 +119,14 @@ class _Planner:
             one = length == 1 or bool((rows[s] == rows[s][first[major]]).all())
             one = self.choose("by chunk", k, s, found=one and s != share.slot)
             by_row.append(not one)
-            lookup.append(Index(at[:, 0] if one else at, along, ("table", name)))
+            lookup.append(as_index(at[:, 0] if one else at, along, ("table", name)))
         touches = []
         for group, touched in slots:
             slot = touched[0][0]
             row = chunk(self.by.group_of[of[slot]][2][rows[slot]])[:, 0]
             stop = max(start + self.by.tables[of[s]].space.width for s, start in touched)
             start = min(start for _, start in touched)
-            index = Index(row, along, ("group", group))
+            index = as_index(row, along, ("group", group))
             touches.append(Touch(group, touched, start, stop, index, None))
         source = np.where(used, share.source[order], -1).reshape(-1, length)
         place = np.full(given.number, -1)
@@ -134,12 +134,12 @@ class _Planner:
         eliminated = None
         if share.slot is not None:
             at = self.by.row_in[chunk(rows[share.slot])]
-            eliminated = Index(at, along, ("group", self.by.eliminate))
+            eliminated = as_index(at, along, ("group", self.by.eliminate))
         number = ("observations", share.observations)
         made = Part(
             observations=share.observations, slot=share.slot, by_row=tuple(by_row),
             large=large, lookup=tuple(lookup), eliminated=eliminated,
-            source=Index(source, along, number), place=Index(place, number, along, length),
+            source=as_index(source, along, number), place=as_index(place, number, along, length),
             touches=tuple(touches), couples=(),
         )  # fmt: skip
         return _LaidPart(made, used, length, along)
@@ -178,12 +178,12 @@ class _Planner:
             cuts = np.cumsum([len(parts[k].used) for k, _ in at])[:-1]
             for (k, t), where in zip(at, np.split(whole, cuts)):
                 p = parts[k]
-                index = Index(where.reshape(-1, p.length), p.along, along, length)
+                index = as_index(where.reshape(-1, p.length), p.along, along, length)
                 p.set("touches", t, incidence=index)
             eliminated, row, used = q[order], r[order], live
         plan = Incidences(
-            Index(eliminated.reshape(-1, length), along, ("group", self.by.eliminate)),
-            Index(row[::length], along, ("group", group)),
+            as_index(eliminated.reshape(-1, length), along, ("group", self.by.eliminate)),
+            as_index(row[::length], along, ("group", group)),
         )
         live = np.flatnonzero(used)
         eliminated, row = eliminated[live], row[live]
@@ -196,10 +196,10 @@ class _Planner:
         for k, p in enumerate(parts):
             self._couples(k, p, direct)
         blocks = {}
-        for b, later in enumerate(self.by.kept):
-            for earlier in self.by.kept[: b + 1]:
-                key, both = (later, earlier), map(incidences.get, (later, earlier))
-                pairs = self._pairs(*both, later == earlier)
+        for place, later in enumerate(self.by.kept):
+            for earlier in self.by.kept[: place + 1]:
+                key, a, b = (later, earlier), incidences.get(later), incidences.get(earlier)
+                pairs = self._pairs(a, b, later == earlier)
                 made = self._block_list(key, pairs, direct.get(key, ()), parts)
                 if made is not None:
                     blocks[key] = made
@@ -217,8 +217,8 @@ class _Planner:
                     equal, less = row == column, row < column
                     row, column = np.maximum(row, column), np.minimum(row, column)
                     meets = self.choose("same", k, j, i, found=bool(equal.any()))
-                    same = Column(equal.astype(float), p.along) if meets else None
-                    turned = Column(less.astype(float), p.along)
+                    same = as_column(equal.astype(float), p.along) if meets else None
+                    turned = as_column(less.astype(float), p.along)
                     row = np.where(equal, -1, row)
                 direct.setdefault((a.group, b.group), []).append((k, len(couples), row, column))
                 couples.append(Couple(j, i, None, turned, same))
@@ -248,14 +248,14 @@ class _Planner:
         along = ("blocks", *key)
         for k, couple, r, c in direct:
             block = np.where(r >= 0, np.searchsorted(keys, number(r, c)), -1)
-            parts[k].set("couples", couple, block=Index(block, parts[k].along, along))
+            parts[k].set("couples", couple, block=as_index(block, parts[k].along, along))
         found = None
         lengths = self.choose("pair chunks", *key, found=pair_chunk_lengths(len(i)))
         if lengths:
             block = np.searchsorted(keys, number(row, column))
             found = chunk_pairs(i, j, block, into, along, key, lengths)
         return Blocks(
-            Index(keys // columns, along, ("group", key[0])),
-            Index(keys % columns, along, ("group", key[1])),
+            as_index(keys // columns, along, ("group", key[0])),
+            as_index(keys % columns, along, ("group", key[1])),
             found,
         )

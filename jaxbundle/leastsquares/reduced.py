@@ -15,7 +15,7 @@ import numpy as np
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 
-from jaxbundle.leastsquares.normal import Tangent
+from jaxbundle.leastsquares.normal import AnyTangent, Tangent
 from jaxbundle.leastsquares.plan import Key, Plan
 
 Groups = tuple[str, ...]
@@ -100,15 +100,17 @@ def _(primals, tangents):
 def blocks_of(plan: Plan, groups: Groups, Q: Float[Array, "n n"]) -> Reduced:
     """The blocks of a symmetric matrix of some groups where S has blocks."""
     cut = lambda x: split(plan, groups, x)
-    Q = {b: cut(jnp.moveaxis(x, -1, 0)) for b, x in cut(Q).items()}
+    parts = {b: cut(jnp.moveaxis(x, -1, 0)) for b, x in cut(Q).items()}
     index = {g: jnp.arange(plan.groups[g].rows) for g in groups}
-    own = {g: Q[g][g][i, :, i] for g, i in index.items()}
+    own = {g: parts[g][g][i, :, i] for g, i in index.items()}
     keys = [(a, b) for a, b in plan.blocks if a in index and b in index]
     at = plan.blocks
-    return Reduced(own, {(a, b): Q[b][a][at[a, b].row, :, at[a, b].column] for a, b in keys})
+    return Reduced(own, {
+        (a, b): parts[b][a][at[a, b].row, :, at[a, b].column] for a, b in keys
+    })
 
 
-def flat(groups: Groups, rows: Tangent) -> Float[Array, " n"]:
+def flat(groups: Groups, rows: AnyTangent) -> Float[Array, " n"]:
     """Some groups as one vector."""
     return jnp.concatenate([jnp.zeros(0), *(rows[g].ravel() for g in groups)])
 

@@ -11,11 +11,13 @@ each of the super-blocks of m unknowns, and for conjugate gradients some forty p
 observations, which need no pairs of incidences at all.
 """
 
+from typing import Any
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Int
 
-from jaxbundle.leastsquares.indices import Column
+from jaxbundle.leastsquares.indices import as_column
 
 REDUCTIONS = ("dense", "banded", "iterative")
 FACTORS = ("dense", "banded")
@@ -53,8 +55,9 @@ def plan_reduction(shapes: dict[str, tuple[int, int]], ties, observations: int, 
     if not shapes or (len(ways) > 1 and unknowns < SMALL):
         return "dense", None
     group = max(shapes, key=lambda g: np.prod(shapes[g]))
-    band = find_band(group, *ties(group), *shapes[group]) if "banded" in ways else None
-    way, w = ways[0], shapes[group][1]
+    (row, column), (rows, w) = ties(group), shapes[group]
+    band = find_band(group, row, column, rows, w) if "banded" in ways else None
+    way = ways[0]
     if len(ways) > 1:
         way = choose_reduction(band, w, unknowns, observations, ways)
     return way, band if way == "banded" else None
@@ -70,18 +73,19 @@ def find_band(group: str, row, column, rows: int, w: int) -> Band:
     place[reverse_cuthill_mckee((links + links.T).tocsr(), symmetric_mode=True)] = np.arange(rows)
     width = max(int(np.abs(place[row] - place[column]).max(initial=0)), -(-NARROWEST // w))
     blocks = rows // width + 1  # The last place is empty.
-    return Band(group, Column(place, ("group", group), blocks * width - 1), width, blocks)
+    return Band(group, as_column(place, ("group", group), blocks * width - 1), width, blocks)
 
 
 def choose_reduction(band: Band | None, w: int, unknowns: int, observations: int, ways):
     """The way for so many unknowns, those of the band in blocks of `w`; None: none fits."""
-    n, work = float(unknowns), {"iterative": (STEPS * WORK * observations, 0)}
+    n, work = float(unknowns), {"iterative": (STEPS * WORK * observations, 0.0)}
     work["dense"] = n**3 / 3, n**2
     if band is not None:
-        m, rows = float(band.width * w), len(band.place.rows) * w
+        place: Any = band.place  # not an array yet (`as_column`)
+        m, rows = float(band.width * w), len(place.rows) * w
         q = n - rows
         border = 2 * rows * m * q + rows * q**2 + q**3 / 3
         work["banded"] = band.blocks * 10 / 3 * m**3 + border, 3 * band.blocks * m**2 + n * q
     fits = {way: work[way][0] for way in ways if work[way][1] <= LARGEST_FACTOR}
-    least = min(fits, key=fits.get, default=None)
+    least = min(fits, key=fits.__getitem__, default=None)
     return "dense" if "dense" in fits and fits["dense"] < GAIN * fits[least] else least

@@ -12,11 +12,14 @@ With the residuals divided by their a priori σ (v/σ) and h = diag(J·Q·Jᵀ) 
 Of observations with a covariance, v/σ stands for L⁻¹·v.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbundle.leastsquares.cofactors import Cofactors
 from jaxbundle.leastsquares.linearise import differentiate
@@ -31,6 +34,7 @@ from jaxbundle.leastsquares.rows import (
     lay_out_data,
     prepare,
 )
+from jaxbundle.types import AnyArray, present
 
 UNCONTROLLED = 1e-8
 """Redundancy numbers below this are rounding: the observation is not controlled at all."""
@@ -41,10 +45,10 @@ class Reliability(eqx.Module):
     """By set of observations, [n, r]: v/σ, redundancy number, Baarda's w (NaN where r is zero), and
     the part of h = 1 − r that the eliminated row of the observation alone has in it."""
 
-    residual: dict[int, Float[Array, "n r"]]
-    redundancy: dict[int, Float[Array, "n r"]]
-    w: dict[int, Float[Array, "n r"]]
-    own: dict[int, Float[Array, "n r"]]
+    residual: Mapping[int, Float[AnyArray, "n r"]]
+    redundancy: Mapping[int, Float[AnyArray, "n r"]]
+    w: Mapping[int, Float[AnyArray, "n r"]]
+    own: Mapping[int, Float[AnyArray, "n r"]]
 
 
 @eqx.filter_jit
@@ -75,7 +79,8 @@ def hat_diagonal(declared: Declared, plan: Plan, values: Values, laid: Laid, Q: 
 
 
 def _of_eliminated(part: Part, E, Q: Cofactors):
-    return jnp.sum(jnp.einsum("clri,clji->clrj", E, Q.lower_inverse[part.eliminated]) ** 2, -1)
+    lower_inverse = present(Q.lower_inverse)[part.eliminated]
+    return jnp.sum(jnp.einsum("clri,clji->clrj", E, lower_inverse) ** 2, -1)
 
 
 def _of_part(plan: Plan, part: Part, touches, E, Q: Cofactors):
@@ -91,7 +96,7 @@ def _of_part(plan: Plan, part: Part, touches, E, Q: Cofactors):
             h = form(J, _of_kept(part, at, Q), J)
         if E is None:
             return h
-        h = h + form(E, Q.eliminated[at["eliminated"]], E)
+        h = h + form(E, present(Q.eliminated)[at["eliminated"]], E)
         for touch, incidence, J in zip(part.touches, at["incidences"], touches):
             coupled = Q.coupled[touch.group]
             rows = coupled.reshape(-1, *coupled.shape[2:])[incidence]
@@ -122,12 +127,12 @@ def _of_kept(part: Part, at, Q: Cofactors):
     """The block of Q of all kept rows that a chunk touches, in the order of its touches."""
     touches = part.touches
     cut = lambda B, rows, columns: B[rows.start : rows.stop, columns.start : columns.stop]
-    blocks = [[None] * len(touches) for _ in touches]
+    blocks: list[list[Any]] = [[None] * len(touches) for _ in touches]
     for t, row in enumerate(at["rows"]):
         blocks[t][t] = cut(Q.kept.own[touches[t].group][row], touches[t], touches[t])
     for couple, (block, turned, same) in zip(part.couples, at["blocks"]):
         first, second = touches[couple.first], touches[couple.second]
-        found = 0.0
+        found: Any = 0.0
         if block is not None:
             B = Q.kept.off[first.group, second.group][block]
             found = cut(B, first, second)

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from jaxbundle.leastsquares.normal import Tangent
+from jaxbundle.leastsquares.normal import AnyTangent, Rows, Tangent
 from jaxbundle.leastsquares.plan import Plan
 from jaxbundle.leastsquares.rows import Declared, Values
 
@@ -16,9 +16,9 @@ def retract(declared: Declared, plan: Plan, values: Values, change: Tangent) -> 
     return moved
 
 
-def changes_of_tables(plan: Plan, values: Values, change: Tangent) -> Tangent:
+def changes_of_tables(plan: Plan, values: Values, change: AnyTangent) -> dict[str, Rows]:
     """The change of every table that moves, [rows, width]."""
-    found: Tangent = {}
+    found: dict[str, Rows] = {}
     for name, group in plan.groups.items():
         for member in group.members:
             part = change[name][:, member.start : member.start + member.width]

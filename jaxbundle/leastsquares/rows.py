@@ -7,6 +7,7 @@ Everything is a structure of arrays: one array for each scalar of a block.
 
 import dataclasses
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -109,7 +110,7 @@ def evaluate(kind: Kind, blocks, measured):
     return (found,) if jnp.ndim(found) == 0 else tuple(found)
 
 
-def _stacked(block):
+def _stacked(block) -> Any:
     """Tuples of scalars as arrays; other blocks as they are."""
     if type(block) is tuple and block:
         return jnp.stack([_stacked(x) for x in block])
@@ -124,7 +125,7 @@ def _weighted(v, weight):
     return tuple(jnp.where(w > 0, w * x, 0.0) for w, x in zip(weight, v))
 
 
-def diagonal_of(weight):
+def diagonal_of(weight) -> Any:
     """The weight of every residual, 0 where it does not count: of observations [n, r] or [n, r, r],
     or of one as scalars."""
     if isinstance(weight, tuple):
@@ -148,7 +149,7 @@ def fill_places(plan: Plan, laid: Laid) -> tuple[Plan, Laid]:
     return dataclasses.replace(plan, parts=tuple(parts)), Laid(tuple(measured), laid.weight)
 
 
-def over(part: Part, kind: Kind, prepared, laid: Laid, number: int, function):
+def over(part: Part, kind: Kind, prepared, laid: Laid, number: int, function) -> Any:
     """`function(blocks, measured, weight)` of every observation of a part; its scalars get the
     axes [chunks, length]. Functions that are equal are traced once for columns of one size."""
     blocks = tuple(look_up(prepared[name], at) for name, at in zip(kind.of, part.lookup))

@@ -24,6 +24,7 @@ class Info(optx.FunctionInfo.EvalGradHessian):
     """What is known at an accepted point: ½vᵀPv, its gradient and N; `damping`: λ of the step that
     is judged; `noise`: how much of a change of ½vᵀPv is rounding."""
 
+    hessian: Normal
     damping: Float[Array, ""]
     noise: Float[Array, ""]
 

@@ -54,7 +54,7 @@ def choose_together(
             continue
         chosen.append(a)
         taken.add(int(own[a]))
-        influence[block] = before + root[a] * tests[a]
+        influence[block] = float(before + root[a] * tests[a])
     return chosen
 
 

@@ -8,6 +8,8 @@ and in several processes after `jax.distributed.initialize`.
 """
 
 import dataclasses
+from collections.abc import Hashable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -23,6 +25,7 @@ from jaxbundle.leastsquares.planner import make_plan
 from jaxbundle.leastsquares.problem import Problem, fill_data, pad_values, rounder, without_filling
 from jaxbundle.leastsquares.rows import Data, Values
 from jaxbundle.leastsquares.solver import LeastSquares, Minimum, minimise
+from jaxbundle.types import present
 
 AXIS = "devices"
 OBSERVATION = 3.0
@@ -66,10 +69,10 @@ def find_minimum_of_shards(
     for ever.
 
     **Raises:** `NotSolvedError` where one of several processes is lost."""
-    problem, e = shards.problem, shards.problem.plan.eliminated
+    problem, e = shards.problem, present(shards.problem.plan.eliminated)
     here = dataclasses.replace(problem, sizes=shards.sizes)
-    start = jax.tree.map(np.asarray, problem.data.start if start is None else start)
-    part = lambda rows: pad_values(here, start | {e: _take(start[e], rows)})
+    given = jax.tree.map(np.asarray, problem.data.start if start is None else start)
+    part = lambda rows: pad_values(here, given | {e: _take(given[e], rows)})
     parts = _place(shards.mesh, [part(rows) for rows in shards.rows])
     solver = dataclasses.replace(solver, plan=shards.plan)
     try:
@@ -99,16 +102,19 @@ def _minimise(mesh: Mesh, solver: LeastSquares, data: Data, start: Values) -> Mi
         values = values | {e: jax.lax.all_gather(values[e], AXIS)}
         return dataclasses.replace(minimum, values=values)
 
-    specs = dict(in_specs=PartitionSpec(AXIS), out_specs=PartitionSpec())
-    return jax.shard_map(on_device, mesh=mesh, check_vma=False, **specs)(arrays)
+    own, same = PartitionSpec(AXIS), PartitionSpec()
+    run = jax.shard_map(on_device, mesh=mesh, in_specs=own, out_specs=same, check_vma=False)
+    return run(arrays)
 
 
 def _place(mesh: Mesh, parts):
     """The arrays of all parts with the device as first axis; every device holds its own."""
     spread = NamedSharding(mesh, PartitionSpec(AXIS))
-    make = lambda *x: jax.make_array_from_callback(
-        (len(x), *x[0].shape), spread, lambda at: x[at[0].start or 0][None]
-    )
+
+    def make(*x):
+        own = lambda at: x[0 if at is None else at[0].start or 0][None]
+        return jax.make_array_from_callback((len(x), *x[0].shape), spread, own)
+
     return jax.tree.map(make, *parts)
 
 
@@ -133,8 +139,9 @@ def _cut(problem: Problem, parts: int):
 
 def _plan_part(problem: Problem, rows, seen):
     """The plan of some eliminated rows and observations, on the host, and its sizes."""
-    e, groups = problem.plan.eliminated, problem.plan.groups.items()
-    choices = problem.choices | {("all free", name): group.all_free for name, group in groups}
+    e, groups = present(problem.plan.eliminated), problem.plan.groups.items()
+    free = {("all free", name): group.all_free for name, group in groups}
+    choices: dict[Hashable, Any] = {**problem.choices, **free}
     choices["stays",] = choices["stays",][rows]
     row = np.full(problem.table(e).rows, -1)
     row[rows] = np.arange(len(rows))

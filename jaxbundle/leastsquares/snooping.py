@@ -181,7 +181,7 @@ def _worst(found, touched: _Touched, unit, critical: float, apart: float) -> lis
     of, row = of.astype(int), row.astype(int)
     worst = max(alone, key=lambda r: r.test, default=None)
     other, largest = worst.test if worst else 0.0, together.max(initial=0.0)
-    if other > max(critical, largest):
+    if worst and other > max(critical, largest):
         return [worst]
     at = np.flatnonzero(together > max(critical, other, TOGETHER * largest))
     if not len(at):
@@ -191,7 +191,9 @@ def _worst(found, touched: _Touched, unit, critical: float, apart: float) -> lis
         together[at], pick(touched.own), pick(touched.shared), pick(_leverage(found)), critical,
     )]  # fmt: skip
     rays = _Neighbours(found, touched, unit)
-    others = {k: rays.alternatives(of[k], row[k], critical, apart) for k in chosen.tolist()}
+    others = {
+        k: rays.alternatives(int(of[k]), int(row[k]), critical, apart) for k in chosen.tolist()
+    }
     certain = [k for k in others if not others[k]]
     return [
         Removed(int(of[k]), int(row[k]), None, float(together[k]), others[k])
@@ -297,4 +299,4 @@ def without(problem: Problem, removed: Sequence[Removed]) -> Problem:
             weight[o][np.isin(own, lone)] = 0.0
     data = dataclasses.replace(problem.data, weight=tuple(weight))
     problem = with_data(problem, data)
-    return hold(problem, e, lone) if len(lone) else problem
+    return problem if e is None or not lone else hold(problem, e, lone)

@@ -98,12 +98,13 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
         struct = eqx.filter_eval_shape(self._linearise, y, args)
         info = eqx.filter_eval_shape(self._info, struct)
         zero, rows = zero_tangent(self.plan), self.rows
+        nothing = jnp.full(rows, jnp.nan)
         return State(
             first=jnp.asarray(True), known=_zeros(struct), change=zero, trial=y,
             step_size=jnp.asarray(jnp.inf), descent=self.descent.init(zero, info),
             search=self.search.init(zero, info), approach=Approach.begin(),
             termination=jnp.asarray(LIMIT), steps=jnp.asarray(0),
-            history=History(*(jnp.full(rows, jnp.nan) for _ in range(2)), jnp.zeros(rows, bool)),
+            history=History(nothing, nothing, jnp.zeros(rows, bool)),
         )  # fmt: skip
 
     def step(self, fn, y, args, options, state: State, tags):
@@ -209,7 +210,7 @@ find = eqx.filter_jit(minimise)
 
 def half_square(plan: Plan, residual) -> Float[Array, ""]:
     """½·vᵀPv of all devices."""
-    return total(plan, 0.5 * sum(jnp.vdot(r, r) for r in residual))
+    return total(plan, 0.5 * sum((jnp.vdot(r, r) for r in residual), jnp.zeros(())))
 
 
 def _zeros(struct):

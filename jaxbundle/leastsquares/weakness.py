@@ -150,7 +150,8 @@ def _sigma_of_weakest(found: Solution, factor: Factor, per_extent):
     for _ in range(ROUNDS):
         directions = np.linalg.qr(directions.T)[0].T
         previous = directions
-        directions = np.asarray(_products(*found.given[:3:2], factor, per_extent, directions))
+        declared, _, values, _ = found.given
+        directions = np.asarray(_products(declared, values, factor, per_extent, directions))
     mu, turn = np.linalg.eigh(previous @ directions.T)
     return np.sqrt(np.maximum(mu, 0) @ (turn.T @ previous) ** 2)
 

@@ -71,25 +71,25 @@ def find_match(
         raise InputError(f"matching: Zmin {Zmin:g} must be below Zmax {Zmax:g}")
     if window < 3 or window % 2 == 0:
         raise InputError(f"matching: window {window} must be an odd number of at least 3 pixels")
-    base, other = jnp.asarray(base, float), jnp.asarray(other, float)
-    xy, half = jnp.asarray(xy, float), window // 2
-    rows, columns = base.shape
-    if not (half <= xy[0] <= columns - 1 - half and half <= xy[1] <= rows - 1 - half):
-        x, y = np.asarray(xy)
+    grey, other_grey = jnp.asarray(base, float), jnp.asarray(other, float)
+    place, half = jnp.asarray(xy, float), window // 2
+    rows, columns = grey.shape
+    x, y = np.asarray(place)
+    if not (half <= x <= columns - 1 - half and half <= y <= rows - 1 - half):
         raise InputError(f"matching: the window at ({x:.1f}, {y:.1f}) is not within the base image")
-    ends = np.asarray(_locus(view, other_view, xy, jnp.array([Zmin, Zmax])))
+    ends = np.asarray(_locus(view, other_view, place, jnp.array([Zmin, Zmax])))
     length = np.linalg.norm(ends[1] - ends[0])
     steps = FEWEST if not np.isfinite(length) else math.ceil(length / STEP) + 1
     # a power of two, lest every point compile a program of its own
     steps = min(2 ** math.ceil(math.log2(max(steps, FEWEST))), MOST)
     Z = jnp.linspace(Zmin, Zmax, steps)
-    rho = np.asarray(_correlations(base, other, view, other_view, xy, Z, half))
+    rho = np.asarray(_correlations(grey, other_grey, view, other_view, place, Z, half))
     best = int(np.nanargmax(rho)) if np.isfinite(rho).any() else -1
     if best < 0 or rho[best] <= -1:
         raise InputError("matching: no height puts the window into the other image with contrast")
     height = float(Z[best]) + _peak(rho, best) * float(Z[1] - Z[0])
-    point = np.asarray(_ground(view, xy, height))
-    found = np.asarray(_locus(view, other_view, xy, jnp.array([height])))[0]
+    point = np.asarray(_ground(view, place, height))
+    found = np.asarray(_locus(view, other_view, place, jnp.array([height])))[0]
     return Match(found, point, float(rho[best]))
 
 

@@ -78,7 +78,7 @@ class BoardViews:
     @property
     def visible(self) -> Bool[np.ndarray, "views points"]:
         """Which points were found."""
-        return np.isfinite(self.xy).all(2)
+        return np.all(np.isfinite(self.xy), axis=2)
 
     def take(self, rows, why: str = "") -> "BoardViews":
         """Some of the views (a mask or indices); the others count as failed where `why` says so."""
@@ -129,10 +129,10 @@ def measure_boards(
     if not files:
         raise InputError("no photographs are given")
     names = _names(files)
-    paths = dict(zip(names, files))
-    repeated = _repeated(paths)
+    file_of = dict(zip(names, files))
+    repeated = _repeated(file_of)
     found, failed = [], {}
-    look = lambda name: repeated.get(name) or _look(paths[name], board)
+    look = lambda name: repeated.get(name) or _look(file_of[name], board)
     with ThreadPoolExecutor(available_cores()) as pool:
         for done, (name, result) in enumerate(zip(names, pool.map(look, names)), 1):
             if isinstance(result, str):
@@ -142,9 +142,9 @@ def measure_boards(
             if progress is not None:
                 progress(done, len(names))
     if len(found) < len(names) / 2:
-        failed |= _other_boards(paths, board, failed)
+        failed |= _other_boards(file_of, board, failed)
     if not found:
-        raise InputError(_nothing_found(paths, failed))
+        raise InputError(_nothing_found(file_of, failed))
     sizes = Counter(size for _, size, _ in found)
     size = sizes.most_common(1)[0][0]
     for name, other, _ in found:
@@ -160,7 +160,7 @@ def measure_boards(
     return BoardViews(
         board, tuple(name for name, _ in used), size, np.array([xy for _, xy in used]),
         tuple(sorted(failed.items(), key=lambda item: order[item[0]])),
-        _part_of_a_larger(paths, [name for name, _ in used], board),
+        _part_of_a_larger(file_of, [name for name, _ in used], board),
     )  # fmt: skip
 
 

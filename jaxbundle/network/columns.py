@@ -18,6 +18,7 @@ from jaxbundle.arguments import shown as shown
 from jaxbundle.cameras.names import closest_name
 from jaxbundle.errors import InputError
 from jaxbundle.network.tables import Source
+from jaxbundle.types import Column
 
 NO_NUMBERS = (bool, np.bool_, complex, np.complexfloating, type(np.ma.masked))
 """Python or numpy converts them: truth values to 0 and 1, complex numbers to their real parts."""
@@ -27,7 +28,7 @@ NO_NUMBERS = (bool, np.bool_, complex, np.complexfloating, type(np.ma.masked))
 class Columns:
     """Columns of equal length: text or numbers; None, NaN and empty text are missing values."""
 
-    values: Mapping[str, Sequence[Any]]
+    values: Mapping[str, Column]
     source: Source
 
     def __len__(self) -> int:
@@ -149,7 +150,7 @@ def _of_frame(table: Any, source: Source) -> Columns:
     }, source)
 
 
-def _column(values: Any, column: str, name: str) -> Sequence[Any]:
+def _column(values: Any, column: str, name: str) -> Column:
     """Values of a column; None where an array is masked."""
     refuse_traced(f"{name}: column {column!r}", values)
     if isinstance(values, str) or not isinstance(values, Iterable):
@@ -196,7 +197,7 @@ def some(names: Iterable[Any], most: int = 5, as_text: Callable[[Any], str] = qu
     return f"{text} and {len(names) - most} more" if len(names) > most else text
 
 
-def count(number: int, thing: str, rest: str = "") -> str:
+def count(number: int | np.integer, thing: str, rest: str = "") -> str:
     """A number of things, in words: "1 image", "3 images", "3 images held"."""
     return f"{number} {thing}{'' if number == 1 else 's'}{rest}"
 
@@ -211,7 +212,7 @@ def _id(value: Any) -> str:
     return str(value)
 
 
-def _plain_numbers(values: Sequence[Any]) -> np.ndarray | None:
+def _plain_numbers(values: Column) -> np.ndarray | None:
     """The fast way, for columns without a missing or odd cell; else None."""
     if isinstance(values, np.ndarray) and values.dtype.kind in "iuf":
         return values.astype(float)

@@ -20,8 +20,9 @@ def name_angle_unit(network: Network) -> str:
     """The unit in which the start values of the images fit the measurements, in words; empty where
     the one given does, or no other."""
     seen, images = sights(network), network.images
-    there = np.isfinite(images.position).all(1) & np.isfinite(images.angles).all(1)
-    known = np.isfinite(network.points.position).all(1)
+    poses = np.concatenate([images.position, images.angles], axis=1)
+    there = np.all(np.isfinite(poses), axis=1)
+    known = np.all(np.isfinite(network.points.position), axis=1)
     rows = there[seen.image] & known[seen.point]
     given = ANGLE_UNITS[network.angle_unit]
     if not rows.any():
@@ -34,7 +35,7 @@ def name_angle_unit(network: Network) -> str:
         model.X[known] = network.points.position[known]
         off = misclosures(seen, model)[rows] / seen.tolerance[seen.image[rows]]
         missed[unit] = float(np.median(off))
-    best = min(missed, key=missed.get)
+    best = min(missed, key=missed.__getitem__)
     if not (missed[best] < 1 and missed[network.angle_unit] > FAR):
         return ""
     return (

@@ -115,7 +115,8 @@ def _collect():
     monomials = _CUBIC + _BASIS
     out = np.zeros((64, 20))
     for row, factors in enumerate(product(range(4), repeat=3)):
-        out[row, monomials.index(tuple(factors.count(v) for v in range(3)))] = 1
+        powers = factors.count(0), factors.count(1), factors.count(2)
+        out[row, monomials.index(powers)] = 1
     return out
 
 

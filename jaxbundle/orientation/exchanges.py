@@ -99,7 +99,10 @@ def contradiction(
 
 
 def _by_majority(source, target, good, tolerance, before):
-    A, t = many.similarity(source, target, good.astype(float))
+    found = many.similarity(source, target, good.astype(float))
+    if found is None:
+        return None
+    A, t = found
     moved, suspects = source @ A.T + t, set(np.flatnonzero(~good).tolist())
     off = [np.linalg.norm(moved - target, axis=1)[good].max()]
     exchanges = []

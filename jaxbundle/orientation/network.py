@@ -178,7 +178,10 @@ def _model(network: Network, seen: Sights, improve) -> tuple[Model, str]:
         part = _from_a_pair(seen, model, improve)
         if part is None:
             break
-        model = part if not model.placed.any() else joined(seen, model, part)
+        if model.placed.any():
+            part = joined(seen, model, part)
+            assert part is not None, "a pair is taken only if it can be joined"
+        model = part
         grow(seen, model, improve=improve)
         if not fixed and (moved := onto_the_given(network, seen, model)):
             fixed, frame = True, "in the frame given"
@@ -213,7 +216,7 @@ def _with_approximate_points(network: Network, model: Model) -> Model:
 def _from_a_pair(seen: Sights, model: Model, improve) -> Model | None:
     """The best of the models that grow from a few good pairs of the images not placed; if some are
     placed, from pairs with one of them, to a model that can be joined to theirs."""
-    new, linked = ~model.placed, model.placed.any()
+    new, linked = ~model.placed, bool(model.placed.any())
     old = _neighbours(seen, new) & model.placed
     best, most = None, 0
     for image, other, M, b in _good_pairs(seen, new | old, old, linked):
@@ -298,7 +301,7 @@ def _result(network: Network, seen: Sights, model: Model, frame: str) -> Oriente
     )
     wrong = seen.row[_out_of_the_question(seen, model)]
     keep = model.placed
-    known = np.isfinite(X).all(1)
+    known = np.all(np.isfinite(X), axis=1)
     reasons = _reasons(network, seen, model, known)
     rays = network.observations
     network = network.replace(

@@ -30,7 +30,7 @@ def name_one_place(network: Network) -> str:
     seen = sights(network)
     number = np.bincount(seen.image, minlength=seen.images)
     base = int(number.argmax())
-    others = [image for image in np.flatnonzero(number) if image != base][:MOST]
+    others = [image for image in np.flatnonzero(number).tolist() if image != base][:MOST]
     c = np.array([camera.parameters[get_model(camera.model).principal_distance[0]]
                   for camera in network.cameras])  # fmt: skip
     of_camera = network.images.camera[seen.image]

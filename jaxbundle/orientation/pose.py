@@ -14,7 +14,7 @@ from jaxtyping import Float
 from jaxbundle.cameras.perspective import perspective
 from jaxbundle.geometry import matrix_from_rotation_vector
 
-_ideal, _ = perspective((0,), "up")
+_ideal, _ = perspective((0,), up=True)
 
 
 class Pose(eqx.Module):

@@ -89,9 +89,9 @@ def relative_orientation(
     chosen, score = _refined_best(M, b, stop_gradient(data), p)
     fit = finish(_misclosures, _retract, chosen, data, 5)
     M, b = fit.estimate
-    front = _in_front(M, b, xy1, xy2, p)
+    front = _in_front((M, b), xy1, xy2, p)
     vtpv = stop_gradient(fit.vtpv)
-    no_base, flat = _simpler(*_after(vtpv, held), vtpv)
+    no_base, flat = _simpler(_after(vtpv, held), vtpv)
     status = first_of(
         (no_base, Status.NO_BASE),
         (flat if method == "eight" else jnp.asarray(False), Status.COPLANAR_POINTS),
@@ -128,7 +128,7 @@ def _refined_best(M, b, data, p):
     xy1, xy2, _ = data
 
     def score(pair, square):
-        behind = 1 - _in_front(*pair, xy1, xy2, p)
+        behind = 1 - _in_front(pair, xy1, xy2, p)
         value = (square / jnp.sum(p) + EXACT) * (1 + 100 * behind)
         return jnp.where(jnp.isfinite(value), value, jnp.inf)
 
@@ -149,7 +149,8 @@ def _after(done, arrays):
 
 
 def _misclosures(pair, xy1, xy2, root):
-    return root * jax.vmap(sampson_distance, (None, None, 0, 0))(*pair, xy1, xy2)
+    M, b = pair
+    return root * jax.vmap(sampson_distance, (None, None, 0, 0))(M, b, xy1, xy2)
 
 
 def _retract(pair, delta):
@@ -167,20 +168,22 @@ def _across(b):
     return jnp.stack([first, jnp.cross(b, first)])
 
 
-def _in_front(M, b, xy1, xy2, p):
+def _in_front(pair, xy1, xy2, p):
+    M, b = pair
     s = jax.vmap(distances_along_rays, (None, None, 0, 0))(M, b, xy1, xy2)
     return jnp.sum(jnp.where(jnp.all(s > 0, 1), p, 0)) / jnp.sum(p)
 
 
-def _simpler(xy1, xy2, p, vtpv):
+def _simpler(points, vtpv):
     """Whether a rotation, and whether a homography, explain the second image as well."""
+    xy1, xy2, p = points
     n, average = jnp.sum(p > 0), jnp.sum(p) / jnp.sum(p > 0)
     redundancy = n - 5
     variance = vtpv / jnp.where(redundancy > 0, redundancy, 1)
     unit = lambda a: a / jnp.linalg.norm(a)
-    rays = [jax.vmap(lambda xy: unit(ray_of(xy)))(xy) for xy in (xy1, xy2)]
-    turned = Pose(jnp.zeros(3), matrix_from_quaternion(rotation_between(*rays, p)))
-    by_rotation = jax.vmap(image_of, (None, 0))(turned, rays[0])
+    rays1, rays2 = (jax.vmap(lambda xy: unit(ray_of(xy)))(xy) for xy in (xy1, xy2))
+    turned = Pose(jnp.zeros(3), matrix_from_quaternion(rotation_between(rays1, rays2, p)))
+    by_rotation = jax.vmap(image_of, (None, 0))(turned, rays1)
     H, _ = homography(*_after(by_rotation, (xy1, xy2, p)))
     by_plane = jax.vmap(apply_homography, (None, 0))(H, xy1)
 

@@ -155,8 +155,9 @@ def robust_relative_orientation(
     p = ones_unless(weights, xy1)
 
     def errors(pair, xy1, xy2):
-        e = jnp.abs(jax.vmap(sampson_distance, (None, None, 0, 0))(*pair, xy1, xy2))
-        s = jax.vmap(distances_along_rays, (None, None, 0, 0))(*pair, xy1, xy2)
+        M, b = pair
+        e = jnp.abs(jax.vmap(sampson_distance, (None, None, 0, 0))(M, b, xy1, xy2))
+        s = jax.vmap(distances_along_rays, (None, None, 0, 0))(M, b, xy1, xy2)
         return jnp.where(jnp.all(s > 0, 1), e, FAR)
 
     def solve(xy1, xy2):

@@ -56,7 +56,10 @@ def residual_vectors(adjustment, image: str, ax=None):
     )  # fmt: skip
     ax.scatter(*xy.T, s=5, color=INK, linewidths=0, zorder=4)
     if known:
-        frame = Rectangle(low, *(high - low), fill=False, edgecolor=GREY, linewidth=1.2, zorder=2)
+        corner, sides = (low[0], low[1]), high - low
+        frame = Rectangle(
+            corner, *sides, fill=False, edgecolor=GREY, linewidth=1.2, zorder=2
+        )
         ax.add_patch(frame)
     scale, unit = micrometres(model.unit)
     bar = round_number(scale * 0.1 * diagonal / factor) / scale

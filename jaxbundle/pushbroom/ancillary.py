@@ -1,6 +1,5 @@
 """Ancillary data made into tables; what is wrong is said with its row before it is used."""
 
-from collections.abc import Sequence
 from typing import Literal
 
 import jax.numpy as jnp
@@ -171,7 +170,7 @@ def check_span(rows, extrapolate, times, source, thing="image line") -> None:
 
 
 def check_covered(
-    table: Table, times: Sequence[float], source: Source, thing: str = "image line"
+    table: Table, times: Float[np.ndarray, " lines"], source: Source, thing: str = "image line"
 ) -> None:
     """Refuse a table that does not reach over the times, or has a gap among them.
 
@@ -211,7 +210,7 @@ def _table(times, values, rates, method, order, gap, extrapolate, what, source):
             raise InputError(f"{source(int(bad.argmax()))}: the {name} is not a finite number")
     if method in ("lagrange", "usgscsm") and order < 1:
         raise InputError(f"{source.name}: the order of {method!r} is {order}; at least 1, please")
-    fewest = FEWEST.get(method, order + 1)
+    fewest = FEWEST[method] if method in FEWEST else order + 1
     if len(times) < fewest:
         advice = " or a lower order" if method == "lagrange" else ""
         raise InputError(

@@ -16,10 +16,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbundle.geometry.ellipsoid import earth_fixed, up
 from jaxbundle.geometry.vectors import difference, dot, length
+from jaxbundle.types import AnyArray
 
 from .accuracy import east_north, horizontal
 from .image import Pose, PushbroomImage
@@ -38,15 +39,15 @@ BESIDE = 2.0 * BLOCK
 class Nodes(NamedTuple):
     """Ground points at the nodes of a block: on the ellipsoid (Z = 0), and the vertical there."""
 
-    X: Float[Array, "3 n n"]
-    up: Float[Array, "3 n n"]
+    X: Float[AnyArray, "3 n n"]
+    up: Float[AnyArray, "3 n n"]
 
 
 class Places(NamedTuple):
     """Where in the image the pixels of a block are; NaN outside."""
 
-    line: Float[Array, "rows columns"]
-    pixel: Float[Array, "rows columns"]
+    line: Float[AnyArray, "rows columns"]
+    pixel: Float[AnyArray, "rows columns"]
 
 
 def geographic_nodes(surface: Surface, longitude: np.ndarray, latitude: np.ndarray) -> Nodes:

@@ -32,6 +32,7 @@ from jaxbundle.geometry.ellipsoid import (
 )
 from jaxbundle.geometry.vectors import (
     Scalar,
+    Triple,
     Vector,
     along,
     difference,
@@ -39,6 +40,7 @@ from jaxbundle.geometry.vectors import (
     length,
     scaled,
     unit,
+    unpacked,
 )
 
 from .frames import EARTH_RATE
@@ -75,7 +77,7 @@ class Corrections(NamedTuple):
         return self.light_time or self.aberration or self.refraction
 
 
-def true_direction(seen: Vector, velocity: Vector) -> Vector:
+def true_direction(seen: Vector, velocity: Vector) -> Triple:
     """The unit vector l of the light that is seen along `seen`: c·l = k·seen − v, k > 0."""
     a, b = dot(seen, seen), dot(seen, velocity)
     c = dot(velocity, velocity) - LIGHT**2
@@ -83,17 +85,17 @@ def true_direction(seen: Vector, velocity: Vector) -> Vector:
     return scaled(1 / LIGHT, along(scaled(-1.0, velocity), seen, k))
 
 
-def seen_direction(true: Vector, velocity: Vector) -> Vector:
+def seen_direction(true: Vector, velocity: Vector) -> Triple:
     """The direction in which a camera with this velocity sees light from `true`."""
     return along(velocity, unit(true), LIGHT)
 
 
-def inertial_velocity(P: Vector, V: Vector) -> Vector:
+def inertial_velocity(P: Vector, V: Vector) -> Triple:
     """V + Ω × P."""
     return V[0] - EARTH_RATE * P[1], V[1] + EARTH_RATE * P[0], V[2]
 
 
-def earlier_earth(v: Vector, distance: Scalar) -> Vector:
+def earlier_earth(v: Vector, distance: Scalar) -> Triple:
     """v in the Earth-fixed frame of the moment when light left the ground, `distance` metres ago.
 
     A negative distance leads back.
@@ -104,9 +106,12 @@ def earlier_earth(v: Vector, distance: Scalar) -> Vector:
 
 
 def refracted(
-    earth: Ellipsoid, height: Scalar, o: Vector, d: Vector
-) -> tuple[Vector, Vector]:
-    """The last straight part of a ray that goes down to a `height`: where it starts, where to."""
+    earth: Ellipsoid | None, height: Scalar, o: Vector, d: Vector
+) -> tuple[Triple, Triple]:
+    """The last straight part of a ray that goes down to a `height`: where it starts, where to.
+
+    **Raises:** `ValueError` without an ellipsoid."""
+    earth = require_ellipsoid(earth)
 
     def through(ray, layer):
         (o, d), (border, ratio, zeta) = ray, layer
@@ -121,19 +126,30 @@ def refracted(
 
     # a loop: the layers written out one by one would take minutes to compile
     *ray, _ = jnp.broadcast_arrays(*o, *unit(d), height)
-    ray, _ = jax.lax.scan(through, (tuple(ray[:3]), tuple(ray[3:])), (BORDERS, RATIOS, ZETAS))
-    return ray
+    ends = tuple(ray[:3]), tuple(ray[3:])
+    (start, bent), _ = jax.lax.scan(through, ends, (BORDERS, RATIOS, ZETAS))
+    return unpacked(start), unpacked(bent)
+
+
+def require_ellipsoid(earth: Ellipsoid | None) -> Ellipsoid:
+    """The ellipsoid that heights refer to.
+
+    **Raises:** `ValueError` in a local frame, which has none."""
+    if earth is None:
+        raise ValueError("refraction and RPC need heights above an ellipsoid; give one as `earth`")
+    return earth
 
 
 def seen_point(
     corrections: Corrections, earth: Ellipsoid | None, P: Vector, V: Vector, X: Vector
-) -> Vector:
+) -> Triple:
     """The point in whose direction a camera at P, with the velocity V, sees the point X.
 
     The inverse of what `locate` does to a ray: without corrections X itself.
     """
     if not corrections.any:
-        return X
+        x, y, z = X
+        return x, y, z
     o, distance = P, length(difference(X, P))
     if corrections.light_time:
         for _ in range(2):
@@ -141,7 +157,7 @@ def seen_point(
             distance = length(difference(X, o))
     d = difference(X, o)
     if corrections.refraction:
-        height = geodetic(earth, X)[2]
+        height = geodetic(require_ellipsoid(earth), X)[2]
         for _ in range(2):
             start, bent = refracted(earth, height, o, d)
             nearest = along(start, bent, dot(difference(X, start), bent))

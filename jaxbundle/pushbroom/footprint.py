@@ -79,11 +79,11 @@ def make_footprint(
     heights = _heights(image, earth)
     if heights is None:
         return None
-    times = np.linspace(*np.asarray(pieces.ends)[[0, -1]], TIMES)
+    times = np.linspace(float(pieces.ends[0]), float(pieces.ends[-1]), TIMES)
     u = np.linspace(-0.5, image.pixels - 0.5, ACROSS)
     xi, eta = (np.asarray(v) for v in slopes(image.optics, u))
     k, tau = _places(pieces, times)
-    levels = np.linspace(*heights, LEVELS)
+    levels = np.linspace(heights[0], heights[1], LEVELS)
     D, _ = _speeds_at(pieces, k, tau, xi, eta, levels, line, earth)
     if not np.isfinite(D).all():
         return None
@@ -122,7 +122,8 @@ def _places(pieces, times):
 
 def _speeds_at(pieces, k, tau, xi, eta, heights, line, earth):
     """Sights D [times, slopes, heights, 3] and ∂F/∂t [times, slopes, heights] at many times."""
-    half = np.diff(np.asarray(pieces.ends))[k] / 2
+    ends = np.asarray(pieces.ends)
+    half = (ends[k + 1] - ends[k]) / 2
     c = np.asarray(pieces.coefficients)[k]
     pad = lambda a: np.pad(a, [(0, -len(k) % CHUNK)] + [(0, 0)] * (a.ndim - 1), mode="edge")
     parts = [
@@ -139,7 +140,7 @@ def _speeds(c, tau, half, origin, xi, eta, heights, line, earth):
         numbers, rates = value_and_rate(c, tau)
         P, _ = motion(numbers, rates, origin)
         d = tuple(numbers[k] * xi + numbers[3 + k] * eta - numbers[6 + k] for k in range(3))
-        surface = Plane(h) if earth is None else Ground(at_height(earth, h))
+        surface = Plane(level=h) if earth is None else Ground(at_height(earth, h))
         D = difference(along(P, d, surface.distance(P, d)), origin)
         speed = jax.jvp(lambda n: ahead(n, D, line)[0], (numbers,), (rates / half,))[1]
         return jnp.stack(D), speed

@@ -13,7 +13,7 @@ Needs pyerfa; two-line elements need sgp4 (both in the extra `geo`).
 
 import datetime
 import warnings
-from typing import NamedTuple
+from typing import NamedTuple, overload
 
 import numpy as np
 from jaxtyping import Float
@@ -75,6 +75,24 @@ def to_earth(
         bias, _, _ = erfa.bp06(2451545.0, 0.0)
         matrices = matrices @ bias.T
     return matrices
+
+
+@overload
+def turn_positions(
+    R: Matrices, positions: Rows, velocities: Rows, orientation: EarthOrientation = ...
+) -> tuple[Rows, Rows]: ...
+
+
+@overload
+def turn_positions(
+    R: Matrices, positions: Rows, velocities: None = ..., orientation: EarthOrientation = ...
+) -> tuple[Rows, None]: ...
+
+
+@overload
+def turn_positions(
+    R: Matrices, positions: Rows, velocities: Rows | None, orientation: EarthOrientation = ...
+) -> tuple[Rows, Rows | None]: ...
 
 
 def turn_positions(

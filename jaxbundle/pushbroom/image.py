@@ -18,6 +18,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.geometry import matrix_from_rotation_vector
 from jaxbundle.network.tables import Source
+from jaxbundle.types import Numbers, Scalar
 
 from .ancillary import ATTITUDE, POSITIONS, check_covered
 from .corrections import Corrections
@@ -66,7 +67,7 @@ class PushbroomImage(eqx.Module):
     pixels: int = eqx.field(static=True)
 
     @property
-    def middle_time(self) -> Float[Array, ""]:
+    def middle_time(self) -> Scalar:
         """The time of the middle line, in seconds."""
         return self.times.time((self.lines - 1) / 2)
 
@@ -85,7 +86,7 @@ def make_image(
     optics: Optics,
     lines: int,
     pixels: int,
-    mounting: Float[Array, "3"] | None = None,
+    mounting: Numbers | Float[Array, "3"] | None = None,
     corrections: Corrections = Corrections(),  # noqa: B008
     sources: tuple[Source, Source] = (POSITIONS, ATTITUDE),
 ) -> PushbroomImage:
@@ -118,19 +119,19 @@ def check_size(lines: float, pixels: float, where: str) -> None:
             )
 
 
-def pose_at(image: PushbroomImage, t: Float[Array, ""]) -> Pose:
+def pose_at(image: PushbroomImage, t: Scalar) -> Pose:
     """The pose at the time t, in seconds; NaN where the tables do not reach."""
     return moved_pose(given_pose(image, t), t - image.middle_time, image.offsets, image.mounting)
 
 
-def given_pose(image: PushbroomImage, t: Float[Array, ""]) -> Pose:
+def given_pose(image: PushbroomImage, t: Scalar) -> Pose:
     """The pose of the platform as its tables have it, without offsets and mounting."""
     of = image.trajectory
     return Pose(position_at(of, t), rotation_at(of, t), velocity_at(of, t))
 
 
 def moved_pose(
-    given: Pose, dt: Float[Array, ""], offsets: Offsets, mounting: Float[Array, "3"]
+    given: Pose, dt: Scalar, offsets: Offsets, mounting: Float[Array, "3"]
 ) -> Pose:
     """The pose of the camera, `dt` seconds after the middle line."""
     turn = matrix_from_rotation_vector(offsets.attitude + dt * offsets.attitude_rate)

@@ -23,7 +23,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.lax.linalg import tridiagonal_solve
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxbundle.types import AnyArray, Scalar
 
 Method = Literal["linear", "lagrange", "usgscsm", "hermite", "spline"]
 METHODS: tuple[str, ...] = get_args(Method)
@@ -46,7 +48,7 @@ class Table(eqx.Module):
     extrapolate: float = eqx.field(static=True, default=0.0)
 
 
-def interpolate(table: Table, t: Float[Array, ""]) -> Float[Array, " k"]:
+def interpolate(table: Table, t: Scalar) -> Float[Array, " k"]:
     """The values at the time t, in seconds; NaN where the table says nothing."""
     i = interval(table, t)
     match table.method:
@@ -65,24 +67,24 @@ def interpolate(table: Table, t: Float[Array, ""]) -> Float[Array, " k"]:
     return jnp.where(covers(table, i, t), value, jnp.nan)
 
 
-def rate(table: Table, t: Float[Array, ""]) -> Float[Array, " k"]:
+def rate(table: Table, t: Scalar) -> Float[Array, " k"]:
     """The derivative of the interpolated values by time, per second."""
     return jax.jvp(lambda t: interpolate(table, t), (t,), (jnp.ones_like(t),))[1]
 
 
-def interval(table: Table, t: Float[Array, ""]) -> Int[Array, ""]:
+def interval(table: Table, t: Scalar) -> Int[Array, ""]:
     """The row i with tᵢ ≤ t < tᵢ₊₁; the first or last interval beyond the ends."""
     i = jnp.searchsorted(table.times, t, side="right") - 1
     return jnp.clip(i, 0, len(table.times) - 2)
 
 
-def fraction(table: Table, i: Int[Array, ""], t: Float[Array, ""]) -> Float[Array, ""]:
+def fraction(table: Table, i: Int[Array, ""], t: Scalar) -> Scalar:
     """τ, the part of the interval i that has passed at t; beyond 0 and 1 outside the table."""
     start, end = table.times[i], table.times[i + 1]
     return (t - start) / (end - start)
 
 
-def covers(table: Table, i: Int[Array, ""], t: Float[Array, ""]) -> Array:
+def covers(table: Table, i: Int[Array, ""], t: Scalar) -> Bool[AnyArray, "..."]:
     """Whether the table covers t: between its ends, or near enough to them, and not in a gap."""
     times = table.times
     inside = (t >= times[0] - table.extrapolate) & (t <= times[-1] + table.extrapolate)

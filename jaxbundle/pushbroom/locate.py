@@ -11,12 +11,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxbundle.geometry.vectors import Vector, along, difference, length, turned
+from jaxbundle.geometry.vectors import Triple, along, difference, length, turned
+from jaxbundle.types import Scalar
 
 from .corrections import Corrections, earlier_earth, inertial_velocity, refracted
 from .corrections import true_direction as without_aberration
 from .image import Pose, PushbroomImage, pose_at
-from .scanner import slopes_of
+from .scanner import Pair, slopes_of
 from .surfaces import Surface
 
 TOGETHER = 1000
@@ -24,21 +25,21 @@ TOGETHER = 1000
 
 
 def locate_point(
-    image: PushbroomImage, surface: Surface, line: Float[Array, ""], pixel: Float[Array, ""]
-) -> Vector:
+    image: PushbroomImage, surface: Surface, line: Scalar, pixel: Scalar
+) -> Triple:
     """The point (X, Y, Z), in metres, that a place in the image shows; NaN if the ray misses."""
     pose = pose_at(image, image.times.time(line))
     return ground_point(pose, image.optics.slopes(pixel), surface, image.corrections)
 
 
 def ground_point(
-    pose: Pose, slopes: tuple[Array, Array], surface: Surface, corrections: Corrections
-) -> Vector:
+    pose: Pose, slopes: Pair, surface: Surface, corrections: Corrections
+) -> Triple:
     """The first point on the surface in the direction [ξ, η, −1] of a pose."""
     P, R, V = pose
-    o, d = tuple(P), turned(R, (*slopes, -1.0))
+    o, d = P, turned(R, (*slopes, -1.0))
     if corrections.aberration:
-        d = without_aberration(d, inertial_velocity(o, tuple(V)))
+        d = without_aberration(d, inertial_velocity(o, V))
     X = along(o, d, surface.distance(o, d))
     if corrections.light_time:
         start, direction = o, d

@@ -92,7 +92,8 @@ def line_period(image):
 
 def seen_from(image, earth, motion, X):
     """Where X seems to be to a camera at P with the velocity V; `motion` is (P, V)."""
-    return seen_point(image.corrections, earth, *motion, X) if image.corrections.any else X
+    P, V = motion
+    return seen_point(image.corrections, earth, P, V, X) if image.corrections.any else X
 
 
 def motion(numbers, rates, origin):

@@ -24,6 +24,7 @@ from jaxbundle.geometry import (
     quaternion_multiply,
 )
 from jaxbundle.geometry.quaternions import matrix_from_rotation_vector
+from jaxbundle.types import AnyArray
 
 from .image import PushbroomImage
 
@@ -44,12 +45,12 @@ class Noise(NamedTuple):
 class Errors(NamedTuple):
     """Errors of an image's ancillary data, in the order of `Noise`."""
 
-    attitude_bias: Float[Array, "3"]
-    attitude_drift: Float[Array, "3"]
-    attitude_white: Float[Array, "rows 3"]
-    position_bias: Float[Array, "3"]
-    position_drift: Float[Array, "3"]
-    position_white: Float[Array, "rows2 3"]
+    attitude_bias: Float[AnyArray, "3"]
+    attitude_drift: Float[AnyArray, "3"]
+    attitude_white: Float[AnyArray, "rows 3"]
+    position_bias: Float[AnyArray, "3"]
+    position_drift: Float[AnyArray, "3"]
+    position_white: Float[AnyArray, "rows2 3"]
 
 
 def no_errors(image: PushbroomImage) -> Errors:

@@ -3,24 +3,27 @@
 from collections.abc import Sequence
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax import Array
+from jaxtyping import Float
 
-Coefficients = Float[Array, "k *shape"] | Sequence[Float[Array, "*shape"] | float]
+from jaxbundle.types import AnyArray, Scalar
+
+Coefficients = Float[AnyArray, "k ..."] | Sequence[Scalar]
 
 
-def value(coefficients: Coefficients, x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+def value(coefficients: Coefficients, x: Scalar) -> Float[Array, "..."]:
     """c₀ + c₁·x + c₂·x² + …"""
-    total = coefficients[-1]
+    total = jnp.asarray(coefficients[-1])
     for c in coefficients[-2::-1]:
         total = total * x + c
     return total
 
 
 def value_and_rate(
-    coefficients: Coefficients, x: Float[Array, "*shape"]
-) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
+    coefficients: Coefficients, x: Scalar
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """The same, and its derivative by x."""
-    total, rate = coefficients[-1], jnp.zeros_like(x)
+    total, rate = jnp.asarray(coefficients[-1]), jnp.zeros_like(x)
     for c in coefficients[-2::-1]:
         total, rate = total * x + c, rate * x + total
     return total, rate

@@ -26,6 +26,7 @@ from jaxtyping import Array, Float, Int
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, normal
 from jaxbundle.geometry.vectors import Vector, difference, dot, turned_back
 from jaxbundle.implicit import implicit_root, solve_dense
+from jaxbundle.types import AnyArray, Scalar
 
 from .corrections import Corrections, seen_point
 from .footprint import Footprint, make_footprint
@@ -33,6 +34,7 @@ from .image import Pose, PushbroomImage, pose_at
 from .newton import collected, first_of, refine, replaced
 from .passages import FINE_SEARCH, line_of_detectors, passages, sample, sample_times
 from .pieces import Pieces, make_pieces
+from .scanner import Pair
 
 CHUNK = 2048
 """Points that go through all steps together, so that they stay in the cache."""
@@ -103,7 +105,7 @@ def make_search(image: PushbroomImage, earth: Ellipsoid | None = WGS84) -> Searc
 def project_points(
     image: PushbroomImage,
     search: Search,
-    X: Float[Array, "3 n"],
+    X: Float[AnyArray, "3 n"],
     most: int = 1,
     margin: float = 0.0,
 ) -> Projected:
@@ -125,7 +127,7 @@ def _project_points(image, search, X, most, margin):
 
 @jax.jit
 def project_from(
-    image: PushbroomImage, search: Search, X: Vector, line: Array, pixel: Array
+    image: PushbroomImage, search: Search, X: Vector, line: Scalar, pixel: Scalar
 ) -> tuple[Array, Array]:
     """Line and pixel of points near the given places; arrays of any one shape, not searched for.
 
@@ -141,11 +143,11 @@ def project_from(
 
 def project_near(
     image: PushbroomImage,
-    X: Float[Array, "3"],
-    line: Float[Array, ""],
-    pixel: Float[Array, ""],
+    X: Float[AnyArray, "3"],
+    line: Scalar,
+    pixel: Scalar,
     earth: Ellipsoid | None = WGS84,
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
+) -> tuple[Scalar, Scalar]:
     """Line and pixel of one point seen near a place; differentiable in image and point, to every
     order."""
     fixed = stop_gradient((image, X))
@@ -161,15 +163,15 @@ def project_near(
 
 
 def _misclosure_near(tu, earth, data):
-    image, X = data
-    return misclosure(image, X, *tu, earth)
+    (image, X), (t, u) = data, tu
+    return misclosure(image, X, t, u, earth)
 
 
 def misclosure(
     image: PushbroomImage,
     X: Float[Array, "3"],
-    t: Float[Array, ""],
-    u: Float[Array, ""],
+    t: Scalar,
+    u: Scalar,
     earth: Ellipsoid | None,
 ) -> Float[Array, "2"]:
     """Slopes at which X is seen at the time t less those of the pixel u."""
@@ -179,15 +181,14 @@ def misclosure(
 
 def misclosure_of(
     pose: Pose,
-    slopes: tuple[Array, Array],
+    slopes: Pair,
     X: Float[Array, "3"],
     corrections: Corrections,
     earth: Ellipsoid | None,
 ) -> Float[Array, "2"]:
     """Slopes at which X is seen from a pose less others."""
     P, R, V = pose
-    X = seen_point(corrections, earth, tuple(P), tuple(V), tuple(X))
-    r, s, q = turned_back(R, difference(X, tuple(P)))
+    r, s, q = turned_back(R, difference(seen_point(corrections, earth, P, V, X), P))
     xi, eta = slopes
     return jnp.stack([-r / q - xi, -s / q - eta])
 

@@ -28,12 +28,12 @@ from jax.lax import stop_gradient
 from jaxtyping import Array, Float
 
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, earth_fixed
-from jaxbundle.geometry.vectors import Vector, along, difference, unit
+from jaxbundle.geometry.vectors import Triple, along, difference, unit, unpacked
 from jaxbundle.implicit import implicit_root, solve_dense
+from jaxbundle.types import AnyArray, Scalar
 
+from .corrections import require_ellipsoid
 from .surfaces import Surface
-
-Scalar = float | Float[Array, ""]
 
 TERMS = 20
 STEPS = 6
@@ -86,7 +86,7 @@ class Rpc(eqx.Module):
     height_scale: Scalar
 
 
-def project(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> tuple[Array, Array]:
+def project(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> tuple[Scalar, Scalar]:
     """Line and sample of one point, given in radians and metres; see `domain` for their status."""
     return _image(rpc, *normalised(rpc, longitude, latitude, height))
 
@@ -125,8 +125,8 @@ def locate(
 
 
 def _misclosure(place, _, data):
-    rpc, H, target = data
-    return jnp.stack(_ratios(rpc, *place, H)) - target
+    (rpc, H, target), (L, P) = data, place
+    return jnp.stack(_ratios(rpc, L, P, H)) - target
 
 
 def _twice_misclosure(place, data):
@@ -144,7 +144,7 @@ def domain(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> Arr
 
 def locate_on(
     rpc: Rpc, surface: Surface, line: Scalar, sample: Scalar
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[Array, Array, Scalar, Array]:
     """(longitude, latitude, height, status) of the first point of the line of sight on a surface.
 
     The points at the lowest and the highest height of the domain span a straight line; where it
@@ -152,14 +152,15 @@ def locate_on(
 
     **Arguments:** `surface` above an ellipsoid of revolution.
     """
-    top, d = sight(rpc, line, sample, surface.earth)
+    earth = require_ellipsoid(surface.earth)
+    top, d = sight(rpc, line, sample, earth)
 
     def shift(state, _):
         o, _ = state
         X = along(o, d, surface.distance(o, d))
         h = surface.height(X)
         longitude, latitude, status = locate(rpc, line, sample, h)
-        own = earth_fixed(surface.earth, (longitude, latitude, h))
+        own = earth_fixed(earth, (longitude, latitude, h))
         return (along(o, difference(own, X), 1.0), (longitude, latitude, h, status)), None
 
     nothing = (jnp.zeros(()), jnp.zeros(()), jnp.zeros(()), jnp.zeros((), int))
@@ -171,7 +172,7 @@ def locate_on(
 
 def sight(
     rpc: Rpc, line: Scalar, sample: Scalar, earth: Ellipsoid = WGS84
-) -> tuple[Vector, Vector]:
+) -> tuple[Triple, Triple]:
     """The chord of a line of sight: its point at the highest height, and its direction downwards.
 
     Earth-fixed, metres; the direction is a unit vector.
@@ -182,16 +183,16 @@ def sight(
 
     ends = rpc.height_offset + jnp.abs(rpc.height_scale) * jnp.array([1.0, -1.0])
     top, bottom = jax.vmap(point)(ends)
-    return tuple(top), unit(difference(bottom, top))
+    return unpacked(top), unit(difference(bottom, top))
 
 
 @jax.jit
 def project_points(
     rpc: Rpc,
-    longitude: Float[Array, " n"],
-    latitude: Float[Array, " n"],
-    height: Float[Array, " n"],
-) -> tuple[Array, Array, Array]:
+    longitude: Float[AnyArray, " n"],
+    latitude: Float[AnyArray, " n"],
+    height: Float[AnyArray, " n"],
+) -> tuple[Scalar, Scalar, Array]:
     """Lines, samples and statuses of many points, radians and metres."""
     place = lambda *point: (*project(rpc, *point), domain(rpc, *point))
     return jax.vmap(place)(longitude, latitude, height)
@@ -199,7 +200,10 @@ def project_points(
 
 @jax.jit
 def locate_points(
-    rpc: Rpc, line: Float[Array, " n"], sample: Float[Array, " n"], height: Float[Array, " n"]
+    rpc: Rpc,
+    line: Float[AnyArray, " n"],
+    sample: Float[AnyArray, " n"],
+    height: Float[AnyArray, " n"],
 ) -> tuple[Array, Array, Array]:
     """Longitudes, latitudes (radians) and statuses of many places at given heights."""
     return jax.vmap(lambda l, s, h: locate(rpc, l, s, h))(line, sample, height)
@@ -207,8 +211,8 @@ def locate_points(
 
 @jax.jit
 def locate_points_on(
-    rpc: Rpc, surface: Surface, line: Float[Array, " n"], sample: Float[Array, " n"]
-) -> tuple[Array, Array, Array, Array]:
+    rpc: Rpc, surface: Surface, line: Float[AnyArray, " n"], sample: Float[AnyArray, " n"]
+) -> tuple[Array, Array, Scalar, Array]:
     """Longitudes, latitudes, heights and statuses of many places on a surface."""
     return jax.vmap(lambda l, s: locate_on(rpc, surface, l, s))(line, sample)
 
@@ -222,7 +226,7 @@ def monomials(L: Scalar, P: Scalar, H: Scalar) -> tuple[Scalar, ...]:
     )  # fmt: skip
 
 
-def normalised(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> Vector:
+def normalised(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> Triple:
     """(L, P, H); longitudes may differ by turns."""
     east = jnp.degrees(longitude) - rpc.longitude_offset
     east = east - 360 * jnp.round(east / 360)

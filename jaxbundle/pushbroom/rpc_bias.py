@@ -67,7 +67,7 @@ class BiasFit(eqx.Module):
 
 def project_compensated(
     rpc: Rpc, bias: Bias, longitude: Scalar, latitude: Scalar, height: Scalar
-) -> tuple[Array, Array]:
+) -> tuple[Scalar, Scalar]:
     """Line and sample of one point, radians and metres, with the bias."""
     line, sample = project(rpc, longitude, latitude, height)
     terms = _terms(rpc, line, sample)

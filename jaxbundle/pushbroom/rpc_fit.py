@@ -187,7 +187,7 @@ def check_rpc(rpc: Rpc, table: RpcTable) -> RpcCheck:
 
 @jax.jit
 def _ground(image, earth, height, lines, pixels):
-    X = locate_points(image, Height(height, earth), lines, pixels)
+    X = locate_points(image, Height(level=height, earth=earth), lines, pixels)
     return jnp.stack(geodetic(earth, tuple(X)))
 
 

@@ -15,13 +15,15 @@ import abc
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax import Array
+from jaxtyping import Float
 
 from jaxbundle.cameras import get_model, image_ray
+from jaxbundle.types import AnyArray, Scalar
 
 from .polynomial import value
 
-Pair = tuple[Array, Array]
+Pair = tuple[Scalar, Scalar]
 
 
 class LineTimes(eqx.Module):
@@ -31,13 +33,13 @@ class LineTimes(eqx.Module):
     period: Float[Array, ""]
     table: Float[Array, " lines"] | None = None
 
-    def time(self, line: Float[Array, ""]) -> Float[Array, ""]:
+    def time(self, line: Scalar) -> Scalar:
         """The time of a line."""
         if self.table is None:
             return self.first + self.period * line
         return _at(self.table, line)
 
-    def line(self, t: Float[Array, ""]) -> Float[Array, ""]:
+    def line(self, t: Scalar) -> Scalar:
         """The line of a time."""
         if self.table is None:
             return (t - self.first) / self.period
@@ -51,7 +53,7 @@ class Optics(eqx.Module):
     """Where the pixels of the line look."""
 
     @abc.abstractmethod
-    def slopes(self, u: Float[Array, ""]) -> Pair:
+    def slopes(self, u: Scalar) -> Pair:
         """(ξ, η) of the pixel u."""
 
 
@@ -68,7 +70,7 @@ class FocalLine(Optics):
     row: Float[Array, ""]
     model: str = eqx.field(static=True, default="brown")
 
-    def slopes(self, u: Float[Array, ""]) -> Pair:
+    def slopes(self, u: Scalar) -> Pair:
         model = get_model(self.model)
         x = self.pitch * (u - self.middle)
         r, s, q = image_ray(model, tuple(self.parameters), x, self.row + 0 * x)
@@ -81,7 +83,7 @@ class AngleTable(Optics):
     across: Float[Array, " pixels"]
     along: Float[Array, " pixels"]
 
-    def slopes(self, u: Float[Array, ""]) -> Pair:
+    def slopes(self, u: Scalar) -> Pair:
         return jnp.tan(_at(self.across, u)), jnp.tan(_at(self.along, u))
 
 
@@ -93,13 +95,13 @@ class AnglePolynomial(Optics):
     middle: Float[Array, ""]
     half: Float[Array, ""]
 
-    def slopes(self, u: Float[Array, ""]) -> Pair:
+    def slopes(self, u: Scalar) -> Pair:
         x = (u - self.middle) / self.half
         zero = jnp.zeros_like(x)  # a constant has the shape of x too
         return zero + value(self.across, x), zero + value(self.along, x)
 
 
-def slopes_of(optics: Optics, pixels: Float[Array, " n"]) -> tuple[Array, Array]:
+def slopes_of(optics: Optics, pixels: Float[AnyArray, " n"]) -> Pair:
     """(ξ, η) of many pixels."""
     return jax.vmap(optics.slopes)(pixels)
 

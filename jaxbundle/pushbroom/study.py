@@ -83,11 +83,8 @@ def accuracy_table(
     surface is any but a terrain.
     """
     middles = lambda n, size: (np.arange(n) + 0.5) * size / n - 0.5
-    places = tuple(
-        v.ravel() for v in np.meshgrid(
-            middles(lines, flight.lines), middles(pixels, flight.pixels), indexing="ij"
-        )
-    )  # fmt: skip
+    of_line, of_pixel = middles(lines, flight.lines), middles(pixels, flight.pixels)
+    places = np.repeat(of_line, pixels), np.tile(of_pixel, lines)
     quiet = dataclasses.replace(flight, noise=Noise())
     altitude, view = altitude_and_view(true_image(quiet), surface)
     error_free, erring = [], []

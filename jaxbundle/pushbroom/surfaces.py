@@ -9,7 +9,6 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from jaxbundle.geometry.ellipsoid import (
     WGS84,
@@ -43,7 +42,7 @@ class Surface(eqx.Module):
 class Plane(Surface):
     """Z = height, in a local frame with Z up."""
 
-    level: Float[Array, ""] | float = 0.0
+    level: Scalar = 0.0
     earth: Ellipsoid | None = None
 
     def distance(self, o: Vector, d: Vector) -> Scalar:
@@ -63,7 +62,7 @@ class Ground(Surface):
 class Height(Surface):
     """All points of one geodetic height above an ellipsoid of revolution."""
 
-    level: Float[Array, ""] | float
+    level: Scalar
     earth: Ellipsoid = WGS84
 
     def distance(self, o: Vector, d: Vector) -> Scalar:

@@ -32,7 +32,7 @@ from jaxtyping import Array, Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, at_height, geodetic, ray_to_ellipsoid
-from jaxbundle.geometry.vectors import Scalar, Vector, along
+from jaxbundle.geometry.vectors import Scalar, Triple, Vector, along
 from jaxbundle.implicit import implicit_root, solve_dense
 
 from .polynomial import value, value_and_rate
@@ -60,16 +60,17 @@ class Terrain(Surface):
     over_voids: bool = eqx.field(static=True, default=True)
 
     def distance(self, o: Vector, d: Vector) -> Scalar:
-        still, *ray = stop_gradient((self, o, d))
-        top, bottom = still._slab(*ray)
-        path = still._path(*ray, top, bottom)
+        start = o, d
+        still, o, d = stop_gradient((self, o, d))
+        top, bottom = still._slab(o, d)
+        path = still._path(o, d, top, bottom)
         tau = _first_hit(path, still.heights, self.over_voids)
         s = top + tau * (bottom - top)
         slope = _rate(path, tau, still.heights) / (bottom - top)
-        s = s - _above_ground(s, None, (still, *ray)) / slope
-        return implicit_root(_above_ground, solve_dense, s, None, (self, o, d))
+        s = s - _above_ground(s, None, (still, o, d)) / slope
+        return implicit_root(_above_ground, solve_dense, s, None, (self, *start))
 
-    def grid(self, X: Vector) -> Vector:
+    def grid(self, X: Vector) -> Triple:
         """(column, row, height) of a point."""
         x, y, h = X if self.earth is None else geodetic(self.earth, X)
         dx = x - self.origin[0]
@@ -116,9 +117,10 @@ def make_terrain(
         raise InputError("terrain: no height is a number; give a model that covers the image")
     low, high = float(np.nanmin(heights)), float(np.nanmax(heights))
     heights = np.where(np.isfinite(heights), heights, np.nan)
+    (x, y), (dx, dy) = origin, step
     return Terrain(
-        jnp.asarray(heights), tuple(map(float, origin)), tuple(map(float, step)), low, high, earth,
-        over_voids,
+        heights=jnp.asarray(heights), origin=(float(x), float(y)), step=(float(dx), float(dy)),
+        lowest=low, highest=high, earth=earth, over_voids=over_voids,
     )  # fmt: skip
 
 

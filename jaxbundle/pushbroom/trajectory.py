@@ -32,6 +32,7 @@ from jaxbundle.geometry import (
     quaternion_multiply,
     rotation_vector_from_quaternion,
 )
+from jaxbundle.types import AnyArray, Scalar
 
 from .interpolation import Table, covers, fraction, interpolate, interval, rate
 
@@ -54,17 +55,17 @@ class Trajectory(eqx.Module):
     attitude: Attitude
 
 
-def position_at(trajectory: Trajectory, t: Float[Array, ""]) -> Float[Array, "3"]:
+def position_at(trajectory: Trajectory, t: Scalar) -> Float[Array, "3"]:
     """The projection centre P at t, metres; NaN outside the table."""
     return interpolate(trajectory.position, t)
 
 
-def velocity_at(trajectory: Trajectory, t: Float[Array, ""]) -> Float[Array, "3"]:
+def velocity_at(trajectory: Trajectory, t: Scalar) -> Float[Array, "3"]:
     """The rate V of the interpolated position in the (turning) object frame, metres a second."""
     return rate(trajectory.position, t)
 
 
-def rotation_at(trajectory: Trajectory, t: Float[Array, ""]) -> Float[Array, "3 3"]:
+def rotation_at(trajectory: Trajectory, t: Scalar) -> Float[Array, "3 3"]:
     """R from the camera frame to the object frame at t; NaN outside the table."""
     R = attitude_at(trajectory.attitude, t)
     if trajectory.attitude.reference == "earth":
@@ -72,7 +73,7 @@ def rotation_at(trajectory: Trajectory, t: Float[Array, ""]) -> Float[Array, "3 
     return orbital_frame(position_at(trajectory, t), velocity_at(trajectory, t)) @ R
 
 
-def attitude_at(attitude: Attitude, t: Float[Array, ""]) -> Float[Array, "3 3"]:
+def attitude_at(attitude: Attitude, t: Scalar) -> Float[Array, "3 3"]:
     """R from the camera frame to the frame the attitudes refer to."""
     table = attitude.table
     if table.values.shape[1] == 3:
@@ -80,12 +81,12 @@ def attitude_at(attitude: Attitude, t: Float[Array, ""]) -> Float[Array, "3 3"]:
     return matrix_from_quaternion(_slerp(table, t) if attitude.slerp else interpolate(table, t))
 
 
-def matrix_from_pitch_roll_yaw(angles: Float[Array, "3"]) -> Float[Array, "3 3"]:
+def matrix_from_pitch_roll_yaw(angles: Float[AnyArray, "3"]) -> Float[Array, "3 3"]:
     """R = Rx(θ₂)·Ry(θ₁)·Rz(θ₃) of (θ₂, θ₁, θ₃) = (pitch, roll, yaw), radians."""
     return matrix_from_omega_phi_kappa(angles).T
 
 
-def orbital_frame(P: Float[Array, "3"], V: Float[Array, "3"]) -> Float[Array, "3 3"]:
+def orbital_frame(P: Float[AnyArray, "3"], V: Float[AnyArray, "3"]) -> Float[Array, "3 3"]:
     """The axes right, forward and up at P, of a platform that moves with V, as columns."""
     up = P / jnp.linalg.norm(P)
     right = jnp.cross(V, up)

@@ -75,11 +75,11 @@ def surface_of(
         terrain = read_terrain(dem, earth, extent)
         return terrain if geoid is None else add_geoid(terrain, geoid)
     if earth is None:
-        return Plane(height or 0.0)
+        return Plane(level=height or 0.0)
     if height is None:
         return Ground(earth)
     check_spheroid(earth)
-    return Height(height, earth)
+    return Height(level=height, earth=earth)
 
 
 def open_scanner(path: Path) -> Scanner:
