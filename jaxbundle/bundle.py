@@ -1,6 +1,7 @@
 """`adjust`: a network in, an `Adjustment` out."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from types import MappingProxyType
 
 import numpy as np
@@ -8,6 +9,7 @@ import numpy as np
 from jaxbundle.adjustment.problem import REDUCTIONS, Problem, make_problem
 from jaxbundle.arguments import at_least_zero, one_of, shown, truth, whole
 from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.far_points import minimise_at_any_distance, minimise_with_infinity
 from jaxbundle.leastsquares.declarations import Observations, Table
 from jaxbundle.leastsquares.robust import ESTIMATORS
 from jaxbundle.leastsquares.search import METHODS
@@ -28,7 +30,6 @@ from jaxbundle.repeated import eliminated_parameters, robustly, snooped, with_co
 from jaxbundle.result import Adjustment
 from jaxbundle.solution import (
     adjusted_cameras,
-    minimise,
     misjudged,
     names_of_defects,
     solved,
@@ -104,15 +105,17 @@ def adjust(
         found = orient(given)
         network, finding = _placed(found), found.finding
     options = {"search": METHODS[method], "max_steps": max_iterations + 1, "progress": progress}
-    again = lambda problem, values: minimise(problem, values, **options)
+    again = lambda problem, values: minimise_with_infinity(problem, values, **options)
 
     def begin(network, cameras=MappingProxyType({})):
         network, *check = split_check_points(check_network(network))
+        make = partial(make_problem, network, reduction, also)
         try:
-            problem = make_problem(network, reduction, also)
+            problem = make()
         except InputError as error:  # The datum, for want of the control points left out.
             raise InputError(f"{error} {finding}".strip()) from None
-        return problem, again(problem, start_with(problem, cameras)), check
+        start = start_with(problem, cameras)
+        return *minimise_at_any_distance(problem, start, make, **options), check
 
     problem, minimum, check = begin(network)
     while len(network.observations) < len(given.observations) and misjudged(problem, minimum):

@@ -83,7 +83,7 @@ class _Repeat:
 
     def __call__(self, system, tables) -> Solution:
         problem = self.problem.with_system(system)
-        self.minimum = self.again(problem, self.problem.layout.values(tables))
+        problem, self.minimum = self.again(problem, self.problem.layout.values(tables))
         return require_solved(problem, self.minimum, self.when).solution
 
 
@@ -126,7 +126,7 @@ def eliminated_parameters(problem, minimum, again, critical_t):
             return problem, minimum, names
         names.append(weak[0])
         problem, values = _without_parameter(problem, minimum.values, weak[0])
-        minimum = again(problem, values)
+        problem, minimum = again(problem, values)
         require_solved(problem, minimum, f"without {weak[0]}")
 
 

@@ -25,6 +25,7 @@ from jaxbundle.arguments import at_least_zero
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.adjust import TableResult, table_result
+from jaxbundle.leastsquares.any_distance import is_at_infinity
 from jaxbundle.leastsquares.components import Component, variance_components
 from jaxbundle.leastsquares.distributions import chi2_quantile
 from jaxbundle.leastsquares.names import Name
@@ -43,6 +44,7 @@ from jaxbundle.orientation.exchanges import CONTRADICTION
 from jaxbundle.statistics.blunders import Removed, Suspect
 from jaxbundle.statistics.check_points import CheckPoints
 from jaxbundle.statistics.components import groups
+from jaxbundle.statistics.far_points import FarPoints, find_far_points
 from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.statistics.misfit import doubt_of_fit
 from jaxbundle.statistics.validity import Reach, distortion_reach
@@ -61,6 +63,8 @@ class Adjustment:
     - `warnings`, `removed` (data snooping), `eliminated` (insignificant parameters),
       `undetermined` (names, where the network is singular), `weakness` (what is determined in name
       only)
+    - `far_points`: direction and distance of the points at any distance, whose rays are nearly
+      parallel; None where there are none
     - `sigma_factors`: where variance components were estimated, by group of observations, what its
       a priori σ have been multiplied by; empty otherwise. Everything called a priori then means
       the estimated σ, except in `variance_components`.
@@ -296,13 +300,26 @@ class Adjustment:
 
     @functools.cached_property
     def point_values(self) -> Float[np.ndarray, "points 3"]:
-        """X, Y, Z in the object unit."""
-        return np.asarray(self.values.point) + self.problem.origin
+        """X, Y, Z in the object unit; NaN at infinity."""
+        return self._unless_at_infinity(np.asarray(self.values.point) + self.problem.origin)
 
     @functools.cached_property
     def point_covariance(self) -> Float[np.ndarray, "points 3 3"]:
-        """Marginal covariance of every point; zero where it is fixed."""
-        return self.sigma0**2 * self.cofactors.point_cofactors
+        """Marginal covariance of every point; zero where it is fixed, NaN at infinity."""
+        return self._unless_at_infinity(self.sigma0**2 * self.cofactors.point_cofactors)
+
+    def _unless_at_infinity(self, of_points):
+        lengths = self.problem.layout.lengths
+        if lengths is None:
+            return of_points
+        there = is_at_infinity(np.asarray(self.values.point), lengths)
+        return np.where(there.reshape(-1, *(1,) * (of_points.ndim - 1)), np.nan, of_points)
+
+    @functools.cached_property
+    def far_points(self) -> FarPoints | None:
+        """The points that are adjusted at any distance, since their rays are nearly parallel; None
+        where there are none."""
+        return find_far_points(self.cofactors, self.sigma0)
 
     def camera_parameters(self, camera: str) -> dict[str, float]:
         """All parameters of a camera by name."""
@@ -405,13 +422,15 @@ class Adjustment:
         return result_tables.residuals(self)
 
     def table(self, name: str) -> dict[str, np.ndarray]:
-        """A table by name: images, points, residuals, cameras (one row a parameter) or checks."""
-        if name == "cameras":
-            return result_tables.parameters(self)
-        if name == "checks":
-            return result_tables.checks(self)
+        """A table by name: images, points, residuals, cameras (one row a parameter), checks or
+        far_points."""
+        made = {"cameras": result_tables.parameters, "checks": result_tables.checks,
+                "far_points": result_tables.far_points}  # fmt: skip
+        if name in made:
+            return made[name](self)
         if name not in ("images", "points", "residuals"):
-            raise KeyError(f"tables are cameras, images, points, residuals, checks; not {name!r}")
+            known = "cameras, images, points, residuals, checks, far_points"
+            raise KeyError(f"tables are {known}; not {name!r}")
         return getattr(self, name)
 
     # --- for people -------------------------------------------------------------------------

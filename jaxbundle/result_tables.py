@@ -84,6 +84,20 @@ def points(adjustment) -> dict[str, np.ndarray]:
     return table | _rays_and_rms(adjustment, problem.point, len(network.points))
 
 
+def far_points(adjustment) -> dict[str, np.ndarray]:
+    """Of the points at any distance, if there are any: columns id, uX, uY, uZ (the direction from
+    the middle of the projection centres), su (its largest σ, angle unit), distance, nearer and
+    farther (one σ of the inverse distance from it), at_infinity."""
+    found = adjustment.far_points
+    if found is None:
+        return {}
+    table = {"id": np.array(found.id, dtype=object)}
+    table |= {f"u{axis}": found.direction[:, i] for i, axis in enumerate("XYZ")}
+    table["su"] = found.sigma_direction[:, 0] * adjustment.angle_scale
+    table |= {"distance": found.distance, "nearer": found.reach[:, 0], "farther": found.reach[:, 1]}
+    return table | {"at_infinity": found.at_infinity}
+
+
 def _rays_and_rms(adjustment, of_ray, n: int) -> dict[str, np.ndarray]:
     """Columns rays and rms (of v, image unit) of what `of_ray` gives for every ray."""
     weight = np.asarray(adjustment.problem.data.image_weight)

@@ -25,7 +25,7 @@ from jaxbundle.plotting.style import need_matplotlib
 from jaxbundle.result import Adjustment
 
 REPORT, RESULT = "report.txt", "result.json"
-TABLES = ("cameras", "images", "points", "residuals", "checks")
+TABLES = ("cameras", "images", "points", "residuals", "checks", "far_points")
 FILES = (
     REPORT, RESULT, *(f"{name}.csv" for name in TABLES),
     *(f"{ADJUSTED}/{name}" for name in NETWORK_FILES), *FIGURES,

@@ -10,7 +10,7 @@ import pytest
 from scipy import integrate
 
 import jaxbundle
-from jaxbundle import Camera, InputError, bundle
+from jaxbundle import Camera, InputError, far_points
 from jaxbundle.bundle import adjust
 from jaxbundle.cameras import get_model, residual
 from jaxbundle.geometry import matrix_from_quaternion
@@ -214,8 +214,8 @@ def test_a_large_network_takes_single_steps(network, options, monkeypatch):
     spoilt, _, _ = with_blunders(network, 1)
     usual = adjust(spoilt, **options)
     monkeypatch.setattr(snooping, "STEPPING", 0)
-    calls, whole = [], bundle.minimise
-    monkeypatch.setattr(bundle, "minimise", lambda *a, **k: calls.append(1) or whole(*a, **k))
+    calls, whole = [], far_points.minimise
+    monkeypatch.setattr(far_points, "minimise", lambda *a, **k: calls.append(1) or whole(*a, **k))
     found = adjust(spoilt, **options)
     assert len(calls) <= 3
     names = lambda result: {r.name for r in (*result.removed, *result.suspects)}

@@ -8,6 +8,7 @@ import pytest
 
 LAYERS = (
     "errors",
+    "types",
     "file_content",
     "arguments",
     "temporaries",
@@ -32,6 +33,7 @@ LAYERS = (
     "result_tables",
     "result",
     "solution",
+    "far_points",
     "oriented",
     "repeated",
     "bundle",

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.arguments import one_of
 from jaxbundle.configuration import require_x64
@@ -81,6 +81,12 @@ class Problem:
         """The camera of every image point."""
         return self.network.images.camera[self.image]
 
+    @property
+    def at_any_distance(self) -> Bool[np.ndarray, " points"]:
+        """Which points move as directions and distances up to infinity."""
+        lengths = self.layout.lengths
+        return np.zeros(len(self.network.points), bool) if lengths is None else lengths > 0
+
     def interior(self, c: int) -> tuple[tuple[str, ...], Int[np.ndarray, " k"]]:
         """The parameters of a camera that move in any camera of its model, and which of them are
         free in this one."""
@@ -95,8 +101,11 @@ class Problem:
         return self.system.plan.reduction
 
     def with_system(self, system: engine.Problem) -> "Problem":
-        """The same after its system was changed: weights, what is held."""
-        return self._with(system, self.layout.with_weights(self.data, system.data.weight))
+        """The same after its system was changed: weights, what is held, and where."""
+        data = self.layout.with_weights(self.data, system.data.weight)
+        if self.layout.lengths is not None:
+            data = dataclasses.replace(data, start=self.layout.values(system.data.start))
+        return self._with(system, data)
 
     def with_factor(self) -> "Problem":
         """The same with a reduced system that can be factorised, as statistics need it; unchanged
@@ -111,13 +120,18 @@ class Problem:
         """The same with some unknowns held at their start values."""
         return self._with(engine.hold(self.system, table, rows, columns), self.data)
 
+    def with_free(self, table: str, free) -> "Problem":
+        """The same with these unknowns of a table free, the others held at their start values."""
+        return self._with(engine.with_free(self.system, table, free), self.data)
+
     def _with(self, system, data: Data) -> "Problem":
         counts = count_rows(self.layout, system)
         return dataclasses.replace(self, system=system, data=data, counts=counts)
 
 
 def make_problem(
-    network: Network, reduction: str | None = None, also: Sequence[Table | Observations] = ()
+    network: Network, reduction: str | None = None, also: Sequence[Table | Observations] = (),
+    lengths: Float[np.ndarray, " points"] | None = None,
 ) -> Problem:
     """Plan, arrays and datum of a checked network (see `jaxbundle.network.check_network`).
 
@@ -125,7 +139,8 @@ def make_problem(
 
     `reduction`: how the reduced system is solved, "dense", "banded" or "iterative"; chosen by its
     size and fill if not given. `also`: observations of further kinds, and tables of the unknowns
-    they bring (see `jaxbundle.adjust`).
+    they bring (see `jaxbundle.adjust`). `lengths`: of points that may be at any distance, the unit
+    of theirs, 0 of the others (`leastsquares.any_distance`); those hold no datum.
 
     **Raises:** `InputError` where the datum asked for cannot be had; `RuntimeError` without
     64-bit floats.
@@ -134,8 +149,10 @@ def make_problem(
     one_of("reduction", reduction, REDUCTIONS, none=True)
     require_network(network)
     network = order_cameras(split_check_points(network)[0])
-    declared = declare(network, also=also)
-    chosen = _datum_points(network)
+    chosen, origin = _datum_points(network), None
+    if lengths is not None:
+        chosen, origin = chosen & (lengths == 0), np.round(network.images.position.mean(0))
+    declared = declare(network, origin, also, lengths)
     try:
         system = engine.make_problem(
             declared.tables, declared.observations, "point", motions=declared.motions,

@@ -50,6 +50,7 @@ def result_dict(adjustment, brief: bool = False) -> dict:
         "cameras": {name: _camera(table) for name, table in adjustment.cameras.items()},
         "images": _images(adjustment),
         "further_unknowns": adjustment.further_unknowns,
+        "far_points": _far_points(adjustment),
         "removed": [
             {"kind": r.kind, "name": r.name, "test": r.test} for r in adjustment.removed
         ],
@@ -158,6 +159,26 @@ def _points(table) -> Iterator[tuple[str, dict]]:
         yield point["id"], {"role": point["role"]} | estimates | {
             "rays": point["rays"], "rms": point["rms"]
         }  # fmt: skip
+
+
+def _far_points(adjustment) -> dict:
+    found = adjustment.far_points
+    if found is None:
+        return {}
+    columns = {name: column.tolist() for name, column in adjustment.table("far_points").items()}
+    inverse = zip(found.inverse_distance.tolist(), found.sigma_inverse_distance.tolist())
+    return {
+        "origin": dict(zip("XYZ", found.origin.tolist())),
+        "points": {
+            point: {
+                "direction": {axis: columns[f"u{axis}"][i] for axis in "XYZ"},
+                "sigma_direction": columns["su"][i],
+                "inverse_distance": _estimate(*estimate),
+                "at_infinity": columns["at_infinity"][i],
+            }
+            for i, (point, estimate) in enumerate(zip(columns["id"], inverse))
+        },
+    }
 
 
 def _residuals(table) -> Iterator[dict]:

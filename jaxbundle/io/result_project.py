@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 
+from jaxbundle.network.sightings import keep_points
 from jaxbundle.network.tables import Images, Network, Observations, Points
 
 
@@ -15,7 +16,7 @@ def adjusted_network(adjustment) -> Network:
     kinds are dropped: what they said has been used, and around the adjusted values they would say
     it twice. So the datum is inner; adjusted again, the network stays as it is. σ of image
     coordinates are those given, also where variance components were estimated. Check points are
-    not in it.
+    not in it, nor are points at infinity, which have no coordinates.
     """
     problem = adjustment.problem
     network = problem.network
@@ -31,7 +32,7 @@ def adjusted_network(adjustment) -> Network:
     )  # fmt: skip
     used = (np.asarray(problem.data.image_weight) > 0).any(1)
     roles = tuple("tie" if role == "control" else role for role in points.role)
-    return network.replace(
+    adjusted = network.replace(
         cameras=cameras,
         images=Images(images.id, images.camera, values[:, :3], values[:, 3:],
                       np.full_like(images.sigma, np.nan), images.source),
@@ -41,3 +42,4 @@ def adjusted_network(adjustment) -> Network:
                                   rays.source).take(used),
         datum="inner", datum_points=(), further=(), warnings=("the adjusted network",),
     )  # fmt: skip
+    return keep_points(adjusted, np.isfinite(adjustment.point_values).all(1))

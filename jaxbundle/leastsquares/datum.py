@@ -132,8 +132,7 @@ def move_to_datum(
     if plan.datum is None:
         return values, jnp.asarray(True)
     plan, still = leave_held(declared, plan, values), jnp.zeros(plan.datum.gauge.shape[1])
-    weighted = tuple(plan.datum.weight)
-    size = max(jnp.abs(x).max() for name in weighted for x in jax.tree.leaves(start[name]))
+    size = _largest(plan, start)
 
     def moving(state):
         _, distance, before, count = state
@@ -149,15 +148,21 @@ def move_to_datum(
         step = plan.datum.gauge @ -jnp.linalg.solve(slope, missing)
         curved = jnp.abs(step[jnp.array(declared.motions.curved, int)]).max(initial=0.0)
         moved = _moved(declared, plan, step / jnp.maximum(curved / LONGEST, 1.0), values)
-        distance = max(
-            jnp.abs(a - b).max() for name in weighted
-            for a, b in zip(jax.tree.leaves(moved[name]), jax.tree.leaves(values[name]))
-        )  # fmt: skip
-        return moved, distance, before, count + 1
+        differences = {name: jax.tree.map(jnp.subtract, moved[name], values[name])
+                       for name in plan.datum.weight}  # fmt: skip
+        return moved, _largest(plan, differences), before, count + 1
 
     begin = values, jnp.asarray(1e300), jnp.asarray(jnp.inf), 0
     values, distance, *_ = jax.lax.while_loop(moving, further, begin)
     return values, distance <= THERE * size
+
+
+def _largest(plan: Plan, tables: Values):
+    """The largest number of the rows that hold the datum."""
+    return max(
+        jnp.where(weight.max(1) > 0, jnp.abs(x.reshape(len(weight), -1)).max(1), 0.0).max()
+        for name, weight in plan.datum.weight.items() for x in jax.tree.leaves(tables[name])
+    )  # fmt: skip
 
 
 def _datum_equations(declared, plan, values, start):

@@ -176,9 +176,15 @@ def open_at(problem: Problem, values: Values) -> Problem:
 
 def hold(problem: Problem, table: str, rows, columns=slice(None)) -> Problem:
     """The problem with some unknowns held at their start values; they hold no datum any more."""
-    given = next(t for t in problem.tables if t.name == table)
+    given = problem.table(table)
     free = given.free.copy()
     free[np.ix_(np.atleast_1d(rows), np.arange(given.space.width)[columns])] = 0.0
+    return with_free(problem, table, free)
+
+
+def with_free(problem: Problem, table: str, free: Float[np.ndarray, "rows width"]) -> Problem:
+    """The problem with these unknowns of a table free, the others held at their start values; of
+    those only what was free when the plan was made, and what is held holds no datum any more."""
     tables = tuple(
         dataclasses.replace(t, free=free) if t.name == table else t for t in problem.tables
     )
@@ -189,7 +195,7 @@ def hold(problem: Problem, table: str, rows, columns=slice(None)) -> Problem:
             if m.table == table:
                 part = wide if m.rows is None else wide[np.asarray(m.rows)]
                 now = np.array(group.free)
-                now[:, m.start : m.start + m.width] *= part[: len(now)]
+                now[:, m.start : m.start + m.width] = part[: len(now)]
                 group = dataclasses.replace(group, free=jax.device_put(now), all_free=False)
         groups[name] = group
     if plan.datum is not None and table in plan.datum.weight:

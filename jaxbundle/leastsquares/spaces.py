@@ -285,7 +285,7 @@ class Direction:
         return self.size - 1
 
     def prepare(self, value):
-        return tuple(value), tuple(map(tuple, _tangent_basis(value)))
+        return tuple(value), tuple(map(tuple, tangent_basis(value)))
 
     def moved(self, block, change):
         value, basis = block
@@ -298,11 +298,11 @@ class Direction:
         )
 
     def retract(self, value, change):
-        moved = value + _tangent_basis(value) @ change
+        moved = value + tangent_basis(value) @ change
         return moved / jnp.linalg.norm(moved)
 
     def difference(self, value, origin):
-        return _tangent_basis(origin).T @ value / (value @ origin)
+        return tangent_basis(origin).T @ value / (value @ origin)
 
     def hold(self, value, given, free):
         return jnp.where(free.max() > 0, value, given)
@@ -311,7 +311,7 @@ class Direction:
         return None
 
 
-def _tangent_basis(value: Float[Array, " n"]) -> Float[Array, "n n-1"]:
+def tangent_basis(value: Float[Array, " n"]) -> Float[Array, "n n-1"]:
     """Columns orthogonal to a unit vector: those of a reflection that takes it to ∓ its last axis,
     without the last."""
     sign = jnp.where(value[-1] < 0, -1.0, 1.0)

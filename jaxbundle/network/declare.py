@@ -17,10 +17,11 @@ from jaxtyping import Float, Int
 from jaxbundle.cameras import get_model
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, quaternion_from_matrix
 from jaxbundle.leastsquares import declarations as ls
+from jaxbundle.leastsquares.any_distance import AnyDistance, derivative
 from jaxbundle.leastsquares.problem import observed_weights
 from jaxbundle.leastsquares.rows import Data as EngineData
 from jaxbundle.leastsquares.rows import Values as Tables
-from jaxbundle.leastsquares.spaces import Pose, PoseValue
+from jaxbundle.leastsquares.spaces import Pose, PoseValue, Vector
 from jaxbundle.network import kinds
 from jaxbundle.network.also import place, split
 from jaxbundle.network.arrays import Data, Values
@@ -60,16 +61,19 @@ class Set:
 @dataclasses.dataclass(frozen=True)
 class Layout:
     """Where the arrays of a network stand; `width`: of `Values.camera`; `given`: the points, images
-    and cameras that the rows of control, exterior and interior belong to."""
+    and cameras that the rows of control, exterior and interior belong to; `lengths`: where points
+    move at any distance, the unit of theirs, 0 of the others."""
 
     cameras: tuple[CameraTable, ...]
     sets: tuple[Set, ...]
     width: int
     given: Mapping[str, Int[np.ndarray, " rows"]]
+    lengths: Float[np.ndarray, " points"] | None = None
 
     def tables(self, values: Values) -> Tables:
         """The unknowns as the engine's tables."""
-        found = {"image": PoseValue(values.position, values.rotation), "point": values.point}
+        found = {"image": PoseValue(values.position, values.rotation)}
+        found["point"] = self._points(values.point)
         camera = values.camera
         # On the host, where nothing is compiled for it.
         camera = camera if isinstance(camera, jax.core.Tracer) else np.asarray(camera)
@@ -87,7 +91,21 @@ class Layout:
         own = {"image", "point", *(table.name for table in self.cameras)}
         other = {name: rows for name, rows in tables.items() if name not in own}
         camera = jax.device_put(camera)
-        return Values(camera, *tables["image"], tables["point"], other)
+        return Values(camera, *tables["image"], tables["point"][:, :3], other)
+
+    def _points(self, point):
+        """The rows of the table of points."""
+        if self.lengths is None:
+            return point
+        module = jnp if isinstance(point, jax.core.Tracer) else np
+        return module.concatenate([point, self.lengths[:, None]], 1)
+
+    def coordinate_cofactors(self, point, Q):
+        """The cofactors of X, Y, Z of all points, of those of the directions in which they move."""
+        if self.lengths is None:
+            return Q
+        A = jax.vmap(derivative)(jnp.asarray(self._points(point)))
+        return A @ Q @ A.transpose(0, 2, 1)
 
     def data(self, data: Data) -> EngineData:
         """The numbers of a network as the engine's."""
@@ -153,22 +171,25 @@ class Declared:
     motions: ls.Motions
 
 
-def declare(network: Network, origin=None, also=()) -> Declared:
+def declare(network: Network, origin=None, also=(), lengths=None) -> Declared:
     """The tables and observations of a checked network (`check_network`) without check points.
 
     `origin`: of its coordinates, the middle of its points if not given; `also`: further tables, and
-    observations of further kinds (`also.py`)."""
+    observations of further kinds (`also.py`); `lengths`: of points at any distance (`Layout`)."""
     data, origin, priors = _data(network, origin)
     further, others = split(also)
     images, points, observations = network.images, network.points, network.observations
     cameras = camera_tables(network.cameras)
     table_of = {int(c): (t, row) for t in cameras for row, c in enumerate(t.cameras)}
     start = data.start
+    placed = start.point, Vector(3)
+    if lengths is not None:
+        placed = np.concatenate([start.point, lengths[:, None]], 1), AnyDistance()
     tables = [
         ls.Table("image", PoseValue(start.position, start.rotation), Pose(), images.sigma != 0,
                  images.id, EXTERIOR),
         *(t.unknowns(network.cameras) for t in cameras),
-        ls.Table("point", start.point, free=~points.has_role("fixed"), labels=points.id,
+        ls.Table("point", *placed, free=~points.has_role("fixed"), labels=points.id,
                  parameters=("X", "Y", "Z")),
     ]
     sets, given = [], []
@@ -207,7 +228,7 @@ def declare(network: Network, origin=None, also=()) -> Declared:
     tables += further
     others = [place(one, origin).resolved(tables) for one in others]
     others += [one for of_kind in declared for one in of_kind.observations]
-    similarity = kinds.SIMILARITY
+    similarity = kinds.SIMILARITY if lengths is None else kinds.SIMILARITY_AT_ANY_DISTANCE
     actions = (*similarity.actions, *(action for one in declared for action in one.actions))
     start = dataclasses.replace(start, other={t.name: t.value for t in further})
     weights = observed_weights(tables, others)
@@ -215,7 +236,7 @@ def declare(network: Network, origin=None, also=()) -> Declared:
         data, start=start, other=tuple((one.measured, w) for one, w in zip(others, weights))
     )
     given += others
-    layout = Layout(cameras, tuple(sets), start.camera.shape[1], priors)
+    layout = Layout(cameras, tuple(sets), start.camera.shape[1], priors, lengths)
     motions = dataclasses.replace(similarity, actions=actions)
     return Declared(tuple(tables), tuple(given), layout, data, origin, motions)
 

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 
 from jaxbundle import cameras
 from jaxbundle.geometry import omega_phi_kappa_near
+from jaxbundle.leastsquares.any_distance import move_at_any_distance
 from jaxbundle.leastsquares.declarations import Kind
 from jaxbundle.leastsquares.motions import similarity
 from jaxbundle.leastsquares.spaces import Posed, turn_by
@@ -98,3 +99,8 @@ def interior_orientation(camera: str, parameters: tuple[str, ...]) -> Kind:
 
 
 SIMILARITY = similarity(("point",), ("image",))
+SIMILARITY_AT_ANY_DISTANCE = dataclasses.replace(
+    SIMILARITY,
+    actions=tuple((name, move_at_any_distance if name == "point" else act)
+                  for name, act in SIMILARITY.actions),
+)  # fmt: skip

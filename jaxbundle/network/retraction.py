@@ -48,7 +48,7 @@ class TurnAboutSeen:
 
     def _middle(self, plan: Plan, values: Values):
         """The middle of the points that each image sees; 0 where it sees none."""
-        position, points = values["image"].position, values["point"]
+        position, points = values["image"].position, values["point"][:, :3]
         seen = jnp.zeros((position.shape[0], 4))
         for part in plan.parts:
             if not isinstance(self.declared.kinds[part.observations].residual, ImagePoint):

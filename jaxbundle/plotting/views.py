@@ -186,9 +186,10 @@ def _neighbour(places, most: int = 400) -> float:
 
 
 def _points(adjustment):
-    """Ids, roles and coordinates, check points included."""
+    """Ids, roles and coordinates, check points included; none at any distance."""
     table = adjustment.points
-    id, role, xyz = table["id"], table["role"], adjustment.point_values
+    there = ~adjustment.problem.at_any_distance
+    id, role, xyz = table["id"][there], table["role"][there], adjustment.point_values[there]
     checks = adjustment.check_points
     if checks is not None:
         id = np.concatenate([id, np.array(checks.id, dtype=object)])
@@ -206,7 +207,8 @@ def error_ellipses(adjustment, factor: float, corners: int = 49) -> np.ndarray:
     """Closed polygons [points, corners, 2] of the ellipses of X and Y of the estimated points."""
     covariance = adjustment.point_covariance[:, :2, :2]
     covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
-    there = np.isfinite(covariance).all((1, 2)) & (np.trace(covariance, axis1=1, axis2=2) > 0)
+    there = ~adjustment.problem.at_any_distance & np.isfinite(covariance).all((1, 2))
+    there &= (np.trace(covariance, axis1=1, axis2=2) > 0)
     square, direction = np.linalg.eigh(covariance[there])
     t = np.linspace(0, 2 * np.pi, corners)
     circle = np.stack([np.cos(t), np.sin(t)])
@@ -219,11 +221,11 @@ def _draw_ellipses(adjustment, ax, size: float) -> np.ndarray:
     from matplotlib.collections import LineCollection
 
     covariance = adjustment.point_covariance[:, :2, :2]
-    large = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
+    large = np.sqrt(np.trace(covariance, axis1=1, axis2=2))[~adjustment.problem.at_any_distance]
     large = large[np.isfinite(large) & (large > 0)]
     if not len(large) or len(large) > ELLIPSES:
         return np.zeros((0, 1, 2))
-    neighbour = _neighbour(adjustment.point_values[:, :2])
+    neighbour = _neighbour(adjustment.point_values[~adjustment.problem.at_any_distance, :2])
     reach = np.clip(0.45 * neighbour, 0.012 * size, 0.03 * size)
     factor = round_number(reach / np.median(large))
     polygons = error_ellipses(adjustment, factor)

@@ -50,6 +50,7 @@ def text(
     lines += unknowns.cameras(adjustment)
     lines += unknowns.images(adjustment, max_rows)
     lines += unknowns.points(adjustment, max_rows, accuracy_unit)
+    lines += unknowns.far_points(adjustment, max_rows)
     lines += unknowns.further(adjustment, max_rows)
     lines += observations.check_points(adjustment, max_rows)
     lines += observations.distances(adjustment, max_rows)

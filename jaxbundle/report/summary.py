@@ -60,6 +60,7 @@ def summary(adjustment) -> list[tuple[str, str]]:
             ("χ² test", chi_squared(adjustment)),
             *_cameras(adjustment),
             ("Points", _points(adjustment)),
+            *_far_points(adjustment),
             ("Largest |τ|", _worst(adjustment)),
         ]
     for noun, things in (
@@ -92,11 +93,18 @@ def _points(adjustment) -> str:
     parts = []
     for axis in "XYZ":
         sigma = adjustment.points[f"s{axis}"]
-        sigma = sigma[np.isfinite(sigma) & (sigma > 0)]
+        sigma = sigma[np.isfinite(sigma) & (sigma > 0) & ~adjustment.problem.at_any_distance]
         if len(sigma):
             rms, most = np.sqrt((sigma**2).mean()), sigma.max()
             parts.append(f"σ{axis} {significant(rms)} (max {significant(most)})")
     return f"RMS {', '.join(parts)} {unit}" if parts else "no coordinate is estimated with a σ"
+
+
+def _far_points(adjustment):
+    found = adjustment.far_points
+    if found is not None:
+        number = f"{count(len(found.id), 'point')} at any distance"
+        yield "", f"and {number}, {found.at_infinity.sum()} of them at infinity"
 
 
 def _worst(adjustment) -> str:

@@ -181,6 +181,7 @@ def _precision(adjustment, accuracy_unit) -> list[str]:
     sigma = np.stack([found[f"s{axis}"] for axis in "XYZ"], 1)
     free = adjustment.problem.system.table("point").free > 0
     free = free & np.isfinite(sigma) & (sigma > 0)
+    free &= ~adjustment.problem.at_any_distance[:, None]
     if not free.any():
         return ["No point has an estimated coordinate with a standard deviation."]
     columns = [sigma[free[:, i], i] for i in range(3)]
@@ -249,6 +250,39 @@ def _list_of_points(adjustment, most) -> list[str]:
         *table(header, rows, "llrrrrrrr"),
         *_left_out(total, most, "point", "points.csv"),
     ]
+
+
+# --- points at any distance -----------------------------------------------------------------
+
+
+def far_points(adjustment, most: int) -> list[str]:
+    """Direction and distance of the points whose rays are nearly parallel, those at infinity
+    first."""
+    found = adjustment.table("far_points")
+    if not found:
+        return []
+    of = adjustment.network
+    order = np.lexsort((-found["distance"], ~found["at_infinity"]))
+    rows = [
+        (
+            found["id"][i],
+            *(f"{found[f'u{axis}'][i]:.6f}" for axis in "XYZ"),
+            significant(found["su"][i]),
+            "at infinity" if found["at_infinity"][i] else significant(found["distance"][i], 4),
+            significant(found["nearer"][i]),
+            "∞" if np.isinf(found["farther"][i]) else significant(found["farther"][i]),
+        )
+        for i in order[:most]
+    ]
+    place = ", ".join(significant(x, 8) for x in adjustment.far_points.origin)
+    lines = [
+        *heading(f"Points at any distance: directions from {place}"),
+        f"Their rays are nearly parallel. σ in {of.angle_unit}; distance, and from where to where",
+        f"one σ of the inverse distance reaches, in {clean(of.object_unit)}.",
+        "",
+        *table(("point", "uX", "uY", "uZ", "σ", "distance", "from", "to"), rows, "lrrrrrrr"),
+    ]
+    return [*lines, *_left_out(len(order), most, "point", "far_points.csv")]
 
 
 # --- further kinds of observations ----------------------------------------------------------

@@ -48,7 +48,8 @@ class Inspection:
     @functools.cached_property
     def point_cofactors(self) -> Float[np.ndarray, "points 3 3"]:
         """Of X, Y, Z of every point; zero where it is held."""
-        return self.solution.cofactor("point")
+        Q = self.solution.cofactor("point")
+        return np.asarray(self.problem.layout.coordinate_cofactors(self.adjusted.point, Q))
 
     @functools.cached_property
     def camera_cofactors(self) -> list[Float[np.ndarray, "k k"]]:

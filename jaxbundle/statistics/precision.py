@@ -85,10 +85,11 @@ def precision(
     found = engine_precision(
         problem.system, problem.layout.data(_predicted(problem, data)), of if wanted else None
     )
+    of_points = problem.layout.coordinate_cofactors(data.start.point, found.own["point"])
     parts = Precision(
         images=_root(_image_variances(problem, data.start, found.own["image"])),
         cameras=_camera_sigma(problem, data.start, found.own),
-        points=_root(jnp.diagonal(found.own["point"], axis1=1, axis2=2)),
+        points=_root(jnp.diagonal(of_points, axis1=1, axis2=2)),
         covariance=found.covariance,
     )
     scales = Precision(sigma0, sigma0, sigma0, jnp.square(sigma0))

@@ -106,7 +106,7 @@ def _extents(inspection: Inspection) -> Extents:
             found[name] = np.tile(judged, (given.rows, 1))
         if name == READ_OUT:
             found[name] = 1 / np.maximum(np.abs(given.value), np.finfo(float).tiny)
-    return found | {"point": of_point}
+    return found | {"point": of_point * ~problem.at_any_distance}
 
 
 def _ray_lengths(inspection: Inspection):

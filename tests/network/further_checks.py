@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.leastsquares.rows import evaluate
-from jaxbundle.leastsquares.spaces import Vector
 from jaxbundle.solution import minimise
 
 STENCIL = ((1, 8 / 12), (-1, -8 / 12), (2, -1 / 12), (-2, 1 / 12))
@@ -66,7 +65,7 @@ def sample(problem, values, tables, draws=60):
         minimum = minimise(problem.with_data(dataclasses.replace(data, **change)), values)
         for name in tables:
             value = problem.layout.tables(minimum.values)[name]
-            value = value if isinstance(problem.system.table(name).space, Vector) else value[0]
+            value = value if hasattr(value, "shape") else value[0]
             found[name].append(np.asarray(value))
     return {name: np.array(x) for name, x in found.items()}
 

@@ -1,0 +1,111 @@
+"""Points at any distance, up to infinity, as the engine moves them."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.geometry import transform_point
+from jaxbundle.leastsquares.motions import Together
+from jaxbundle.leastsquares.spaces import tangent_basis
+
+FARTHEST = 1e8
+"""Infinity, in the unit s of a row: rays that differ by 1e-8 are parallel in every image."""
+THERE = 0.99
+"""Of it, from where a place counts as there."""
+
+
+@dataclasses.dataclass(frozen=True)
+class AnyDistance:
+    """Places X of space with a length s each, [4]; where s is 0 the coordinates move, as those of
+    `Vector(3)` do; where it is not, the homogeneous vector (X, s) on its sphere: two directions
+    across the ray from the origin, and one along it in which s/|X| moves,
+
+        X ← (X + A·δ)/(1 + |X|/s·δ₃),   A = (n·e₁, n·e₂, −s·u),  u = X/|X|,  n² = |X|² + s².
+
+    So nearly parallel rays give a direction well determined, and an inverse distance that may
+    become 0, not a distance that runs away. A step beyond infinity (`FARTHEST`) ends there.
+
+    Source: Förstner and Wrobel (2016), 5.1 and 10.2, spherically normalised homogeneous vectors.
+    """
+
+    width = 3
+
+    def prepare(self, value):
+        A, c = _frame(value)
+        return tuple(value[:3]), tuple(map(tuple, A)), c
+
+    def moved(self, block, change):
+        X, A, c = block
+        if not change:
+            return X
+        scale = 1 / (1 + c * change[2])
+        return tuple((x + sum(a * d for a, d in zip(row, change))) * scale for x, row in zip(X, A))
+
+    def retract(self, value, change):
+        A, c = _frame(value)
+        moved, s = value[:3] + A @ change, value[3]
+        least = jnp.where(s > 0, length(moved) / jnp.where(s > 0, FARTHEST * s, 1.0), 0.0)
+        return value.at[:3].set(moved / jnp.maximum(1 + c * change[2], least))
+
+    def difference(self, value, origin):
+        A, c = _frame(origin)
+        u, X = origin[:3] / length(origin[:3]), value[:3]
+        along = (length(origin[:3]) - u @ X) / jnp.where(c > 0, origin[3] + c * (u @ X), 1.0)
+        shift = X * (1 + c * along) - origin[:3]
+        across = A.T @ shift / (A * A).sum(0)
+        return jnp.where(c > 0, across.at[2].set(along), X - origin[:3])
+
+    def hold(self, value, given, free):
+        held = self.retract(given, jnp.where(free > 0, self.difference(value, given), 0.0))
+        return jnp.where(free.min() > 0, value, held)
+
+    def chart(self, value):
+        return None
+
+
+def derivative(value):
+    """∂X/∂δ [3, 3]."""
+    A, c = _frame(value)
+    return A.at[:, 2].add(-c * value[:3])
+
+
+def is_at_infinity(X: Float[np.ndarray, "n 3"], s: Float[np.ndarray, " n"]):
+    """Which places that may be at any distance are there."""
+    return (np.linalg.norm(X, axis=1) > THERE * FARTHEST * s) & (s > 0)
+
+
+def shares(X: Float[np.ndarray, "n 3"], s: Float[np.ndarray, " n"]):
+    """Of places at any distance, what a change of 1 across the ray turns their directions by
+    (radians), and what one along it adds to 1/|X|."""
+    square = (X**2).sum(1)
+    return np.sqrt(1 + s**2 / square), s / square + 1 / s
+
+
+def length(X):
+    """|X|, 1 where it is 0."""
+    square = X @ X
+    return jnp.sqrt(jnp.where(square > 0, square, 1.0))
+
+
+def _frame(value):
+    """A [3, 3] and |X|/s; the unit matrix and 0 where the coordinates move."""
+    X, s = value[:3], value[3]
+    r = length(X)
+    across = jnp.sqrt(r * r + s * s) * tangent_basis(X / r)
+    A = jnp.concatenate([across, -s * X[:, None] / r], 1)
+    far = s > 0
+    return jnp.where(far, A, jnp.eye(3)), jnp.where(far, r / jnp.where(far, s, 1.0), 0.0)
+
+
+def _transform(motion, value):
+    """A place that moves with space; at infinity its direction turns, and that is all."""
+    moved = transform_point(motion, value[:3])
+    turned = moved - transform_point(motion, jnp.zeros(3))
+    turned = turned * length(value[:3]) / length(turned)
+    far = jnp.sqrt(value[:3] @ value[:3]) > THERE * FARTHEST * value[3]
+    return value.at[:3].set(jnp.where(far & (value[3] > 0), turned, moved))
+
+
+move_at_any_distance = Together(_transform, transform_point, 3)

@@ -1,0 +1,272 @@
+"""Points at any distance: nearly parallel rays give directions, and distances up to infinity."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from network.further_checks import sample
+
+import jaxbundle
+from jaxbundle.far_points import at_infinity, minimise_with_infinity
+from jaxbundle.io import adjusted_network
+from jaxbundle.io.result_json import result_text
+from jaxbundle.leastsquares.any_distance import FARTHEST, AnyDistance, derivative
+from jaxbundle.leastsquares.problem import pad_data, pad_values
+from jaxbundle.leastsquares.rows import lay_out_data, residuals
+from jaxbundle.leastsquares.spaces import Vector
+from jaxbundle.solution import solved
+from jaxbundle.statistics.far_points import find_far_points
+from jaxbundle.statistics.inspection import Inspection
+
+NEAR, FAR = 24, 8
+LENGTHS = np.repeat([0.0, 2.0], [NEAR, FAR])
+
+
+def simulated(distances, seed=4):
+    """Six images side by side, 24 points near by and 8 of a horizon, and their truth."""
+    random = np.random.default_rng(seed)
+    near = random.uniform([-6, 6, -2], [6, 14, 3], (NEAR, 3))
+    azimuth, elevation = random.uniform([-0.5, 0.0], [0.5, 0.2], (FAR, 2)).T
+    direction = np.stack([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation),
+                          np.sin(elevation)], 1)  # fmt: skip
+    centres = np.column_stack([np.linspace(-2.5, 2.5, 6), random.uniform(-0.5, 1, (6, 2))])
+    stations = jaxbundle.stations_looking_at(centres, np.array([0.0, 12, 0.3]))
+    camera = jaxbundle.Camera("cam", "brown", {"c": 24.0, "K1": -1e-4}, free=("c", "K1"))
+    targets = np.concatenate([near, np.asarray(distances)[:, None] * direction])
+    network = jaxbundle.simulate(
+        stations, targets, camera, noise=0.0005, seed=seed, distances=[(0, 1)]
+    )
+    return network, targets
+
+
+def prepared(network, lengths=None):
+    return jaxbundle.make_problem(jaxbundle.check_network(network), lengths=lengths)
+
+
+@pytest.fixture(scope="module")
+def horizon():
+    """A horizon from two thousand times the base to infinity, and its adjustment."""
+    network, targets = simulated(np.geomspace(1e4, 1e9, FAR), seed=6)
+    return network, targets, jaxbundle.adjust(network)
+
+
+@pytest.fixture(scope="module")
+def moderate():
+    """Points so far that their coordinates still can be adjusted: in both ways."""
+    network, _ = simulated(np.full(FAR, 150.0))
+    found = []
+    for lengths in (None, LENGTHS):
+        problem = prepared(network, lengths)
+        problem, minimum = minimise_with_infinity(problem, problem.data.start, max_steps=50)
+        found.append(solved(problem, minimum))
+    return found
+
+
+# --- the space ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [(3.0, -2, 5, 2), (4e7, 1e8, -6e7, 2), (3.0, -2, 5, 0)])
+def test_a_place_moves_as_its_derivative_says(value):
+    space, value = AnyDistance(), jnp.array(value)
+    change = jnp.array([0.02, -0.03, 0.05])
+    A = derivative(value)
+    scale = np.abs(value).max()
+    retracted = lambda d: space.retract(value, d)[:3]
+    np.testing.assert_allclose(A, jax.jacfwd(retracted)(jnp.zeros(3)), rtol=1e-12, atol=1e-12)
+    moved = jnp.stack(space.moved(space.prepare(value), tuple(change)))
+    np.testing.assert_allclose(moved, retracted(change), rtol=1e-13, atol=1e-13 * scale)
+    there = space.retract(value, change)
+    np.testing.assert_allclose(space.difference(there, value), change, rtol=1e-7)
+    if value[3] == 0:
+        np.testing.assert_array_equal(there[:3], Vector(3).retract(value[:3], change))
+
+
+def test_across_the_ray_only_the_direction_turns_and_along_it_only_the_distance():
+    value = jnp.array([30.0, -20, 50, 2])
+    u = value[:3] / jnp.linalg.norm(value[:3])
+    A = derivative(value)
+    np.testing.assert_allclose(A[:, :2].T @ u, 0, atol=1e-12)
+    np.testing.assert_allclose(jnp.cross(A[:, 2], u), 0, atol=1e-12)
+
+
+def test_a_step_beyond_infinity_ends_there():
+    space, value = AnyDistance(), jnp.array([3.0, -2, 500, 2])
+    u = value[:3] / jnp.linalg.norm(value[:3])
+    there = space.retract(value, jnp.array([0.0, 0.0, -5.0]))
+    np.testing.assert_allclose(there[:3], FARTHEST * 2 * u, rtol=1e-12)
+    back = space.retract(there, jnp.array([0.0, 0.0, 0.5]))
+    assert 0 < jnp.linalg.norm(back[:3]) < 10 and back[:3] @ u > 0
+
+
+def test_what_is_held_along_its_ray_keeps_its_distance_to_first_order():
+    space, given = AnyDistance(), jnp.array([3.0, -2, 50, 2])
+    moved = space.retract(given, jnp.array([1e-5, -2e-5, 3e-5]))
+    held = space.hold(moved, given, jnp.array([1.0, 1.0, 0.0]))
+    wanted = space.retract(given, jnp.array([1e-5, -2e-5, 0.0]))
+    np.testing.assert_allclose(held, wanted, rtol=1e-12)
+    np.testing.assert_array_equal(space.hold(moved, given, jnp.ones(3)), moved)
+
+
+# --- the adjustment -------------------------------------------------------------------------
+
+
+def test_coordinates_and_their_covariance_do_not_depend_on_how_points_move(moderate):
+    one, other = moderate
+    shift = other.problem.origin - one.problem.origin
+    assert other.problem.layout.lengths is not None
+    np.testing.assert_allclose(other.vtpv, one.vtpv, rtol=1e-10)
+    # In both the datum is that of the near points, the distance theirs.
+    np.testing.assert_allclose(
+        other.solution.propagate(_distances_of(other)),
+        one.solution.propagate(_distances_of(one)), rtol=1e-5,
+    )  # fmt: skip
+    a, b = np.asarray(one.adjusted.point), np.asarray(other.adjusted.point) + shift
+    lengths = lambda x: np.linalg.norm(x[NEAR:] - x[0], axis=1)
+    sigma = np.sqrt(np.diagonal(one.solution.propagate(_distances_of(one))))
+    assert np.abs((lengths(a) - lengths(b)) / sigma).max() < 1e-4
+
+
+def _distances_of(inspection):
+    """The function: distances of all far points from the first point."""
+
+    def distances(tables):
+        X = inspection.problem.layout.values(tables).point
+        return jnp.linalg.norm(X[NEAR:] - X[0], axis=1)
+
+    return distances
+
+
+def test_sigma_of_direction_and_inverse_distance_are_those_of_a_sample(moderate):
+    found = moderate[1]
+    far = find_far_points(found, 1.0)
+    draws = sample(found.problem, found.adjusted, ("point",), draws=150)["point"][:, NEAR:, :3]
+    inverse = 1 / np.linalg.norm(draws, axis=2)
+    ratio = inverse.std(0, ddof=1) / far.sigma_inverse_distance
+    # The σ of a σ from 150 draws is 6 %; eight of them.
+    assert 0.8 < ratio.min() and ratio.max() < 1.22
+    u = draws * inverse[..., None]
+    off = u - (u * far.direction).sum(2, keepdims=True) * far.direction
+    across = np.sqrt((off**2).sum(2).mean(0) / (far.sigma_direction**2).sum(1))
+    assert 0.8 < across.min() and across.max() < 1.22
+
+
+def test_a_horizon_is_adjusted_and_lies_where_it_is(horizon):
+    _, targets, result = horizon
+    assert result.converged and 0.8 < result.sigma0 < 1.2
+    far = result.far_points
+    assert far.id == tuple(str(k + 1) for k in range(NEAR, NEAR + FAR))
+    # The datum is inner, and the start values of the near points, which hold it, are the truth.
+    truth = targets[NEAR:] - far.origin
+    distance = np.linalg.norm(truth, axis=1)
+    angle = np.linalg.norm(np.cross(truth / distance[:, None], far.direction), axis=1)
+    assert (angle < 4 * np.hypot(*far.sigma_direction.T)).all()
+    free = ~far.at_infinity
+    error = (far.inverse_distance - 1 / distance) / far.sigma_inverse_distance
+    assert np.abs(error[free]).max() < 3.5
+    assert 0 < far.at_infinity.sum() < FAR and far.distance[far.at_infinity].min() == np.inf
+    low, high = far.reach[free].T
+    assert (low < far.distance[free]).all() and (far.distance[free] < high).all()
+
+
+def test_points_at_infinity_are_named_and_have_no_coordinates(horizon, tmp_path):
+    _, _, result = horizon
+    there = result.far_points.at_infinity
+    text = result.report()
+    for id, infinite in zip(result.far_points.id, there):
+        line = next(x for x in text.splitlines() if x.startswith(f"{id} ") and ("0." in x))
+        assert ("at infinity" in text) and (infinite == np.isnan(result.points["X"][int(id) - 1]))
+        assert line
+    found = json.loads("".join(result_text(result)))
+    told = {id for id, point in found["far_points"]["points"].items() if point["at_infinity"]}
+    assert told == set(np.array(result.far_points.id)[there])
+    for id in told:
+        assert found["points"][id]["X"] == {"value": None, "sigma": None}
+        np.testing.assert_allclose(
+            sum(x**2 for x in found["far_points"]["points"][id]["direction"].values()), 1
+        )
+    adjusted = adjusted_network(result)
+    assert not told & set(adjusted.points.id)
+    assert len(adjusted.points) == NEAR + FAR - len(told)
+    jaxbundle.write_project(adjusted, tmp_path / "adjusted")
+
+
+def test_a_minimum_does_not_depend_on_what_was_held_at_infinity_before(horizon):
+    _, _, result = horizon
+    problem, values = result.problem, result.values
+    point = np.array(values.point)
+    u = point[NEAR:] / np.linalg.norm(point[NEAR:], axis=1)[:, None]
+    point[NEAR:] = FARTHEST * LENGTHS[NEAR:, None] * u
+    for start in (problem.data.start, dataclasses.replace(values, point=jnp.asarray(point))):
+        again, minimum = minimise_with_infinity(problem, start, max_steps=100)
+        np.testing.assert_array_equal(
+            at_infinity(again, minimum.values), at_infinity(problem, values)
+        )
+        found = solved(again, minimum)
+        np.testing.assert_allclose(found.vtpv, result.vtpv, rtol=1e-9)
+
+
+def test_vtpv_would_fall_beyond_infinity_and_nowhere_else(horizon):
+    """The active set is right: of points there the slope along the inverse distance is positive,
+    of the others it vanishes."""
+    _, _, result = horizon
+    problem, values = result.problem, result.values
+    there = result.far_points.at_infinity
+    tables = problem.layout.tables(values)
+    space = problem.system.declared.spaces["point"]
+    rows = tables["point"][NEAR:]
+
+    def vtpv(along):
+        X = jnp.stack([jnp.stack(space.moved(space.prepare(row), (0.0, 0.0, d)))
+                       for row, d in zip(rows, along)])  # fmt: skip
+        point = values.point.at[NEAR:].set(X)
+        return _vtpv_of_images(problem, dataclasses.replace(values, point=point))
+
+    slope = np.asarray(jax.grad(vtpv)(jnp.zeros(FAR)))
+    sigma = result.far_points.sigma_inverse_distance * problem.layout.lengths[NEAR:]
+    # An inverse distance falls where δ grows.
+    assert (slope[there] > 0).all()
+    assert np.abs(slope * sigma)[~there].max() < 1e-3
+
+
+def _vtpv_of_images(problem, values):
+    tables = problem.layout.tables(values)
+    laid = lay_out_data(problem.system.plan, pad_data(problem.system, problem.system.data))
+    rows = residuals(
+        problem.system.declared, problem.system.plan, pad_values(problem.system, tables), laid
+    )
+    of_images = [o for o, s in enumerate(problem.layout.sets) if s.field == "image"]
+    return sum(jnp.vdot(rows[k], rows[k]) for k, part in enumerate(problem.system.plan.parts)
+               if part.observations in of_images)  # fmt: skip
+
+
+def test_a_blunder_among_the_rays_of_the_horizon_is_found(horizon):
+    network, _, result = horizon
+    row = int(np.flatnonzero(network.observations.point == NEAR + 1)[2])
+    xy = network.observations.xy.copy()
+    xy[row] += 0.02
+    rays = dataclasses.replace(network.observations, xy=xy)
+    found = jaxbundle.adjust(network.replace(observations=rays), snooping="pope")
+    assert found.converged and found.far_points is not None
+    name = f"{network.images.id[network.observations.image[row]]}"
+    assert len(found.removed) == 1 and str(NEAR + 2) in found.removed[0].name
+    assert name in found.removed[0].name
+    np.testing.assert_allclose(
+        found.camera_parameters("cam")["c"], result.camera_parameters("cam")["c"], atol=3e-3
+    )
+
+
+def test_images_from_one_place_are_not_solved_by_points_at_infinity():
+    """A panorama determines no distance at all: that is said."""
+    network, _ = simulated(np.full(FAR, 50.0))
+    images = network.images
+    position = np.tile(images.position[:1], (len(images), 1))
+    network = network.replace(images=dataclasses.replace(images, position=position))
+    problem = prepared(network)
+    v = Inspection(problem, problem.data.start).residuals.image
+    xy = network.observations.xy + v / np.asarray(problem.data.image_weight)
+    seen = dataclasses.replace(network.observations, xy=xy)
+    result = jaxbundle.adjust(network.replace(observations=seen))
+    assert not result.converged and result.weakness.lines
