@@ -25,7 +25,7 @@ from jaxbundle.statistics.inspection import Inspection
 
 NARROW, PARALLEL = 0.03, 1e-3
 """Radians between the rays of a point that may be at any distance; and of one that is from the
-beginning, unless half of the points are: then the images stand at one place."""
+beginning, unless half of the tie points are: then the images stand at one place."""
 PATIENCE = 30
 """Evaluations of a network with narrow points before they are at any distance."""
 ROUND = 4
@@ -46,7 +46,7 @@ def minimise_at_any_distance(
     if not (angle < NARROW).any():
         return problem, minimise(problem, start, max_steps=max_steps, **options)
     legs, parallel = [], angle < PARALLEL
-    for chosen in (parallel & (2 * parallel.sum() < len(parallel)), None):
+    for chosen in (parallel & (2 * parallel.sum() < (angle < np.pi).sum()), None):
         if chosen is None:
             plain = minimise(problem, start, max_steps=min(PATIENCE, max_steps), **options)
             if solved(problem.with_factor(), plain) or int(plain.iterations) >= max_steps:
