@@ -74,6 +74,7 @@ def matrix_from_quaternion(q: Float[AnyArray, "4"]) -> Float[Array, "3 3"]:
     return jnp.array(rows) / (ww + xx + yy + zz)
 
 
+@traced_once
 def quaternion_from_matrix(M: Float[AnyArray, "3 3"]) -> Float[Array, "4"]:
     """The unit quaternion (w, x, y, z), w ≥ 0, of a rotation matrix.
 
@@ -136,6 +137,7 @@ def retract_quaternion(q: Float[AnyArray, "4"], delta: Float[AnyArray, "3"]) -> 
     return _normalise(quaternion_multiply(quaternion_from_rotation_vector(delta), q))
 
 
+@traced_once
 def quaternion_difference(q1: Float[AnyArray, "4"], q0: Float[AnyArray, "4"]) -> Float[Array, "3"]:
     """The rotation q₁ ⊟ q₀ = δ, in radians, in the camera frame, that leads from q₀ to q₁.
 

@@ -38,7 +38,7 @@ from jaxtyping import Float
 
 from jaxbundle.types import AnyArray, Scalar
 
-from .quaternions import matrix_from_quaternion, quaternion_from_matrix
+from .quaternions import matrix_from_quaternion, quaternion_from_matrix, traced_once
 
 
 def R1(omega: Scalar) -> Float[Array, "3 3"]:
@@ -62,6 +62,7 @@ def R3(kappa: Scalar) -> Float[Array, "3 3"]:
     return jnp.array([[c, s, zero], [-s, c, zero], [zero, zero, one]])
 
 
+@traced_once
 def matrix_from_omega_phi_kappa(angles: Float[AnyArray, "3"]) -> Float[Array, "3 3"]:
     """M = R3(κ)·R2(φ)·R1(ω) of (ω, φ, κ) in radians (Wolf and Dewitt, 2000, appendix C).
 
@@ -73,6 +74,7 @@ def matrix_from_omega_phi_kappa(angles: Float[AnyArray, "3"]) -> Float[Array, "3
     return R3(kappa) @ R2(phi) @ R1(omega)
 
 
+@traced_once
 def omega_phi_kappa_from_matrix(M: Float[AnyArray, "3 3"]) -> Float[Array, "3"]:
     """(ω, φ, κ) in radians, ω and κ in (−π, π], φ in [−π/2, π/2]; ω = 0 at φ = ±90°."""
     (_, m12, m13), (_, m22, m23), (m31, m32, m33) = M
@@ -83,6 +85,7 @@ def omega_phi_kappa_from_matrix(M: Float[AnyArray, "3 3"]) -> Float[Array, "3"]:
     return jnp.stack([omega, phi, kappa])
 
 
+@traced_once
 def omega_phi_kappa_near(
     M: Float[AnyArray, "3 3"], given: Float[AnyArray, "3"]
 ) -> Float[Array, "3"]:
@@ -98,6 +101,7 @@ def omega_phi_kappa_near(
     return jnp.where(distance(other) < distance(angles), other, angles)
 
 
+@traced_once
 def matrix_from_phi_omega_kappa(angles: Float[AnyArray, "3"]) -> Float[Array, "3 3"]:
     """M = R3(κ)·R1(ω)·R2(φ) of (φ, ω, κ), in this order, in radians.
 
@@ -107,6 +111,7 @@ def matrix_from_phi_omega_kappa(angles: Float[AnyArray, "3"]) -> Float[Array, "3
     return R3(kappa) @ R1(omega) @ R2(phi)
 
 
+@traced_once
 def phi_omega_kappa_from_matrix(M: Float[AnyArray, "3 3"]) -> Float[Array, "3"]:
     """(φ, ω, κ) in radians, φ and κ in (−π, π], ω in [−π/2, π/2]; φ = 0 at ω = ±90°."""
     (m11, _, m13), (m21, _, m23), (m31, m32, m33) = M
@@ -117,6 +122,7 @@ def phi_omega_kappa_from_matrix(M: Float[AnyArray, "3 3"]) -> Float[Array, "3"]:
     return jnp.stack([phi, omega, kappa])
 
 
+@traced_once
 def matrix_from_azimuth_tilt_swing(angles: Float[AnyArray, "3"]) -> Float[Array, "3 3"]:
     """M = R3(s − π)·R1(t)·R3(−α) of (α, t, s) in radians (Wolf and Dewitt, 2000, appendix C).
 
@@ -131,6 +137,7 @@ def matrix_from_azimuth_tilt_swing(angles: Float[AnyArray, "3"]) -> Float[Array,
     return R3(swing - jnp.pi) @ R1(tilt) @ R3(-azimuth)
 
 
+@traced_once
 def azimuth_tilt_swing_from_matrix(M: Float[AnyArray, "3 3"]) -> Float[Array, "3"]:
     """(α, t, s) in radians, α and s in (−π, π], t in [0, π]; α = 0 for a vertical photograph."""
     (m11, m12, _), (m21, m22, _), (m31, m32, m33) = M

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -58,14 +59,20 @@ def _residuals(declared, seen, values):
     """Computed minus measured of all observations of a set."""
     spaces = [next(t.space for t in declared.tables if t.name == name) for name in seen.kind.of]
     touched = [
-        jax.tree.map(lambda x, rows=rows: jnp.asarray(x)[rows], values[name])
+        jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], values[name])
         for name, rows in zip(seen.kind.of, seen.rows)
     ]
-    blocks = [jax.vmap(space.prepare)(rows) for space, rows in zip(spaces, touched)]
-    one = lambda blocks, measured: jnp.stack(evaluate(seen.kind, blocks, measured))
-    measured = scalars(jax.tree.map(jnp.asarray, seen.measured))
-    found = np.asarray(jax.jit(jax.vmap(one))(blocks, measured))
+    found = np.asarray(_evaluated(seen.kind, tuple(spaces), touched, seen.measured))
     return found.reshape(np.shape(jax.tree.leaves(seen.measured)[0]))
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _evaluated(kind, spaces, touched, measured):
+    def one(touched, measured):
+        blocks = [space.prepare(value) for space, value in zip(spaces, touched)]
+        return jnp.stack(evaluate(kind, blocks, measured))
+
+    return jax.vmap(one)(touched, scalars(measured))
 
 
 def _noise(random, weight):

@@ -1,5 +1,6 @@
 """The unknowns that came with further kinds of observations, row by row, with their σ."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -32,38 +33,50 @@ def estimates(found: Solution, names, sigma0: float, origin) -> list[Estimate]:
     every = []
     for table in (t for t in found.problem.tables if t.name in names):
         values, Q = found.values[table.name], np.asarray(found.cofactor(table.name))
-        for row in range(table.rows):
-            value = jax.tree.map(lambda x, row=row: jnp.asarray(x)[row], values)
-            readable, labels, angles = _readable(table, value)
-            zero = jnp.zeros(table.space.width)
-            A = np.asarray(jax.jacfwd(lambda d: readable(table.space.retract(value, d)))(zero))  # noqa: B023
-            sigma = sigma0 * np.sqrt(np.clip(np.diag(A @ Q[row] @ A.T), 0, None))
-            shown = np.array(readable(value))
-            if isinstance(value, PoseValue) and table.name != MOUNTING:
-                shown[:3] += origin
-            every += [
-                Estimate(table.name, table.label(row), label, float(x), float(s), angle)
-                for label, x, s, angle in zip(labels, shown, sigma, angles)
-            ]
+        shown, A = map(np.array, _read_rows(table.space, values))
+        if isinstance(values, PoseValue) and table.name != MOUNTING:
+            shown[:, :3] += origin
+        variance = np.einsum("nij,njk,nik->ni", A, Q, A)
+        sigma = sigma0 * np.sqrt(np.clip(variance, 0, None))
+        labels, angles = _labels(table, shown.shape[1])
+        every += [
+            Estimate(table.name, table.label(row), *one)
+            for row in range(table.rows)
+            for one in zip(labels, shown[row].tolist(), sigma[row].tolist(), angles)
+        ]
     return every
 
 
-def _readable(table, value):
-    """A value as numbers people read, their names, and which are angles."""
+@partial(jax.jit, static_argnums=0)
+def _read_rows(space, values):
+    """Every row as numbers people read [rows, n], and their derivatives by its changes [rows, n,
+    width]."""
+
+    def of_row(value):
+        near = _read(space, value, jnp.zeros(3))[-3:]  # of angles, the same after a change
+        change = lambda d: _read(space, space.retract(value, d), near)
+        return _read(space, value, near), jax.jacfwd(change)(jnp.zeros(space.width))
+
+    return jax.vmap(of_row)(values)
+
+
+def _read(space, value, near):
+    """A row as numbers people read; `near`: of all angles the nearest to these."""
     if isinstance(value, PoseValue):
-        near = _angles(value.rotation, jnp.zeros(3))
-        function = lambda v: jnp.concatenate([v.position, _angles(v.rotation, near)])
-        return function, ("X0", "Y0", "Z0", *ANGLES), (False,) * 3 + (True,) * 3
+        return jnp.concatenate([value.position, _angles(value.rotation, near)])
+    if isinstance(space, Rotation):
+        return _angles(value, near)
+    return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(value)])
+
+
+def _labels(table, size: int):
+    """The names of these numbers, and which of them are angles."""
+    if isinstance(table.value, PoseValue):
+        return ("X0", "Y0", "Z0", *ANGLES), (False,) * 3 + (True,) * 3
     if isinstance(table.space, Rotation):
-        near = _angles(value, jnp.zeros(3))
-        return lambda v: _angles(v, near), ANGLES, (True,) * 3
-    leaves = jax.tree.leaves(value)
-    size = sum(np.size(x) for x in leaves)
-    names = [str(k + 1) for k in range(size)]
-    if len(table.parameters) == size:
-        names = list(table.parameters)
-    flat = lambda v: jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(v)])
-    return flat, names, (False,) * size
+        return ANGLES, (True,) * 3
+    named = len(table.parameters) == size
+    return table.parameters if named else [str(k + 1) for k in range(size)], (False,) * size
 
 
 def _angles(q, near):
