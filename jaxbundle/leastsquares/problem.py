@@ -167,7 +167,8 @@ def open_at(problem: Problem, values: Values) -> Problem:
         return problem
     data = pad_data(problem, dataclasses.replace(problem.data, start=values))
     real = {t.name: np.arange(problem.sizes["table", t.name]) < t.rows for t in problem.tables}
-    gauge = find_open_motions(survey_motions(problem.declared, problem.plan, data, real))
+    floating = dataclasses.replace(problem.plan, datum=None)  # As when the problem was made.
+    gauge = find_open_motions(survey_motions(problem.declared, floating, data, real))
     if gauge.shape != datum.gauge.shape:
         return problem
     datum = dataclasses.replace(datum, gauge=jax.device_put(gauge))
