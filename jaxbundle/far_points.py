@@ -25,9 +25,10 @@ from jaxbundle.statistics.inspection import Inspection
 
 NARROW, PARALLEL = 0.03, 1e-3
 """Radians between the rays of a point that may be at any distance; and of one that is from the
-beginning, unless half of the tie points are: then the images stand at one place."""
+beginning, unless half of the tie points are: then the images stand at one place, or nearly."""
 PATIENCE = 30
-"""Evaluations of a network with narrow points before they are at any distance."""
+"""Evaluations of a network with narrow points before they are at any distance; twice as many where
+half of the tie points are narrow."""
 ROUND = 4
 """Evaluations until it is looked who is pulled beyond infinity, or back; twice as many each time
 that nobody was."""
@@ -45,10 +46,12 @@ def minimise_at_any_distance(
     angle = angle_of_rays(problem, start)
     if not (angle < NARROW).any():
         return problem, minimise(problem, start, max_steps=max_steps, **options)
+    mostly = lambda narrow: 2 * narrow.sum() >= (angle < np.pi).sum()
     legs, parallel = [], angle < PARALLEL
-    for chosen in (parallel & (2 * parallel.sum() < (angle < np.pi).sum()), None):
+    for chosen in (parallel & ~mostly(parallel), None):
         if chosen is None:
-            plain = minimise(problem, start, max_steps=min(PATIENCE, max_steps), **options)
+            patience = PATIENCE * (2 if mostly(angle < NARROW) else 1)
+            plain = minimise(problem, start, max_steps=min(patience, max_steps), **options)
             if solved(problem.with_factor(), plain) or int(plain.iterations) >= max_steps:
                 return problem, plain
             legs, start = [plain], plain.values

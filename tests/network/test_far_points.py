@@ -269,4 +269,5 @@ def test_images_from_one_place_are_not_solved_by_points_at_infinity():
     xy = network.observations.xy + v / np.asarray(problem.data.image_weight)
     seen = dataclasses.replace(network.observations, xy=xy)
     result = jaxbundle.adjust(network.replace(observations=seen))
-    assert not result.converged and result.weakness.lines
+    assert not result.converged
+    assert result.undetermined or result.weakness.lines
