@@ -33,6 +33,7 @@ demo: install
 
 test: install
 	$(BIN)/python -m ruff check jaxbundle tests benchmarks
+	$(BIN)/basedpyright --pythonpath $(BIN)/python
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 $(VENV)/compared: $(VENV)/installed

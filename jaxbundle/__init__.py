@@ -87,7 +87,7 @@ _HOME = {
     "jaxbundle.statistics.precision": ("Precision", "precision"),
 }
 _MODULE = {name: module for module, names in _HOME.items() for name in names}
-__all__ = [*_MODULE]
+__all__ = [*_MODULE]  # pyright: ignore[reportUnsupportedDunderAll]: the names above
 
 
 def __getattr__(name: str):

@@ -30,7 +30,7 @@ def main() -> None:
     try:
         main()
     except SystemExit as ended:
-        set_status(ended.code or 0)
+        set_status(ended.code if isinstance(ended.code, int) else int(bool(ended.code)))
         raise
     set_status(0)
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.core import Tracer
 
 from jaxbundle.errors import InputError
 
@@ -124,8 +125,8 @@ def numeric_array(name: str, values: Any, expected: str, truths: bool = False) -
     if array.dtype.kind not in "biuf" or (array.dtype.kind == "b" and not truths):
         raise InputError(f"{name} must be {expected}, but {_found(array)}")
     if isinstance(array, np.ma.MaskedArray):
-        array = array.filled(False) if array.dtype.kind == "b" else array.astype(float).filled(
-            np.nan)  # fmt: skip
+        truth = array.dtype.kind == "b"
+        array = np.ma.filled(array, False) if truth else np.ma.filled(array.astype(float), np.nan)
     return array
 
 
@@ -143,7 +144,7 @@ def refuse_traced(name: str, *values: Any) -> None:
     """Refuse what JAX traces, wherever it is among the values.
 
     **Raises:** `InputError`."""
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values)):
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values)):
         raise InputError(
             f"{name} must be numbers, but is traced by JAX: this function does not work under "
             "jax.jit, jax.vmap or jax.grad; jaxbundle.solve does"

@@ -104,7 +104,7 @@ def run_batch(
             done += len(work.keys) - len(chosen)
             progress(done, total)
             for first in range(0, len(chosen), portion):
-                rows = _rows(work, chosen[first : first + portion])
+                rows = _rows(work, chosen[first : first + portion].tolist())
                 lines.append(rows)
                 done += len(rows)
                 progress(done, total)

@@ -8,7 +8,6 @@ import time
 from typing import NoReturn
 
 from jaxbundle.errors import InputError
-from jaxbundle.float64 import require_x64 as require_x64  # until every module has it from there
 from jaxbundle.temporaries import watch_cache
 
 WORTH_KEEPING = 0.02
@@ -102,7 +101,7 @@ def join_processes(
         parts = re.fullmatch(r"(\S+):(\d{1,5})", str(address))
         if not parts or not 0 < int(parts[2]) < 65536:
             raise InputError(f"the processes cannot be joined at {address!r}; {expected}")
-        if None not in (processes, process) and not 0 <= process < processes:
+        if processes is not None and process is not None and not 0 <= process < processes:
             raise InputError(f"process {process} of {processes} cannot be joined; {expected}")
         _check_address(parts[1].strip("[]"), int(parts[2]), process, wait_seconds)
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
@@ -131,7 +130,8 @@ def _check_address(host: str, port: int, process: int | None, wait_seconds: int)
         try:
             socket.create_server(("", port)).close()
         except OSError as error:
-            raise InputError(f"port {port}: {os.strerror(error.errno)}; take another") from None
+            why = os.strerror(error.errno or 0)
+            raise InputError(f"port {port}: {why}; take another") from None
         return
     end = time.monotonic() + wait_seconds
     while process:

@@ -17,13 +17,17 @@ import signal
 import sys
 import time
 
+TYPE_CHECKING = False  # typing would be imported for nothing else
+if TYPE_CHECKING:
+    from typing import NoReturn
+
 GRACE = 0.3
 """Seconds the main thread has to take notice of a signal."""
 
 PATIENCE = 10.0
 """Seconds for what must not be cut in two; a disk that does not answer holds nobody longer."""
 
-WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
+WORDS: dict[int, str] = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 if os.name == "posix":
     WORDS[signal.SIGHUP] = "the terminal is gone"
 
@@ -102,6 +106,8 @@ def _watch(reader: int) -> None:
 
 def _end(number: int) -> None:
     """Tidy up, say so, and end; a thread that comes second waits here for the end."""
+    if _ending is None or _temporaries is None:
+        _say_and_exit(number)
     _ending.acquire()
     _become_deaf()
     _temporaries.remove_temporaries(PATIENCE)
@@ -121,7 +127,7 @@ def _become_deaf() -> None:
         pass  # another thread; the main thread would come to wait in `_end`
 
 
-def _say_and_exit(number: int) -> None:
+def _say_and_exit(number: int) -> "NoReturn":
     line = f"jaxbundle: {WORDS[number]}" + (_advice and f"; {_advice}") + "\n"
     try:
         if os.isatty(_screen):  # There may be a bar of progress, which hides the cursor.

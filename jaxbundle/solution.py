@@ -30,13 +30,14 @@ RUNAWAY = 20.0
 """A principal distance that changed by more than this factor belongs to no camera."""
 
 
-def minimise(problem: Problem, start: Values, **options) -> Minimum:
+def minimise(problem: Problem, start: Values, **options) -> Minimum[Values]:
     """Iterate from `start`; the datum and what is held stay those of the problem's own start."""
-    minimum = find_minimum(problem.system, problem.layout.tables(start), **options)
-    return dataclasses.replace(minimum, values=problem.layout.values(minimum.values))
+    found = find_minimum(problem.system, problem.layout.tables(start), **options)
+    values = problem.layout.values(found.values)
+    return Minimum(values, found.termination, found.iterations, found.history)
 
 
-def solved(problem: Problem, minimum: Minimum) -> Inspection | None:
+def solved(problem: Problem, minimum: Minimum[Values]) -> Inspection | None:
     """The solution, to be looked at: converged, no camera collapsed, all unknowns determined;
     else None."""
     if not bool(converged(int(minimum.termination))) or _collapsed(problem, minimum.values):
@@ -45,7 +46,7 @@ def solved(problem: Problem, minimum: Minimum) -> Inspection | None:
     return inspection if inspection.determined else None
 
 
-def names_of_defects(problem: Problem, minimum: Minimum) -> list[str]:
+def names_of_defects(problem: Problem, minimum: Minimum[Values]) -> list[str]:
     """What nothing determines where the iterations ended; of a large network, whose eigenvectors
     nobody can wait for, what is weak where it is singular."""
     values = minimum.values
@@ -58,19 +59,19 @@ def names_of_defects(problem: Problem, minimum: Minimum) -> list[str]:
     return list(weakness_without_solution(problem, minimum).unknowns) if singular else []
 
 
-def weakness_without_solution(problem: Problem, minimum: Minimum) -> Weakness:
+def weakness_without_solution(problem: Problem, minimum: Minimum[Values]) -> Weakness:
     """What is poorly determined where the iterations ended."""
     return weakness_of_unsolved(problem, _last(problem, minimum))
 
 
-def _last(problem: Problem, minimum: Minimum) -> Values:
+def _last(problem: Problem, minimum: Minimum[Values]) -> Values:
     """Where the iterations ended; the start where that is nowhere."""
     values = minimum.values
     finite = all(np.isfinite(np.asarray(x)).all() for x in (values.camera, values.position))
     return values if finite else problem.data.start
 
 
-def require_solved(problem: Problem, minimum: Minimum, when: str) -> Inspection:
+def require_solved(problem: Problem, minimum: Minimum[Values], when: str) -> Inspection:
     """The solution of an adjustment repeated; one that was not solved is refused.
 
     **Raises:** `NotSolvedError`."""
@@ -97,7 +98,7 @@ def _collapsed(problem: Problem, values: Values) -> list[str]:
     ]
 
 
-def misjudged(problem: Problem, minimum: Minimum) -> bool:
+def misjudged(problem: Problem, minimum: Minimum[Values]) -> bool:
     """Whether a principal distance came out otherwise than it was given, though not absurdly."""
     ratios = [ratio for *_, ratio in _principal_distances(problem, minimum.values)]
     sane = all(1 / RUNAWAY < ratio < RUNAWAY for ratio in ratios)

@@ -71,7 +71,7 @@ def check_writable(
             raise InputError(f"--json {json}: there is no folder {path.parent}")
         if not os.access(path.parent, os.W_OK | os.X_OK):
             raise InputError(f"--json {json}: cannot be written: no permission in {path.parent}")
-    if str(real) in map(os.path.realpath, inputs):
+    if any(str(real) == os.path.realpath(file) for file in inputs):
         raise InputError(f"{path} is part of the input and would be overwritten; give another")
     if not force:
         check_json(json, ", or --force to replace it")
@@ -140,7 +140,12 @@ def write_targets(
 ) -> None:  # fmt: skip
     """Write JSON (`-`: on standard output) and folder of a result, or of why there is none."""
     solved = isinstance(result, Adjustment)
-    text = lambda brief: result_text(result, brief) if solved else unsolved_text(result)
+
+    def text(brief: bool) -> str | Iterable[str]:
+        if isinstance(result, Adjustment):
+            return result_text(result, brief)
+        return unsolved_text(result)
+
     plots = plots and out is not None and solved and result.converged and can_plot()
     with written(json, text(brief), out, "adjust", FILES, force) as new:
         if new is None:

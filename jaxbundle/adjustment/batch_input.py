@@ -134,12 +134,15 @@ class Batch:
         cameras = len(xy)
         free = free_parameters(model, free)
         interior, known = _interior(model, free, start, size, cameras)
-        there = ~np.isnan(X).any(-1)
+        there = ~np.any(np.isnan(X), axis=-1)
         visible = visible.astype(bool) & ~np.isnan(xy).any(-1) & there[..., None, :]
-        seen = visible.any(1)
+        seen = np.any(visible, axis=1)
         X = np.where(seen[..., None], X, 0.0)
         xy = np.where(visible[..., None], xy, 0.0)
-        finite = _usable(X).all((1, 2)) & _usable(xy).all((1, 2, 3)) & _usable(interior).all(1)
+        finite = np.all([
+            np.all(_usable(numbers), axis=tuple(range(1, numbers.ndim)))
+            for numbers in (X, xy, interior)
+        ], axis=0)  # fmt: skip
         X[~finite], xy[~finite] = 0.0, 0.0
         return cls(
             finite, *_principal_axes(X, seen), xy=xy, visible=visible, interior=interior,

@@ -30,6 +30,7 @@ from jaxtyping import Array, Bool, Float
 from jaxbundle import cameras
 from jaxbundle.adjustment.small_cholesky import backward, cholesky, forward, rows_of
 from jaxbundle.geometry import matrix_from_quaternion, retract_quaternion
+from jaxbundle.types import AnyArray
 
 POSE = 6
 """Unknowns of a view: δt (3), δθ (3)."""
@@ -38,9 +39,9 @@ POSE = 6
 class Sightings(eqx.Module):
     """What one camera saw: object points about their middle, image points, weights 1 or 0."""
 
-    point: Float[Array, "points 3"]
-    xy: Float[Array, "views points 2"]
-    weight: Float[Array, "views points"]
+    point: Float[AnyArray, "*cameras points 3"]
+    xy: Float[AnyArray, "*cameras views points 2"]
+    weight: Float[AnyArray, "*cameras views points"]
 
     @property
     def views(self) -> Bool[Array, " views"]:
@@ -96,12 +97,12 @@ def residual_lengths(model, seen: Sightings, at: Calibration) -> Float[Array, "v
     """√(vx² + vy²) of all points, 0 where none is seen."""
     M = jax.vmap(matrix_from_quaternion)(at.rotation)
     X = [jnp.where(seen.weight > 0, seen.point[:, i], 0.0) for i in range(3)]
-    ray = tuple(
+    r, s, q = (
         sum(M[:, i, j, None] * X[j] for j in range(3)) + at.shift[:, i, None] for i in range(3)
     )
     xy = (seen.xy[..., 0], seen.xy[..., 1])
-    vx, vy = cameras.residual(model, "measured", tuple(at.interior), ray, xy)
-    return seen.weight * jnp.sqrt(vx * vx + vy * vy)
+    vx, vy = cameras.residual(model, "measured", tuple(at.interior), (r, s, q), xy)
+    return jnp.asarray(seen.weight) * jnp.sqrt(vx * vx + vy * vy)
 
 
 def gram(x: list, y: list) -> Float[Array, "views n n"]:

@@ -36,7 +36,7 @@ def vague(
 
 def vanishing(reduced: Float[np.ndarray, "cameras k k"]) -> Bool[np.ndarray, "cameras k"]:
     """Parameters with part in the null space of the scaled reduced normal matrix."""
-    finite = np.isfinite(reduced).all((1, 2))
+    finite = np.all(np.isfinite(reduced), axis=(1, 2))
     values, vectors = np.linalg.eigh(np.where(finite[:, None, None], reduced, 0.0))
     null = values < INDETERMINATE
     share = np.einsum("cij,cj->ci", vectors**2, null.astype(float))

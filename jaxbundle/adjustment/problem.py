@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.arguments import one_of
-from jaxbundle.configuration import require_x64
 from jaxbundle.errors import InputError
+from jaxbundle.float64 import require_x64
 from jaxbundle.leastsquares import problem as engine
 from jaxbundle.leastsquares.declarations import Observations, Table
 from jaxbundle.leastsquares.defect import CannotHold

@@ -129,7 +129,7 @@ def adjust_rig(rig: Rig, max_iterations: int = 50, **options) -> Result:
 
 def used_rays(rig: Rig, problem: Problem) -> Bool[np.ndarray, " n"]:
     """Which image points carry weight."""
-    return rig.in_order(problem.data.weight).all(1)
+    return np.all(rig.in_order(problem.data.weight), axis=1)
 
 
 def leave_out(rig: Rig, found: Result, rays, max_iterations: int = 50) -> Result:

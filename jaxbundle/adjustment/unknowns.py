@@ -1,6 +1,7 @@
 """Unknowns of a network by name: which image, which parameter."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -26,12 +27,13 @@ def named(problem: Problem, names: Sequence[tuple[str, str, str]]) -> list[Name]
 
     **Raises:** `InputError` where nothing is named, or a name has other than three parts;
     `KeyError` for a name that is not there."""
-    for name in names or (None,):
-        if isinstance(name, str) or np.shape(name) != (3,):
-            given = "none is given" if name is None else f"one is {shown(name)}"
+    given: Sequence[Any] = names or (None,)
+    for name in given:
+        if name is None or isinstance(name, str) or np.shape(name) != (3,):
+            said = "none is given" if name is None else f"one is {shown(name)}"
             raise InputError(
                 'covariance: names of unknowns are expected, such as ("camera", "cam", "c") or '
-                f'("point", "7", "Z"), but {given}'
+                f'("point", "7", "Z"), but {said}'
             )
     wanted = [Name(*map(str, name)) for name in names]
     for name in wanted:

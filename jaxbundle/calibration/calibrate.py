@@ -38,6 +38,7 @@ from jaxbundle.measure.views import BoardViews, measure_boards
 from jaxbundle.network.build import make_network
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.orientation.pose import Pose
+from jaxbundle.types import present
 
 SIGMA = 0.1
 """A priori σ of an image coordinate in pixels; σ0 of the result says what it was."""
@@ -92,27 +93,29 @@ def calibrate(
     unit_size(camera_model, pixel_size)
     _check(sigma_image, board_sigma, board_free)
     _check_given(camera_model, given)
-    text("camera", camera), text("object_unit", object_unit)
+    text("camera", camera)
+    text("object_unit", object_unit)
     options |= {"robust": robust, "snooping": None if robust else snooping}
     check_options(**options)
     check_test(snooping, options.get("significance", 0.001))
-    views = photographs
-    if not isinstance(views, BoardViews):
+    if isinstance(photographs, BoardViews):
+        views = photographs
+    else:
         if board is None:
             raise InputError("calibrate: give the board that is in the photographs")
         require_board(board)
-        if isinstance(views, str | Path):
-            views = photographs = [views]
-        if not isinstance(views, Sequence):
+        files = [photographs] if isinstance(photographs, str | Path) else photographs
+        if not isinstance(files, Sequence):
             raise InputError(
                 "photographs must be a list of files, patterns or folders, or BoardViews, but is "
-                f"{shown(views)}"
+                f"{shown(files)}"
             )
-        views = measure_boards(photographs, board, progress)
+        views = measure_boards(files, board, progress)
     board = views.board
     start = start_values(views, camera_model, free, pixel_size, given)
+    columns, rows = views.image_size
     made = Camera(
-        camera, model, start.parameters, free, image_size=tuple(map(int, views.image_size)),
+        camera, model, start.parameters, free, image_size=(int(columns), int(rows)),
         pixel_size=pixel_size,
     )  # fmt: skip
     network = board_network(
@@ -180,9 +183,10 @@ def _without_eccentricity(start: Start, result, camera: Camera) -> BoardViews:
     the centres of the circles."""
     views, model = start.views, get_model(camera.model)
     p = np.asarray(result.values.camera)[0][: len(model.parameters)]
-    M = np.asarray(jax.vmap(matrix_from_quaternion)(result.values.rotation))
-    poses = Pose(result.image_values[:, :3], M)
-    shift = _shifts(model, p, poses, views.board.points, views.board.diameter / 2)
+    M = jax.vmap(matrix_from_quaternion)(result.values.rotation)
+    poses = Pose(jnp.asarray(result.image_values[:, :3]), M)
+    radius = present(views.board.diameter) / 2
+    shift = _shifts(model, p, poses, views.board.points, radius)
     xy = in_model_units(views.xy, model, views.image_size, camera.pixel_size) - np.asarray(shift)
     return dataclasses.replace(
         views, xy=in_pixels(xy, model, views.image_size, camera.pixel_size)

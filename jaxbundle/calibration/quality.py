@@ -226,7 +226,7 @@ def cross_validation(result) -> CrossValidation | None:
     test = float((d / scale) @ np.linalg.solve(C / np.outer(scale, scale), d / scale)) / len(d)
     rms = lambda parts: float(np.sqrt(np.mean([_rms(p) ** 2 for p in parts])))
     return CrossValidation(
-        rms(halves), rms(held), dict(zip(names, (d / scale).tolist())), test, tuple(own),
+        rms(halves), rms(held), dict(zip(names, (d / scale).tolist())), test, (own[0], own[1]),
         _compared(network.cameras[0], own),
     )  # fmt: skip
 
@@ -290,7 +290,7 @@ def residuals_in_pixels(adjustment, camera):
     problem, data, model = adjustment.problem, adjustment.problem.data, get_model(camera.model)
     weight = np.asarray(data.image_weight)
     v = adjustment.inspection.residuals.image
-    used = (weight > 0).all(1)
+    used = np.all(weight > 0, axis=1)
     v = np.where(used[:, None], v / np.where(used[:, None], weight, 1.0), np.nan)
     c = [given.id for given in adjustment.problem.network.cameras].index(camera.id)
     own = problem.camera == c

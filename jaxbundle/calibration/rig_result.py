@@ -21,6 +21,7 @@ from jaxbundle.leastsquares import Pose, PoseValue, Result
 from jaxbundle.network.kinds import exterior
 from jaxbundle.network.tables import Camera, units_of
 from jaxbundle.statistics.blunders import Removed, either_of
+from jaxbundle.types import present
 
 POSE = Pose.width
 DEGREES = np.array([1, 1, 1, *[180 / np.pi] * 3])
@@ -147,8 +148,9 @@ class RigCalibration:
         rig, found = self.rig, []
         for item in self.result.removed:
             if item.set == len(rig.sets):
-                name = f"{'XYZ'[item.residual]} of point {rig.ids[item.row]}"
-                found.append(Removed("control", 3 * item.row + item.residual, name, item.test))
+                axis = present(item.residual)  # coordinates are tested one by one
+                name = f"{'XYZ'[axis]} of point {rig.ids[item.row]}"
+                found.append(Removed("control", 3 * item.row + axis, name, item.test))
                 continue
             rows = rig.sets[item.set][1][list(item.rows)]
             seen = zip(rig.point[rows], rig.camera[rows], rig.epoch[rows])
@@ -275,9 +277,10 @@ def _to_angles(mounting: PoseValue):
 
 def _mounting(at: PoseValue, C) -> Mounting:
     R, angles, J = map(np.asarray, _to_angles(at))
-    J, length = DEGREES[:, None] * J, float(np.linalg.norm(at.position))
-    along = at.position / length if length else np.zeros(3)
+    base = np.asarray(at.position)
+    J, length = DEGREES[:, None] * J, float(np.linalg.norm(base))
+    along = base / length if length else np.zeros(3)
     return Mounting(
-        at.position, R, np.degrees(angles), J @ C @ J.T, length,
+        base, R, np.degrees(angles), J @ C @ J.T, length,
         float(np.sqrt(along @ C[:3, :3] @ along)),
     )  # fmt: skip

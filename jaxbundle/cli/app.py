@@ -75,8 +75,8 @@ def run() -> None:
         _end(" ".join(str(error).split()), BAD_INPUT)
     except Exception as error:
         # Usage errors of the command line itself (unknown option, missing argument).
-        if hasattr(error, "format_message"):
-            _end(error.format_message(), BAD_INPUT)
+        if message := getattr(error, "format_message", None):
+            _end(message(), BAD_INPUT)
         traceback.print_exc()
         leave(1)
     sys.exit(status)

@@ -47,7 +47,7 @@ def camera(
         given = camera_given(file)
         size, pitch = _sizes(file, given, *sizes)
         unit = get_model(given.model).unit
-        extent = np.multiply(size, pitch if unit == "mm" else 1.0)
+        extent = np.multiply(size, 1.0 if unit == "px" or pitch is None else pitch)
         reach = float(np.hypot(*extent) / 2)
         width = reach / STEPS if step is None else step
         if width * MOST_ROWS < reach:

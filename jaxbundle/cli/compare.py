@@ -36,10 +36,10 @@ def compare(
 ) -> None:
     """Compare two calibrations: parameters, and how far images are apart over the image."""
     (first, C_first), (second, C_second) = calibration_given(a), calibration_given(b)
-    if None not in (first.image_size, second.image_size) and first.image_size != second.image_size:
+    sizes = [list(c.image_size) for c in (first, second) if c.image_size is not None]
+    if len(sizes) == 2 and sizes[0] != sizes[1]:
         raise InputError(
-            f"{a}, {b}: images of {list(first.image_size)} and {list(second.image_size)} pixels "
-            "are not of one camera"
+            f"{a}, {b}: images of {sizes[0]} and {sizes[1]} pixels are not of one camera"
         )
     size = pair("--image-size", image_size) or first.image_size or second.image_size
     pitch = pair("--pixel-size", pixel_size) or first.pixel_size or second.pixel_size

@@ -13,7 +13,8 @@ def join_processes(join: tuple[str, int, int] | None, quiet: bool) -> bool:
     """Join, and say whether this is the process that writes."""
     if join and not quiet:
         print(f"jaxbundle: waiting for {join[1]} processes at {join[0]}", file=sys.stderr)
-    return jaxbundle.join_processes(*(join or ()))
+    address, processes, process = join or (None, None, None)
+    return jaxbundle.join_processes(address, processes, process)
 
 
 def check_sameness(*given: object) -> None:

@@ -67,7 +67,7 @@ class Result:
     """
 
     def __init__(
-        self, problem: Problem, minimum: Minimum, removed: Sequence[Removed] = (),
+        self, problem: Problem, minimum: Minimum[Values], removed: Sequence[Removed] = (),
         suspects: Sequence[Suspect] = (), factors: Mapping[str, float] | None = None,
     ):  # fmt: skip
         self.problem, self.minimum = problem, minimum
@@ -229,7 +229,7 @@ def adjust(
         tables, observations, eliminate, motions=_motions(tables, datum, motions),
         datum=functools.partial(_hold_datum, tables, datum), reduction=reduction, **options,
     )  # fmt: skip
-    minima: list[Minimum] = []
+    minima: list[Minimum[Values]] = []
 
     def again(problem: Problem, start: Values) -> Solution:
         minima.append(find_minimum(

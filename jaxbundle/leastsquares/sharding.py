@@ -63,7 +63,7 @@ def distribute(problem: Problem, devices=None) -> Shards:
 
 def find_minimum_of_shards(
     shards: Shards, solver: LeastSquares, start: Values | None = None
-) -> Minimum:
+) -> Minimum[Values]:
     """As `solver.minimise`, with the solver of the whole problem; values are not moved into the
     datum. `start` must be finite: devices that end at different steps would wait for each other
     for ever.
@@ -91,7 +91,7 @@ def find_minimum_of_shards(
 
 
 @eqx.filter_jit
-def _minimise(mesh: Mesh, solver: LeastSquares, data: Data, start: Values) -> Minimum:
+def _minimise(mesh: Mesh, solver: LeastSquares, data: Data, start: Values) -> Minimum[Values]:
     """What all devices find; eliminated rows [devices, rows, …]."""
     arrays, static = eqx.partition((solver.plan, data, start), eqx.is_array)
 

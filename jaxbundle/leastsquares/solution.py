@@ -56,7 +56,7 @@ Rows = dict[int, Float[np.ndarray, "n r"]]
 """By set of observations, in the order they were given."""
 
 
-def find_minimum(problem: Problem, start: Values | None = None, **options) -> Minimum:
+def find_minimum(problem: Problem, start: Values | None = None, **options) -> Minimum[Values]:
     """Iterate from `start` (the problem's own if not given) and move the solution into the datum;
     `options`: of the solver (`make_solver`). What is held, and the datum, stay the problem's."""
     given = pad_values(problem, problem.data.start)

@@ -7,7 +7,7 @@ formed once for each accepted point; a refused step costs a factorisation and th
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import equinox as eqx
 import jax
@@ -183,17 +183,20 @@ class NoAdjoint(optx.AbstractAdjoint):
         return primal_fn((*inputs, loop))
 
 
-class Minimum(eqx.Module):
-    """Where the loop ended: unknowns, why (`stopping.TERMINATIONS`), how many steps, their
-    history."""
+V = TypeVar("V")
 
-    values: Values
+
+class Minimum(eqx.Module, Generic[V]):
+    """Where the loop ended: unknowns (tables, or as a network has them), why
+    (`stopping.TERMINATIONS`), how many steps, their history."""
+
+    values: V
     termination: Int[Array, ""]
     iterations: Int[Array, ""]
     history: History
 
 
-def minimise(solver: LeastSquares, data: Data, start: Values) -> Minimum:
+def minimise(solver: LeastSquares, data: Data, start: Values) -> Minimum[Values]:
     """Run the solver from `start` by `optimistix.least_squares`; no derivatives."""
     laid = lay_out_data(solver.plan, data)
     fn = lambda values, laid: residuals(solver.declared, solver.plan, values, laid)

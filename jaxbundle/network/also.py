@@ -61,8 +61,8 @@ def split(also: Sequence[Table | Observations]) -> tuple[list[Table], list[Obser
 
 def place(given: Observations, origin) -> Observations:
     """The observations in the coordinates of the arrays."""
-    kind, origin = given.kind, tuple(float(x) for x in origin)
+    kind, (X, Y, Z) = given.kind, (float(x) for x in origin)
     if not {"image", "point"} & set(kind.of):
         return given
-    residual = InObjectSpace(kind.residual, kind.of, origin)
+    residual = InObjectSpace(kind.residual, kind.of, (X, Y, Z))
     return dataclasses.replace(given, kind=dataclasses.replace(kind, residual=residual))

@@ -104,7 +104,7 @@ def make_network(
 
     **Raises:** `InputError` naming table, row and column. `check_network` does the rest.
     """
-    given = {"datum": datum, "residuals": residuals,
+    given: dict[str, Any] = {"datum": datum, "residuals": residuals,
              "angle_unit": angle_unit, "image_unit": image_unit}  # fmt: skip
     for key, choices in CHOICES.items():
         check_choice(key, given[key], choices)
@@ -237,12 +237,12 @@ def _camera(row: Mapping[str, Any], number: int, where: str, models) -> Camera:
 
 def _ties(where: str, given: Any) -> tuple[tuple[str, ...], ...]:
     """Groups of names of parameters."""
-    groups = given if isinstance(given, Sequence) and not isinstance(given, str) else (None,)
-    if any(isinstance(g, str) or not isinstance(g, Sequence) or len(g) < 2 for g in groups):
+    listed = lambda g: isinstance(g, Sequence) and not isinstance(g, str)
+    if not listed(given) or not all(listed(g) and len(g) > 1 for g in given):
         raise InputError(
             f'{where}tie is {shown(given)}; expected groups of names such as [["fx", "fy"]]'
         )
-    return tuple(tuple(map(str, group)) for group in groups)
+    return tuple(tuple(map(str, group)) for group in given)
 
 
 def _number(where: str, key: str, value: Any) -> float:

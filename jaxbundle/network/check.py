@@ -6,6 +6,7 @@ what can be determined from them: rays a point, points an image, connected parts
 
 import math
 from collections.abc import Callable, Mapping
+from typing import SupportsIndex
 
 import numpy as np
 
@@ -120,7 +121,7 @@ def _refuse(table: Images | Points, mask, thing: str, message: Callable[[int, in
         raise InputError(f"{table.source(row)}: {thing} {table.id[row]!r}: {message(row, k)}")
 
 
-def _sighting(network: Network, row: int) -> str:
+def _sighting(network: Network, row: SupportsIndex) -> str:
     rays = network.observations
     point, image = network.points.id[rays.point[row]], network.images.id[rays.image[row]]
     return f"point {point!r} in image {image!r}"
@@ -247,7 +248,7 @@ def _check_observations(network: Network) -> None:
     key = observations.image.astype(np.int64) * len(network.points) + observations.point
     order = np.argsort(key, kind="stable")
     for k in np.flatnonzero(np.diff(key[order]) == 0)[:1]:
-        first, second = order[k], order[k + 1]
+        first, second = int(order[k]), int(order[k + 1])
         raise InputError(
             f"{observations.source(second)}: {_sighting(network, second)} "
             f"stands already in {observations.source(first)}; remove one of them"
@@ -274,7 +275,7 @@ def _check_distances(network: Network) -> Network:
             f"{distances.source(row)}: distance {names[row]}: a check point takes no part in the "
             "adjustment; make it a tie point or remove the distance"
         )
-    idle = points.has_role("fixed")[distances.points].all(1)
+    idle = np.all(points.has_role("fixed")[distances.points], axis=1)
     if idle.any():
         network = without_distances(network, idle).warn(
             f"left out {count(idle.sum(), 'distance')} between fixed points: "

@@ -8,7 +8,8 @@ it came from.
 import dataclasses
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from operator import index
+from typing import Any, SupportsIndex
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -155,7 +156,7 @@ def _column(values: Any, column: str, name: str) -> Column:
     refuse_traced(f"{name}: column {column!r}", values)
     if isinstance(values, str) or not isinstance(values, Iterable):
         raise InputError(f"{name}: column {column!r} must be a sequence, not {shown(values)}")
-    shape = np.shape(values) if hasattr(values, "shape") else (0,)
+    shape = tuple(getattr(values, "shape", (0,)))
     if len(shape) != 1:
         raise InputError(
             f"{name}: column {column!r} must have one dimension, a value for each row, but has "
@@ -197,9 +198,9 @@ def some(names: Iterable[Any], most: int = 5, as_text: Callable[[Any], str] = qu
     return f"{text} and {len(names) - most} more" if len(names) > most else text
 
 
-def count(number: int | np.integer, thing: str, rest: str = "") -> str:
+def count(number: SupportsIndex, thing: str, rest: str = "") -> str:
     """A number of things, in words: "1 image", "3 images", "3 images held"."""
-    return f"{number} {thing}{'' if number == 1 else 's'}{rest}"
+    return f"{number} {thing}{'' if index(number) == 1 else 's'}{rest}"
 
 
 def _id(value: Any) -> str:

@@ -19,7 +19,7 @@ def is_outside(camera: Camera, xy: Float[np.ndarray, "any 2"]) -> Bool[np.ndarra
         low, high = image_area(get_model(camera.model), camera.image_size, camera.pixel_size)
     except ValueError:
         return np.zeros(len(xy), bool)
-    return ((xy < low) | (xy > high)).any(1)
+    return np.any((xy < low) | (xy > high), axis=1)
 
 
 def outside_warnings(cameras: Sequence[Camera], network: Network | None = None) -> tuple[str, ...]:
@@ -27,6 +27,8 @@ def outside_warnings(cameras: Sequence[Camera], network: Network | None = None) 
     found = []
     for c, camera in enumerate(cameras):
         model, size = get_model(camera.model), camera.image_size
+        if size is None:
+            continue
         origin = "image centre" if model.axes != "down" else "centre of the upper-left pixel"
         point = np.array([[camera.parameters.get(name, 0.0) for name in model.principal_point]])
         where = f"camera {camera.id!r}: "

@@ -15,6 +15,7 @@ import dataclasses
 import math
 
 from jaxbundle.errors import InputError
+from jaxbundle.types import present
 
 
 def scale(c: float, height: float, terrain: float = 0.0) -> float:
@@ -114,7 +115,8 @@ def design_block(
         if pixel is None:
             raise InputError("pixel_on_ground needs the pixel size (pixel, mm)")
         scale_number = pixel_on_ground / pixel * 1000
-    height = height if height is not None else scale_number * c / 1000
+    if height is None:
+        height = present(scale_number) * c / 1000
     ratio = height / c
     footprint = (image_format[0] * ratio, image_format[1] * ratio)
     base, spacing = footprint[0] * (1 - forward_overlap), footprint[1] * (1 - side_overlap)

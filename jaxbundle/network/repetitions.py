@@ -47,7 +47,7 @@ def _repetitions(of, by, xy) -> Sequence[tuple[int, int]]:
     mixed = (mixed ^ (mixed >> np.uint64(29))) * MIX[0]
     order = np.argsort(of, kind="stable")
     first = np.flatnonzero(np.diff(of[order], prepend=-1))
-    total, number = np.add.reduceat(mixed[order], first), np.diff([*first, len(of)])
+    total, number = np.add.reduceat(mixed[order], first), np.diff(np.append(first, len(of)))
     _, group, size = np.unique(total, return_inverse=True, return_counts=True)
     candidates = of[order[first]][(size[group] > 1) & (number >= LEAST)]
     rows = np.flatnonzero(np.isin(of, candidates))

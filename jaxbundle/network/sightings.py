@@ -36,7 +36,7 @@ def keep_points(network: Network, keep: Bool[np.ndarray, " points"]) -> Network:
         return network
     index = np.cumsum(keep) - 1
     observations = network.observations.take(keep[network.observations.point])
-    network = without_distances(network, ~keep[network.distances.points].all(1))
+    network = without_distances(network, ~np.all(keep[network.distances.points], axis=1))
     gone = {id for id, kept in zip(network.points.id, keep) if not kept}
     return network.replace(
         points=network.points.take(keep),

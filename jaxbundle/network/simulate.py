@@ -160,7 +160,7 @@ def simulate_with_truth(
     if len(begin) != len(cameras):
         raise InputError(f"start has {len(begin)} cameras, camera {len(cameras)}; give as many")
     role = _roles(len(targets), control, control_sigma, check)
-    noise = _not_negative(noise, 2, "noise")
+    sigma_xy = _not_negative(noise, 2, "noise")
 
     image, point, xy = _look(stations, targets, cameras, of_station, image_format)
     rng = np.random.default_rng(seed)
@@ -204,7 +204,8 @@ def simulate_with_truth(
             Source("targets", np.flatnonzero(used) + 1, "target"),
         ),
         observations=Observations(
-            image, point, xy, np.broadcast_to(np.where(noise > 0, noise, 1.0), xy.shape).copy(),
+            image, point, xy,
+            np.broadcast_to(np.where(sigma_xy > 0, sigma_xy, 1.0), xy.shape).copy(),
             Source("image points"),
         ),
         distances=Distances(
@@ -216,8 +217,8 @@ def simulate_with_truth(
         object_unit=object_unit,
         image_unit=get_model(cameras[0].model).unit,
     )
-    disturb = _disturbance(disturb, stations.position[image] - true[point])
-    return Simulation(_measured(truth, begin, noise, disturb, rng), truth)
+    disturbance = _disturbance(disturb, stations.position[image] - true[point])
+    return Simulation(_measured(truth, begin, sigma_xy, disturbance, rng), truth)
 
 
 def _measured(truth: Network, begin, noise, disturb, rng) -> Network:

@@ -5,7 +5,6 @@ for `jaxbundle.simulate`. Lengths are in the object unit, angles in radians.
 """
 
 import dataclasses
-from collections.abc import Sequence
 
 import jax
 import numpy as np
@@ -14,6 +13,7 @@ from jaxtyping import Float
 from jaxbundle.arguments import number, numeric_array, positive, shown, vector, whole
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import omega_phi_kappa_from_matrix
+from jaxbundle.types import Numbers
 
 COORDINATES = "finite coordinates X, Y, Z"
 LARGEST_SEED = 2**128
@@ -62,8 +62,8 @@ def stations_looking_at(
     position: Float[np.ndarray, "images 3"],
     look_at: Float[np.ndarray, "3"] | Float[np.ndarray, "images 3"],
     *,
-    roll: float | Sequence[float] = 0.0,
-    up: Sequence[float] = (0.0, 0.0, 1.0),
+    roll: float | Numbers = 0.0,
+    up: Numbers = (0.0, 0.0, 1.0),
 ) -> Stations:
     """Stations whose optical axes pass through given points.
 
@@ -82,10 +82,10 @@ def stations_looking_at(
             f"look_at must be finite coordinates [3], or {list(position.shape)}, one point for "
             f"each station, but is {shown(look_at.tolist())}"
         )
-    up = vector("up", up, 3, "a direction X, Y, Z")
-    if not up.any():
+    above = vector("up", up, 3, "a direction X, Y, Z")
+    if not above.any():
         raise InputError("up must be a direction X, Y, Z, but is 0, 0, 0")
-    roll = vector("roll", roll, len(position), f"an angle, or one for each of {len(position)} "
+    angle = vector("roll", roll, len(position), f"an angle, or one for each of {len(position)} "
                   "stations")  # fmt: skip
     # The camera looks along −z, so z points from the object back to the camera.
     z = position - look_at
@@ -93,13 +93,13 @@ def stations_looking_at(
     for row in np.flatnonzero(length[:, 0] == 0)[:1]:
         raise InputError(f"stations: station {row + 1} stands on the point it looks at")
     z = z / length
-    x = np.cross(up, z)
-    along = np.linalg.norm(x, axis=1, keepdims=True) < 1e-9 * np.linalg.norm(up)
+    x = np.cross(above, z)
+    along = np.linalg.norm(x, axis=1, keepdims=True) < 1e-9 * np.linalg.norm(above)
     first = np.array([1.0, 0.0, 0.0])
     x = np.where(along, first - (z @ first)[:, None] * z, x)
     x = x / np.linalg.norm(x, axis=1, keepdims=True)
     y = np.cross(z, x)
-    c, s = np.cos(roll), np.sin(roll)
+    c, s = np.cos(angle), np.sin(angle)
     c, s = (np.broadcast_to(v, len(position))[:, None] for v in (c, s))
     matrices = np.stack([c * x + s * y, -s * x + c * y, z], 1)
     return Stations(position, _angles(matrices))
@@ -109,7 +109,7 @@ def ring_of_stations(
     stations: int,
     radius: float,
     height: float = 0.0,
-    look_at: Sequence[float] = (0.0, 0.0, 0.0),
+    look_at: Numbers = (0.0, 0.0, 0.0),
     *,
     roll_every: int = 0,
 ) -> Stations:
@@ -122,13 +122,13 @@ def ring_of_stations(
     stations = whole("stations", stations)
     radius, height = positive("radius", radius), number("height", height)
     roll_every = whole("roll_every", roll_every, least=0)
-    look_at = vector("look_at", look_at, 3, COORDINATES)
+    middle = vector("look_at", look_at, 3, COORDINATES)
     azimuth = 2 * np.pi * np.arange(stations) / stations
     offset = np.stack(
         [radius * np.cos(azimuth), radius * np.sin(azimuth), np.full(stations, height)], 1
     )
     turned = np.arange(1, stations + 1) % roll_every == 0 if roll_every else np.zeros(stations)
-    return stations_looking_at(look_at + offset, look_at, roll=np.pi / 2 * turned)
+    return stations_looking_at(middle + offset, middle, roll=np.pi / 2 * turned)
 
 
 def aerial_block(
@@ -139,7 +139,7 @@ def aerial_block(
     footprint: tuple[float, float],
     forward_overlap: float = 0.6,
     side_overlap: float = 0.3,
-    centre: Sequence[float] = (0.0, 0.0, 0.0),
+    centre: Numbers = (0.0, 0.0, 0.0),
     heading: float = 0.0,
     tilt: float = 0.0,
 ) -> Stations:
@@ -160,10 +160,10 @@ def aerial_block(
     """
     strips = whole("strips", strips)
     images_per_strip = whole("images_per_strip", images_per_strip)
-    footprint = vector("footprint", footprint, 2, "two lengths, along and across the flight")
-    if not (footprint > 0).all():
-        raise InputError(f"footprint must be two positive lengths, but is {footprint.tolist()}")
-    centre = vector("centre", centre, 3, COORDINATES)
+    size = vector("footprint", footprint, 2, "two lengths, along and across the flight")
+    if not (size > 0).all():
+        raise InputError(f"footprint must be two positive lengths, but is {size.tolist()}")
+    middle = vector("centre", centre, 3, COORDINATES)
     height, heading, tilt = (
         number(name, value)
         for name, value in (("height", height), ("heading", heading), ("tilt", tilt))
@@ -171,7 +171,7 @@ def aerial_block(
     below_one = lambda x: -np.inf < x < 1
     forward_overlap = number("forward_overlap", forward_overlap, "a fraction below 1", below_one)
     side_overlap = number("side_overlap", side_overlap, "a fraction below 1", below_one)
-    base, spacing = footprint[0] * (1 - forward_overlap), footprint[1] * (1 - side_overlap)
+    base, spacing = size[0] * (1 - forward_overlap), size[1] * (1 - side_overlap)
     strip, place = np.divmod(np.arange(strips * images_per_strip), images_per_strip)
     back = strip % 2 == 1
     along = base * (place - (images_per_strip - 1) / 2) * np.where(back, -1, 1)
@@ -185,7 +185,7 @@ def aerial_block(
     x = np.cos(tilt) * direction + np.sin(tilt) * up
     z = np.cos(tilt) * up - np.sin(tilt) * direction
     return Stations(
-        centre + offset, _angles(np.stack([x, np.cross(z, x), z], 1))
+        middle + offset, _angles(np.stack([x, np.cross(z, x), z], 1))
     )
 
 
@@ -208,7 +208,7 @@ def grid_of_targets(
     *,
     relief: float = 0.0,
     seed: int = 0,
-    centre: Sequence[float] = (0.0, 0.0, 0.0),
+    centre: Numbers = (0.0, 0.0, 0.0),
 ) -> Float[np.ndarray, "points 3"]:
     """Targets on a horizontal grid, row by row: [columns·rows, 3], object unit.
 
@@ -220,27 +220,27 @@ def grid_of_targets(
     if not min(dx, dy) > 0:
         raise InputError(f"spacing must be positive, but is {shown(spacing)}")
     relief = number("relief", relief, "0 or a positive length", _a_length)
-    centre = vector("centre", centre, 3, COORDINATES)
+    middle = vector("centre", centre, 3, COORDINATES)
     seed = whole("seed", seed, least=0, most=LARGEST_SEED)
     x = dx * (np.arange(columns) - (columns - 1) / 2)
     y = dy * (np.arange(rows) - (rows - 1) / 2)
     xy = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     z = np.random.default_rng(seed).uniform(-relief, relief, len(xy))
-    return centre + np.concatenate([xy, z[:, None]], 1)
+    return middle + np.concatenate([xy, z[:, None]], 1)
 
 
 def cloud_of_targets(
     points: int,
-    size: float | Sequence[float],
+    size: float | Numbers,
     *,
     seed: int = 0,
-    centre: Sequence[float] = (0.0, 0.0, 0.0),
+    centre: Numbers = (0.0, 0.0, 0.0),
 ) -> Float[np.ndarray, "points 3"]:
     """Targets at random in a box of the given `size` (one edge, or three): [points, 3]."""
     points = whole("points", points)
     half = vector("size", size, 3, "one length of an edge, or three") / 2
     if (half < 0).any():
         raise InputError(f"size must be 0 or positive lengths, but is {shown((2 * half).tolist())}")
-    centre = vector("centre", centre, 3, COORDINATES)
+    middle = vector("centre", centre, 3, COORDINATES)
     rng = np.random.default_rng(whole("seed", seed, least=0, most=LARGEST_SEED))
-    return centre + rng.uniform(-half, half, (points, 3))
+    return middle + rng.uniform(-half, half, (points, 3))

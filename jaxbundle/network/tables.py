@@ -15,7 +15,8 @@ are kept beside them for people.
 import dataclasses
 import os
 from collections.abc import Iterable, Mapping
-from typing import Any
+from operator import index
+from typing import Any, SupportsIndex
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -38,9 +39,9 @@ class Source:
     numbers: Int[np.ndarray, " rows"] | None = None
     word: str = "row"
 
-    def __call__(self, row: int) -> str:
+    def __call__(self, row: SupportsIndex) -> str:
         """The place of a row, as a person would look it up."""
-        number = row + 1 if self.numbers is None else self.numbers[row]
+        number = index(row) + 1 if self.numbers is None else self.numbers[row]
         return f"{self.name}, {self.word} {number}"
 
     def take(self, rows) -> "Source":

@@ -50,7 +50,7 @@ def check_units(network: Network) -> Network:
 def _check_field(camera: Camera, xy) -> str:
     """A warning for a pixel size in metres; refuses a principal distance too short for anything."""
     model = get_model(camera.model)
-    values = [camera.parameters.get(name) for name in model.principal_distance]
+    values = [camera.parameters[name] for name in model.principal_distance]
     name, c = model.principal_distance[0], min(float(value) for value in values)
     point = [camera.parameters.get(n, 0.0) for n in model.principal_point] or [0.0, 0.0]
     usual = float(np.median(np.hypot(*(xy - point).T)))

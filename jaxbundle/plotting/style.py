@@ -33,15 +33,26 @@ def need_matplotlib():
     return matplotlib
 
 
-def axes(ax, size: tuple[float, float], projection: str | None = None):
+def axes(ax, size: tuple[float, float]):
     """The axes given, or those of a new pyplot figure (shown by notebooks and `plt.show`)."""
     need_matplotlib()
     if ax is None:
         from matplotlib import pyplot
 
-        keywords = {"projection": projection} if projection else None
-        _, ax = pyplot.subplots(figsize=size, layout="constrained", subplot_kw=keywords)
-    if projection == "3d" and not hasattr(ax, "set_zlabel"):
+        _, ax = pyplot.subplots(figsize=size, layout="constrained")
+    return ax
+
+
+def axes_3d(ax, size: tuple[float, float]):
+    """The same, in perspective."""
+    need_matplotlib()
+    from mpl_toolkits.mplot3d import Axes3D
+
+    if ax is None:
+        from matplotlib import pyplot
+
+        ax = pyplot.figure(figsize=size, layout="constrained").add_subplot(projection="3d")
+    if not isinstance(ax, Axes3D):
         raise ValueError("a perspective view needs 3D axes: add_subplot(projection=\"3d\")")
     return ax
 

@@ -17,6 +17,7 @@ from jaxbundle.plotting.style import (
     PALE,
     ROLE_STYLE,
     axes,
+    axes_3d,
     extent,
     label,
     legend,
@@ -48,11 +49,11 @@ def network_plan(adjustment, ax=None):
     _, size = extent(np.concatenate([points["xyz"], centres]))
     pyramids = camera_pyramids(adjustment, _pyramid_size(centres, size))
     lines = LineCollection(
-        _pyramid_lines(pyramids)[:, :, :2], colors=GREY, linewidths=0.6, zorder=2
+        list(_pyramid_lines(pyramids)[:, :, :2]), colors=GREY, linewidths=0.6, zorder=2
     )
     ax.add_collection(lines)
     axis = np.stack([centres, pyramids[:, 1:].mean(1)], 1)[:, :, :2]
-    ax.add_collection(LineCollection(axis, colors=INK, linewidths=1.0, zorder=3))
+    ax.add_collection(LineCollection(list(axis), colors=INK, linewidths=1.0, zorder=3))
     ax.scatter(centres[:, 0], centres[:, 1], s=9, color=INK, zorder=4, label="cameras")
     for role, style in ROLE_STYLE.items():
         chosen = points["xyz"][points["role"] == role]
@@ -86,7 +87,7 @@ def network_perspective(adjustment, ax=None):
 
     **Returns:** matplotlib 3D `Axes`, in the object unit.
     """
-    ax = axes(ax, (7.5, 6.5), "3d")
+    ax = axes_3d(ax, (7.5, 6.5))
     from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
     points, centres = _points(adjustment), adjustment.image_values[:, :3]
@@ -140,10 +141,10 @@ def camera_pyramids(adjustment, size: float) -> np.ndarray:
         p = adjustment.values.camera[np.array(chosen), : len(model.parameters)]
         corners[chosen] = _corner_rays(model, p, frames[chosen])
     # where a distortion turns back inside the frame there is no ray: a corner to look at instead
-    missing = ~np.isfinite(corners).all(2)
+    missing = ~np.all(np.isfinite(corners), axis=2)
     plain = np.array([(-1, -1, -1.4), (1, -1, -1.4), (1, 1, -1.4), (-1, 1, -1.4)])
     corners = np.where(missing[:, :, None], plain, corners)
-    flat = (corners[:, :, 2] < -0.2).all(1)
+    flat = np.all(corners[:, :, 2] < -0.2, axis=1)
     corners[flat] /= -corners[flat][:, :, 2:]
     corners /= np.linalg.norm(corners, axis=2).mean(1)[:, None, None]
     edges = size * corners[network.images.camera]
@@ -230,7 +231,7 @@ def _draw_ellipses(adjustment, ax, size: float) -> np.ndarray:
     factor = round_number(reach / np.median(large))
     polygons = error_ellipses(adjustment, factor)
     ellipses = LineCollection(
-        polygons, colors=BLUE, linewidths=0.8, alpha=0.8, zorder=3,
+        list(polygons), colors=BLUE, linewidths=0.8, alpha=0.8, zorder=3,
         label=f"error ellipses (1σ) × {factor:,.12g}".replace(",", " "),
     )  # fmt: skip
     ax.add_collection(ellipses)

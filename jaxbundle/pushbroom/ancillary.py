@@ -34,8 +34,8 @@ ROUNDING = 1e-6
 
 def position_table(
     times: Float[np.ndarray, " rows"],
-    positions: Float[np.ndarray, "rows 3"],
-    velocities: Float[np.ndarray, "rows 3"] | None = None,
+    positions: Float[np.ndarray, "rows k"],
+    velocities: Float[np.ndarray, "rows k"] | None = None,
     *,
     method: str = "lagrange",
     order: int = 7,

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 Resampling = Literal["nearest", "bilinear", "cubic"]
-RESAMPLINGS: tuple[str, ...] = get_args(Resampling)
+RESAMPLINGS: tuple[Resampling, ...] = get_args(Resampling)
 
 
 def resample(

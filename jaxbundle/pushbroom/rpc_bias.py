@@ -13,7 +13,6 @@ Of correlated observations (Baarda, 1968), with Q the cofactors of the unknowns:
     Qv = P⁻¹ − A·Q·Aᵀ,      r = diag(Qv·P),      w = (P·v)ᵢ/√(P·Qv·P)ᵢᵢ.
 """
 
-from typing import Literal
 
 import equinox as eqx
 import jax
@@ -78,7 +77,7 @@ def fit_bias(
     rpc: Rpc,
     control: RpcTable,
     *,
-    model: Literal["shift", "affine"] = "shift",
+    model: str = "shift",
     sigma: float | Float[np.ndarray, "n 2"] = 1.0,
     ground_sigma: Float[np.ndarray, "n 3"] | None = None,
     earth: Ellipsoid = WGS84,

@@ -10,11 +10,13 @@ and rate of the samples; here they are stated.
 """
 
 import dataclasses
-from collections.abc import Sequence
+import math
 from typing import Literal, NamedTuple
 
 import jax
 import numpy as np
+
+from jaxbundle.types import Numbers
 
 from .accuracy import circular_error, closed_form, drawn, ground_errors, propagated
 from .image import PushbroomImage, pose_at
@@ -29,6 +31,8 @@ TRAJECTORIES = {
 }  # fmt: skip
 FLOORS = ("linear", "spline")
 Kind = Literal["bias", "white"]
+SIGMAS = (math.radians(0.01), math.radians(0.1))
+"""Accuracies of attitudes, radians, if none are given."""
 
 
 class ErrorFree(NamedTuple):
@@ -67,7 +71,7 @@ class AccuracyTable(NamedTuple):
 def accuracy_table(
     flight: Flight,
     surface: Surface,
-    sigmas: Sequence[float] = (np.radians(0.01), np.radians(0.1)),
+    sigmas: Numbers = SIGMAS,
     kind: Kind = "bias",
     draws: int = 1000,
     seed: int = 0,

@@ -34,6 +34,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, at_height, geodetic, ray_to_ellipsoid
 from jaxbundle.geometry.vectors import Scalar, Triple, Vector, along
 from jaxbundle.implicit import implicit_root, solve_dense
+from jaxbundle.types import Numbers
 
 from .polynomial import value, value_and_rate
 from .surfaces import Surface
@@ -98,8 +99,8 @@ class Terrain(Surface):
 
 def make_terrain(
     heights: Float[np.ndarray, "rows columns"],
-    origin: tuple[float, float],
-    step: tuple[float, float],
+    origin: Numbers,
+    step: Numbers,
     earth: Ellipsoid | None = WGS84,
     over_voids: bool = True,
 ) -> Terrain:

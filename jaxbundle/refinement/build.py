@@ -67,7 +67,7 @@ def start_points(given: Given, rays: Rays) -> Float[np.ndarray, "points 3"]:
     """Coordinates as given, or where the rays of a tie point meet."""
     points, chosen = given.points, rays.points
     X = points.X[chosen].copy()
-    wanted = np.isnan(X).any(1)
+    wanted = np.any(np.isnan(X), axis=1)
     if not wanted.any():
         return X
     centre, direction, point = (np.concatenate(x) for x in zip(*_sights(given, rays)))
@@ -82,7 +82,8 @@ def start_points(given: Given, rays: Rays) -> Float[np.ndarray, "points 3"]:
     X[rows] = met.X
     lost = (np.asarray(met.status) != Status.SOUND) | ~np.isfinite(X[rows]).all(1)
     if lost.any():
-        p, status = chosen[rows[lost.argmax()]], Status(int(met.status[lost.argmax()]))
+        p = int(chosen[rows[lost.argmax()]])
+        status = Status(int(met.status[lost.argmax()]))
         raise InputError(
             f"{points.source(p)}: the rays of tie point {points.id[p]!r} do not meet "
             f"({status.name.lower().replace('_', ' ')}); give approximate coordinates, or measure "
@@ -98,7 +99,9 @@ def _sights(given: Given, rays: Rays):
         rows = rays.scanner[observations.image[rays.scanner] == i]
         found = _scanner_sights(one.image, jnp.asarray(observations.xy[rows]))
         yield *map(np.asarray, found), observations.point[rows]
-    for j in range(0 if frames is None else len(frames.images)):
+    if frames is None:
+        return
+    for j in range(len(frames.images)):
         rows = rays.frame[frames.observations.image[rays.frame] == j]
         camera = frames.cameras[frames.images.camera[j]]
         model = cameras.get_model(camera.model)

@@ -21,6 +21,7 @@ from jaxbundle.network.tables import EXTERIOR, Distances, Network, Observations,
 from jaxbundle.refinement import kinds
 from jaxbundle.refinement.freedom import Form, Name, make_form, names, of_one_size, priors
 from jaxbundle.refinement.tables import GroundPoints, ScannerImage
+from jaxbundle.types import present
 
 ARCSEC = math.degrees(1) * 3600
 IMAGE, SENSOR = "scanner image", "sensor"
@@ -274,7 +275,7 @@ def _points(given: Given, chosen, X, seen):
 
 def _network_of(given: Given, rays: Rays, index, X, checking: bool) -> Network:
     """The photographs with the points and rays used; control is declared here (`_points`)."""
-    frames, n = given.frames, len(X)
+    frames, n = present(given.frames), len(X)
     used = list(dict.fromkeys(frames.images.camera.tolist()))
     camera = np.array([used.index(c) for c in frames.images.camera], int)
     seen, d = frames.observations.take(rays.frame), frames.distances
@@ -293,10 +294,9 @@ def _network_of(given: Given, rays: Rays, index, X, checking: bool) -> Network:
 def _columns_of_photographs(network: Network, tables, of_cameras) -> list[Column]:
     """Their unknowns: of every image, and of its camera where it is the first."""
     columns, called = [], {t.name: t for t in tables}
-    words = dict(zip(EXTERIOR[:3], ("X0", "Y0", "Z0")))
     for i, id in enumerate(network.images.id):
         for k in np.flatnonzero(called["image"].free[i]).tolist():
-            word = words.get(EXTERIOR[k], EXTERIOR[k])
+            word = EXTERIOR[k]
             unit = ("m", 1.0) if k < 3 else ("arcsec", ARCSEC)
             name = Name(f"photograph {id}", word, *unit, word)
             columns.append(Column(name, math.inf, "image", i, k))
@@ -318,7 +318,7 @@ def _check_near(given: Given, rows, v) -> None:
     far = (~(np.abs(v) <= FAR * size[observations.image[rows]])).any(1)
     if not far.any():
         return
-    row, away = rows[far.argmax()], v[far.argmax()]
+    row, away = int(rows[far.argmax()]), v[far.argmax()]
     p, id = observations.point[row], given.images[observations.image[row]].id
     said = (
         f"{away[0]:.0f} lines and {away[1]:.0f} pixels away" if np.isfinite(away).all()

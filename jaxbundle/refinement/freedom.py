@@ -33,6 +33,7 @@ from jaxbundle.pushbroom.image import Offsets, PushbroomImage
 from jaxbundle.pushbroom.scanner import AnglePolynomial, Optics
 from jaxbundle.pushbroom.trajectory import orbital_frame, position_at, velocity_at
 from jaxbundle.refinement.spline import NO_SPLINE, JitterSpline, make_spline
+from jaxbundle.types import AnyArray, Scalar
 
 Three = tuple[float, float, float]
 HELD: Three = (0.0, 0.0, 0.0)
@@ -77,7 +78,21 @@ class Change(NamedTuple):
     look_along: Float[Array, " b"]
 
 
-LEAST = Change(3, 3, 3, 3, 3, 1, 3, 1, 1)
+class Sizes(NamedTuple):
+    """How many numbers each unknown of a `Change` has."""
+
+    attitude: int
+    attitude_rate: int
+    jitter: int
+    position: int
+    position_rate: int
+    focal_length: int
+    mounting: int
+    look_across: int
+    look_along: int
+
+
+LEAST = Sizes(3, 3, 3, 3, 3, 1, 3, 1, 1)
 
 
 class ChangedOptics(Optics):
@@ -118,7 +133,7 @@ class Form(eqx.Module):
 
     axes: Float[Array, "3 3"]
     spline: JitterSpline = eqx.field(static=True)
-    sizes: Change = eqx.field(static=True)
+    sizes: Sizes = eqx.field(static=True)
 
     @property
     def own(self) -> int:
@@ -134,7 +149,7 @@ def make_form(image: PushbroomImage, earth: Ellipsoid | None, freedom: Freedom) 
         spline = make_spline(first, last, freedom.knot_spacing)
     axes = _axes(image, earth is None)
     across, along = len(freedom.look_across), len(freedom.look_along)
-    return Form(axes, spline, Change(3, 3, 3 * spline.unknowns, 3, 3, 1, 3, across, along))
+    return Form(axes, spline, Sizes(3, 3, 3 * spline.unknowns, 3, 3, 1, 3, across, along))
 
 
 @eqx.filter_jit
@@ -147,11 +162,11 @@ def _axes(image: PushbroomImage, local: bool) -> Float[Array, "3 3"]:
 
 def of_one_size(forms: list[Form]) -> list[Form]:
     """The forms with room for the most numbers that any of them has, and for one of each."""
-    sizes = Change(*map(max, zip(LEAST, *(form.sizes for form in forms))))
+    sizes = Sizes(*map(max, zip(LEAST, *(form.sizes for form in forms))))
     return [dataclasses.replace(form, sizes=sizes) for form in forms]
 
 
-def change_of(sizes: Change, p: Float[Array, " n"]) -> Change:
+def change_of(sizes: Sizes, p: Float[AnyArray, " n"]) -> Change:
     """The unknowns of one image out of their vector."""
     parts = Change(*jnp.split(p, np.cumsum(sizes)[:-1]))
     return parts._replace(
@@ -160,7 +175,7 @@ def change_of(sizes: Change, p: Float[Array, " n"]) -> Change:
 
 
 def changed(
-    image: PushbroomImage, form: Form, change: Change, t: Float[Array, ""]
+    image: PushbroomImage, form: Form, change: Change, t: Scalar
 ) -> PushbroomImage:
     """The image as it is at the time t with its unknowns changed."""
     jitter = form.spline.at(change.jitter, t)
@@ -180,7 +195,7 @@ def changed_offsets(old: Offsets, axes, change: Change, jitter: Float[Array, "3"
     )
 
 
-def changed_optics(image: PushbroomImage, change: Change) -> Optics:
+def changed_optics(image: PushbroomImage, change: Change) -> ChangedOptics:
     """The optics with focal length and look angles changed."""
     pad = lambda a: jnp.concatenate([a, jnp.zeros(1)])
     middle, half = middle_and_half(image)
@@ -207,7 +222,7 @@ def priors(form: Form, freedom: Freedom) -> Float[np.ndarray, " n"]:
     ])  # fmt: skip
 
 
-def names(sizes: Change, image: str, sensor: str) -> list[Name]:
+def names(sizes: Sizes, image: str, sensor: str) -> list[Name]:
     """The name of every number of an image's vector."""
     own, of = f"image {image}", f"sensor {sensor}"
     arcsec = math.degrees(1) * 3600

@@ -126,7 +126,7 @@ class Inspection:
         """v, r, w of a set of observations, NaN where there is none, and what is removed."""
         used, found = self.used[o], self.solution.reliability
         tell = lambda x: np.where(used, x[o], np.nan)
-        return self.residuals[o], tell(found.redundancy), tell(found.w), ~used.any(1)
+        return self.residuals[o], tell(found.redundancy), tell(found.w), ~np.any(used, axis=1)
 
 
 def adjust(declared: Declared, snooping: str, significance: float) -> Inspection:

@@ -42,20 +42,21 @@ from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.image import Offsets, Pose, PushbroomImage, given_pose, moved_pose
 from jaxbundle.pushbroom.project import misclosure_of
 from jaxbundle.refinement.freedom import (
-    Change,
     Form,
+    Sizes,
     change_of,
     changed_offsets,
     changed_slopes,
     middle_and_half,
 )
+from jaxbundle.types import AnyArray, Scalar
 
 
 class Placed(NamedTuple):
     """Points, and the axes (rows) along which each of them moves."""
 
-    position: Float[Array, "*rows 3"]
-    axes: Float[Array, "*rows 3 3"]
+    position: Float[AnyArray, "*rows 3"]
+    axes: Float[AnyArray, "*rows 3 3"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,7 +103,7 @@ class Line(NamedTuple):
     is in the jitter; the slopes (ξ, η); 1, û, û², … by the coefficients across and along; S."""
 
     pose: Pose
-    dt: Float[Array, "*n"]
+    dt: Scalar
     offsets: Offsets
     mounting: Float[Array, "*n 3"]
     axes: Float[Array, "*n 3 3"]
@@ -119,7 +120,7 @@ class ScannerPoint:
 
     corrections: Corrections
     earth: Ellipsoid | None
-    sizes: Change
+    sizes: Sizes
 
     def __call__(self, own, sensor, X, line: Line):
         return line.scale @ self.misclosure(own, sensor, X, line)

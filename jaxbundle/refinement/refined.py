@@ -164,4 +164,5 @@ def _sum(base, e, added):
         total.append(jnp.asarray(np.polynomial.polynomial.polyadd(
             np.asarray(own) / (1 + float(e)), moved
         )))  # fmt: skip
-    return AnglePolynomial(*total, base.middle, base.half)
+    across, along = total
+    return AnglePolynomial(across, along, base.middle, base.half)

@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbundle.types import Scalar
+
 FEWEST = 3
 """Intervals between knots: with fewer, nothing is left beside constant and line."""
 
@@ -49,18 +51,18 @@ class JitterSpline:
         full = np.linalg.qr(np.stack([np.ones_like(k), k], 1).astype(float), mode="complete")[0]
         return full[:, 2:]
 
-    def at(self, z: Float[Array, "3 k"], t: Float[Array, ""]) -> Float[Array, "3"]:
+    def at(self, z: Float[Array, "3 k"], t: Scalar) -> Float[Array, "3"]:
         """s(t) of three axes; z may have more columns than there are unknowns."""
         return z[:, : self.unknowns] @ self.weights(t)
 
-    def weights(self, t: Float[Array, ""]) -> Float[Array, " unknowns"]:
+    def weights(self, t: Scalar) -> Float[Array, " unknowns"]:
         """How much of every z is in s(t)."""
         if not self.intervals:
             return jnp.zeros(0)
         x = jnp.abs((t - self.centres) / self.spacing)
         near = 2 / 3 - x**2 + x**3 / 2
         far = jnp.maximum(2 - x, 0.0) ** 3 / 6
-        return self.basis.T @ jnp.where(x < 1, near, far)
+        return jnp.asarray(self.basis.T) @ jnp.where(x < 1, near, far)
 
 
 def make_spline(first: float, last: float, spacing: float) -> JitterSpline:

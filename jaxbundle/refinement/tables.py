@@ -125,7 +125,7 @@ def check_observations(
         seen[i, p] = row
     for i, one in enumerate(images):
         rows = np.flatnonzero(observations.image == i)
-        t = one.image.times.time(jnp.asarray(observations.xy[rows, 0]))
+        t = jnp.asarray(one.image.times.time(observations.xy[rows, 0]))
         tables = ("positions", one.image.trajectory.position), (
             "attitude", one.image.trajectory.attitude.table,
         )  # fmt: skip

@@ -62,7 +62,7 @@ def settings(adjustment) -> list[str]:
         "",
         *facts(
             [
-                ("Method", METHODS.get(adjustment.method, adjustment.method)),
+                ("Method", METHODS.get(adjustment.method) or adjustment.method),
                 ("Reduced system", reduced_system(adjustment)),
                 ("Datum", datum(adjustment)),
                 ("Residuals", f"v = computed − observed, {DOMAINS[network.residuals]}"),

@@ -224,7 +224,7 @@ def check_points(adjustment, most: int) -> list[str]:
     unit = clean(adjustment.network.object_unit)
     total = len(found["id"])
     places = column_decimals(np.concatenate([found[f"s{axis}"] for axis in "XYZ"]))
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (
             found["id"][i],
             *(fixed(found[f"d{axis}"][i], places) for axis in "XYZ"),

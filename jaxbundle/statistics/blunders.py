@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.leastsquares import robust, snooping
+from jaxbundle.types import present
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +42,7 @@ def name_removed(problem: Problem, found: snooping.Removed) -> Removed:
     kind, rows = _place(problem, found.set, found.rows)
     names = [_name(problem, found.set, row, found.residual) for row in found.rows]
     if kind == "control":
-        rows = tuple(3 * row + found.residual for row in rows)
+        rows = tuple(3 * row + present(found.residual) for row in rows)
     return Removed(kind, rows[0], either_of(names), found.test, rows[1:])
 
 
@@ -73,7 +74,7 @@ def _name(problem: Problem, o: int, row: int, residual: int | None) -> str:
         image = network.images.id[problem.image[place]]
         return f"point {points[problem.point[place]]} in image {image}"
     if kind == "control":
-        return f"{'XYZ'[residual]} of control point {points[given.rows[0][row]]}"
+        return f"{'XYZ'[present(residual)]} of control point {points[given.rows[0][row]]}"
     if kind == "distance":
         a, b = (points[int(p)] for p in network.distances.points[place])
         return f"distance {a}–{b}"

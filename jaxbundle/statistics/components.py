@@ -24,13 +24,13 @@ def groups(problem: Problem) -> list[Group]:
                   [(o, np.flatnonzero(camera == c)) for o, camera in sets])
             for c, given in enumerate(network.cameras)
         ]  # fmt: skip
-    every = lambda field, at=np.s_[:]: [(o, at) for o in of[field]]
+    every = lambda field, *at: [(o, np.s_[:, *at] if at else np.s_[:]) for o in of[field]]
     for i, axis in enumerate("XYZ"):
-        found.append(Group(f"control points in {axis}", every("control", np.s_[:, i])))
+        found.append(Group(f"control points in {axis}", every("control", i)))
     angle = 1 / ANGLE_UNITS[network.angle_unit]
     found += [
-        Group("exterior orientation, position", every("exterior", np.s_[:, :3])),
-        Group("exterior orientation, angles", every("exterior", np.s_[:, 3:]), angle),
+        Group("exterior orientation, position", every("exterior", np.s_[:3])),
+        Group("exterior orientation, angles", every("exterior", np.s_[3:]), angle),
         Group("interior orientation", every("interior"), np.nan),
         Group("distances", every("distance")),
     ]

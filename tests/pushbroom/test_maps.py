@@ -6,6 +6,7 @@ import pytest
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, earth_fixed
 from jaxbundle.io.maps import MapSystem, contiguous, grid_around
+from jaxbundle.pushbroom import Ground
 
 LATTICE = np.meshgrid(179.7 + 0.02 * np.arange(33), -16 + 0.02 * np.arange(33))
 X = np.array(earth_fixed(WGS84, (*np.radians(LATTICE), np.zeros((33, 33)))))
@@ -21,13 +22,9 @@ def test_longitudes_go_on_beyond_180(crs, turn):
     assert np.ptp(x) == pytest.approx(0.64 * turn / 360, rel=1e-3)
     grid = grid_around(x, y, 0.01 * turn / 360)
     assert 64 <= grid.columns <= 68 and 64 <= grid.rows <= 68
-    nodes = system.nodes(_Ground, x, y)
+    nodes = system.nodes(Ground(), x, y)
     # the fourth system has its own ellipsoid: some hundred metres
     assert np.abs(nodes.X - X).max() < (1e-6 if turn == 360 else 500)
-
-
-class _Ground:
-    earth = WGS84
 
 
 def test_a_projected_system_has_an_edge():

@@ -21,10 +21,11 @@ from jaxbundle.io.result_json import without_nan
 from jaxbundle.io.scanner import Scanner, read_scanner
 from jaxbundle.network.columns import Columns
 from jaxbundle.pushbroom.image import PushbroomImage
-from jaxbundle.pushbroom.resample import RESAMPLINGS
+from jaxbundle.pushbroom.resample import RESAMPLINGS, Resampling
 from jaxbundle.pushbroom.rpc import Rpc
 from jaxbundle.pushbroom.surfaces import Ground, Height, Plane, Surface
 from jaxbundle.targets import check_json
+from jaxbundle.types import Column
 
 pushbroom = typer.Typer(
     help="Line scanners: image to ground and back, simulation, correction, accuracy.",
@@ -102,10 +103,12 @@ def keep_inputs(inputs: Sequence[str | Path | None], **outputs: str | Path | Non
     check_json(str(outputs.get("json") or ""))
 
 
-def check_resampling(kind: str) -> None:
-    """Refuse a resampling that is none."""
-    if kind not in RESAMPLINGS:
-        raise InputError(f"--resampling {kind!r}: {', '.join(RESAMPLINGS)}")
+def resampling_of(word: str) -> Resampling:
+    """The resampling of this name."""
+    for kind in RESAMPLINGS:
+        if kind == word:
+            return kind
+    raise InputError(f"--resampling {word!r}: {', '.join(RESAMPLINGS)}")
 
 
 def check_spheroid(earth: Ellipsoid | None) -> None:
@@ -135,7 +138,7 @@ def geographic(table: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def write_rows(
-    columns: Mapping[str, Sequence], csv: Path | None, json_: str, head: Mapping | None = None
+    columns: Mapping[str, Column], csv: Path | None, json_: str, head: Mapping | None = None
 ) -> None:
     """A table as CSV or JSON, in a file or on standard output."""
     columns = {name: _plain(values) for name, values in columns.items()}

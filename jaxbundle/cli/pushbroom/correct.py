@@ -12,10 +12,10 @@ from jaxbundle.cli.pushbroom.app import (
     Geoid,
     Level,
     ScannerFile,
-    check_resampling,
     keep_inputs,
     open_scanner,
     pushbroom,
+    resampling_of,
     surface_of,
 )
 from jaxbundle.errors import InputError
@@ -53,7 +53,7 @@ def correct(
 ) -> None:
     """Correct an image to a map, in blocks."""
     keep_inputs([scanner, image, dem, truth], out=out, error_map=error_map)
-    check_resampling(resampling)
+    kind = resampling_of(resampling)
     if spacing is not None and not spacing > 0:
         raise InputError(f"--spacing {spacing:g}: a positive number is expected")
     if (truth is None) != (error_map is None):
@@ -75,10 +75,10 @@ def correct(
     with counting(quiet) as bar:
         task = bar.add_task("blocks", total=None)
         write_corrected(
-            image, out, file.image, search, surface, system, grid, resampling,
+            image, out, file.image, search, surface, system, grid, kind,
             lambda done, total: bar.update(task, completed=done, total=total), occlusion,
         )  # fmt: skip
-        if truth is not None:
+        if truth is not None and error_map is not None:
             task = bar.add_task("errors", total=None)
             rms = write_error_map(
                 error_map, file.image, search, true, make_search(true, file.earth), surface, system,

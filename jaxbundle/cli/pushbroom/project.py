@@ -80,7 +80,7 @@ def _with_points(table: Columns) -> Columns:
     if not np.any(empty):
         return table
     warn(f"{table.source(int(empty.argmax()))}: no point ({empty.sum()} rows are left out)")
-    kept = np.flatnonzero(~empty)
+    kept = np.flatnonzero(~empty).tolist()
     values = {name: [column[row] for row in kept] for name, column in table.values.items()}
     return Columns(values, table.source.take(kept))
 

@@ -13,8 +13,8 @@ from jaxbundle.cli.pushbroom.app import (
     Dem,
     Geoid,
     Level,
-    check_resampling,
     pushbroom,
+    resampling_of,
     surface_of,
 )
 from jaxbundle.io.fingerprints import files_read
@@ -40,7 +40,7 @@ def simulate(
     quiet: Quiet = False,
 ) -> None:
     """Simulate a flight: what its instruments tell, the truth, and the image of a scene."""
-    check_resampling(resampling)
+    kind = resampling_of(resampling)
     given = read_flight(flight)
     names = [IMAGE, *(f"{place}{n}" for place in ("", f"{TRUTH}/") for n in names_of(NAME, ""))]
     inputs = [path for path in (scene, dem, geoid) if path is not None]
@@ -60,7 +60,7 @@ def simulate(
                 task = bar.add_task("lines", total=None)
                 write_taken(
                     new / IMAGE, truth, surface, jnp.asarray(shown.bands), shown.place,
-                    np.dtype(shown.dtype), resampling,
+                    np.dtype(shown.dtype), kind,
                     lambda done, total: bar.update(task, completed=done, total=total),
                 )  # fmt: skip
     if not quiet:

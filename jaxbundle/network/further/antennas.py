@@ -139,7 +139,7 @@ class Antennas(Further):
         since, velocity = _track(self.position, strip, self.time)
         if "time_offset" in parameters.free and not velocity.any():
             raise InputError(f"{self.source.name}: time_offset needs three positions in a strip")
-        groups = np.repeat(["shift", "drift"], 3)
+        groups = ["shift"] * 3 + ["drift"] * 3
         names = ("shift X", "shift Y", "shift Z", "drift X", "drift Y", "drift Z")
         shift = Table("GNSS strip", np.zeros((len(strips), 6)), Vector(6), parameters.mask(groups),
                       list(strips), names)  # fmt: skip

@@ -125,7 +125,7 @@ class Edges(Further):
             normals.append(np.linalg.svd(r @ M)[2][-1])
             through.append(normals[-1] @ (network.images.position[i] - origin))
         n = np.array(normals).reshape(-1, 3)
-        _, size, Vt = np.linalg.svd(n) if len(n) else (0, np.zeros(3), 0)
+        _, size, Vt = np.linalg.svd(n if len(n) else np.zeros((1, 3)))
         if len(n) < 2 or size[1] < LEAST_ANGLE:
             raise InputError(
                 f"{self.source(rows[0])}: line {self.line[rows[0]]!r} needs two points in each of "

@@ -93,7 +93,7 @@ class Rigs(Further):
         images = network.images
         camera = {id: network.cameras[c].id for id, c in zip(images.id, images.camera)}
         seen: dict[tuple[str, ...], int] = {}
-        for row, key in enumerate(zip(self.rig, self.epoch, map(camera.get, self.image))):
+        for row, key in enumerate(zip(self.rig, self.epoch, map(camera.__getitem__, self.image))):
             if seen.setdefault(key, row) != row:
                 raise InputError(
                     f"{self.source(row)}: camera {key[2]!r} has two images at epoch {key[1]!r} of "
@@ -154,7 +154,7 @@ class Rigs(Further):
             return ids.index(named)
         if named is not None and named not in ids:
             raise InputError(f"[{SECTION}]: reference is {named!r}, but there is no such camera")
-        return max(sorted(cameras), key=cameras.get, default=0)
+        return max(sorted(cameras), key=cameras.__getitem__, default=0)
 
 
 def _mounting(epochs, reference, camera, position, M):
