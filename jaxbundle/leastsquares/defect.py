@@ -24,6 +24,8 @@ from jaxbundle.types import present
 
 HERE = "table"
 """The name of a table that is looked at alone."""
+LEAST_ROWS = 128
+"""So many rows at least are filled up."""
 OPEN = 1e-10
 """Relative size of J·G below which a direction counts as open (rounding gives about 1e-14)."""
 
@@ -62,12 +64,16 @@ def survey_motions(
         action = tuple((HERE, act) for table, act in given.actions if table == name)
         motions = Motions(given.names, action)
         one = Declared((), ((HERE, declared.spaces[name]),), motions)
-        moves[name] = _generators(one, {HERE: value})[HERE]
+        rows = jax.tree.leaves(value)[0].shape[0]
+        more = max(LEAST_ROWS - rows, 0)
+        wide = lambda x, more=more: np.pad(x, [(0, more), *[(0, 0)] * (x.ndim - 1)], mode="edge")
+        found = _generators(one, {HERE: jax.tree.map(wide, value)})[HERE]
+        moves[name] = np.asarray(found)[:rows]
     return _survey(declared, plan, data, real, moves)
 
 
 _generators = eqx.filter_jit(generators)
-"""Of one table at a time: those of one space and size share the program."""
+"""Of one table at a time: those of one space and size share the program, all small ones too."""
 
 
 @eqx.filter_jit

@@ -18,6 +18,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, quaternion_from_matrix
 from jaxbundle.leastsquares import declarations as ls
 from jaxbundle.leastsquares.any_distance import AnyDistance, derivative
+from jaxbundle.leastsquares.indices import rounded
 from jaxbundle.leastsquares.problem import observed_weights
 from jaxbundle.leastsquares.rows import Data as EngineData
 from jaxbundle.leastsquares.rows import Values as Tables
@@ -29,6 +30,9 @@ from jaxbundle.network.camera_tables import CameraTable, camera_tables, start_of
 from jaxbundle.network.further.base import among
 from jaxbundle.network.further.rolling_shutter import RollingShutter
 from jaxbundle.network.tables import EXTERIOR, Network
+
+LEAST_IMAGES = 64
+"""So many rotations at least are computed at once, so that small networks share the program."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -251,9 +255,16 @@ def order_cameras(network: Network) -> Network:
     return network
 
 
-@jax.jit
 def _quaternions(angles):
-    return jax.vmap(lambda a: quaternion_from_matrix(matrix_from_omega_phi_kappa(a)))(angles)
+    """By a program that small networks share."""
+    wide = np.resize(angles, (max(rounded(len(angles)), LEAST_IMAGES), 3))
+    return np.asarray(_quaternions_of(wide))[: len(angles)]
+
+
+@jax.jit
+@jax.vmap
+def _quaternions_of(angles):
+    return quaternion_from_matrix(matrix_from_omega_phi_kappa(angles))
 
 
 def _data(network: Network, origin):
@@ -273,7 +284,7 @@ def _data(network: Network, origin):
     start = Values(
         camera=camera,
         position=images.position - origin,
-        rotation=np.asarray(_quaternions(images.angles)),
+        rotation=_quaternions(images.angles),
         point=points.position - origin,
     )
     weight = lambda sigma: np.where(

@@ -27,6 +27,7 @@ from jaxbundle.cameras import default_parameters, get_model, image_ray, project
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
+from jaxbundle.leastsquares.indices import rounded
 from jaxbundle.network.build import make_cameras
 from jaxbundle.network.rules import CHOICES, check_choice
 from jaxbundle.network.stations import LARGEST_SEED, Stations, rows_of_three
@@ -42,6 +43,8 @@ from jaxbundle.network.tables import (
 
 RAYS_AT_ONCE = 2_000_000
 """Rays projected in one call, so that memory does not grow with stations × targets."""
+LEAST_STATIONS, LEAST_TARGETS = 16, 128
+"""So many at least are filled up, and so small networks share one program."""
 
 SAME_DIRECTION = 1e-6
 """Largest distance of two unit vectors taken for one direction (rounding gives 1e-12)."""
@@ -350,21 +353,24 @@ def _at_most(point, max_rays: int, rng):
 
 def _look(stations, targets, cameras, of_station, image_format):
     """All images of targets inside the format: image, point [rays], true coordinates [rays, 2]."""
-    found = []
+    found, number = [], len(targets)
+    wide = max(LEAST_TARGETS, rounded(number))
+    targets = np.pad(targets, [(0, wide - number), (0, 0)], mode="edge")
     for c, camera in enumerate(cameras):
         model = get_model(camera.model)
         values = {**default_parameters(model), **camera.parameters}
         p = tuple(float(values[name]) for name in model.parameters)
         low, high = _format(camera, image_format)
         index = np.flatnonzero(of_station == c)
-        at_once = int(np.clip(RAYS_AT_ONCE // len(targets), 1, max(len(index), 1)))
+        some = max(LEAST_STATIONS, rounded(len(index)))
+        at_once = int(np.clip(RAYS_AT_ONCE // wide, 1, some))
         for begin in range(0, len(index), at_once):
             # The last batch is filled up, so that all have one shape and compile once.
             batch = np.resize(index[begin : begin + at_once], at_once)
             xy, back = _images_of(
                 model, p, stations.position[batch], stations.angles[batch], targets
             )
-            xy, back = np.asarray(xy), np.asarray(back)
+            xy, back = np.asarray(xy)[:, :number], np.asarray(back)[:, :number]
             inside = ((xy >= low) & (xy <= high)).all(-1) & back
             inside[len(index) - begin :] = False
             i, k = np.nonzero(inside)

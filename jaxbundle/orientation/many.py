@@ -31,7 +31,7 @@ SLOTS = 64
 """Points of an image, of a pair, of two models."""
 RAYS = 8
 """Rays of a point."""
-LANES, POINT_LANES = 8, 1024
+LANES, POINT_LANES = 8, 256
 BY_RAYS = 40
 """Steps of a similarity by rays, whose start is rough."""
 

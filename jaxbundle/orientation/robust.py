@@ -161,9 +161,16 @@ def robust_relative_orientation(
         return jnp.where(jnp.all(s > 0, 1), e, FAR)
 
     def solve(xy1, xy2):
+        """Of the four orientations of an E that with most of the five points in front."""
+
+        def in_front(E):
+            pairs = orientations(E)
+            along = lambda M, b: jax.vmap(distances_along_rays, (None, None, 0, 0))(M, b, xy1, xy2)
+            best = jnp.argmax(jnp.sum(jax.vmap(along)(*pairs) > 0, (1, 2)))
+            return jax.tree.map(lambda a: a[best], pairs)
+
         E, valid = five_points(xy1, xy2)
-        M, b = jax.vmap(orientations)(E)
-        return (M.reshape(-1, 3, 3), b.reshape(-1, 3)), jnp.repeat(valid, 4)
+        return jax.vmap(in_front)(E), valid
 
     found = consensus(key, solve, errors, (xy1, xy2), 5, samples, threshold, p)
 
