@@ -1,6 +1,6 @@
 """`adjust`: a network in, an `Adjustment` out."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
 
@@ -19,7 +19,7 @@ from jaxbundle.leastsquares.stopping import converged
 from jaxbundle.network.check import check_network
 from jaxbundle.network.columns import count, some
 from jaxbundle.network.sightings import split_check_points
-from jaxbundle.network.tables import Network, require_network
+from jaxbundle.network.tables import Camera, Network, require_network
 from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.orientation.angle_units import name_angle_unit
 from jaxbundle.orientation.exchanges import CONTRADICTION, name_contradiction
@@ -107,15 +107,15 @@ def adjust(
     options = {"search": METHODS[method], "max_steps": max_iterations + 1, "progress": progress}
     again = lambda problem, values: minimise_with_infinity(problem, values, **options)
 
-    def begin(network, cameras=MappingProxyType({})):
-        network, *check = split_check_points(check_network(network))
+    def begin(network, cameras: Mapping[str, Camera] = MappingProxyType({})):
+        network, points, rays = split_check_points(check_network(network))
         make = partial(make_problem, network, reduction, also)
         try:
             problem = make()
         except InputError as error:  # The datum, for want of the control points left out.
             raise InputError(f"{error} {finding}".strip()) from None
         start = start_with(problem, cameras)
-        return *minimise_at_any_distance(problem, start, make, **options), check
+        return *minimise_at_any_distance(problem, start, make, **options), (points, rays)
 
     problem, minimum, check = begin(network)
     while len(network.observations) < len(given.observations) and misjudged(problem, minimum):
@@ -158,8 +158,9 @@ def adjust(
     weak = None if inspection or names else weakness_without_solution(problem, minimum)
     intersected = None
     if len(check[0]):
+        points, rays = check
         intersected = lambda result: intersect_check_points(
-            result.inspection, *check, factors
+            result.inspection, points, rays, factors
         )
     return Adjustment(
         network, problem, minimum, removed=tuple(removed), eliminated=tuple(eliminated),
@@ -212,8 +213,9 @@ def _likely_causes(
         return ()
     told = any(CONTRADICTION in line for line in network.warnings)
     causes = (
-        name_pixels(network), name_angle_unit(network), not told and name_contradiction(network),
-        not inspection and name_one_place(network),
+        name_pixels(network), name_angle_unit(network),
+        "" if told else name_contradiction(network),
+        "" if inspection else name_one_place(network),
     )  # fmt: skip
     return tuple(filter(None, causes))
 

@@ -9,6 +9,7 @@ it is let go again where they pull it back (an active set).
 import dataclasses
 from collections.abc import Callable, Sequence
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -22,6 +23,7 @@ from jaxbundle.orientation.many import matrices_of_quaternions
 from jaxbundle.orientation.sights import sights
 from jaxbundle.solution import adjusted_cameras, minimise, solved
 from jaxbundle.statistics.inspection import Inspection
+from jaxbundle.types import present
 
 NARROW, PARALLEL = 0.03, 1e-3
 """Radians between the rays of a point that may be at any distance; and of one that is from the
@@ -141,7 +143,7 @@ def _in_front(problem: Problem, values: Values) -> Float[np.ndarray, "points 3"]
     depth = (ray * (X[seen.point] - np.asarray(values.position)[seen.image])).sum(1)
     sides = np.bincount(seen.point, np.sign(depth), len(X))
     length = np.linalg.norm(X, axis=1)
-    most = FARTHEST * problem.layout.lengths
+    most = FARTHEST * present(problem.layout.lengths)
     move = (most > 0) & ((sides < 0) | (length > most))
     factor = np.where(move, np.where(sides < 0, -most, most) / length, 1.0)
     return X * factor[:, None]
@@ -195,9 +197,9 @@ def _joined(legs: Sequence[Minimum]) -> Minimum:
     if len(legs) == 1:
         return legs[0]
     rows = [slice(k > 0, int(leg.iterations)) for k, leg in enumerate(legs)]
-    column = lambda name: np.concatenate(
+    column = lambda name: jax.device_put(np.concatenate(
         [np.asarray(getattr(leg.history, name))[of] for leg, of in zip(legs, rows)]
-    )
+    ))  # fmt: skip
     history = History(column("cost"), column("damping"), column("accepted"))
     return dataclasses.replace(
         legs[-1], iterations=np.asarray(len(history.cost)), history=history

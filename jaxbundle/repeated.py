@@ -3,6 +3,7 @@
 import dataclasses
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.adjustment.problem import Problem
@@ -137,14 +138,15 @@ def _without_parameter(problem: Problem, values: Values, name: Name):
     tied = next((g for g in problem.network.cameras[c].tie if name.parameter in g), ())
     columns = np.array([model.parameters.index(n) for n in tied or (name.parameter,)])
     value = default_parameters(model)[name.parameter]
-    reset = lambda v: eqx.tree_at(lambda v: v.camera, v, v.camera.at[c, columns].set(value))
+    with_value = lambda camera: jnp.asarray(camera).at[c, columns].set(value)
+    reset = lambda v: eqx.tree_at(lambda v: v.camera, v, with_value(v.camera))
     data = dataclasses.replace(problem.data, start=reset(problem.data.start))
     row = np.flatnonzero(problem.layout.given["interior"] == c)
     if len(row):
-        weight = data.interior_weight.at[row[0], column].set(0.0)
+        weight = jnp.asarray(data.interior_weight).at[row[0], column].set(0.0)
         data = dataclasses.replace(data, interior_weight=weight)
     table = next(t for t in problem.layout.cameras if c in t.cameras)
     row = np.flatnonzero(table.cameras == c)
-    moving = problem.system.table(table.name).space.moving.index(column)
+    moving = problem.system.table(table.name).vector.moving.index(column)
     problem = problem.with_data(data).hold(table.name, row, [moving])
     return problem, reset(values)

@@ -30,7 +30,6 @@ from jaxbundle.leastsquares.components import Component, variance_components
 from jaxbundle.leastsquares.distributions import chi2_quantile
 from jaxbundle.leastsquares.names import Name
 from jaxbundle.leastsquares.reduction import FACTORS
-from jaxbundle.leastsquares.reliability import Reliability
 from jaxbundle.leastsquares.robust import Reweighted, residual_lengths, robust_scale
 from jaxbundle.leastsquares.solver import Minimum
 from jaxbundle.leastsquares.stopping import SINGULAR, TERMINATIONS
@@ -45,7 +44,7 @@ from jaxbundle.statistics.blunders import Removed, Suspect
 from jaxbundle.statistics.check_points import CheckPoints
 from jaxbundle.statistics.components import groups
 from jaxbundle.statistics.far_points import FarPoints, find_far_points
-from jaxbundle.statistics.inspection import Inspection
+from jaxbundle.statistics.inspection import Inspection, OfNetwork
 from jaxbundle.statistics.misfit import doubt_of_fit
 from jaxbundle.statistics.validity import Reach, distortion_reach
 from jaxbundle.statistics.weakness import Weakness, weakness
@@ -257,7 +256,7 @@ class Adjustment:
         return self.inspection
 
     @property
-    def reliability(self) -> Reliability:
+    def reliability(self) -> OfNetwork:
         """Redundancy numbers and w of all observations, in the order of the arrays."""
         return self.cofactors.reliability
 

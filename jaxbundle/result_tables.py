@@ -3,6 +3,8 @@
 σ are a posteriori, angles in the network's unit; the tables of one kind of thing are one function.
 """
 
+from typing import Any
+
 import numpy as np
 
 from jaxbundle.cameras import default_parameters, get_model
@@ -121,7 +123,7 @@ def residuals(adjustment) -> dict[str, np.ndarray]:
     points = np.array(network.points.id, dtype=object)
     cameras = np.array([c.id for c in network.cameras], dtype=object)
     blank = lambda rows: np.full(rows, "", dtype=object)
-    parts = [
+    parts: list[tuple[Any, ...]] = [
         ("image", images[problem.image], points[problem.point], ("x", "y"),
          found.residual.image, data.image_weight, found.redundancy.image, found.w.image),
     ]  # fmt: skip

@@ -22,6 +22,7 @@ from jaxbundle.network.further.rolling_shutter import RollingShutter
 from jaxbundle.network.retraction import TurnAboutSeen
 from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.tables import Network, require_network
+from jaxbundle.types import present
 
 REDUCTIONS = ("dense", "banded", "iterative")
 HELD = 1e-6
@@ -98,7 +99,7 @@ class Problem:
     @property
     def reduction(self) -> str:
         """How the reduced system is solved."""
-        return self.system.plan.reduction
+        return present(self.system.plan.reduction)
 
     def with_system(self, system: engine.Problem) -> "Problem":
         """The same after its system was changed: weights, what is held, and where."""
@@ -116,7 +117,9 @@ class Problem:
         """The same with other numbers (not other start values of what moves the datum)."""
         return self._with(engine.with_data(self.system, self.layout.data(data)), data)
 
-    def hold(self, table: str, rows, columns=slice(None)) -> "Problem":
+    def hold(
+        self, table: str, rows, columns: slice | Sequence[int] = slice(None)
+    ) -> "Problem":
         """The same with some unknowns held at their start values."""
         return self._with(engine.hold(self.system, table, rows, columns), self.data)
 
@@ -201,7 +204,8 @@ def _datum(network: Network, gauge, origin, chosen):
 
 def count_rows(layout: Layout, system: engine.Problem) -> Counts:
     """Rows that carry weight, datum conditions, free unknowns."""
-    number = dict.fromkeys(("image", "control", "exterior", "interior", "distance"), 0)
+    fields = "image", "control", "exterior", "interior", "distance"
+    number: dict[str, int] = dict.fromkeys(fields, 0)
     for s, weight in zip(layout.sets, system.data.weight):
         number[s.field] += int((np.asarray(weight) > 0).sum())
     return Counts(

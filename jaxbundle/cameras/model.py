@@ -213,7 +213,7 @@ def image_ray(model: CameraModel, p: Parameters, x: Scalar, y: Scalar) -> Triple
 
 def residual(
     model: CameraModel,
-    domain: Literal["corrected", "measured"],
+    domain: str,
     p: Parameters,
     ray: Triple,
     xy: Pair,

@@ -25,6 +25,7 @@ from jaxbundle.implicit import implicit_root, solve_dense
 from jaxbundle.leastsquares.normal import Tangent, total
 from jaxbundle.leastsquares.plan import Plan
 from jaxbundle.leastsquares.rows import Declared, Values
+from jaxbundle.types import present
 
 HELD = 1e-7
 """Relative size of the least motion of datum unknowns that hold the datum."""
@@ -39,8 +40,8 @@ MOST_MOTIONS = 50
 
 def generators(declared: Declared, values: Values) -> Tangent:
     """How every table moves along each motion, [rows, width, motions]; zero where it does not."""
-    motions = len(declared.motions.names)
-    actions = dict(declared.motions.actions)
+    given = present(declared.motions)
+    motions, actions = len(given.names), dict(given.actions)
 
     def of_table(name):
         space, act = declared.spaces[name], actions.get(name)
@@ -72,13 +73,15 @@ def of_groups(plan: Plan, of_tables) -> Tangent:
 def open_directions(declared: Declared, plan: Plan, values: Values) -> Tangent:
     """G: the directions of the open motions, [rows, w, defect]."""
     moves, plan = generators(declared, values), leave_held(declared, plan, values)
-    return {name: rows @ plan.datum.gauge for name, rows in of_groups(plan, moves).items()}
+    gauge = present(plan.datum).gauge
+    return {name: rows @ gauge for name, rows in of_groups(plan, moves).items()}
 
 
 def leave_held(declared: Declared, plan: Plan, values: Values) -> Plan:
     """The plan with open motions changed least so that what is held stays where it is now: a
     rotation about a held point goes with the point."""
-    held, gauge = plan.datum.held, plan.datum.gauge
+    datum = present(plan.datum)
+    held, gauge = datum.held, datum.gauge
     if not held:
         return plan
     moves = generators(declared, {name: values[name] for name in held})
@@ -90,8 +93,8 @@ def leave_held(declared: Declared, plan: Plan, values: Values) -> Plan:
     scale = jnp.where(scale > 0, jnp.where(scale > 0, scale, 1.0) ** -0.5, 1.0)
     A = A * scale * scale[:, None]
     moved = jnp.linalg.pinv(A, HELD, hermitian=True) @ (A @ (gauge / scale[:, None]))
-    datum = dataclasses.replace(plan.datum, gauge=gauge - scale[:, None] * moved)
-    return dataclasses.replace(plan, datum=datum)
+    moved = dataclasses.replace(datum, gauge=gauge - scale[:, None] * moved)
+    return dataclasses.replace(plan, datum=moved)
 
 
 def s_transform(declared: Declared, plan: Plan, values: Values, change: Tangent) -> Tangent:
@@ -116,7 +119,7 @@ def s_transform_transposed(declared: Declared, plan: Plan, values: Values, row: 
 def datum_directions(declared: Declared, plan: Plan, values: Values) -> tuple[Tangent, Tangent]:
     """G and B of all groups, [rows, w, defect]."""
     G = open_directions(declared, plan, values)
-    weight = of_groups(plan, zeros_of_tables(declared, values) | plan.datum.weight)
+    weight = of_groups(plan, zeros_of_tables(declared, values) | present(plan.datum).weight)
     return G, {name: g * weight[name][..., None] for name, g in G.items()}
 
 
@@ -131,7 +134,9 @@ def move_to_datum(
     small one that is no smaller than the one before."""
     if plan.datum is None:
         return values, jnp.asarray(True)
-    plan, still = leave_held(declared, plan, values), jnp.zeros(plan.datum.gauge.shape[1])
+    plan = leave_held(declared, plan, values)
+    datum = present(plan.datum)
+    still, curved_ones = jnp.zeros(datum.gauge.shape[1]), present(declared.motions).curved
     size = _largest(plan, start)
 
     def moving(state):
@@ -145,11 +150,11 @@ def move_to_datum(
         if newton:
             near = jax.jacfwd(_missing)(still, (declared, plan), (values, start))
             slope = jnp.where(before > NEAR * size, slope, near)
-        step = plan.datum.gauge @ -jnp.linalg.solve(slope, missing)
-        curved = jnp.abs(step[jnp.array(declared.motions.curved, int)]).max(initial=0.0)
+        step = datum.gauge @ -jnp.linalg.solve(slope, missing)
+        curved = jnp.abs(step[jnp.array(curved_ones, int)]).max(initial=0.0)
         moved = _moved(declared, plan, step / jnp.maximum(curved / LONGEST, 1.0), values)
         differences = {name: jax.tree.map(jnp.subtract, moved[name], values[name])
-                       for name in plan.datum.weight}  # fmt: skip
+                       for name in datum.weight}  # fmt: skip
         return moved, _largest(plan, differences), before, count + 1
 
     begin = values, jnp.asarray(1e300), jnp.asarray(jnp.inf), 0
@@ -159,18 +164,19 @@ def move_to_datum(
 
 def _largest(plan: Plan, tables: Values):
     """The largest number of the rows that hold the datum."""
+    holding = present(plan.datum).weight
     return max(
         jnp.where(weight.max(1) > 0, jnp.abs(x.reshape(len(weight), -1)).max(1), 0.0).max()
-        for name, weight in plan.datum.weight.items() for x in jax.tree.leaves(tables[name])
+        for name, weight in holding.items() for x in jax.tree.leaves(tables[name])
     )  # fmt: skip
 
 
 def _datum_equations(declared, plan, values, start):
     """Bᵀ(x − x_start) and BᵀG, over the datum tables."""
-    missing = gram = 0.0
-    moves = generators(declared, {name: values[name] for name in plan.datum.weight})
-    for name, weight in plan.datum.weight.items():
-        G = moves[name] @ plan.datum.gauge
+    missing, gram, datum = 0.0, 0.0, present(plan.datum)
+    moves = generators(declared, {name: values[name] for name in datum.weight})
+    for name, weight in datum.weight.items():
+        G = moves[name] @ datum.gauge
         B = G * weight[..., None]
         x = jax.vmap(declared.spaces[name].difference)(values[name], start[name])
         missing += jnp.einsum("nwk,nw->k", B, x)
@@ -182,8 +188,9 @@ def _missing(tau, fixed, given):
     """Bᵀ(x − x_start) after a motion along the open directions."""
     (declared, plan), (values, start) = fixed, given
     plan = leave_held(declared, plan, values)
-    tables = {name: values[name] for name in plan.datum.weight}
-    moved = _moved(declared, plan, plan.datum.gauge @ tau, tables)
+    datum = present(plan.datum)
+    tables = {name: values[name] for name in datum.weight}
+    moved = _moved(declared, plan, datum.gauge @ tau, tables)
     return _datum_equations(declared, plan, moved, start)[0]
 
 
@@ -195,7 +202,8 @@ def attach_motion(declared: Declared, plan: Plan, values: Values, start: Values)
     still, fixed = jnp.zeros(plan.datum.gauge.shape[1]), (declared, plan)
 
     def along(tau, of, values):
-        return _moved(declared, plan, leave_held(declared, plan, of).datum.gauge @ tau, values)
+        datum = present(leave_held(declared, plan, of).datum)
+        return _moved(declared, plan, datum.gauge @ tau, values)
 
     # What is missing first, so that derivatives are taken where nothing moves.
     known = jax.lax.stop_gradient((values, start))

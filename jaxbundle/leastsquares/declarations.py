@@ -78,6 +78,12 @@ class Table:
         object.__setattr__(self, "title", self.title or self.name)
 
     @property
+    def vector(self) -> Vector:
+        """The space of a table of vectors."""
+        assert isinstance(self.space, Vector)
+        return self.space
+
+    @property
     def rows(self) -> int:
         return len(jax.tree.leaves(self.value)[0])
 

@@ -3,10 +3,12 @@
 import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Bool, Float
 
 from jaxbundle.arguments import one_of
@@ -175,7 +177,9 @@ def open_at(problem: Problem, values: Values) -> Problem:
     return dataclasses.replace(problem, plan=dataclasses.replace(problem.plan, datum=datum))
 
 
-def hold(problem: Problem, table: str, rows, columns=slice(None)) -> Problem:
+def hold(
+    problem: Problem, table: str, rows, columns: slice | Sequence[int] = slice(None)
+) -> Problem:
     """The problem with some unknowns held at their start values; they hold no datum any more."""
     given = problem.table(table)
     free = given.free.copy()
@@ -265,7 +269,8 @@ def make_data(declared: Declared, tables, observations) -> Data:
     start = {t.name: jax.tree.map(lambda x: np.asarray(x, float), t.value) for t in tables}
     weights = observed_weights(tables, observations)
     check_numbers(tables, observations, weights)
-    return jax.device_put(Data(start, tuple(o.measured for o in observations), tuple(weights)))
+    measured = tuple(o.measured for o in observations)
+    return Data(*jax.device_put((start, measured, tuple(weights))))
 
 
 def observed_weights(tables, observations) -> list[Float[np.ndarray, "n ..."]]:
@@ -313,18 +318,18 @@ def pad_values(problem: Problem, values: Values) -> Values:
 
 def without_filling(problem: Problem, values: Values) -> Values:
     """The tables in their own sizes."""
-    traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(values))
+    traced = any(isinstance(x, Tracer) for x in jax.tree.leaves(values))
     # On the host, where nothing is compiled for it.
     cut = lambda x, n: x[:n] if traced else jax.device_put(np.asarray(x)[:n])
     return {t.name: jax.tree.map(lambda x, n=t.rows: cut(x, n), values[t.name])
             for t in problem.tables}  # fmt: skip
 
 
-def _longer(x, n: int, mode: str):
+def _longer(x, n: int, mode: Literal["constant", "edge"]) -> Any:
     """At least one row more, so that there is one to which nothing refers."""
-    module = jnp if isinstance(x, jax.core.Tracer) else np
-    x = module.asarray(x)
-    return module.pad(x, ((0, n - len(x)), *((0, 0),) * (x.ndim - 1)), mode=mode)
+    x = x if isinstance(x, Tracer) else np.asarray(x)
+    room = [(0, n - len(x)), *[(0, 0)] * (x.ndim - 1)]
+    return jnp.pad(x, room, mode) if isinstance(x, Tracer) else np.pad(x, room, mode)
 
 
 def given_data(problem: Problem, data: Data | None) -> Data:

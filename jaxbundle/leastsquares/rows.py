@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from jaxbundle.leastsquares.declarations import Kind, Motions
 from jaxbundle.leastsquares.plan import Part, Plan
 from jaxbundle.leastsquares.spaces import Space
+from jaxbundle.types import AnyArray
 
 Values = dict[str, PyTree[Float[Array, "rows ..."]]]
 """The rows of every table."""
@@ -31,7 +32,7 @@ class Data(eqx.Module):
 
     start: Values
     measured: tuple[PyTree[Float[Array, "n ..."]], ...]
-    weight: tuple[Float[Array, "n ..."], ...]
+    weight: tuple[Float[AnyArray, "n ..."], ...]
 
 
 class Laid(eqx.Module):

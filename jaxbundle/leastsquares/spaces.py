@@ -13,7 +13,7 @@ time of small matrix products).
 """
 
 import dataclasses
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -24,11 +24,12 @@ from jaxbundle.geometry import (
     quaternion_difference,
     retract_quaternion,
 )
+from jaxbundle.types import AnyArray, Scalar
 
-Scalar = float | Float[Array, ""]
 Change = tuple[Scalar, ...]
 
 
+@runtime_checkable
 class Space(Protocol):
     """What the engine asks of a space; instances are hashable and compare by their fields."""
 
@@ -39,7 +40,7 @@ class Space(Protocol):
 
     def moved(self, block: Any, change: Change) -> Any: ...
 
-    def retract(self, value: Any, change: Float[Array, " width"]) -> Any: ...
+    def retract(self, value: Any, change: Float[AnyArray, " width"]) -> Any: ...
 
     def difference(self, value: Any, origin: Any) -> Float[Array, " width"]: ...
 
@@ -70,7 +71,7 @@ class Vector:
     def moves(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """The columns that move, and which number of a change moves each."""
         pairs = (*((column, k) for k, column in enumerate(self.moving)), *self.tied)
-        return tuple(zip(*pairs)) or ((), ())
+        return tuple(column for column, _ in pairs), tuple(k for _, k in pairs)
 
     def prepare(self, value):
         return tuple(value) if self.size else value
@@ -180,8 +181,8 @@ class Rotation:
 class PoseValue(NamedTuple):
     """Projection centres and rotations of poses, as arrays of a table."""
 
-    position: Float[Array, "*rows 3"]
-    rotation: Float[Array, "*rows 4"]
+    position: Float[AnyArray, "*rows 3"]
+    rotation: Float[AnyArray, "*rows 4"]
 
 
 @dataclasses.dataclass(frozen=True)

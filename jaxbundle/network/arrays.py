@@ -10,6 +10,8 @@ import dataclasses
 import equinox as eqx
 from jaxtyping import Array, Float, PyTree
 
+from jaxbundle.types import AnyArray
+
 
 class Values(eqx.Module):
     """All quantities of the network, the free and the fixed ones.
@@ -20,10 +22,10 @@ class Values(eqx.Module):
     `other`: the tables that came with further kinds of observations, by name.
     """
 
-    camera: Float[Array, "cameras parameters"]
-    position: Float[Array, "images 3"]
-    rotation: Float[Array, "images 4"]
-    point: Float[Array, "points 3"]
+    camera: Float[AnyArray, "cameras parameters"]
+    position: Float[AnyArray, "images 3"]
+    rotation: Float[AnyArray, "images 4"]
+    point: Float[AnyArray, "points 3"]
     other: dict[str, PyTree[Array]] = dataclasses.field(default_factory=dict)
 
 
@@ -36,23 +38,23 @@ class Data(eqx.Module):
     """
 
     start: Values
-    image_xy: Float[Array, "rays 2"]
-    image_weight: Float[Array, "rays 2"]
-    control: Float[Array, "control 3"]
-    control_weight: Float[Array, "control 3"]
-    exterior: Float[Array, "exterior 6"]
-    exterior_weight: Float[Array, "exterior 6"]
-    interior: Float[Array, "interior parameters"]
-    interior_weight: Float[Array, "interior parameters"]
-    distance: Float[Array, " distances"]
-    distance_weight: Float[Array, " distances"]
-    other: tuple[tuple[PyTree[Array], Array], ...] = ()
+    image_xy: Float[AnyArray, "rays 2"]
+    image_weight: Float[AnyArray, "rays 2"]
+    control: Float[AnyArray, "control 3"]
+    control_weight: Float[AnyArray, "control 3"]
+    exterior: Float[AnyArray, "exterior 6"]
+    exterior_weight: Float[AnyArray, "exterior 6"]
+    interior: Float[AnyArray, "interior parameters"]
+    interior_weight: Float[AnyArray, "interior parameters"]
+    distance: Float[AnyArray, " distances"]
+    distance_weight: Float[AnyArray, " distances"]
+    other: tuple[tuple[PyTree[Array], AnyArray], ...] = ()
 
-    def measured(self, kind: str) -> Array:
+    def measured(self, kind: str) -> AnyArray:
         """What was measured, or is given, of a kind: image, control, exterior, interior,
         distance."""
         return self.image_xy if kind == "image" else getattr(self, kind)
 
-    def weight(self, kind: str) -> Array:
+    def weight(self, kind: str) -> AnyArray:
         """The weights of a kind."""
         return getattr(self, f"{kind}_weight")

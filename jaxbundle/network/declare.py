@@ -12,6 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Float, Int
 
 from jaxbundle.cameras import get_model
@@ -76,11 +77,11 @@ class Layout:
 
     def tables(self, values: Values) -> Tables:
         """The unknowns as the engine's tables."""
-        found = {"image": PoseValue(values.position, values.rotation)}
+        found: Tables = {"image": PoseValue(values.position, values.rotation)}
         found["point"] = self._points(values.point)
         camera = values.camera
         # On the host, where nothing is compiled for it.
-        camera = camera if isinstance(camera, jax.core.Tracer) else np.asarray(camera)
+        camera = camera if isinstance(camera, Tracer) else np.asarray(camera)
         for table in self.cameras:
             found[table.name] = camera[table.cameras, : len(table.parameters)]
         return found | values.other
@@ -94,14 +95,14 @@ class Layout:
             camera = _put(camera, (table.cameras, np.s_[: rows.shape[1]]), rows)
         own = {"image", "point", *(table.name for table in self.cameras)}
         other = {name: rows for name, rows in tables.items() if name not in own}
-        camera = jax.device_put(camera)
-        return Values(camera, *tables["image"], tables["point"][:, :3], other)
+        camera, pose = jax.device_put(camera), tables["image"]
+        return Values(camera, pose.position, pose.rotation, tables["point"][:, :3], other)
 
     def _points(self, point):
         """The rows of the table of points."""
         if self.lengths is None:
             return point
-        module = jnp if isinstance(point, jax.core.Tracer) else np
+        module = jnp if isinstance(point, Tracer) else np
         return module.concatenate([point, self.lengths[:, None]], 1)
 
     def coordinate_cofactors(self, point, Q):
@@ -151,7 +152,7 @@ class Rows(NamedTuple):
 
 def _put(whole, at, part):
     """The array with a part in it: on the host, where nothing is compiled for it, unless traced."""
-    if isinstance(part, jax.core.Tracer) or isinstance(whole, jax.core.Tracer):
+    if isinstance(part, Tracer) or isinstance(whole, Tracer):
         return jnp.asarray(whole).at[at].set(part)
     whole[at] = part
     return whole

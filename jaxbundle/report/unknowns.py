@@ -188,7 +188,7 @@ def _precision(adjustment, accuracy_unit) -> list[str]:
     together = sigma[free]
     places = column_decimals(together)
     rows = [
-        (name, *(fixed(of(s), places) if len(s) else "–" for s in (*columns, together)))
+        (name, *(fixed(float(of(s)), places) if len(s) else "–" for s in (*columns, together)))
         for name, of in (("mean", np.mean), ("RMS", _rms), ("max", np.max), ("min", np.min))
     ]
     scale = _rms(together) if accuracy_unit is None else float(accuracy_unit)

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 
 from jaxbundle.leastsquares.any_distance import is_at_infinity, shares
 from jaxbundle.statistics.inspection import Inspection
+from jaxbundle.types import present
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +47,7 @@ def find_far_points(inspection: Inspection, sigma0: float) -> FarPoints | None:
     if not problem.at_any_distance.any():
         return None
     rows = np.flatnonzero(problem.at_any_distance)
-    X, s = np.asarray(inspection.adjusted.point)[rows], problem.layout.lengths[rows]
+    X, s = np.asarray(inspection.adjusted.point)[rows], present(problem.layout.lengths)[rows]
     across, along = shares(X, s)
     Q = sigma0**2 * np.asarray(inspection.solution.cofactor("point"))[rows]
     ellipse = np.linalg.eigvalsh(Q[:, :2, :2])[:, ::-1] * across[:, None] ** 2

@@ -2,15 +2,24 @@
 
 import functools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbundle.adjustment.problem import Problem
-from jaxbundle.leastsquares.reliability import Reliability
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.declare import Rows
+
+
+class OfNetwork(NamedTuple):
+    """`Reliability` in the order of the network."""
+
+    residual: Rows
+    redundancy: Rows
+    w: Rows
+    own: Rows
 
 
 class Inspection:
@@ -61,10 +70,10 @@ class Inspection:
         return found
 
     @functools.cached_property
-    def reliability(self) -> Reliability:
-        """Redundancy numbers and w of all observations, each as `Rows`."""
-        found = vars(self.solution.reliability)
-        return Reliability(**{name: self._rows(rows) for name, rows in found.items()})
+    def reliability(self) -> OfNetwork:
+        """Redundancy numbers and w of all observations."""
+        found = self.solution.reliability
+        return OfNetwork(*(self._rows(getattr(found, name)) for name in OfNetwork._fields))
 
     def propagate(self, function: Callable[[Values], Array]) -> Float[np.ndarray, "n n"]:
         """The cofactors of any differentiable function (`Values` → [n]) of the unknowns."""

@@ -86,14 +86,12 @@ def precision(
         problem.system, problem.layout.data(_predicted(problem, data)), of if wanted else None
     )
     of_points = problem.layout.coordinate_cofactors(data.start.point, found.own["point"])
-    parts = Precision(
-        images=_root(_image_variances(problem, data.start, found.own["image"])),
-        cameras=_camera_sigma(problem, data.start, found.own),
-        points=_root(jnp.diagonal(of_points, axis1=1, axis2=2)),
-        covariance=found.covariance,
+    return Precision(
+        images=_root(_image_variances(problem, data.start, found.own["image"])) * sigma0,
+        cameras=_camera_sigma(problem, data.start, found.own) * sigma0,
+        points=_root(jnp.diagonal(of_points, axis1=1, axis2=2)) * sigma0,
+        covariance=found.covariance * jnp.square(sigma0),
     )
-    scales = Precision(sigma0, sigma0, sigma0, jnp.square(sigma0))
-    return jax.tree.map(jnp.multiply, parts, scales)
 
 
 def _predicted(problem: Problem, data: Data) -> Data:
@@ -134,6 +132,6 @@ def _camera_sigma(problem: Problem, values: Values, own):
     for table in problem.layout.cameras:
         variance = jnp.diagonal(own[table.name], axis1=1, axis2=2)
         root = jnp.where(variance <= 0, 0.0, jnp.sqrt(jnp.where(variance <= 0, 1.0, variance)))
-        columns, of = map(list, problem.system.table(table.name).space.moves)
+        columns, of = map(list, problem.system.table(table.name).vector.moves)
         sigma = sigma.at[table.cameras[:, None], columns].set(root[:, of])
     return sigma

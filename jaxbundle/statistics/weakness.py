@@ -90,7 +90,7 @@ def _extents(inspection: Inspection) -> Extents:
     found = {"image": np.concatenate([np.repeat(1 / pose, 3, 1), np.ones((len(pose), 3))], 1)}
     for table in problem.layout.cameras:
         model = get_model(table.model)
-        moving = problem.system.table(table.name).space.moving
+        moving = problem.system.table(table.name).vector.moving
         at = [model.parameters.index(name) for name in model.principal_distance]
         judged = np.array([
             model.parameters[j] in model.core for j in moving
