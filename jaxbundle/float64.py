@@ -17,16 +17,21 @@ from importlib.metadata import version
 
 QUICK_LOOPS = "--xla_cpu_use_fusion_emitters=false"
 """XLA writes loops in the older of its two ways: compiled in half the time and memory, as fast."""
+THREADS = 8
+"""Of XLA's pool at least. jaxlib waits inside the pool for the parts of a batched factorisation or
+triangular solve: two of them at once, as under `vmap`, block a pool of two threads for ever."""
 
 
 def enable_x64() -> None:
     """Switch JAX to the 64-bit floats adjustment needs; call it before the first JAX computation.
 
     The compiler is set up for the processor, too, where it still has the choice (jaxlib 0.10):
-    `QUICK_LOOPS` is put into the environment variable XLA_FLAGS, unless that speaks of it.
+    `QUICK_LOOPS` is put into the environment variable XLA_FLAGS, unless that speaks of it; NPROC,
+    the number of XLA's threads, is set to `THREADS` on machines with fewer cores, unless it is set.
     """
     import jax
 
+    os.environ.setdefault("NPROC", str(max(THREADS, os.cpu_count() or 1)))
     flags = os.environ.get("XLA_FLAGS", "")
     if version("jaxlib").startswith("0.10.") and "fusion_emitters" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {QUICK_LOOPS}".strip()

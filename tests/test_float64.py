@@ -1,5 +1,8 @@
 """One rule for 64-bit floats: who refuses without them, and who brings them along."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -87,3 +90,21 @@ def test_the_policy_is_in_one_module():
     words = "jax_enable_x64", "jax.enable_x64"
     texts = {p.name: p.read_text() for p in PACKAGE.rglob("*.py")}
     assert [f for f, text in texts.items() if any(w in text for w in words)] == ["float64.py"]
+
+
+FACTORISATIONS_AT_ONCE = """
+import jax, jaxbundle
+jaxbundle.enable_x64()
+import jax.numpy as jnp
+A = jnp.eye(40) + jax.random.normal(jax.random.key(1), (4, 50, 40, 40)) / 100
+b = jnp.ones((50, 40, 1))
+at_once = jax.jit(lambda A: [jnp.linalg.solve(a, b) for a in A])
+for _ in range(100):
+    jax.block_until_ready(at_once(A))
+"""
+
+
+def test_batched_factorisations_at_once_come_to_an_end():
+    """jaxlib 0.10 blocks for ever where as many of them as XLA has threads are in work."""
+    here = {k: v for k, v in os.environ.items() if k != "NPROC"}
+    subprocess.run([sys.executable, "-c", FACTORISATIONS_AT_ONCE], env=here, check=True, timeout=120)
