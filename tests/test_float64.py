@@ -107,4 +107,5 @@ for _ in range(100):
 def test_batched_factorisations_at_once_come_to_an_end():
     """jaxlib 0.10 blocks for ever where as many of them as XLA has threads are in work."""
     here = {k: v for k, v in os.environ.items() if k != "NPROC"}
-    subprocess.run([sys.executable, "-c", FACTORISATIONS_AT_ONCE], env=here, check=True, timeout=120)
+    program = [sys.executable, "-c", FACTORISATIONS_AT_ONCE]
+    subprocess.run(program, env=here, check=True, timeout=120)
