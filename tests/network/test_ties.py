@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 
 import jaxbundle
+from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.spaces import Vector
+from jaxbundle.network.build import make_further
 from jaxbundle.statistics.inspection import Inspection
 
 FREE = ("fx", "fy", "cx", "cy", "k1")
@@ -94,3 +96,93 @@ def test_the_space_of_tied_numbers():
     np.testing.assert_array_equal(space.difference(moved, value), change)
     held = space.hold(jnp.asarray(moved), value, np.array([0.0, 1.0]))
     np.testing.assert_array_equal(held, [5.0, 5.0, 0.75, 7.0])
+
+
+# --- over cameras ---------------------------------------------------------------------------
+
+PAIR = ("c", "K1")
+
+
+def two_cameras(K1=(1e-4, 1e-4), **tables):
+    """Twelve photographs, by two cameras in turn, whose true c is the same."""
+    cameras = [
+        jaxbundle.Camera(id, "brown", {"c": 24.0, "K1": k}, ("c", "K1"))
+        for id, k in zip(("left", "right"), K1)
+    ]
+    network = jaxbundle.simulate(
+        jaxbundle.ring_of_stations(12, radius=4.0, height=2.0, roll_every=2),
+        jaxbundle.cloud_of_targets(24, 1.5, seed=2), cameras, camera_of_station=[0, 1] * 6,
+        noise=0.0005, seed=3, distances=[(0, 5)],
+    )  # fmt: skip
+    return network.replace(further=make_further(tables, 1.0)) if tables else network
+
+
+def rows(*parameters, **more):
+    number = len(parameters)
+    columns = {"camera": ["left"] * number, "other": ["right"] * number}
+    return {**columns, "parameter": [*parameters], **more}
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return jaxbundle.adjust(two_cameras(ties=rows(*PAIR))), jaxbundle.adjust(two_cameras())
+
+
+def test_a_parameter_of_two_cameras_is_one(pair):
+    tied, apart = pair
+    assert tied.converged and tied.redundancy == apart.redundancy + 2
+    sigma = {name: apart.cameras["left"]["parameters"][name]["sigma"] for name in PAIR}
+    for name in PAIR:
+        left, right = (tied.camera_parameters(id)[name] for id in ("left", "right"))
+        assert abs(left - right) < 1e-4 * sigma[name]
+    kinds = tied.residuals["kind"].tolist()
+    assert kinds.count("same parameters") == 2
+    assert "same parameters" in tied.variance_components
+
+
+def test_it_is_the_condition_left_minus_right(pair):
+    """Cofactors Q − Q·B·(Bᵀ·Q·B)⁻¹·Bᵀ·Q, at the same values, but for what an exact σ leaves."""
+    tied, apart = pair
+    columns = [get_model("brown").parameters.index(name) for name in PAIR]
+    pick = lambda values: values.camera[:, jnp.array(columns)].ravel()
+    Q = Inspection(apart.problem, tied.values).propagate(pick)
+    B = np.array([[1.0, 0, -1, 0], [0, 1, 0, -1]]).T
+    expected = Q - Q @ B @ np.linalg.solve(B.T @ Q @ B, B.T @ Q)
+    size = np.sqrt(np.diag(Q))
+    off = (Inspection(tied.problem, tied.values).propagate(pick) - expected) / np.outer(size, size)
+    assert np.abs(off).max() < 1e-5
+
+
+def test_a_sigma_of_the_difference_lets_it_move():
+    """With σ as large as those of the parameters themselves the difference is about halved."""
+    free = jaxbundle.adjust(two_cameras((1e-4, 1.05e-4)))
+    s = free.cameras["left"]["parameters"]["K1"]["sigma"]
+    network = two_cameras((1e-4, 1.05e-4), ties=rows("K1", sigma=[s]))
+    found = jaxbundle.adjust(network)
+    of = lambda result: np.diff([result.camera_parameters(i)["K1"] for i in ("left", "right")])[0]
+    column = jnp.array([get_model("brown").parameters.index("K1")])
+    Q = Inspection(free.problem, found.values).propagate(
+        lambda v: v.camera[1, column] - v.camera[0, column]
+    )[0, 0]
+    assert of(found) == pytest.approx(of(free) * s**2 / (s**2 + Q), rel=0.05)
+
+
+@pytest.mark.parametrize("table, message", [
+    (rows("c") | {"other": ["rigth"]}, "camera 'rigth' is unknown; did you mean 'right'"),
+    (rows("k1"), "camera 'left' has no 'k1'; did you mean 'K1'"),
+    (rows("c") | {"other": ["left"]}, "two different cameras are expected"),
+    (rows("x0"), "x0 is free in neither 'left' nor 'right'"),
+    (rows("c", sigma=[-1.0]), "sigma is -1; it must be positive"),
+])  # fmt: skip
+def test_ties_that_cannot_be_are_refused(table, message):
+    with pytest.raises(InputError, match=message):
+        for one in (network := two_cameras(ties=table)).further:
+            one.check(network)
+
+
+def test_ties_are_written_and_read(tmp_path):
+    network = two_cameras(ties=rows(*PAIR, sigma=["exact", 1e-6]))
+    jaxbundle.write_project(network, tmp_path)
+    (again,) = jaxbundle.read_network(tmp_path).further
+    (given,) = network.further
+    assert again.columns(1.0) == given.columns(1.0)

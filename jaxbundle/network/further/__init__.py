@@ -12,11 +12,13 @@ from jaxbundle.network.further.figures import Shapes as Shapes
 from jaxbundle.network.further.lines import Edges as Edges
 from jaxbundle.network.further.rigs import Rigs as Rigs
 from jaxbundle.network.further.rolling_shutter import RollingShutter as RollingShutter
+from jaxbundle.network.further.ties import Ties as Ties
 
 KINDS = {
     kind.TABLE: kind
     for kind in (
         Antennas, Attitudes, Rigs, RollingShutter, Differences, Angles, Figures, Shapes, Edges,
+        Ties,
     )  # fmt: skip
 }
 """By the name of their table."""

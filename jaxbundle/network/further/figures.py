@@ -104,7 +104,7 @@ class Figures(Further):
         table.check_names(("figure", "type", "point"), ("sigma", "radius"))
         made = cls(
             figure=table.ids("figure"), type=table.ids("type"), point=table.ids("point"),
-            sigma=_sigma(table), radius=positive_sigma(table, "radius", required=False),
+            sigma=sigma_or_exact(table), radius=positive_sigma(table, "radius", required=False),
             source=table.source,
         )  # fmt: skip
         for row, word in enumerate(made.type):
@@ -203,7 +203,7 @@ class Shapes(Further):
         table.check_names(("shape", "point", "x", "y", "z"), ("sigma",))
         place = np.stack([table.numbers(a, required=True) for a in "xyz"], 1)
         return cls(shape=table.ids("shape"), point=table.ids("point"), place=place,
-                   sigma=_sigma(table), source=table.source)  # fmt: skip
+                   sigma=sigma_or_exact(table), source=table.source)  # fmt: skip
 
     def columns(self, radians: float) -> dict:
         columns = {"shape": self.shape, "point": self.point}
@@ -254,7 +254,7 @@ def across_rays(network) -> float:
     return float(np.median(np.linalg.norm(away, axis=1) * rays.sigma.min(1) / c))
 
 
-def _sigma(table: Columns):
+def sigma_or_exact(table: Columns):
     """σ of distances; 0 where they are exact."""
     sigma = table.numbers("sigma", words={"exact": 0.0})
     for row in np.flatnonzero(sigma < 0)[:1]:

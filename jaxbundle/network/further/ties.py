@@ -1,0 +1,154 @@
+"""Parameters that two cameras have in common: table `ties`.
+
+A row: `camera`, `other`, `parameter`, and `sigma` of the difference, "exact" or nothing where there
+is none: σ is then a thousandth of what the rays of the two cameras give for the parameter. (Ties
+within a camera are its own: `tie` of a `Camera`.)
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxbundle.cameras import get_model, image_ray, project
+from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.declarations import Kind
+from jaxbundle.network.camera_tables import camera_tables, start_of
+from jaxbundle.network.columns import Columns, did_you_mean
+from jaxbundle.network.further.base import Declared, Further
+from jaxbundle.network.further.figures import EXACT, sigma_or_exact
+
+SAMPLE = 256
+"""Rays of a camera that tell how much a parameter moves image points."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SameParameter:
+    """The parameter of one camera less that of the other; columns in their tables."""
+
+    one: int
+    other: int
+
+    def __call__(self, a, b, given):
+        return b[self.other] - a[self.one] - given
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Ties(Further):
+    """Parameters of two cameras that are the same; σ 0: exactly."""
+
+    camera: tuple[str, ...]
+    other: tuple[str, ...]
+    parameter: tuple[str, ...]
+    sigma: Float[np.ndarray, " n"]
+
+    TABLE = "ties"
+
+    @classmethod
+    def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "Ties":
+        table.check_names(("camera", "other", "parameter"), ("sigma",))
+        return cls(
+            camera=table.ids("camera"), other=table.ids("other"),
+            parameter=table.ids("parameter"), sigma=sigma_or_exact(table), source=table.source,
+        )  # fmt: skip
+
+    def columns(self, radians: float) -> dict:
+        sigma = ["exact" if s == 0 else s for s in self.sigma.tolist()]
+        return {"camera": self.camera, "other": self.other, "parameter": self.parameter,
+                "sigma": sigma}  # fmt: skip
+
+    def __len__(self) -> int:
+        return len(self.camera)
+
+    def _present(self, network) -> Bool[np.ndarray, " n"]:
+        known = {camera.id for camera in network.cameras}
+        return np.array([{*ids} <= known for ids in zip(self.camera, self.other)], bool)
+
+    def check(self, network) -> None:
+        cameras = {camera.id: camera for camera in network.cameras}
+        for row, (*ids, name) in enumerate(zip(self.camera, self.other, self.parameter)):
+            for id in ids:
+                if id not in cameras:
+                    raise InputError(
+                        f"{self.source(row)}: camera {id!r} is unknown{did_you_mean(id, cameras)}"
+                    )
+                known = get_model(cameras[id].model).parameters
+                if name not in known:
+                    raise InputError(
+                        f"{self.source(row)}: camera {id!r} has no {name!r}"
+                        f"{did_you_mean(name, known)}"
+                    )
+            if ids[0] == ids[1]:
+                raise InputError(f"{self.source(row)}: two different cameras are expected")
+            units = [get_model(cameras[id].model).unit for id in ids]
+            if units[0] != units[1]:
+                raise InputError(
+                    f"{self.source(row)}: {name} of {ids[0]!r} is in {units[0]}, of {ids[1]!r} in "
+                    f"{units[1]}: they cannot be the same"
+                )
+            if not any(name in cameras[id].unknowns for id in ids):
+                raise InputError(
+                    f"{self.source(row)}: {name} is free in neither {ids[0]!r} nor {ids[1]!r}: "
+                    "there is nothing to tie"
+                )
+
+    def declare(self, network, origin) -> Declared:
+        index = {camera.id: c for c, camera in enumerate(network.cameras)}
+        place = {int(c): (t, k) for t in camera_tables(network.cameras)
+                 for k, c in enumerate(t.cameras)}  # fmt: skip
+        sigma = np.where(self.sigma > 0, self.sigma, EXACT * self._from_rays(network, index))
+        sets: dict[tuple, list] = {}
+        for row, (a, b, name) in enumerate(zip(self.camera, self.other, self.parameter)):
+            (one, k), (other, m) = place[index[a]], place[index[b]]
+            residual = SameParameter(one.parameters.index(name), other.parameters.index(name))
+            sets.setdefault((one.name, other.name, name, residual), []).append((k, m, sigma[row]))
+        return Declared((), tuple(
+            _kind(one, other, name, residual)(
+                (np.array([r[0] for r in rows]), np.array([r[1] for r in rows])),
+                np.zeros(len(rows)), sigma=np.array([r[2] for r in rows]),
+            )
+            for (one, other, name, residual), rows in sets.items()
+        ))  # fmt: skip
+
+    def _from_rays(self, network, index) -> Float[np.ndarray, " n"]:
+        """σ of the parameters from the rays of their cameras, everything else given; the smaller
+        one of the two."""
+        used = {index[id] for id in (*self.camera, *self.other)}
+        of = {c: parameter_sigmas(network, c) for c in used}
+        return np.array([
+            min(of[index[id]][name] for id in (a, b))
+            for a, b, name in zip(self.camera, self.other, self.parameter)
+        ])  # fmt: skip
+
+
+def _kind(one: str, other: str, name: str, residual: SameParameter) -> Kind:
+    return Kind("same parameters", residual, (one, other), (name,), snooped="", invariant=True)
+
+
+def parameter_sigmas(network, c: int) -> dict[str, float]:
+    """By parameter of a camera, its σ from all its image points where everything else is known."""
+    camera, rays = network.cameras[c], network.observations
+    model = get_model(camera.model)
+    own = np.flatnonzero(network.images.camera[rays.image] == c)
+    sample = own[np.linspace(0, len(own) - 1, SAMPLE).astype(int)]
+    slope = np.asarray(_slopes(model, np.array(start_of(camera)), rays.xy[sample]))
+    weight = np.nan_to_num(slope / rays.sigma[sample, :, None])
+    information = (weight**2).sum((0, 1)) * len(own) / SAMPLE
+    sigma = 1 / np.sqrt(np.maximum(information, np.finfo(float).tiny))
+    return dict(zip(model.parameters, sigma.tolist()))
+
+
+@partial(jax.jit, static_argnums=0)
+def _slopes(model, p, xy):
+    """∂(x, y)/∂p of the rays of image points [n, 2, parameters]."""
+
+    def one(xy):
+        ray = image_ray(model, tuple(p), xy[0], xy[1])
+        return jax.jacfwd(lambda p: jnp.stack(project(model, tuple(p), *ray)))(p)
+
+    return jax.vmap(one)(xy)
