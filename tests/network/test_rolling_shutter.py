@@ -138,6 +138,65 @@ def test_a_project_keeps_them(flown, result, tmp_path):
     assert again.further[0].image == network.further[0].image
 
 
+# --- velocities from neighbours -------------------------------------------------------------
+
+TIME, STRIP = np.array([0.0, 2, 4.5, 10, 12, 14]), list("aaabbb")
+NEIGHBOURS = {"v": 0.05, "w": 0.002}
+
+
+def between_neighbours(images):
+    """From the pose before to the pose after, by scipy."""
+    M = [np.asarray(matrix_from_omega_phi_kappa(a)) for a in images.angles]
+    found = []
+    for k in range(6):
+        a, b = max(k - 1, 3 * (k // 3)), min(k + 1, 3 * (k // 3) + 2)
+        turn = Rotation.from_matrix(M[b] @ M[a].T).as_rotvec()
+        shift = images.position[b] - images.position[a]
+        found.append(np.concatenate([shift, turn]) / (TIME[b] - TIME[a]))
+    return np.array(found)
+
+
+def with_neighbours(network, xy):
+    network = moving(network, xy)
+    order = [3, 0, 5, 1, 4, 2]
+    table = {"image": [network.images.id[k] for k in order], "t": TIME[order],
+             "strip": [STRIP[k] for k in order]}  # fmt: skip
+    section = network.further[0].settings | {"neighbours": NEIGHBOURS}
+    return network.replace(
+        further=make_further({"velocities": table, "rolling_shutter": section}, 1.0)
+    )
+
+
+def test_neighbours_tell_velocities(flown, result):
+    made, _ = flown
+    truth = made.truth.images
+    random = np.random.default_rng(4)
+    sigma = np.repeat([NEIGHBOURS["v"], NEIGHBOURS["w"]], 3)
+    velocity = between_neighbours(truth) + sigma * random.normal(size=(6, 6))
+    xy = seen(made.truth, velocity)
+    network = with_neighbours(made.network, xy + SIGMA * random.normal(size=xy.shape))
+    found = jaxbundle.adjust(network)
+    assert found.converged and 0.8 < found.sigma0 < 1.2
+    of = found.unknowns("velocity")
+    assert (np.abs(of.value - velocity) < 4 * of.sigma).all()
+    assert (of.sigma < 1.3 * sigma).all()
+    assert (of.sigma[:, 3:] < 0.7 * result.unknowns("velocity").sigma[:, 3:]).any()
+    assert found.residuals["kind"].tolist().count("velocities of neighbours") == 36
+    check_jacobians(found.problem, found.values, skip=("control points", "image coordinates"))
+
+
+def test_neighbours_need_times(flown, tmp_path):
+    made, _ = flown
+    with pytest.raises(InputError, match="row 1: t, the time of exposure, is missing"):
+        moving(made.network, made.network.observations.xy, neighbours=NEIGHBOURS)
+    with pytest.raises(InputError, match="σ of velocities and turns are expected"):
+        moving(made.network, made.network.observations.xy, neighbours=3)
+    network = with_neighbours(made.network, made.network.observations.xy)
+    again = jaxbundle.read_network(jaxbundle.write_project(network, tmp_path / "timed"))
+    np.testing.assert_array_equal(again.further[0].time, network.further[0].time)
+    assert again.further[0].strip == network.further[0].strip
+
+
 def test_the_line_is_needed(flown):
     made, _ = flown
     network = moving(made.network, made.network.observations.xy)

@@ -11,12 +11,15 @@ coordinates stay explicit.
 
 Columns: `image`, and of `vX`, `vY`, `vZ` (object unit a second), `wx`, `wy`, `wz` (radians a
 second) the start values, 0 if not given; `svX` … `swz`: their prior σ. All images of the cameras
-with a line time move; those without a row start at rest.
+with a line time move; those without a row start at rest. `t`, the time of exposure in seconds, and
+`strip` (all one if absent), where neighbours tell the velocity.
 
 Section: `line_time = 3e-5`, seconds a line, or by camera `{ left = 3e-5 }`, cameras that are not
 named have none; `free`: of `vX` … `wz` and `line_time`; `sigma`: a table of prior σ of the start
 values, of all images alike where a row has none of its own. Velocities and the line time cannot
-be free together without any prior: only their product shows.
+be free together without any prior: only their product shows. `neighbours = { v = 0.5, w = 0.02 }`:
+a velocity is that from the image before to the image after (of the same camera and strip; at the
+ends the image itself stands for the one that is missing), with these σ.
 """
 
 import dataclasses
@@ -27,9 +30,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.arguments import shown
+from jaxbundle.arguments import positive, shown
 from jaxbundle.errors import InputError
-from jaxbundle.geometry import matrix_from_rotation_vector
+from jaxbundle.geometry import matrix_from_rotation_vector, rotation_vector_from_matrix
 from jaxbundle.leastsquares.declarations import Kind, Table
 from jaxbundle.leastsquares.spaces import Vector
 from jaxbundle.network.columns import Columns, did_you_mean
@@ -59,14 +62,17 @@ class RollingShutter(Further):
     image: tuple[str, ...]
     velocity: Float[np.ndarray, "n 6"]
     sigma: Float[np.ndarray, "n 6"]
+    time: Float[np.ndarray, " n"]
+    strip: tuple[str, ...]
 
     TABLE, SECTION, IMAGES = "velocities", SECTION, ("image",)
 
     @classmethod
     def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> "RollingShutter":
         sigmas = tuple(f"s{name}" for name in VELOCITY)
-        table.check_names(("image",), (*VELOCITY, *sigmas))
-        check_settings(SECTION, settings, ("line_time", "free", "sigma"))
+        table.check_names(("image",), (*VELOCITY, *sigmas, "t", "strip"))
+        check_settings(SECTION, settings, ("line_time", "free", "sigma", "neighbours"))
+        _check_neighbours(settings.get("neighbours", {}), table)
         Parameters.of(SECTION, settings, FREE)
         if "line_time" not in settings:
             raise InputError(f"[{SECTION}]: line_time is missing, seconds from a line to the next")
@@ -74,13 +80,16 @@ class RollingShutter(Further):
         return cls(
             image=table.ids("image"), sigma=np.stack(sigma, 1), settings=dict(settings),
             velocity=np.nan_to_num(np.stack([table.numbers(name) for name in VELOCITY], 1)),
-            source=table.source,
+            time=table.numbers("t"), source=table.source,
+            strip=table.ids("strip") if "strip" in table.values else ("all",) * len(table),
         )  # fmt: skip
 
     def columns(self, radians: float) -> dict:
         columns = {"image": self.image}
         columns |= {name: self.velocity[:, k] for k, name in enumerate(VELOCITY)}
-        return columns | {f"s{name}": self.sigma[:, k] for k, name in enumerate(VELOCITY)}
+        columns |= {f"s{name}": self.sigma[:, k] for k, name in enumerate(VELOCITY)}
+        timed = not np.isnan(self.time).all()
+        return columns | ({"t": self.time, "strip": self.strip} if timed else {})
 
     def number_of_equations(self) -> int:
         return 0
@@ -141,9 +150,53 @@ class RollingShutter(Further):
         if len(weighted):
             sigma = np.where(free > 0, sigma, np.inf)[weighted]
             priors.append(PRIOR((weighted,), velocity[weighted], sigma=sigma))
+        priors += self._from_neighbours(network, free)
         return Declared((moves, read_out), priors, ((VELOCITIES, _move_velocity),))
 
 
+    def _from_neighbours(self, network, free):
+        """Velocities between the images before and after, as observations."""
+        given = self.settings.get("neighbours", {})
+        sigma = np.repeat([given.get("v", np.inf), given.get("w", np.inf)], 3)
+        image, rows = rows_of(self.image, network.images), []
+        camera = network.images.camera[image]
+        for one in sorted({*zip(camera.tolist(), self.strip)} if given else ()):
+            own = np.array([pair == one for pair in zip(camera.tolist(), self.strip)])
+            order = np.flatnonzero(own)[np.argsort(self.time[own], kind="stable")]
+            if len(order) > 1:
+                before, after = (order[0], *order[:-1]), (*order[1:], order[-1])
+                rows.append(np.stack([order, before, after]))
+        if not rows:
+            return []
+        this, before, after = np.concatenate(rows, 1)
+        moves = free[image[this]].any(1) & (self.time[after] > self.time[before])
+        this, before, after = this[moves], before[moves], after[moves]
+        sigma = np.where(free[image[this]] > 0, sigma, np.inf)
+        time = self.time[after] - self.time[before]
+        return [NEIGHBOURS((image[this], image[before], image[after]), time, sigma=sigma)]
+
+
+def between_neighbours(velocity, before, after, time):
+    """A velocity less that from the pose before to the pose after."""
+    shift = jnp.stack([b - a for a, b in zip(before.centre, after.centre)])
+    turn = rotation_vector_from_matrix(after.rotation.matrix() @ before.rotation.matrix().T)
+    return velocity - jnp.concatenate([shift, turn]) / time
+
+
+def _check_neighbours(given: Any, table: Columns) -> None:
+    if not isinstance(given, Mapping) or set(given) - {"v", "w"}:
+        raise InputError(f"[{SECTION}]: neighbours is {shown(given)}; the σ of velocities and "
+                         "turns are expected, { v = 0.5, w = 0.02 }")  # fmt: skip
+    for name, value in given.items():
+        positive(f"[{SECTION}]: neighbours, σ of {name}", value)
+    for row in np.flatnonzero(np.isnan(table.numbers("t")))[:1]:
+        if given:
+            raise InputError(f"{table.source(row)}: t, the time of exposure, is missing, which "
+                             f"[{SECTION}] neighbours needs")  # fmt: skip
+
+
+NEIGHBOURS = Kind("velocities of neighbours", between_neighbours, (VELOCITIES, "image", "image"),
+                  VELOCITY, snooped="")  # fmt: skip
 PRIOR = Kind("velocities", less, (VELOCITIES,), VELOCITY, snooped="")
 
 
