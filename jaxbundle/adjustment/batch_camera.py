@@ -1,10 +1,8 @@
 """Levenberg–Marquardt for one camera calibrated from many views of known points.
 
-Damping is Marquardt's (1963), λ·diag(N); λ follows Nielsen (1999). Near the minimum it is dropped:
-the last steps are Gauss–Newton's. A camera has converged when the undamped step promises to move
-no unknown by more than `TOLERANCE` of its standard deviation, d² = δᵀNδ ≤ (`TOLERANCE`·σ₀)²
-(compare `solver.py`); that step is still taken. Where the damped steps have settled and the
-undamped one cannot be computed, or is rounding, the camera is singular.
+The layout of the normal equations is its own (`batch_normal.py`), the rules are the engine's: which
+step is accepted and how far the next one may go (`leastsquares/search.py`), when to stop and why
+(`leastsquares/stopping.py`).
 """
 
 import equinox as eqx
@@ -22,26 +20,25 @@ from jaxbundle.adjustment.batch_normal import (
     retract,
     step,
 )
+from jaxbundle.leastsquares import stopping
+from jaxbundle.leastsquares.search import RegionState, fraction_kept
 
 STATUS = (
     "converged", "iteration limit", "singular", "not finite", "too few points", "weak", "misfit"
 )  # fmt: skip
 CONVERGED, LIMIT, SINGULAR, NOT_FINITE, TOO_FEW, WEAK, MISFIT = range(7)
-RUNNING = -1
+MEANING = {
+    stopping.LIMIT: LIMIT, stopping.SETTLED: CONVERGED, stopping.RELATIVE_COST: CONVERGED,
+    stopping.SINGULAR: SINGULAR, stopping.STUCK: LIMIT, stopping.NOT_FINITE: NOT_FINITE,
+}  # fmt: skip
+"""The status of a camera by why its iterations ended."""
 
 TOLERANCE = 1e-5
-FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-14
-NEAR = 1e-2
-"""Near the minimum: the last step promised to decrease vᵀv by less than this fraction."""
-ROUNDING, NOISE_FLOOR = 2e-14, 1e-14
-"""Below these a decrease of vᵀv, relative, and a residual, relative to the image, are noise."""
 INDETERMINATE = 1e-13
 """A parameter of which so little is left beside all others is determined by rounding: singular.
 
 (5 coefficients: 1e-8 to 1e-4; 8, where 5 are enough: 1e-13 to 1e-11; one view repeated: 1e-15.)
 """
-NEARER = 1e-2
-"""Each undamped step that was refused, or could not be computed, asks for so much nearer."""
 
 
 class Solved(eqx.Module):
@@ -66,12 +63,11 @@ class _Loop(eqx.Module):
     trial: Calibration
     N: Float[Array, "views n n"]
     cost: Float[Array, ""]
-    predicted: Float[Array, ""]
-    damping: Float[Array, ""]
-    growth: Float[Array, ""]
-    near: Bool[Array, ""]
-    refusals: Int[Array, ""]
-    status: Int[Array, ""]
+    promised: Float[Array, ""]
+    step_size: Float[Array, ""]
+    region: RegionState
+    approach: stopping.Approach
+    termination: Int[Array, ""]
     steps: Int[Array, ""]
 
 
@@ -83,68 +79,60 @@ def solve_camera(model, free, max_steps, size, seen: Sightings, start: Calibrati
     views = seen.views
     rows = 2 * jnp.sum(seen.weight > 0)
     redundancy = rows - len(free) - POSE * jnp.sum(views)
-    floor = rows * (NOISE_FLOOR * size) ** 2
+    zero = jnp.asarray(0.0)
+    tolerance = stopping.Tolerance(redundancy, rows * size**2, zero + TOLERANCE, zero)
 
     def body(loop: _Loop) -> _Loop:
-        N = normal_equations(model, free, seen, loop.trial)
-        cost = 0.5 * jnp.sum(N[:, -1, -1])
-        first, finite = loop.steps == 0, jnp.all(jnp.isfinite(N))
-        ratio = (loop.cost - cost) / loop.predicted
-        accept = finite & (first | (ratio > 1e-3))
+        first, N = loop.steps == 0, normal_equations(model, free, seen, loop.trial)
+        tried = 0.5 * jnp.sum(N[:, -1, -1])
+        tried = jnp.where(jnp.all(jnp.isfinite(N)), tried, jnp.nan)
+        kept = fraction_kept(loop.promised, loop.cost - tried, tolerance.noise(loop.cost))
+        accept, region = loop.region.after(first, kept)
         choose = lambda new, old: jax.tree.map(lambda a, b: jnp.where(accept, a, b), new, old)
-        at, N, cost = choose((loop.trial, N, cost), (loop.at, loop.N, loop.cost))
+        at, N, cost = choose((loop.trial, N, tried), (loop.at, loop.N, loop.cost))
+        step_size, approach = loop.approach.choose_step(
+            region.radius, loop.step_size, first, accept, loop.promised, kept, cost
+        )
 
-        wider = loop.damping * jnp.maximum(1 / 10, 1 - (2 * ratio - 1) ** 3)
-        damping = jnp.where(accept, wider, loop.damping * loop.growth)
-        damping = jnp.where(first, FIRST_DAMPING, jnp.maximum(damping, LEAST_DAMPING))
-        growth = jnp.where(accept, 2.0, 2.0 * loop.growth)
-        refusals = loop.refusals + (loop.near & ~accept)
-        near = accept & ~first & (loop.predicted < NEAR * NEARER**refusals * cost)
-        near |= accept & (cost <= floor)
-
-        used = jnp.where(near, 0.0, damping)
-        factor = factorise(N, views, used)
-        d_pose, d_interior = step(factor)
+        damping = 1 / step_size
+        d_pose, d_interior = step(factorise(N, views, damping))
         # −gᵀδ and δᵀDδ
         g_pose, g_interior = N[:, :POSE, -1], N[:, POSE:-1, -1].sum(0)
-        slope = -jnp.sum(g_pose * d_pose) - jnp.vdot(g_interior, d_interior)
+        decrement = -jnp.sum(g_pose * d_pose) - jnp.vdot(g_interior, d_interior)
         D = jnp.diagonal(N, axis1=1, axis2=2)
         damped = jnp.sum(D[:, :POSE] * d_pose**2)
         damped += jnp.vdot(D[:, POSE:-1].sum(0), d_interior**2)
+        finite = jnp.isfinite(decrement)
+        d_pose, d_interior = jnp.where(finite, d_pose, 0.0), jnp.where(finite, d_interior, 0.0)
 
-        variance = 2 * cost / jnp.maximum(redundancy, 1)
-        small = jnp.maximum(TOLERANCE**2 * variance, jnp.maximum(2 * ROUNDING * cost, floor))
-        solvable = jnp.isfinite(slope)
-        status = jnp.where(loop.steps + 1 >= max_steps, LIMIT, RUNNING)
-        status = jnp.where(near & solvable & (slope <= small), CONVERGED, status)
-        unsolved = near & ~solvable
-        settled = (loop.predicted <= small) & ~first
-        status = jnp.where(unsolved & settled, SINGULAR, status)
-        status = jnp.where(first & ~finite, NOT_FINITE, status)
+        termination, approach = approach.judge(
+            tolerance, step_size, finite, decrement, first, accept, loop.cost, cost, tried
+        )
         return _Loop(
             at=at, trial=retract(free, at, d_pose, d_interior), N=N, cost=cost,
-            predicted=jnp.where(unsolved, jnp.nan, 0.5 * (slope + used * damped)),
-            damping=damping, growth=growth, near=near,
-            refusals=refusals, status=status, steps=loop.steps + 1,
+            promised=jnp.where(finite, 0.5 * (decrement + damping * damped), 0.0),
+            step_size=step_size, region=region, approach=approach, termination=termination,
+            steps=loop.steps + 1,
         )  # fmt: skip
 
     few = (redundancy < 1) | ~jnp.any(views)
-    n, zero = POSE + len(free) + 1, jnp.asarray(0.0)
+    n = POSE + len(free) + 1
     loop = jax.lax.while_loop(
-        lambda loop: loop.status == RUNNING,
+        lambda loop: (loop.termination == stopping.LIMIT) & (loop.steps < max_steps) & ~few,
         body,
         _Loop(
-            at=start, trial=start, N=jnp.zeros((len(views), n, n)), cost=zero,
-            predicted=zero, damping=zero + FIRST_DAMPING, growth=zero + 2,
-            near=jnp.asarray(False), refusals=jnp.asarray(0),
-            status=jnp.where(few, TOO_FEW, RUNNING), steps=jnp.asarray(0),
+            at=start, trial=start, N=jnp.zeros((len(views), n, n)), cost=zero, promised=zero,
+            step_size=jnp.asarray(jnp.inf), region=RegionState.begin(),
+            approach=stopping.Approach.begin(), termination=jnp.asarray(stopping.LIMIT),
+            steps=jnp.asarray(0),
         ),
     )  # fmt: skip
     factor = factorise(loop.N, views, 0.0)
     Q_interior, Q_pose, weakest = cofactors(factor)
-    lost = (loop.status == CONVERGED) & ~(weakest > INDETERMINATE)
-    status = jnp.where(lost, SINGULAR, loop.status)
+    meaning = jnp.array([MEANING[code] for code in range(len(MEANING))])
+    status = jnp.where(few, TOO_FEW, meaning[loop.termination])
+    lost = (status == CONVERGED) & ~(weakest > INDETERMINATE)
     return Solved(
-        loop.trial, loop.cost, Q_interior, Q_pose, factor.reduced, redundancy, views, status,
-        loop.steps,
+        loop.trial, loop.cost, Q_interior, Q_pose, factor.reduced, redundancy, views,
+        jnp.where(lost, SINGULAR, status), loop.steps,
     )  # fmt: skip

@@ -87,25 +87,34 @@ class RegionState(eqx.Module):
     radius: Float[Array, ""]
     reduction: Float[Array, ""]
 
+    @classmethod
+    def begin(cls, radius: float = 1e4) -> "RegionState":
+        return cls(jnp.asarray(radius), jnp.asarray(2.0))
+
+    def after(self, first, kept) -> tuple[Bool[Array, ""], "RegionState"]:
+        """Whether a step that kept this fraction of its promise is accepted, and the region for the
+        next: widened by the rule of Nielsen (1999), narrowed by 2, 4, 8, …"""
+        accept = first | (kept > SUFFICIENT)
+        finite = jnp.minimum(self.radius, WIDEST)
+        wider = jnp.minimum(finite / jnp.maximum(1 / 3, 1 - (2 * kept - 1) ** 3), WIDEST)
+        radius = jnp.where(accept, wider, finite / self.reduction)
+        radius = jnp.where(first, self.radius, radius)
+        return accept, RegionState(radius, jnp.where(accept, 2.0, 2.0 * self.reduction))
+
 
 class NielsenTrustRegion(optx.AbstractSearch):
-    """Accept what decreases vᵀPv; widen by the rule of Nielsen (1999), narrow by 2, 4, 8, …"""
+    """Accept what decreases vᵀPv, in a region by the rule of Nielsen (`RegionState`)."""
 
     initial: float = 1e4
 
     def init(self, y: Tangent, f_info_struct: Info) -> RegionState:
-        return RegionState(jnp.asarray(self.initial), jnp.asarray(2.0))
+        return RegionState.begin(self.initial)
 
     def step(self, first_step, y, y_eval, f_info, f_eval_info, state: RegionState):
         change = jax.tree.map(jnp.subtract, y_eval, y)
-        promised, kept = promise(f_info, change, f_eval_info.as_min())
-        accept = first_step | (kept > SUFFICIENT)
-        finite = jnp.minimum(state.radius, WIDEST)
-        wider = jnp.minimum(finite / jnp.maximum(1 / 3, 1 - (2 * kept - 1) ** 3), WIDEST)
-        radius = jnp.where(accept, wider, finite / state.reduction)
-        radius = jnp.where(first_step, state.radius, radius)
-        reduction = jnp.where(accept, 2.0, 2.0 * state.reduction)
-        return radius, accept, optx.RESULTS.successful, RegionState(radius, reduction)
+        _, kept = promise(f_info, change, f_eval_info.as_min())
+        accept, state = state.after(first_step, kept)
+        return state.radius, accept, optx.RESULTS.successful, state
 
 
 class FullStep(optx.AbstractSearch):
@@ -123,13 +132,17 @@ METHODS = {"levenberg-marquardt": NielsenTrustRegion(), "gauss-newton": FullStep
 
 def promise(info: Info, change: Tangent, cost: Float[Array, ""]):
     """The decrease of ½vᵀPv that a damped step promised, ½(−gᵀδ + λ·δᵀDδ), and the fraction it
-    kept; −1 where that cannot be computed. A promise below rounding is kept unless the sum of
-    squares visibly grows."""
+    kept."""
     plan, D = info.hessian.plan, info.hessian.blocks.metric
     damped = info.damping * dot(plan, change, times(D, change))
     promised = 0.5 * (damped - dot(plan, info.grad, change))
-    gain = info.as_min() - cost
+    return promised, fraction_kept(promised, info.as_min() - cost, info.noise)
+
+
+def fraction_kept(promised, gain, noise):
+    """The fraction of the promise that ½vᵀPv has decreased by; −1 where that cannot be computed. A
+    promise below rounding is kept unless the sum of squares visibly grows."""
     kept = jnp.where(promised > 0, gain / promised, -1.0)
     kept = jnp.where(jnp.isfinite(kept), kept, -1.0)
-    unseen = (promised > 0) & (promised < info.noise) & (gain > -info.noise)
-    return promised, jnp.where(unseen, 1.0, kept)
+    unseen = (promised > 0) & (promised < noise) & (gain > -noise)
+    return jnp.where(unseen, 1.0, kept)

@@ -25,6 +25,9 @@ ENOUGH = 12
 """An image with so many known points need not wait for better ones."""
 DRIFTS, LARGER = 30, 2.5
 """Images of a model that is improved first, and how much larger it becomes before the next time."""
+PARALLEL, FAR_AWAY = 2e-3, 2e3
+"""Radians between the rays of a point that is far away and their middle; and how far, in radii of
+the places of the images."""
 AGREE = 0.4
 """Least part of the points of an image, or a pair, that must agree."""
 
@@ -120,6 +123,32 @@ def finish(sights: Sights, model: Model) -> None:
         intersect(sights, model, FOR_ITSELF, again=True)
         _refine(sights, model)
     intersect(sights, model, FOR_ITSELF, again=True)
+
+
+def place_far_points(sights: Sights, model: Model) -> None:
+    """Points that are not known, but of whose rays three or more are all parallel: far away in
+    their direction. Such rays hardly meet, and for noise often behind the cameras.
+
+    None where they are many: then the images stand at one place."""
+    rows = np.flatnonzero(model.placed[sights.image] & ~model.known[sights.point])
+    point, image = sights.point[rows], sights.image[rows]
+    xy1 = np.pad(sights.xy[rows], ((0, 0), (0, 1)), constant_values=-1.0)
+    ray = np.einsum("nij,ni->nj", model.M[image], xy1)
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    direction = np.zeros((sights.points, 3))
+    np.add.at(direction, point, ray)
+    number = np.bincount(point, minlength=sights.points)
+    direction /= np.where(number > 0, np.linalg.norm(direction, axis=1), 1.0)[:, None]
+    widest = np.zeros(sights.points)
+    np.fmax.at(widest, point, np.linalg.norm(np.cross(ray, direction[point]), axis=1))
+    far = (number >= 3) & (widest < PARALLEL) & ~model.held
+    if not far.any() or 2 * far.sum() > model.known.sum():
+        return
+    centres = model.X0[model.placed]
+    middle = centres.mean(0)
+    spread = np.sqrt(((centres - middle) ** 2).sum(1).mean())
+    model.X[far] = middle + FAR_AWAY * spread * direction[far]
+    model.known[far] = True
 
 
 def place_images(sights: Sights, model: Model, images) -> int:

@@ -38,6 +38,7 @@ from jaxbundle.orientation.growth import (
     finish,
     grow,
     misclosures,
+    place_far_points,
 )
 from jaxbundle.orientation.sights import Sights, sights
 
@@ -188,6 +189,7 @@ def _model(network: Network, seen: Sights, improve) -> tuple[Model, str]:
             model = _with_control(network, moved)
             grow(seen, model, improve=improve)
     finish(seen, model)
+    place_far_points(seen, model)
     return (model, frame) if fixed else to_scale(network, model)
 
 

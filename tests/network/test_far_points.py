@@ -258,6 +258,23 @@ def test_a_blunder_among_the_rays_of_the_horizon_is_found(horizon):
     )
 
 
+def test_start_values_of_a_horizon_are_found(horizon):
+    """Of nothing but image coordinates and a distance; most of its rays do not meet."""
+    network, _, result = horizon
+    points, images = network.points, network.images
+    blank = lambda x: np.full_like(x, np.nan)
+    found = jaxbundle.adjust(network.replace(
+        points=dataclasses.replace(points, position=blank(points.position)),
+        images=dataclasses.replace(
+            images, position=blank(images.position), angles=blank(images.angles)
+        ),
+    ))  # fmt: skip
+    assert found.far_points.id == result.far_points.id
+    np.testing.assert_array_equal(found.far_points.at_infinity, result.far_points.at_infinity)
+    # Infinity is 1e8 of the unit of a frame, which is another: vᵀPv ends 1e-7 apart.
+    np.testing.assert_allclose(found.vtpv, result.vtpv, rtol=1e-6)
+
+
 def test_images_from_one_place_are_not_solved_by_points_at_infinity():
     """A panorama determines no distance at all: that is said."""
     network, _ = simulated(np.full(FAR, 50.0))
