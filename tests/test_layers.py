@@ -20,6 +20,7 @@ LAYERS = (
     "leastsquares",
     "cameras",
     "network",
+    "planning",
     "orientation",
     "pushbroom",
     "measure",

@@ -1,0 +1,1 @@
+"""Networks before there are photographs: rendered photographs of known surfaces."""

@@ -1,0 +1,147 @@
+"""Procedural texture: fractal noise with edges, and grey values of it at any width.
+
+A periodic tile holds fractal noise, whose amplitude falls with the wavelength λ as 1/f, and flat
+patches with sharp edges at several scales. A pyramid of means over 2 × 2 texels has the tile at
+twice, four times … the texel; between its levels it is interpolated linearly. So a place has the
+mean grey value of a patch of about the `width` that is asked for, and nothing is shifted: a mean is
+symmetrical about its centre.
+
+Two rotated copies of the tile at scales whose ratio is no fraction, and one much larger, keep the
+texture from repeating itself; with a `period` it does, as brickwork.
+
+Source: Williams (1983), Pyramidal parametrics.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxbundle.arguments import number, positive, whole
+
+OCTAVES_OF_EDGES = 4
+AT_ONCE = 1 << 15
+"""Places that are interpolated together, so that they stay in the cache."""
+TURN = (1.0, 1.0), (0.7236, 0.6180), (2.1, 0.0731)
+"""Rotation, radians, and scale of the copies of the tile; the first is not turned."""
+
+Mask = Callable[[np.ndarray, np.ndarray], Bool[np.ndarray, "..."]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Texture:
+    """Grey values, 0 to 1, on a surface.
+
+    **Arguments:**
+
+    - `texel`: size of the finest detail in the object unit; half the ground sampling distance of
+      the photographs shows detail at all their scales.
+    - `seed`: of the noise. `side`: texels of the tile, a power of two.
+    - `mean`, `contrast`: mean and standard deviation of the grey values.
+    - `period`: the texture repeats itself after this length in both directions; None: never.
+    - `blank`: where there is no texture, a function of the two surface coordinates.
+    """
+
+    texel: float
+    seed: int = 0
+    side: int = 1024
+    mean: float = 0.5
+    contrast: float = 0.18
+    period: float | None = None
+    blank: Mask | None = None
+
+    def __post_init__(self):
+        positive("texture: texel", self.texel)
+        side = whole("texture: side", self.side, least=16, most=1 << 14)
+        if side & (side - 1):
+            raise ValueError(f"texture: side must be a power of two, but is {side}")
+        number("texture: contrast", self.contrast)
+        if self.period is not None:
+            positive("texture: period", self.period)
+
+    def __call__(
+        self, s: Float[np.ndarray, " n"], t: Float[np.ndarray, " n"], width: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, " n"]:
+        """Grey values of patches of the given widths at surface coordinates, object unit."""
+        out = np.empty(len(s))
+        for first in range(0, len(s), AT_ONCE):
+            part = slice(first, first + AT_ONCE)
+            out[part] = self._grey(s[part], t[part], width[part])
+        return out
+
+    def _grey(self, s, t, width):
+        if self.period is None:
+            total = np.zeros(len(s))
+            for (angle, scale), share in zip(TURN, (0.62, 0.62, 0.48)):
+                texel = self.texel / scale
+                x = (np.cos(angle) * s - np.sin(angle) * t) / texel
+                y = (np.sin(angle) * s + np.cos(angle) * t) / texel
+                total += share * _interpolate(self.pyramid, x, y, width / texel)
+        else:
+            texel = self.period / self.side
+            total = _interpolate(self.pyramid, s / texel, t / texel, width / texel)
+        grey = np.clip(self.mean + self.contrast * total, 0.0, 1.0)
+        if self.blank is not None:
+            grey = np.where(self.blank(s, t), self.mean, grey)
+        return grey
+
+    @cached_property
+    def pyramid(self) -> tuple[Float[np.ndarray, "side side"], ...]:
+        """The tile, of mean 0 and standard deviation 1, and its means over 2 × 2, 4 × 4, …"""
+        levels = [make_tile(self.side, self.seed)]
+        while len(levels[-1]) > 2:
+            a = levels[-1]
+            levels.append((a[::2, ::2] + a[1::2, ::2] + a[::2, 1::2] + a[1::2, 1::2]) / 4)
+        return tuple(levels)
+
+
+def make_tile(side: int, seed: int) -> Float[np.ndarray, "side side"]:
+    """A periodic tile of fractal noise and flat patches with edges, mean 0, deviation 1."""
+    rng = np.random.default_rng(seed)
+    f = np.hypot(np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side)[None])
+    f[0, 0] = np.inf
+
+    def noise(spectrum):
+        white = np.fft.rfft2(rng.standard_normal((side, side)))
+        a = np.fft.irfft2(white * spectrum, s=(side, side))
+        return a / a.std()
+
+    tile = noise(1 / f)
+    for octave in range(OCTAVES_OF_EDGES):
+        low = 1.5 / side * 4**octave
+        patches = noise(np.exp(-((f / (4 * low)) ** 2)) * (f < np.inf))
+        tile += 0.6 * np.sign(patches)
+    tile -= tile.mean()
+    return (tile / tile.std()).astype(np.float32)
+
+
+def _interpolate(pyramid, x, y, width):
+    """Linear between the two levels next to the width, bilinear in both."""
+    level = np.clip(np.log2(np.maximum(width, 1e-30)), 0, len(pyramid) - 1)
+    low = np.floor(level).astype(int)
+    total = np.zeros(len(x))
+    for k in range(low.min(), min(low.max() + 1, len(pyramid) - 1) + 1):
+        share = 1 - np.abs(level - k)
+        chosen = np.flatnonzero(share > 0)
+        whole_chunk = len(chosen) == len(x)
+        at = slice(None) if whole_chunk else chosen
+        size = 0.5**k
+        total[at] += share[at] * _bilinear(pyramid[k], x[at] * size - 0.5, y[at] * size - 0.5)
+    return total
+
+
+def _bilinear(tile, x, y):
+    """Values of a periodic tile; its texel (0, 0) has its centre at (0, 0)."""
+    side = len(tile)
+    column, row = np.floor(x), np.floor(y)
+    fx, fy = (x - column).astype(np.float32), (y - row).astype(np.float32)
+    column, row = column.astype(np.int64) & (side - 1), row.astype(np.int64) & (side - 1)
+    right, below = (column + 1) & (side - 1), ((row + 1) & (side - 1)) * side
+    row, flat = row * side, tile.ravel()
+    upper = flat[row + column]
+    upper += (flat[row + right] - upper) * fx
+    lower = flat[below + column]
+    lower += (flat[below + right] - lower) * fx
+    return upper + (lower - upper) * fy
