@@ -16,6 +16,10 @@ from .ellipses import fit_ellipse as fit_ellipse
 from .ellipses import rim_centre_shift as rim_centre_shift
 from .fiducials import Transformation as Transformation
 from .fiducials import fit_fiducials as fit_fiducials
+from .least_squares_matching import LeastSquaresMatch as LeastSquaresMatch
+from .least_squares_matching import MatchingStatus as MatchingStatus
+from .least_squares_matching import grey_value as grey_value
+from .least_squares_matching import match_least_squares as match_least_squares
 from .matching import Match as Match
 from .matching import correlation as correlation
 from .matching import find_match as find_match

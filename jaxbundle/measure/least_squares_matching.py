@@ -1,0 +1,228 @@
+"""Least squares matching: a window of one image found in another, to a fraction of a pixel.
+
+    g1(x, y) + v = h0 + h1·g2(u, v),        [u, v] = A·[x, y, 1]
+
+with x, y counted from the centre of the window, A [2, 3] an affine transformation into the other
+image, whose last column is the place of the centre, h0 and h1 for brightness and contrast: eight
+unknowns. g2 between the pixels by cubic convolution (Keys, 1981, a = −½), which has a continuous
+derivative; the Jacobian is that of automatic differentiation. Damped steps (Marquardt).
+
+With σ0² = vᵀv/(n − 8) the cofactors give the covariance of the place. v has the noise of both
+windows, so that it is the covariance of the one place relative to the other: of two windows with
+like noise half of it belongs to either.
+
+Sources: Gruen (1985), Adaptive least squares correlation, South African J. of Photogrammetry 14(3);
+Ackermann (1984), Digital image correlation, Photogrammetric Record 11(64).
+"""
+
+from enum import IntEnum
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import cho_factor, cho_solve
+from jaxtyping import Array, Float, Int
+
+STEPS = 12
+"""Evaluations of a matching: two of three end after six."""
+STILL = 0.005
+"""Steps below so many pixels, anywhere in the window, end the iterations."""
+FAR = 0.5
+"""The centre may move from its start by this part of the side of the window."""
+FLAT = 1e-6
+"""Standard deviation of grey values, in parts of the largest, below which there is no contrast."""
+DETERMINED = 1e-5
+"""Least square of a pivot of N, scaled to a unit diagonal, below it nothing is determined."""
+LOST = 2 / (1 + 0.663)
+"""Interpolation takes a third of the variance of the noise of g2 out of v, not out of the place: of
+like noise in both windows 2 are left as 1.663, the mean of the squares of the weights."""
+TINY = 1e-20
+UNKNOWNS = 8
+
+
+class MatchingStatus(IntEnum):
+    """How a matching ended."""
+
+    CONVERGED = 0
+    NOT_CONVERGED = 1
+    OUTSIDE = 2
+    """The window reaches beyond the other image."""
+    NO_TEXTURE = 3
+    """The grey values do not determine the place."""
+    DIVERGED = 4
+    """It went too far from its start, or was turned inside out."""
+
+
+class LeastSquaresMatch(eqx.Module):
+    """`affine`: A, pixels of the other image; `radiometry`: (h0, h1); `covariance`: of the place
+    A[:, 2], pixels², relative to the window; `sigma0`: of a grey value; `correlation`: ρ of the
+    window and what it was matched with; `status`: a `MatchingStatus`."""
+
+    affine: Float[Array, "2 3"]
+    radiometry: Float[Array, "2"]
+    covariance: Float[Array, "2 2"]
+    sigma0: Float[Array, ""]
+    correlation: Float[Array, ""]
+    status: Int[Array, ""]
+
+    @property
+    def place(self) -> Float[Array, "2"]:
+        """(u, v) of the centre of the window in the other image."""
+        return self.affine[..., 2]
+
+
+def match_least_squares(
+    template: Float[Array, "n n"],
+    image: Float[Array, "rows columns"],
+    start: Float[Array, "2 3"],
+    steps: int = STEPS,
+) -> LeastSquaresMatch:
+    """Match a window with another image, from a start within a few pixels; batch it by `jax.vmap`.
+
+    **Arguments:** `template`: grey values of the window, n odd, its centre the point; `image`: the
+    other image or a piece of it; `start`: A, from pixels about the centre of the window (x right, y
+    down) to pixels of `image`; `steps`: evaluations at most.
+
+    **Returns:** `status` names what failed; the covariance is infinite where nothing is determined.
+    """
+    n, dtype = template.shape[0], template.dtype
+    start = start.astype(dtype)
+    mean = jnp.mean(template)
+    contrast = jnp.std(template)
+    textured = contrast > FLAT * jnp.max(jnp.abs(template))
+    unit = jnp.where(textured, contrast, 1)
+    grey, other = ((template - mean) / unit).ravel(), (image.astype(dtype) - mean) / unit
+    x, y = _window(n, dtype)
+    # unknowns of one size: what they do at the edge of the window
+    size = jnp.asarray([n // 2, n // 2, 1, n // 2, n // 2, 1, 1, 1], dtype)
+    computed = lambda p: jax.vmap(_computed, (None, None, 0, 0))(p / size, other, x, y)
+
+    def normal_equations(p):
+        # forward, kept: in reverse, or within the products, the grey values are looked up again
+        J, v = jax.lax.optimization_barrier((jax.jacfwd(computed)(p), computed(p) - grey))
+        return J.T @ J, J.T @ v, v @ v
+
+    begin = size * _with_radiometry(start, other, grey, x, y)
+    p, N, square, moving = _minimise(normal_equations, begin, steps)
+    spare = n * n - UNKNOWNS
+    Q, determined = _inverse(N)
+    p = p / size
+    affine = p[:6].reshape(2, 3)
+    known = textured & determined & (p[7] > 0)
+    status = _status(affine, start, image.shape, n, textured, known, moving)
+    return LeastSquaresMatch(
+        affine,
+        jnp.stack([mean + unit * p[6] - p[7] * mean, p[7]]),
+        jnp.where(known, LOST * square / spare * Q[2:6:3, 2:6:3], jnp.inf),
+        unit * jnp.sqrt(square / spare),
+        jnp.sqrt(jnp.maximum(1 - square / n**2, 0)),
+        status,
+    )
+
+
+def _status(affine, start, shape, n, textured, known, moving):
+    """What ended a matching; of several reasons the first."""
+    middle = (jnp.asarray(shape[::-1]) - 1) / 2
+    reach = jnp.max(jnp.abs(affine @ _corners(n, affine.dtype) - middle[:, None]), 1)
+    away = jnp.linalg.norm(affine[:, 2] - start[:, 2])
+    turned = jnp.linalg.det(affine[:, :2]) / jnp.linalg.det(start[:, :2])
+    reasons = (
+        (~textured, MatchingStatus.NO_TEXTURE),
+        (jnp.any(reach > middle), MatchingStatus.OUTSIDE),
+        (~((away < FAR * n) & (turned > 0.1)), MatchingStatus.DIVERGED),
+        (~known, MatchingStatus.NO_TEXTURE),
+        (moving, MatchingStatus.NOT_CONVERGED),
+    )
+    return jnp.select(
+        [holds for holds, _ in reasons], [int(status) for _, status in reasons],
+        int(MatchingStatus.CONVERGED),
+    )  # fmt: skip
+
+
+def grey_value(image: Float[Array, "rows columns"], u, v) -> Float[Array, ""]:
+    """The grey value of an image at (u, v), by cubic convolution; beyond its edge that of the edge.
+
+    Source: Keys (1981), IEEE Trans. Acoustics, Speech, Signal Processing 29(6), equation 15.
+    """
+    rows, columns = image.shape
+    i, j = (jnp.floor(jax.lax.stop_gradient(a)) for a in (v, u))
+    row = [jnp.clip(i.astype(int) + k, 0, rows - 1) for k in (-1, 0, 1, 2)]
+    column = [jnp.clip(j.astype(int) + k, 0, columns - 1) for k in (-1, 0, 1, 2)]
+    down, along = _cubic_weights(v - i), _cubic_weights(u - j)
+    # sums written out: one loop over the window, where small products are one call each
+    nil = jnp.zeros((), image.dtype)
+    line = lambda r: sum((b * image[r, c] for b, c in zip(along, column)), nil)
+    return sum((a * line(r) for a, r in zip(down, row)), nil)
+
+
+def _cubic_weights(t):
+    return (
+        ((2 - t) * t - 1) * t / 2, ((3 * t - 5) * t * t + 2) / 2,
+        ((4 - 3 * t) * t + 1) * t / 2, (t - 1) * t * t / 2,
+    )  # fmt: skip
+
+
+def _computed(p, image, x, y):
+    """h0 + h1·g2 of one pixel of the window."""
+    return p[6] + p[7] * grey_value(
+        image, p[0] * x + p[1] * y + p[2], p[3] * x + p[4] * y + p[5]
+    )
+
+
+def _window(n, dtype):
+    """x, y of the pixels of a window."""
+    offset = jnp.arange(n, dtype=dtype) - n // 2
+    y, x = jnp.meshgrid(offset, offset, indexing="ij")
+    return x.ravel(), y.ravel()
+
+
+def _corners(n, dtype):
+    h = n // 2
+    return jnp.asarray([[-h, h, h, -h], [-h, -h, h, h], [1, 1, 1, 1]], dtype)
+
+
+def _with_radiometry(start, image, grey, x, y):
+    """The eight unknowns: A, and h0, h1 by the mean and the variance of what it covers."""
+    u, v = start @ jnp.stack([x, y, jnp.ones_like(x)])
+    covered = jax.vmap(grey_value, (None, 0, 0))(image, u, v)
+    spread = jnp.std(covered)
+    h1 = jnp.where(spread > 0, 1 / jnp.where(spread > 0, spread, 1), 1)
+    return jnp.concatenate([start.ravel(), jnp.stack([-h1 * jnp.mean(covered), h1])])
+
+
+def _minimise(normal_equations, begin, steps):
+    """The unknowns, N, vᵀv, and whether they still move, after damped steps."""
+
+    def improve(state):
+        count, p, N, g, square, damping, moving = state
+        # what is not determined does not move: a unit diagonal, and something beside it
+        scale = 1 / jnp.sqrt(jnp.diag(N) + TINY)
+        scaled = N * scale * scale[:, None] + damping * jnp.eye(UNKNOWNS, dtype=N.dtype)
+        step = -scale * cho_solve(cho_factor(scaled), scale * g)
+        N1, g1, square1 = normal_equations(p + step)
+        better = square1 <= square
+        new = (p + step, N1, g1, square1)
+        kept = [jnp.where(better & moving, a, b) for a, b in zip(new, (p, N, g, square))]
+        still = jnp.max(jnp.abs(step[:6])) < STILL
+        rate = jnp.where(better, 0.1, 10.0).astype(damping.dtype)
+        return count + 1, *kept, jnp.maximum(damping * rate, 1e-6), moving & ~still
+
+    def goes_on(state):
+        return (state[0] < steps) & state[-1]
+
+    start = (0, begin, *normal_equations(begin), jnp.asarray(1e-3, begin.dtype), jnp.asarray(True))
+    _, p, N, _, square, _, moving = jax.lax.while_loop(goes_on, improve, start)
+    return p, N, square, moving
+
+
+def _inverse(N):
+    """N⁻¹, and whether N determines everything."""
+    scale = 1 / jnp.sqrt(jnp.diag(N) + TINY)
+    scaled = N * scale * scale[:, None]
+    factor = cho_factor(scaled)
+    least = jnp.min(jnp.diag(factor[0]) ** 2)
+    determined = jnp.isfinite(least) & (least > DETERMINED)
+    safe = jnp.where(determined, scaled, jnp.eye(UNKNOWNS, dtype=N.dtype))
+    return cho_solve(cho_factor(safe), jnp.eye(UNKNOWNS, dtype=N.dtype)) * scale * scale[
+        :, None
+    ], determined

@@ -1,0 +1,99 @@
+"""Least squares matching of windows whose transformation is known."""
+
+import jax
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from jaxbundle.measure.least_squares_matching import (
+    MatchingStatus,
+    grey_value,
+    match_least_squares,
+)
+
+LANES, SIDE, PIECE, NOISE = 200, 15, 33, 2.0
+match = jax.jit(jax.vmap(match_least_squares))
+
+
+@pytest.fixture(scope="module")
+def texture():
+    """A continuous surface: smooth noise, sampled four times as densely as the images."""
+    rng = np.random.default_rng(1)
+    fine = ndimage.gaussian_filter(rng.normal(size=(800, 800)), 7.0)
+    coefficients = ndimage.spline_filter(fine / fine.std() * 40 + 120)
+    return lambda xy: ndimage.map_coordinates(
+        coefficients, [4 * xy[..., 1], 4 * xy[..., 0]], order=3, prefilter=False
+    )
+
+
+def grid(side):
+    offset = np.arange(side) - side // 2
+    return np.stack(np.meshgrid(offset, offset), -1).astype(float)
+
+
+@pytest.fixture(scope="module")
+def pairs(texture):
+    """Windows, pieces of another image, and A from one to the other."""
+    rng = np.random.default_rng(2)
+    centre = rng.uniform(40, 160, (LANES, 1, 1, 2))
+    A = np.eye(2) + 0.06 * rng.normal(size=(LANES, 2, 2))
+    place = PIECE // 2 + rng.uniform(-0.5, 0.5, (LANES, 2))
+    back = np.einsum("bij,bxyj->bxyi", np.linalg.inv(A), PIECE // 2 + grid(PIECE)[None]
+                     - place[:, None, None])  # fmt: skip
+    noise = lambda side: NOISE * rng.normal(size=(LANES, side, side))
+    template = texture(centre + grid(SIDE)) + noise(SIDE)
+    piece = 0.9 * texture(centre + back) - 7 + noise(PIECE)
+    return template, piece, np.concatenate([A, place[..., None]], 2)
+
+
+def started(truth, rng, error=0.7):
+    start = truth.copy()
+    start[:, :, :2] = np.eye(2)
+    start[:, :, 2] += error * rng.uniform(-1, 1, (len(truth), 2))
+    return start
+
+
+def test_places_are_found_and_their_covariance_is_that_of_the_errors(pairs):
+    template, piece, truth = pairs
+    found = match(template, piece, started(truth, np.random.default_rng(3)))
+    good = np.asarray(found.status) == MatchingStatus.CONVERGED
+    assert good.mean() > 0.97
+    e = np.asarray(found.place - truth[:, :, 2])[good]
+    Q = np.linalg.inv(np.asarray(found.covariance)[good])
+    normalised = np.sqrt(np.einsum("bi,bij,bj->b", e, Q, e) / 2)
+    assert np.median(np.linalg.norm(e, axis=1)) < 0.03
+    assert 0.85 < np.sqrt(np.mean(normalised**2)) < 1.3
+    slope = np.asarray(found.affine - truth)[good, :, :2]
+    assert np.sqrt(np.mean(slope**2)) < 0.01
+    assert np.allclose(np.median(found.radiometry[good, 1]), 1 / 0.9, rtol=0.02)
+    assert np.allclose(np.median(found.radiometry[good, 0]), 7 / 0.9, atol=2.0)
+
+
+def test_what_cannot_be_matched_is_named(pairs):
+    template, piece, truth = (a[:LANES].copy() for a in pairs)
+    start = started(truth, np.random.default_rng(3), 0.0)
+    template[0] = 100.0
+    start[1, :, 2] = 2.0
+    template[2] = np.linspace(0, 200, SIDE)  # an edge says nothing about the place along it
+    piece[2] = np.linspace(0, 200 * PIECE / SIDE, PIECE)
+    start[3, :, 2] += 9.0
+    start[4] = np.nan
+    found = match(template, piece, start)
+    status = [MatchingStatus(int(s)) for s in found.status[:5]]
+    assert status[0] == status[2] == MatchingStatus.NO_TEXTURE
+    assert status[1] in (MatchingStatus.OUTSIDE, MatchingStatus.DIVERGED)
+    assert MatchingStatus.CONVERGED not in status
+    assert np.isinf(found.covariance[0]).all()
+    assert (np.asarray(found.status[5:]) == 0).mean() > 0.97
+
+
+def test_grey_values_of_a_quadratic_surface_are_exact():
+    v, u = np.mgrid[:12, :14].astype(float)
+    surface = lambda u, v: 3 + 2 * u - v + 0.3 * u * v + 0.2 * u**2 - 0.1 * v**2
+    for place in ((5.3, 4.8), (2.01, 7.99), (8.0, 5.0)):
+        value, slope = jax.value_and_grad(lambda p: grey_value(surface(u, v), p[0], p[1]))(
+            np.array(place)
+        )
+        a, b = place
+        assert np.allclose(value, surface(a, b), atol=1e-10)
+        assert np.allclose(slope, (2 + 0.3 * b + 0.4 * a, -1 + 0.3 * a - 0.2 * b), atol=1e-10)
