@@ -26,12 +26,12 @@ import machine
 import numpy as np
 
 import jaxbundle
+from jaxbundle.bundle.minimum import minimise
 from jaxbundle.leastsquares.datum import move_to_datum
 from jaxbundle.leastsquares.problem import pad_values
 from jaxbundle.network.check import check_network
-from jaxbundle.network.simulate import Simulation, simulate_with_truth
-from jaxbundle.network.stations import aerial_block, cloud_of_targets
-from jaxbundle.solution import minimise
+from jaxbundle.planning.simulate import Simulation, simulate_with_truth
+from jaxbundle.planning.stations import aerial_block, cloud_of_targets
 
 FREE = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2")
 TRUE = {"c": 100.0, "x0": 0.02, "y0": -0.03, "K1": 1e-6, "K2": -1e-10, "K3": 2e-14, "P1": 1e-7,

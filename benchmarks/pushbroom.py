@@ -38,7 +38,7 @@ jaxbundle.enable_x64()
 
 from jaxbundle.geometry.ellipsoid import WGS84, geodetic, residual  # noqa: E402
 from jaxbundle.pushbroom.ancillary import attitude_table, position_table  # noqa: E402
-from jaxbundle.pushbroom.frames import circular_orbit  # noqa: E402
+from jaxbundle.pushbroom.earth_frames import circular_orbit  # noqa: E402
 from jaxbundle.pushbroom.image import make_image  # noqa: E402
 from jaxbundle.pushbroom.locate import locate_lines  # noqa: E402
 from jaxbundle.pushbroom.project import make_search, project_from, project_points  # noqa: E402
@@ -157,8 +157,8 @@ def map_seconds():
     """Seconds to correct a whole image to UTM, with the reading and writing of the rasters."""
     import rasterio
 
-    from jaxbundle.io.correction import map_of, write_corrected
-    from jaxbundle.io.maps import MapSystem
+    from jaxbundle.io.rasters.correction import map_of, write_corrected
+    from jaxbundle.io.rasters.maps import MapSystem
 
     scan, ground = image(), Ground()
     system = MapSystem(WGS84, "EPSG:32637")

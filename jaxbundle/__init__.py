@@ -19,22 +19,21 @@ if TYPE_CHECKING:
     from jaxbundle.adjustment import Problem as Problem
     from jaxbundle.adjustment import make_problem as make_problem
     from jaxbundle.adjustment import solve as solve
-    from jaxbundle.bundle import adjust as adjust
+    from jaxbundle.adjustment.gradients import check_gradients as check_gradients
+    from jaxbundle.batch.calibrate import BatchCalibration as BatchCalibration
+    from jaxbundle.batch.calibrate import calibrate_batch as calibrate_batch
+    from jaxbundle.bundle.adjust import adjust as adjust
+    from jaxbundle.bundle.orient import orient as orient
+    from jaxbundle.bundle.result import Adjustment as Adjustment
     from jaxbundle.calibration import Board as Board
     from jaxbundle.calibration import BoardViews as BoardViews
     from jaxbundle.calibration import Calibration as Calibration
     from jaxbundle.calibration import calibrate as calibrate
     from jaxbundle.calibration import calibrate_cameras as calibrate_cameras
-    from jaxbundle.calibration.batch import BatchCalibration as BatchCalibration
-    from jaxbundle.calibration.batch import calibrate_batch as calibrate_batch
     from jaxbundle.cameras import CameraModel as CameraModel
-    from jaxbundle.configuration import join_processes as join_processes
-    from jaxbundle.configuration import keep_programs as keep_programs
-    from jaxbundle.configuration import use_cores as use_cores
     from jaxbundle.errors import InputError as InputError
     from jaxbundle.errors import NotSolvedError as NotSolvedError
     from jaxbundle.float64 import enable_x64 as enable_x64
-    from jaxbundle.gradients import check_gradients as check_gradients
     from jaxbundle.io import convert as convert
     from jaxbundle.io import read_network as read_network
     from jaxbundle.io import write_project as write_project
@@ -44,46 +43,47 @@ if TYPE_CHECKING:
     from jaxbundle.network.arrays import Values as Values
     from jaxbundle.network.build import make_network as make_network
     from jaxbundle.network.check import check_network as check_network
-    from jaxbundle.network.simulate import simulate as simulate
-    from jaxbundle.network.simulate import simulate_with_truth as simulate_with_truth
-    from jaxbundle.network.simulate_further import simulate_further as simulate_further
-    from jaxbundle.network.stations import aerial_block as aerial_block
-    from jaxbundle.network.stations import cloud_of_targets as cloud_of_targets
-    from jaxbundle.network.stations import grid_of_targets as grid_of_targets
-    from jaxbundle.network.stations import ring_of_stations as ring_of_stations
-    from jaxbundle.network.stations import stations_looking_at as stations_looking_at
     from jaxbundle.orientation.network import Oriented as Oriented
-    from jaxbundle.oriented import orient as orient
-    from jaxbundle.result import Adjustment as Adjustment
+    from jaxbundle.planning.simulate import simulate as simulate
+    from jaxbundle.planning.simulate import simulate_with_truth as simulate_with_truth
+    from jaxbundle.planning.simulate_further import simulate_further as simulate_further
+    from jaxbundle.planning.stations import aerial_block as aerial_block
+    from jaxbundle.planning.stations import cloud_of_targets as cloud_of_targets
+    from jaxbundle.planning.stations import grid_of_targets as grid_of_targets
+    from jaxbundle.planning.stations import ring_of_stations as ring_of_stations
+    from jaxbundle.planning.stations import stations_looking_at as stations_looking_at
     from jaxbundle.statistics.precision import Precision as Precision
     from jaxbundle.statistics.precision import precision as precision
+    from jaxbundle.system.configuration import join_processes as join_processes
+    from jaxbundle.system.configuration import keep_programs as keep_programs
+    from jaxbundle.system.configuration import use_cores as use_cores
 
 _HOME = {
     "jaxbundle.adjustment": ("Problem", "make_problem", "solve"),
-    "jaxbundle.calibration.batch": ("BatchCalibration", "calibrate_batch"),
-    "jaxbundle.bundle": ("adjust",),
+    "jaxbundle.batch.calibrate": ("BatchCalibration", "calibrate_batch"),
+    "jaxbundle.bundle.adjust": ("adjust",),
     "jaxbundle.calibration": (
         "Board", "BoardViews", "Calibration", "calibrate", "calibrate_cameras",
     ),
     "jaxbundle.cameras": ("CameraModel",),
-    "jaxbundle.configuration": ("join_processes", "keep_programs", "use_cores"),
+    "jaxbundle.system.configuration": ("join_processes", "keep_programs", "use_cores"),
     "jaxbundle.errors": ("InputError", "NotSolvedError"),
     "jaxbundle.float64": ("enable_x64",),
-    "jaxbundle.gradients": ("check_gradients",),
+    "jaxbundle.adjustment.gradients": ("check_gradients",),
     "jaxbundle.io": ("convert", "read_network", "write_project"),
     "jaxbundle.network": ("Camera", "Network"),
     "jaxbundle.network.arrays": ("Data", "Values"),
     "jaxbundle.network.build": ("make_network",),
     "jaxbundle.network.check": ("check_network",),
-    "jaxbundle.network.simulate": ("simulate", "simulate_with_truth"),
-    "jaxbundle.network.simulate_further": ("simulate_further",),
-    "jaxbundle.network.stations": (
+    "jaxbundle.planning.simulate": ("simulate", "simulate_with_truth"),
+    "jaxbundle.planning.simulate_further": ("simulate_further",),
+    "jaxbundle.planning.stations": (
         "aerial_block", "cloud_of_targets", "grid_of_targets", "ring_of_stations",
         "stations_looking_at",
     ),
     "jaxbundle.orientation.network": ("Oriented",),
-    "jaxbundle.oriented": ("orient",),
-    "jaxbundle.result": ("Adjustment",),
+    "jaxbundle.bundle.orient": ("orient",),
+    "jaxbundle.bundle.result": ("Adjustment",),
     "jaxbundle.statistics.precision": ("Precision", "precision"),
 }
 _MODULE = {name: module for module, names in _HOME.items() for name in names}

@@ -9,7 +9,7 @@ import os
 import sys
 import warnings
 
-from jaxbundle.interrupts import handle_interrupts, set_status
+from jaxbundle.system.interrupts import handle_interrupts, set_status
 
 SELDOM = 50_000, 20, 100
 """Thresholds of Python's garbage collector. Tracing makes objects by the million, and nearly all of
@@ -21,7 +21,7 @@ def main() -> None:
     handle_interrupts()
     gc.set_threshold(*SELDOM)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from jaxbundle.configuration import keep_programs
+    from jaxbundle.system.configuration import keep_programs
 
     keep_programs()
     _tell_once_of_damage()

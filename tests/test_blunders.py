@@ -10,17 +10,18 @@ import pytest
 from scipy import integrate
 
 import jaxbundle
-from jaxbundle import Camera, InputError, far_points
-from jaxbundle.bundle import adjust
+from jaxbundle import Camera, InputError
+from jaxbundle.bundle import far_points
+from jaxbundle.bundle.adjust import adjust
+from jaxbundle.bundle.minimum import minimise
 from jaxbundle.cameras import get_model, residual
 from jaxbundle.geometry import matrix_from_quaternion
-from jaxbundle.io.result_json import result_dict
+from jaxbundle.io.results.result_json import result_dict
 from jaxbundle.leastsquares import robust, snooping
 from jaxbundle.leastsquares.robust import residual_lengths, robust_scale
 from jaxbundle.leastsquares.snooping import Removed, _passing, _Touched, _worst, without
 from jaxbundle.leastsquares.solution import Solution, find_minimum
 from jaxbundle.report import text
-from jaxbundle.solution import minimise
 from jaxbundle.statistics.inspection import Inspection
 
 SIGMA = 0.002

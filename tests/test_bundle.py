@@ -8,14 +8,14 @@ import pytest
 
 import jaxbundle
 from jaxbundle import Camera
-from jaxbundle.bundle import adjust
+from jaxbundle.bundle.adjust import adjust
+from jaxbundle.bundle.minimum import minimise
 from jaxbundle.errors import NotSolvedError
-from jaxbundle.io import csv_tables
-from jaxbundle.io.result_json import result_dict, result_text, without_nan
+from jaxbundle.io.results.result_json import result_dict, result_text, without_nan
+from jaxbundle.io.text import csv_tables
 from jaxbundle.leastsquares.distributions import tau_quantile
 from jaxbundle.leastsquares.names import undetermined
 from jaxbundle.network.tables import EXTERIOR
-from jaxbundle.solution import minimise
 
 SIGMA = 0.002
 TRUE = {"c": 24.0, "x0": 0.05, "y0": -0.03, "K1": 1.2e-4}

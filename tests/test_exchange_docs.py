@@ -8,10 +8,10 @@ import pytest
 
 from jaxbundle import cli
 from jaxbundle.io import FORMATS, TARGETS, read_network
-from jaxbundle.io.camera_files import read_cameras
-from jaxbundle.io.colmap_models import MODELS, OTHERS
-from jaxbundle.io.column_map import KEYS, ROTATIONS
+from jaxbundle.io.cameras.camera_files import read_cameras
 from jaxbundle.io.exchange import CAMERA_KINDS
+from jaxbundle.io.networks.colmap_models import MODELS, OTHERS
+from jaxbundle.io.networks.column_map import KEYS, ROTATIONS
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "docs" / "exchange.md").read_text(encoding="utf-8")

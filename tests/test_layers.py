@@ -1,6 +1,7 @@
 """The layout is the architecture: a module imports only from packages above it in this list."""
 
 import ast
+import graphlib
 import re
 from pathlib import Path
 
@@ -9,12 +10,9 @@ import pytest
 LAYERS = (
     "errors",
     "types",
-    "file_content",
     "arguments",
-    "temporaries",
-    "interrupts",
     "float64",
-    "configuration",
+    "system",
     "implicit",
     "geometry",
     "leastsquares",
@@ -28,19 +26,11 @@ LAYERS = (
     "statistics",
     "refinement",
     "io",
-    "gradients",
     "plotting",
     "report",
-    "result_tables",
-    "result",
-    "solution",
-    "far_points",
-    "oriented",
-    "repeated",
     "bundle",
+    "batch",
     "calibration",
-    "batches",
-    "targets",
     "cli",
     "__main__",
 )
@@ -73,42 +63,68 @@ def imports(path: Path):
         elif isinstance(node, ast.ImportFrom):
             base = package[: len(package) - node.level + 1] if node.level else ()
             module = ".".join((*base, node.module or ""))
-            if module.strip(".") == "jaxbundle":
-                for alias in node.names:
-                    yield f"jaxbundle.{alias.name}", id(node) in inside
-            else:
-                yield module, id(node) in inside
+            file = PACKAGE.parent.joinpath(*module.split("."))
+            for alias in node.names:
+                whole = (file / f"{alias.name}.py").exists() or module == "jaxbundle"
+                yield f"{module}.{alias.name}" if whole else module, id(node) in inside
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_imports_go_up(path):
-    own = LAYERS.index(layer_of(path))
-    for module, _ in imports(path):
+@pytest.fixture(scope="module")
+def imported() -> dict[Path, list[tuple[str, bool]]]:
+    return {path: list(imports(path)) for path in FILES}
+
+
+def refused(imported, wrong) -> list[str]:
+    """The imports of which `wrong(path, module, inside)` holds, as lines to read."""
+    return [
+        f"{path.relative_to(PACKAGE)} imports {module}"
+        for path, found in imported.items()
+        for module, inside in found
+        if wrong(path, module, inside)
+    ]
+
+
+def test_imports_go_up(imported):
+    def wrong(path, module, _):
         parts = module.split(".")
-        if parts[0] == "jaxbundle" and len(parts) > 1 and parts[1] in LAYERS:
-            assert LAYERS.index(parts[1]) <= own, f"{path} imports {module}"
+        if parts[0] != "jaxbundle" or len(parts) == 1 or parts[1] not in LAYERS:
+            return False
+        return LAYERS.index(parts[1]) > LAYERS.index(layer_of(path))
+
+    assert refused(imported, wrong) == []
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_optional_packages_are_imported_where_needed(path):
-    for module, inside in imports(path):
-        assert inside or module.split(".")[0] not in OPTIONAL, f"{path} imports {module} at the top"
+def test_every_room_has_its_place():
+    assert {layer_of(path) for path in FILES} == set(LAYERS)
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_no_private_imports(path):
-    for module, _ in imports(path):
+def test_nothing_imports_in_a_circle(imported):
+    """Neither at the top nor inside a function."""
+    names = {path: ".".join(("jaxbundle", *path.relative_to(PACKAGE).with_suffix("").parts))
+             for path in FILES}  # fmt: skip
+    needs = {names[path]: {module for module, _ in found} for path, found in imported.items()}
+    sorter = graphlib.TopologicalSorter({name: needs[name] & set(needs) for name in needs})
+    sorter.prepare()
+
+
+def test_optional_packages_are_imported_where_needed(imported):
+    wrong = lambda _, module, inside: not inside and module.split(".")[0] in OPTIONAL
+    assert refused(imported, wrong) == []
+
+
+def test_no_private_imports(imported):
+    def wrong(_, module, __):
         parts = module.split(".")
-        outside = parts[0] != "jaxbundle"
         private = any(p.startswith("_") and not p.startswith("__") for p in parts)
-        assert not (outside and private), f"{path} imports {module}"
+        return parts[0] != "jaxbundle" and private
+
+    assert refused(imported, wrong) == []
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_geometry_and_cameras_know_no_solver(path):
-    if layer_of(path) in LIGHT:
-        for module, _ in imports(path):
-            assert module.split(".")[0] not in {"optimistix", "lineax"}, f"{path} imports {module}"
+def test_geometry_and_cameras_know_no_solver(imported):
+    solvers = {"optimistix", "lineax"}
+    wrong = lambda path, module, _: layer_of(path) in LIGHT and module.split(".")[0] in solvers
+    assert refused(imported, wrong) == []
 
 
 def test_the_page_of_the_architecture_names_files_that_are_there():

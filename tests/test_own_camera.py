@@ -14,12 +14,12 @@ import jaxbundle
 from jaxbundle import Camera, CameraModel, InputError, adjust, plotting, simulate_with_truth
 from jaxbundle.adjustment import design_matrix, make_problem, residuals
 from jaxbundle.adjustment.unknowns import Name
+from jaxbundle.bundle.repeated import _without_parameter
 from jaxbundle.cameras import brown, get_model
 from jaxbundle.io import read_cameras
-from jaxbundle.io.camera_files import write_cameras
-from jaxbundle.io.result_json import result_dict
+from jaxbundle.io.cameras.camera_files import write_cameras
+from jaxbundle.io.results.result_json import result_dict
 from jaxbundle.network.check import check_network
-from jaxbundle.repeated import _without_parameter
 
 PAGE = (Path(__file__).parents[1] / "docs" / "own_camera.md").read_text(encoding="utf-8")
 

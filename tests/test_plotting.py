@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
 from jaxbundle import plotting
+from jaxbundle.bundle.result import Adjustment
 from jaxbundle.cameras import default_parameters, get_model, project
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.geometry import matrix_from_quaternion
@@ -23,7 +24,6 @@ from jaxbundle.plotting import files, quality
 from jaxbundle.plotting.distortion import distortion_at
 from jaxbundle.plotting.style import extent, round_number
 from jaxbundle.plotting.views import camera_pyramids, error_ellipses
-from jaxbundle.result import Adjustment
 
 matplotlib.use("Agg")
 

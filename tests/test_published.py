@@ -13,10 +13,10 @@ import pytest
 
 import jaxbundle
 from jaxbundle.adjustment import make_problem
-from jaxbundle.bundle import adjust
+from jaxbundle.bundle.adjust import adjust
+from jaxbundle.bundle.minimum import minimise
 from jaxbundle.leastsquares.stopping import converged
 from jaxbundle.network.check import check_network
-from jaxbundle.solution import minimise
 
 pytestmark = pytest.mark.slow
 

@@ -13,8 +13,8 @@ from jaxbundle import Camera, grid_of_targets, ring_of_stations, simulate, stati
 from jaxbundle.adjustment.problem import make_problem
 from jaxbundle.cli.adjust import _why_not
 from jaxbundle.network.repetitions import warn_of_repetitions
-from jaxbundle.network.stations import Stations
 from jaxbundle.orientation.one_place import name_one_place
+from jaxbundle.planning.stations import Stations
 from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.statistics.weakness import VAGUE, Weakness, weakness, weakness_of_unsolved
 

@@ -4,8 +4,8 @@ from jaxbundle.calibration.calibrate import calibrate as calibrate
 from jaxbundle.calibration.files import write_calibration as write_calibration
 from jaxbundle.calibration.files import write_calibrations as write_calibrations
 from jaxbundle.calibration.result import Calibration as Calibration
-from jaxbundle.calibration.rig import calibrate_rig as calibrate_rig
-from jaxbundle.calibration.rig_result import RigCalibration as RigCalibration
+from jaxbundle.calibration.rig.calibrate import calibrate_rig as calibrate_rig
+from jaxbundle.calibration.rig.result import RigCalibration as RigCalibration
 from jaxbundle.calibration.several import Calibrations as Calibrations
 from jaxbundle.calibration.several import calibrate_cameras as calibrate_cameras
 from jaxbundle.measure import Board as Board

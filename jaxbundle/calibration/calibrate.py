@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.arguments import number, positive, shown, text, vector
-from jaxbundle.bundle import adjust, check_options
-from jaxbundle.calibration.frames import in_model_units, in_pixels, unit_size
+from jaxbundle.bundle.adjust import adjust, check_options
+from jaxbundle.calibration.pixels import in_model_units, in_pixels, unit_size
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.start import Start, start_values
 from jaxbundle.cameras import CameraModel, check_own, get_model, is_own

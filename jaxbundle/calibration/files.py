@@ -24,12 +24,12 @@ import numpy as np
 from jaxbundle.calibration.report import rig_dict
 from jaxbundle.errors import InputError
 from jaxbundle.io import adjusted_network, write_opencv
-from jaxbundle.io.colmap import FILES as COLMAP_FILES
-from jaxbundle.io.colmap import fill_colmap
-from jaxbundle.io.csv_tables import write_text
-from jaxbundle.io.folders import replaced_folder
-from jaxbundle.io.project import ADJUSTED, cameras_text, fill_project
-from jaxbundle.io.project import FILES as NETWORK_FILES
+from jaxbundle.io.networks.colmap import FILES as COLMAP_FILES
+from jaxbundle.io.networks.colmap import fill_colmap
+from jaxbundle.io.networks.project import ADJUSTED, cameras_text, fill_project
+from jaxbundle.io.networks.project import FILES as NETWORK_FILES
+from jaxbundle.io.text.csv_tables import write_text
+from jaxbundle.io.writing.folders import replaced_folder
 from jaxbundle.network.conversion import convert_cameras
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.plotting import write_figures
@@ -78,7 +78,7 @@ def write_calibration(
     **Arguments:** `force`: replace what no calibration has written.
 
     **Raises:** `InputError` where the folder may not or cannot be written
-    (`jaxbundle.io.folders`); `ImportError` for plots without matplotlib.
+    (`jaxbundle.io.writing.folders`); `ImportError` for plots without matplotlib.
     """
     if plots:
         need_matplotlib()

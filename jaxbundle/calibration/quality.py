@@ -7,8 +7,8 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbundle.bundle import adjust
-from jaxbundle.calibration.frames import in_model_units, in_pixels, unit_size
+from jaxbundle.bundle.adjust import adjust
+from jaxbundle.calibration.pixels import in_model_units, in_pixels, unit_size
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.compare import Comparison, compare_cameras
 from jaxbundle.errors import InputError, NotSolvedError

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from jaxbundle.io.csv_tables import table_rows
-from jaxbundle.io.result_json import result_dict
+from jaxbundle.io.results.result_json import result_dict
+from jaxbundle.io.text.csv_tables import table_rows
 from jaxbundle.report import observations
 from jaxbundle.report.layout import (
     clean,

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle import plotting
+from jaxbundle.bundle.result import Adjustment
 from jaxbundle.calibration import quality
 from jaxbundle.calibration.advice import advice
 from jaxbundle.calibration.left_out import left_out
@@ -16,7 +17,6 @@ from jaxbundle.cameras import get_model
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.tables import Camera
-from jaxbundle.result import Adjustment
 
 DISTANCES = 400
 """Distances of a curve of uncertainty, so many that no dip is missed."""

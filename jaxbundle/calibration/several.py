@@ -7,8 +7,8 @@ from pathlib import Path
 from jaxbundle.arguments import shown
 from jaxbundle.calibration.calibrate import calibrate
 from jaxbundle.calibration.result import Calibration
-from jaxbundle.calibration.rig import calibrate_rig
-from jaxbundle.calibration.rig_result import RigCalibration
+from jaxbundle.calibration.rig.calibrate import calibrate_rig
+from jaxbundle.calibration.rig.result import RigCalibration
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.measure.boards import Board
 from jaxbundle.measure.views import BoardViews
@@ -46,7 +46,7 @@ def calibrate_cameras(
     """Calibrate several cameras from photographs of one board.
 
     **Arguments:** `photographs` by the name of the camera; `rig`: the cameras are mounted rigidly
-    and photographed in step (`jaxbundle.calibration.rig`), the first is the reference; epochs that
+    and photographed in step (`calibration.rig`), the first is the reference; epochs that
     contradict the mounting are left out, and then single points (`snooping`, also where the cameras
     were estimated robustly), but with `snooping=None` neither, and such epochs are only named;
     `progress()`: after every photograph; `options`: those of `calibrate`.

@@ -18,8 +18,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.calibration.batch import BatchCalibration, calibrate_batch
-from jaxbundle.calibration.frames import images_of_board, in_model_units
+from jaxbundle.batch.calibrate import BatchCalibration, calibrate_batch
+from jaxbundle.calibration.pixels import images_of_board, in_model_units
 from jaxbundle.cameras import CameraModel, convert_camera, get_model, is_own
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.measure.views import BoardViews

@@ -13,22 +13,22 @@ Batch them with `jax.vmap`. A model is a `CameraModel`: a user's own, or one fou
 | `snavely` | Bundler and BAL | px, y up |
 """
 
-from .catalogue import MODEL_NAMES as MODEL_NAMES
-from .catalogue import get_model as get_model
-from .catalogue import is_own as is_own
-from .catalogue import key_of as key_of
-from .compare import Comparison as Comparison
-from .compare import compare_cameras as compare_cameras
-from .compare import difference_rings as difference_rings
-from .convert import Conversion as Conversion
-from .convert import convert_camera as convert_camera
-from .inverse import implicit_inverse as implicit_inverse
-from .model import CameraModel as CameraModel
-from .model import image_ray as image_ray
-from .model import project as project
-from .model import residual as residual
-from .own import check_own as check_own
-from .parameters import check_parameters as check_parameters
-from .parameters import default_parameters as default_parameters
-from .validity import turning_radius as turning_radius
-from .validity import validity_message as validity_message
+from jaxbundle.cameras.catalogue import MODEL_NAMES as MODEL_NAMES
+from jaxbundle.cameras.catalogue import get_model as get_model
+from jaxbundle.cameras.catalogue import is_own as is_own
+from jaxbundle.cameras.catalogue import key_of as key_of
+from jaxbundle.cameras.compare import Comparison as Comparison
+from jaxbundle.cameras.compare import compare_cameras as compare_cameras
+from jaxbundle.cameras.compare import difference_rings as difference_rings
+from jaxbundle.cameras.convert import Conversion as Conversion
+from jaxbundle.cameras.convert import convert_camera as convert_camera
+from jaxbundle.cameras.inverse import implicit_inverse as implicit_inverse
+from jaxbundle.cameras.model import CameraModel as CameraModel
+from jaxbundle.cameras.model import image_ray as image_ray
+from jaxbundle.cameras.model import project as project
+from jaxbundle.cameras.model import residual as residual
+from jaxbundle.cameras.own import check_own as check_own
+from jaxbundle.cameras.parameters import check_parameters as check_parameters
+from jaxbundle.cameras.parameters import default_parameters as default_parameters
+from jaxbundle.cameras.validity import turning_radius as turning_radius
+from jaxbundle.cameras.validity import validity_message as validity_message

@@ -21,9 +21,9 @@ published there and not offered here.
 
 import jax.numpy as jnp
 
-from . import brown
-from .model import CameraModel
-from .scalars import Pair, Parameters, Scalar
+from jaxbundle.cameras import brown
+from jaxbundle.cameras.model import CameraModel
+from jaxbundle.cameras.scalars import Pair, Parameters, Scalar
 
 S25 = 0.3737850724543663
 S26 = 0.304789700626975

@@ -18,8 +18,8 @@ Source: Brown (1971), Close-Range Camera Calibration, Photogrammetric Engineerin
 balanced form: Luhmann, Robson, Kyle and Boehm (2014), Close-Range Photogrammetry and 3D Imaging.
 """
 
-from .model import CameraModel
-from .scalars import Pair, Parameters, Scalar
+from jaxbundle.cameras.model import CameraModel
+from jaxbundle.cameras.scalars import Pair, Parameters, Scalar
 
 PARAMETERS = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2", "r0")
 

@@ -4,14 +4,14 @@ Own models are in no list: a list that grows would let one part of a program cha
 means in another.
 """
 
-from .bingo import BINGO
-from .brown import BROWN, BROWN_PROJECTED
-from .kannala_brandt import KANNALA_BRANDT
-from .model import CameraModel
-from .names import closest
-from .opencv import OPENCV
-from .snavely import SNAVELY
-from .usgs import USGS
+from jaxbundle.cameras.bingo import BINGO
+from jaxbundle.cameras.brown import BROWN, BROWN_PROJECTED
+from jaxbundle.cameras.kannala_brandt import KANNALA_BRANDT
+from jaxbundle.cameras.model import CameraModel
+from jaxbundle.cameras.names import closest
+from jaxbundle.cameras.opencv import OPENCV
+from jaxbundle.cameras.snavely import SNAVELY
+from jaxbundle.cameras.usgs import USGS
 
 MODELS = {
     model.name: model

@@ -20,15 +20,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.cameras.convert import Area, image_area
+from jaxbundle.cameras.convert_fit import GRID, image_grid, images_of, rays_of
+from jaxbundle.cameras.model import CameraModel, project
+from jaxbundle.cameras.parameters import default_parameters
+from jaxbundle.cameras.pixel_frame import between_frames
 from jaxbundle.float64 import local_x64
 from jaxbundle.geometry import matrix_from_rotation_vector
 from jaxbundle.types import Numbers
-
-from .convert import Area, image_area
-from .convert_fit import GRID, image_grid, images_of, rays_of
-from .frames import between_frames
-from .model import CameraModel, project
-from .parameters import default_parameters
 
 ITERATIONS = 20
 

@@ -10,13 +10,18 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.cameras.convert_exact import NotExact, exact_parameters
+from jaxbundle.cameras.convert_fit import (
+    fit_parameters,
+    image_grid,
+    images_of,
+    rays_of,
+    start_values,
+)
+from jaxbundle.cameras.model import CameraModel
+from jaxbundle.cameras.parameters import default_parameters
+from jaxbundle.cameras.pixel_frame import between_frames
 from jaxbundle.types import Numbers
-
-from .convert_exact import NotExact, exact_parameters
-from .convert_fit import fit_parameters, image_grid, images_of, rays_of, start_values
-from .frames import between_frames
-from .model import CameraModel
-from .parameters import default_parameters
 
 Area = tuple[Numbers, Numbers]
 MEASURABLE = 0.5

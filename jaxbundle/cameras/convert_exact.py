@@ -34,10 +34,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from jaxbundle.cameras.model import CameraModel
+from jaxbundle.cameras.pixel_frame import pixel_frame
 from jaxbundle.types import Numbers
-
-from .frames import pixel_frame
-from .model import CameraModel
 
 CORRECTIONS = ("brown", "usgs")
 DISTORTIONS = ("brown-projected", "opencv", "snavely")

@@ -15,10 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.float64 import local_x64
-from jaxbundle.types import Numbers
-
-from .convert_exact import (
+from jaxbundle.cameras.convert_exact import (
     CORRECTIONS,
     DISTORTIONS,
     Sizes,
@@ -27,9 +24,11 @@ from .convert_exact import (
     inverted_radial,
     normalised_correction,
 )
-from .frames import between_frames
-from .model import CameraModel, image_ray, project
-from .parameters import default_parameters
+from jaxbundle.cameras.model import CameraModel, image_ray, project
+from jaxbundle.cameras.parameters import default_parameters
+from jaxbundle.cameras.pixel_frame import between_frames
+from jaxbundle.float64 import local_x64
+from jaxbundle.types import Numbers
 
 MORE_FITTED = {"brown": ("b1", "b2"), "brown-projected": ("b1", "b2"), "usgs": ("K4",)}
 """What is fitted beside the parameters that are free if nothing is said."""

@@ -13,10 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbundle.cameras.model import CameraModel
+from jaxbundle.cameras.parameters import default_parameters
 from jaxbundle.float64 import local_x64
-
-from .model import CameraModel
-from .parameters import default_parameters
 
 AZIMUTHS = 12
 ROUNDING = 1e-13

@@ -19,12 +19,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxbundle.cameras.convert import image_area
+from jaxbundle.cameras.convert_fit import rays_of
+from jaxbundle.cameras.model import CameraModel
+from jaxbundle.cameras.parameters import default_parameters
 from jaxbundle.types import Numbers
-
-from .convert import image_area
-from .convert_fit import rays_of
-from .model import CameraModel
-from .parameters import default_parameters
 
 SMALL_FORMAT = (36.0, 24.0)
 """Width and height of a small-format ("35 mm") image, mm."""

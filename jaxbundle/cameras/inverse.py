@@ -31,7 +31,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from .scalars import Formula
+from jaxbundle.cameras.scalars import Formula
 
 
 def implicit_inverse(g: Formula, start: Formula, iterations: int = 6) -> Formula:

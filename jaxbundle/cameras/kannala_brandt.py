@@ -13,9 +13,9 @@ coefficients without unit, θ in radians.
 Source: Kannala and Brandt (2006), IEEE PAMI 28(8), eq. 6; OpenCV 4 documentation, fisheye.
 """
 
-from . import opencv
-from .model import CameraModel
-from .scalars import Pair, Parameters, Scalar
+from jaxbundle.cameras import opencv
+from jaxbundle.cameras.model import CameraModel
+from jaxbundle.cameras.scalars import Pair, Parameters, Scalar
 
 
 def distort(p: Parameters, xi: Scalar, yi: Scalar) -> Pair:

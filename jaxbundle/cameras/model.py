@@ -15,10 +15,10 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Literal
 
-from .equidistant import equidistant
-from .inverse import implicit_inverse
-from .perspective import perspective
-from .scalars import Formula, OfRay, Pair, Parameters, Scalar, ToRay, Triple
+from jaxbundle.cameras.equidistant import equidistant
+from jaxbundle.cameras.inverse import implicit_inverse
+from jaxbundle.cameras.perspective import perspective
+from jaxbundle.cameras.scalars import Formula, OfRay, Pair, Parameters, Scalar, ToRay, Triple
 
 IMAGES = {"perspective": perspective, "equidistant": equidistant}
 FORMULAS = ("correct", "distort", "project")

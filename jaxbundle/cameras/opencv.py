@@ -16,8 +16,8 @@ coefficients without unit. Ideal coordinates are pixels from the principal point
 Source: OpenCV 4 documentation, calib3d, "Camera Calibration and 3D Reconstruction".
 """
 
-from .model import CameraModel
-from .scalars import Pair, Parameters, Scalar
+from jaxbundle.cameras.model import CameraModel
+from jaxbundle.cameras.scalars import Pair, Parameters, Scalar
 
 
 def distort(p: Parameters, xi: Scalar, yi: Scalar) -> Pair:

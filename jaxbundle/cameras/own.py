@@ -7,10 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbundle.cameras.inverse import value_and_derivative
+from jaxbundle.cameras.model import CameraModel
 from jaxbundle.float64 import local_x64
-
-from .inverse import value_and_derivative
-from .model import CameraModel
 
 ROUND_TRIP = 1e-9
 """So much of the principal distance an inverse may miss the point."""

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from .model import CameraModel
-from .names import closest
+from jaxbundle.cameras.model import CameraModel
+from jaxbundle.cameras.names import closest
 
 
 def default_parameters(model: CameraModel) -> dict[str, float]:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 
-from .scalars import OfRay, Pair, Parameters, Scalar, ToRay, Triple
+from jaxbundle.cameras.scalars import OfRay, Pair, Parameters, Scalar, ToRay, Triple
 
 
 def perspective(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:

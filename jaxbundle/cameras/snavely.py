@@ -10,8 +10,8 @@ Source: Snavely, Seitz and Szeliski (2006), Photo Tourism; Agarwal et al. (2010)
 in the Large.
 """
 
-from .model import CameraModel
-from .scalars import Pair, Parameters, Scalar
+from jaxbundle.cameras.model import CameraModel
+from jaxbundle.cameras.scalars import Pair, Parameters, Scalar
 
 
 def distort(p: Parameters, xi: Scalar, yi: Scalar) -> Pair:

@@ -15,9 +15,9 @@ Source: Light (1992), The new camera calibration system at the U.S. Geological S
 the figures of a Report of Calibration of 16 June 2005 follow.
 """
 
-from . import brown
-from .model import CameraModel
-from .scalars import Pair, Parameters, Scalar
+from jaxbundle.cameras import brown
+from jaxbundle.cameras.model import CameraModel
+from jaxbundle.cameras.scalars import Pair, Parameters, Scalar
 
 
 def polynomial(p: Parameters, x: Scalar, y: Scalar) -> Pair:

@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .inverse import value_and_derivative
-from .model import CameraModel
-from .parameters import default_parameters
+from jaxbundle.cameras.inverse import value_and_derivative
+from jaxbundle.cameras.model import CameraModel
+from jaxbundle.cameras.parameters import default_parameters
 
 AZIMUTHS = 36
 STEPS = 400

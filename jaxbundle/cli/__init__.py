@@ -1,7 +1,7 @@
 """The command line, a file for each command.
 
 Exit status: 0 solved; 2 bad input (one line, nothing written); 3 not solved (says why); 130, 143,
-129 ended by Ctrl-C, SIGTERM, a lost terminal (`jaxbundle.interrupts`); 141 nobody reads the output.
+129 ended by Ctrl-C, SIGTERM, a lost terminal (`system.interrupts`); 141 nobody reads the output.
 """
 
 import importlib

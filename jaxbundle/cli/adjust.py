@@ -8,16 +8,16 @@ import typer
 import jaxbundle
 from jaxbundle import report
 from jaxbundle.adjustment.problem import REDUCTIONS
+from jaxbundle.bundle.result import Adjustment
 from jaxbundle.cli.app import Control, Force, Format, Input, Quiet, Settings, app
+from jaxbundle.cli.outputs import check_targets, write_targets
 from jaxbundle.cli.processes import check_sameness, join_processes
 from jaxbundle.cli.progress import iterating
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io import read_network
-from jaxbundle.io.fingerprints import of_input
+from jaxbundle.io.writing.fingerprints import of_input
 from jaxbundle.leastsquares.snooping import check_test
 from jaxbundle.network.columns import some
-from jaxbundle.result import Adjustment
-from jaxbundle.targets import check_targets, write_targets
 
 
 @app.command()

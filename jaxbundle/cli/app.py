@@ -9,8 +9,8 @@ from typing import Annotated, NoReturn
 import typer
 
 import jaxbundle
-from jaxbundle.configuration import leave
 from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.system.configuration import leave
 
 BAD_INPUT, NOT_SOLVED = 2, 3
 NO_READER = 128 + 13

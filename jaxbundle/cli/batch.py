@@ -6,12 +6,12 @@ import typer
 
 import jaxbundle
 from jaxbundle.arguments import one_of
-from jaxbundle.batches import run_batch
-from jaxbundle.calibration.batch_snooping import TESTS
+from jaxbundle.batch.run import run_batch
+from jaxbundle.batch.snooping import TESTS
+from jaxbundle.batch.stacks import is_camera_stack
 from jaxbundle.cli.app import Quiet, app
 from jaxbundle.cli.progress import counting
-from jaxbundle.interrupts import advise
-from jaxbundle.io.camera_stacks import is_camera_stack
+from jaxbundle.system.interrupts import advise
 
 
 @app.command()

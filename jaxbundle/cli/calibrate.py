@@ -16,12 +16,12 @@ from jaxbundle.calibration.files import (
     json_text,
 )
 from jaxbundle.cli.app import Force, Quiet, app
+from jaxbundle.cli.outputs import can_plot, check_writable, name_inside, written
 from jaxbundle.cli.progress import counting
 from jaxbundle.errors import InputError, NotSolvedError
-from jaxbundle.io.result_json import unsolved_text
+from jaxbundle.io.results.result_json import unsolved_text
 from jaxbundle.leastsquares.snooping import check_test
 from jaxbundle.measure.views import photographs
-from jaxbundle.targets import can_plot, check_writable, name_inside, written
 
 
 @app.command()

@@ -17,8 +17,8 @@ from jaxbundle.cameras.field_of_view import (
 from jaxbundle.cli.app import app
 from jaxbundle.cli.cameras_given import camera_given, pair, write_png
 from jaxbundle.errors import InputError
-from jaxbundle.io.assemble import all_parameters
-from jaxbundle.io.csv_tables import write_csv
+from jaxbundle.io.networks.assemble import all_parameters
+from jaxbundle.io.text.csv_tables import write_csv
 from jaxbundle.network.tables import Camera
 
 STEPS, CURVE = 12, 200

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_network
-from jaxbundle.io.calibrated import is_result, read_calibrated
-from jaxbundle.io.camera_files import LOOKS, chosen_camera, is_camera_file, read_cameras
-from jaxbundle.io.csv_tables import write_bytes
+from jaxbundle.io.cameras.calibrated import is_result, read_calibrated
+from jaxbundle.io.cameras.camera_files import LOOKS, chosen_camera, is_camera_file, read_cameras
+from jaxbundle.io.cameras.nearest_camera import fits_told
 from jaxbundle.io.formats import FORMATS, recognised_format
-from jaxbundle.io.nearest_camera import fits_told
+from jaxbundle.io.text.csv_tables import write_bytes
 from jaxbundle.network.tables import Camera
 from jaxbundle.statistics.difference import Covariance
 

@@ -13,8 +13,8 @@ from jaxbundle.cameras.compare import compare_cameras, difference_rings
 from jaxbundle.cli.app import app
 from jaxbundle.cli.cameras_given import calibration_given, pair, write_png
 from jaxbundle.errors import InputError
-from jaxbundle.io.assemble import all_parameters
-from jaxbundle.io.csv_tables import write_csv
+from jaxbundle.io.networks.assemble import all_parameters
+from jaxbundle.io.text.csv_tables import write_csv
 from jaxbundle.statistics.difference import expected_difference
 
 RINGS = 10

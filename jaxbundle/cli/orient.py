@@ -7,10 +7,10 @@ import typer
 
 import jaxbundle
 from jaxbundle.cli.app import Control, Force, Format, Input, Quiet, Settings, app
+from jaxbundle.cli.outputs import network_files
 from jaxbundle.io import read_network, write_project
-from jaxbundle.io.folders import check_folder
-from jaxbundle.io.project import FILES
-from jaxbundle.targets import network_files
+from jaxbundle.io.networks.project import FILES
+from jaxbundle.io.writing.folders import check_folder
 
 
 @app.command()

@@ -11,11 +11,11 @@ from jaxbundle.cli.app import Force, app
 from jaxbundle.cli.cameras_given import pair
 from jaxbundle.errors import InputError
 from jaxbundle.io import write_project
-from jaxbundle.io.folders import check_folder
-from jaxbundle.io.project import FILES
-from jaxbundle.network.planned_block import planned_network
-from jaxbundle.network.planning import design_block, relief_displacement
+from jaxbundle.io.networks.project import FILES
+from jaxbundle.io.writing.folders import check_folder
 from jaxbundle.network.tables import Camera
+from jaxbundle.planning.planned_block import planned_network
+from jaxbundle.planning.vertical_photographs import design_block, relief_displacement
 from jaxbundle.statistics.expected import expected_precision
 
 MOST_PHOTOGRAPHS = 2000

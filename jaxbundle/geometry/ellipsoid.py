@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from .vectors import Scalar, Triple, Vector, along, dot, unit
+from jaxbundle.geometry.vectors import Scalar, Triple, Vector, along, dot, unit
 
 
 class Ellipsoid(NamedTuple):

@@ -36,9 +36,12 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
+from jaxbundle.geometry.quaternions import (
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    traced_once,
+)
 from jaxbundle.types import AnyArray, Scalar
-
-from .quaternions import matrix_from_quaternion, quaternion_from_matrix, traced_once
 
 
 def R1(omega: Scalar) -> Float[Array, "3 3"]:

@@ -22,9 +22,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from jaxbundle.types import AnyArray
-
-from .quaternions import (
+from jaxbundle.geometry.quaternions import (
     matrix_from_quaternion,
     matrix_from_rotation_vector,
     quaternion_conjugate,
@@ -33,6 +31,7 @@ from .quaternions import (
     rotation_vector_from_quaternion,
     traced_once,
 )
+from jaxbundle.types import AnyArray
 
 
 @traced_once

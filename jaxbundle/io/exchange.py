@@ -12,20 +12,20 @@ from pathlib import Path
 from jaxbundle.arguments import path as given_path
 from jaxbundle.cameras import CameraModel, Conversion, key_of
 from jaxbundle.errors import InputError
-from jaxbundle.io.bundler import LIST
-from jaxbundle.io.camera_files import (
+from jaxbundle.io.cameras.camera_files import (
     chosen_camera,
     is_camera_file,
     read_cameras,
     write_cameras,
 )
-from jaxbundle.io.colmap import write_colmap_cameras
-from jaxbundle.io.coordinates import images_path
-from jaxbundle.io.folders import check_folder, replaced_folder
+from jaxbundle.io.cameras.nearest_camera import fits_told
+from jaxbundle.io.cameras.opencv_file import SUFFIXES, write_opencv
 from jaxbundle.io.formats import PIXEL_MODELS, TARGETS, check_own_models, read_network
-from jaxbundle.io.nearest_camera import fits_told
-from jaxbundle.io.opencv_file import SUFFIXES, write_opencv
-from jaxbundle.io.project import FILE_NAME
+from jaxbundle.io.networks.bundler import LIST
+from jaxbundle.io.networks.colmap import write_colmap_cameras
+from jaxbundle.io.networks.project import FILE_NAME
+from jaxbundle.io.results.coordinates import images_path
+from jaxbundle.io.writing.folders import check_folder, replaced_folder
 from jaxbundle.network.columns import did_you_mean, some
 from jaxbundle.network.conversion import convert_cameras, convert_one
 from jaxbundle.network.outside import outside_warnings

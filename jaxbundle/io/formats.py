@@ -10,26 +10,26 @@ from jaxbundle.arguments import path as given_path
 from jaxbundle.arguments import shown
 from jaxbundle.cameras import CameraModel
 from jaxbundle.errors import InputError
-from jaxbundle.file_content import is_plain
-from jaxbundle.io.bal import OPENERS, is_bal, read_bal, write_bal
-from jaxbundle.io.bingo import is_bingo, read_bingo
-from jaxbundle.io.bundler import is_bundler, read_bundler, write_bundler
-from jaxbundle.io.camera_files import is_camera_file
-from jaxbundle.io.colmap import FILES as COLMAP_FILES
-from jaxbundle.io.colmap import fill_colmap, is_colmap, read_colmap
-from jaxbundle.io.column_map import is_column_map, read_column_map
-from jaxbundle.io.control import read_control, with_control
-from jaxbundle.io.coordinates import write_coordinates
-from jaxbundle.io.dxf import write_dxf
-from jaxbundle.io.metashape import is_metashape, read_metashape
-from jaxbundle.io.photo_list import read_photo_list
-from jaxbundle.io.photomodeler import is_photomodeler, read_photomodeler
-from jaxbundle.io.ply import write_ply
-from jaxbundle.io.project import FILE_NAME, fill_project, project_file, read_project
-from jaxbundle.io.project import FILES as PROJECT_FILES
+from jaxbundle.io.cameras.camera_files import is_camera_file
+from jaxbundle.io.networks.bal import OPENERS, is_bal, read_bal, write_bal
+from jaxbundle.io.networks.bingo import is_bingo, read_bingo
+from jaxbundle.io.networks.bundler import is_bundler, read_bundler, write_bundler
+from jaxbundle.io.networks.colmap import FILES as COLMAP_FILES
+from jaxbundle.io.networks.colmap import fill_colmap, is_colmap, read_colmap
+from jaxbundle.io.networks.column_map import is_column_map, read_column_map
+from jaxbundle.io.networks.control import read_control, with_control
+from jaxbundle.io.networks.metashape import is_metashape, read_metashape
+from jaxbundle.io.networks.photo_list import read_photo_list
+from jaxbundle.io.networks.photomodeler import is_photomodeler, read_photomodeler
+from jaxbundle.io.networks.project import FILE_NAME, fill_project, project_file, read_project
+from jaxbundle.io.networks.project import FILES as PROJECT_FILES
+from jaxbundle.io.results.coordinates import write_coordinates
+from jaxbundle.io.results.dxf import write_dxf
+from jaxbundle.io.results.ply import write_ply
 from jaxbundle.network.columns import count, did_you_mean, some
 from jaxbundle.network.rules import check_unique, model_of
 from jaxbundle.network.tables import Network, Source
+from jaxbundle.system.file_content import is_plain
 
 FIRST_LINES = 100_000
 """Characters of a file that tell what it is."""
@@ -164,7 +164,7 @@ def read_network(
     - `path`: a file or folder.
     - `format`: a name in `FORMATS`; recognised from the path and its content if not given.
     - `overrides`: settings `KEY=VALUE` that replace those of the input.
-    - `control`: a table whose control points replace those of the input (`jaxbundle.io.control`).
+    - `control`: a table whose control points replace those of the input (`networks.control`).
     - `models`: `CameraModel`s of one's own that a project, or a column map, may name.
 
     **Raises:** `InputError`.

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from jaxbundle.errors import InputError
-from jaxbundle.file_content import read_content
 from jaxbundle.measure.opencv import need_opencv
+from jaxbundle.system.file_content import read_content
 
 
 def read_photograph(path: str | Path) -> UInt8[np.ndarray, "rows columns"]:

@@ -12,12 +12,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbundle.arguments import numeric_array
-from jaxbundle.configuration import available_cores
 from jaxbundle.errors import InputError
-from jaxbundle.file_content import read_content
 from jaxbundle.measure.boards import Board, require_board
 from jaxbundle.measure.corners import find_board, largest_chessboard, other_sizes
 from jaxbundle.measure.photographs import read_photograph
+from jaxbundle.system.configuration import available_cores
+from jaxbundle.system.file_content import read_content
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".jp2")
 """Files of a folder that are taken for photographs."""

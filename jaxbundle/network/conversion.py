@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from jaxbundle.cameras import CameraModel, Conversion, convert_camera, get_model, is_own, key_of
-from jaxbundle.cameras.frames import between_frames
+from jaxbundle.cameras.pixel_frame import between_frames
 from jaxbundle.errors import InputError
 from jaxbundle.network.further import Edges
 from jaxbundle.network.rules import model_of

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbundle.cameras import get_model
-from jaxbundle.cameras.frames import pixel_frame
+from jaxbundle.cameras.pixel_frame import pixel_frame
 from jaxbundle.errors import InputError
 from jaxbundle.network.tables import Camera
 

@@ -18,10 +18,9 @@ from jaxbundle.geometry import (
     rotation_vector_from_quaternion,
     transform_point,
 )
-
-from .least_squares import inverse
-from .linear import extent, normalisation, ones_unless
-from .status import Status, first_of
+from jaxbundle.orientation.least_squares import inverse
+from jaxbundle.orientation.linear import extent, normalisation, ones_unless
+from jaxbundle.orientation.status import Status, first_of
 
 LINE = 1e-7
 """Points whose second extent is below this part of the first lie on a line."""

@@ -23,10 +23,10 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
-from .least_squares import adjust
-from .linear import extent, normalisation, null_vector, ones_unless
-from .pose import Pose, image_of, retract_pose, to_camera
-from .status import Status, first_of
+from jaxbundle.orientation.least_squares import adjust
+from jaxbundle.orientation.linear import extent, normalisation, null_vector, ones_unless
+from jaxbundle.orientation.pose import Pose, image_of, retract_pose, to_camera
+from jaxbundle.orientation.status import Status, first_of
 
 FLAT = 1e-7
 """Extents of points, and second last singular values, below this part of the first are zero."""

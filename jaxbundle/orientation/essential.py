@@ -20,8 +20,8 @@ from jax import Array
 from jax.lax import stop_gradient
 from jaxtyping import Bool, Float
 
-from .linear import normalisation, null_space, null_vector, ones_unless
-from .pose import ray_of
+from jaxbundle.orientation.linear import normalisation, null_space, null_vector, ones_unless
+from jaxbundle.orientation.pose import ray_of
 
 REAL = 1e-6
 """A root is real if its imaginary part is below this part of its length."""

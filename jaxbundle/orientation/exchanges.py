@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from jaxbundle.network.columns import some
 from jaxbundle.network.tables import Network
 from jaxbundle.orientation import many
-from jaxbundle.orientation.frames import FITS
+from jaxbundle.orientation.alignment import FITS
 from jaxbundle.orientation.growth import FOR_ITSELF, Model, controlled, intersect
 from jaxbundle.orientation.sights import Sights, sights
 

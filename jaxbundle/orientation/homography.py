@@ -19,9 +19,9 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
-from .linear import extent, normalisation, null_vector, ones_unless
-from .pose import Pose
-from .status import Status, first_of
+from jaxbundle.orientation.linear import extent, normalisation, null_vector, ones_unless
+from jaxbundle.orientation.pose import Pose
+from jaxbundle.orientation.status import Status, first_of
 
 LINE = 1e-7
 """Points whose second extent is below this part of the first lie on a line."""

@@ -16,9 +16,9 @@ from jax import Array
 from jax.lax import stop_gradient
 from jaxtyping import Float, Int
 
-from .least_squares import adjust
-from .linear import ones_unless
-from .status import Status, first_of
+from jaxbundle.orientation.least_squares import adjust
+from jaxbundle.orientation.linear import ones_unless
+from jaxbundle.orientation.status import Status, first_of
 
 PARALLEL = 1e-7
 """Angle of intersection, in radians, below which rays are parallel."""

@@ -18,14 +18,13 @@ from jaxbundle.geometry import (
     rotation_vector_from_matrix,
     transform_point,
 )
-
-from .absolute import absolute_orientation
-from .intersection import intersection, misclosure
-from .least_squares import minimise
-from .pose import Pose
-from .resection import refine_resection
-from .robust import robust_relative_orientation, robust_resection
-from .status import Status
+from jaxbundle.orientation.absolute import absolute_orientation
+from jaxbundle.orientation.intersection import intersection, misclosure
+from jaxbundle.orientation.least_squares import minimise
+from jaxbundle.orientation.pose import Pose
+from jaxbundle.orientation.resection import refine_resection
+from jaxbundle.orientation.robust import robust_relative_orientation, robust_resection
+from jaxbundle.orientation.status import Status
 
 SLOTS = 64
 """Points of an image, of a pair, of two models."""

@@ -27,8 +27,8 @@ from jaxbundle.network.sightings import keep_images, keep_points
 from jaxbundle.network.tables import Network
 from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.orientation import many
+from jaxbundle.orientation.alignment import joined, mirrored, onto_the_given, to_scale
 from jaxbundle.orientation.exchanges import name_contradiction, name_suspects
-from jaxbundle.orientation.frames import joined, mirrored, onto_the_given, to_scale
 from jaxbundle.orientation.growth import (
     AGREE,
     FOR_OTHERS,

@@ -20,10 +20,10 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from .homography import homography
-from .linear import ones_unless
-from .pose import ray_of
-from .status import Status, first_of
+from jaxbundle.orientation.homography import homography
+from jaxbundle.orientation.linear import ones_unless
+from jaxbundle.orientation.pose import ray_of
+from jaxbundle.orientation.status import Status, first_of
 
 SAME = 1e-9
 """Squares of singular values nearer than this are equal: there is no base."""

@@ -22,14 +22,13 @@ from jax.lax import stop_gradient
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.geometry import matrix_from_quaternion, matrix_from_rotation_vector
-
-from .absolute import rotation_between
-from .essential import eight_points, five_points, orientations
-from .homography import apply_homography, homography
-from .least_squares import finish, minimise
-from .linear import ones_unless
-from .pose import Pose, image_of, ray_of
-from .status import Status, first_of
+from jaxbundle.orientation.absolute import rotation_between
+from jaxbundle.orientation.essential import eight_points, five_points, orientations
+from jaxbundle.orientation.homography import apply_homography, homography
+from jaxbundle.orientation.least_squares import finish, minimise
+from jaxbundle.orientation.linear import ones_unless
+from jaxbundle.orientation.pose import Pose, image_of, ray_of
+from jaxbundle.orientation.status import Status, first_of
 
 SIMPLER = 6.0
 """Ratio of variances below which the simpler explanation counts: F(0.99) of a dozen points."""

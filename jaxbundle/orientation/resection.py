@@ -15,11 +15,11 @@ from jax import Array
 from jax.lax import stop_gradient
 from jaxtyping import Float, Int
 
-from .least_squares import finish, minimise
-from .linear import extent, normalisation, ones_unless
-from .pose import Pose, image_of, ray_of, retract_pose, to_camera
-from .status import Status, first_of
-from .three_points import three_points
+from jaxbundle.orientation.least_squares import finish, minimise
+from jaxbundle.orientation.linear import extent, normalisation, ones_unless
+from jaxbundle.orientation.pose import Pose, image_of, ray_of, retract_pose, to_camera
+from jaxbundle.orientation.status import Status, first_of
+from jaxbundle.orientation.three_points import three_points
 
 LINE = 1e-7
 """Points whose second extent is below this part of the first lie on a line."""

@@ -21,23 +21,22 @@ from jax import Array
 from jaxtyping import Bool, Float, PyTree
 
 from jaxbundle.geometry import transform_point
-
-from .absolute import AbsoluteOrientation, absolute_orientation
-from .dlt import direct_linear_transformation
-from .essential import five_points, orientations
-from .homography import apply_homography, homography
-from .intersection import Intersection, intersection
-from .linear import ones_unless
-from .pose import image_of, ray_of, to_camera
-from .relative import (
+from jaxbundle.orientation.absolute import AbsoluteOrientation, absolute_orientation
+from jaxbundle.orientation.dlt import direct_linear_transformation
+from jaxbundle.orientation.essential import five_points, orientations
+from jaxbundle.orientation.homography import apply_homography, homography
+from jaxbundle.orientation.intersection import Intersection, intersection
+from jaxbundle.orientation.linear import ones_unless
+from jaxbundle.orientation.pose import image_of, ray_of, to_camera
+from jaxbundle.orientation.relative import (
     RelativeOrientation,
     distances_along_rays,
     relative_orientation,
     sampson_distance,
 )
-from .resection import Resection, refine_resection
-from .status import Status
-from .three_points import three_points
+from jaxbundle.orientation.resection import Resection, refine_resection
+from jaxbundle.orientation.status import Status
+from jaxbundle.orientation.three_points import three_points
 
 FAR = 1e6
 """Error of an observation that contradicts a model altogether (a point behind the camera)."""

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
-from .pose import Pose
+from jaxbundle.orientation.pose import Pose
 
 FITS = 1e-9
 """Greatest misclosure of the law of cosines, in parts of the sum of the squared sides."""

@@ -1,1 +1,1 @@
-"""Networks before there are photographs: rendered photographs of known surfaces."""
+"""Networks before there are photographs: stations, targets, simulated and rendered measurements."""

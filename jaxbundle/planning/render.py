@@ -20,13 +20,13 @@ from jaxtyping import Float, Int, UInt8
 
 from jaxbundle.arguments import at_least_zero, numeric_array, vector, whole
 from jaxbundle.cameras import default_parameters, get_model, image_ray
-from jaxbundle.cameras.frames import pixel_frame
-from jaxbundle.configuration import available_cores
+from jaxbundle.cameras.pixel_frame import pixel_frame
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.network.tables import Camera
 from jaxbundle.planning.shapes import Shape
 from jaxbundle.planning.texture import Texture
+from jaxbundle.system.configuration import available_cores
 
 STRIP = 1 << 17
 """Pixels that are rendered together."""

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.csv_tables import write_bytes
-from jaxbundle.io.folders import replaced_folder
+from jaxbundle.io.text.csv_tables import write_bytes
+from jaxbundle.io.writing.folders import replaced_folder
 from jaxbundle.plotting.cameras import correlation_matrix, distortion_curve
 from jaxbundle.plotting.images import residual_histogram, residual_vectors
 from jaxbundle.plotting.style import need_matplotlib
@@ -39,7 +39,7 @@ def save_figures(adjustment, folder: str | Path, force: bool = False) -> list[Pa
     **Returns:** the paths written.
 
     **Raises:** `ImportError` without matplotlib, `InputError` where the folder cannot or may not be
-    written (`jaxbundle.io.folders`), `NotSolvedError` where there is no result.
+    written (`jaxbundle.io.writing.folders`), `NotSolvedError` where there is no result.
     """
     need_matplotlib()
     with replaced_folder(folder, "save_figures", FIGURES, force) as new:

@@ -23,11 +23,10 @@ from scipy.optimize import brentq
 
 from jaxbundle.geometry.ellipsoid import geodetic
 from jaxbundle.geometry.vectors import Vector, difference
-
-from .image import PushbroomImage
-from .locate import locate_point
-from .noise import Noise, disturbed, draw, no_errors, sigmas
-from .surfaces import Surface
+from jaxbundle.pushbroom.image import PushbroomImage
+from jaxbundle.pushbroom.locate import locate_point
+from jaxbundle.pushbroom.noise import Noise, disturbed, draw, no_errors, sigmas
+from jaxbundle.pushbroom.surfaces import Surface
 
 TINY = 1e-300
 """Instead of zero under a fraction."""

@@ -9,9 +9,8 @@ from jaxtyping import Float
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.network.tables import Source
-
-from .interpolation import METHODS, Table
-from .trajectory import Attitude
+from jaxbundle.pushbroom.interpolation import METHODS, Table
+from jaxbundle.pushbroom.trajectory import Attitude
 
 POSITIONS, ATTITUDE = Source("positions"), Source("attitude")
 

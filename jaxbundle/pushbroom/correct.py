@@ -20,15 +20,14 @@ from jaxtyping import Float
 
 from jaxbundle.geometry.ellipsoid import earth_fixed, up
 from jaxbundle.geometry.vectors import difference, dot, length
+from jaxbundle.pushbroom.accuracy import east_north, horizontal
+from jaxbundle.pushbroom.image import Pose, PushbroomImage
+from jaxbundle.pushbroom.locate import ground_point
+from jaxbundle.pushbroom.passages import sample
+from jaxbundle.pushbroom.project import Search, project_from, project_points
+from jaxbundle.pushbroom.surfaces import Ground, Surface
+from jaxbundle.pushbroom.terrain import Terrain, bilinear
 from jaxbundle.types import AnyArray
-
-from .accuracy import east_north, horizontal
-from .image import Pose, PushbroomImage
-from .locate import ground_point
-from .passages import sample
-from .project import Search, project_from, project_points
-from .surfaces import Ground, Surface
-from .terrain import Terrain, bilinear
 
 BLOCK, STEP = 256, 16
 """Pixels of a block of the map along each side, and between its nodes."""

@@ -42,8 +42,7 @@ from jaxbundle.geometry.vectors import (
     unit,
     unpacked,
 )
-
-from .frames import EARTH_RATE
+from jaxbundle.pushbroom.earth_frames import EARTH_RATE
 
 LIGHT = 299792458.0
 """Speed of light, m/s."""

@@ -22,12 +22,11 @@ from jaxtyping import Array, Float
 
 from jaxbundle.geometry.ellipsoid import Ellipsoid, at_height, residual
 from jaxbundle.geometry.vectors import along, difference
-
-from .newton import motion
-from .passages import ahead, slopes
-from .pieces import CHUNK, Pieces
-from .polynomial import value, value_and_rate
-from .surfaces import Ground, Plane
+from jaxbundle.pushbroom.newton import motion
+from jaxbundle.pushbroom.passages import ahead, slopes
+from jaxbundle.pushbroom.pieces import CHUNK, Pieces
+from jaxbundle.pushbroom.polynomial import value, value_and_rate
+from jaxbundle.pushbroom.surfaces import Ground, Plane
 
 HEIGHTS = -1000.0, 10_000.0
 """Lowest and highest height, metres, if the camera is more than twice as high."""

@@ -18,18 +18,17 @@ from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.geometry import matrix_from_rotation_vector
 from jaxbundle.network.tables import Source
-from jaxbundle.types import Numbers, Scalar
-
-from .ancillary import ATTITUDE, POSITIONS, check_covered
-from .corrections import Corrections
-from .scanner import LineTimes, Optics
-from .trajectory import (
+from jaxbundle.pushbroom.ancillary import ATTITUDE, POSITIONS, check_covered
+from jaxbundle.pushbroom.corrections import Corrections
+from jaxbundle.pushbroom.scanner import LineTimes, Optics
+from jaxbundle.pushbroom.trajectory import (
     Trajectory,
     matrix_from_pitch_roll_yaw,
     position_at,
     rotation_at,
     velocity_at,
 )
+from jaxbundle.types import Numbers, Scalar
 
 LONGEST = 10_000_000
 """More lines or pixels than any image has."""

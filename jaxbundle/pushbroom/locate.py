@@ -12,13 +12,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxbundle.geometry.vectors import Triple, along, difference, length, turned
+from jaxbundle.pushbroom.corrections import Corrections, earlier_earth, inertial_velocity, refracted
+from jaxbundle.pushbroom.corrections import true_direction as without_aberration
+from jaxbundle.pushbroom.image import Pose, PushbroomImage, pose_at
+from jaxbundle.pushbroom.scanner import Pair, slopes_of
+from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.types import Scalar
-
-from .corrections import Corrections, earlier_earth, inertial_velocity, refracted
-from .corrections import true_direction as without_aberration
-from .image import Pose, PushbroomImage, pose_at
-from .scanner import Pair, slopes_of
-from .surfaces import Surface
 
 TOGETHER = 1000
 """Pixels that are refracted together, layer by layer: 8000 take half as long again."""

@@ -15,9 +15,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxbundle.geometry.vectors import difference
-
-from .corrections import seen_point
-from .polynomial import value, value_and_rate
+from jaxbundle.pushbroom.corrections import seen_point
+from jaxbundle.pushbroom.polynomial import value, value_and_rate
 
 STEPS = 2
 """Steps of a round."""

@@ -24,9 +24,8 @@ from jaxbundle.geometry import (
     quaternion_multiply,
 )
 from jaxbundle.geometry.quaternions import matrix_from_rotation_vector
+from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.types import AnyArray
-
-from .image import PushbroomImage
 
 Sigma = float | Float[np.ndarray, "3"]
 

@@ -14,8 +14,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from jaxbundle.errors import InputError
-
-from .frames import EARTH_RATE, GM, Rows
+from jaxbundle.pushbroom.earth_frames import EARTH_RATE, GM, Rows
 
 J2 = 1.08262668e-3
 RADIUS = 6378137.0

@@ -16,9 +16,8 @@ import numpy as np
 
 from jaxbundle.geometry.ellipsoid import normal
 from jaxbundle.geometry.vectors import difference, dot
-
-from .newton import line_period, motion, seen_from
-from .polynomial import value, value_and_rate
+from jaxbundle.pushbroom.newton import line_period, motion, seen_from
+from jaxbundle.pushbroom.polynomial import value, value_and_rate
 
 SEARCH, FINE_SEARCH = 128, 512
 """The search has so many steps at most; where the camera may turn back, the finer one."""

@@ -17,9 +17,8 @@ from jaxtyping import Array, Float
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid, ray_to_ellipsoid
 from jaxbundle.geometry.vectors import turned
-
-from .image import PushbroomImage, pose_at
-from .interpolation import breaks, span
+from jaxbundle.pushbroom.image import PushbroomImage, pose_at
+from jaxbundle.pushbroom.interpolation import breaks, span
 
 DEGREE = 3
 TOLERANCE = 1e-7

@@ -26,15 +26,20 @@ from jaxtyping import Array, Float, Int
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, normal
 from jaxbundle.geometry.vectors import Vector, difference, dot, turned_back
 from jaxbundle.implicit import implicit_root, solve_dense
+from jaxbundle.pushbroom.corrections import Corrections, seen_point
+from jaxbundle.pushbroom.footprint import Footprint, make_footprint
+from jaxbundle.pushbroom.image import Pose, PushbroomImage, pose_at
+from jaxbundle.pushbroom.newton import collected, first_of, refine, replaced
+from jaxbundle.pushbroom.passages import (
+    FINE_SEARCH,
+    line_of_detectors,
+    passages,
+    sample,
+    sample_times,
+)
+from jaxbundle.pushbroom.pieces import Pieces, make_pieces
+from jaxbundle.pushbroom.scanner import Pair
 from jaxbundle.types import AnyArray, Scalar
-
-from .corrections import Corrections, seen_point
-from .footprint import Footprint, make_footprint
-from .image import Pose, PushbroomImage, pose_at
-from .newton import collected, first_of, refine, replaced
-from .passages import FINE_SEARCH, line_of_detectors, passages, sample, sample_times
-from .pieces import Pieces, make_pieces
-from .scanner import Pair
 
 CHUNK = 2048
 """Points that go through all steps together, so that they stay in the cache."""

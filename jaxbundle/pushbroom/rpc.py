@@ -30,10 +30,9 @@ from jaxtyping import Array, Float
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, earth_fixed
 from jaxbundle.geometry.vectors import Triple, along, difference, unit, unpacked
 from jaxbundle.implicit import implicit_root, solve_dense
+from jaxbundle.pushbroom.corrections import require_ellipsoid
+from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.types import AnyArray, Scalar
-
-from .corrections import require_ellipsoid
-from .surfaces import Surface
 
 TERMS = 20
 STEPS = 6

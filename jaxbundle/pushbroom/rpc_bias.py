@@ -25,9 +25,8 @@ from jaxbundle.float64 import require_x64
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, earth_fixed, geodetic
 from jaxbundle.geometry.vectors import along
 from jaxbundle.network.tables import Source
-
-from .rpc import MARGIN, Rpc, Scalar, project, project_points
-from .rpc_fit import RpcCheck, RpcTable, check_rpc, fit_rpc
+from jaxbundle.pushbroom.rpc import MARGIN, Rpc, Scalar, project, project_points
+from jaxbundle.pushbroom.rpc_fit import RpcCheck, RpcTable, check_rpc, fit_rpc
 
 MODELS = {"shift": 1, "affine": 3}
 """Unknowns of each axis."""

@@ -34,11 +34,10 @@ from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.geometry.ellipsoid import Ellipsoid, geodetic
 from jaxbundle.network.tables import Source
-
-from .image import PushbroomImage
-from .locate import locate_points
-from .rpc import TERMS, Rpc, monomials, project_points
-from .surfaces import Height
+from jaxbundle.pushbroom.image import PushbroomImage
+from jaxbundle.pushbroom.locate import locate_points
+from jaxbundle.pushbroom.rpc import TERMS, Rpc, monomials, project_points
+from jaxbundle.pushbroom.surfaces import Height
 
 UNKNOWNS = 2 * TERMS - 1
 FEWEST = UNKNOWNS + 1

@@ -19,9 +19,8 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxbundle.cameras import get_model, image_ray
+from jaxbundle.pushbroom.polynomial import value
 from jaxbundle.types import AnyArray, Scalar
-
-from .polynomial import value
 
 Pair = tuple[Scalar, Scalar]
 

@@ -16,18 +16,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbundle.errors import InputError
-
-from .ancillary import attitude_table, position_table
-from .frames import circular_orbit
-from .image import PushbroomImage, make_image
-from .locate import locate_lines
-from .noise import Noise, disturbed, draw, sigmas
-from .orbit import state_orbit
-from .resample import Resampling, resample
-from .scanner import LineTimes, Optics
-from .signals import signal
-from .surfaces import Surface
-from .trajectory import Trajectory
+from jaxbundle.pushbroom.ancillary import attitude_table, position_table
+from jaxbundle.pushbroom.earth_frames import circular_orbit
+from jaxbundle.pushbroom.image import PushbroomImage, make_image
+from jaxbundle.pushbroom.locate import locate_lines
+from jaxbundle.pushbroom.noise import Noise, disturbed, draw, sigmas
+from jaxbundle.pushbroom.orbit import state_orbit
+from jaxbundle.pushbroom.resample import Resampling, resample
+from jaxbundle.pushbroom.scanner import LineTimes, Optics
+from jaxbundle.pushbroom.signals import signal
+from jaxbundle.pushbroom.surfaces import Surface
+from jaxbundle.pushbroom.trajectory import Trajectory
 
 MARGIN = 6
 """Rows of ancillary data before the first line and after the last."""

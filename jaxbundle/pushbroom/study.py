@@ -16,15 +16,20 @@ from typing import Literal, NamedTuple
 import jax
 import numpy as np
 
+from jaxbundle.pushbroom.accuracy import (
+    circular_error,
+    closed_form,
+    drawn,
+    ground_errors,
+    propagated,
+)
+from jaxbundle.pushbroom.image import PushbroomImage, pose_at
+from jaxbundle.pushbroom.locate import locate_points
+from jaxbundle.pushbroom.noise import Noise
+from jaxbundle.pushbroom.scanner import slopes_of
+from jaxbundle.pushbroom.simulate import Flight, measured_image, true_image
+from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.types import Numbers
-
-from .accuracy import circular_error, closed_form, drawn, ground_errors, propagated
-from .image import PushbroomImage, pose_at
-from .locate import locate_points
-from .noise import Noise
-from .scanner import slopes_of
-from .simulate import Flight, measured_image, true_image
-from .surfaces import Surface
 
 TRAJECTORIES = {
     "roll": ("roll",), "pitch": ("pitch",), "yaw": ("yaw",), "3 axes": ("pitch", "roll", "yaw"),

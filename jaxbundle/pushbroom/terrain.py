@@ -34,10 +34,9 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, at_height, geodetic, ray_to_ellipsoid
 from jaxbundle.geometry.vectors import Scalar, Triple, Vector, along
 from jaxbundle.implicit import implicit_root, solve_dense
+from jaxbundle.pushbroom.polynomial import value, value_and_rate
+from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.types import Numbers
-
-from .polynomial import value, value_and_rate
-from .surfaces import Surface
 
 MARGIN = 1.0
 """The traverse begins this far above the highest height and ends as far below the lowest, metres;

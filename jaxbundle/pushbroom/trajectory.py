@@ -32,9 +32,8 @@ from jaxbundle.geometry import (
     quaternion_multiply,
     rotation_vector_from_quaternion,
 )
+from jaxbundle.pushbroom.interpolation import Table, covers, fraction, interpolate, interval, rate
 from jaxbundle.types import AnyArray, Scalar
-
-from .interpolation import Table, covers, fraction, interpolate, interval, rate
 
 
 class Attitude(eqx.Module):

@@ -15,9 +15,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.cameras import CameraModel, Comparison, default_parameters
-from jaxbundle.cameras.frames import between_frames
-
-from .projection import interior_covariance_of_images
+from jaxbundle.cameras.pixel_frame import between_frames
+from jaxbundle.statistics.projection import interior_covariance_of_images
 
 Covariance = tuple[Sequence[str], Float[np.ndarray, "k k"]]
 """Names of free parameters, and their covariance."""

@@ -11,8 +11,8 @@ from scipy import optimize
 
 import jaxbundle
 from jaxbundle import cameras
-from jaxbundle.adjustment import batch_input
-from jaxbundle.adjustment.batch_input import bucket, once
+from jaxbundle.batch import input as batch_input
+from jaxbundle.batch.input import bucket, once
 from jaxbundle.geometry import omega_phi_kappa_from_matrix
 
 SIZE = (1280, 960)

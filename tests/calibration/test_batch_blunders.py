@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import jaxbundle
-from jaxbundle.adjustment.batch_normal import Calibration, Sightings, design
-from jaxbundle.adjustment.batch_tests import point_tests
-from jaxbundle.calibration.batch_misfit import NORMAL, axes_remark, far_outside, misfits
+from jaxbundle.batch.misfit import NORMAL, axes_remark, far_outside, misfits
+from jaxbundle.batch.normal import Calibration, Sightings, design
+from jaxbundle.batch.test_values import point_tests
 from jaxbundle.cameras import get_model
 
 SIZE, VIEWS, NOISE = (1280, 960), 8, 0.2

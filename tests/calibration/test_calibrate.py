@@ -9,8 +9,8 @@ import pytest
 import render
 from scipy.spatial.transform import Rotation
 
+from jaxbundle.batch.calibrate import calibrate_batch
 from jaxbundle.calibration import Board, BoardViews, calibrate
-from jaxbundle.calibration.batch import calibrate_batch
 from jaxbundle.calibration.calibrate import board_network
 from jaxbundle.calibration.left_out import left_out
 from jaxbundle.calibration.start import start_values

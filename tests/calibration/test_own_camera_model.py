@@ -9,8 +9,8 @@ import pytest
 from test_calibrate import TRUTH, VIEWS, normalised, simulated
 
 from jaxbundle import CameraModel
+from jaxbundle.batch.calibrate import calibrate_batch
 from jaxbundle.calibration import calibrate
-from jaxbundle.calibration.batch import calibrate_batch
 from jaxbundle.calibration.files import json_text
 from jaxbundle.calibration.start import start_values
 from jaxbundle.cameras import opencv

@@ -13,15 +13,15 @@ from scipy.spatial.transform import Rotation
 from test_calibrate import NOISE, simulated
 
 from jaxbundle import cli
+from jaxbundle.batch.calibrate import calibrate_batch
 from jaxbundle.calibration import calibrate
 from jaxbundle.calibration.advice import advice
-from jaxbundle.calibration.batch import calibrate_batch
 from jaxbundle.calibration.files import json_text, write_calibration
 from jaxbundle.calibration.quality import coverage, grid_of, uncertainty_map
 from jaxbundle.cameras import compare_cameras, get_model
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_cameras, read_network, read_opencv
-from jaxbundle.io.calibrated import read_calibrated
+from jaxbundle.io.cameras.calibrated import read_calibrated
 from jaxbundle.plotting import write_figures
 from jaxbundle.statistics.difference import expected_difference
 

@@ -12,11 +12,11 @@ import pytest
 import render
 from test_calibrate import VIEWS
 
-from jaxbundle.adjustment.rig import Rig, adjust_rig, declare_rig, leave_out
 from jaxbundle.calibration import BoardViews, calibrate_cameras, calibrate_rig
 from jaxbundle.calibration.files import calibrations_dict, save_rig_plots
 from jaxbundle.calibration.report import rig_dict, rig_text
-from jaxbundle.calibration.rig import epoch_keys, require_solved
+from jaxbundle.calibration.rig.calibrate import epoch_keys, require_solved
+from jaxbundle.calibration.rig.declare import Rig, adjust_rig, declare_rig, leave_out
 from jaxbundle.cameras import get_model, image_ray, project
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.geometry import (

@@ -13,7 +13,7 @@ from jaxbundle.cameras.convert_exact import (
     normalised_correction,
 )
 from jaxbundle.cameras.convert_fit import images_of, rays_of
-from jaxbundle.cameras.frames import between_frames
+from jaxbundle.cameras.pixel_frame import between_frames
 
 VALUES = {case.name: case.values for case in CASES}
 SIZE, PIXEL = (4000, 3000), (0.009, 0.009)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from batch_cameras import images_of, write_cameras
 
-from jaxbundle import batches
-from jaxbundle.batches import key_of, run_batch
+from jaxbundle.batch import run as batches
+from jaxbundle.batch.run import key_of, run_batch
 from jaxbundle.errors import InputError
-from jaxbundle.io.fingerprints import of_input
+from jaxbundle.io.writing.fingerprints import of_input
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "convergent4"
 FREE = ["fx", "fy", "k1"]

@@ -15,8 +15,8 @@ from jaxbundle import cli
 
 BEGIN = """
 import gc, hashlib, os, signal, sys, threading
-from jaxbundle.interrupts import advise, handle_interrupts, set_status
-from jaxbundle.temporaries import temporary, unbroken, watch_cache
+from jaxbundle.system.interrupts import advise, handle_interrupts, set_status
+from jaxbundle.system.temporaries import temporary, unbroken, watch_cache
 interrupt = lambda number=signal.SIGINT: signal.raise_signal(number)
 """
 STARTED = BEGIN + "handle_interrupts()\n"
@@ -124,7 +124,7 @@ open("third", "w").close()
 def test_what_belongs_together_and_does_not_end_holds_nobody(tmp_path):
     """A disk that does not answer between two renames: after `PATIENCE` all is as without it."""
     code = """
-from jaxbundle import interrupts
+from jaxbundle.system import interrupts
 interrupts.PATIENCE = 0.2
 with temporary("half"), unbroken():
     open("half", "w").close()

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 import jaxbundle
+from jaxbundle.cli.outputs import check_targets, write_targets
 from jaxbundle.cli.pushbroom.app import keep_inputs
 from jaxbundle.errors import InputError, NotSolvedError
-from jaxbundle.io.csv_tables import write_text
-from jaxbundle.io.folders import MARKER
-from jaxbundle.targets import check_targets, write_targets
+from jaxbundle.io.text.csv_tables import write_text
+from jaxbundle.io.writing.folders import MARKER
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "convergent4" / "project.toml"
 REASON = NotSolvedError("not solved: too few images", ["X0 of image 7"])

@@ -9,8 +9,8 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.bal import read_bal, write_bal
-from jaxbundle.io.bundler import is_bundler, read_bundler, write_bundler
+from jaxbundle.io.networks.bal import read_bal, write_bal
+from jaxbundle.io.networks.bundler import is_bundler, read_bundler, write_bundler
 
 NUMBERED = ("0", "1", "2")
 

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.bingo import is_bingo, read_bingo
+from jaxbundle.io.networks.bingo import is_bingo, read_bingo
 
 IMAGE = """\
 C a comment

@@ -5,8 +5,8 @@ import tracemalloc
 import numpy as np
 import pytest
 
+from jaxbundle.batch.stacks import read_camera_stack
 from jaxbundle.errors import InputError
-from jaxbundle.io.camera_stacks import read_camera_stack
 
 
 def arrays(cameras, xy):

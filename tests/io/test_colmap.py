@@ -12,14 +12,14 @@ from scipy.spatial.transform import Rotation
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.convert_fit import images_of
 from jaxbundle.errors import InputError
-from jaxbundle.io.assemble import all_parameters
-from jaxbundle.io.colmap import (
+from jaxbundle.io.networks.assemble import all_parameters
+from jaxbundle.io.networks.colmap import (
     is_colmap,
     read_colmap,
     read_colmap_cameras,
     write_colmap,
 )
-from jaxbundle.io.colmap_models import MODELS, from_colmap, to_colmap
+from jaxbundle.io.networks.colmap_models import MODELS, from_colmap, to_colmap
 from jaxbundle.network import Camera
 
 FILES = {

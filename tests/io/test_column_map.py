@@ -6,7 +6,7 @@ from exchange_cases import ANGLES, POINTS, POSITION, assert_same, matrix, networ
 from scipy.spatial.transform import Rotation
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.column_map import is_column_map, read_column_map
+from jaxbundle.io.networks.column_map import is_column_map, read_column_map
 
 MAP = """
 [project]

@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 from test_photomodeler import export
 
 from jaxbundle import cli
+from jaxbundle.cli.outputs import check_targets
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_network
-from jaxbundle.io.bundler import write_bundler
-from jaxbundle.io.control import read_control
-from jaxbundle.io.project import write_project
-from jaxbundle.targets import check_targets
+from jaxbundle.io.networks.bundler import write_bundler
+from jaxbundle.io.networks.control import read_control
+from jaxbundle.io.networks.project import write_project
 
 TURN, SCALE = Rotation.from_euler("xyz", [0.3, -0.2, 0.7]).as_matrix(), 40.0
 SHIFT = np.array([999_000.0, 112_000.0, 130.0])

@@ -13,12 +13,12 @@ from numpy.testing import assert_allclose
 
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_network
-from jaxbundle.io.colmap import write_colmap
-from jaxbundle.io.coordinates import images_path, write_coordinates
-from jaxbundle.io.dxf import write_dxf
-from jaxbundle.io.ply import write_ply
-from jaxbundle.io.project import write_project
-from jaxbundle.io.pyramids import pyramids
+from jaxbundle.io.networks.colmap import write_colmap
+from jaxbundle.io.networks.project import write_project
+from jaxbundle.io.results.coordinates import images_path, write_coordinates
+from jaxbundle.io.results.dxf import write_dxf
+from jaxbundle.io.results.ply import write_ply
+from jaxbundle.io.results.pyramids import pyramids
 from jaxbundle.network.reprojection import point_errors
 from jaxbundle.network.tables import Points
 

@@ -11,12 +11,12 @@ import pytest
 from test_hostile_files import KINDS, made, read
 
 from jaxbundle.errors import InputError
-from jaxbundle.file_content import check_plain, parse_json, parse_toml, read_content
-from jaxbundle.io.csv_tables import read_text, read_toml
-from jaxbundle.io.fingerprints import of_input
-from jaxbundle.io.photomodeler_camera import header_camera
-from jaxbundle.io.rows import Row
+from jaxbundle.io.networks.photomodeler_camera import header_camera
+from jaxbundle.io.text.csv_tables import read_text, read_toml
+from jaxbundle.io.text.rows import Row
+from jaxbundle.io.writing.fingerprints import of_input
 from jaxbundle.measure.photographs import read_photograph
+from jaxbundle.system.file_content import check_plain, parse_json, parse_toml, read_content
 
 BINARY = ("colmap", "camera-stack")
 LARGE = 2**30

@@ -12,11 +12,12 @@ from full_disk import files_end_at
 from typer.testing import CliRunner
 
 from jaxbundle.errors import InputError
-from jaxbundle.io import folders, read_network
-from jaxbundle.io.bundler import write_bundler
-from jaxbundle.io.coordinates import write_coordinates
-from jaxbundle.io.folders import INSIDE, MARKER, check_folder, read_marker, replaced_folder
-from jaxbundle.temporaries import remove_temporaries
+from jaxbundle.io import read_network
+from jaxbundle.io.networks.bundler import write_bundler
+from jaxbundle.io.results.coordinates import write_coordinates
+from jaxbundle.io.writing import folders
+from jaxbundle.io.writing.folders import INSIDE, MARKER, check_folder, read_marker, replaced_folder
+from jaxbundle.system.temporaries import remove_temporaries
 
 OLD = {"report.txt": "old", "network/points.csv": "1", "histogram.png": "h"}
 NEWER = {"report.txt": "newer", "network/points.csv": "2", "network/deep/x": "3", "plan.png": "p"}

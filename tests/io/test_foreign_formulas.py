@@ -6,7 +6,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from jaxbundle.cameras import default_parameters, get_model
-from jaxbundle.io import colmap_models, metashape_camera, opencv_file
+from jaxbundle.io.cameras import opencv_file
+from jaxbundle.io.networks import colmap_models, metashape_camera
 
 SIZES = dict(fx=500.0, fy=400.0, cx=0.0, cy=0.0)
 AGISOFT = dict(f=400.0, b1=100.0, w=640.0, h=480.0)

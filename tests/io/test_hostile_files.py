@@ -15,14 +15,14 @@ import pytest
 from exchange_cases import CAMERAS, network
 from garbling import often, read_or_refused, what_is_done
 
+from jaxbundle.batch.stacks import read_camera_stack
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_cameras, read_network, write_project
-from jaxbundle.io.bal import write_bal
-from jaxbundle.io.bundler import write_bundler
-from jaxbundle.io.calibrated import read_calibrated
-from jaxbundle.io.camera_stacks import read_camera_stack
-from jaxbundle.io.colmap import write_colmap
-from jaxbundle.io.opencv_file import write_opencv
+from jaxbundle.io.cameras.calibrated import read_calibrated
+from jaxbundle.io.cameras.opencv_file import write_opencv
+from jaxbundle.io.networks.bal import write_bal
+from jaxbundle.io.networks.bundler import write_bundler
+from jaxbundle.io.networks.colmap import write_colmap
 from jaxbundle.network.tables import Camera, Network
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "convergent4" / "convergent4.txt"

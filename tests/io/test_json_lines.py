@@ -9,8 +9,8 @@ import pytest
 from garbling import often, read_or_refused, what_is_done
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.json_lines import JsonLines
-from jaxbundle.io.locks import locked
+from jaxbundle.io.results.json_lines import JsonLines
+from jaxbundle.io.writing.locks import locked
 
 
 def rows(path: Path):

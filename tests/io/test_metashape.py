@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.cameras.convert_fit import images_of
 from jaxbundle.errors import InputError
-from jaxbundle.io.assemble import all_parameters
-from jaxbundle.io.metashape import is_metashape, read_metashape
+from jaxbundle.io.networks.assemble import all_parameters
+from jaxbundle.io.networks.metashape import is_metashape, read_metashape
 
 P = dict(f=1000.0, cx=3.5, cy=-2.25, k1=-0.1, k2=0.02, k3=0.001, p1=1e-3, p2=-5e-4, b1=1.5)
 SCALE, SHIFT = 2.5, np.array([100.0, 200.0, 300.0])

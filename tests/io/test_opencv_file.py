@@ -11,8 +11,8 @@ from numpy.testing import assert_array_equal
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.convert_fit import images_of
 from jaxbundle.errors import InputError
-from jaxbundle.io.assemble import all_parameters
-from jaxbundle.io.opencv_file import is_opencv, read_opencv, write_opencv
+from jaxbundle.io.cameras.opencv_file import is_opencv, read_opencv, write_opencv
+from jaxbundle.io.networks.assemble import all_parameters
 from jaxbundle.network import Camera
 
 VALUES = dict(fx=535.9, fy=536.2, cx=342.3, cy=235.6, k1=-0.2663, k2=-0.0386, p1=0.0018,

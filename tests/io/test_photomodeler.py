@@ -12,8 +12,8 @@ from numpy.testing import assert_allclose
 import jaxbundle
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_network
-from jaxbundle.io.photomodeler import is_photomodeler
-from jaxbundle.io.photomodeler_points import Block, renumber_smart
+from jaxbundle.io.networks.photomodeler import is_photomodeler
+from jaxbundle.io.networks.photomodeler_points import Block, renumber_smart
 
 BROWN = CAMERAS["brown"]
 NAMES = ("a.jpg", "b.jpg", "c.jpg")

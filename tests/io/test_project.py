@@ -9,9 +9,9 @@ import pytest
 
 from jaxbundle.errors import InputError
 from jaxbundle.io import read_network, read_project, write_opencv, write_project
-from jaxbundle.io.folders import MARKER
 from jaxbundle.io.formats import FORMATS
-from jaxbundle.io.settings import CAMERA_KEYS, SETTINGS, TABLES, apply_overrides
+from jaxbundle.io.networks.settings import CAMERA_KEYS, SETTINGS, TABLES, apply_overrides
+from jaxbundle.io.writing.folders import MARKER
 from jaxbundle.network.build import (
     CAMERA_FIELDS,
     DISTANCE_COLUMNS,

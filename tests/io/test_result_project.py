@@ -7,8 +7,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbundle
+from jaxbundle.cli.outputs import NETWORK_FILES, check_targets, write_targets
 from jaxbundle.io import adjusted_network, read_network, write_project
-from jaxbundle.targets import NETWORK_FILES, check_targets, write_targets
 
 
 def test_it_is_a_fixed_point(convergent4, tmp_path):

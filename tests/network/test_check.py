@@ -13,8 +13,8 @@ from jaxbundle.network import Camera, Network
 from jaxbundle.network.build import make_network
 from jaxbundle.network.check import check_network, split_check_points
 from jaxbundle.network.sightings import connected_parts
-from jaxbundle.network.simulate import simulate
-from jaxbundle.network.stations import aerial_block, cloud_of_targets
+from jaxbundle.planning.simulate import simulate
+from jaxbundle.planning.stations import aerial_block, cloud_of_targets
 
 RNG = np.random.default_rng(3)
 GROUND = RNG.uniform(-10, 10, (8, 3)) * [1, 1, 0.1]

@@ -10,14 +10,14 @@ import pytest
 from network.further_checks import sample
 
 import jaxbundle
-from jaxbundle.far_points import at_infinity, minimise_with_infinity
+from jaxbundle.bundle.far_points import at_infinity, minimise_with_infinity
+from jaxbundle.bundle.minimum import solved
 from jaxbundle.io import adjusted_network
-from jaxbundle.io.result_json import result_text
+from jaxbundle.io.results.result_json import result_text
 from jaxbundle.leastsquares.any_distance import FARTHEST, AnyDistance, derivative
 from jaxbundle.leastsquares.problem import pad_data, pad_values
 from jaxbundle.leastsquares.rows import lay_out_data, residuals
 from jaxbundle.leastsquares.spaces import Vector
-from jaxbundle.solution import solved
 from jaxbundle.statistics.far_points import find_far_points
 from jaxbundle.statistics.inspection import Inspection
 

@@ -11,8 +11,8 @@ import jaxbundle
 from jaxbundle import cli
 from jaxbundle.errors import InputError
 from jaxbundle.network import Camera
-from jaxbundle.network.planned_block import planned_network
-from jaxbundle.network.planning import (
+from jaxbundle.planning.planned_block import planned_network
+from jaxbundle.planning.vertical_photographs import (
     design_block,
     relief_displacement,
     scale,

@@ -9,8 +9,8 @@ import jaxbundle
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, omega_phi_kappa_from_matrix
 from jaxbundle.network.build import make_further
-from jaxbundle.network.stations import Stations
 from jaxbundle.network.tables import Distances
+from jaxbundle.planning.stations import Stations
 
 T = np.array([0.3, 0.02, -0.01])
 R = Rotation.from_euler("xyz", [0.02, -0.1, 0.05]).as_matrix()

@@ -11,8 +11,8 @@ import pytest
 import jaxbundle
 from jaxbundle import Camera, InputError, cameras
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
-from jaxbundle.network.simulate import simulate, simulate_with_truth
-from jaxbundle.network.stations import (
+from jaxbundle.planning.simulate import simulate, simulate_with_truth
+from jaxbundle.planning.stations import (
     Stations,
     aerial_block,
     cloud_of_targets,
@@ -299,7 +299,7 @@ def test_a_camera_for_every_station():
 def test_a_big_network_is_made_in_batches(monkeypatch):
     """Batches change nothing, the last one smaller than the others."""
     whole = simulate(RING, TARGETS, BROWN, noise=0.01, image_format=(24, 16))
-    monkeypatch.setattr("jaxbundle.network.simulate.RAYS_AT_ONCE", 2 * len(TARGETS))
+    monkeypatch.setattr("jaxbundle.planning.simulate.RAYS_AT_ONCE", 2 * len(TARGETS))
     parts = simulate(RING, TARGETS, BROWN, noise=0.01, image_format=(24, 16))
     np.testing.assert_allclose(parts.observations.xy, whole.observations.xy, rtol=0, atol=1e-12)
     assert len(parts.observations) == len(whole.observations)

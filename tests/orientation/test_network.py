@@ -10,14 +10,14 @@ import pytest
 import jaxbundle
 from jaxbundle import Camera, InputError, NotSolvedError
 from jaxbundle.adjustment.problem import make_problem
-from jaxbundle.bundle import adjust
+from jaxbundle.bundle.adjust import adjust
+from jaxbundle.bundle.minimum import minimise
+from jaxbundle.bundle.orient import orient
 from jaxbundle.leastsquares.stopping import converged
 from jaxbundle.network.check import check_network
 from jaxbundle.network.sightings import keep_images
-from jaxbundle.network.stations import Stations
 from jaxbundle.orientation.network import lacks_start_values
-from jaxbundle.oriented import orient
-from jaxbundle.solution import minimise
+from jaxbundle.planning.stations import Stations
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 CASES = Path(__file__).parents[3] / "shared" / "cases"

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from jaxbundle.geometry import ellipsoid as el
 from jaxbundle.pushbroom.ancillary import attitude_table, position_table
 from jaxbundle.pushbroom.corrections import Corrections
-from jaxbundle.pushbroom.frames import circular_orbit
+from jaxbundle.pushbroom.earth_frames import circular_orbit
 from jaxbundle.pushbroom.image import make_image
 from jaxbundle.pushbroom.locate import locate_lines
 from jaxbundle.pushbroom.scanner import FocalLine, LineTimes

@@ -3,7 +3,7 @@
 import numpy as np
 from pushbroom_scenes import LINES, PERIOD, PIXELS, orbit, quaternions
 
-from jaxbundle.io.csv_tables import write_csv
+from jaxbundle.io.text.csv_tables import write_csv
 
 TEXT = f"""
 [scanner]

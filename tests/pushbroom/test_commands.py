@@ -10,7 +10,7 @@ from scipy.ndimage import binary_erosion
 from test_simulate_correct import pattern
 
 from jaxbundle import cli
-from jaxbundle.io.folders import MARKER
+from jaxbundle.io.writing.folders import MARKER
 
 FLIGHT = """
 [scanner]

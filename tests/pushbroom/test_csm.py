@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
-from jaxbundle.io.csm import read_csm
-from jaxbundle.pushbroom.frames import EARTH_RATE
+from jaxbundle.io.scanner.csm import read_csm
+from jaxbundle.pushbroom.earth_frames import EARTH_RATE
 from jaxbundle.pushbroom.image import pose_at
 from jaxbundle.pushbroom.project import make_search, project_points
 from jaxbundle.pushbroom.scanner import FocalLine

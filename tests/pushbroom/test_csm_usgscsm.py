@@ -15,9 +15,9 @@ from test_csm import PLACES, support_data, write
 
 from jaxbundle import cli
 from jaxbundle.errors import InputError
-from jaxbundle.io.csm import read_csm
-from jaxbundle.io.scanner import read_scanner
-from jaxbundle.io.scanner_writing import write_scanner_image
+from jaxbundle.io.scanner.csm import read_csm
+from jaxbundle.io.scanner.read import read_scanner
+from jaxbundle.io.scanner.writing import write_scanner_image
 from jaxbundle.pushbroom.image import pose_at
 from jaxbundle.pushbroom.locate import locate_points
 from jaxbundle.pushbroom.pieces import make_pieces

@@ -8,7 +8,7 @@ from pushbroom_scenes import LINES, PERIOD, PIXELS, locate, orbit
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, ray_to_ellipsoid
-from jaxbundle.io.scanner import read_scanner
+from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.pushbroom.surfaces import Ground
 
 CENTRE = np.datetime64("2008-03-04T12:31:03.081912", "ns")

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxbundle.errors import InputError
-from jaxbundle.pushbroom.frames import (
+from jaxbundle.pushbroom.earth_frames import (
     ARCSECOND,
     EARTH_RATE,
     EarthOrientation,

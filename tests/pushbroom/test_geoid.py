@@ -16,8 +16,8 @@ from jaxbundle import cli
 from jaxbundle.cli.pushbroom.app import surface_of
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
-from jaxbundle.io.geoid import add_geoid, undulations
-from jaxbundle.io.rpc import write_rpc
+from jaxbundle.io.rasters.geoid import add_geoid, undulations
+from jaxbundle.io.scanner.rpc import write_rpc
 from jaxbundle.pushbroom.terrain import make_terrain
 
 FLIGHT = Path(__file__).parents[2] / "examples" / "line_scanner" / "flight.toml"

@@ -13,11 +13,11 @@ from test_csm import support_data
 from test_dimap import write_dimap
 from test_xml_products import dimap, worldview
 
-from jaxbundle.io.csm import read_csm
-from jaxbundle.io.flight import read_flight
-from jaxbundle.io.refinement import read_refinement
-from jaxbundle.io.rpc import read_rpc, write_rpc
-from jaxbundle.io.scanner import read_scanner
+from jaxbundle.io.scanner.csm import read_csm
+from jaxbundle.io.scanner.flight import read_flight
+from jaxbundle.io.scanner.read import read_scanner
+from jaxbundle.io.scanner.refinement import read_refinement
+from jaxbundle.io.scanner.rpc import read_rpc, write_rpc
 
 FLIGHT = Path(__file__).parents[2] / "examples" / "line_scanner" / "flight.toml"
 REFINE = """

@@ -36,7 +36,7 @@ from jaxbundle.pushbroom.corrections import (
     seen_point,
     true_direction,
 )
-from jaxbundle.pushbroom.frames import EARTH_RATE, GM
+from jaxbundle.pushbroom.earth_frames import EARTH_RATE, GM
 from jaxbundle.pushbroom.image import Pose, make_image, pose_at
 from jaxbundle.pushbroom.locate import ground_point, locate_points
 from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable, LineTimes, slopes_of

@@ -5,7 +5,7 @@ import pytest
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, earth_fixed
-from jaxbundle.io.maps import MapSystem, contiguous, grid_around
+from jaxbundle.io.rasters.maps import MapSystem, contiguous, grid_around
 from jaxbundle.pushbroom import Ground
 
 LATTICE = np.meshgrid(179.7 + 0.02 * np.arange(33), -16 + 0.02 * np.arange(33))

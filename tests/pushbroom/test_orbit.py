@@ -7,8 +7,8 @@ from scanner_files import TEXT, write_scanner
 from scipy.spatial.transform import Rotation
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.scanner import read_scanner
-from jaxbundle.pushbroom.frames import EARTH_RATE, GM
+from jaxbundle.io.scanner.read import read_scanner
+from jaxbundle.pushbroom.earth_frames import EARTH_RATE, GM
 from jaxbundle.pushbroom.orbit import J2, RADIUS, acceleration, state_orbit
 from jaxbundle.pushbroom.simulate import Flight, true_image
 from jaxbundle.pushbroom.surfaces import Ground
@@ -60,7 +60,7 @@ def test_the_acceleration_is_the_gradient_of_the_potential():
 @pytest.mark.parametrize("frame", ["ITRF", "GCRF"])
 def test_a_state_in_a_file(tmp_path, frame):
     """The image of the tables from one state, Kepler; J2 moves it by metres in seconds."""
-    from jaxbundle.pushbroom.frames import to_earth
+    from jaxbundle.pushbroom.earth_frames import to_earth
 
     P, V = START
     if frame == "GCRF":

@@ -8,11 +8,12 @@ import rasterio
 from full_disk import files_end_at
 
 from jaxbundle.errors import InputError
-from jaxbundle.io import correction, error_maps, raster_writing
-from jaxbundle.io.map_blocks import write_map
-from jaxbundle.io.maps import MapGrid, MapSystem
+from jaxbundle.io.rasters import correction, error_maps
+from jaxbundle.io.rasters import writing as raster_writing
+from jaxbundle.io.rasters.map_blocks import write_map
+from jaxbundle.io.rasters.maps import MapGrid, MapSystem
 from jaxbundle.pushbroom.surfaces import Plane
-from jaxbundle.temporaries import put_off
+from jaxbundle.system.temporaries import put_off
 
 
 def write(target):

@@ -11,8 +11,8 @@ from rpc_scenes import made_up, table_of
 from scanner_files import write_scanner
 
 from jaxbundle import cli
-from jaxbundle.io.csv_tables import write_csv
-from jaxbundle.io.rpc import read_rpc, write_rpc
+from jaxbundle.io.scanner.rpc import read_rpc, write_rpc
+from jaxbundle.io.text.csv_tables import write_csv
 from jaxbundle.pushbroom.rpc_fit import RpcTable, check_rpc
 
 RPC = made_up(longitude_offset=12.3)

@@ -7,7 +7,7 @@ import rasterio
 from rpc_scenes import made_up
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.rpc import read_rpc, write_rpc
+from jaxbundle.io.scanner.rpc import read_rpc, write_rpc
 
 RPC = made_up(longitude_offset=12.3)
 

@@ -26,7 +26,7 @@ from jaxbundle.pushbroom import (
     turn_positions,
     turn_quaternions,
 )
-from jaxbundle.pushbroom.frames import EARTH_RATE
+from jaxbundle.pushbroom.earth_frames import EARTH_RATE
 from jaxbundle.pushbroom.trajectory import orbital_frame
 
 A, F = 6378137.0, 1 / 298.257223563

@@ -15,10 +15,10 @@ from scanner_files import TEXT, write_scanner
 from jaxbundle import cli
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import ellipsoid as el
-from jaxbundle.io.extent import Extent, image_extent
-from jaxbundle.io.rasters import read_terrain
-from jaxbundle.io.scanner import read_scanner
-from jaxbundle.pushbroom.frames import EarthOrientation, to_earth, turn_quaternions
+from jaxbundle.io.rasters.extent import Extent, image_extent
+from jaxbundle.io.rasters.reading import read_terrain
+from jaxbundle.io.scanner.read import read_scanner
+from jaxbundle.pushbroom.earth_frames import EarthOrientation, to_earth, turn_quaternions
 from jaxbundle.pushbroom.surfaces import Ground
 from jaxbundle.pushbroom.terrain import bilinear
 

@@ -12,9 +12,9 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import binary_erosion
 
 from jaxbundle.errors import InputError
-from jaxbundle.io import correction
-from jaxbundle.io.correction import map_of, write_corrected
-from jaxbundle.io.maps import MapGrid, MapSystem
+from jaxbundle.io.rasters import correction
+from jaxbundle.io.rasters.correction import map_of, write_corrected
+from jaxbundle.io.rasters.maps import MapGrid, MapSystem
 from jaxbundle.pushbroom.correct import BLOCK, STEP, block_places
 from jaxbundle.pushbroom.noise import Noise
 from jaxbundle.pushbroom.project import make_search, project_points

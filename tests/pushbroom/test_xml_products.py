@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, ray_to_ellipsoid
-from jaxbundle.io.scanner import read_scanner
+from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.pushbroom.project import project_near
 from jaxbundle.pushbroom.surfaces import Ground
 

@@ -11,7 +11,7 @@ from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.network.tables import Observations, Source
 from jaxbundle.pushbroom.ancillary import attitude_table, position_table
 from jaxbundle.pushbroom.corrections import Corrections
-from jaxbundle.pushbroom.frames import circular_orbit
+from jaxbundle.pushbroom.earth_frames import circular_orbit
 from jaxbundle.pushbroom.image import make_image
 from jaxbundle.pushbroom.locate import locate_point
 from jaxbundle.pushbroom.scanner import FocalLine, LineTimes

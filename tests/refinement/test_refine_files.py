@@ -21,10 +21,10 @@ from jaxbundle.cli.app import app
 from jaxbundle.cli.pushbroom import refine as _refine  # noqa: F401
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, geodetic
-from jaxbundle.io.csv_tables import read_csv, write_csv
-from jaxbundle.io.refinement import read_refinement
-from jaxbundle.io.scanner import read_scanner
-from jaxbundle.io.scanner_writing import write_scanner_image
+from jaxbundle.io.scanner.read import read_scanner
+from jaxbundle.io.scanner.refinement import read_refinement
+from jaxbundle.io.scanner.writing import write_scanner_image
+from jaxbundle.io.text.csv_tables import read_csv, write_csv
 from jaxbundle.pushbroom.image import pose_at
 from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable
 from jaxbundle.refinement import Freedom, refine

@@ -16,7 +16,7 @@ from jaxbundle.geometry import (
     retract_quaternion,
 )
 from jaxbundle.io.formats import read_network
-from jaxbundle.io.project import write_project
+from jaxbundle.io.networks.project import write_project
 from jaxbundle.network.tables import Camera, Distances, Images, Network, Observations, Points
 from jaxbundle.pushbroom.image import pose_at
 from jaxbundle.pushbroom.project import misclosure

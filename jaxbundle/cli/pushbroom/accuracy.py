@@ -22,7 +22,7 @@ from jaxbundle.cli.pushbroom.app import (
 )
 from jaxbundle.cli.pushbroom.locate import places
 from jaxbundle.errors import InputError
-from jaxbundle.io.error_maps import write_image_raster
+from jaxbundle.io.rasters.error_maps import write_image_raster
 from jaxbundle.plotting import image_map
 from jaxbundle.plotting.files import write_figures
 from jaxbundle.pushbroom.accuracy import drawn, ground_errors, propagated

@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxbundle.cli.pushbroom.app import surface_of, write_rows
 from jaxbundle.errors import InputError
-from jaxbundle.io.flight import read_flight
+from jaxbundle.io.scanner.flight import read_flight
 from jaxbundle.pushbroom.study import TRAJECTORIES, AccuracyTable, accuracy_table
 
 KINDS = ("bias", "white")

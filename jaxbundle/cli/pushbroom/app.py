@@ -10,21 +10,22 @@ import numpy as np
 import typer
 
 from jaxbundle.cli.app import app
+from jaxbundle.cli.outputs import check_json
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid
-from jaxbundle.io.csv_tables import write_csv, write_text
-from jaxbundle.io.extent import image_extent, rpc_extent
-from jaxbundle.io.fingerprints import files_read
-from jaxbundle.io.geoid import add_geoid
-from jaxbundle.io.rasters import read_terrain
-from jaxbundle.io.result_json import without_nan
-from jaxbundle.io.scanner import Scanner, read_scanner
+from jaxbundle.io.rasters.extent import image_extent, rpc_extent
+from jaxbundle.io.rasters.geoid import add_geoid
+from jaxbundle.io.rasters.reading import read_terrain
+from jaxbundle.io.results.result_json import without_nan
+from jaxbundle.io.scanner.read import read_scanner
+from jaxbundle.io.scanner.scanner import Scanner
+from jaxbundle.io.text.csv_tables import write_csv, write_text
+from jaxbundle.io.writing.fingerprints import files_read
 from jaxbundle.network.columns import Columns
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.resample import RESAMPLINGS, Resampling
 from jaxbundle.pushbroom.rpc import Rpc
 from jaxbundle.pushbroom.surfaces import Ground, Height, Plane, Surface
-from jaxbundle.targets import check_json
 from jaxbundle.types import Column
 
 pushbroom = typer.Typer(

@@ -19,10 +19,10 @@ from jaxbundle.cli.pushbroom.app import (
     surface_of,
 )
 from jaxbundle.errors import InputError
-from jaxbundle.io.correction import map_of, write_corrected
-from jaxbundle.io.error_maps import write_error_map
-from jaxbundle.io.maps import MapSystem
-from jaxbundle.io.scanner import Scanner
+from jaxbundle.io.rasters.correction import map_of, write_corrected
+from jaxbundle.io.rasters.error_maps import write_error_map
+from jaxbundle.io.rasters.maps import MapSystem
+from jaxbundle.io.scanner.scanner import Scanner
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.project import make_search
 

@@ -24,7 +24,7 @@ from jaxbundle.cli.pushbroom.app import (
 )
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import geodetic
-from jaxbundle.io.csv_tables import read_csv
+from jaxbundle.io.text.csv_tables import read_csv
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.locate import locate_points

@@ -20,7 +20,7 @@ from jaxbundle.cli.pushbroom.app import (
 )
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed
-from jaxbundle.io.csv_tables import read_csv
+from jaxbundle.io.text.csv_tables import read_csv
 from jaxbundle.network.columns import Columns, did_you_mean
 from jaxbundle.pushbroom.project import Status, make_search, project_points
 

@@ -8,16 +8,16 @@ from typing import Annotated
 import typer
 
 from jaxbundle.cli.app import Force
+from jaxbundle.cli.outputs import REPORT, RESULT, check_writable, written
 from jaxbundle.cli.pushbroom.app import pushbroom, warn
-from jaxbundle.io.csv_tables import write_csv, write_text
-from jaxbundle.io.fingerprints import files_read
-from jaxbundle.io.project import FILES, fill_project
-from jaxbundle.io.refinement import read_refinement
-from jaxbundle.io.result_json import without_nan
-from jaxbundle.io.scanner_writing import names_of, write_scanner_image
+from jaxbundle.io.networks.project import FILES, fill_project
+from jaxbundle.io.results.result_json import without_nan
+from jaxbundle.io.scanner.refinement import read_refinement
+from jaxbundle.io.scanner.writing import names_of, write_scanner_image
+from jaxbundle.io.text.csv_tables import write_csv, write_text
+from jaxbundle.io.writing.fingerprints import files_read
 from jaxbundle.refinement import adjusted_photographs, point_rows, report, to_json
 from jaxbundle.refinement import refine as refine_images
-from jaxbundle.targets import REPORT, RESULT, check_writable, written
 
 PHOTOGRAPHS = "photographs"
 

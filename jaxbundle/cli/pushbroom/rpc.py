@@ -23,8 +23,8 @@ from jaxbundle.cli.pushbroom.app import (
 )
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.geometry.ellipsoid import WGS84
-from jaxbundle.io.csv_tables import read_csv
-from jaxbundle.io.rpc import RASTERS, read_rpc, write_rpc
+from jaxbundle.io.scanner.rpc import RASTERS, read_rpc, write_rpc
+from jaxbundle.io.text.csv_tables import read_csv
 from jaxbundle.network.columns import Columns
 from jaxbundle.pushbroom.rpc import RpcStatus, locate_points_on, project_points
 from jaxbundle.pushbroom.rpc_bias import compensated, fit_bias

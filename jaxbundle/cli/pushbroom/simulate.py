@@ -17,11 +17,11 @@ from jaxbundle.cli.pushbroom.app import (
     resampling_of,
     surface_of,
 )
-from jaxbundle.io.fingerprints import files_read
-from jaxbundle.io.flight import read_flight
-from jaxbundle.io.folders import check_folder, replaced_folder
-from jaxbundle.io.scanner_writing import names_of, write_scanner_image
-from jaxbundle.io.scenes import read_scene, write_taken
+from jaxbundle.io.rasters.scenes import read_scene, write_taken
+from jaxbundle.io.scanner.flight import read_flight
+from jaxbundle.io.scanner.writing import names_of, write_scanner_image
+from jaxbundle.io.writing.fingerprints import files_read
+from jaxbundle.io.writing.folders import check_folder, replaced_folder
 from jaxbundle.pushbroom.simulate import measured_image, true_image
 
 COMMAND, NAME, IMAGE, TRUTH = "pushbroom simulate", "scanner", "image.tif", "truth"

@@ -1,0 +1,1 @@
+"""Many cameras of one model, calibrated in one program; many networks in one run."""

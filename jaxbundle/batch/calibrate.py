@@ -1,0 +1,300 @@
+"""`calibrate_batch`: many cameras, each calibrated by itself from views of known points.
+
+Cameras are solved in portions of one compiled shape: views and points are padded to the next size
+of a short list (`bucket`), padding being points that are not seen. Where many cameras have far
+fewer views than others, they have a shape of their own.
+
+On a CPU a portion is a loop over its cameras (`lax.map`), and as many portions as there are cores
+run at the same time, each in a thread. Milliseconds of one core for a camera of 20 views × 88
+points: the loop 1.6, four cameras at a time 2.0, eight 2.4, `vmap` over 32 3.0, for all of them
+wait for the slowest and their arrays leave the cache. On an accelerator a portion is a `vmap` over
+many cameras.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxbundle.arguments import one_of, whole
+from jaxbundle.batch.camera import (
+    CONVERGED,
+    LIMIT,
+    MISFIT,
+    NOT_FINITE,
+    SINGULAR,
+    STATUS,
+    WEAK,
+    solve_camera,
+)
+from jaxbundle.batch.input import Batch, Portion
+from jaxbundle.batch.misfit import far_outside, misfits, remarks
+from jaxbundle.batch.normal import POSE, Calibration, Sightings, residual_lengths
+from jaxbundle.batch.result import BatchCalibration as BatchCalibration
+from jaxbundle.batch.snooping import ROUNDS, TESTS, Snooping
+from jaxbundle.batch.start import start_values
+from jaxbundle.batch.test_values import point_tests
+from jaxbundle.batch.weakness import vague, vanishing
+from jaxbundle.cameras import CameraModel, get_model, key_of
+from jaxbundle.float64 import require_x64
+from jaxbundle.geometry import (
+    matrix_from_quaternion,
+    matrix_from_rotation_vector,
+    omega_phi_kappa_from_matrix,
+)
+from jaxbundle.leastsquares.snooping import check_test
+from jaxbundle.system.configuration import available_cores
+
+OF_A_START = ("quaternion", "shift")
+"""Poses as the solver has them, for data snooping alone."""
+OF_A_VIEW = ("position", "angles", "sigma_position", "sigma_angles", "rotation")
+
+TESTED = (CONVERGED, LIMIT, SINGULAR)
+"""Statuses of cameras with residuals that data snooping can test."""
+MOST_FAILED = 60
+"""So many rounds without a solution, and data snooping of a camera ends."""
+
+
+def calibrate_batch(
+    object_points: Float[np.ndarray, "*cameras points 3"],
+    image_points: Float[np.ndarray, "cameras views points 2"],
+    image_size: tuple[int, int],
+    model: str | CameraModel = "opencv",
+    visible: Bool[np.ndarray, "cameras views points"] | None = None,
+    *,
+    free: Sequence[str] | None = None,
+    start: Mapping[str, float | Float[np.ndarray, " cameras"]] | None = None,
+    max_iterations: int = 100,
+    snooping: str | None = None,
+    significance: float = 0.001,
+    threads: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> BatchCalibration:
+    """Calibrate many cameras, each by itself, from views of points with known coordinates.
+
+    **Arguments:**
+
+    - `object_points`: [points, 3] for all cameras, or [cameras, points, 3]; flat or solid. They may
+      be repeated for every view ([views, points, 3] or [cameras, views, points, 3]).
+    - `image_points`: pixels in the axes of the model.
+    - `image_size`: width and height in pixels: the principal point starts in the middle.
+    - `model`: a camera model in pixels: "opencv", "kannala-brandt", "snavely", or a `CameraModel`.
+    - `visible`: which points were measured where; all, if not given. What is not visible may have
+      any coordinates. A point that is NaN or masked is not visible: in an image, where it was not
+      measured, or in the object (`make_network` refuses such a row).
+    - `free`: the parameters to estimate; if not given, for "opencv" those of OpenCV's model of 5
+      coefficients, otherwise all.
+    - `start`: start values of parameters, for all cameras or [cameras]; without focal lengths these
+      are found by themselves. What is neither free nor given is 0, or the middle of the image. A
+      view is left out if the given camera turns too few of its points into rays.
+    - `snooping`: `"pope"`: image points that are blunders at the level `significance`, the
+      probability to lose anything of a camera without blunders, are removed, camera by camera;
+      before that those more than one image size outside the image.
+    - `threads`: portions solved at the same time on a CPU; the number of cores if not given.
+    - `progress(done, total)`: called after every portion.
+
+    **Returns:** a `BatchCalibration`; look at `status` before anything else.
+
+    **Raises:** `InputError` for shapes and names that do not fit, and under `jax.jit`, `jax.vmap`
+    or `jax.grad`; `RuntimeError` without 64-bit floats. What is wrong with the numbers of one
+    camera stands in its status.
+    """
+    require_x64()
+    max_iterations = whole("max_iterations", max_iterations)
+    one_of("snooping", snooping, TESTS, none=True)
+    check_test(snooping, significance)
+    threads = available_cores() if threads is None else whole("threads", threads)
+    batch = Batch.of(object_points, image_points, image_size, model, visible, free, start)
+    camera_model = get_model(model)
+    if snooping is not None:
+        down = camera_model.axes == "down"
+        far = far_outside(batch.xy, batch.visible, batch.image_size, down)
+        batch = dataclasses.replace(batch, visible=batch.visible & ~far)
+    on_cpu = jax.default_backend() == "cpu"
+    portions = list(batch.portions(on_cpu))
+    fixed = camera_model, batch.free, batch.known, max_iterations, batch.size, on_cpu
+
+    def run(portion):
+        rows = _solve_portion(*fixed, portion)
+        return rows if snooping is None else _snooped(*fixed, portion, rows, snooping, significance)
+
+    parts, done = [], 0
+    with ThreadPoolExecutor(threads if on_cpu else 1) as pool:
+        for portion, solved in zip(portions, pool.map(run, portions)):
+            parts.append(_without_padding(portion, batch.xy.shape[1:3], solved))
+            done += len(portion.cameras)
+            if progress is not None:
+                progress(done, len(batch))
+    order = np.argsort(np.concatenate([portion.cameras for portion in portions]))
+    rows = {name: np.concatenate([p[name] for p in parts])[order] for name in parts[0]}
+    if snooping is not None:
+        rows["removed"] |= far
+    return _result(camera_model, batch, rows)
+
+
+def _without_padding(portion: Portion, shape: tuple[int, int], solved: dict) -> dict:
+    """The rows of the cameras of a portion, views at their places among all."""
+    views, points = shape
+    rows = {name: values[: len(portion.cameras)] for name, values in solved.items()
+            if name not in OF_A_START}  # fmt: skip
+    camera = np.arange(len(portion.cameras))[:, None]
+    for name in ({"views", "removed", *OF_A_VIEW} & {*rows}):
+        values = rows[name] if name != "removed" else rows[name][:, :, :points]
+        rows[name] = np.zeros((len(values), views, *values.shape[2:]), values.dtype)
+        rows[name][camera, portion.views] = values[:, : portion.views.shape[1]]
+    return rows
+
+
+def _result(model: CameraModel, batch: Batch, rows: dict) -> BatchCalibration:
+    """Rows in the order of the cameras; NaN for no result."""
+    ended = np.where(batch.finite, rows["status"], NOT_FINITE)
+    solved = ended == CONVERGED
+    undetermined = _undetermined(model, batch, ended, rows)
+    for name in OF_A_VIEW:
+        rows[name][~rows["views"]] = np.nan
+    for values in rows.values():
+        if np.issubdtype(values.dtype, np.floating):
+            values[~solved] = np.nan
+    ended = np.where(solved & undetermined.any(1), WEAK, ended)
+    ended = np.where(misfits(rows["rms"], rows["mean_length"], solved), MISFIT, ended)
+    del rows["reduced"], rows["mean_length"]
+    rows["undetermined"], rows["status"] = undetermined, np.array(STATUS)[ended]
+    rows["remark"] = remarks(model, batch, rows, solved & (ended == CONVERGED))
+    free = tuple(model.parameters[column] for column in batch.free)
+    return BatchCalibration(model=key_of(model), parameters=free, **rows)
+
+
+def _undetermined(model: CameraModel, batch: Batch, ended, rows) -> Bool[np.ndarray, "cameras k"]:
+    """What the views do not determine, of cameras for which that can be said."""
+    sigma = rows["sigma"]
+    null = vanishing(rows["reduced"]) & np.isin(ended, (SINGULAR, LIMIT))[:, None]
+    # At the limit the last σ say why, if the equations can be solved.
+    told = (ended == LIMIT) & ~null.any(1) & np.isfinite(sigma).all(1) | (ended == CONVERGED)
+    return np.where(told[:, None], vague(model, batch.free, rows["interior"], sigma), null)
+
+
+def _snooped(
+    model, free, known, max_steps, size, on_cpu, portion: Portion, rows, test, significance
+) -> dict:
+    """The rows of a portion without blunders; only cameras that lose any are solved again.
+
+    One without a solution is tested where its iterations ended, for blunders may be why. Where it
+    has none without them either, everything stays as it was.
+    """
+    weight = np.asarray(portion.seen.weight)
+    found = [Snooping(seen > 0, test, significance) for seen in weight]
+    open_ones = np.arange(len(portion.cameras))
+    first = {name: values.copy() for name, values in rows.items()}
+    failed = np.zeros(len(weight), int)
+    for _ in range(ROUNDS):
+        used = np.stack([camera.used for camera in found]).astype(float)
+        tests = np.asarray(_tests_program(
+            model, free, on_cpu, portion.seen, used, rows["interior"], rows["quaternion"],
+            rows["shift"], rows["views"],
+        ))  # fmt: skip
+        tested = np.isin(rows["status"], TESTED) & np.isfinite(rows["sigma0"])
+        failed += rows["status"] != CONVERGED
+        open_ones = np.array([
+            i for i in open_ones
+            if tested[i] and failed[i] <= MOST_FAILED
+            and found[i].next(tests[i], rows["sigma0"][i], rows["redundancy"][i])
+        ], int)  # fmt: skip
+        if not len(open_ones):
+            break
+        left = np.zeros_like(weight)
+        left[open_ones] = [found[i].used for i in open_ones]
+        seen = dataclasses.replace(portion.seen, weight=left)
+        again = dataclasses.replace(portion, seen=seen)
+        again = _solve_portion(model, free, known, max_steps, size, on_cpu, again)
+        for name, values in rows.items():
+            values[open_ones] = again[name][open_ones]
+    lost = (first["status"] != CONVERGED) & (rows["status"] != CONVERGED)
+    for name, values in rows.items():
+        values[lost] = first[name][lost]
+    for i in np.flatnonzero(lost):
+        found[i].used = found[i].seen
+    rows["removed"] = np.stack([camera.seen & ~camera.used for camera in found])
+    return rows
+
+
+@partial(jax.jit, static_argnums=range(3))
+def _tests_program(model, free, on_cpu, seen, used, interior, quaternion, shift, views):
+    def one(arguments):
+        seen, used, at, views = arguments
+        seen = Sightings(seen.point, seen.xy, seen.weight * views[:, None])
+        return point_tests(model, free, seen, seen.weight * used, at)
+
+    every = partial(jax.lax.map, one) if on_cpu else jax.vmap(one)
+    return every((seen, used, Calibration(interior, quaternion, shift), views))
+
+
+def _solve_portion(model, free, known, max_steps, size, on_cpu, portion: Portion) -> dict:
+    """The rows of a `BatchCalibration`, with the status as its number."""
+    result = _portion_program(
+        model, free, known, portion.flat, on_cpu, max_steps, size,
+        portion.seen, portion.interior, portion.axes, portion.middle,
+    )  # fmt: skip
+    return jax.tree.map(np.array, result)
+
+
+@partial(jax.jit, static_argnums=range(5))
+def _portion_program(
+    model, free, known, flat, on_cpu, max_steps, size, seen, interior, axes, middle
+):
+    def one(arguments):
+        seen, interior = arguments
+        usable, start = start_values(model, flat, known, seen, interior, size)
+        solved = solve_camera(model, free, max_steps, size, usable, start)
+        return solved, jnp.sum(residual_lengths(model, usable, solved.at))
+
+    every = partial(jax.lax.map, one) if on_cpu else jax.vmap(one)
+    solved, lengths = every((seen, interior))
+    variance = 2 * solved.cost / solved.redundancy
+    covariance = variance[:, None, None] * solved.interior_cofactors
+    points = 0.5 * (solved.redundancy + len(free) + POSE * solved.views.sum(1))
+    rotation, position, angles, pose_sigma = jax.vmap(
+        jax.vmap(_exterior_orientation, (0, 0, 0, None, None))
+    )(solved.at.rotation, solved.at.shift, solved.pose_cofactors, axes, middle)
+    pose_sigma = jnp.sqrt(variance)[:, None, None] * pose_sigma
+    return dict(
+        status=solved.status,
+        values=solved.at.interior[:, jnp.array(free)],
+        sigma=jnp.sqrt(jnp.diagonal(covariance, axis1=1, axis2=2)),
+        covariance=covariance,
+        reduced=solved.reduced,
+        interior=solved.at.interior,
+        sigma0=jnp.sqrt(variance),
+        rms=jnp.sqrt(2 * solved.cost / points),
+        mean_length=lengths / points,
+        quaternion=solved.at.rotation,
+        shift=solved.at.shift,
+        redundancy=solved.redundancy,
+        iterations=solved.steps,
+        views=solved.views,
+        position=position,
+        angles=angles,
+        sigma_position=pose_sigma[..., :3],
+        sigma_angles=pose_sigma[..., 3:],
+        rotation=rotation,
+    )
+
+
+def _exterior_orientation(quaternion, shift, Q, axes, middle):
+    """M, X0, (ω, φ, κ) and their σ for σ₀ = 1 of one view, from the cofactors Q of (δt, δθ).
+
+    ray = M'·A·(X − X̄) + t, so that M = M'·A and X0 = X̄ − Mᵀ·t; A: the object's principal axes.
+    """
+
+    def pose(change):
+        M = matrix_from_rotation_vector(change[3:]) @ matrix_from_quaternion(quaternion) @ axes
+        X0 = middle - M.T @ (shift + change[:3])
+        return jnp.concatenate([X0, omega_phi_kappa_from_matrix(M)]), M
+
+    J, _ = jax.jacfwd(pose, has_aux=True)(jnp.zeros(6))
+    orientation, M = pose(jnp.zeros(6))
+    return M, orientation[:3], orientation[3:], jnp.sqrt(jnp.diagonal(J @ Q @ J.T))

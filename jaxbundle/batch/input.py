@@ -1,0 +1,288 @@
+"""The input of `calibrate_batch`: checked, turned into principal axes, cut into padded portions."""
+
+import dataclasses
+import math
+from collections.abc import Iterable, Iterator, Mapping
+
+import numpy as np
+
+from jaxbundle.arguments import numeric_array
+from jaxbundle.batch.normal import Sightings
+from jaxbundle.cameras import CameraModel, check_own, default_parameters, get_model, is_own
+from jaxbundle.errors import InputError
+
+FLAT = 0.02
+"""A smaller extent across than this fraction of the second largest: the object starts as flat."""
+
+LARGEST = 1e100
+"""Larger numbers are as good as infinite: their products soon are."""
+
+ON_CPU, ON_ACCELERATOR = 32, 512
+"""Cameras of a portion."""
+
+WORTH_COMPILING = 4_000_000
+"""So many points of views take as long as compiling for another number of views: 2 to 3 s."""
+
+
+def bucket(n: int) -> int:
+    """The next size to pad to: 4, 5, 6, 7, 8, 10, 12, 14, 16, 20, 24, 28, 32, …"""
+    step = 2 ** max(0, math.ceil(math.log2(max(n, 4))) - 3)
+    return max(4, math.ceil(n / step) * step)
+
+
+@dataclasses.dataclass(frozen=True)
+class Portion:
+    """Padded arrays of some cameras, for one call of the compiled program.
+
+    `views` [cameras, n]: the numbers of the views that are there, all that show anything.
+    """
+
+    cameras: np.ndarray
+    views: np.ndarray
+    flat: bool
+    seen: Sightings
+    interior: np.ndarray
+    axes: np.ndarray
+    middle: np.ndarray
+
+
+def once(X: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    """Object points listed for every view, as OpenCV takes them, but the same in all: once."""
+    if xy.ndim != 4 or X.shape in (xy.shape[2:3] + (3,), xy.shape[::2] + (3,)):
+        return X
+    cameras, views, points, _ = xy.shape
+    if X.shape in ((1, points, 3), (views, points, 3), (cameras, views, points, 3)):
+        first = X[..., :1, :, :]
+        if np.array_equal(X, np.broadcast_to(first, X.shape), equal_nan=True):
+            return first[..., 0, :, :]
+        raise InputError(
+            "object_points differ from view to view; give the points of all views as one list "
+            "[points, 3], and by visible which of them a view shows"
+        )
+    return X
+
+
+def check_shapes(X: np.ndarray, xy: np.ndarray, size: np.ndarray, visible: np.ndarray) -> None:
+    """Refuse the arrays of a batch whose shapes do not fit each other.
+
+    **Raises:** `InputError`."""
+    if xy.ndim != 4 or xy.shape[3] != 2:
+        raise InputError(
+            f"image_points must have the shape [cameras, views, points, 2], but has {xy.shape}"
+        )
+    cameras, _, points, _ = xy.shape
+    if X.shape not in ((points, 3), (cameras, points, 3)):
+        raise InputError(
+            f"object_points must have the shape [{points}, 3] or [{cameras}, {points}, 3], as "
+            f"image_points has {points} points a view, but has {X.shape}"
+        )
+    if visible.shape != xy.shape[:3]:
+        raise InputError(
+            f"visible must have the shape {xy.shape[:3]} of image_points, but has {visible.shape}"
+        )
+    for number, thing in zip(xy.shape, ("camera", "view", "point")):
+        if not number:
+            raise InputError(f"image_points has no {thing}: its shape is {xy.shape}")
+    if visible.dtype.kind != "b" and not np.isin(visible, (0, 1)).all():
+        raise InputError("visible must be true or false, or 1 or 0")
+    if size.shape != (2,) or not (np.isfinite(size) & (size > 0)).all():
+        raise InputError(
+            f"image_size must be width and height in pixels, but is {str(size.tolist())[:80]}"
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Batch:
+    """The checked input: object points about their mean and along their principal axes.
+
+    `finite`: all numbers of the camera can be used; the others are not looked at.
+    """
+
+    finite: np.ndarray
+    point: np.ndarray
+    middle: np.ndarray
+    axes: np.ndarray
+    flat: np.ndarray
+    xy: np.ndarray
+    visible: np.ndarray
+    interior: np.ndarray
+    free: tuple[int, ...]
+    known: bool
+    image_size: np.ndarray
+
+    @property
+    def size(self) -> float:
+        """A length of the image, pixels."""
+        return float(self.image_size.max())
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    @classmethod
+    def of(cls, object_points, image_points, image_size, model, visible, free, start):
+        model = pixel_model(model)
+        xy = numeric_array("image_points", image_points, "numbers [cameras, views, points, 2]")
+        X = once(numeric_array("object_points", object_points, "numbers [points, 3]"), xy)
+        size = numeric_array("image_size", image_size, "width and height in pixels")
+        if visible is None:
+            visible = np.ones(xy.shape[:3], bool)
+        visible = numeric_array(
+            "visible", visible, "true or false [cameras, views, points]", truths=True
+        )
+        check_shapes(X, xy, size, visible)
+        X, xy = X.astype(float), xy.astype(float)
+        cameras = len(xy)
+        free = free_parameters(model, free)
+        interior, known = _interior(model, free, start, size, cameras)
+        there = ~np.any(np.isnan(X), axis=-1)
+        visible = visible.astype(bool) & ~np.isnan(xy).any(-1) & there[..., None, :]
+        seen = np.any(visible, axis=1)
+        X = np.where(seen[..., None], X, 0.0)
+        xy = np.where(visible[..., None], xy, 0.0)
+        finite = np.all([
+            np.all(_usable(numbers), axis=tuple(range(1, numbers.ndim)))
+            for numbers in (X, xy, interior)
+        ], axis=0)  # fmt: skip
+        X[~finite], xy[~finite] = 0.0, 0.0
+        return cls(
+            finite, *_principal_axes(X, seen), xy=xy, visible=visible, interior=interior,
+            free=tuple(model.parameters.index(name) for name in free), known=known,
+            image_size=size.astype(float),
+        )  # fmt: skip
+
+    def portions(self, on_cpu: bool) -> Iterator[Portion]:
+        """Cameras in portions; flat and solid objects apart, and few views from many."""
+        points = self.xy.shape[2]
+        points = bucket(points) if points > 128 else -(-points // 8) * 8
+        shown = self.visible.any(2) & self.finite[:, None]
+        widths = self._widths(shown.sum(1), points)
+        size = ON_CPU
+        if not on_cpu:
+            size = min(ON_ACCELERATOR, 2 ** math.ceil(math.log2(max(len(self), 1))))
+        for flat in (True, False):
+            for width in np.unique(widths):
+                cameras = np.flatnonzero((self.flat == flat) & (widths == width))
+                for first in range(0, len(cameras), size):
+                    some = cameras[first : first + size]
+                    views = np.argsort(~shown[some], axis=1, kind="stable")[:, :width]
+                    yield self._portion(some, np.sort(views), flat, size, (width, points))
+
+    def _widths(self, views: np.ndarray, points: int) -> np.ndarray:
+        """To how many views each camera is filled up: cameras with fewer go by themselves where
+        they save more than the compilation of another program costs."""
+        need = np.array([bucket(number) for number in views])
+        width = bucket(self.xy.shape[1])
+        widths = np.full(len(need), width)
+        for fewer in np.unique(need)[::-1]:
+            if (need <= fewer).sum() * (width - fewer) * points > WORTH_COMPILING:
+                width = fewer
+            widths[need <= fewer] = width
+        return widths
+
+    def _portion(self, cameras, views, flat, size, shape) -> Portion:
+        def wide(rows, *axes):
+            missing = [n - old for n, old in zip(axes, rows.shape)]
+            return np.pad(rows, [(0, n) for n in missing] + [(0, 0)] * (rows.ndim - len(axes)))
+
+        of_views = lambda rows: rows[cameras[:, None], views]
+        visible = of_views(self.visible) & self.finite[cameras, None, None]
+        seen = Sightings(
+            point=wide(self.point[cameras], size, shape[1]),
+            xy=wide(of_views(self.xy), size, *shape),
+            weight=wide(visible.astype(float), size, *shape),
+        )
+        interior = np.pad(self.interior[cameras], [(0, size - len(cameras)), (0, 0)], mode="edge")
+        return Portion(
+            cameras, views, flat, seen, interior,
+            wide(self.axes[cameras], size), wide(self.middle[cameras], size),
+        )  # fmt: skip
+
+
+def _usable(numbers: np.ndarray) -> np.ndarray:
+    """Finite, and so are sums of their squares."""
+    return np.abs(numbers) < LARGEST
+
+
+def pixel_model(name: str | CameraModel) -> CameraModel:
+    """The camera model of this name, or an own one, if its unit is the pixel."""
+    if not isinstance(name, str | CameraModel):
+        raise InputError(
+            f"model must be a name, such as 'opencv', or a CameraModel, but is {name!r}"
+        )
+    try:
+        model = get_model(name)
+        if is_own(model):
+            check_own(model)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+    if model.unit != "px":
+        raise InputError(
+            f"model {model.name!r} is in {model.unit}; a batch needs a camera in pixels"
+        )
+    return model
+
+
+def free_parameters(model: CameraModel, free) -> tuple[str, ...]:
+    """The parameters to estimate, checked."""
+    if free is None:
+        free = model.free
+    if isinstance(free, str | bytes) or not isinstance(free, Iterable):
+        raise InputError(f"free must be a list of names, such as ['fx', 'fy'], but is {free!r}")
+    free = list(free)
+    for name in free:
+        if name not in model.parameters or name in model.never_free:
+            raise InputError(
+                f"free: camera model {model.name!r} has no free parameter {name!r}; "
+                f"its parameters are {', '.join(model.parameters)}"
+            )
+    if not free or len({*free}) < len(free):
+        raise InputError("free: name at least one parameter, and each once")
+    return tuple(free)
+
+
+def _middle_of(model: CameraModel) -> tuple[str, ...]:
+    """The principal point, where it is in the middle of the image and not at zero."""
+    return model.principal_point if model.axes == "down" else ()
+
+
+def _interior(model: CameraModel, free, start, size, cameras):
+    """Start values [cameras, parameters]; are the focal lengths among them?"""
+    values = {name: 1.0 for name in model.principal_distance} | default_parameters(model)
+    values |= {name: (n - 1) / 2 for name, n in zip(_middle_of(model), size)}
+    start = {} if start is None else start
+    if not isinstance(start, Mapping):
+        raise InputError(f"start must be like {{'fx': 900.0, 'fy': 900.0}}, but is {start!r:.80}")
+    for name in start:
+        if name not in values:
+            raise InputError(
+                f"start: camera model {model.name!r} has no parameter {name!r}; "
+                f"its parameters are {', '.join(model.parameters)}"
+            )
+    given = [name for name in model.principal_distance if name in start]
+    missing = [name for name in model.principal_distance if name not in start]
+    held = [name for name in missing if name not in free]
+    if (given and missing) or held:
+        raise InputError(f"start: give {', '.join(missing)} as well")
+    number = f"a number, or one for each of {cameras} cameras"
+    columns = []
+    for name in model.parameters:
+        column = numeric_array(f"start: {name}", {**values, **start}[name], number)
+        if column.shape not in ((), (1,), (cameras,)):
+            raise InputError(f"start: {name} must be {number}, but has the shape {column.shape}")
+        if name in model.principal_distance and (column <= 0).any():
+            raise InputError(f"start: {name} must be positive")
+        columns.append(np.broadcast_to(column.astype(float), (cameras,)))
+    return np.stack(columns, 1), bool(given)
+
+
+def _principal_axes(X, seen):
+    """Points [cameras, points, 3] about the mean of those seen, along their principal axes; the
+    mean; the axes as rows [cameras, 3, 3]; is the object flat?"""
+    number = np.maximum(seen.sum(1), 1)[:, None]
+    middle = X.sum(1) / number
+    centred = np.where(seen[..., None], X - middle[:, None], 0.0)
+    values, vectors = np.linalg.eigh(np.einsum("cpi,cpj->cij", centred, centred))
+    axes = vectors[:, :, ::-1].swapaxes(1, 2)
+    axes = axes * np.linalg.det(axes)[:, None, None]
+    flat = values[:, 0] <= np.maximum(FLAT**2 * values[:, 1], 1e-12 * values[:, 2])
+    return centred @ axes.swapaxes(1, 2), middle, axes, flat

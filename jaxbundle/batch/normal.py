@@ -1,0 +1,185 @@
+"""The normal equations of one camera calibrated from many views of known points, by view.
+
+    ray = M·X + t,        v = computed − observed image point      (pixels, weight 1 or 0)
+
+Unknown are the free parameters of the interior orientation, shared by all views, and 6 of every
+view: a shift δt and a turn δθ about the middle of the object, which is the origin of X:
+
+    ray(δ) = M·X + δθ × (M·X) + t + δt
+
+A board in front of a camera hardly correlates the two, whereas a turn about the projection centre
+shifts the image as a displacement does. For each view the *augmented* normal matrix is kept,
+
+    N = [Jₑ Jᵢ v]ᵀ·[Jₑ Jᵢ v],        Jₑ ∂v/∂(δt, δθ),  Jᵢ ∂v/∂(interior),
+
+all that a step, its predicted effect and the covariances need. The views are eliminated first
+(Schur), then a small dense system of the interior orientation remains:
+
+    S = Σ Nᵢᵢ − Nᵢₑ·Nₑₑ⁻¹·Nₑᵢ
+
+Arrays are [views, points] for every quantity of a point, and one product of matrices a view builds
+N: a camera of 20 views × 88 points takes 0.12 ms a core, with the derivatives as the last axis
+0.18 ms.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxbundle import cameras
+from jaxbundle.batch.small_cholesky import backward, cholesky, forward, rows_of
+from jaxbundle.geometry import matrix_from_quaternion, retract_quaternion
+from jaxbundle.types import AnyArray
+
+POSE = 6
+"""Unknowns of a view: δt (3), δθ (3)."""
+
+
+class Sightings(eqx.Module):
+    """What one camera saw: object points about their middle, image points, weights 1 or 0."""
+
+    point: Float[AnyArray, "*cameras points 3"]
+    xy: Float[AnyArray, "*cameras views points 2"]
+    weight: Float[AnyArray, "*cameras views points"]
+
+    @property
+    def views(self) -> Bool[Array, " views"]:
+        """Views that take part."""
+        return jnp.any(self.weight > 0, 1)
+
+
+class Calibration(eqx.Module):
+    """The unknowns: all interior parameters; unit quaternion of M and t of every view."""
+
+    interior: Float[Array, " parameters"]
+    rotation: Float[Array, "views 4"]
+    shift: Float[Array, "views 3"]
+
+
+def normal_equations(model, free, seen: Sightings, at: Calibration):
+    """The augmented normal matrix of every view [views, 6 + k + 1, 6 + k + 1].
+
+    **Arguments:** `free`: the columns of the k free parameters.
+    """
+    return gram(*design(model, free, seen, at))
+
+
+def design(model, free, seen: Sightings, at: Calibration) -> tuple[list, list]:
+    """The columns of [Jₑ Jᵢ v], each [views, points]: the rows of x, and those of y."""
+    M = jax.vmap(matrix_from_quaternion)(at.rotation)
+    of_view = lambda column: column[:, None]
+    # What is not seen stands at the middle of the object, whose image always exists.
+    X = [jnp.where(seen.weight > 0, seen.point[:, i], 0.0) for i in range(3)]
+    Y = [sum(of_view(M[:, i, j]) * X[j] for j in range(3)) for i in range(3)]
+    t = [of_view(at.shift[:, i]) for i in range(3)]
+    xy = (seen.xy[..., 0], seen.xy[..., 1])
+
+    def weighted_residual(change):
+        d_shift, (a, b, c), d_interior = change
+        turn = (b * Y[2] - c * Y[1], c * Y[0] - a * Y[2], a * Y[1] - b * Y[0])
+        ray = tuple(Y[i] + turn[i] + t[i] + d_shift[i] for i in range(3))
+        interior = list(at.interior)
+        for column, d in zip(free, d_interior):
+            interior[column] = interior[column] + d
+        vx, vy = cameras.residual(model, "measured", tuple(interior), ray, xy)
+        return seen.weight * vx, seen.weight * vy
+
+    nil = jnp.zeros_like(seen.weight)
+    one = jnp.ones_like(nil)
+    still = ((nil,) * 3, (nil,) * 3, (nil,) * len(free))
+    (vx, vy), pull = jax.vjp(weighted_residual, still)
+    flat = lambda rows: [column for group in rows for column in group]
+    return [*flat(pull((one, nil))[0]), vx], [*flat(pull((nil, one))[0]), vy]
+
+
+def residual_lengths(model, seen: Sightings, at: Calibration) -> Float[Array, "views points"]:
+    """√(vx² + vy²) of all points, 0 where none is seen."""
+    M = jax.vmap(matrix_from_quaternion)(at.rotation)
+    X = [jnp.where(seen.weight > 0, seen.point[:, i], 0.0) for i in range(3)]
+    r, s, q = (
+        sum(M[:, i, j, None] * X[j] for j in range(3)) + at.shift[:, i, None] for i in range(3)
+    )
+    xy = (seen.xy[..., 0], seen.xy[..., 1])
+    vx, vy = cameras.residual(model, "measured", tuple(at.interior), (r, s, q), xy)
+    return jnp.asarray(seen.weight) * jnp.sqrt(vx * vx + vy * vy)
+
+
+def gram(x: list, y: list) -> Float[Array, "views n n"]:
+    """AᵀA by view, of the n columns of A, of which every point has a row in x and one in y."""
+    square = lambda A: jnp.einsum("vip,vjp->vij", A, A)
+    return square(jnp.stack(x, 1)) + square(jnp.stack(y, 1))
+
+
+class Factor(eqx.Module):
+    """The damped normal equations, factorised.
+
+    `scale` [views, 6] and `interior_scale` [k] make the diagonal 1 before the damping; `reduced` is
+    the matrix of the interior orientation, so scaled, after the elimination.
+    """
+
+    pose: list
+    eliminated: list
+    reduced: Float[Array, "k k"]
+    scale: Float[Array, "views 6"]
+    interior: Float[Array, "k k"]
+    interior_scale: Float[Array, " k"]
+    right: Float[Array, " k"]
+
+
+def factorise(N, views, damping) -> Factor:
+    """Eliminate the views and factorise what remains; damping is Marquardt's, λ·diag(N)."""
+    k = N.shape[1] - POSE - 1
+    diagonal = jnp.diagonal(N, axis1=1, axis2=2)
+    scale = jax.lax.rsqrt(jnp.where(views[:, None], diagonal[:, :POSE], 1.0))
+    E = rows_of(N[:, :POSE, :POSE])
+    s = [scale[:, i] for i in range(POSE)]
+    E = [[s[i] * s[j] * E[i][j] for j in range(i + 1)] for i in range(POSE)]
+    for i in range(POSE):
+        E[i][i] = jnp.where(views, 1.0 + damping, 1.0)
+    L = cholesky(E)
+    wide = [[element[:, None] for element in row] for row in L]
+    Y = forward(wide, [s[i][:, None] * N[:, i, POSE:] for i in range(POSE)])
+    flat = jnp.concatenate(Y, 0)
+    total = N[:, POSE:, POSE:].sum(0)
+    reduced = total - flat.T @ flat
+    interior_scale = jax.lax.rsqrt(jnp.diagonal(total)[:k])
+    S = interior_scale[:, None] * reduced[:k, :k] * interior_scale + damping * jnp.eye(k)
+    factor = jnp.linalg.cholesky(S)
+    return Factor(
+        pose=L, eliminated=Y, reduced=S, scale=scale, interior=factor,
+        interior_scale=interior_scale, right=reduced[:k, k],
+    )
+
+
+def step(factor: Factor):
+    """The change −(N + λD)⁻¹·Jᵀv: of the views [views, 6] and the interior orientation [k]."""
+    b = -factor.interior_scale * factor.right
+    d_interior = factor.interior_scale * jax.scipy.linalg.cho_solve((factor.interior, True), b)
+    k = len(b)
+    Y = [-(row[:, k] + row[:, :k] @ d_interior) for row in factor.eliminated]
+    return factor.scale * jnp.stack(backward(factor.pose, Y), 1), d_interior
+
+
+def cofactors(factor: Factor):
+    """Q of the interior orientation [k, k], and of every view [views, 6, 6], marginal; and how well
+    the weakest interior parameter is determined, 1/(Qᵢᵢ·Nᵢᵢ): 1 by itself, 0 not at all."""
+    k = len(factor.right)
+    inverse = jax.scipy.linalg.cho_solve((factor.interior, True), jnp.eye(k))
+    interior = factor.interior_scale[:, None] * inverse * factor.interior_scale
+    columns = [jnp.broadcast_to(row, (len(factor.scale), POSE)) for row in jnp.eye(POSE)]
+    wide = [[element[:, None] for element in row] for row in factor.pose]
+    own = backward(wide, forward(wide, columns))
+    through = backward(wide, [row[:, :k] for row in factor.eliminated])
+    own, through = (factor.scale[:, :, None] * jnp.stack(x, 1) for x in (own, through))
+    pose = own * factor.scale[:, None, :] + through @ interior @ through.swapaxes(1, 2)
+    return interior, pose, 1 / jnp.max(jnp.diagonal(inverse))
+
+
+def retract(free, at: Calibration, d_pose, d_interior) -> Calibration:
+    """The unknowns after a change; every view turns about the middle of the object."""
+    return Calibration(
+        interior=at.interior.at[jnp.array(free)].add(d_interior),
+        rotation=jax.vmap(retract_quaternion)(at.rotation, d_pose[:, 3:]),
+        shift=at.shift + d_pose[:, :3],
+    )

@@ -1,0 +1,140 @@
+"""The result of `calibrate_batch`: numbers by camera, as arrays, a table, or HTML."""
+
+import dataclasses
+from html import escape
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
+
+from jaxbundle.batch.camera import CONVERGED, MISFIT, STATUS, WEAK
+from jaxbundle.cameras import CameraModel
+
+SOLVED = (STATUS[CONVERGED], STATUS[WEAK], STATUS[MISFIT])
+"""Statuses of cameras that have values."""
+MOST_ROWS = 20
+"""Cameras in the HTML table; those that need attention first."""
+MOST_REMARKS = 10
+"""Remarks that differ, in the text."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BatchCalibration:
+    """The cameras of a batch; everything of a camera that has no solution is NaN.
+
+    **Fields:**
+
+    - `model`, `parameters`: the camera model and its k free parameters.
+    - `status`: "converged"; "weak", as that, but the views do not determine the principal distance
+      or point, whose σ is above a fiftieth of the principal distance; "misfit": it has values, but
+      the residuals do not fit, by themselves (gross errors) or beside those of the other cameras of
+      the batch (see `jaxbundle.batch.misfit`). Without a solution "iteration limit",
+      "singular", "not finite" (an infinite number among the measurements, or the start) or
+      "too few points" (no view of use, or no redundancy).
+    - `remark`: what seems not to be meant about its image points, and of a camera that is not
+      determined an RMS far above that of the others; mostly empty.
+    - `undetermined`: the free parameters that the views do not determine, where that is why the
+      camera is weak, is singular or came to no end.
+    - `values`, `sigma`, `covariance`: of the free parameters; pixels, coefficients without unit.
+    - `interior`: all parameters of the model, in its order.
+    - `sigma0`: √(vᵀv/redundancy), pixels; all σ and covariances are a posteriori.
+    - `rms`: √(Σ(vx² + vy²)/points), pixels, as OpenCV defines it.
+    - `redundancy`, `iterations` (evaluations of the normal equations).
+    - `views`: the views that took part. One with fewer than 4 points of a flat object (6 of a solid
+      one), or with all of them on a line (in a plane), is left out.
+    - `removed`: the image points removed by data snooping; None without it.
+    - `position`, `angles`: X0, Y0, Z0 in the unit of the object; ω, φ, κ in radians, with
+      `sigma_position`, `sigma_angles`; `rotation`: the matrices M.
+    """
+
+    model: str | CameraModel
+    parameters: tuple[str, ...]
+    status: Shaped[np.ndarray, " cameras"]
+    remark: Shaped[np.ndarray, " cameras"]
+    undetermined: Bool[np.ndarray, "cameras k"]
+    values: Float[np.ndarray, "cameras k"]
+    sigma: Float[np.ndarray, "cameras k"]
+    covariance: Float[np.ndarray, "cameras k k"]
+    interior: Float[np.ndarray, "cameras parameters"]
+    sigma0: Float[np.ndarray, " cameras"]
+    rms: Float[np.ndarray, " cameras"]
+    redundancy: Int[np.ndarray, " cameras"]
+    iterations: Int[np.ndarray, " cameras"]
+    views: Bool[np.ndarray, "cameras views"]
+    position: Float[np.ndarray, "cameras views 3"]
+    angles: Float[np.ndarray, "cameras views 3"]
+    sigma_position: Float[np.ndarray, "cameras views 3"]
+    sigma_angles: Float[np.ndarray, "cameras views 3"]
+    rotation: Float[np.ndarray, "cameras views 3 3"]
+    removed: Bool[np.ndarray, "cameras views points"] | None = None
+
+    @property
+    def converged(self) -> Bool[np.ndarray, " cameras"]:
+        """Which have a solution that fits, and everything in it is determined."""
+        return self.status == STATUS[CONVERGED]
+
+    @property
+    def solved(self) -> Bool[np.ndarray, " cameras"]:
+        """Which have values: the weak ones and the misfits as well."""
+        return np.isin(self.status, SOLVED)
+
+    def __len__(self) -> int:
+        return len(self.status)
+
+    def __str__(self) -> str:
+        names, counts = np.unique(self.status, return_counts=True)
+        states = ", ".join(f"{count} {name}" for name, count in zip(names, counts))
+        rms = f"median RMS {np.nanmedian(self.rms):.4g} px" if self.solved.any() else "no result"
+        said = [f"{len(self)} cameras, model {self.model}: {states}; {rms}"]
+        if self.removed is not None:
+            said.append(f"{int(self.removed.sum())} image points removed by data snooping")
+        remarks, first, counts = np.unique(self.remark, return_index=True, return_counts=True)
+        lines = [
+            f"camera {row}{f' and {count - 1} more' if count > 1 else ''}: {remark}"
+            for row, remark, count in sorted(zip(first, remarks, counts)) if remark
+        ]  # fmt: skip
+        if len(lines) > MOST_REMARKS:
+            lines[MOST_REMARKS:] = [f"and {len(lines) - MOST_REMARKS} more remarks, see `remark`"]
+        return "\n".join(said + lines)
+
+    def table(self) -> dict[str, np.ndarray]:
+        """A row a camera: status, remark, rms and sigma0 (pixels), redundancy, iterations, views,
+        points removed where there was data snooping, every parameter and its σ."""
+        columns = {
+            "status": self.status, "remark": self.remark, "rms": self.rms, "sigma0": self.sigma0,
+            "redundancy": self.redundancy, "iterations": self.iterations,
+            "views": self.views.sum(1),
+        }  # fmt: skip
+        if self.removed is not None:
+            columns["removed"] = self.removed.sum((1, 2))
+        for k, name in enumerate(self.parameters):
+            columns |= {name: self.values[:, k], f"sigma_{name}": self.sigma[:, k]}
+        return columns
+
+    def to_pandas(self):
+        """`table` as a pandas data frame (extra `tables`)."""
+        try:
+            import pandas
+        except ImportError as error:
+            raise ImportError("data frames need pandas: pip install 'jaxbundle[tables]'") from error
+        return pandas.DataFrame(self.table())
+
+    def _repr_html_(self) -> str:
+        """The cameras as a table, those that did not converge first."""
+        table = self.table()
+        if not (self.remark != "").any():
+            del table["remark"]
+        rows = np.argsort(self.converged, kind="stable")[:MOST_ROWS]
+        cell = 'style="text-align:left;padding:2px 12px 2px 0"'
+        shown = lambda x: f"{x:.6g}" if isinstance(x, float | np.floating) else escape(str(x))
+        line = lambda tag, texts: "<tr>" + "".join(
+            f"<{tag} {cell}>{text}</{tag}>" for text in texts
+        ) + "</tr>"
+        body = "".join(
+            line("td", [row, *(shown(column[row]) for column in table.values())]) for row in rows
+        )
+        more = f"<p>and {len(self) - len(rows)} more</p>" if len(self) > len(rows) else ""
+        head = "<br>".join(map(escape, str(self).splitlines()))
+        return (
+            f'<div><b>{head}</b><table style="border-collapse:collapse;font-size:90%">'
+            f'{line("th", ["camera", *table])}{body}</table>{more}</div>'
+        )

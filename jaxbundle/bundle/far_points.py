@@ -1,0 +1,211 @@
+"""Points of which nearly parallel rays tell the direction, but hardly the distance.
+
+Their distances drift for ever, or leave the normal equations singular. So points with parallel
+rays, and where an adjustment does not end all narrow ones, are adjusted as points at any distance
+(`leastsquares.any_distance`). One that its rays pull beyond infinity is held there, as a direction;
+it is let go again where they pull it back (an active set).
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxbundle.adjustment.problem import Problem
+from jaxbundle.bundle.minimum import adjusted_cameras, minimise, solved
+from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.any_distance import FARTHEST, is_at_infinity
+from jaxbundle.leastsquares.solver import History, Minimum
+from jaxbundle.leastsquares.stopping import LIMIT
+from jaxbundle.network.arrays import Values
+from jaxbundle.orientation.many import matrices_of_quaternions
+from jaxbundle.orientation.sights import sights
+from jaxbundle.statistics.inspection import Inspection
+from jaxbundle.types import present
+
+NARROW, PARALLEL = 0.03, 1e-3
+"""Radians between the rays of a point that may be at any distance; and of one that is from the
+beginning, unless half of the tie points are: then the images stand at one place, or nearly."""
+PATIENCE = 30
+"""Evaluations of a network with narrow points before they are at any distance; twice as many where
+half of the tie points are narrow."""
+ROUND = 4
+"""Evaluations until it is looked who is pulled beyond infinity, or back; twice as many each time
+that nobody was."""
+RELEASES = 10
+"""A point that was let go so often stays at infinity."""
+
+
+def minimise_at_any_distance(
+    problem: Problem, start: Values, make: Callable, *, max_steps: int, **options
+) -> tuple[Problem, Minimum]:
+    """Iterate from `start`, points with parallel rays at any distance; where that does not end, all
+    narrow ones. What is returned is that problem if it was solved, else the one given.
+
+    `make(lengths)`: the problem anew (see `make_problem`)."""
+    angle = angle_of_rays(problem, start)
+    if not (angle < NARROW).any():
+        return problem, minimise(problem, start, max_steps=max_steps, **options)
+    mostly = lambda narrow: 2 * narrow.sum() >= (angle < np.pi).sum()
+    legs, parallel = [], angle < PARALLEL
+    for chosen in (parallel & ~mostly(parallel), None):
+        if chosen is None:
+            patience = PATIENCE * (2 if mostly(angle < NARROW) else 1)
+            plain = minimise(problem, start, max_steps=min(patience, max_steps), **options)
+            if solved(problem.with_factor(), plain) or int(plain.iterations) >= max_steps:
+                return problem, plain
+            legs, start = [plain], plain.values
+            chosen = angle_of_rays(problem, start) < NARROW
+        left = max_steps - sum(int(leg.iterations) for leg in legs)
+        far = _with_far_points(problem, start, chosen, make)
+        if far is not None:
+            found, minimum = minimise_with_infinity(*far, max_steps=left, **options)
+            if solved(found.with_factor(), minimum):
+                return found, _joined([*legs, minimum])
+    if int(legs[0].termination) != LIMIT:
+        return problem, legs[0]
+    return problem, _joined([*legs, minimise(problem, start, max_steps=left, **options)])
+
+
+def minimise_with_infinity(
+    problem: Problem, start: Values, *, max_steps: int, **options
+) -> tuple[Problem, Minimum]:
+    """Iterate from `start`; of points at any distance those stay at infinity that are pulled beyond
+    it. The problem that is returned holds them there."""
+    if problem.layout.lengths is None:
+        return problem, minimise(problem, start, max_steps=max_steps, **options)
+    held = _held(problem)
+    legs, released, steps = [], np.zeros(len(held), int), ROUND
+    problem = _hold_at_infinity(problem, held, start)  # One program for all rounds.
+    while True:
+        left = max_steps - sum(int(leg.iterations) for leg in legs)
+        legs.append(minimise(problem, start, max_steps=min(steps, left), **options))
+        start = legs[-1].values
+        there = at_infinity(problem, start)
+        if there.any():
+            outward = _pulled_outward(problem, start)
+            there &= np.where(held, outward | (released >= RELEASES), outward)
+        released += held & ~there
+        changed = (there != held).any()
+        if left <= steps or not changed and int(legs[-1].termination) != LIMIT:
+            return problem, _joined(legs)
+        steps = ROUND if changed else 2 * steps
+        if changed:
+            held = there
+            problem = _hold_at_infinity(problem, held, start)
+
+
+def angle_of_rays(problem: Problem, values: Values) -> Float[np.ndarray, " points"]:
+    """About the largest angle between two rays of every tie point, radians; 180° of what is none,
+    or has no two rays."""
+    rays = (np.asarray(problem.data.image_weight) > 0).any(1)
+    point, image = problem.point[rays], problem.image[rays]
+    ray = _unit_vectors(np.asarray(values.point)[point] - np.asarray(values.position)[image])
+    middle = np.zeros((len(values.point), 3))
+    np.add.at(middle, point, ray)
+    off = np.linalg.norm(np.cross(ray, _unit_vectors(middle)[point]), axis=1)
+    widest = np.zeros(len(middle))
+    np.fmax.at(widest, point, off)
+    number = np.bincount(point, minlength=len(middle))
+    tie = (number > 1) & problem.network.points.has_role("tie")
+    return np.where(tie, 2 * widest, np.pi)
+
+
+def _with_far_points(problem: Problem, values: Values, chosen, make: Callable):
+    """The problem with these points at any distance, and the values as its own; without those whose
+    coordinates other observations touch; None where none is left, or too few others for the datum.
+    """
+    lengths = np.where(chosen & ~problem.system.kept_rows, _unit(problem), 0.0)
+    if not lengths.any():
+        return None
+    try:
+        far = make(lengths)
+    except InputError:
+        return None
+    if values.other:  # Frames and more that would have to move with the origin.
+        return far, far.data.start
+    shift = problem.origin - far.origin
+    point = np.asarray(values.point) + shift
+    moved = dataclasses.replace(values, position=values.position + shift, point=point)
+    return far, dataclasses.replace(moved, point=_in_front(far, moved))
+
+
+def _in_front(problem: Problem, values: Values) -> Float[np.ndarray, "points 3"]:
+    """The points; of those at any distance the ones that have drifted through infinity, or lie
+    beyond it, are at infinity."""
+    network, X = problem.network, np.asarray(values.point)
+    seen = sights(network.replace(cameras=tuple(adjusted_cameras(problem, values).values())))
+    in_camera = np.column_stack([seen.xy, -np.ones(len(seen.xy))])
+    M = matrices_of_quaternions(np.asarray(values.rotation))[seen.image]
+    ray = np.einsum("nij,ni->nj", M, in_camera)
+    depth = (ray * (X[seen.point] - np.asarray(values.position)[seen.image])).sum(1)
+    sides = np.bincount(seen.point, np.sign(depth), len(X))
+    length = np.linalg.norm(X, axis=1)
+    most = FARTHEST * present(problem.layout.lengths)
+    move = (most > 0) & ((sides < 0) | (length > most))
+    factor = np.where(move, np.where(sides < 0, -most, most) / length, 1.0)
+    return X * factor[:, None]
+
+
+def at_infinity(problem: Problem, values: Values) -> Bool[np.ndarray, " points"]:
+    """Which points are there."""
+    if problem.layout.lengths is None:
+        return problem.at_any_distance
+    return is_at_infinity(np.asarray(values.point), problem.layout.lengths)
+
+
+def _held(problem: Problem) -> Bool[np.ndarray, " points"]:
+    """Which points at any distance are held at infinity."""
+    return problem.at_any_distance & (problem.system.table("point").free[:, 2] == 0)
+
+
+def _hold_at_infinity(problem: Problem, held, values: Values) -> Problem:
+    """These points held at infinity, the others not."""
+    start, far = problem.data.start, problem.at_any_distance
+    point = np.where(held[:, None], np.asarray(values.point), np.asarray(start.point))
+    problem = problem.with_data(
+        dataclasses.replace(problem.data, start=dataclasses.replace(start, point=point))
+    )
+    free = problem.system.table("point").free.copy()
+    free[:, 2] = np.where(far, ~held, free[:, 2])
+    return problem.with_free("point", free)
+
+
+def _pulled_outward(problem: Problem, values: Values) -> Bool[np.ndarray, " points"]:
+    """Whether vᵀPv falls with the distance of a point."""
+    free = _hold_at_infinity(problem, np.zeros(len(values.point), bool), values)
+    solution, slope = Inspection(free, values).solution, np.zeros(len(values.point))
+    for o, s in enumerate(problem.layout.sets):
+        if s.field == "image":
+            rows = slice(None) if s.rows is None else s.rows
+            along = (solution.residuals[o] * solution.by_eliminated[o][:, :, 2]).sum(1)
+            np.add.at(slope, problem.point[rows], along)
+    return slope > 0
+
+
+def _unit(problem: Problem) -> float:
+    """The distance of projection centres from their middle, root of the mean square."""
+    centres = problem.network.images.position
+    return float(np.sqrt(((centres - np.round(centres.mean(0))) ** 2).sum(1).mean()))
+
+
+def _joined(legs: Sequence[Minimum]) -> Minimum:
+    """One minimum of several that were found one after the other; each but the first evaluates
+    first where the one before it ended."""
+    if len(legs) == 1:
+        return legs[0]
+    rows = [slice(k > 0, int(leg.iterations)) for k, leg in enumerate(legs)]
+    column = lambda name: jax.device_put(np.concatenate(
+        [np.asarray(getattr(leg.history, name))[of] for leg, of in zip(legs, rows)]
+    ))  # fmt: skip
+    history = History(column("cost"), column("damping"), column("accepted"))
+    return dataclasses.replace(
+        legs[-1], iterations=np.asarray(len(history.cost)), history=history
+    )
+
+
+def _unit_vectors(v: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return v / np.linalg.norm(v, axis=1, keepdims=True)

@@ -1,0 +1,152 @@
+"""Adjustments repeated: robust estimation, data snooping, variance components, elimination."""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbundle.adjustment.problem import Problem
+from jaxbundle.bundle.minimum import require_solved, solved
+from jaxbundle.bundle.result import Adjustment
+from jaxbundle.cameras import default_parameters, get_model
+from jaxbundle.errors import NotSolvedError
+from jaxbundle.leastsquares.components import ROUNDS, Component, estimate, variance_components
+from jaxbundle.leastsquares.names import Name
+from jaxbundle.leastsquares.robust import residual_lengths, reweight, robust_scale
+from jaxbundle.leastsquares.snooping import Removed, snoop, without
+from jaxbundle.leastsquares.solution import Solution
+from jaxbundle.network.arrays import Values
+from jaxbundle.statistics.blunders import name_removed
+from jaxbundle.statistics.components import groups
+from jaxbundle.statistics.inspection import Inspection
+from jaxbundle.statistics.misfit import contradicts, doubt_of_baarda
+
+
+def snooped(found: Inspection, minimum, again, test: str, significance: float):
+    """The problem and its minimum without blunders, what was removed, and what is to be said of σ
+    that the test trusts though the data contradict them."""
+    problem, whole, doubt = found.problem, found.solution, None
+    repeat = _Repeat(problem, again, "after data snooping", minimum)
+    solution, removed = snoop(whole, repeat, test=test, significance=significance)
+    removed = [name_removed(problem, r) for r in removed]
+    counts = problem.counts
+    if test == "baarda" and counts.redundancy > 0:
+        scale = _scale_of_good(whole, _Repeat(problem, again, "after data snooping", minimum))
+        rays = sum(len(r.rows) for r in removed if r.kind == "image")
+        doubt = doubt_of_baarda(
+            scale, rays, counts.observations // 2, counts.redundancy, significance
+        )
+    return problem.with_system(solution.problem), repeat.minimum, removed, doubt
+
+
+def _scale_of_good(found: Solution, repeat: "_Repeat") -> float:
+    """The robust scale of the image points, whatever the a priori σ.
+
+    What Baarda's test leaves fits too well, for it is what fitted; and blunders spread over the
+    residuals of good points. So where the scale of all points is large, it is that of those which
+    Tukey's estimator does not suspect, whose own scale is a posteriori.
+    """
+    problem = found.problem
+    scale = robust_scale(problem, residual_lengths(found))
+    if scale < 1 or not contradicts(scale, problem.counts.redundancy):
+        return scale
+    try:
+        tukey = reweight(problem, found.values, repeat, "tukey")
+    except NotSolvedError:
+        return scale
+    suspects = [Removed(s.set, s.row, None, s.test) for s in tukey.suspects()]
+    if not suspects:
+        return scale
+    lengths = {o: t * tukey.scale for o, t in tukey.lengths.items()}
+    return robust_scale(without(problem, suspects), lengths)
+
+
+def robustly(problem: Problem, minimum, again, estimator: str):
+    """The solution with the weights of a robust estimator, and its minimum. The first weights come
+    from the minimum, or from the start values if it is no solution."""
+    repeat = _Repeat(problem, again, "by robust estimation", minimum)
+    first = minimum.values if solved(problem, minimum) else problem.data.start
+    reweighted = reweight(problem.system, problem.layout.tables(first), repeat, estimator)
+    if not reweighted.rests:
+        raise NotSolvedError(
+            f"not solved by robust estimation: the weights of {estimator} do not come to rest; use "
+            f"{'' if estimator == 'huber' else 'huber, or '}data snooping"
+        )
+    return reweighted, repeat.minimum
+
+
+class _Repeat:
+    """Adjusts a changed system of a problem, and keeps the minimum."""
+
+    def __init__(self, problem: Problem, again, when: str, minimum):
+        self.problem, self.again, self.when, self.minimum = problem, again, when, minimum
+
+    def __call__(self, system, tables) -> Solution:
+        problem = self.problem.with_system(system)
+        problem, self.minimum = self.again(problem, self.problem.layout.values(tables))
+        return require_solved(problem, self.minimum, self.when).solution
+
+
+def with_components(problem: Problem, minimum, again):
+    """The problem with the σ of every group estimated, its minimum, and by group what the σ have
+    been multiplied by."""
+    repeat = _Repeat(problem, again, "with the estimated variance components", minimum)
+    whole, of = Inspection(problem, minimum.values).solution, groups(problem)
+    found, factors, unsettled = estimate(whole, of, repeat)
+    components = variance_components(found, of, factors)
+    network = problem.network.warn(*_doubts(components, unsettled))
+    problem = dataclasses.replace(problem.with_system(found.problem), network=network)
+    return problem, repeat.minimum, factors
+
+
+def _doubts(components: dict[str, Component], unsettled: list[str]):
+    """What is to be said of an estimate of variance components."""
+    if unsettled:
+        yield (
+            f"the variance components did not settle in {ROUNDS} rounds ({', '.join(unsettled)}): "
+            "their σ are not final"
+        )
+    for name, component in components.items():
+        if not component.usable:
+            why = "fit exactly" if component.redundancy >= 1 else "have too little redundancy"
+            yield f"variance components: {name} {why}; their σ are left as they are"
+
+
+def eliminated_parameters(problem, minimum, again, critical_t):
+    """Fix insignificant additional parameters at 0, or their default, the weakest first."""
+    names = []
+    models = {camera.id: get_model(camera.model) for camera in problem.network.cameras}
+    while True:
+        result = Adjustment(problem.network, problem, minimum)
+        weak = [
+            name for _, name in result.insignificant(critical_t)
+            if name.parameter not in models[name.id].core
+        ]  # fmt: skip
+        if not weak:
+            return problem, minimum, names
+        names.append(weak[0])
+        problem, values = _without_parameter(problem, minimum.values, weak[0])
+        problem, minimum = again(problem, values)
+        require_solved(problem, minimum, f"without {weak[0]}")
+
+
+def _without_parameter(problem: Problem, values: Values, name: Name):
+    c = [camera.id for camera in problem.network.cameras].index(name.id)
+    model = get_model(problem.network.cameras[c].model)
+    column = model.parameters.index(name.parameter)
+    tied = next((g for g in problem.network.cameras[c].tie if name.parameter in g), ())
+    columns = np.array([model.parameters.index(n) for n in tied or (name.parameter,)])
+    value = default_parameters(model)[name.parameter]
+    with_value = lambda camera: jnp.asarray(camera).at[c, columns].set(value)
+    reset = lambda v: eqx.tree_at(lambda v: v.camera, v, with_value(v.camera))
+    data = dataclasses.replace(problem.data, start=reset(problem.data.start))
+    row = np.flatnonzero(problem.layout.given["interior"] == c)
+    if len(row):
+        weight = jnp.asarray(data.interior_weight).at[row[0], column].set(0.0)
+        data = dataclasses.replace(data, interior_weight=weight)
+    table = next(t for t in problem.layout.cameras if c in t.cameras)
+    row = np.flatnonzero(table.cameras == c)
+    moving = problem.system.table(table.name).vector.moving.index(column)
+    problem = problem.with_data(data).hold(table.name, row, [moving])
+    return problem, reset(values)

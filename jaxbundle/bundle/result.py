@@ -1,0 +1,501 @@
+"""The result of an adjustment: values with standard deviations, tests, tables, figures.
+
+Every σ here is a posteriori (times σ0) unless it says a priori. What is costly (cofactors,
+redundancy numbers) is computed when first asked for. A network that was not solved has no
+values to ask for: every accessor raises `NotSolvedError` and says why.
+"""
+
+import functools
+from collections.abc import Callable, Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle import plotting, report
+from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.unknowns import (
+    angles_near,
+    named,
+    place_of,
+    value_of,
+)
+from jaxbundle.arguments import at_least_zero
+from jaxbundle.bundle import tables as result_tables
+from jaxbundle.cameras import get_model
+from jaxbundle.errors import NotSolvedError
+from jaxbundle.leastsquares.adjust import TableResult, table_result
+from jaxbundle.leastsquares.any_distance import is_at_infinity
+from jaxbundle.leastsquares.components import Component, variance_components
+from jaxbundle.leastsquares.distributions import chi2_quantile
+from jaxbundle.leastsquares.names import Name
+from jaxbundle.leastsquares.reduction import FACTORS
+from jaxbundle.leastsquares.robust import Reweighted, residual_lengths, robust_scale
+from jaxbundle.leastsquares.solver import Minimum
+from jaxbundle.leastsquares.stopping import SINGULAR, TERMINATIONS
+from jaxbundle.leastsquares.stopping import converged as reached_minimum
+from jaxbundle.network.arrays import Values
+from jaxbundle.network.columns import some
+from jaxbundle.network.tables import Network, units_of
+from jaxbundle.network.unit_mistakes import name_pixels
+from jaxbundle.network.units import ANGLE_UNITS
+from jaxbundle.orientation.exchanges import CONTRADICTION
+from jaxbundle.statistics.blunders import Removed, Suspect
+from jaxbundle.statistics.check_points import CheckPoints
+from jaxbundle.statistics.components import groups
+from jaxbundle.statistics.far_points import FarPoints, find_far_points
+from jaxbundle.statistics.inspection import Inspection, OfNetwork
+from jaxbundle.statistics.misfit import doubt_of_fit
+from jaxbundle.statistics.validity import Reach, distortion_reach
+from jaxbundle.statistics.weakness import Weakness, weakness
+
+
+class Adjustment:
+    """An adjusted network. Print it, or let a notebook show it; `report()` is the whole protocol.
+
+    **Attributes** (object unit, image unit and angle unit are the network's; angles in methods
+    that return arrays are radians):
+
+    - `converged`, `termination`, `iterations`, `sigma0`, `vtpv`, `redundancy`, `counts`
+    - `cameras`, `images`, `points`, `residuals`: tables (dicts of numpy columns)
+    - `method`, `reduction`: of the solution; the latter of the reduced system of images and cameras
+    - `warnings`, `removed` (data snooping), `eliminated` (insignificant parameters),
+      `undetermined` (names, where the network is singular), `weakness` (what is determined in name
+      only)
+    - `far_points`: direction and distance of the points at any distance, whose rays are nearly
+      parallel; None where there are none
+    - `sigma_factors`: where variance components were estimated, by group of observations, what its
+      a priori σ have been multiplied by; empty otherwise. Everything called a priori then means
+      the estimated σ, except in `variance_components`.
+    - `findings`: likely causes where there is no solution, or one that fits badly; in words, among
+      the `warnings`.
+    - `robust`, `weights`: the estimator, and the factors of the weights it gave the image points
+      in the order of the observations; None otherwise. A priori σ are then those after weighting.
+      `robust_scale`: of the residuals, a posteriori (MAD), in a priori σ; `suspects`: image points
+      whose residuals are too long for good ones.
+    - `doubts`: those of the warnings that the a priori σ, σ0 and blunders are about
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        problem: Problem,
+        minimum: Minimum,
+        *,
+        removed: tuple[Removed, ...] = (),
+        eliminated: tuple[Name, ...] = (),
+        undetermined: tuple[str, ...] = (),
+        check: Callable[["Adjustment"], CheckPoints] | None = None,
+        method: str = "levenberg-marquardt",
+        reduction: str | None = None,
+        sigma_factors: Mapping[str, float] | None = None,
+        inspection: Inspection | None = None,
+        robust: str | None = None,
+        reweighted: Reweighted | None = None,
+        suspects: tuple[Suspect, ...] = (),
+        doubts: tuple[str, ...] = (),
+        weakness: Weakness | None = None,
+        findings: tuple[str, ...] = (),
+    ):
+        self.network = network
+        self.problem = problem
+        self.minimum = minimum
+        self.removed = removed
+        self.eliminated = eliminated
+        self.undetermined = undetermined
+        self.method = method
+        self.reduction = reduction or problem.reduction
+        self.sigma_factors = dict(sigma_factors or {})
+        self.robust = robust
+        self.weights = None if reweighted is None else _of_image_points(problem, reweighted.weights)
+        self.robust_scale = None if reweighted is None else reweighted.scale
+        self.suspects = suspects
+        self._doubts = doubts
+        self.findings = findings
+        self._weakness = weakness
+        self._inspection = inspection
+        self._check = check
+
+    # --- how it ended -----------------------------------------------------------------------
+
+    @property
+    def converged(self) -> bool:
+        """Whether a minimum was reached and everything in it is determined."""
+        return bool(reached_minimum(int(self.minimum.termination))) and not self.undetermined
+
+    @property
+    def termination(self) -> str:
+        """Why the iterations ended, in words."""
+        if self.undetermined:
+            return TERMINATIONS[SINGULAR]
+        return TERMINATIONS[int(self.minimum.termination)]
+
+    @property
+    def iterations(self) -> int:
+        """Steps tried, the rejected ones counted; the evaluation of the start is not one."""
+        return max(int(self.minimum.iterations) - 1, 0)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What was left out or looked strange, in words; also what is poorly determined,
+        distortions that turn back, and a σ0 far from 1."""
+        found = self.distortion_reach.values() if self.converged else ()
+        turns = (reach.message for reach in found if reach.message is not None)
+        lines = (
+            *self.problem.network.warnings, *self.findings, *self.weakness.lines, *turns,
+            *self.doubts,
+        )  # fmt: skip
+        return tuple(dict.fromkeys(lines))
+
+    @functools.cached_property
+    def weakness(self) -> Weakness:
+        """What is determined in name only: unknowns with a σ above a fiftieth of their extent, or,
+        without a solution, with such a σ a priori where the iterations ended.
+
+        The σ are a posteriori, but neither blunders, which the robust scale leaves out, nor a
+        contradiction that is named make good geometry weak."""
+        if self._weakness is not None or not self.converged:
+            return self._weakness or Weakness()
+        scale = self._scale
+        if any(CONTRADICTION in line for line in (*self.problem.network.warnings, *self.findings)):
+            scale = min(scale, 1.0)
+        return weakness(self.inspection, min(self.sigma0, scale))
+
+    @functools.cached_property
+    def _scale(self) -> float:
+        return robust_scale(self.problem.system, residual_lengths(self.inspection.solution))
+
+    @functools.cached_property
+    def doubts(self) -> tuple[str, ...]:
+        """The warnings that are about a priori σ, σ0 and blunders, with the remedy; the last one of
+        a global test that is far from passed."""
+        if not self.converged:
+            return self._doubts
+        doubt, downweighted = None, self.robust and self.sigma0 < 1
+        if not (self.sigma_factors or downweighted or report.unit_weights(self)):
+            in_pixels = bool(name_pixels(self.problem.network))
+            doubt = doubt_of_fit(self.sigma0, self._scale, self.redundancy, in_pixels)
+        return self._doubts if doubt is None else (*self._doubts, doubt)
+
+    @functools.cached_property
+    def distortion_reach(self) -> dict[str, Reach]:
+        """By camera, how far its distortion was looked at, and whether it turns back there."""
+        return distortion_reach(self.problem, self.values)
+
+    @property
+    def counts(self):
+        """Rows and unknowns of the adjustment."""
+        return self.problem.counts
+
+    @property
+    def redundancy(self) -> int:
+        """Observations + pseudo-observations + datum conditions − unknowns."""
+        return self.counts.redundancy
+
+    @property
+    def values(self) -> Values:
+        """The adjusted arrays (relative to `problem.origin`)."""
+        self._require_solved()
+        return self.minimum.values
+
+    def _require_solved(self) -> None:
+        if not self.converged:
+            names = some(self.undetermined, 8, str)
+            what = f"; not determined: {names}" if names else ""
+            what += "".join(f"; {line}" for line in (*self.findings, *self.weakness.lines))
+            raise NotSolvedError(
+                f"the adjustment did not converge ({self.termination}){what}; it has no result"
+            )
+
+    # --- precision of the whole -------------------------------------------------------------
+
+    @functools.cached_property
+    def vtpv(self) -> float:
+        """vᵀPv of all observations, pseudo-observations included."""
+        return self.inspection.vtpv
+
+    @property
+    def sigma0(self) -> float:
+        """σ0 = √(vᵀPv/redundancy), dimensionless; NaN without redundancy."""
+        r = self.redundancy
+        return float(np.sqrt(self.vtpv / r)) if r > 0 else float("nan")
+
+    def pope(self, w: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """Pope's τ = w/σ0 of Baarda's w; NaN where all observations fit exactly."""
+        return w / (self.sigma0 or float("nan"))
+
+    def global_test(self, significance: float = 0.05) -> dict:
+        """χ² test of vᵀPv against a variance factor of 1 (two-sided).
+
+        `passed` is None where variance components were estimated, which makes σ0 = 1.
+        """
+        f = self.redundancy
+        low, high = chi2_quantile(significance / 2, f), chi2_quantile(1 - significance / 2, f)
+        passed = None if self.sigma_factors else low <= self.vtpv <= high
+        return {"vtpv": self.vtpv, "low": low, "high": high, "passed": passed}
+
+    # --- cofactors --------------------------------------------------------------------------
+
+    @functools.cached_property
+    def inspection(self) -> Inspection:
+        """The solution as statistics look at it."""
+        self._require_solved()
+        return self._inspection or Inspection(self.problem, self.values)
+
+    @property
+    def cofactors(self) -> Inspection:
+        """The inspection, where there is a factor to compute cofactors from.
+
+        **Raises:** `NotSolvedError`."""
+        if self.problem.reduction not in FACTORS:
+            raise NotSolvedError(
+                f"the reduced system of {self.problem.system.reduced_size} unknowns was solved "
+                "by iteration and its factor does not fit into memory: there are coordinates, σ0 "
+                "and covariances of single unknowns (`covariance`), but no others"
+            )
+        return self.inspection
+
+    @property
+    def reliability(self) -> OfNetwork:
+        """Redundancy numbers and w of all observations, in the order of the arrays."""
+        return self.cofactors.reliability
+
+    @functools.cached_property
+    def variance_components(self) -> dict[str, Component]:
+        """For every group of observations σ̂ over the a priori σ it was given, and σ̂ itself."""
+        found = self.cofactors.solution
+        return variance_components(found, groups(self.problem), self.sigma_factors)
+
+    @functools.cached_property
+    def check_points(self) -> CheckPoints | None:
+        """Check points intersected after the adjustment; None where there are none."""
+        self._require_solved()
+        return None if self._check is None else self._check(self)
+
+    # --- unknowns ---------------------------------------------------------------------------
+
+    @functools.cached_property
+    def image_values(self) -> Float[np.ndarray, "images 6"]:
+        """X0, Y0, Z0 (object unit), ω, φ, κ (radians, on the turn and branch of the start)."""
+        values = self.values
+        position = np.asarray(values.position) + self.problem.origin
+        return np.concatenate([position, np.asarray(self._angles[0])], 1)
+
+    @functools.cached_property
+    def _angles(self):
+        """ω, φ, κ of all images, next to the angles that were given, and their Jacobians by δθ."""
+        return _all_angles(self.values.rotation, self.problem.network.images.angles)
+
+    @functools.cached_property
+    def image_covariance(self) -> Float[np.ndarray, "images 6 6"]:
+        """Covariance of X0, Y0, Z0, ω, φ, κ, angles by their exact Jacobian; radians."""
+        Q = self.cofactors.image_cofactors
+        A = np.zeros((len(Q), 6, 6))
+        A[:, :3, :3] = np.eye(3)
+        A[:, 3:, 3:] = self._angles[1]
+        free = self.problem.system.table("image").free
+        Q = Q * free[:, :, None] * free[:, None, :]
+        return self.sigma0**2 * A @ Q @ A.transpose(0, 2, 1)
+
+    @functools.cached_property
+    def point_values(self) -> Float[np.ndarray, "points 3"]:
+        """X, Y, Z in the object unit; NaN at infinity."""
+        return self._unless_at_infinity(np.asarray(self.values.point) + self.problem.origin)
+
+    @functools.cached_property
+    def point_covariance(self) -> Float[np.ndarray, "points 3 3"]:
+        """Marginal covariance of every point; zero where it is fixed, NaN at infinity."""
+        return self._unless_at_infinity(self.sigma0**2 * self.cofactors.point_cofactors)
+
+    def _unless_at_infinity(self, of_points):
+        lengths = self.problem.layout.lengths
+        if lengths is None:
+            return of_points
+        there = is_at_infinity(np.asarray(self.values.point), lengths)
+        return np.where(there.reshape(-1, *(1,) * (of_points.ndim - 1)), np.nan, of_points)
+
+    @functools.cached_property
+    def far_points(self) -> FarPoints | None:
+        """The points that are adjusted at any distance, since their rays are nearly parallel; None
+        where there are none."""
+        return find_far_points(self.cofactors, self.sigma0)
+
+    def camera_parameters(self, camera: str) -> dict[str, float]:
+        """All parameters of a camera by name."""
+        c = self._camera(camera)
+        model = get_model(self.problem.network.cameras[c].model)
+        return dict(zip(model.parameters, np.asarray(self.values.camera)[c].tolist()))
+
+    def camera_covariance(self, camera: str) -> tuple[list[str], Float[np.ndarray, "n n"]]:
+        """Names and covariance of the free parameters of a camera."""
+        names, Q = self.camera_cofactor(camera)
+        return names, self.sigma0**2 * Q
+
+    def camera_cofactor(self, camera: str) -> tuple[list[str], Float[np.ndarray, "n n"]]:
+        """Names and cofactors of the free parameters of a camera."""
+        names, free = self.problem.interior(self._camera(camera))
+        Q = self.cofactors.camera_cofactors[self._camera(camera)]
+        return [names[i] for i in free], Q[np.ix_(free, free)]
+
+    def _camera(self, camera: str) -> int:
+        return place_of(camera, [given.id for given in self.problem.network.cameras], "camera")
+
+    def insignificant(self, critical: float = 2.0) -> list[tuple[float, Name]]:
+        """Free interior parameters with t = |value|/σ below `critical`, the least first.
+
+        **Raises:** `InputError` for a critical value that is negative or no number."""
+        critical = at_least_zero("critical", critical)
+        found = [
+            (entry["t"], Name("camera", camera, parameter))
+            for camera, table in self.cameras.items()
+            for parameter, entry in table["parameters"].items()
+            if parameter in table["free"] and entry["t"] < critical
+        ]
+        return sorted(found, key=lambda item: item[0])
+
+    def covariance(self, *names: tuple[str, str, str]) -> Float[np.ndarray, "n n"]:
+        """Covariance of any unknowns by name, e.g. `("camera", "cam", "c")`,
+        `("image", "12", "kappa")` (radians), `("point", "7", "Z")`.
+
+        **Raises:** `InputError` where nothing is named, or a name has other than three parts;
+        `KeyError` for a name that is not there."""
+        wanted = named(self.problem, names)
+
+        def pick(values: Values):
+            return jnp.stack([value_of(self.problem, name, values) for name in wanted])
+
+        return self.covariance_of(pick)
+
+    def covariance_of(self, function: Callable[[Values], jax.Array]) -> Float[np.ndarray, "n n"]:
+        """Covariance of any differentiable function of the adjusted unknowns (`Values` → [n])."""
+        self._require_solved()
+        return self.sigma0**2 * self.inspection.propagate(function)
+
+    # --- tables -----------------------------------------------------------------------------
+
+    @property
+    def angle_scale(self) -> float:
+        """Factor from radians to the network's angle unit."""
+        return 1 / ANGLE_UNITS[self.network.angle_unit]
+
+    @property
+    def image_unit(self) -> str:
+        """The unit of image coordinates inside the adjustment: that of the cameras' models."""
+        return units_of(self.problem.network.cameras)
+
+    @functools.cached_property
+    def cameras(self) -> dict[str, dict]:
+        """Per camera: model, and per parameter value, sigma, free, t, total_correlation; and the
+        correlation matrix of the free ones."""
+        return result_tables.cameras(self)
+
+    def unknowns(self, table: str) -> TableResult:
+        """Values, σ and covariances of a table of unknowns that came with further kinds of
+        observations (`also` of `jaxbundle.adjust`)."""
+        if table not in self.values.other:
+            known = ", ".join(self.values.other) or "none"
+            raise KeyError(f"there is no further table {table!r}; known: {known}")
+        return table_result(self.cofactors.solution, table, self.sigma0)
+
+    @functools.cached_property
+    def further_unknowns(self) -> dict[str, dict[str, dict[str, dict[str, float]]]]:
+        """By table, row and name: value and sigma of the unknowns that came with further kinds of
+        observations (angles in the network's unit)."""
+        return result_tables.further_unknowns(self)
+
+    @functools.cached_property
+    def images(self) -> dict[str, np.ndarray]:
+        """Columns id, X0 … kappa, sX0 … skappa (angles in the network's unit), rays, rms (of v,
+        image unit)."""
+        return result_tables.images(self)
+
+    @functools.cached_property
+    def points(self) -> dict[str, np.ndarray]:
+        """Columns id, role, X, Y, Z, sX, sY, sZ, rays."""
+        return result_tables.points(self)
+
+    @functools.cached_property
+    def residuals(self) -> dict[str, np.ndarray]:
+        """One row an observation: kind, image, point, axis, v, sigma (a priori), r, w (Baarda),
+        tau (Pope), mdb, external; image observations first, in the order they were given."""
+        return result_tables.residuals(self)
+
+    def table(self, name: str) -> dict[str, np.ndarray]:
+        """A table by name: images, points, residuals, cameras (one row a parameter), checks or
+        far_points."""
+        made = {"cameras": result_tables.parameters, "checks": result_tables.checks,
+                "far_points": result_tables.far_points}  # fmt: skip
+        if name in made:
+            return made[name](self)
+        if name not in ("images", "points", "residuals"):
+            known = "cameras, images, points, residuals, checks, far_points"
+            raise KeyError(f"tables are {known}; not {name!r}")
+        return getattr(self, name)
+
+    # --- for people -------------------------------------------------------------------------
+
+    def report(self, residual_limit: float = 3.0, **options) -> str:
+        """The whole protocol as text (options: see `jaxbundle.report.text`)."""
+        residual_limit = at_least_zero("residual_limit", residual_limit)
+        return report.text(self, residual_limit, **options)
+
+    def __str__(self) -> str:
+        return report.short(self)
+
+    def __repr__(self) -> str:
+        return report.one_line(self)
+
+    def _repr_html_(self) -> str:
+        return report.html(self)
+
+    def plot_plan(self, ax=None):
+        """The network seen from above, with error ellipses; matplotlib axes."""
+        return plotting.network_plan(self, ax)
+
+    def plot_perspective(self, ax=None):
+        """The network in perspective; matplotlib 3D axes."""
+        return plotting.network_perspective(self, ax)
+
+    def plot_residuals(self, image: str, ax=None):
+        """The residuals of an image as vectors; matplotlib axes."""
+        return plotting.residual_vectors(self, image, ax)
+
+    def plot_distortion(self, camera: str, ax=None):
+        """The distortion of a camera over the radius, with ±σ; matplotlib axes."""
+        return plotting.distortion_curve(self, camera, ax)
+
+    def plot_correlations(self, camera: str | None = None, ax=None):
+        """Correlations of the free parameters of a camera, or of all; matplotlib axes."""
+        return plotting.correlation_matrix(self, camera, ax)
+
+    def plot_histogram(self, ax=None):
+        """The normalised residuals beside the normal distribution; matplotlib axes."""
+        return plotting.residual_histogram(self, ax)
+
+    def to_pandas(self, name: str):
+        """A table as a pandas data frame (extra `tables`)."""
+        try:
+            import pandas
+        except ImportError as error:
+            raise ImportError("data frames need pandas: pip install 'jaxbundle[tables]'") from error
+        return pandas.DataFrame(self.table(name))
+
+
+@jax.jit
+def _all_angles(rotation, given):
+    """ω, φ, κ of all images near the given ones, and their Jacobians by δθ."""
+    zero = jnp.zeros((rotation.shape[0], 3))
+    return (
+        jax.vmap(angles_near)(rotation, zero, given),
+        jax.vmap(jax.jacfwd(angles_near, 1))(rotation, zero, given),
+    )
+
+
+def _of_image_points(problem: Problem, weights) -> Float[np.ndarray, " rays"]:
+    """The factors of the weights of image points, from those of the sets of observations."""
+    found = np.ones(len(problem.network.observations))
+    for o, s in enumerate(problem.layout.sets):
+        if s.field == "image":
+            found[slice(None) if s.rows is None else s.rows] = weights[o]
+    return found

@@ -1,0 +1,61 @@
+"""Pixels of photographs in the unit and axes of a camera model, and the image of a board."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.cameras import CameraModel, project
+from jaxbundle.cameras.pixel_frame import pixel_frame
+from jaxbundle.errors import InputError
+
+
+def in_model_units(
+    uv: Float[np.ndarray, "*any 2"], model: CameraModel, image_size, pixel_size=None
+) -> Float[np.ndarray, "*any 2"]:
+    """Pixels (v down) as the model counts: as they are; from the image centre, y up; in mm."""
+    origin, step = pixel_frame(model, image_size, pixel_size)
+    return (np.asarray(uv, float) - origin) / step
+
+
+def in_pixels(
+    xy: Float[np.ndarray, "*any 2"], model: CameraModel, image_size, pixel_size=None
+) -> Float[np.ndarray, "*any 2"]:
+    """The inverse of `in_model_units`."""
+    origin, step = pixel_frame(model, image_size, pixel_size)
+    return origin + step * np.asarray(xy, float)
+
+
+def unit_size(model: CameraModel, pixel_size) -> tuple[float, float]:
+    """Width and height of a pixel in the unit of the model.
+
+    **Raises:** `InputError` where the model is in mm and the size of a pixel is not given.
+    """
+    if model.unit == "px":
+        return 1.0, 1.0
+    if pixel_size is None:
+        raise InputError(
+            f"camera model {model.name!r} is in mm: give the size of a pixel (--pixel-size 0.0045)"
+        )
+    return pixel_size
+
+
+@partial(jax.jit, static_argnums=0)
+def _images(model, p, position, rotation, points):
+    def one(X0, M, X):
+        return jnp.stack(project(model, tuple(p), *(M @ (X - X0))))
+
+    return jax.vmap(jax.vmap(one, (None, None, 0)), (0, 0, None))(position, rotation, points)
+
+
+def images_of_board(
+    model: CameraModel,
+    p: Float[np.ndarray, " parameters"],
+    position: Float[np.ndarray, "views 3"],
+    rotation: Float[np.ndarray, "views 3 3"],
+    points: Float[np.ndarray, "points 3"],
+) -> Float[np.ndarray, "views points 2"]:
+    """Image points of a board in the model's unit, for X0 and M of every view."""
+    return np.array(_images(model, p, position, rotation, points))

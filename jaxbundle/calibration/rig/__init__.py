@@ -1,0 +1,1 @@
+"""Cameras mounted rigidly to each other: declared on the engine, calibrated, and the result."""

@@ -1,0 +1,227 @@
+"""Cameras on one mounting: calibrated by themselves first, then together with the mounting.
+
+    ray of camera k = R_k·(Y − b_k)      Y: point in the frame of the reference camera
+
+Photographs taken at the same moment are an epoch; they are found by name: equal file names, or
+else equal last numbers in them (left_017.jpg, right_017.jpg). Start values of the mounting come
+from the epochs two cameras share: M_k·Mᵣᵀ and Mᵣ·(X0_k − X0_r) should be the same in all of them,
+and the one nearest to all others is taken. Epochs that contradict the mounting (the board moved in
+between) are left out, or named where nothing is to be left out. The board is known, weighted or
+free, as in the calibration of one camera. Gross errors were removed camera by camera; what only the
+mounting shows is removed then.
+"""
+
+import dataclasses
+import re
+from collections.abc import Mapping
+
+import jax
+import numpy as np
+
+from jaxbundle.calibration.pixels import unit_size
+from jaxbundle.calibration.quality import kept_rays
+from jaxbundle.calibration.result import Calibration
+from jaxbundle.calibration.rig.declare import Rig, adjust_rig, leave_out, snoop_rig, used_rays
+from jaxbundle.calibration.rig.result import RigCalibration
+from jaxbundle.cameras import get_model
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.geometry import quaternion_from_matrix
+from jaxbundle.leastsquares import Result
+from jaxbundle.leastsquares.snooping import check_test
+from jaxbundle.leastsquares.spaces import PoseValue
+from jaxbundle.network.columns import some
+
+FEWEST = 3
+"""Epochs that two cameras must share."""
+CONTRADICTS, LEAST_CONTRADICTION = 3.0, 1.0
+"""An epoch is left out whose RMS is above so many times the median of all, and so many pixels."""
+WORST = 0.5
+"""In one round those go whose RMS is above this part of the largest: the worst spoil the others."""
+
+
+def calibrate_rig(
+    calibrations: Mapping[str, Calibration],
+    *,
+    board_sigma: float | None = None,
+    board_free: bool = False,
+    snooping: str | None = "pope",
+    significance: float = 0.001,
+    max_iterations: int = 50,
+) -> RigCalibration:
+    """The common calibration of cameras that were calibrated by themselves, from photographs of one
+    board taken in step; the first is the reference.
+
+    **Arguments:** `board_sigma` (object unit), `board_free`, `snooping`, `significance`: as in
+    `calibrate`; without snooping, epochs that contradict the mounting stay as well, and are named
+    in `contradicting`.
+
+    **Raises:** `InputError` where the photographs of two cameras cannot be paired;
+    `NotSolvedError` where an adjustment does not settle.
+    """
+    check_test(snooping, significance)
+    if len(calibrations) < 2:
+        raise InputError("a rig has two cameras or more: give --camera NAME=PATTERN for each")
+    for name, one in calibrations.items():
+        if not one.converged:
+            why = one.adjustment.termination
+            raise NotSolvedError(f"not solved: camera {name} by itself: {why}")
+    keys = epoch_keys({name: one.views.names for name, one in calibrations.items()})
+    epochs = list(dict.fromkeys(key for name in calibrations for key in keys[name]))
+    poses = _poses(calibrations, keys)
+    base, turn = _start_of_mountings(list(calibrations), poses)
+    rig = _start(calibrations, keys, poses, base, turn, epochs)
+    rig = dataclasses.replace(rig, point_sigma=board_sigma, points_free=board_free)
+    size = {name: unit_size(get_model(one.camera.model), one.camera.pixel_size)
+            for name, one in calibrations.items()}  # fmt: skip
+    left_out, found = [], require_solved(adjust_rig(rig, max_iterations))
+    while (bad := _contradictions(rig, found, np.array([*size.values()]))) and snooping:
+        left_out += [(rig.epochs[e], f"does not fit the mounting (RMS {rms:.1f} px): photographs "
+                      "not of the same moment?") for e, rms in bad.items()]  # fmt: skip
+        found = require_solved(leave_out(rig, found, np.isin(rig.epoch, list(bad)), max_iterations))
+    if snooping:
+        found = snoop_rig(found, snooping, significance, max_iterations)
+    return RigCalibration(
+        dict(calibrations), rig, found, left_out,
+        [(rig.epochs[e], f"kept, but does not fit the mounting (RMS {rms:.1f} px)")
+         for e, rms in bad.items()],
+    )  # fmt: skip
+
+
+def require_solved(found: Result) -> Result:
+    """The same.
+
+    **Raises:** `NotSolvedError` where it is not solved."""
+    if not found.converged:
+        names = found.undetermined
+        what = f"; not determined: {some(names, 8, str)}" if names else ""
+        raise NotSolvedError(
+            f"not solved: the rig did not settle ({found.termination}){what}; look for cameras "
+            "that share too few epochs, or photographs that are not of the same moment",
+            list(names),
+        )  # fmt: skip
+    return found
+
+
+def epoch_keys(names: Mapping[str, tuple[str, ...]]) -> dict[str, list[str]]:
+    """The epoch of every photograph of every camera: equal file names, or equal last numbers.
+
+    **Raises:** `InputError` where neither pairs them.
+    """
+    whole = lambda name: re.sub(r"\.\w+$", "", name.rsplit("/", 1)[-1])
+
+    def number(name):
+        found = re.findall(r"\d+", whole(name))
+        return found[-1].lstrip("0") or "0" if found else ""
+
+    for key in (whole, number):
+        keys = {camera: [key(name) for name in given] for camera, given in names.items()}
+        once = all("" not in k and len({*k}) == len(k) for k in keys.values())
+        first, *others = ({*k} for k in keys.values())
+        if once and all(len(first & other) >= min(FEWEST, len(first)) for other in others):
+            return keys
+        if once and len(keys) > 2 and _connected(keys):
+            return keys
+    shown = "; ".join(f"{camera}: {some(given, 2)}" for camera, given in names.items())
+    raise InputError(
+        f"the photographs of the cameras cannot be paired by their names ({shown}): call those of "
+        "one moment alike, or give them the same last number"
+    )
+
+
+def _connected(keys) -> bool:
+    """Whether every camera shares epochs with the first, directly or through others."""
+    sets = {name: {*k} for name, k in keys.items()}
+    reached = [next(iter(sets))]
+    for name in reached:
+        reached += [other for other in sets if other not in reached
+                    and len(sets[name] & sets[other]) >= FEWEST]  # fmt: skip
+    return len(reached) == len(sets)
+
+
+def _poses(calibrations, keys):
+    """M and X0 of every camera at every epoch it saw."""
+    return {
+        name: {key: (M, X0) for key, M, X0 in zip(keys[name], one.rotation, one.position)}
+        for name, one in calibrations.items()
+    }
+
+
+def _start_of_mountings(names, poses):
+    """b and R of every camera, from the epochs it shares with one that has them already."""
+    base, turn = {names[0]: np.zeros(3)}, {names[0]: np.eye(3)}
+    while len(base) < len(names):
+        pairs = [(placed, name) for placed in base for name in names if name not in base]
+        common = lambda pair: poses[pair[0]].keys() & poses[pair[1]].keys()
+        best = max(pairs, key=lambda pair: len(common(pair)))
+        shared = [key for key in poses[best[0]] if key in common(best)]
+        if len(shared) < min(FEWEST, len(poses[best[1]])) or not shared:
+            raise InputError(
+                f"camera {best[1]!r} shares {len(shared)} epochs with the others; {FEWEST} or more "
+                "photographs must be of the same moments"
+            )
+        placed, name = best
+        both = [(poses[placed][key], poses[name][key]) for key in shared]
+        R = np.array([M2 @ M1.T for (M1, _), (M2, _) in both])
+        b = np.array([M1 @ (X2 - X1) for (M1, X1), (_, X2) in both])
+        size = np.median(np.linalg.norm(b, axis=1)) + 1e-12
+        apart = np.linalg.norm(R[:, None] - R, axis=(2, 3))
+        apart += np.linalg.norm(b[:, None] - b, axis=2) / size
+        k = int(np.median(apart, axis=1).argmin())
+        base[name] = base[placed] + turn[placed].T @ b[k]
+        turn[name] = R[k] @ turn[placed]
+    return base, turn
+
+
+def _start(calibrations, keys, poses, base, turn, epochs) -> Rig:
+    """The rig with start values, and the image points that the calibration of each camera kept."""
+    names, board = list(calibrations), next(iter(calibrations.values())).views.board
+    middle = board.points.mean(0)
+    rotation, centre = [], []
+    for key in epochs:
+        name = next(name for name in names if key in poses[name])
+        M, X0 = poses[name][key]
+        # ray = R·(Y − b) = M·(X − X0)
+        rotation.append(turn[name].T @ M)
+        centre.append(X0 - M.T @ turn[name] @ base[name] - middle)
+    place = lambda b, R: PoseValue(np.array(b), np.asarray(_quaternions(np.array(R))))
+    rays = [_rays(one, keys[name], epochs) for name, one in calibrations.items()]
+    epoch, point, xy, sigma = (np.concatenate(column) for column in zip(*rays))
+    free = {name: one.adjustment.problem.network.cameras[0].free
+            for name, one in calibrations.items()}  # fmt: skip
+    return Rig(
+        tuple(dataclasses.replace(one.camera, id=name, free=free[name])
+              for name, one in calibrations.items()),
+        place([base[n] for n in names], [turn[n] for n in names]), tuple(epochs),
+        place(centre, rotation), board.ids, board.points - middle, epoch,
+        np.repeat(np.arange(len(names)), [len(ray[0]) for ray in rays]), point, xy, sigma,
+    )  # fmt: skip
+
+
+@jax.jit
+def _quaternions(matrices):
+    return jax.vmap(quaternion_from_matrix)(matrices)
+
+
+def _rays(calibration: Calibration, keys, epochs):
+    """Epoch, point, xy and σ of the image points that the calibration of a camera kept."""
+    network, views = calibration.adjustment.problem.network, calibration.views
+    rays, kept = network.observations, kept_rays(calibration.adjustment)
+    row, point = ({key: i for i, key in enumerate(ids)} for ids in (epochs, views.board.ids))
+    epoch_of = {name: row[key] for name, key in zip(views.names, keys)}
+    epoch = np.array([epoch_of[id] for id in network.images.id])[rays.image[kept]]
+    return (epoch, np.array([point[id] for id in network.points.id])[rays.point[kept]],
+            rays.xy[kept], rays.sigma[kept])  # fmt: skip
+
+
+def _contradictions(rig: Rig, found, size):
+    """Epochs, of those several cameras saw, that do not fit, with their RMS in pixels; `size` of a
+    pixel, [cameras, 2]."""
+    v = rig.in_order(found.solution.residuals) * rig.sigma / size[rig.camera]
+    number = np.zeros((len(rig.epochs), len(size)))
+    np.add.at(number, (rig.epoch, rig.camera), used_rays(rig, found.problem))
+    rays = number.sum(1)
+    rms = np.sqrt(np.bincount(rig.epoch, (v**2).sum(1), len(rays)) / np.maximum(rays, 1))
+    limit = max(CONTRADICTS * float(np.median(rms[rays > 0])), LEAST_CONTRADICTION)
+    rms = np.where((number > 0).sum(1) > 1, rms, 0.0)
+    bad = np.flatnonzero(rms > max(limit, WORST * rms.max()))
+    return {int(e): float(rms[e]) for e in bad}

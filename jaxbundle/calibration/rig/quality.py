@@ -1,0 +1,100 @@
+r"""How good are the cameras of a rig: the uncertainty of a projected point, and coverage.
+
+A point Y at the distance d from camera k is held in the frame
+
+    "rig"       of the reference camera: mounting and interior orientation of camera k vary,
+                ray = R_k·(Y − b_k). This is what the rig is used for: points intersected from its
+                cameras. Of the reference camera there is no mounting.
+    "camera"    of camera k itself, the interior orientation alone
+    "rotation"  of camera k, the rotation that moves the images least taken off
+
+with the covariance of the common adjustment, as `jaxbundle.statistics.projection` for one camera.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbundle.calibration.pixels import in_model_units, in_pixels, unit_size
+from jaxbundle.calibration.quality import GRID, Coverage, UncertaintyMap, coverage, grid_of
+from jaxbundle.cameras import get_model, image_ray, project
+from jaxbundle.errors import InputError
+from jaxbundle.leastsquares import Pose, PoseValue
+from jaxbundle.network.columns import did_you_mean
+from jaxbundle.statistics.projection import interior_covariance_of_images
+
+FRAMES = ("rig", "camera", "rotation")
+
+
+@partial(jax.jit, static_argnums=0)
+def _slopes(model, p, mounting: PoseValue, xy, nearness):
+    """∂x/∂(δb, δθ, p) [n, 2, 6 + parameters] of points at the distance 1/nearness, whose images
+    are `xy`."""
+    space = Pose()
+    # Seen from where the camera is, in units of the distance.
+    block = space.prepare(mounting._replace(position=jnp.zeros(3)))
+
+    def one(xy):
+        ray = block.rotation.apply_inverse(image_ray(model, tuple(p), xy[0], xy[1]))
+
+        def image(change, p):
+            moved = space.moved(block, (*(nearness * change[:3]), *change[3:]))
+            return jnp.stack(project(model, tuple(p), *moved.ray(ray)))
+
+        return jnp.concatenate(jax.jacfwd(image, (0, 1))(jnp.zeros(space.width), p), 1)
+
+    return jax.vmap(one)(xy)
+
+
+def rig_uncertainty(
+    rig, name: str, distance: float = np.inf, frame: str = "rig", grid: tuple[int, int] = GRID
+) -> UncertaintyMap:
+    """The uncertainty of a projected point over the image of a camera of a rig, pixels.
+
+    **Arguments:** `rig`: a `RigCalibration`; `distance` (object unit) matters for "rig" only;
+    `grid`: columns and rows of the map.
+
+    **Raises:** `InputError` for a camera, frame or distance that is none.
+    """
+    if frame not in FRAMES:
+        raise InputError(f"frame {frame!r}: {', '.join(FRAMES)}")
+    if not distance > 0:
+        raise InputError(f"distance {distance:g}: a positive distance is expected")
+    k = _index(rig, name)
+    given, space = rig.camera(name), rig.result.problem.table(rig.rig.place(k)[0]).space
+    model = get_model(given.model)
+    p = np.array(list(given.parameters.values()))
+    uv = grid_of(given.image_size, *grid)
+    xy = in_model_units(uv.reshape(-1, 2), model, given.image_size, given.pixel_size)
+    C = rig.covariance(name)
+    if frame == "rig":
+        mounting = jax.tree.map(lambda x: x[k], rig.values("mounting"))
+        J = np.asarray(_slopes(model, p, mounting, xy, 1 / distance))
+        J = J[:, :, [*range(Pose.width), *(Pose.width + c for c in space.moving)]]
+        C = J @ C @ J.swapaxes(1, 2)
+    else:
+        own = C[Pose.width :, Pose.width :]
+        C = interior_covariance_of_images(model, p, space.moving, own, xy, frame)
+    per_unit = 1 / np.array(unit_size(model, given.pixel_size))
+    C = C * per_unit[:, None] * per_unit
+    return UncertaintyMap(frame, float(distance), uv, C.reshape(*uv.shape[:2], 2, 2))
+
+
+def rig_points(rig, name: str):
+    """The image points of a camera that the rig was adjusted from, pixels [n, 2]."""
+    own, given = rig.used & (rig.rig.camera == _index(rig, name)), rig.camera(name)
+    model = get_model(given.model)
+    return in_pixels(rig.rig.xy[own], model, given.image_size, given.pixel_size)
+
+
+def rig_coverage(rig, name: str) -> Coverage:
+    """Where in the image of a camera the rig has points."""
+    return coverage(rig_points(rig, name), rig.camera(name).image_size)
+
+
+def _index(rig, name: str) -> int:
+    if name not in rig.names:
+        raise InputError(f"camera {name!r} is not of the rig{did_you_mean(name, rig.names)}")
+    return rig.names.index(name)

@@ -1,0 +1,287 @@
+"""The result of a rig: the mountings of its cameras, and the cameras as they are in it."""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxbundle import plotting
+from jaxbundle.bundle import tables as result_tables
+from jaxbundle.calibration.pixels import unit_size
+from jaxbundle.calibration.quality import DRAWN, GRID, Coverage, UncertaintyMap
+from jaxbundle.calibration.result import Calibration
+from jaxbundle.calibration.rig.declare import Rig, used_rays
+from jaxbundle.calibration.rig.quality import rig_coverage, rig_points, rig_uncertainty
+from jaxbundle.cameras import get_model
+from jaxbundle.geometry import omega_phi_kappa_from_matrix
+from jaxbundle.leastsquares import Pose, PoseValue, Result
+from jaxbundle.network.kinds import exterior
+from jaxbundle.network.tables import Camera, units_of
+from jaxbundle.statistics.blunders import Removed, either_of
+from jaxbundle.types import present
+
+POSE = Pose.width
+DEGREES = np.array([1, 1, 1, *[180 / np.pi] * 3])
+
+
+@dataclasses.dataclass(frozen=True)
+class Mounting:
+    """Where a camera sits in the frame of the reference camera.
+
+    **Fields:** `base`: its projection centre, object unit; `rotation`: R, from the reference's
+    frame to its own; `angles`: ω, φ, κ of R, degrees; `covariance` [6, 6] of base and angles, a
+    posteriori; `length` of the base and its σ.
+    """
+
+    base: Float[np.ndarray, "3"]
+    rotation: Float[np.ndarray, "3 3"]
+    angles: Float[np.ndarray, "3"]
+    covariance: Float[np.ndarray, "6 6"]
+    length: float
+    length_sigma: float
+
+    @property
+    def sigma(self) -> Float[np.ndarray, "6"]:
+        """σ of base (object unit) and ω, φ, κ (degrees)."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+
+class RigCalibration:
+    """Cameras of one mounting, calibrated together.
+
+    **Attributes:** `cameras`: the calibrations of each by itself; `mountings`, `parameters`,
+    `sigma` of the common adjustment, by camera; `board`: its points [points, 3]; `epochs`; `rig`:
+    what was adjusted, `result`: the engine's (`jaxbundle.leastsquares.Result`); `left_out`, and
+    `contradicting` that were kept all the same: epoch and reason; `removed` by data snooping;
+    `residuals`: a table as of an `Adjustment`; `rms` (pixels) by camera; `sigma0`, `redundancy`,
+    `converged`.
+    """
+
+    weights = None
+    eliminated = ()
+
+    def __init__(
+        self, cameras: dict[str, Calibration], rig: Rig, result: Result,
+        left_out: Sequence[tuple[str, str]], contradicting: Sequence[tuple[str, str]] = (),
+    ):  # fmt: skip
+        self.cameras, self.rig, self.result = cameras, rig, result
+        self._maps: dict[tuple, UncertaintyMap] = {}
+        self._covariances: dict[tuple[str, ...], np.ndarray] = {}
+        self.left_out, self.contradicting = tuple(left_out), tuple(contradicting)
+
+    @property
+    def names(self) -> list[str]:
+        return list(self.cameras)
+
+    @property
+    def epochs(self) -> tuple[str, ...]:
+        gone = dict(self.left_out)
+        return tuple(epoch for epoch in self.rig.epochs if epoch not in gone)
+
+    @property
+    def converged(self) -> bool:
+        return self.result.converged
+
+    @property
+    def sigma0(self) -> float:
+        return self.result.sigma0
+
+    @property
+    def redundancy(self) -> int:
+        return self.result.counts.redundancy
+
+    @property
+    def image_unit(self) -> str:
+        """The unit of image coordinates inside the adjustment: that of the cameras' models."""
+        return units_of(self.rig.cameras)
+
+    @functools.cached_property
+    def used(self) -> Bool[np.ndarray, " n"]:
+        """Which image points were not removed."""
+        return used_rays(self.rig, self.result.problem)
+
+    @functools.cached_property
+    def rms(self) -> dict[str, float]:
+        """√(Σ|v|²/points) in pixels, by camera."""
+        v, found = self.rig.in_order(self.result.solution.residuals) * self.rig.sigma, {}
+        for k, name in enumerate(self.names):
+            given = self.cameras[name].camera
+            own = v[self.used & (self.rig.camera == k)]
+            own = own / np.array(unit_size(get_model(given.model), given.pixel_size))
+            found[name] = float(np.sqrt((own**2).sum(1).mean()))
+        return found
+
+    @functools.cached_property
+    def residuals(self) -> dict[str, np.ndarray]:
+        """One row an observation: kind, image (camera and epoch), point, axis, v, sigma (a priori),
+        r, w (Baarda), tau (Pope), mdb, external."""
+        rig, found, weight = self.rig, self.result.solution.reliability, self.result.problem.weights
+        ids = np.array(rig.ids, dtype=object)
+        photographs = [self._photograph(*row) for row in zip(rig.camera, rig.epoch)]
+        rows = rig.in_order
+        parts = [result_tables.residual_rows(
+            self, "image", np.array(photographs, dtype=object), ids[rig.point], ("x", "y"),
+            rows(found.residual), rows([weight(o) for o in range(len(rig.sets))]),
+            rows(found.redundancy), rows(found.w),
+        )]  # fmt: skip
+        if rig.point_sigma is not None:
+            o, blank = len(rig.sets), np.full(len(ids), "", dtype=object)
+            parts.append(result_tables.residual_rows(
+                self, "control", blank, ids, tuple("XYZ"), found.residual[o], weight(o),
+                found.redundancy[o], found.w[o],
+            ))  # fmt: skip
+        return result_tables.concatenate(parts)
+
+    def pope(self, w):
+        """τ = w/σ0."""
+        return w / self.sigma0
+
+    def _photograph(self, camera: int, epoch: int) -> str:
+        return f"{self.names[camera]} {self.rig.epochs[epoch]}"
+
+    @property
+    def removed(self) -> list[Removed]:
+        """What data snooping has removed."""
+        rig, found = self.rig, []
+        for item in self.result.removed:
+            if item.set == len(rig.sets):
+                axis = present(item.residual)  # coordinates are tested one by one
+                name = f"{'XYZ'[axis]} of point {rig.ids[item.row]}"
+                found.append(Removed("control", 3 * item.row + axis, name, item.test))
+                continue
+            rows = rig.sets[item.set][1][list(item.rows)]
+            seen = zip(rig.point[rows], rig.camera[rows], rig.epoch[rows])
+            names = [f"point {rig.ids[p]} in image {self._photograph(k, e)}" for p, k, e in seen]
+            others = tuple(rows[1:].tolist())
+            found.append(Removed("image", int(rows[0]), either_of(names), item.test, others))
+        return found
+
+    @property
+    def board(self) -> Float[np.ndarray, "points 3"]:
+        """Adjusted coordinates of the board, object unit."""
+        nominal = next(iter(self.cameras.values())).views.board.points
+        return self.values("point") + nominal.mean(0)
+
+    def values(self, table: str):
+        """The adjusted rows of a table of unknowns."""
+        return jax.tree.map(np.asarray, self.result.minimum.values[table])
+
+    @functools.cached_property
+    def parameters(self) -> dict[str, dict[str, float]]:
+        """Parameters of every camera by name."""
+        found = {}
+        for k, name in enumerate(self.names):
+            table, row = self.rig.place(k)
+            names = get_model(self.rig.cameras[k].model).parameters
+            found[name] = dict(zip(names, self.values(table)[row].tolist()))
+        return found
+
+    @functools.cached_property
+    def sigma(self) -> dict[str, dict[str, float]]:
+        """σ of the free parameters of every camera, a posteriori."""
+        found = {}
+        for k, name in enumerate(self.names):
+            table = self.result.problem.table(self.rig.place(k)[0])
+            sigma = np.sqrt(np.clip(np.diagonal(self.covariance(name))[POSE:], 0, None)).tolist()
+            free = self.rig.cameras[k].free
+            found[name] = {n: s for n, s in zip(table.parameters, sigma) if n in free}
+        return found
+
+    def covariance(self, *names: str) -> Float[np.ndarray, "k k"]:
+        """The joint covariance of cameras: of each the mounting (δb, δθ) and its parameters that
+        are free in some camera of its model; zero where something is held."""
+        if names not in self._covariances:
+            problem = self.result.problem
+            places = [(self.names.index(name), *self.rig.place(self.names.index(name)))
+                      for name in names]  # fmt: skip
+            widths = [POSE + problem.table(table).space.width for _, table, _ in places]
+            number, starts = sum(widths), np.cumsum([0, *widths])
+            rows = {t.name: np.zeros((number, t.rows, t.space.width)) for t in problem.tables}
+            for start, width, (k, table, row) in zip(starts, widths, places):
+                rows["mounting"][start : start + POSE, k] = np.eye(POSE)
+                rows[table][start + POSE : start + width, row] = np.eye(width - POSE)
+            Q = self.result.solution.propagate_rows(rows)
+            self._covariances[names] = self.sigma0**2 * Q
+        return self._covariances[names]
+
+    @functools.cached_property
+    def mountings(self) -> dict[str, Mounting]:
+        """The mounting of every camera but the reference, the first."""
+        found = {}
+        for k, name in enumerate(self.names[1:], 1):
+            at = jax.tree.map(lambda x, k=k: x[k], self.values("mounting"))
+            found[name] = _mounting(at, self.covariance(name)[:POSE, :POSE])
+        return found
+
+    def camera(self, name: str) -> Camera:
+        """A camera with the parameters of the common adjustment, held."""
+        return dataclasses.replace(self.cameras[name].camera, parameters=self.parameters[name])
+
+    @property
+    def distance(self) -> float:
+        """The median distance of the board from the reference camera, object unit."""
+        stays = np.isin(self.rig.epochs, self.epochs)
+        return float(np.median(np.linalg.norm(self.values("epoch").position[stays], axis=1)))
+
+    def coverage(self, name: str) -> Coverage:
+        """Where in the image of a camera the rig has points."""
+        return rig_coverage(self, name)
+
+    def uncertainty(
+        self, name: str, distance: float = np.inf, frame: str = "rig", grid=GRID
+    ) -> UncertaintyMap:
+        """Uncertainty of a projected point over the image of a camera, pixels; frames: see
+        `jaxbundle.calibration.rig.quality`."""
+        key = (name, distance, frame, grid)
+        if key not in self._maps:
+            self._maps[key] = rig_uncertainty(self, name, distance, frame, grid)
+        return self._maps[key]
+
+    def reported_maps(self, name: str) -> list[UncertaintyMap]:
+        """At the distance of the board, at ten times that, at infinity; and without mounting."""
+        chosen = (("rig", self.distance), ("rig", 10 * self.distance), ("rig", np.inf),
+                  ("rotation", np.inf))  # fmt: skip
+        return [self.uncertainty(name, distance, frame) for frame, distance in chosen]
+
+    def plot_coverage(self, name: str, ax=None):
+        """Where in the image of a camera the rig has points; matplotlib axes."""
+        size = self.cameras[name].views.image_size
+        return plotting.coverage_map(self.coverage(name), rig_points(self, name), size, name, ax)
+
+    def plot_uncertainty(self, name: str, distance: float = np.inf, frame: str = "rig", ax=None):
+        """σ of a projected point over the image of a camera; matplotlib axes."""
+        found, one = self.uncertainty(name, distance, frame, DRAWN), self.cameras[name]
+        unit = one.adjustment.network.object_unit
+        return plotting.uncertainty_image(found, one.views.image_size, unit, name, ax)
+
+    def __str__(self) -> str:
+        lines = [f"Rig of {len(self.cameras)} cameras, {len(self.epochs)} epochs, σ0 "
+                 f"{self.sigma0:.3f}, reference {self.names[0]}"]  # fmt: skip
+        for name, m in self.mountings.items():
+            lines.append(f"{name}: base {m.length:.6g} ± {m.length_sigma:.2g}")
+        return "\n".join(lines)
+
+
+@jax.jit
+def _to_angles(mounting: PoseValue):
+    """R, ω, φ, κ, and derivatives of base and angles by (δb, δθ)."""
+    block = Pose().prepare(mounting)
+    R = block.rotation.matrix()
+    given = jnp.concatenate([mounting.position, omega_phi_kappa_from_matrix(R)])
+    change = lambda d: exterior(Pose().moved(block, tuple(d)), given)
+    return R, given[3:], jax.jacfwd(change)(jnp.zeros(POSE))
+
+
+def _mounting(at: PoseValue, C) -> Mounting:
+    R, angles, J = map(np.asarray, _to_angles(at))
+    base = np.asarray(at.position)
+    J, length = DEGREES[:, None] * J, float(np.linalg.norm(base))
+    along = base / length if length else np.zeros(3)
+    return Mounting(
+        base, R, np.degrees(angles), J @ C @ J.T, length,
+        float(np.sqrt(along @ C[:3, :3] @ along)),
+    )  # fmt: skip

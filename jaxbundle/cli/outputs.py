@@ -1,0 +1,176 @@
+"""What the command line writes: a JSON file, and a folder of report, JSON, tables, plots and the
+adjusted network as a project.
+
+`check_targets` finds before an adjustment what could not be written after it.
+"""
+
+import os
+import re
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from jaxbundle import report
+from jaxbundle.bundle.result import Adjustment
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.io.networks.project import ADJUSTED, FILE_NAME, fill_project
+from jaxbundle.io.networks.project import FILES as NETWORK_FILES
+from jaxbundle.io.results.result_json import result_text, unsolved_text
+from jaxbundle.io.results.result_project import adjusted_network
+from jaxbundle.io.text.csv_tables import table_rows, write_csv, write_text
+from jaxbundle.io.writing.folders import check_folder, replaced_folder
+from jaxbundle.network.tables import Network
+from jaxbundle.plotting.files import FIGURES, draw_figures
+from jaxbundle.plotting.style import need_matplotlib
+
+REPORT, RESULT = "report.txt", "result.json"
+TABLES = ("cameras", "images", "points", "residuals", "checks", "far_points")
+FILES = (
+    REPORT, RESULT, *(f"{name}.csv" for name in TABLES),
+    *(f"{ADJUSTED}/{name}" for name in NETWORK_FILES), *FIGURES,
+)  # fmt: skip
+"""What is written into a folder, figures as patterns."""
+
+JSON = re.compile(rb'\s*(\{\s*["}]|\[[\s\[]*([]{"\d-]|true|false|null))')
+"""How JSON begins; a table of TOML, `[project]`, does not."""
+
+
+def network_files(
+    input: Path, network: Network, control: Path | None = None
+) -> tuple[str | Path, ...]:
+    """The files a network was read from."""
+    tables = (network.images, network.points, network.observations, network.distances)
+    files = (input, input / FILE_NAME, *(table.source.name for table in tables))
+    return files if control is None else (*files, control)
+
+
+def check_writable(
+    json: str,
+    out: Path | None,
+    by: str,
+    names: Iterable[str],
+    inputs: Iterable[str | Path],
+    force: bool = False,
+) -> None:
+    """Refuse a JSON file, or a folder for files of these names, that the command `by` cannot or may
+    not write (`io.writing.folders`, `check_json`), or that would replace one of the inputs."""
+    inputs = tuple(inputs)
+    if out is not None:
+        check_folder(out, by, names, inputs, force)
+    if json in ("", "-"):
+        return
+    path = Path(json)
+    real = Path(os.path.realpath(path))
+    if path.is_dir():
+        raise InputError(f"--json {json}: is a folder; give the name of a file")
+    if out is not None and Path(os.path.realpath(out)).is_relative_to(real):
+        raise InputError(f"--json {json}: is to be the folder of --out; give the name of a file")
+    if name_inside(json, out) is None:
+        if not os.path.isdir(path.parent):
+            raise InputError(f"--json {json}: there is no folder {path.parent}")
+        if not os.access(path.parent, os.W_OK | os.X_OK):
+            raise InputError(f"--json {json}: cannot be written: no permission in {path.parent}")
+    if any(str(real) == os.path.realpath(file) for file in inputs):
+        raise InputError(f"{path} is part of the input and would be overwritten; give another")
+    if not force:
+        check_json(json, ", or --force to replace it")
+
+
+def check_json(json: str, way: str = "") -> None:
+    """Refuse to replace by JSON a file that is not JSON, for it was not meant, unless it is empty.
+
+    `way`: what else than to give another name the command offers, for the message.
+    """
+    path = Path(json)
+    if json in ("", "-") or not path.is_file():
+        return
+    try:
+        with path.open("rb") as file:
+            head = file.read(4096)
+    except OSError as error:
+        raise InputError(f"--json {json}: cannot be read: {error.strerror}") from None
+    if head and not JSON.match(head):
+        raise InputError(f"--json {json}: exists and is not JSON; give another name{way}")
+
+
+def check_targets(
+    input: Path, network: Network, json: str, out: Path | None, control: Path | None = None,
+    force: bool = False,
+) -> None:  # fmt: skip
+    """Check what `adjust` is to write, before it is computed (`check_writable`)."""
+    check_writable(json, out, "adjust", FILES, network_files(input, network, control), force)
+
+
+def name_inside(json: str, out: Path | None) -> str | None:
+    """The name of a JSON file directly in the folder of --out, which it then belongs to."""
+    if json in ("", "-") or out is None:
+        return None
+    path = Path(json)
+    return path.name if os.path.realpath(path.parent) == os.path.realpath(out) else None
+
+
+@contextmanager
+def written(
+    json: str, text: str | Iterable[str], out: Path | None, by: str, names: Iterable[str],
+    force: bool,
+) -> Iterator[Path | None]:  # fmt: skip
+    """Write the JSON of a result (`-`: on standard output), and give the folder to fill that
+    becomes --out, None if there is none.
+
+    A JSON file is written when the folder is in place; one in the folder belongs to it.
+    """
+    if json == "-":
+        sys.stdout.writelines((text,) if isinstance(text, str) else text)
+    if out is None:
+        yield None
+    else:
+        with replaced_folder(out, by, names, force) as new:
+            yield new
+            if (name := name_inside(json, out)) is not None:
+                write_text(new / name, text)
+                json = ""
+    if json not in ("", "-"):
+        write_text(Path(json), text)
+
+
+def write_targets(
+    result: Adjustment | NotSolvedError, json: str, out: Path | None, brief: bool, plots: bool,
+    force: bool = False,
+) -> None:  # fmt: skip
+    """Write JSON (`-`: on standard output) and folder of a result, or of why there is none."""
+    solved = isinstance(result, Adjustment)
+
+    def text(brief: bool) -> str | Iterable[str]:
+        if isinstance(result, Adjustment):
+            return result_text(result, brief)
+        return unsolved_text(result)
+
+    plots = plots and out is not None and solved and result.converged and can_plot()
+    with written(json, text(brief), out, "adjust", FILES, force) as new:
+        if new is None:
+            return
+        write_text(new / REPORT, report.text(result) if solved else f"{result}\n")
+        write_text(new / RESULT, text(False))
+        if solved and result.converged:
+            _write_tables(result, new)
+            fill_project(adjusted_network(result), new / ADJUSTED)
+        if plots:
+            draw_figures(result, new)
+
+
+def can_plot() -> bool:
+    """Whether there is matplotlib; where not, that is said on standard error."""
+    try:
+        need_matplotlib()
+    except ImportError as error:
+        print(f"no plots: {error}", file=sys.stderr)
+        return False
+    return True
+
+
+def _write_tables(result: Adjustment, folder: Path) -> None:
+    for name in TABLES:
+        table = result.table(name)
+        if table:
+            write_csv(folder / f"{name}.csv", list(table), table_rows(table))

@@ -1,0 +1,59 @@
+"""Cameras with the covariance of their parameters, from the JSON of `adjust` and `calibrate`."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.cameras.opencv_file import is_opencv
+from jaxbundle.io.text.csv_tables import read_text
+from jaxbundle.network.build import make_cameras
+from jaxbundle.network.tables import Camera
+from jaxbundle.system.file_content import parse_json
+
+Calibrated = tuple[Camera, tuple[list[str], Float[np.ndarray, "k k"]]]
+"""A camera, the names of its free parameters, their covariance."""
+
+
+def is_result(path: Path) -> bool:
+    """Whether a file may be the result of an adjustment or a calibration."""
+    return path.suffix.lower() == ".json" and path.is_file() and not is_opencv(path)
+
+
+def read_calibrated(path: str | Path) -> list[Calibrated]:
+    """The cameras of a result.
+
+    **Raises:** `InputError` where it is not solved, or entries are missing or wrong.
+    """
+    try:
+        document = parse_json(path, read_text(Path(path)))
+        if document["converged"] is not True:
+            raise InputError(f"{path}: was not solved; there is no camera in it")
+        parts = document.get("calibrations", {"": document})
+        return [
+            _calibrated(path, id, entry, part.get("calibration", {}))
+            for part in parts.values() for id, entry in part["cameras"].items()
+        ]
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"{path}: not a result in JSON: {str(error)[:100]}") from None
+    except (KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path}: not the result of adjust or calibrate: {error!r:.100}") from None
+
+
+def _calibrated(path, id, entry, about) -> Calibrated:
+    parameters = entry["parameters"]
+    row = {"id": id, "model": entry["model"]} | {n: p["value"] for n, p in parameters.items()}
+    if about.get("image_size"):
+        row["image_size"] = about["image_size"]
+    (camera,) = make_cameras([row], f"{path}, ")
+    free = [name for name, p in parameters.items() if p["free"]]
+    sigma = np.array([float(parameters[name]["sigma"]) for name in free])
+    R = np.array([
+        [1.0 if a == b else float(entry["correlations"][a][b]) for b in free] for a in free
+    ]).reshape(len(free), len(free))  # fmt: skip
+    if not (np.isfinite(sigma).all() and np.isfinite(R).all()):
+        raise InputError(f"{path}, camera {id!r}: a σ or correlation is not a number")
+    return camera, (free, sigma[:, None] * R * sigma)

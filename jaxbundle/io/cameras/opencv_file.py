@@ -1,0 +1,315 @@
+"""A camera in the form of OpenCV's FileStorage: YAML or JSON.
+
+    %YAML:1.0
+    ---
+    image_width: 640
+    image_height: 480
+    camera_matrix: !!opencv-matrix
+       rows: 3
+       cols: 3
+       dt: d
+       data: [ fx, 0., cx, 0., fy, cy, 0., 0., 1. ]
+    distortion_coefficients: !!opencv-matrix
+       …
+       data: [ k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 ]      4, 5, 8, 12 or 14 of them
+
+The files of ROS, which look alike, are read as well: with `distortion_model` "equidistant" or
+"fisheye" the four coefficients are those of `kannala-brandt`. Pixels have their origin at the
+centre of the first pixel, as ours. A skew and a tilted sensor (τx, τy),
+
+    s·[x'', y'', 1] = [R33, 0, −R13; 0, R33, −R23; 0, 0, 1]·R·[x', y', 1]
+    R = [cos τy, 0, −sin τy; 0, 1, 0; sin τy, 0, cos τy]
+        ·[1, 0, 0; 0, cos τx, sin τx; 0, −sin τx, cos τx]
+    u = fx·x'' + skew·y'' + cx
+
+have no place in our models: where they are not 0 the nearest is fitted, which needs the image size.
+
+The reader knows what cameras need of YAML, and nothing else of it; other entries are skipped.
+
+Source: OpenCV 4 documentation, XML/YAML/JSON file storages; ROS wiki, camera_calibration_parsers.
+"""
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbundle.cameras import get_model
+from jaxbundle.cameras.model import project
+from jaxbundle.errors import InputError
+from jaxbundle.io.cameras.nearest_camera import FittedCamera, Foreign, fitted_camera
+from jaxbundle.io.networks.assemble import all_parameters
+from jaxbundle.io.text.csv_tables import read_text, write_text
+from jaxbundle.network.columns import shown
+from jaxbundle.network.rules import check_camera
+from jaxbundle.network.tables import Camera
+from jaxbundle.system.file_content import is_plain, parse_json
+
+SUFFIXES = (".yaml", ".yml", ".json")
+MATRIX = ("camera_matrix", "cameraMatrix", "K")
+COEFFICIENTS = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "D")
+ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
+LENGTHS = (4, 5, 8, 12)
+FISHEYE = ("equidistant", "fisheye")
+
+_TOP = re.compile(r"([A-Za-z_]\w*)\s*:\s*(.*)")
+_INNER = re.compile(r"\s+([A-Za-z_]\w*)\s*:\s*(.*)")
+
+
+def is_opencv(path: Path) -> bool:
+    """Whether a file has a name of this kind and mentions a camera matrix."""
+    if path.suffix.lower() not in SUFFIXES or not is_plain(path):
+        return False
+    with path.open("rb") as file:
+        text = file.read(1_000_000)
+    return any(re.search(rb"^[\s{]*\"?%s\"?\s*:" % name.encode(), text, re.M) for name in MATRIX)
+
+
+def read_opencv(path: str | Path) -> Camera:
+    """The camera of a file; its id is the name of the file.
+
+    **Raises:** `InputError` naming the entry.
+    """
+    path = Path(path)
+    text = read_text(path)
+    is_json = path.suffix.lower() == ".json" or text.lstrip().startswith("{")
+    entries = _from_json(path, text) if is_json else _from_yaml(path, text)
+    name, K = _matrix(path, entries, MATRIX, (3, 3))
+    for row, column, wanted in ((1, 0, 0), (2, 0, 0), (2, 1, 0), (2, 2, 1)):
+        if K[row, column] != wanted:
+            raise InputError(
+                f"{path}: {name}[{row}][{column}] is {K[row, column]:g}; {wanted} is expected"
+            )
+    coefficients = _coefficients(path, entries)
+    coefficients, tilt = coefficients[: len(ORDER)], coefficients[len(ORDER) :]
+    parameters = dict(zip(("fx", "fy", "cx", "cy"), (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
+    fisheye = entries.get("distortion_model") in FISHEYE or _is_one(entries.get("fisheye_model"))
+    if fisheye:
+        if any(coefficients[4:]) or any(tilt):
+            raise InputError(
+                f"{path}: {len(coefficients)} distortion coefficients; a fisheye has 4"
+            )
+        names = ("k1", "k2", "k3", "k4")
+    else:
+        names = ORDER
+    camera = Camera(
+        id=path.stem,
+        model="kannala-brandt" if fisheye else "opencv",
+        parameters={k: float(v) for k, v in parameters.items()} | dict(zip(names, coefficients)),
+        image_size=_image_size(path, entries),
+    )
+    check_camera(camera, f"{path}, ")
+    return camera if K[0, 1] == 0 and not any(tilt) else _fitted(path, camera, K[0, 1], tilt)
+
+
+def _fitted(path: Path, camera: Camera, skew: float, tilt: Sequence[float]) -> FittedCamera:
+    """The nearest of our cameras to one with a skew or a tilted sensor."""
+    if camera.image_size is None:
+        raise InputError(
+            f"{path}: a skew or a tilted sensor has no place in our models; to fit the nearest one "
+            "the image size is needed: give image_width and image_height"
+        )
+    p = all_parameters(camera)
+    parameters = {"camera": p, "skew": skew, "H": _tilted(*tilt) if tilt else np.eye(3)}
+    has = [f"skew {skew:g}"] if skew else []
+    has += [f"tilt τx {tilt[0]:g}, τy {tilt[1]:g}"] if any(tilt) else []
+    foreign = Foreign(FORMULAS[str(camera.model)], parameters, p, camera.image_size,
+                      fisheye=camera.model == "kannala-brandt")  # fmt: skip
+    return fitted_camera(camera.id, foreign, str(path), f"has {' and '.join(has)}")
+
+
+def _image(name: str, p: Mapping, X, Y, Z):
+    """Pixels of a ray in a camera with a skew and a tilted sensor."""
+    model, own = get_model(name), p["camera"]
+    one = own | {"fx": 1.0, "fy": 1.0, "cx": 0.0, "cy": 0.0}
+    xy = project(model, tuple(one[key] for key in model.parameters), X, -Y, -Z)
+    x, y, s = p["H"] @ jnp.stack([*xy, 1.0])
+    u = own["fx"] * x / s + p["skew"] * y / s + own["cx"]
+    return jnp.stack([u, own["fy"] * y / s + own["cy"]])
+
+
+FORMULAS = {name: partial(_image, name) for name in ("opencv", "kannala-brandt")}
+
+
+def _tilted(tx: float, ty: float) -> np.ndarray:
+    cx, sx, cy, sy = np.cos(tx), np.sin(tx), np.cos(ty), np.sin(ty)
+    about_y = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])
+    R = about_y @ np.array([[1, 0, 0], [0, cx, sx], [0, -sx, cx]])
+    return np.array([[R[2, 2], 0, -R[0, 2]], [0, R[2, 2], -R[1, 2]], [0, 0, 1]]) @ R
+
+
+def opencv_text(camera: Camera, as_json: bool = False) -> str:
+    """The text of a file for a camera of model `opencv` or `kannala-brandt`.
+
+    **Raises:** `InputError` for another model.
+    """
+    if camera.model not in ("opencv", "kannala-brandt"):
+        raise InputError(
+            f"camera {camera.id!r}: OpenCV has no model {str(camera.model)!r}; convert it with "
+            "--model opencv"
+        )
+    p = all_parameters(camera)
+    fisheye = camera.model == "kannala-brandt"
+    K = [p["fx"], 0.0, p["cx"], 0.0, p["fy"], p["cy"], 0.0, 0.0, 1.0]
+    values = [p[name] for name in (("k1", "k2", "k3", "k4") if fisheye else ORDER)]
+    if not fisheye:
+        values = values[: next(n for n in LENGTHS if not any(values[n:]))]
+    entries: dict[str, Any] = {}
+    if camera.image_size is not None:
+        entries |= dict(zip(("image_width", "image_height"), camera.image_size))
+    if fisheye:
+        entries |= {"fisheye_model": 1, "distortion_model": "equidistant"}
+    entries |= {"camera_matrix": (3, 3, K), "distortion_coefficients": (len(values), 1, values)}
+    return _as_json(entries) if as_json else _as_yaml(entries)
+
+
+def write_opencv(camera: Camera, path: str | Path) -> None:
+    """Write a camera as YAML or, where the name ends so, JSON."""
+    path = Path(path)
+    write_text(path, opencv_text(camera, path.suffix.lower() == ".json"))
+
+
+def _as_yaml(entries: Mapping) -> str:
+    lines = ["%YAML:1.0", "---"]
+    for key, value in entries.items():
+        if isinstance(value, tuple):
+            rows, columns, data = value
+            numbers = ", ".join(map(repr, map(float, data)))
+            lines += [f"{key}: !!opencv-matrix", f"   rows: {rows}", f"   cols: {columns}",
+                      "   dt: d", f"   data: [ {numbers} ]"]  # fmt: skip
+        else:
+            lines.append(f"{key}: {json.dumps(value)}")
+    return "\n".join(lines) + "\n"
+
+
+def _as_json(entries: Mapping) -> str:
+    document = {
+        key: {"type_id": "opencv-matrix", "rows": value[0], "cols": value[1], "dt": "d",
+              "data": [float(x) for x in value[2]]} if isinstance(value, tuple) else value
+        for key, value in entries.items()
+    }  # fmt: skip
+    return json.dumps(document, indent=4) + "\n"
+
+
+def _from_json(path: Path, text: str) -> dict[str, Any]:
+    document = parse_json(path, text)
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: an object with camera_matrix is expected")
+    return document
+
+
+def _from_yaml(path: Path, text: str) -> dict[str, Any]:
+    """Entries of the first two levels: words, numbers, and lists of numbers."""
+    entries: dict[str, Any] = {}
+    top, lines = "", iter(enumerate(text.splitlines(), 1))
+    for number, line in lines:
+        if outer := _TOP.fullmatch(line.rstrip()):
+            top, value = outer.groups()
+            if top in entries:
+                raise InputError(f"{path}, line {number}: {top} stands there twice")
+            entries[top] = {} if not value or value.startswith("!!") else value
+            place = (entries, top)
+        elif (inner := _INNER.fullmatch(line.rstrip())) and isinstance(entries.get(top), dict):
+            key, value = inner.groups()
+            entries[top][key] = value
+            place = (entries[top], key)
+        else:
+            continue
+        if value.startswith("[") and "]" not in value:
+            parts = [value]
+            for _, more in lines:
+                parts.append(more)
+                if "]" in more:
+                    break
+            else:
+                raise InputError(f"{path}, line {number}: the list {place[1]} has no end")
+            value = " ".join(parts)
+        place[0][place[1]] = entries[top] if value.startswith("!!") or not value else _value(value)
+    return entries
+
+
+def _value(text: str):
+    """A number, a list of numbers, or the text itself."""
+    text = text.strip()
+    if text.startswith("["):
+        return [_value(word) for word in text.strip("[] \t").split(",") if word.strip()]
+    try:
+        return float(text)
+    except ValueError:
+        return text.strip("\"'")
+
+
+def _matrix(path: Path, entries: Mapping, names, shape):
+    name = next((name for name in names if name in entries), None)
+    if name is None:
+        raise InputError(f"{path}: {names[0]} is missing")
+    value = entries[name]
+    if isinstance(value, Mapping):
+        given = tuple(_whole(value.get(key)) for key in ("rows", "cols"))
+        data = value.get("data")
+        whole = [n for n in given if n is not None]
+        if len(whole) < 2 or not isinstance(data, list) or len(data) != whole[0] * whole[1]:
+            size = len(data) if isinstance(data, list) else "no"
+            raise InputError(
+                f"{path}: {name} has {size} numbers for {shown(value.get('rows'))} rows and "
+                f"{shown(value.get('cols'))} columns"
+            )
+    else:
+        data, given = value, None
+        if isinstance(value, list) and all(isinstance(row, list) for row in value):
+            data = [x for row in value for x in row]
+    if not isinstance(data, list) or not all(_is_number(x) for x in data):
+        raise InputError(f"{path}: {name}: a list of finite numbers is expected")
+    if shape is not None and (given not in (None, shape) or len(data) != shape[0] * shape[1]):
+        raise InputError(f"{path}: {name} must have {shape[0]} rows and {shape[1]} columns")
+    array = np.array(data, float)
+    return name, array if shape is None else array.reshape(shape)
+
+
+def _coefficients(path: Path, entries: Mapping) -> list[float]:
+    if not any(name in entries for name in COEFFICIENTS):
+        return [0.0] * 4
+    name, values = _matrix(path, entries, COEFFICIENTS, None)
+    values = values.tolist()
+    while values and len(values) not in (*LENGTHS, 14) and values[-1] == 0:
+        values = values[:-1]
+    values = values or [0.0] * 4
+    if len(values) not in (*LENGTHS, 14):
+        raise InputError(f"{path}: {name} has {len(values)} values; 4, 5, 8, 12 or 14 are known")
+    return values
+
+
+def _image_size(path: Path, entries: Mapping) -> tuple[int, int] | None:
+    given = [entries.get(name) for name in ("image_width", "image_height")]
+    if given == [None, None]:
+        size = entries.get("image_size", entries.get("image_Size"))
+        if size is None:
+            return None
+        given = size if isinstance(size, list) and len(size) == 2 else [None, None]
+    width, height = (_whole(x) for x in given)
+    if width is None or height is None:
+        raise InputError(f"{path}: the image size is {shown(given)}; two whole numbers expected")
+    return width, height
+
+
+def _whole(value) -> int | None:
+    good = _is_number(value) and float(value).is_integer() and 0 < value < 1e9
+    return int(value) if good else None
+
+
+def _is_number(value) -> bool:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    try:
+        return bool(np.isfinite(float(value)))
+    except OverflowError:
+        return False
+
+
+def _is_one(value) -> bool:
+    return _is_number(value) and value == 1

@@ -1,0 +1,1 @@
+"""Networks of photographs: our project, and the files of other programs."""

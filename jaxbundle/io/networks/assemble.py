@@ -1,0 +1,101 @@
+"""Networks from what readers of other programs' files find, and the pieces writers need.
+
+The readers give rotation matrices and numbers; here they become tables, with the settings of the
+command line put in.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.cameras import default_parameters, get_model
+from jaxbundle.io.networks.poses import angles_of
+from jaxbundle.io.networks.settings import SETTINGS, Document, apply_overrides, check_settings
+from jaxbundle.network.build import make_cameras, make_network
+from jaxbundle.network.columns import Columns
+from jaxbundle.network.rules import check_unique
+from jaxbundle.network.tables import (
+    EXTERIOR,
+    Camera,
+    Images,
+    Network,
+    Observations,
+    Points,
+    Source,
+)
+
+
+def foreign_document(name: str, cameras: Iterable[Mapping], **project) -> Document:
+    """What a project file would say of a network of another program: measured in pixels, free."""
+    settings = {"name": name, "datum": "inner", "image_unit": "px", "residuals": "measured",
+                "object_unit": "model", "sigma_image": 1.0}  # fmt: skip
+    return {"project": settings | project, "camera": [dict(camera) for camera in cameras]}
+
+
+def assemble(
+    path: Path,
+    document: Document,
+    overrides: Sequence[str],
+    images: Columns,
+    points: Columns | None = None,
+    observations: Columns | None = None,
+    warnings: Iterable[str] = (),
+) -> Network:
+    """The network of a document and its tables, angles in radians.
+
+    Without points there is a network of cameras and images alone, which can be written but not
+    adjusted. The image unit is the file's and cannot be set.
+
+    **Raises:** `InputError`.
+    """
+    keys = tuple(key for key in SETTINGS if key != "image_unit")
+    document = apply_overrides(document, overrides, keys)
+    project = dict(document["project"])
+    check_settings(project, f"{path}: ")
+    angle_unit = project.pop("angle_unit", "rad")
+    cameras = make_cameras(document["camera"], f"{path}, ")
+    if points is not None and len(points) and observations is not None and len(observations):
+        network = make_network(cameras, images, points, observations, **project)
+    else:
+        network = _without_points(cameras, images, project)
+    return network.replace(angle_unit=angle_unit).warn(*warnings)
+
+
+def _without_points(cameras: Sequence[Camera], images: Columns, project: Mapping) -> Network:
+    ids = images.ids("id")
+    check_unique(ids, images.source, "image")
+    index = {camera.id: c for c, camera in enumerate(cameras)}
+    exterior = np.stack([images.numbers(name) for name in EXTERIOR], 1)
+    none = np.zeros(0, np.int64)
+    settings = {k: v for k, v in project.items() if k not in ("sigma_image", "datum_points")}
+    return Network(
+        cameras=tuple(cameras),
+        images=Images(
+            ids, images.indices("camera", "camera", index, "cameras"), exterior[:, :3],
+            exterior[:, 3:], np.full((len(ids), 6), np.nan), images.source,
+        ),
+        points=Points((), (), np.zeros((0, 3)), np.zeros((0, 3))),
+        observations=Observations(none, none, np.zeros((0, 2)), np.zeros((0, 2))),
+        **settings,
+    ).warn("there are no image points: nothing can be adjusted")  # fmt: skip
+
+
+def image_columns(
+    source: Source,
+    ids: Sequence,
+    cameras: Sequence,
+    M: Float[np.ndarray, "images 3 3"],
+    X0: Float[np.ndarray, "images 3"],
+) -> Columns:
+    """The table of images from rotation matrices and projection centres."""
+    values = np.concatenate([np.reshape(X0, (-1, 3)), angles_of(M)], 1)
+    columns = {"id": ids, "camera": cameras, **dict(zip(EXTERIOR, values.T))}
+    return Columns(columns, source)
+
+
+def all_parameters(camera: Camera) -> dict[str, float]:
+    """All parameters of a camera by name, those not given with their defaults."""
+    values = {**default_parameters(get_model(camera.model)), **camera.parameters}
+    return {name: float(values[name]) for name in get_model(camera.model).parameters}

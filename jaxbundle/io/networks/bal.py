@@ -1,0 +1,227 @@
+"""Problems of "bundle adjustment in the large" (BAL), plain or compressed (.gz, .bz2).
+
+    cameras points observations         three whole numbers
+    camera point x y                    an image point, px; x right, y up, from the image centre
+    …
+    r1 r2 r3 t1 t2 t3 f k1 k2           nine numbers for every camera
+    X Y Z                               three for every point
+
+Cameras and points are counted from 0; these numbers become their ids. Every image has its own
+camera of model `snavely`, all of it free; residuals are formed in the image as measured, σ is
+1 px, and the datum is given by inner constraints. [r] is a rotation vector and t a shift:
+M = exp([r]×), X0 = −Mᵀt.
+
+Source: Agarwal, Snavely, Seitz and Szeliski (2010), Bundle Adjustment in the Large.
+"""
+
+import bz2
+import gzip
+import warnings
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.cameras import get_model
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.pose_conventions import bundler_pose, exterior_from_bundler
+from jaxbundle.io.networks.assemble import all_parameters
+from jaxbundle.io.networks.losses import need_values, what_is_lost
+from jaxbundle.io.networks.poses import (
+    angles_of,
+    matrices_of,
+    matrices_of_rotation_vectors,
+    rotation_vectors_of,
+)
+from jaxbundle.io.networks.settings import apply_overrides, check_settings
+from jaxbundle.io.text.csv_tables import write_bytes
+from jaxbundle.io.text.unpacking import most_unpacked
+from jaxbundle.network.build import make_cameras, make_network
+from jaxbundle.network.columns import Columns, shown
+from jaxbundle.network.tables import EXTERIOR, Network, Source
+
+OPENERS = {".gz": gzip.open, ".bz2": bz2.open}
+FIRST_LINE, MOST_DIGITS = 200, 18
+"""Characters of the first line, and of a count in it."""
+NUMBER = 64
+"""Characters a number has at most, the blanks around it included."""
+UNREADABLE = (OSError, EOFError, zlib.error)
+MODEL = get_model("snavely")
+
+
+def is_bal(path: Path) -> bool:
+    """Whether the first line of a text file is three whole numbers."""
+    if not path.is_file():
+        return False
+    try:
+        with OPENERS.get(path.suffix.lower(), open)(path, "rb") as file:
+            words = file.readline(FIRST_LINE).split()
+    except UNREADABLE:
+        return False
+    return _are_counts(words)
+
+
+def read_bal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
+    """The network of a BAL problem; `overrides` as for a project file.
+
+    **Raises:** `InputError` where numbers are missing, too many, or not numbers.
+    """
+    path = Path(path)
+    (cameras, points, rows), numbers = _numbers(path)
+    observed, numbers = np.split(numbers, [4 * rows])
+    given, position = np.split(numbers, [9 * cameras])
+    observed, given = observed.reshape(-1, 4), given.reshape(-1, 9)
+    for column, count, what in ((0, cameras, "camera"), (1, points, "point")):
+        index = observed[:, column]
+        wrong = (index < 0) | (index >= count) | (index % 1 != 0)
+        if wrong.any():
+            row = int(wrong.argmax())
+            raise InputError(
+                f"{path}, line {row + 2}: {what} {index[row]:g} does not exist; the first line "
+                f"announces {count}, counted from 0"
+            )
+    document = {
+        "project": {"name": path.name.split(".")[0], "datum": "inner", "image_unit": "px",
+                    "residuals": "measured", "object_unit": "model", "sigma_image": 1.0},
+        "camera": [
+            {"id": str(c), "model": MODEL.name, "free": list(MODEL.parameters),
+             **dict(zip(MODEL.parameters, map(float, row)))}
+            for c, row in enumerate(given[:, 6:])
+        ],
+    }  # fmt: skip
+    document = apply_overrides(document, overrides)
+    project = document["project"]
+    check_settings(project, f"{path}: ")
+    angle_unit = project.pop("angle_unit", "rad")
+    return make_network(
+        make_cameras(document["camera"], f"{path}, "),
+        _table(path, "camera", _images(given[:, :6])),
+        _table(path, "point", {
+            "id": np.arange(points), "role": np.full(points, "tie"),
+            **dict(zip("XYZ", position.reshape(-1, 3).T)),
+        }),
+        Columns(
+            {
+                "image": observed[:, 0].astype(np.int64), "point": observed[:, 1].astype(np.int64),
+                "x": observed[:, 2], "y": observed[:, 3],
+            },
+            Source(str(path), np.arange(rows) + 2, "line"),
+        ),
+        **project,
+    ).replace(angle_unit=angle_unit)  # fmt: skip
+
+
+def write_bal(network: Network, path: str | Path) -> tuple[str, ...]:
+    """Write a network as a problem, compressed if the name ends in .gz or .bz2.
+
+    Its cameras must be of model `snavely`. Images that share a camera each get a copy of it.
+
+    **Returns:** what the format has no place for, in words.
+    """
+    path = Path(path)
+    images, points, rays = network.images, network.points, network.observations
+    need_values(network, "snavely", "BAL")
+    R, t = bundler_pose(matrices_of(images.angles), images.position)
+    given = np.array([[*all_parameters(c).values()] for c in network.cameras])[images.camera]
+    cameras = np.concatenate([rotation_vectors_of(R), t, given], 1)
+    lines = [f"{len(images)} {len(points)} {len(rays)}"]
+    lines += [
+        f"{image} {point} {x!r} {y!r}"
+        for image, point, (x, y) in zip(rays.image.tolist(), rays.point.tolist(), rays.xy.tolist())
+    ]
+    lines += map(repr, [*cameras.ravel().tolist(), *points.position.ravel().tolist()])
+    text = ("\n".join(lines) + "\n").encode()
+    match path.suffix.lower():
+        case ".gz":
+            text = gzip.compress(text, mtime=0)
+        case ".bz2":
+            text = bz2.compress(text)
+    write_bytes(path, text)
+    return what_is_lost(network, shared_cameras=True, names=True)
+
+
+def _are_counts(words: Sequence[bytes]) -> bool:
+    """Whether these are three whole numbers."""
+    return len(words) == 3 and all(word.isdigit() for word in words)
+
+
+def _counts(path: Path, first: Sequence[bytes]) -> tuple[int, ...]:
+    """Cameras, points and observations, as the words of the first line announce them."""
+    if not _are_counts(first):
+        raise InputError(
+            f"{path}, line 1: three whole numbers are expected: cameras, points, observations"
+        )
+    if max(map(len, first)) > MOST_DIGITS:
+        raise InputError(
+            f"{path}, line 1: {b' '.join(first)[:60].decode()}: more cameras, points, observations "
+            "than a file can hold"
+        )
+    return tuple(map(int, first))
+
+
+def _numbers(path: Path):
+    """The three counts of the first line, and all numbers after it.
+
+    No more is read than these can be, whatever a compressed file unpacks to.
+    """
+    suffix = path.suffix.lower()
+    try:
+        with OPENERS.get(suffix, open)(path, "rb") as file:
+            counts = _counts(path, file.readline(FIRST_LINE).split())
+            cameras, points, rows = counts
+            expected = 4 * rows + 9 * cameras + 3 * points
+            size = path.stat().st_size
+            held = most_unpacked(size) if suffix in OPENERS else size
+            most = min(NUMBER * (expected + 1), held)
+            text = file.read(most + 1)
+    except UNREADABLE as error:
+        raise InputError(f"{path}: cannot be read: {error}") from None
+    if len(text) > most:
+        raise InputError(
+            f"{path}: holds more than {most} characters, too many for the {expected} numbers that "
+            f"line 1 announces, in a file of {size} bytes"
+        )
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # Of text that is no number.
+            numbers = np.fromstring(text, sep=" ")
+    except (ValueError, DeprecationWarning):
+        raise _not_a_number(path, text) from None
+    if len(numbers) != expected:
+        raise InputError(
+            f"{path}: {len(numbers)} numbers follow the first line; {expected} are expected "
+            f"(4 for each of {rows} observations, 9 for each of {cameras} cameras, 3 for each of "
+            f"{points} points)"
+        )
+    finite = np.isfinite(numbers)
+    if not finite.all():
+        raise _not_a_number(path, text)
+    return counts, numbers
+
+
+def _not_a_number(path: Path, text: bytes) -> InputError:
+    for line, row in enumerate(text.splitlines(), 2):
+        for word in row.split():
+            try:
+                good = np.isfinite(float(word)) and b"_" not in word
+            except ValueError:
+                good = False
+            if not good:
+                word = word.decode(errors="replace")
+                return InputError(f"{path}, line {line}: {shown(word)} where a number is expected")
+    return InputError(f"{path}: there is something between the numbers that is none")
+
+
+def _images(pose) -> dict:
+    """Exterior orientation of the images from rotation vectors and shifts."""
+    M, centre = exterior_from_bundler(matrices_of_rotation_vectors(pose[:, :3]), pose[:, 3:])
+    columns = np.concatenate([centre, angles_of(M)], 1).T
+    ids = np.arange(len(pose))
+    return {"id": ids, "camera": ids, **dict(zip(EXTERIOR, columns))}
+
+
+def _table(path: Path, word: str, columns: dict) -> Columns:
+    """A table whose rows are known by their number, from 0."""
+    first = next(iter(columns.values()))
+    return Columns(columns, Source(str(path), np.arange(len(first)), word))

@@ -1,0 +1,191 @@
+"""Input of the BINGO program: image coordinates (`image.dat`) and geo input (`geoin.dat`).
+
+`image.dat`, free of columns; a photograph ends with −99 or where the next begins:
+
+    PHOTO [CAMERA]
+    POINT x y
+    …
+    -99
+
+`geoin.dat`, of which these statements are read:
+
+    CAPA key CAMERA c xH yH [σc σx σy]      camera; key 3: all three are adjusted, with these σ
+    CONT POINT X Y Z                        control point, held
+    CHCK POINT X Y Z                        check point
+
+Lines that begin with `*` or the word `C` are comments, so is what begins with `#`. RADI and ADPA
+(distortion curve, additional parameters) are skipped with a warning: they concern the distortion,
+which starts at 0 here. Every other statement is refused by name: the program's manual is not
+public, and what is said here of the two files is what a thesis and an open reader show of them.
+`itera.dat` (orientations and coordinates) is not read for the same reason: photographs have no
+start values.
+
+Image coordinates have y up and the unit of the file, which is also that of c, xH, yH; it is called
+"mm" here. The camera is of model `bingo`.
+
+Sources: Repanšek (2009), section 7.1.2 and appendices; the BINGO reader of an add-on to GRASS GIS
+for the orientation of images (Turek).
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.networks.assemble import assemble, foreign_document
+from jaxbundle.io.text.rows import Row, Rows
+from jaxbundle.network.columns import Columns, did_you_mean, some
+from jaxbundle.network.tables import EXTERIOR, Network, Source
+
+IMAGE, GEO = "image.dat", "geoin.dat"
+END = "-99"
+ADJUSTED = 3
+SKIPPED = ("RADI", "ADPA")
+KNOWN = ("CAPA", "CONT", "CHCK", *SKIPPED)
+INTERIOR = ("c", "x0", "y0")
+ROLES = {"CONT": "fixed", "CHCK": "check"}
+
+
+def is_bingo(path: Path) -> bool:
+    """Whether a path is a folder with both files, or the first of them."""
+    if path.name.lower() == IMAGE:
+        path = path.parent
+    return path.is_dir() and {IMAGE, GEO} <= {p.name.lower() for p in path.iterdir()}
+
+
+def read_bingo(path: str | Path, overrides: Sequence[str] = ()) -> Network:
+    """The network of a folder with `image.dat` and `geoin.dat`.
+
+    **Raises:** `InputError` naming file and line.
+    """
+    path = Path(path)
+    folder = path if path.is_dir() else path.parent
+    files = {p.name.lower(): p for p in folder.iterdir()} if folder.is_dir() else {}
+    for name in (IMAGE, GEO):
+        if name not in files:
+            raise InputError(f"{folder}: there is no {name} in it")
+    photos, rays = _image_coordinates(files[IMAGE])
+    cameras, points, skipped = _geo_input(files[GEO])
+    chosen = []
+    for photo, camera, row in photos:
+        if camera is None and len(cameras) == 1:
+            camera = next(iter(cameras))
+        if camera not in cameras:
+            what = f"camera {camera!r}" if camera else "no camera is named, and there are several"
+            raise row.error(
+                f"photograph {photo}: {what}; CAPA statements in {files[GEO]}: {', '.join(cameras)}"
+            )
+        chosen.append(camera)
+    none = np.full(len(photos), np.nan)
+    lines = np.array([row.number for *_, row in photos])
+    images = Columns(
+        {"id": [photo for photo, *_ in photos], "camera": chosen, **dict.fromkeys(EXTERIOR, none)},
+        Source(str(files[IMAGE]), lines, "line"),
+    )  # fmt: skip
+    ids = dict.fromkeys(rays.values["point"])
+    known = {row["id"]: row for row in points}
+    tie = [{"id": id, "role": "tie"} for id in ids if id not in known]
+    table = [*(row for row in points if row["id"] in ids), *tie]
+    network = assemble(
+        folder,
+        foreign_document(
+            folder.resolve().name, cameras.values(), object_unit="m", image_unit="mm",
+            residuals="corrected", datum="control" if points else "inner",
+        ),
+        overrides, images,
+        Columns(
+            {key: [row.get(key) for row in table] for key in ("id", "role", "X", "Y", "Z")},
+            Source(str(files[GEO]), np.array([row.get("line", 0) for row in table]), "line"),
+        ),
+        rays,
+    )  # fmt: skip
+    unseen = [row["id"] for row in points if row["id"] not in ids]
+    if unseen:
+        network = network.warn(f"no photograph shows the points {some(unseen)}: left out")
+    if skipped:
+        network = network.warn(
+            f"{', '.join(skipped)} of {files[GEO].name} are not read: the distortion starts at 0; "
+            "give its parameters with --set camera.ID.p25=… and free=…"
+        )
+    return network.warn(
+        "photographs and new points have no start values: the file with them (itera.dat) is not "
+        "read"
+    )
+
+
+def _image_coordinates(path: Path):
+    """Photographs (id, camera or None, line) and the table of image points."""
+    photos: list[tuple[str, str | None, Row]] = []
+    images, points, values, lines = [], [], [], []
+    begun = False
+    for row in Rows(path, "#"):
+        if _is_comment(row):
+            continue
+        if row.words[0] == END:
+            begun = False
+        elif len(row) <= 2:
+            photos.append((row.words[0], row.words[1] if len(row) == 2 else None, row))
+            begun = True
+        else:
+            if not begun:
+                raise row.error(f"{len(row)} values where a photograph (PHOTO [CAMERA]) is "
+                                "expected")  # fmt: skip
+            images.append(photos[-1][0])
+            points.append(row.words[0])
+            values.append(row.numbers("xy", 1))
+            lines.append(row.number)
+    if not values:
+        raise InputError(f"{path}: there are no image points")
+    xy = np.array(values)
+    source = Source(str(path), np.array(lines), "line")
+    return photos, Columns({"image": images, "point": points, "x": xy[:, 0], "y": xy[:, 1]}, source)
+
+
+def _geo_input(path: Path):
+    """Cameras by name, rows of points, and the statements that were skipped."""
+    cameras: dict[str, dict] = {}
+    points, skipped = [], {}
+    for row in Rows(path, "#"):
+        if _is_comment(row):
+            continue
+        keyword = row.words[0].upper()
+        if keyword in SKIPPED:
+            skipped[keyword] = True
+        elif keyword == "CAPA":
+            camera = _camera(row)
+            if camera["id"] in cameras:
+                raise row.error(f"camera {camera['id']!r} stands there twice")
+            cameras[camera["id"]] = camera
+        elif keyword in ROLES:
+            if len(row) < 2:
+                raise row.error(f"{keyword}: POINT X Y Z are expected")
+            X, Y, Z = row.numbers("XYZ", 2).tolist()
+            points.append({"id": row.words[1], "role": ROLES[keyword], "X": X, "Y": Y, "Z": Z,
+                           "line": row.number})  # fmt: skip
+        else:
+            raise row.error(
+                f"the statement {row.words[0][:20]!r} is not known{did_you_mean(keyword, KNOWN)}; "
+                "take it out if the network does not need it"
+            )
+    if not cameras:
+        raise InputError(f"{path}: no camera (CAPA key CAMERA c xH yH)")
+    return cameras, points, list(skipped)
+
+
+def _camera(row: Row) -> dict:
+    key = row.whole(1, "the key of CAPA")
+    if len(row) not in (6, 9):
+        raise row.error("CAPA key CAMERA c xH yH [σc σx σy] is expected")
+    values = row.numbers(INTERIOR, 3, more=True).tolist()
+    camera = {"id": row.words[2], "model": "bingo", **dict(zip(INTERIOR, values))}
+    if key == ADJUSTED:
+        camera["free"] = list(INTERIOR)
+        if len(row) == 9:
+            sigma = row.numbers(("σc", "σx", "σy"), 6).tolist()
+            camera["sigma"] = dict(zip(INTERIOR, sigma))
+    return camera
+
+
+def _is_comment(row: Row) -> bool:
+    return row.words[0] in ("C", "*") or row.words[0].startswith("*")

@@ -1,0 +1,199 @@
+"""The output of Bundler: `bundle.out`, version 0.3, with the list of images beside it.
+
+    # Bundle file v0.3
+    cameras points                     two whole numbers
+    f k1 k2                            a camera; f = 0: not oriented
+    R, three rows of three
+    t, three numbers
+    …
+    X Y Z                              a point
+    red green blue
+    rays  camera key x y  camera key x y  …
+
+x_camera = R·X + t, x right, y up, looking along −z; image points count from the image centre, y up:
+model `snavely`. `list.txt` in the same folder names the images, one a line; without it they are
+called by their number, from 0. Keys are not kept.
+
+Source: Snavely, Bundler user's manual, section "Output format and scene representation".
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.pose_conventions import bundler_pose, exterior_from_bundler
+from jaxbundle.io.networks.assemble import all_parameters, assemble, foreign_document, image_columns
+from jaxbundle.io.networks.losses import need_values, what_is_lost
+from jaxbundle.io.networks.poses import matrices_of
+from jaxbundle.io.text.csv_tables import read_text
+from jaxbundle.io.text.rows import Row, Rows
+from jaxbundle.io.writing.replacing import replaced_files
+from jaxbundle.network.columns import Columns, count, some
+from jaxbundle.network.tables import Network, Source
+
+HEAD = "# Bundle file v0.3"
+LIST = "list.txt"
+FREE = ["f", "k1", "k2"]
+ORTHOGONAL = 1e-4
+"""How far R·Rᵀ may be from the identity: files have six digits or so."""
+
+
+def is_bundler(path: Path) -> bool:
+    """Whether a file begins as Bundler's output does."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(13) == b"# Bundle file"
+
+
+def read_bundler(path: str | Path, overrides: Sequence[str] = ()) -> Network:
+    """The network of a `bundle.out`: a camera for every image, all of it free, σ 1 px.
+
+    Images without orientation are left out with a warning.
+
+    **Raises:** `InputError` naming file and line.
+    """
+    path = Path(path)
+    rows = Rows(path)
+    head = rows.take(f"{HEAD!r}")
+    if " ".join(head.words) != HEAD:
+        raise head.error(f"{HEAD!r} is expected; other versions are not known")
+    counts = rows.take("the numbers of cameras and points")
+    cameras, points = (counts.whole(k, what) for k, what in ((0, "cameras"), (1, "points")))
+    interior, R, t, places = _cameras(rows, cameras)
+    oriented = np.flatnonzero(interior[:, 0] != 0) if cameras else np.zeros(0, int)
+    if not len(oriented):
+        raise InputError(f"{path}: no camera is oriented")
+    names = _names(path.parent / LIST, cameras)
+    position, lines, observed = _points(rows, points, cameras)
+    if rows.more():
+        raise rows.take("").error(f"a line after the last of {points} points")
+    image = observed[:, 0].astype(np.int64)
+    good = np.isin(image, oriented)
+    left = [names[i] for i in np.setdiff1d(np.arange(cameras), oriented)]
+    warnings = [f"left out {count(len(left), 'image')} that have no orientation: {some(left)}"]
+    M, X0 = exterior_from_bundler(R[oriented], t[oriented])
+    chosen = [names[i] for i in oriented]
+    images = image_columns(Source(str(path), places[oriented], "line"), chosen, chosen, M, X0)
+    ids = np.arange(points)
+    return assemble(
+        path,
+        foreign_document(path.stem, [
+            {"id": names[i], "model": "snavely", "free": FREE, **dict(zip(FREE, interior[i]))}
+            for i in oriented.tolist()
+        ]),
+        overrides, images,
+        Columns({"id": ids, "role": ["tie"] * points, **dict(zip("XYZ", position.T))},
+                Source(str(path), lines, "line")),
+        Columns({"image": [names[i] for i in image[good]],
+                 "point": observed[good, 1].astype(np.int64),
+                 "x": observed[good, 2], "y": observed[good, 3]},
+                Source(str(path), observed[good, 4].astype(np.int64), "line")),
+        warnings if left else (),
+    )  # fmt: skip
+
+
+def _cameras(rows: Rows, number: int):
+    """f, k1, k2; R; t; and lines, of all cameras."""
+    interior, R, t, lines = [], [], [], []
+    for k in range(number):
+        thing = f"camera {k} of {number}"
+        row = rows.take(f"f, k1, k2 of {thing}")
+        interior.append(row.numbers(FREE))
+        lines.append(row.number)
+        matrix = [rows.take(f"R of {thing}").numbers(["R"] * 3) for _ in range(3)]
+        R.append(np.array(matrix))
+        t.append(rows.take(f"t of {thing}").numbers(["t"] * 3))
+        if interior[-1][0] != 0:
+            _check_rotation(row, R[-1], thing)
+    return (np.array(interior).reshape(-1, 3), np.array(R).reshape(-1, 3, 3),
+            np.array(t).reshape(-1, 3), np.array(lines, np.int64))  # fmt: skip
+
+
+def _check_rotation(row: Row, R, thing: str) -> None:
+    if abs(R @ R.T - np.eye(3)).max() > ORTHOGONAL or np.linalg.det(R) < 0:
+        raise row.error(f"R of {thing} is not a rotation matrix")
+
+
+def _points(rows: Rows, number: int, cameras: int):
+    """Coordinates; lines; and (camera, point, x, y, line) of all rays."""
+    position, lines, rays = [], [], []
+    for k in range(number):
+        thing = f"point {k} of {number}"
+        row = rows.take(f"coordinates of {thing}")
+        position.append(row.numbers("XYZ"))
+        lines.append(row.number)
+        rows.take(f"colour of {thing}")
+        row = rows.take(f"rays of {thing}")
+        given = row.all_numbers("a ray")
+        claimed = row.whole(0, f"the number of rays of {thing}")
+        if len(given) != 1 + 4 * claimed:
+            raise row.error(
+                f"{claimed} rays are announced; {4 * claimed} numbers should follow, not "
+                f"{len(given) - 1}"
+            )
+        views = given[1:].reshape(-1, 4)
+        for camera in views[:, 0]:
+            if not (0 <= camera < cameras and camera % 1 == 0):
+                raise row.error(f"camera {camera:g} does not exist; there are {cameras}, from 0")
+        rest = np.full((len(views), 1), row.number)
+        rays.append(np.concatenate([views[:, :1], np.full_like(rest, k), views[:, 2:], rest], 1))
+    rays = np.concatenate(rays) if rays else np.zeros((0, 5))
+    return np.array(position).reshape(-1, 3), np.array(lines, np.int64), rays
+
+
+def _names(path: Path, number: int) -> list[str]:
+    """Names of the images from the list, or their numbers."""
+    if path.is_file():
+        lines = [line.split() for line in read_text(path).splitlines() if line.strip()]
+        names = [words[0].removeprefix("./") for words in lines]
+        if len(names) == number and len(set(names)) == number:
+            return names
+    return [str(k) for k in range(number)]
+
+
+def write_bundler(network: Network, path: str | Path) -> tuple[str, ...]:
+    """Write `bundle.out` and, where the images have names, `list.txt` beside it.
+
+    The cameras must be of model `snavely`; images that share a camera each get a copy of it.
+
+    **Returns:** what the format has no place for, in words.
+    """
+    path = Path(path)
+    images, points, rays = network.images, network.points, network.observations
+    need_values(network, "snavely", "Bundler")
+    R, t = bundler_pose(matrices_of(images.angles), images.position)
+    lines = [HEAD, f"{len(images)} {len(points)}"]
+    for i, c in enumerate(images.camera.tolist()):
+        for row in ([*all_parameters(network.cameras[c]).values()], *R[i], t[i]):
+            lines.append(_join(row))
+    key = np.zeros(len(images), int)
+    of_point: list[list[str]] = [[] for _ in points.id]
+    for image, point, (x, y) in zip(rays.image.tolist(), rays.point.tolist(), rays.xy.tolist()):
+        of_point[point].append(f"{image} {key[image]} {x!r} {y!r}")
+        key[image] += 1
+    for position, views in zip(points.position, of_point):
+        lines += [_join(position), "128 128 128", " ".join([str(len(views)), *views])]
+    numbered = list(images.id) == [str(k) for k in range(len(images))]
+    names = path.parent / LIST
+    if not numbered:
+        if any(character.isspace() for id in images.id for character in id):
+            raise InputError(f"{path.parent / LIST}: names of images cannot have blanks")
+    content: dict[Path, Sequence[str]] = {path: lines}
+    if not numbered or names.is_file():  # a list that is there would name the images
+        content[names] = images.id
+    with replaced_files(*content) as temporary:
+        for place, text in zip(temporary, content.values()):
+            place.write_bytes(("\n".join(text) + "\n").encode())
+    lost = what_is_lost(network, shared_cameras=True)
+    return lost if _from_zero(points.id) else (*lost, "names of points, which are numbered from 0")
+
+
+def _from_zero(ids) -> bool:
+    return list(ids) == [str(k) for k in range(len(ids))]
+
+
+def _join(values) -> str:
+    return " ".join(repr(float(value)) for value in values)

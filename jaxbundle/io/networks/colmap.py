@@ -1,0 +1,100 @@
+"""Sparse models of COLMAP: a folder with cameras, images and points3D, binary or text."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.cameras.nearest_camera import NoPlaceError
+from jaxbundle.io.networks.colmap_binary import binary_files, read_binary_cameras, read_binary_model
+from jaxbundle.io.networks.colmap_model import from_network, numbers_of, to_network
+from jaxbundle.io.networks.colmap_text import (
+    camera_lines,
+    read_text_cameras,
+    read_text_model,
+    text_files,
+)
+from jaxbundle.io.text.csv_tables import write_bytes
+from jaxbundle.io.writing.folders import replaced_folder
+from jaxbundle.network.tables import Camera, Network
+
+PARTS = ("cameras", "images", "points3D")
+RIGS = ("rigs", "frames")
+SUFFIXES = (".bin", ".txt")
+FILES = tuple(f"{part}{suffix}" for part in (*PARTS, *RIGS) for suffix in SUFFIXES)
+"""What a model may consist of, in either form."""
+
+
+def is_colmap(path: Path) -> bool:
+    """Whether a folder holds cameras.bin or cameras.txt with images beside it."""
+    return any((path / f"cameras{s}").is_file() and (path / f"images{s}").is_file()
+               for s in SUFFIXES)  # fmt: skip
+
+
+def read_colmap(path: str | Path, overrides: Sequence[str] = ()) -> Network:
+    """The network of a sparse model; binary files come before text files, as in COLMAP.
+
+    **Raises:** `InputError` naming file and line, or which entry of a binary file.
+    """
+    path = Path(path)
+    suffix, read = next(
+        ((s, r) for s, r in ((".bin", read_binary_model), (".txt", read_text_model))
+         if (path / f"cameras{s}").is_file()), ("", None),
+    )  # fmt: skip
+    if read is None:
+        raise InputError(f"{path}: there is no cameras.bin or cameras.txt in it")
+    for part in PARTS:
+        if not (path / f"{part}{suffix}").is_file():
+            raise InputError(f"{path / part}{suffix}: no such file")
+    network = to_network(path, read(path), overrides)
+    if (path / f"rigs{suffix}").is_file():
+        return network.warn("rigs and frames are not read: every image has a pose of its own")
+    return network
+
+
+def read_colmap_cameras(path: str | Path) -> tuple[Camera, ...]:
+    """The cameras of a cameras.bin or cameras.txt, called by number.
+
+    **Raises:** `InputError`; for a camera that none of ours comes near too.
+    """
+    path = Path(path)
+    read = read_binary_cameras if path.suffix.lower() == ".bin" else read_text_cameras
+    cameras = []
+    for camera in read(path).values():
+        if isinstance(camera, NoPlaceError):
+            raise camera
+        cameras.append(camera)
+    return tuple(cameras)
+
+
+def write_colmap_cameras(cameras: Sequence[Camera], path: str | Path) -> None:
+    """Write a cameras.txt alone; cameras as in `write_colmap`."""
+    lines = camera_lines(dict(zip(numbers_of([camera.id for camera in cameras]), cameras)))
+    write_bytes(Path(path), ("\n".join(lines) + "\n").encode())
+
+
+def write_colmap(
+    network: Network, folder: str | Path, text: bool = False, force: bool = False
+) -> tuple[str, ...]:
+    """Write a sparse model into a folder.
+
+    Cameras must be of model `opencv` or `kannala-brandt` and have an image size.
+
+    **Arguments:** `force`: replace a model that this function has not written, in either form.
+
+    **Returns:** what COLMAP has no place for, in words.
+
+    **Raises:** `InputError` where the folder may not or cannot be written
+    (`jaxbundle.io.writing.folders`).
+    """
+    with replaced_folder(folder, "write_colmap", FILES, force) as new:
+        return fill_colmap(network, new, text)
+
+
+def fill_colmap(network: Network, folder: Path, text: bool) -> tuple[str, ...]:
+    """Write a sparse model beside what is in a folder, or a new one; as `write_colmap`."""
+    model, lost = from_network(network)
+    files = text_files(model) if text else binary_files(model)
+    folder.mkdir(exist_ok=True)
+    for name, content in files.items():
+        write_bytes(folder / name, content)
+    return lost

@@ -1,0 +1,189 @@
+"""COLMAP's binary files: cameras.bin, images.bin, points3D.bin, little endian.
+
+    cameras    count u64;  id u32, model i32, width u64, height u64, parameters f64…
+    images     count u64;  id u32, quaternion 4 f64, shift 3 f64, camera u32, name to a 0 byte,
+               count u64,  x f64, y f64, point u64 (2⁶⁴ − 1: none)
+    points3D   count u64;  id u64, X Y Z f64, R G B u8, error f64, count u64,  image u32, index u32
+
+Every count is held against the bytes that are left before anything is made of it.
+
+Source: COLMAP documentation, "Output Format", and src/colmap/scene/reconstruction_io.
+"""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.cameras.nearest_camera import NoPlaceError
+from jaxbundle.io.networks.colmap_model import (
+    ColmapImage,
+    ColmapModel,
+    check_unique,
+    model_of,
+    rows_of_points,
+    tracks,
+)
+from jaxbundle.io.networks.colmap_models import (
+    MODELS,
+    NAMES,
+    camera_or_why_not,
+    parameter_names,
+    size_of,
+    to_colmap,
+)
+from jaxbundle.io.networks.colmap_text import GREY
+from jaxbundle.network.tables import Camera, Source
+from jaxbundle.system.file_content import read_content
+
+POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
+NONE = np.uint64(2**64 - 1)
+
+
+class _Bytes:
+    """The bytes of a file one after the other; complaints name the file and what was being read."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.data = read_content(path, text=False)
+        self.position = 0
+        self.what = "the head"
+
+    def error(self, message: str) -> InputError:
+        return InputError(f"{self.path}, {self.what}: {message}")
+
+    def take(self, format: str) -> tuple:
+        return struct.unpack("<" + format, self.raw(struct.calcsize("<" + format)))
+
+    def raw(self, size: int) -> bytes:
+        part = self.data[self.position : self.position + size]
+        if len(part) < size:
+            raise self.error(f"the file ends here, after {len(self.data)} bytes; it is cut off")
+        self.position += size
+        return part
+
+    def count(self, what: str, least_size: int) -> int:
+        """A number of things of at least so many bytes each."""
+        (count,) = self.take("Q")
+        left = len(self.data) - self.position
+        if count * least_size > left:
+            raise self.error(f"{count} {what} are announced, but only {left} bytes follow")
+        return count
+
+    def numbers(self, n: int, what: str) -> np.ndarray:
+        values = np.frombuffer(self.raw(8 * n), "<f8")
+        if not np.isfinite(values).all():
+            raise self.error(f"{what}: {values[~np.isfinite(values)][0]} is not a finite number")
+        return values
+
+    def name(self) -> str:
+        end = self.data.find(b"\0", self.position)
+        if end < 0:
+            raise self.error("the name has no end; the file is cut off")
+        text = self.raw(end - self.position)
+        self.position += 1
+        try:
+            return text.decode()
+        except UnicodeDecodeError:
+            raise self.error(f"the name {text[:40]!r} is not UTF-8 text") from None
+
+    def end(self) -> None:
+        left = len(self.data) - self.position
+        if left:
+            raise self.error(f"{left} bytes follow the last entry; the counts do not fit the file")
+
+
+def read_binary_model(folder: Path) -> ColmapModel:
+    """The contents of the three binary files of a folder."""
+    cameras = read_binary_cameras(folder / "cameras.bin")
+    images = _images(folder / "images.bin")
+    ids, points, source = _points(folder / "points3D.bin", {image.id for image in images})
+    return model_of(cameras, images, ids, points, source)
+
+
+def read_binary_cameras(path: Path) -> dict[int, Camera | NoPlaceError]:
+    """The cameras of a cameras.bin by number, or why one has no place."""
+    file, cameras = _Bytes(path), {}
+    for k in range(file.count("cameras", 24)):
+        file.what = f"camera {k + 1}"
+        id, model, width, height = file.take("IiQQ")
+        if id in cameras:
+            raise file.error(f"camera {id} stands there twice")
+        name = NAMES.get(model, f"number {model}")
+        values = file.numbers(len(parameter_names(name, file.error)), "parameters")
+        if not (0 < width < 10**9 and 0 < height < 10**9):
+            raise file.error(f"the image size {width} × {height} is impossible")
+        cameras[id] = camera_or_why_not(str(id), name, (width, height), values, f"{path}, ")
+    file.end()
+    return cameras
+
+
+def _images(path: Path) -> list[ColmapImage]:
+    file, images = _Bytes(path), []
+    for k in range(file.count("images", 73)):
+        file.what = f"image {k + 1}"
+        (id,) = file.take("I")
+        pose = file.numbers(7, "pose")
+        (camera,) = file.take("I")
+        name = file.name()
+        points = np.frombuffer(file.raw(24 * file.count("image points", 24)), POINT2D)
+        if not np.isfinite(points["xy"]).all():
+            raise file.error("an image point is not a finite number")
+        none = points["point"] == NONE
+        if (points["point"][~none] >= 2**63).any():
+            raise file.error("an image point has an impossible object point")
+        point = np.where(none, 0, points["point"]).astype(np.int64) - none
+        images.append(ColmapImage(
+            id, camera, name, pose[:4], pose[4:], points["xy"].reshape(-1, 2), point,
+            f"{path}, image {k + 1}",
+        ))  # fmt: skip
+    file.end()
+    check_unique([image.id for image in images], lambda k: images[k].place, "image")
+    return images
+
+
+def _points(path: Path, images: set[int]):
+    file, ids, positions = _Bytes(path), [], []
+    known = np.array(sorted(images), "<u4")
+    for k in range(file.count("points", 51)):
+        file.what = f"point {k + 1}"
+        (id,) = file.take("Q")
+        if id >= 2**63:
+            raise file.error(f"its number {id} is impossible")
+        ids.append(id)
+        positions.append(file.numbers(3, "coordinates"))
+        file.take("3Bd")
+        track = np.frombuffer(file.raw(8 * file.count("rays", 8)), "<u4")[::2]
+        unknown = track[~np.isin(track, known)]
+        if len(unknown):
+            raise file.error(f"the image {unknown[0]} of the track is not in images")
+    file.end()
+    source = Source(str(path), None, "point")
+    check_unique(ids, source, "point")
+    return np.array(ids, np.int64), np.array(positions, float).reshape(-1, 3), source
+
+
+def binary_files(model: ColmapModel) -> dict[str, bytes]:
+    """The three binary files by name."""
+    cameras = [struct.pack("<Q", len(model.cameras))]
+    for number, camera in model.cameras.items():
+        (name, values), (width, height) = to_colmap(camera), size_of(camera)
+        head = struct.pack("<IiQQ", number, MODELS[name][0], width, height)
+        cameras.append(head + np.array(values, "<f8").tobytes())
+    images = [struct.pack("<Q", len(model.images))]
+    for image in model.images:
+        points = np.zeros(len(image.xy), POINT2D)
+        points["xy"], points["point"] = image.xy, image.point
+        images += [
+            struct.pack("<I7dI", image.id, *image.q, *image.t, image.camera),
+            image.name.encode() + b"\0", struct.pack("<Q", len(points)), points.tobytes(),
+        ]  # fmt: skip
+    points = [struct.pack("<Q", len(model.points))]
+    of_point = tracks(model)
+    for id, position, error in rows_of_points(model):
+        track = np.array(of_point[id], "<u4")
+        head = struct.pack("<Q3d3BdQ", id, *position, *GREY, error, len(track))
+        points += [head, track.tobytes()]
+    parts = {"cameras.bin": cameras, "images.bin": images, "points3D.bin": points}
+    return {name: b"".join(part) for name, part in parts.items()}

@@ -1,0 +1,219 @@
+"""A sparse model of COLMAP as its files have it, and as a network.
+
+A pose is x_camera = R·X + t with x right, y down, z forward (`geometry.pose_conventions`); image
+points count from the corner of the first pixel, ½ more than ours. Image points that belong to no
+object point are left out. Rigs and frames (COLMAP 3.12 and later) are not read: every image has its
+whole pose in `images`; without them COLMAP makes trivial ones.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.pose_conventions import cv_pose, exterior_from_cv
+from jaxbundle.io.cameras.nearest_camera import NoPlaceError, fits_told
+from jaxbundle.io.networks.assemble import assemble, foreign_document, image_columns
+from jaxbundle.io.networks.colmap_models import HALF, to_colmap
+from jaxbundle.io.networks.losses import need_values, what_is_lost
+from jaxbundle.io.networks.poses import matrices_of, matrices_of_quaternions, quaternions_of
+from jaxbundle.network.columns import Columns, count, some
+from jaxbundle.network.reprojection import point_errors
+from jaxbundle.network.tables import Camera, Network, Source
+
+NO_POINT = -1
+NO_ERROR = -1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class ColmapImage:
+    """An image: quaternion (w, x, y, z) and shift of the pose, image points and their object
+    points (−1: none); `place` for messages."""
+
+    id: int
+    camera: int
+    name: str
+    q: Float[np.ndarray, "4"]
+    t: Float[np.ndarray, "3"]
+    xy: Float[np.ndarray, "n 2"]
+    point: Int[np.ndarray, " n"]
+    place: str
+
+
+@dataclasses.dataclass(frozen=True)
+class ColmapModel:
+    """The contents of `cameras`, `images` and `points3D`; `errors` of points: only written.
+
+    `no_place` says why of the cameras that have none here.
+    """
+
+    cameras: dict[int, Camera]
+    images: Sequence[ColmapImage]
+    point_ids: Int[np.ndarray, " points"]
+    points: Float[np.ndarray, "points 3"]
+    points_source: Source
+    errors: Float[np.ndarray, " points"] | None = None
+    no_place: Mapping[int, NoPlaceError] = dataclasses.field(default_factory=dict)
+
+
+def model_of(cameras: Mapping[int, Camera | NoPlaceError], *rest) -> ColmapModel:
+    """The contents of the three files, with what was read of the cameras."""
+    known = {k: c for k, c in cameras.items() if not isinstance(c, NoPlaceError)}
+    lost = {k: c for k, c in cameras.items() if isinstance(c, NoPlaceError)}
+    return ColmapModel(known, *rest, no_place=lost)
+
+
+def rows_of_points(model: ColmapModel) -> Iterator[tuple[int, np.ndarray, float]]:
+    """Number, coordinates and error of every point of a model to be written."""
+    assert model.errors is not None, "of a model to be written"
+    return zip(model.point_ids.tolist(), model.points, model.errors.tolist())
+
+
+def check_unique(ids: Sequence[int], place, thing: str) -> None:
+    """Refuse a number that stands twice; `place(k)` tells where the k-th is."""
+    values, first, counts = np.unique(np.asarray(ids), return_index=True, return_counts=True)
+    for value in values[counts > 1][:1]:
+        again = np.flatnonzero(np.asarray(ids) == value)[1]
+        raise InputError(f"{place(again)}: {thing} {value} stands there twice")
+
+
+def to_network(path: Path, model: ColmapModel, overrides: Sequence[str]) -> Network:
+    """The network of a sparse model; cameras are called by number, images by name.
+
+    Nothing of the cameras is free, σ is 1 px, the datum inner. Images of a camera that has no place
+    here are left out.
+
+    **Raises:** `InputError` for ids that are not there.
+    """
+    images = model.images
+    if not images:
+        raise InputError(f"{path}: the model has no images")
+    for image in images:
+        if image.camera not in model.cameras and image.camera not in model.no_place:
+            raise InputError(
+                f"{image.place}: image {image.name!r} has the camera {image.camera}, which is "
+                "not in cameras"
+            )
+        if not np.any(image.q):
+            raise InputError(f"{image.place}: image {image.name!r}: the quaternion is 0")
+    model, told = _with_place(path, model)
+    images = model.images
+    names = [image.name for image in images]
+    if len(set(names)) < len(names):
+        twice = next(name for k, name in enumerate(names) if name in names[:k])
+        raise InputError(f"{path}: two images are called {twice!r}")
+    R = matrices_of_quaternions(np.stack([image.q for image in images]))
+    M, X0 = exterior_from_cv(R, np.stack([image.t for image in images]))
+    observed, warnings = _observations(path, model)
+    numbers = np.arange(1, len(images) + 1)
+    return assemble(
+        path,
+        foreign_document(path.resolve().name, [_entry(c) for c in model.cameras.values()]),
+        overrides,
+        image_columns(
+            Source(str(path), numbers, "image"), names, [i.camera for i in images], M, X0
+        ),
+        Columns(
+            {"id": model.point_ids, "role": ["tie"] * len(model.points),
+             **dict(zip("XYZ", model.points.T))}, model.points_source,
+        ),
+        observed, (*told, *warnings, *fits_told(model.cameras.values())),
+    )  # fmt: skip
+
+
+def _with_place(path: Path, model: ColmapModel) -> tuple[ColmapModel, list[str]]:
+    """The model without cameras that have no place here and their images, and what to tell."""
+    images = [image for image in model.images if image.camera in model.cameras]
+    told = []
+    for number, error in model.no_place.items():
+        if not images:
+            raise error
+        lost = [image.name for image in model.images if image.camera == number]
+        why = str(error).removeprefix(f"{path}/")
+        told.append(f"{why}; left out {count(len(lost), 'image')}: {some(lost)}")
+    return dataclasses.replace(model, images=images), told
+
+
+def _entry(camera: Camera) -> dict:
+    sizes = {"image_size": camera.image_size, "pixel_size": camera.pixel_size}
+    tie = {"tie": camera.tie} if camera.tie else {}
+    return {"id": camera.id, "model": camera.model, **sizes, **tie, **camera.parameters}
+
+
+def _observations(path: Path, model: ColmapModel):
+    """The table of image points; of several in one image on one object point the first."""
+    index, point, xy = [], [], []
+    repeated = []
+    known = np.sort(model.point_ids)
+    for image in model.images:
+        used = np.flatnonzero(image.point != NO_POINT)
+        unknown = used[~np.isin(image.point[used], known)]
+        if len(unknown):
+            raise InputError(
+                f"{image.place}: image {image.name!r}, image point {unknown[0]}: the object point "
+                f"{image.point[unknown[0]]} is not in points3D"
+            )
+        _, first = np.unique(image.point[used], return_index=True)
+        if len(first) < len(used):
+            repeated += [image.name] * (len(used) - len(first))
+            used = used[np.sort(first)]
+        index += [image.name] * len(used)
+        point.append(image.point[used])
+        xy.append(image.xy[used])
+    xy = np.concatenate(xy) - HALF
+    warnings = (
+        f"left out {count(len(repeated), 'image point')} of object points that have another in "
+        f"the same image: {some(dict.fromkeys(repeated))}",
+    )  # fmt: skip
+    columns = {"image": index, "point": np.concatenate(point), "x": xy[:, 0], "y": xy[:, 1]}
+    source = Source(str(path), np.arange(1, len(xy) + 1), "image point")
+    return Columns(columns, source), warnings if repeated else ()
+
+
+def from_network(network: Network) -> tuple[ColmapModel, tuple[str, ...]]:
+    """The sparse model of a network, and what it does not keep, in words.
+
+    **Raises:** `InputError` for a camera COLMAP has no model for, and for what has no coordinates.
+    """
+    images, points, rays = network.images, network.points, network.observations
+    cameras = dict(zip(numbers_of([c.id for c in network.cameras]), network.cameras))
+    for camera in cameras.values():
+        to_colmap(camera)
+    need_values(network)
+    R, t = cv_pose(matrices_of(images.angles), images.position)
+    q = quaternions_of(R)
+    camera_numbers = list(cameras)
+    point_numbers = np.array(numbers_of(points.id), np.int64)
+    made = []
+    order = np.argsort(rays.image, kind="stable")
+    parts = np.split(order, np.searchsorted(rays.image[order], np.arange(1, len(images))))
+    for i, (number, mine) in enumerate(zip(numbers_of(images.id), parts)):
+        made.append(ColmapImage(
+            number, camera_numbers[images.camera[i]], images.id[i], q[i], t[i],
+            rays.xy[mine] + HALF, point_numbers[rays.point[mine]], f"image {images.id[i]!r}",
+        ))  # fmt: skip
+    lost = what_is_lost(network)
+    if list(point_numbers.astype(str)) != list(points.id):
+        lost = (*lost, "names of points, which are numbered from 1")
+    return ColmapModel(
+        cameras, made, point_numbers, points.position, points.source,
+        np.nan_to_num(point_errors(network)[0], nan=NO_ERROR),
+    ), lost  # fmt: skip
+
+
+def numbers_of(ids: Sequence[str]) -> list[int]:
+    """The ids themselves where all are whole numbers from 1, else 1, 2, 3, …"""
+    good = all(id.isascii() and id.isdigit() and len(id) < 10 and id[0] != "0" for id in ids)
+    return [int(id) for id in ids] if good else list(range(1, len(ids) + 1))
+
+
+def tracks(model: ColmapModel) -> dict[int, list[tuple[int, int]]]:
+    """By object point the (image, index of its image point) of every ray."""
+    found: dict[int, list[tuple[int, int]]] = {int(id): [] for id in model.point_ids}
+    for image in model.images:
+        for k, point in enumerate(image.point.tolist()):
+            found[point].append((image.id, k))
+    return found

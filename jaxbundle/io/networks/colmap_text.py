@@ -1,0 +1,143 @@
+"""COLMAP's text files: cameras.txt, images.txt, points3D.txt.
+
+    CAMERA_ID MODEL WIDTH HEIGHT PARAMS…
+    IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME
+    X Y POINT3D_ID  X Y POINT3D_ID  …                 the second line of an image; may be empty
+    POINT3D_ID X Y Z R G B ERROR  IMAGE_ID POINT2D_IDX  …
+
+Source: COLMAP documentation, "Output Format".
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.cameras.nearest_camera import NoPlaceError
+from jaxbundle.io.networks.colmap_model import (
+    ColmapImage,
+    ColmapModel,
+    check_unique,
+    model_of,
+    rows_of_points,
+    tracks,
+)
+from jaxbundle.io.networks.colmap_models import (
+    camera_or_why_not,
+    parameter_names,
+    size_of,
+    to_colmap,
+)
+from jaxbundle.io.text.rows import Row, Rows
+from jaxbundle.network.tables import Camera, Source
+
+GREY = (128, 128, 128)
+QT = ("QW", "QX", "QY", "QZ", "TX", "TY", "TZ")
+
+
+def read_text_model(folder: Path) -> ColmapModel:
+    """The contents of the three text files of a folder."""
+    cameras = read_text_cameras(folder / "cameras.txt")
+    images = _images(folder / "images.txt")
+    ids, points, source = _points(folder / "points3D.txt", {image.id for image in images})
+    return model_of(cameras, images, ids, points, source)
+
+
+def read_text_cameras(path: Path) -> dict[int, Camera | NoPlaceError]:
+    """The cameras of a cameras.txt by number, or why one has no place."""
+    cameras: dict[int, Camera | NoPlaceError] = {}
+    for row in Rows(path, "#"):
+        number = row.whole(0, "CAMERA_ID")
+        if number in cameras:
+            raise row.error(f"camera {number} stands there twice")
+        model = row.words[1] if len(row) > 1 else ""
+        names = parameter_names(model, row.error)
+        size = [row.whole(k, what, 1) for k, what in ((2, "WIDTH"), (3, "HEIGHT"))]
+        values, where = row.numbers(names, 4), f"{path}, line {row.number}: "
+        cameras[number] = camera_or_why_not(str(number), model, size, values, where)
+    return cameras
+
+
+def _images(path: Path) -> list[ColmapImage]:
+    # comments are skipped before heads only: the line of image points may be empty
+    rows = Rows(path, "#", blank=True)
+    images = []
+    while rows.more():
+        head = rows.take("an image")
+        if not head.words:
+            continue
+        if len(head) < 10:
+            raise head.error(f"{len(head)} values where an image is expected: IMAGE_ID, "
+                             f"{', '.join(QT)}, CAMERA_ID, NAME")  # fmt: skip
+        pose = head.numbers(QT, 1, more=True)
+        points = rows.take("the image points of an image") if rows.more() else Row(path, 0, "")
+        numbers = points.all_numbers("an image point")
+        if len(numbers) % 3:
+            raise points.error(f"{len(numbers)} numbers; X, Y, POINT3D_ID are expected for each "
+                               "image point")  # fmt: skip
+        numbers = numbers.reshape(-1, 3)
+        if (numbers[:, 2] != np.floor(numbers[:, 2])).any() or (abs(numbers) > 2**52).any():
+            raise points.error("a POINT3D_ID is not a whole number")
+        images.append(ColmapImage(
+            head.whole(0, "IMAGE_ID"), head.whole(8, "CAMERA_ID"), " ".join(head.words[9:]),
+            pose[:4], pose[4:7], numbers[:, :2], numbers[:, 2].astype(np.int64),
+            f"{path}, line {head.number}",
+        ))  # fmt: skip
+    check_unique([image.id for image in images], lambda k: images[k].place, "image")
+    return images
+
+
+def _points(path: Path, images: set[int]):
+    ids, positions, lines = [], [], []
+    for row in Rows(path, "#"):
+        ids.append(row.whole(0, "POINT3D_ID"))
+        positions.append(row.numbers(("X", "Y", "Z", "R", "G", "B", "ERROR"), 1, more=True)[:3])
+        lines.append(row.number)
+        if len(row) % 2:
+            raise row.error("the track has an IMAGE_ID without its POINT2D_IDX")
+        for k in range(8, len(row), 2):
+            if row.whole(k, "IMAGE_ID") not in images:
+                raise row.error(f"the image {row.words[k]} of the track is not in images")
+    source = Source(str(path), np.array(lines, np.int64), "line")
+    check_unique(ids, source, "point")
+    return np.array(ids, np.int64), np.array(positions, float).reshape(-1, 3), source
+
+
+def text_files(model: ColmapModel) -> dict[str, bytes]:
+    """The three text files by name."""
+    images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
+              "# POINTS2D[] as (X, Y, POINT3D_ID)"]  # fmt: skip
+    for image in model.images:
+        if any(character.isspace() for character in image.name):
+            raise InputError(
+                f"image {image.name!r}: names in COLMAP's text files have no blanks; rename it, or "
+                "write the binary form"
+            )
+        pose = _join([*image.q, *image.t])
+        images.append(f"{image.id} {pose} {image.camera} {image.name}")
+        images.append(" ".join(
+            f"{x!r} {y!r} {point}" for (x, y), point in zip(image.xy.tolist(), image.point.tolist())
+        ))  # fmt: skip
+    points = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"]
+    of_point = tracks(model)
+    for id, position, error in rows_of_points(model):
+        track = " ".join(f"{image} {k}" for image, k in of_point[id])
+        colour = " ".join(map(str, GREY))
+        points.append(f"{id} {_join(position)} {colour} {error!r} {track}".rstrip())
+    texts = {"cameras.txt": camera_lines(model.cameras), "images.txt": images,
+             "points3D.txt": points}  # fmt: skip
+    return {name: ("\n".join(lines) + "\n").encode() for name, lines in texts.items()}
+
+
+def camera_lines(cameras: Mapping[int, Camera]) -> list[str]:
+    """The lines of a cameras.txt."""
+    lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
+    for number, camera in cameras.items():
+        (name, values), (width, height) = to_colmap(camera), size_of(camera)
+        lines.append(f"{number} {name} {width} {height} {_join(values)}")
+    return lines
+
+
+def _join(values) -> str:
+    return " ".join(repr(float(value)) for value in values)

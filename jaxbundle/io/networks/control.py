@@ -1,0 +1,219 @@
+"""Control points from a table of their own, for a network in any format.
+
+The table has a header with `id`, `X`, `Y`, `Z` and, if wanted, `sX`, `sY`, `sZ`, `role` (a column
+`name` is not used), or no header and 4 or 7 columns in this order. Its columns are separated by
+commas, semicolons, tabs or blanks; decimals may have a comma where commas do not separate. Without
+a role its points are control points, those without σ held.
+
+What a table gives replaces the control of the input: its control and fixed points that the table
+does not name become tie points. Where the input's start values are in another frame (PhotoModeler
+shifts its own), a similarity by the points both know takes images and points into that of the
+table.
+"""
+
+import csv
+import dataclasses
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.io.networks.poses import angles_of, matrices_of
+from jaxbundle.io.text.csv_tables import read_text
+from jaxbundle.network.build import POINT_ERRORS, POINT_SIGMAS
+from jaxbundle.network.columns import Columns, count, did_you_mean, shown, some
+from jaxbundle.network.rules import AXES, check_choice, check_unique
+from jaxbundle.network.tables import ROLES, Images, Network, Points, Source
+from jaxbundle.orientation.alignment import similarity
+from jaxbundle.orientation.network import find_start_values
+
+PLAIN = ("id", *AXES, *POINT_SIGMAS)
+"""The columns of a table without a header, the last three only together."""
+NAMES = {name.lower(): name for name in (*PLAIN, "role", "name", *POINT_ERRORS)}
+ELSEWHERE = 0.01
+"""Control this far from where the input has it, as a part of its extent, is in another frame."""
+
+
+def read_control(path: str | Path) -> Points:
+    """The points of a control table.
+
+    **Raises:** `InputError` naming file, line and column.
+    """
+    path = Path(path)
+    lines = [
+        (number, line)
+        for number, line in enumerate(re.split(r"\r\n?|\n", read_text(path, "latin-1")), 1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if not lines:
+        raise InputError(f"{path}: the file is empty; rows of {', '.join(PLAIN[:4])} are expected")
+    separator = _separator(lines[0][1])
+    try:
+        rows = [_cells(line, separator) for _, line in lines]
+    except csv.Error as error:
+        raise InputError(f"{path}: not a table: {error}") from None
+    header = _header(path, lines[0][0], rows[0])
+    if header is not None:
+        lines, rows = lines[1:], rows[1:]
+    elif len(rows[0]) not in (4, 7):
+        raise InputError(
+            f"{path}, line {lines[0][0]}: {len(rows[0])} columns without a header; "
+            f"{', '.join(PLAIN[:4])}, or these and {', '.join(POINT_SIGMAS)}, are expected"
+        )
+    header = header or PLAIN[: len(rows[0])]
+    for (number, _), row in zip(lines, rows):
+        if len(row) != len(header):
+            raise InputError(
+                f"{path}, line {number}: {len(row)} cells where {len(header)} are expected "
+                f"({', '.join(header)})"
+            )
+    source = Source(str(path), np.array([number for number, _ in lines]), "line")
+    columns = dict(zip(header, zip(*rows))) if rows else {name: () for name in header}
+    if separator != ",":
+        columns = {name: column if name in ("id", "role", "name") else
+                   [cell.replace(",", ".") for cell in column]
+                   for name, column in columns.items()}  # fmt: skip
+    return _points(Columns(columns, source))
+
+
+def _separator(line: str) -> str | None:
+    """What separates the columns: a comma only where it is not that of decimals between blanks."""
+    found = next((s for s in (";", "\t", ",") if s in line), None)
+    decimal = found == "," and any(len(cell.split()) > 1 for cell in line.split(","))
+    return None if decimal else found
+
+
+def _cells(line: str, separator: str | None) -> list[str]:
+    if separator is None:
+        return line.split()
+    (row,) = csv.reader([line], delimiter=separator, skipinitialspace=True, strict=True)
+    return [cell.strip() for cell in row]
+
+
+def _header(path: Path, number: int, cells: list[str]) -> list[str] | None:
+    """The names of the columns; None where the first line is none of names."""
+    if not {"x", "y", "z"} <= {cell.lower() for cell in cells}:
+        return None
+    names = [re.sub("^(σ|sigma_?|std_?)", "s", cell.lower()) for cell in cells]
+    for name, cell in zip(names, cells):
+        if name not in NAMES:
+            raise InputError(
+                f"{path}, line {number}: unknown column {cell!r}"
+                f"{did_you_mean(cell, NAMES.values())}"
+            )
+        if names.count(name) > 1:
+            raise InputError(f"{path}, line {number}: the column {cell!r} stands there twice")
+    if "id" not in names:
+        raise InputError(f"{path}, line {number}: the column 'id' is missing")
+    return [NAMES[name] for name in names]
+
+
+def _points(table: Columns) -> Points:
+    if not len(table):
+        raise InputError(f"{table.source.name}: the table is empty; give at least one row")
+    ids = table.ids("id")
+    check_unique(ids, table.source, "point")
+    roles = ("control",) * len(ids)
+    if "role" in table.values:
+        roles = tuple(role.strip() or "control" for role in table.values["role"])
+    for row, role in enumerate(roles):
+        check_choice("role", role, ROLES, f"{table.source(row)}: ")
+    position = np.stack([table.numbers(axis, required=True) for axis in AXES], 1)
+    words = {"free": math.inf}
+    sigma = np.stack([table.numbers(name, words=words) for name in POINT_SIGMAS], 1)
+    for row, axis in np.argwhere(~(sigma > 0) & ~np.isnan(sigma))[:1]:
+        raise InputError(
+            f"{table.source(row)}: {POINT_SIGMAS[axis]} is {shown(sigma[row, axis])}; a positive "
+            "number is expected, or nothing for a point that is held"
+        )
+    return Points(ids, roles, position, sigma, table.source)
+
+
+def with_control(network: Network, control: Points, datum: bool = True) -> Network:
+    """A network whose control is that of a table.
+
+    **Arguments:** `datum` whether control becomes the datum.
+
+    **Raises:** `InputError` where no point of the network is in the table.
+    """
+    index = {id: k for k, id in enumerate(network.points.id)}
+    rows = [k for k, id in enumerate(control.id) if id in index]
+    at = np.array([index[control.id[k]] for k in rows], np.int64)
+    if not rows:
+        raise InputError(
+            f"{control.source.name}: none of its {len(control)} points is one of the network; it "
+            f"has {some(network.points.id)}"
+        )
+    network = _in_the_frame_of(network, at, control.position[rows])
+    points = network.points
+    named = np.zeros(len(points), bool)
+    named[at] = True
+    dropped = [id for id, role, there in zip(points.id, points.role, named)
+               if role in ("control", "fixed") and not there]  # fmt: skip
+    roles = np.array(points.role, dtype=object)
+    roles[points.has_role("control", "fixed") & ~named] = "tie"
+    roles[at] = [control.role[k] for k in rows]
+    position, sigma = points.position.copy(), np.full_like(points.sigma, np.nan)
+    position[at], sigma[at] = control.position[rows], control.sigma[rows]
+    given = {"datum": "control"} if datum and set(roles) & {"control", "fixed"} else {}
+    network = network.replace(
+        points=Points(points.id, tuple(roles.tolist()), position, sigma, points.source), **given
+    )
+    lost = [id for id in control.id if id not in index]
+    warnings = []
+    if dropped:
+        warnings.append(f"{count(len(dropped), 'control point')} of the input not in "
+                        f"{control.source.name} became tie points: {some(dropped)}")  # fmt: skip
+    if lost:
+        warnings.append(f"{control.source.name}: no photograph shows the points {some(lost)}")
+    return network.warn(*warnings)
+
+
+def _in_the_frame_of(network: Network, at, target) -> Network:
+    """The network with its start values where control points `at` have the coordinates `target`."""
+    images, points = network.images, network.points
+    if np.isfinite(images.sigma).any() or not np.isfinite(images.position).any():
+        return network
+    source = points.position[at]
+    if np.isnan(source).any():
+        source = _intersected(network, at)
+    known = np.isfinite(source).all(1)
+    source, target = source[known], target[known]
+    found = similarity(source, target) if len(source) >= 3 else None
+    extent = np.ptp(target, axis=0).max() if len(target) else 0.0
+    if found is None or np.median(np.linalg.norm(source - target, axis=1)) <= ELSEWHERE * extent:
+        return network
+    A, t = found
+    scale = np.cbrt(np.linalg.det(A))
+    M = matrices_of(images.angles) @ (A / scale).T
+    position = points.position @ A.T + t
+    return network.replace(
+        images=Images(images.id, images.camera, images.position @ A.T + t, angles_of(M),
+                      images.sigma, images.source),
+        points=dataclasses.replace(points, position=position),
+    ).warn(
+        "the start values of the input are in another frame than the control: a similarity by "
+        f"{count(len(source), 'point')} took them there (scale {scale:.6g})"
+    )  # fmt: skip
+
+
+def _intersected(network: Network, at):
+    """The coordinates of points by the orientations of the input; NaN where there are none."""
+    points = network.points
+    roles = np.array(points.role, dtype=object)
+    position, free = points.position.copy(), np.full_like(points.sigma, np.nan)
+    roles[points.has_role("control", "fixed")], position[at] = "tie", np.nan
+    roles[at] = "tie"
+    start = network.replace(
+        points=Points(points.id, tuple(roles.tolist()), position, free, points.source),
+        datum="inner", datum_points=(),
+    )  # fmt: skip
+    try:
+        found = find_start_values(start).network.points
+    except (InputError, NotSolvedError):
+        return position[at]
+    known = dict(zip(found.id, found.position))
+    nothing = np.full(3, np.nan)
+    return np.array([known.get(points.id[k], nothing) for k in at])

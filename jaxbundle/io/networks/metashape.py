@@ -1,0 +1,259 @@
+"""Cameras of Agisoft Metashape: the XML of "Export Cameras".
+
+    document/chunk
+      sensors/sensor id label type            calibration class="adjusted": f cx cy k1… p1 p2 b1 b2
+      cameras/…/camera id sensor_id label     transform: 4 × 4, camera → chunk, by rows
+      transform                               rotation, translation, scale: chunk → world
+      components/component id/transform       the same, where cameras name a component
+      reference                               the coordinate system of the references
+      markers/marker id label                 reference x y z [sx sy sz] enabled
+      frames/frame/markers/marker             location camera_id x y [valid]
+      settings/property accuracy_markers      σ of references that have none
+
+The sensors are in `metashape_camera.py`. Cameras that are disabled or not aligned are left out, and
+those of sensors that no model comes near (spherical, RPC, of size 0, with a distortion that turns
+back inside the image). A chunk with a transform gives world coordinates (geocentric where it is
+georeferenced), one without its own.
+
+Markers are points. Where their references are in a local coordinate system, three of them or more
+are control points, and those that are not enabled check points; otherwise they are tie points
+without coordinates. The tie points of Metashape are not in this file.
+
+Source: Agisoft Metashape user manual, sections on formats; exported files.
+"""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.pose_conventions import flip_rows
+from jaxbundle.io.cameras.nearest_camera import NoPlaceError
+from jaxbundle.io.networks.assemble import assemble, foreign_document, image_columns
+from jaxbundle.io.networks.control import with_control
+from jaxbundle.io.networks.metashape_camera import (
+    label_of,
+    numbers_of,
+    sensor_camera,
+)
+from jaxbundle.io.text.csv_tables import read_text
+from jaxbundle.io.text.xml_fields import number_in
+from jaxbundle.network.columns import Columns, count, some
+from jaxbundle.network.tables import Network, Points, Source
+
+ROTATION = 1e-4
+"""How far a rotation may be from orthogonal: files have six digits or more."""
+LEAST_CONTROL = 3
+ACCURACY = 0.005
+"""Metashape's own σ of markers, where a file has none."""
+LOCAL = "LOCAL_CS"
+
+
+def is_metashape(path: Path) -> bool:
+    """Whether an XML file begins with a `document` that has a `chunk`."""
+    if path.suffix.lower() != ".xml" or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        head = file.read(4000)
+    return b"<document" in head and b"<chunk" in head
+
+
+def read_metashape(path: str | Path, overrides: Sequence[str] = ()) -> Network:
+    """The cameras and images of an export, and the image points of markers if there are any.
+
+    Cameras are called by their label, images too; nothing is free, σ is 1 px, the datum inner.
+
+    **Raises:** `InputError` naming file and element.
+    """
+    path = Path(path)
+    chunk = _chunk(path)
+    sensors = {
+        sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")
+    }
+    cameras = [camera for camera in chunk.iterfind("cameras//camera")]
+    used = [c for c in cameras if _true(c.get("enabled"))
+            and c.find("transform") is not None]  # fmt: skip
+    left = [label_of(c) for c in cameras if not any(c is u for u in used)]
+    if not used:
+        raise InputError(f"{path}: no camera is enabled and aligned")
+    entries, told = _entries(path, sensors, used)
+    used = [camera for camera in used if camera.get("sensor_id") in entries]
+    labels = _unique([label_of(c) for c in used], [c.get("id", "") for c in used])
+    poses = [_pose(f"{path}, camera {label!r}", camera, chunk)
+             for label, camera in zip(labels, used)]  # fmt: skip
+    names = _unique([e["id"] for e in entries.values()], list(entries))
+    for entry, name in zip(entries.values(), names):
+        entry["id"] = name
+    M, X0 = (np.stack(part) for part in zip(*poses))
+    images = image_columns(
+        Source(str(path), None, "camera"), labels,
+        [entries[c.get("sensor_id")]["id"] for c in used], M, X0,
+    )  # fmt: skip
+    by_id = {c.get("id"): label for c, label in zip(used, labels)}
+    points, rays, control = _markers(path, chunk, by_id)
+    document = foreign_document(path.stem, entries.values(), object_unit="m")
+    if left:
+        what = f"left out {count(len(left), 'camera')} that are disabled or not aligned"
+        told.append(f"{what}: {some(left)}")
+    network = assemble(path, document, overrides, images, points, rays)
+    if control is not None:
+        datum = any(text.partition("=")[0].strip() == "datum" for text in overrides)
+        network = with_control(network, control, datum=not datum)
+    return network.warn(*told, *_about_references(chunk, control))
+
+
+def _entries(path: Path, sensors: dict, used: Sequence[ET.Element]):
+    """The entries of the sensors that photographs are of, by id, and what is to be told of them."""
+    entries, told, refused = {}, [], {}
+    for camera in used:
+        id = camera.get("sensor_id")
+        if id not in sensors:
+            raise InputError(
+                f"{path}, camera {label_of(camera)!r}: sensor {id!r} is not in the file"
+            )
+        if id in entries or id in refused:
+            continue
+        try:
+            entries[id], more = sensor_camera(path, sensors[id])
+            told += more
+        except NoPlaceError as error:
+            refused[id] = error
+    for id, error in refused.items():
+        if not entries:
+            raise error
+        lost = [label_of(c) for c in used if c.get("sensor_id") == id]
+        why = str(error).removeprefix(f"{path}, ")
+        told.append(f"{why}; left out {count(len(lost), 'camera')}: {some(lost)}")
+    return entries, told
+
+
+def _chunk(path: Path) -> ET.Element:
+    text = read_text(path)
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise InputError(f"{path}: a document type or entities are not expected in this file")
+    try:
+        root = ET.fromstring(text)
+    except (ET.ParseError, ValueError) as error:
+        raise InputError(f"{path}: not valid XML: {error}") from None
+    except RecursionError:
+        raise InputError(f"{path}: not valid XML: elements are nested too deeply") from None
+    chunks = root.findall("chunk")
+    if root.tag != "document" or len(chunks) != 1:
+        raise InputError(
+            f"{path}: one <chunk> in a <document> is expected; there are {len(chunks)}"
+        )
+    return chunks[0]
+
+
+def _pose(where: str, camera: ET.Element, chunk: ET.Element):
+    """M and X0, in the chunk's frame or, if it has a transform, in that of the world."""
+    T = numbers_of(f"{where}, transform", camera.findtext("transform"), 16).reshape(4, 4)
+    to_chunk, centre = T[:3, :3], T[:3, 3]
+    component = camera.get("component_id")
+    holder = next((c for c in chunk.iterfind("components/component")
+                   if c.get("id") == component), None)  # fmt: skip
+    transform = None if holder is None else holder.find("transform")
+    transform = chunk.find("transform") if transform is None else transform
+    if transform is not None and (transform.text or "").strip():
+        raise InputError(f"{where}: the transform of the chunk has no <rotation>, as old versions")
+    if transform is not None and transform.find("rotation") is not None:
+        of = f"{where}, transform of the chunk"
+        R = numbers_of(f"{of}, rotation", transform.findtext("rotation"), 9).reshape(3, 3)
+        t = numbers_of(f"{of}, translation", transform.findtext("translation"), 3)
+        scale = number_in(transform.findtext("scale", ""), f"{of}, scale")
+        to_chunk, centre = R @ to_chunk, scale * (R @ centre) + t
+    if abs(to_chunk @ to_chunk.T - np.eye(3)).max() > ROTATION or np.linalg.det(to_chunk) < 0:
+        raise InputError(f"{where}: the transform is not a rotation and a shift")
+    return flip_rows(to_chunk.T), centre
+
+
+def _markers(path: Path, chunk: ET.Element, images: dict):
+    """Tables of points and image points of markers, and control points; None: there are none."""
+    markers = {m.get("id"): m for m in chunk.iterfind("markers//marker")}
+    rows, seen = [], {}
+    for marker in chunk.iterfind("frames/frame/markers/marker"):
+        id = marker.get("marker_id")
+        if id not in markers:
+            raise InputError(f"{path}: marker {id!r} of a frame is not among the markers")
+        for location in marker.iterfind("location"):
+            if location.get("camera_id") not in images or not _true(location.get("valid")):
+                continue
+            where = f"{path}, marker {label_of(markers[id])!r}, camera {location.get('camera_id')}"
+            x, y = (number_in(location.get(k, ""), f"{where}, {k}") for k in "xy")
+            rows.append((images[location.get("camera_id")], id, x - 0.5, y - 0.5))
+            seen[id] = None
+    if not rows:
+        return None, None, None
+    names = dict(zip(seen, _unique([label_of(markers[id]) for id in seen], list(seen))))
+    none = [None] * len(seen)
+    image, point, x, y = zip(*rows)
+    return (
+        Columns({"id": list(names.values()), "role": ["tie"] * len(seen), "X": none, "Y": none,
+                 "Z": none}, Source(str(path), None, "marker")),
+        Columns({"image": image, "point": [names[id] for id in point], "x": x, "y": y},
+                Source(str(path), None, "location")),
+        _references(path, chunk, {names[id]: markers[id] for id in seen}),
+    )  # fmt: skip
+
+
+def _references(path: Path, chunk: ET.Element, markers: dict) -> Points | None:
+    """Control and check points of the markers that have a reference in a local system; None where
+    they give no datum."""
+    if not _is_local(chunk):
+        return None
+    ids, roles, position, sigma = [], [], [], []
+    for id, marker in markers.items():
+        reference = marker.find("reference")
+        if reference is None or any(reference.get(k) is None for k in "xyz"):
+            continue
+        where = f"{path}, reference of marker {id!r}"
+        ids.append(id)
+        roles.append("control" if _true(reference.get("enabled")) else "check")
+        position.append([number_in(reference.get(k), f"{where}, {k}") for k in "xyz"])
+        sigma.append([number_in(reference.get(k, str(_accuracy(chunk))), f"{where}, {k}")
+                      for k in ("sx", "sy", "sz")])  # fmt: skip
+    if roles.count("control") < LEAST_CONTROL:
+        return None
+    sigma = np.where(np.array(sigma) > 0, sigma, _accuracy(chunk))
+    return Points(tuple(ids), tuple(roles), np.array(position), sigma, Source(str(path)))
+
+
+def _about_references(chunk: ET.Element, control: Points | None):
+    """What is to be told of the references of markers."""
+    if control is not None:
+        yield (f"{count(len(control), 'marker')} with reference coordinates: control points with "
+               f"σ as the file gives it, else {_accuracy(chunk):g} m; those not enabled are check "
+               "points")  # fmt: skip
+    elif not _is_local(chunk) and chunk.find("markers//marker/reference") is not None:
+        yield ("the reference coordinates of markers are not in a local system and are not read; "
+               "the cameras are in geocentric coordinates: --control FILE gives control in a "
+               "rectangular frame")  # fmt: skip
+
+
+def _is_local(chunk: ET.Element) -> bool:
+    return (chunk.findtext("reference") or LOCAL).strip().upper().startswith(LOCAL)
+
+
+def _accuracy(chunk: ET.Element) -> float:
+    for element in chunk.iterfind("settings/property"):
+        if element.get("name") == "accuracy_markers":
+            try:
+                accuracy = number_in((element.get("value") or "").split("/")[0], "accuracy")
+            except InputError:
+                continue
+            if accuracy > 0:
+                return accuracy
+    return ACCURACY
+
+
+def _true(word: str | None) -> bool:
+    """Whether an attribute is not switched off; old versions write 0 and 1."""
+    return (word or "true").lower() not in ("false", "0")
+
+
+def _unique(labels: Sequence[str], ids: Sequence[str]) -> list[str]:
+    """The labels, those that stand twice with their id."""
+    return [f"{label}#{id}" if labels.count(label) > 1 else label
+            for label, id in zip(labels, ids)]  # fmt: skip

@@ -1,0 +1,168 @@
+"""A sensor of Metashape as one of our cameras.
+
+[X, Y, Z] of a camera are right, down, forward. Its image of X, with x = X/Z, y = Y/Z, r² = x² + y²:
+
+    x' = x·(1 + k1·r² + k2·r⁴ + k3·r⁶ + k4·r⁸) + (p1·(r² + 2x²) + 2·p2·x·y)·(1 + p3·r² + p4·r⁴)
+    y' = y·(1 + …)                             + (p2·(r² + 2y²) + 2·p1·x·y)·(1 + p3·r² + p4·r⁴)
+    u = w/2 + cx + x'·f + x'·b1 + y'·b2        v = h/2 + cy + y'·f
+
+from the corner of the first pixel, hence in `opencv`, exactly if k4 = p3 = p4 = b2 = 0 (where p1
+and p2 are 0, p3 and p4 have no effect),
+
+    fx = f + b1   fy = f   cx_cv = w/2 + cx − ½   cy_cv = h/2 + cy − ½   p1_cv = p2   p2_cv = p1
+
+A fisheye has (x, y) = (X, Y)/√(X² + Y²)·θ, θ the angle to the axis, in the same formula, or
+2·sin(θ/2) for θ (equisolid); the first is exactly `kannala-brandt` if p1 = p2 = b2 = 0. Everything
+else is fitted by the nearest model, with a warning that gives the largest difference.
+
+Old exports (PhotoScan to 1.2) have fx, fy, skew for f, b1, b2, cx and cy from the corner of the
+image, and p1 and p2 exchanged.
+
+Source: Agisoft Metashape user manual, appendix "Camera models"; PhotoScan user manual 1.2, the same
+appendix.
+"""
+
+import re
+import xml.etree.ElementTree as ET
+from functools import partial
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.cameras.nearest_camera import Foreign, NoPlaceError, nearest_camera, root
+from jaxbundle.io.text.xml_fields import number_in
+from jaxbundle.network.columns import shown
+
+COEFFICIENTS = ("f", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
+OLD = ("fx", "fy", "skew")
+FISHEYE = ("fisheye", "equidistant", "equidistant_fisheye", "equisolid", "equisolid_fisheye")
+TYPES = ("frame", *FISHEYE)
+PIXEL = ("pixel_width", "pixel_height")
+
+
+def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict, tuple[str, ...]]:
+    """The entry of a sensor in a document, and warnings: where it is fitted, and of
+    coefficients that are not known.
+
+    **Raises:** `InputError` naming file, sensor and element; `NoPlaceError` for a sensor of
+    another kind, of size 0, or that no model comes near.
+    """
+    label = label_of(sensor)
+    where = f"{path}, sensor {label!r}"
+    kinds = sensor.findall("calibration")
+    if not kinds:
+        raise NoPlaceError(f"{where}: there is no <calibration>")
+    calibration = next((c for c in kinds if c.get("class") == "adjusted"), kinds[0])
+    kind = calibration.get("type", sensor.get("type", "frame"))
+    for name in (sensor.get("type", "frame"), kind):
+        if name not in TYPES:
+            raise NoPlaceError(
+                f"{where}: sensors of type {shown(name)} are not offered; these are: "
+                f"{', '.join(TYPES)}"
+            )
+    size = calibration.find("resolution")
+    size = sensor.find("resolution") if size is None else size
+    if size is None:
+        raise InputError(f"{where}: there is no <resolution>")
+    w, h = (number_in(size.get(k, ""), f"{where}, resolution, {k}") for k in ("width", "height"))
+    p, ignored = _coefficients(where, calibration, w, h)
+    told = (f"sensor {label!r}: not known here and not applied: {ignored}",) if ignored else ()
+    values = {
+        "fx": p["f"] + p["b1"], "fy": p["f"],
+        "cx": w / 2 + p["cx"] - 0.5, "cy": h / 2 + p["cy"] - 0.5,
+        "k1": p["k1"], "k2": p["k2"], "k3": p["k3"],
+    }  # fmt: skip
+    if not (np.array([w, h, values["fx"], values["fy"]]) > 0).all():
+        raise NoPlaceError(f"{where}: sizes and f must be positive")
+    entry = {"id": label, "image_size": [w, h]}
+    decentred = p["p1"] != 0 or p["p2"] != 0
+    if kind == "frame":
+        values |= {"p1": p["p2"], "p2": p["p1"]}
+        rest = {name: p[name] for name in ("k4", "b2", *(("p3", "p4") if decentred else ()))}
+    else:
+        values |= {"k4": p["k4"]}
+        rest = {name: p[name] for name in ("p1", "p2", "b2")}
+    rest = {name: value for name, value in rest.items() if value != 0}
+    if not rest and "equisolid" not in kind:
+        return entry | {"model": "opencv" if kind == "frame" else "kannala-brandt", **values}, told
+    foreign = Foreign(
+        FORMULAS[kind], p | {"w": w, "h": h}, values, (w, h), _pixel_size(where, sensor),
+        kind != "frame",
+    )  # fmt: skip
+    found, fit = nearest_camera(foreign, where)
+    has = "".join(f"{name} {value:g}, " for name, value in rest.items()).rstrip(", ")
+    why = f"has {has}" if has else "is equisolid"
+    return entry | found, (*told, f"sensor {label!r} {why}: {fit}")
+
+
+def _coefficients(where: str, calibration: ET.Element, w: float, h: float):
+    """All coefficients in the form of today, and in words those not 0 that are none of them."""
+    tags = [element.tag for element in calibration]
+    twice = next((tag for tag in (*COEFFICIENTS, *OLD) if tags.count(tag) > 1), None)
+    if twice:
+        raise InputError(f"{where}: <{twice}> stands there twice")
+    given = {
+        element.tag: number_in(element.text or "", f"{where}, {element.tag}")
+        for element in calibration
+        if element.tag in (*COEFFICIENTS, *OLD) or _is_coefficient(element)
+    }
+    old = "f" not in given and "fy" in given
+    known = {*COEFFICIENTS, *OLD} - {"f", "b1", "b2"} if old else {*COEFFICIENTS}
+    ignored = [f"{tag} {value:g}" for tag, value in given.items() if tag not in known and value]
+    p = dict.fromkeys(COEFFICIENTS, 0.0) | {k: v for k, v in given.items() if k in known}
+    if old:
+        fy = p.pop("fy")
+        p |= {"f": fy, "b1": p.pop("fx", fy) - fy, "b2": p.pop("skew", 0.0),
+              "cx": given.get("cx", w / 2) - w / 2, "cy": given.get("cy", h / 2) - h / 2,
+              "p1": p["p2"], "p2": p["p1"]}  # fmt: skip
+    return p, ", ".join(ignored)
+
+
+def _is_coefficient(element: ET.Element) -> bool:
+    """Whether an element is called as coefficients are, such as k5."""
+    return re.fullmatch(r"[a-z]\d+", element.tag) is not None and not len(element)
+
+
+def _pixel_size(where: str, sensor: ET.Element) -> list[float] | None:
+    properties = {e.get("name"): e.get("value") for e in sensor.iterfind("property")}
+    if not all(name in properties for name in PIXEL):
+        return None
+    pixel = [number_in(properties[name] or "", f"{where}, {name}") for name in PIXEL]
+    return pixel if min(pixel) > 0 else None
+
+
+def _published(kind: str, p: dict, X, Y, Z):
+    """The manual's formula, from the centre of the first pixel."""
+    if kind == "frame":
+        x, y = X / Z, Y / Z
+    else:
+        off = root(X * X + Y * Y)
+        angle = jnp.arctan2(off, Z)
+        length = 2 * jnp.sin(angle / 2) if "equisolid" in kind else angle
+        scale = jnp.where(off > 0, length / jnp.where(off > 0, off, 1.0), 1.0)
+        x, y = X * scale, Y * scale
+    r2 = x * x + y * y
+    radial = 1 + r2 * (p["k1"] + r2 * (p["k2"] + r2 * (p["k3"] + r2 * p["k4"])))
+    more = 1 + r2 * (p["p3"] + r2 * p["p4"])
+    xd = x * radial + (p["p1"] * (r2 + 2 * x * x) + 2 * p["p2"] * x * y) * more
+    yd = y * radial + (p["p2"] * (r2 + 2 * y * y) + 2 * p["p1"] * x * y) * more
+    u = p["w"] / 2 + p["cx"] + xd * (p["f"] + p["b1"]) + yd * p["b2"]
+    return jnp.stack([u, p["h"] / 2 + p["cy"] + yd * p["f"]]) - 0.5
+
+
+FORMULAS = {kind: partial(_published, kind) for kind in TYPES}
+
+
+def label_of(element: ET.Element) -> str:
+    """What an element is called."""
+    return element.get("label") or element.get("id") or "?"
+
+
+def numbers_of(where: str, text: str | None, n: int) -> np.ndarray:
+    """So many finite numbers."""
+    words = (text or "").split()
+    if len(words) != n:
+        raise InputError(f"{where}: {len(words)} numbers where {n} are expected")
+    return np.array([number_in(word, where) for word in words])

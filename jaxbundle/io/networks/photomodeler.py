@@ -1,0 +1,246 @@
+"""The text export of PhotoModeler ("Bundle Soln").
+
+    title
+    tolerance  iterations  [width  height]                      image size in pixels, if it is there
+    σ of photo coordinates, control, …                          defaults, not used
+    c xp yp  xs ys  K1 K2 K3 P1 P2                              default camera, mm, all digits
+    σ of these
+    N  file name                                                a photograph, N from 0
+    N  X Y Z  κ φ ω                                             degrees
+    N  σ of these
+    N  covariances, or an empty line
+    N  c xp yp  xs ys  K1 K2 K3 P1 P2                           rounded: `photomodeler_camera`
+    N  σ of these
+    …
+    (empty line)
+    id X Y Z σX σY σZ                                           control points
+    (empty line)
+    id X Y Z σX σY σZ                                           object points, then smart points
+    (empty line)
+    N  id  u v  σu σv                                           image points, pixels
+
+What follows (features) is not read. The distortion is a correction at the measured point, y up:
+model `brown`. Pixels and the principal point count from the upper left corner of the image, whose
+format is xs × ys mm:
+
+    x0 = xp − xs/2,  y0 = ys/2 − yp,  p_x = xs/w,  p_y = ys/h,  our pixel = u − ½, v − ½
+
+Whether the program's own origin is the corner or the centre of the first pixel is not published;
+another choice moves image points and principal point alike, and changes no ray.
+
+A control point with positive σ is weighted, one without is held. The coordinates of weighted ones
+are adjusted ones with a posteriori σ (`formats` warns of that). An image point with σ 0 (a smart
+point) has the default σ. Decimals may have a comma, as the language of the system has it;
+photographs whose numbers were skipped (not used in the project) stay skipped. Where the orientation
+of several photographs is nothing but zeros, they have none.
+
+Source: the file itself, as read by the Damped Bundle Adjustment Toolbox (Börlin and Grussenmeyer
+2013), and the camera of its published calibrations, which agree with this reading.
+"""
+
+import dataclasses
+import ntpath
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.networks.assemble import assemble, foreign_document, image_columns
+from jaxbundle.io.networks.photomodeler_camera import (
+    INNER,
+    Inner,
+    camera_entry,
+    header_camera,
+    photo_camera,
+    rounding_warnings,
+)
+from jaxbundle.io.networks.photomodeler_points import Block, point_table, ray_table, renumber_smart
+from jaxbundle.io.networks.poses import matrices_of
+from jaxbundle.io.networks.settings import apply_overrides
+from jaxbundle.io.text.rows import Row, Rows
+from jaxbundle.network.columns import Columns, count, some
+from jaxbundle.network.tables import Network, Source
+
+TITLE = "Bundle Soln"
+OUTER = ("X", "Y", "Z", "kappa", "phi", "omega")
+POINT = ("X", "Y", "Z", "σX", "σY", "σZ")
+RAY = ("u", "v", "σu", "σv")
+
+
+def is_photomodeler(path: Path) -> bool:
+    """Whether a text file begins as the export does."""
+    if path.suffix.lower() != ".txt" or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(100).removeprefix(b"\xef\xbb\xbf").lstrip().startswith(TITLE.encode())
+
+
+def read_photomodeler(path: str | Path, overrides: Sequence[str] = ()) -> Network:
+    """The network of an export: cameras `cam` (or `cam1`, `cam2`, …), nothing free; photographs
+    are called by their file name.
+
+    The datum is given by control points, where there are any; otherwise it is inner.
+
+    **Raises:** `InputError` naming file and line, or that the image size is missing.
+    """
+    path = Path(path)
+    rows = Rows(path, blank=True, fallback="latin-1")
+    while rows.more() and not rows.next_words():
+        rows.take("the title")
+    rows.take("the title")
+    head = [_take(rows, what) for what in ("tolerance and iterations", "default σ",
+                                           "the default camera", "its σ")]  # fmt: skip
+    given = head[0].all_numbers("tolerance, iterations, width, height")
+    size = given[2:4].tolist() if len(given) >= 4 else None
+    photos = _photos(rows, header_camera(head[2]))
+    if not photos:
+        raise head[3].error("no photograph follows")
+    document, cameras, of_camera, half = _document(path, photos, size, overrides)
+    control, objects = _points(rows, "control points"), _points(rows, "object points")
+    names = dict(zip((photo.number for photo in photos), _names([photo.name for photo in photos])))
+    marks = _marks(rows, names)
+    renumbered = renumber_smart(path, objects, marks)
+    points = point_table(path, control, objects, marks.id)
+    if len(control):
+        document["project"]["datum"] = "control"
+    outer = np.array([photo.outer for photo in photos])
+    nowhere = (outer == 0).all(1)
+    if nowhere.sum() > 1:
+        outer[nowhere] = np.nan
+    images = image_columns(
+        Source(str(path), np.array([photo.line for photo in photos]), "line"),
+        list(names.values()), cameras, matrices_of(np.radians(outer[:, :2:-1])), outer[:, :3],
+    )  # fmt: skip
+    rest = [override for override in overrides if override not in of_camera]
+    network = assemble(path, document, rest, images, points, ray_table(path, marks, names))
+    return network.warn(*_warnings(points, renumbered),
+                        *rounding_warnings(network.cameras, half))  # fmt: skip
+
+
+def _warnings(points: Columns, renumbered: str):
+    if renumbered:
+        yield renumbered
+    lost = [id for id, X in zip(points.values["id"], points.values["X"]) if np.isnan(X)]
+    if lost:
+        yield f"{count(len(lost), 'point')} without coordinates in the file: {some(lost)}"
+
+
+def _document(path: Path, photos: Sequence["Photo"], size, overrides: Sequence[str]):
+    """Settings and cameras with what the command line says of these; by photograph the camera; the
+    overrides used; and by camera half a unit of the last decimal of its values."""
+    distinct, first, camera = np.unique(
+        np.array([photo.inner for photo in photos]), axis=0, return_index=True, return_inverse=True
+    )
+    names = ["cam"] if len(distinct) == 1 else [f"cam{k + 1}" for k in range(len(distinct))]
+    document = foreign_document(
+        path.stem, [camera_entry(id, values, size) for id, values in zip(names, distinct)],
+        object_unit="m", residuals="corrected",
+    )  # fmt: skip
+    # the pixel size follows from an image size that may come from the command line
+    of_camera = [override for override in overrides if override.startswith("camera.")]
+    document = apply_overrides(document, of_camera)
+    for entry, values in zip(document["camera"], distinct):
+        _complete(path, entry, values)
+    half = np.array([photos[k].half_unit for k in first])
+    return document, [names[c] for c in camera.reshape(-1)], of_camera, half
+
+
+def _complete(path: Path, entry: dict, values) -> None:
+    """The pixel size, from the format and the image size."""
+    if "image_size" not in entry:
+        raise InputError(
+            f"{path}: line 2 has no image size; give --set camera.{entry['id']}.image_size="
+            "WIDTH,HEIGHT (pixels)"
+        )
+    size, format = np.array(entry["image_size"], float), values[3:5]
+    if size.shape != (2,) or not (size > 0).all() or not (format > 0).all():
+        raise InputError(
+            f"{path}: image size {entry['image_size']} and format {format.tolist()} mm must be "
+            "positive"
+        )
+    entry.setdefault("pixel_size", (format / size).tolist())
+
+
+@dataclasses.dataclass(frozen=True)
+class Photo:
+    """A photograph: its number in the file, orientation as written, and camera."""
+
+    number: int
+    name: str
+    line: int
+    outer: Float[np.ndarray, "6"]
+    inner: Inner
+    half_unit: Inner
+
+
+def _photos(rows: Rows, header) -> list[Photo]:
+    photos: list[Photo] = []
+    while rows.next_words():
+        row = rows.take("a photograph")
+        number = row.whole(0, "the number of a photograph")
+        if any(photo.number == number for photo in photos):
+            raise row.error(f"photograph {number} is in the file twice")
+        name = row.text.split(None, 1)[1].strip() if len(row) > 1 else ""
+        outer = _numbered(rows, number, "orientation").numbers(OUTER, 1)
+        _numbered(rows, number, "σ of the orientation").numbers(OUTER, 1)
+        rows.take("covariances of the orientation or an empty line")
+        inner = photo_camera(_numbered(rows, number, "the camera"), header)
+        _numbered(rows, number, "σ of the camera").numbers(INNER, 1)
+        photos.append(Photo(number, name or f"photo {number}", row.number, outer, *inner))
+    if rows.more():
+        rows.take("an empty line")
+    return photos
+
+
+def _numbered(rows: Rows, number: int, what: str) -> Row:
+    row = _take(rows, f"{what} of photograph {number}")
+    if row.whole(0, f"the number of the photograph before {what}") != number:
+        raise row.error(f"{what} of photograph {number} is expected, not of {row.words[0]}")
+    return row
+
+
+def _points(rows: Rows, what: str) -> Block:
+    ids, values, lines = [], [], []
+    for row in _block(rows):
+        ids.append(str(row.whole(0, f"the number of one of the {what}")))
+        values.append(row.numbers(POINT, 1))
+        lines.append(row.number)
+    return Block(ids, np.array(values).reshape(-1, 6), lines)
+
+
+def _marks(rows: Rows, names: Mapping[int, str]) -> Block:
+    ids, values, lines, photos = [], [], [], []
+    for row in _block(rows):
+        photo = row.whole(0, "the number of a photograph")
+        if photo not in names:
+            raise row.error(f"photograph {photo} does not exist; there are {len(names)}, "
+                            f"{min(names)} to {max(names)}")  # fmt: skip
+        photos.append(photo)
+        ids.append(str(row.whole(1, "the number of a point")))
+        values.append(row.numbers(RAY, 2))
+        lines.append(row.number)
+    return Block(ids, np.array(values).reshape(-1, 4), lines, photos)
+
+
+def _block(rows: Rows):
+    """Lines to the next empty one, without which the file is cut off."""
+    while True:
+        row = _take(rows, "an empty line after the last of a block")
+        if not row.words:
+            return
+        yield row
+
+
+def _take(rows: Rows, what: str) -> Row:
+    """The next line of numbers, a decimal comma read as a point."""
+    row = rows.take(what)
+    return Row(row.path, row.number, row.text.replace(",", ".")) if "," in row.text else row
+
+
+def _names(files: Sequence[str]) -> list[str]:
+    """File names without their folders, as long as they differ; a file given twice is numbered."""
+    short = [ntpath.basename(name) for name in files]
+    names = short if len(set(short)) == len(short) else list(files)
+    return [f"{name}#{k}" if names.count(name) > 1 else name for k, name in enumerate(names)]

@@ -1,0 +1,92 @@
+"""The cameras of a PhotoModeler export: which of two roundings holds, and what rounding costs.
+
+The header has the default camera with all digits that were written; the line of a photograph
+repeats its camera with c, xp, yp to 3 decimals and the rest to 5:
+
+    7.4693 3.6178 2.6087 7.25320 5.43990 4.981e-3 -9.814e-5 0 -6.587e-5 -2.806e-5       header
+    7.469  3.618  2.609  7.25320 5.43990 0.00498 -0.00010 0.00000 -0.00007 -0.00003     photograph
+
+A photograph has the camera of the header where every number agrees with its own to half a unit of
+the last decimal; otherwise it has another camera, and keeps its own, rounded numbers.
+"""
+
+from collections.abc import Sequence
+from decimal import Decimal, InvalidOperation
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.io.text.rows import Row
+from jaxbundle.network.columns import some
+from jaxbundle.network.tables import Camera
+
+INNER = ("c", "xp", "yp", "xs", "ys", "K1", "K2", "K3", "P1", "P2")
+DECIMALS = (3, 3, 3, 5, 5, 5, 5, 5, 5, 5)
+"""Of the numbers of a photograph, where it has no more: a bare 0 stands for no whole unit."""
+LARGEST_ROUNDING = 0.1
+"""Pixels in the corner of the image: a camera with coarser digits is warned of."""
+
+Inner = Float[np.ndarray, "10"]
+
+
+def header_camera(row: Row) -> tuple[Inner, Inner] | None:
+    """The default camera, and half a unit of its last decimals; None without ten numbers."""
+    return (row.numbers(INNER), _half_units(row.words)) if len(row) == len(INNER) else None
+
+
+def photo_camera(row: Row, header: tuple[Inner, Inner] | None) -> tuple[Inner, Inner]:
+    """The camera of a photograph (number, then ten values), and half a unit of its last decimals:
+    the header's if it is the same."""
+    own, half = row.numbers(INNER, 1), _half_units(row.words[1:])
+    if header is not None and (abs(header[0] - own) <= (1 + 1e-9) * half).all():
+        return header
+    return own, half
+
+
+def _half_units(words: Sequence[str]) -> Inner:
+    given = [_decimals(word) for word in words]
+    return 0.5 * 10.0 ** -np.maximum(given, DECIMALS).astype(float)
+
+
+def _decimals(word: str) -> int:
+    try:
+        return -int(Decimal(word).as_tuple().exponent)
+    except InvalidOperation:  # an exponent of twenty digits: the number is 0
+        return 0
+
+
+def camera_entry(id: str, values: Inner, size: Sequence[float] | None) -> dict:
+    """The entry of a document; `size` of the image in pixels."""
+    c, xp, yp, xs, ys, K1, K2, K3, P1, P2 = values.tolist()
+    entry = {"id": id, "model": "brown", "c": c, "x0": xp - xs / 2, "y0": ys / 2 - yp,
+             "K1": K1, "K2": K2, "K3": K3, "P1": P1, "P2": P2}  # fmt: skip
+    return entry if size is None else entry | {"image_size": size}
+
+
+def rounding_warnings(
+    cameras: Sequence[Camera], half: Float[np.ndarray, "cameras 10"]
+) -> list[str]:
+    """Of cameras whose digits leave more than `LARGEST_ROUNDING` pixels open in the corner of the
+    image; parameters that are 0 or free are not counted.
+
+    **Arguments:** `half` half a unit of the last decimal of each value.
+    """
+    told = []
+    for camera, open in zip(cameras, half):
+        size, pixel = np.array(camera.image_size, float), np.array(camera.pixel_size)
+        r = float(np.linalg.norm(size * pixel)) / 2
+        slopes = {"c": r / camera.parameters["c"], "K1": r**3, "K2": r**5, "K3": r**7,
+                  "P1": 3 * r**2, "P2": 3 * r**2}  # fmt: skip
+        costs = {
+            name: open[INNER.index(name)] * slope / pixel.min() for name, slope in slopes.items()
+            if camera.parameters[name] != 0 and name not in camera.free
+        }  # fmt: skip
+        coarse = {name: cost for name, cost in costs.items() if cost > LARGEST_ROUNDING}
+        if coarse:
+            worst = some((f"{name} to {cost:.2g} px" for name, cost in coarse.items()), as_text=str)
+            told.append(
+                f"the file rounds camera {camera.id!r}: in the corner of the image this leaves "
+                f"open {worst}; give the digits (--set camera.{camera.id}.{next(iter(coarse))}=…) "
+                f"or let them be free (--set camera.{camera.id}.free={','.join(coarse)})"
+            )
+    return told

@@ -1,0 +1,274 @@
+"""The project format: a TOML file with settings and cameras, tables in CSV files beside it.
+
+```toml
+[project]
+name = "Image 63"
+object_unit = "m"
+image_unit = "mm"                   # or "px": (0, 0) the centre of the upper-left pixel
+angle_unit = "deg"                  # rad | deg | gon
+sigma_image = 0.015                 # σ of image coordinates without their own, in image_unit
+datum = "control"                   # control | inner | minimal
+datum_points = ["1", "2", "3"]      # which points carry inner constraints; all tie points if absent
+residuals = "corrected"             # corrected | measured
+images = "images.csv"               # the columns of each table: `jaxbundle.network.build`
+points = "points.csv"
+observations = "observations.csv"
+distances = "distances.csv"         # optional
+
+[[camera]]
+id = "rc30"
+model = "brown"
+image_size = [15333, 15333]         # pixels
+pixel_size = [0.015, 0.015]         # mm
+c = 154.006                         # every parameter not given starts at 0
+free = ["c", "x0", "y0", "K1"]
+sigma = { c = 0.1 }                 # prior σ of the start value
+```
+
+Small tables may stand in the file itself, one `[[image]]`, `[[point]]`, `[[observation]]`,
+`[[distance]]` a row.
+"""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from jaxbundle.arguments import path as given_path
+from jaxbundle.cameras import CameraModel, is_own
+from jaxbundle.errors import InputError
+from jaxbundle.io.networks.settings import (
+    NEEDED,
+    SETTINGS,
+    TABLES,
+    Document,
+    apply_overrides,
+    network_of,
+)
+from jaxbundle.io.text.csv_tables import read_csv, read_toml, write_csv, write_text
+from jaxbundle.io.text.toml_text import assignments
+from jaxbundle.io.writing.folders import replaced_folder
+from jaxbundle.network.build import (
+    DISTANCE_COLUMNS,
+    IMAGE_COLUMNS,
+    IMAGE_SIGMAS,
+    OBSERVATION_COLUMNS,
+    OBSERVATION_SIGMAS,
+    POINT_COLUMNS,
+    POINT_SIGMAS,
+)
+from jaxbundle.network.columns import Columns, as_columns, did_you_mean
+from jaxbundle.network.further import KINDS, SECTIONS, Further
+from jaxbundle.network.further.base import among
+from jaxbundle.network.tables import Camera, Network, Source, require_network
+from jaxbundle.network.units import ANGLE_UNITS, to_image_unit
+from jaxbundle.system.file_content import check_plain
+
+FILE_NAME = "project.toml"
+ADJUSTED = "network"
+"""The folder of the adjusted network beside the tables of a result."""
+FILES = (FILE_NAME, *(f"{table}.csv" for table in TABLES))
+"""What a project consists of."""
+INLINE = {
+    table: table.removesuffix("s") for table in TABLES
+    if table not in KINDS or not KINDS[table].SECTION
+}  # fmt: skip
+"""The tables and the name of one of their rows in the TOML file."""
+
+
+def read_project(
+    path: str | Path, overrides: Sequence[str] = (), models: Sequence[CameraModel] = ()
+) -> Network:
+    """The network of a project file, or of the one in a folder (`project_file`).
+
+    `overrides` are settings `KEY=VALUE` that replace those of the file, see
+    `jaxbundle.io.networks.settings`; `models` own camera models that the file may name.
+
+    **Raises:** `InputError` naming file, line and column.
+    """
+    path = project_file(Path(path))
+    document = apply_overrides(_read_document(path), overrides, (*SETTINGS, *TABLES))
+    document["project"].setdefault("name", path.resolve().parent.name)
+    tables = {table: _read_table(document, table, path) for table in TABLES}
+    return network_of(document, {k: v for k, v in tables.items() if v is not None}, str(path),
+                      models)  # fmt: skip
+
+
+def project_file(path: Path) -> Path:
+    """The project file a path stands for: itself, or the one in a folder.
+
+    In a folder written by `jaxbundle adjust --out` it is that of the adjusted network.
+    """
+    if not path.is_dir():
+        return path
+    places = (path / FILE_NAME, path / ADJUSTED / FILE_NAME)
+    return next((place for place in places if place.is_file()), places[0])
+
+
+def _read_document(path: Path) -> Document:
+    document = read_toml(path)
+    known = ("project", "camera", *INLINE.values(), *SECTIONS)
+    for key, value in document.items():
+        if key not in known:
+            raise InputError(f"{path}: unknown key {key!r}{did_you_mean(key, known)}")
+        if key in SECTIONS and not isinstance(value, dict):
+            table = next(table for table, kind in KINDS.items() if kind.SECTION == key)
+            raise InputError(
+                f"{path}: write [{key}] in single brackets; its rows stand in {table}.csv"
+            )
+        if key not in ("project", *SECTIONS) and not (
+            isinstance(value, list) and all(isinstance(row, dict) for row in value)
+        ):
+            raise InputError(f"{path}: write [[{key}]] in double brackets, one for each {key}")
+    if not isinstance(document.get("project"), dict):
+        raise InputError(f"{path}: the section [project] is missing")
+    return {"camera": [], **document}
+
+
+def _read_table(document: Document, table: str, path: Path) -> Columns | None:
+    """A table from its CSV file or from the document itself; None where it is not needed and not
+    given."""
+    key, file = INLINE.get(table), document["project"].get(table)
+    if key is not None and document.get(key) is not None:
+        if file is not None:
+            raise InputError(f"{path}: give either {table} = {file!r} or [[{key}]], not both")
+        columns = as_columns(document[key], table)
+        return Columns(columns.values, Source(f"{path} [[{key}]]", None, "entry"))
+    if file is None:
+        if table not in NEEDED:
+            return None
+        raise InputError(
+            f"{path}, [project]: {table} is missing; give {table} = \"{table}.csv\" or "
+            f"[[{INLINE[table]}]] entries"
+        )
+    if not isinstance(file, str):
+        raise InputError(f"{path}, [project]: {table} is {file!r}; the name of a file is expected")
+    check_plain(path.parent / file)
+    if not os.path.isfile(path.parent / file):
+        raise InputError(
+            f"{path}, [project]: {table} = {file!r}: no such file {path.parent / file}"
+        )
+    return read_csv(path.parent / file)
+
+
+def write_project(
+    network: Network, folder: str | Path, force: bool = False, by: str = "write_project"
+) -> Path:
+    """Write `project.toml` and its tables into a folder; returns the path of the former.
+
+    Reading it again gives the same network (its warnings stand in the file as comments).
+
+    **Arguments:** `force`: replace what `by`, the command or function, has not written.
+
+    **Raises:** `InputError` where the folder may not or cannot be written
+    (`jaxbundle.io.writing.folders`).
+    """
+    network, folder = require_network(network), Path(given_path("folder", folder))
+    with replaced_folder(folder, by, FILES, force) as new:
+        fill_project(network, new)
+    return folder / FILE_NAME
+
+
+def fill_project(network: Network, folder: Path) -> None:
+    """Write `project.toml` and its tables beside what is in a folder, or a new one."""
+    images, points, rays = network.images, network.points, network.observations
+    xy, sigma = to_image_unit(
+        network.cameras, images.camera[rays.image], rays.xy, rays.sigma, network.image_unit
+    )
+    folder.mkdir(exist_ok=True)
+    radians = ANGLE_UNITS[network.angle_unit]
+    unit = np.array([1, 1, 1, radians, radians, radians])
+    exterior = np.concatenate([images.position, images.angles], 1) / unit
+    camera_id = [network.cameras[c].id for c in images.camera]
+    _write_table(
+        folder / "images.csv", IMAGE_COLUMNS, (images.id, camera_id), exterior,
+        IMAGE_SIGMAS, images.sigma / unit, {0.0: "fixed"},
+    )  # fmt: skip
+    _write_table(
+        folder / "points.csv", POINT_COLUMNS, (points.id, points.role), points.position,
+        POINT_SIGMAS, points.sigma, {np.inf: "free"},
+    )  # fmt: skip
+    _write_table(
+        folder / "observations.csv", OBSERVATION_COLUMNS,
+        ([images.id[i] for i in rays.image], [points.id[p] for p in rays.point]), xy,
+        OBSERVATION_SIGMAS, sigma, {},
+    )  # fmt: skip
+    distances = network.distances
+    if len(distances):
+        ends = [[points.id[p] for p in column] for column in distances.points.T]
+        values = np.stack([distances.value, distances.sigma], 1)
+        _write_table(folder / "distances.csv", DISTANCE_COLUMNS, ends, values, (), values, {})
+    for further in among(network):
+        _write_further(folder, further, radians)
+    write_text(folder / FILE_NAME, _document_text(network))
+
+
+def _write_table(path, header, ids, values, sigma_header, sigma, words):
+    """Ids, numbers and, where there are any, σ; `words` stand for special values of σ."""
+    with_sigma = bool(sigma_header) and not np.isnan(sigma).all()
+    rows = (
+        (*names, *_cells(row), *(_cells(s, words) if with_sigma else ()))
+        for *names, row, s in zip(*ids, values.tolist(), sigma.tolist())
+    )
+    write_csv(path, (*header, *(sigma_header if with_sigma else ())), rows)
+
+
+def _write_further(folder: Path, further: Further, radians: float) -> None:
+    """The table of a further kind."""
+    columns = {
+        name: column if isinstance(column, tuple) else [
+            x if isinstance(x, str) else "" if x != x else repr(float(x)) for x in column
+        ] for name, column in further.columns(radians).items()
+    }  # fmt: skip
+    write_csv(folder / f"{further.TABLE}.csv", tuple(columns), zip(*columns.values()))
+
+
+def _cells(numbers, words=MappingProxyType({})):
+    return (words[x] if x in words else "" if x != x else repr(x) for x in numbers)
+
+
+def _document_text(network: Network) -> str:
+    lines = [f"# {' '.join(warning.split())}" for warning in network.warnings]
+    settings = {key: getattr(network, key) for key in SETTINGS if key != "sigma_image"}
+    further = among(network)
+    tables = [*NEEDED, *["distances"] * (len(network.distances) > 0), *(f.TABLE for f in further)]
+    settings |= {table: f"{table}.csv" for table in tables}
+    if not network.datum_points:
+        del settings["datum_points"]
+    lines += ["[project]", *assignments(settings)]
+    for one in further:
+        if one.SECTION and one.settings:
+            lines += ["", f"[{one.SECTION}]", *assignments(one.settings)]
+    return "\n".join(lines) + "\n\n" + cameras_text(network.cameras)
+
+
+def cameras_text(cameras: Sequence[Camera]) -> str:
+    """Cameras as the `[[camera]]` entries of a TOML file."""
+    entries = ([*_of_own(camera), "[[camera]]", *assignments(_camera_entry(camera)), ""]
+               for camera in cameras)  # fmt: skip
+    return "\n".join(line for entry in entries for line in entry)
+
+
+def _of_own(camera: Camera) -> Sequence[str]:
+    """A remark on a model that a file can only name."""
+    if not is_own(camera.model):
+        return ()
+    return (f"# {str(camera.model)!r} is a model of the user's own: give the object to "
+            "jaxbundle.read_network(path, models=[…])",)  # fmt: skip
+
+
+def _camera_entry(camera: Camera) -> dict:
+    entry: dict[str, Any] = {"id": camera.id, "model": str(camera.model)}
+    for name in ("image_size", "pixel_size"):
+        if getattr(camera, name) is not None:
+            entry[name] = getattr(camera, name)
+    entry |= {name: float(value) for name, value in camera.parameters.items()}
+    entry["free"] = camera.free
+    if camera.tie:
+        entry["tie"] = camera.tie
+    if camera.sigma:
+        entry["sigma"] = {name: float(value) for name, value in camera.sigma.items()}
+    return entry

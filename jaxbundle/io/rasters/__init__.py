@@ -1,0 +1,1 @@
+"""Rasters: terrain models, scenes, maps, corrected images."""

@@ -1,0 +1,155 @@
+"""A raster corrected to a map: GeoTIFF, block by block, a few blocks in memory at a time."""
+
+import itertools
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.rasters.map_blocks import write_map
+from jaxbundle.io.rasters.maps import MapGrid, MapSystem, contiguous, grid_around
+from jaxbundle.io.rasters.reading import open_plain, rasterio, unreadable
+from jaxbundle.pushbroom.correct import BLOCK, block_places
+from jaxbundle.pushbroom.image import PushbroomImage
+from jaxbundle.pushbroom.locate import locate_lines
+from jaxbundle.pushbroom.project import Search
+from jaxbundle.pushbroom.resample import Resampling, resample
+from jaxbundle.pushbroom.surfaces import Surface
+from jaxbundle.pushbroom.terrain import Terrain
+
+REACH = 3
+"""Pixels beyond the outermost place that resampling may ask for."""
+ROUND = 128
+"""Windows of the image are widened to a multiple of this, or an eighth: few shapes to compile."""
+WINDOW = 2**22
+"""Values of the image, of all bands, that are in memory for a part of a block."""
+BORDER = 33
+"""Places along each border of the image that bound the map."""
+MOST = 10_000
+"""A map with so many times the pixels of the image is a mistake in its spacing."""
+
+_resample = jax.jit(resample, static_argnums=3)
+_locate = jax.jit(locate_lines)
+
+
+def map_of(
+    image: PushbroomImage,
+    surface: Surface,
+    system: MapSystem,
+    size: float | None,
+    model: str | Path | None = None,
+) -> MapGrid:
+    """The pixels of a map that hold the whole image, by default of its own size on the ground.
+
+    `model` names the file of a terrain in messages.
+
+    **Raises:** `InputError` if the image shows nothing of the surface, its map does not hold
+    together, or is too large.
+    """
+    lines = np.linspace(-0.5, image.lines - 0.5, BORDER)
+    pixels = np.linspace(-0.5, image.pixels - 0.5, BORDER)
+    inner = np.clip(lines, 0, image.lines - 1)  # the tables may end at the outer lines' centres
+    X = np.asarray(_locate(image, surface, inner, pixels))
+    if not np.isfinite(X).any():
+        raise InputError(
+            f"{model or 'terrain'}: no height where the image looks; give a model that covers it"
+            if isinstance(surface, Terrain) else
+            "no point of the image is on the ground; look at attitude and mounting"
+        )
+    x, y = system.from_ground(X)
+    if not np.isfinite(x).any():
+        raise InputError(f"coordinate system {system.crs}: it has no place for the image")
+    x = contiguous(system, x)
+    if size is None:
+        rows = np.hypot(np.diff(x, axis=0), np.diff(y, axis=0)) / np.diff(inner)[:, None]
+        columns = np.hypot(np.diff(x, axis=1), np.diff(y, axis=1)) / np.diff(pixels)
+        size = float(f"{min(np.nanmedian(rows), np.nanmedian(columns)):.2g}")
+    grid = grid_around(x, y, size, MOST * image.lines * image.pixels)
+    # a line beyond the outermost centres, which the border leaves out
+    return MapGrid(grid.x - size, grid.y + size, size, grid.columns + 2, grid.rows + 2)
+
+
+def write_corrected(
+    source: str | Path,
+    target: str | Path,
+    image: PushbroomImage,
+    search: Search,
+    surface: Surface,
+    system: MapSystem,
+    grid: MapGrid,
+    resampling: Resampling = "bilinear",
+    progress: Callable[[int, int], None] | None = None,
+    occlusion: bool = False,
+) -> None:
+    """Write the raster `source`, taken by the image, as the map `target`.
+
+    All bands, in the type of the source; where the map shows nothing, NaN or 0 (told as no data).
+    With `occlusion` that is also so where terrain hides other terrain.
+
+    **Raises:** `InputError` if the raster has not the size of the image, or cannot be read.
+    """
+    package = rasterio()
+    try:
+        with open_plain(source) as bands:
+            if (bands.height, bands.width) != (image.lines, image.pixels):
+                raise InputError(
+                    f"{source}: {bands.height} lines of {bands.width} pixels; the scanner file has "
+                    f"{image.lines} of {image.pixels}"
+                )
+            reading = threading.Lock()
+
+            def block(nodes):
+                places = block_places(image, search, surface, nodes, occlusion)
+                if places is None:
+                    return None
+                try:
+                    return _values(bands, reading, image, places, resampling)
+                except package.errors.RasterioError as error:
+                    raise unreadable(source, error) from None
+
+            write_map(
+                target, system, grid, surface, bands.count, bands.dtypes[0], block, progress
+            )
+    except package.errors.RasterioError as error:
+        raise unreadable(source, error) from None
+
+
+def _values(bands, reading, image, places, resampling):
+    """All bands at the places of a block."""
+    line, pixel = (np.asarray(p) for p in places)
+    values = np.full((bands.count, *line.shape), np.nan)
+    for part, window in _parts(line, pixel, image, WINDOW / bands.count):
+        with reading:
+            seen = bands.read(window=window)
+        pad = [(0, -n % max(ROUND, 2 ** (n.bit_length() - 3))) for n in seen.shape[1:]]
+        seen = np.pad(seen.astype(float), [(0, 0), *pad], mode="edge")
+        (top, _), (left, _) = window
+        values[:, *part] = _resample(seen, line[part] - top, pixel[part] - left, resampling)
+    return values
+
+
+def _parts(line, pixel, image, most, part=(slice(0, BLOCK), slice(0, BLOCK))):
+    """Quarters of a block, quartered again until each sees at most so many pixels of the image.
+
+    Each as slices of the block, with the rows and columns of the image that it needs. What sees
+    nothing is left out.
+    """
+    seen = line[part], pixel[part]
+    if not np.isfinite(seen[0]).any():
+        return
+    window = tuple(
+        (max(int(np.nanmin(v)) - REACH, 0), min(int(np.nanmax(v)) + REACH + 1, size))
+        for v, size in zip(seen, (image.lines, image.pixels))
+    )
+    side = part[0].stop - part[0].start
+    if side == 1 or (window[0][1] - window[0][0]) * (window[1][1] - window[1][0]) <= most:
+        yield part, window
+        return
+    halves = [
+        [slice(s.start, s.start + side // 2), slice(s.start + side // 2, s.stop)] for s in part
+    ]
+    for quarter in itertools.product(*halves):
+        yield from _parts(line, pixel, image, most, quarter)

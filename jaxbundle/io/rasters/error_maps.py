@@ -1,0 +1,71 @@
+"""Errors as rasters: of a map against a known truth, and of places over an image."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.io.rasters.map_blocks import write_map
+from jaxbundle.io.rasters.maps import MapGrid, MapSystem
+from jaxbundle.io.rasters.reading import rasterio
+from jaxbundle.io.rasters.writing import written_raster
+from jaxbundle.pushbroom.correct import block_errors, block_places
+from jaxbundle.pushbroom.image import PushbroomImage
+from jaxbundle.pushbroom.project import Search
+from jaxbundle.pushbroom.surfaces import Surface
+
+BANDS = "east [m]", "north [m]", "error [m]"
+
+
+def write_error_map(
+    target: str | Path,
+    image: PushbroomImage,
+    search: Search,
+    truth: PushbroomImage,
+    truth_search: Search,
+    surface: Surface,
+    system: MapSystem,
+    grid: MapGrid,
+    progress: Callable[[int, int], None] | None = None,
+) -> float:
+    """Write how far every pixel of a map of the image is off, by the true image: three bands.
+
+    East and north (X and Y in a local frame) of the map less the truth, and their length, metres;
+    NaN where the map shows nothing. Returns the RMS of the length.
+    """
+    squares = []
+
+    def block(nodes):
+        places = block_places(image, search, surface, nodes)
+        if places is None:
+            return None
+        errors = block_errors(truth, truth_search, surface, nodes, places)
+        length = np.hypot(*errors)
+        squares.append((np.nansum(length**2), np.isfinite(length).sum()))
+        return np.stack([*errors, length])
+
+    write_map(target, system, grid, surface, 3, "float32", block, progress, BANDS)
+    total, count = np.sum(squares, axis=0) if squares else (0.0, 0)
+    return float(np.sqrt(total / count)) if count else np.nan
+
+
+def write_image_raster(
+    target: str | Path,
+    lines: Float[np.ndarray, " rows"],
+    pixels: Float[np.ndarray, " columns"],
+    bands: Mapping[str, Float[np.ndarray, "rows columns"]],
+) -> None:
+    """Write values at evenly spaced lines × pixels of an image, named bands, as a GeoTIFF.
+
+    Its coordinates are those of the image: x the pixel, y the line, downwards.
+    """
+    steps = [v[1] - v[0] if len(v) > 1 else 1.0 for v in (pixels, lines)]
+    transform = rasterio().transform.Affine(
+        steps[0], 0, pixels[0] - steps[0] / 2, 0, steps[1], lines[0] - steps[1] / 2
+    )
+    with written_raster(
+        target, len(pixels), len(lines), len(bands), "float32", nodata=np.nan, transform=transform
+    ) as raster:
+        raster.write(np.stack(list(bands.values())).astype("float32"))
+        raster.describe(tuple(bands))

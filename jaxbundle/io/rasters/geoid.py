@@ -1,0 +1,96 @@
+"""Heights of the geoid above the ellipsoid, added to terrain models of orthometric heights.
+
+    h = H + N(λ, φ),      N bilinear in a grid
+
+The grid is a raster with georeference (GeoTIFF, GTX), or one of PROJ's own by its name, such as
+`us_nga_egm96_15.tif`, which `projsync` fetches (through pyproj).
+"""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import WGS84
+from jaxbundle.io.rasters.extent import Extent
+from jaxbundle.io.rasters.reading import read_terrain
+from jaxbundle.pushbroom.terrain import Terrain, make_terrain
+
+EDGE = 1e-6
+"""Places so many cells beyond the last one are on it, but for rounding."""
+
+
+def add_geoid(terrain: Terrain, geoid: Path) -> Terrain:
+    """The terrain with heights above the ellipsoid, of one with heights above the geoid.
+
+    **Raises:** `InputError` if the geoid cannot be read, or has no height at a place that has one
+    in the terrain model.
+    """
+    if terrain.earth is None:
+        raise InputError("--geoid: a local frame has no geoid; leave it away")
+    heights = np.asarray(terrain.heights)
+    longitude, latitude = (
+        np.degrees(terrain.origin[k] + terrain.step[k] * np.arange(heights.shape[1 - k]))
+        for k in (0, 1)
+    )
+    N = undulations(geoid, longitude, latitude)
+    if (missing := np.isnan(N) & np.isfinite(heights)).any():
+        row, column = np.argwhere(missing)[0]
+        raise InputError(
+            f"{geoid}: no height of the geoid at longitude {longitude[column]:.6g}°, latitude "
+            f"{latitude[row]:.6g}°; give a geoid that covers the terrain model"
+        )
+    return make_terrain(heights + N, terrain.origin, terrain.step, terrain.earth)
+
+
+def undulations(
+    geoid: Path, longitude: Float[np.ndarray, " columns"], latitude: Float[np.ndarray, " rows"]
+) -> Float[np.ndarray, "rows columns"]:
+    """N in metres at longitudes × latitudes in degrees; NaN where the grid has none."""
+    if not Path(geoid).exists():
+        return _of_proj(geoid, longitude, latitude)
+    extent = Extent(longitude.min(), latitude.min(), longitude.max(), latitude.max())
+    grid = read_terrain(geoid, WGS84, extent)
+    heights, (x0, y0), (dx, dy) = np.asarray(grid.heights), *np.degrees([grid.origin, grid.step])
+    middle = x0 + dx * (heights.shape[1] - 1) / 2
+    longitude = longitude - 360 * np.round((longitude - middle) / 360)
+    return _bilinear(heights, (latitude - y0) / dy, (longitude - x0) / dx)
+
+
+def _bilinear(values, row, column):
+    """Values at rows × columns; NaN outside, or beside one that is NaN with a weight."""
+    inside = lambda place, n: np.where(
+        (place >= -EDGE) & (place <= n - 1 + EDGE), np.clip(place, 0, n - 1), np.nan
+    )
+    (i, u), (k, v) = (
+        (np.clip(np.nan_to_num(np.floor(p)).astype(int), 0, n - 2), p)
+        for p, n in zip(map(inside, (row, column), values.shape), values.shape)
+    )
+    u, v = (u - i)[:, None], v - k
+    rows = np.where(u == 0, 0, u * values[i + 1]) + np.where(u == 1, 0, (1 - u) * values[i])
+    return np.where(v == 0, 0, v * rows[:, k + 1]) + np.where(v == 1, 0, (1 - v) * rows[:, k])
+
+
+def _of_proj(name, longitude, latitude):
+    try:
+        import pyproj.datadir
+        import pyproj.exceptions
+    except ImportError:
+        raise InputError("PROJ's grids need pyproj: pip install 'jaxbundle[geo]'") from None
+    try:
+        transformer = pyproj.Transformer.from_pipeline(
+            "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=vgridshift "
+            f"+grids={name} +multiplier=1 +step +proj=unitconvert +xy_in=rad +xy_out=deg"
+        )
+    except pyproj.exceptions.ProjError:
+        # public by its documentation, though its stub does not say so
+        folder = pyproj.datadir.get_user_data_dir()  # pyright: ignore[reportPrivateImportUsage]
+        raise InputError(
+            f"--geoid {name}: there is no such file, and PROJ has no grid of this name (its folder "
+            f"is {folder}); give a raster of the geoid, or fetch the "
+            "grid with projsync"
+        ) from None
+    x, y = np.meshgrid(longitude, latitude)
+    N = transformer.transform(x, y, np.zeros_like(x))[2]
+    return np.where(np.isfinite(N), N, np.nan)

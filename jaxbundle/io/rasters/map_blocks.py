@@ -1,0 +1,57 @@
+"""A map as a GeoTIFF, made and written block by block, two at a time, under a temporary name."""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.io.rasters.maps import MapGrid, MapSystem
+from jaxbundle.io.rasters.reading import as_type, rasterio
+from jaxbundle.io.rasters.writing import written_raster
+from jaxbundle.pushbroom.correct import BLOCK, STEP, Nodes
+from jaxbundle.pushbroom.surfaces import Surface
+
+
+def write_map(
+    target: str | Path,
+    system: MapSystem,
+    grid: MapGrid,
+    surface: Surface,
+    count: int,
+    dtype: str,
+    block: Callable[[Nodes], np.ndarray | None],
+    progress: Callable[[int, int], None] | None = None,
+    names: Sequence[str] = (),
+) -> None:
+    """Write the map of `grid`, `count` bands of the type `dtype`.
+
+    `block` makes the values [count, `BLOCK`, `BLOCK`] of a block from its nodes, NaN where there
+    are none; None if there are none at all. `names` describe the bands.
+
+    **Raises:** `InputError` if the file cannot be written.
+    """
+    floating = np.issubdtype(dtype, np.floating)
+    steps = np.arange(0, BLOCK + STEP, STEP)
+
+    def one(corner):
+        row, column = corner
+        values = block(system.nodes(surface, *grid.centres(row + steps, column + steps)))
+        if values is None or not np.isfinite(values).any():
+            return
+        rows, columns = min(BLOCK, grid.rows - row), min(BLOCK, grid.columns - column)
+        values = as_type(values[:, :rows, :columns], dtype)
+        map_.write(values, row, column)
+
+    corners = [(r, c) for r in range(0, grid.rows, BLOCK) for c in range(0, grid.columns, BLOCK)]
+    with written_raster(
+        target, grid.columns, grid.rows, count, dtype, crs=system.text,
+        nodata=np.nan if floating else 0, tiled=True, blockxsize=BLOCK, blockysize=BLOCK,
+        transform=rasterio().transform.Affine(grid.size, 0, grid.x, 0, -grid.size, grid.y),
+    ) as map_:  # fmt: skip
+        if names:
+            map_.describe(names)
+        with ThreadPoolExecutor(2) as workers:
+            for done, _ in enumerate(workers.map(one, corners), 1):
+                if progress:
+                    progress(done, len(corners))

@@ -1,0 +1,143 @@
+"""Rasters through rasterio: terrain models, and what all readers and writers share."""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import Ellipsoid
+from jaxbundle.io.rasters.extent import Extent
+from jaxbundle.pushbroom.terrain import Terrain, make_terrain
+from jaxbundle.system.file_content import check_plain
+
+GEOGRAPHIC = "EPSG:4326"
+
+
+def rasterio():
+    """The package, or an error that names the extra."""
+    try:
+        import rasterio
+        import rasterio.enums
+        import rasterio.errors
+        import rasterio.transform
+    except ImportError:
+        raise InputError("rasters need rasterio: pip install 'jaxbundle[geo]'") from None
+    return rasterio
+
+
+def unreadable(path: str | Path, error: Exception) -> InputError:
+    """What rasterio says about a file, in one line."""
+    return InputError(f"{path}: {' '.join(str(error).split())}")
+
+
+def open_plain(path: str | Path, *arguments, **options):
+    """As `rasterio.open`; an image without georeference is what is expected, and not warned of."""
+    package = rasterio()
+    check_plain(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", package.errors.NotGeoreferencedWarning)
+        return package.open(path, *arguments, **options)
+
+
+def as_type(values: np.ndarray, dtype: np.dtype | str) -> np.ndarray:
+    """Values as they are stored: whole numbers are rounded and kept in range, NaN becomes 0."""
+    if np.issubdtype(dtype, np.floating):
+        return values.astype(dtype)
+    limits = np.iinfo(dtype)
+    return np.clip(np.rint(np.nan_to_num(values)), limits.min, limits.max).astype(dtype)
+
+
+def read_terrain(
+    path: str | Path, earth: Ellipsoid | None, extent: Extent | None = None
+) -> Terrain:
+    """The terrain model of the first band of a raster; its heights are those above `earth`.
+
+    In a projected system it is brought to longitude and latitude first (bilinear, about the same
+    spacing). With `earth` None its own x and y are those of the local frame. Of a model of an Earth
+    only what is inside the `extent` is read.
+
+    **Raises:** `InputError` if it cannot be read, has no georeference, no heights, or none there.
+    """
+    package = rasterio()
+    check_plain(path)
+    from rasterio.vrt import WarpedVRT
+
+    try:
+        with package.open(path) as source:
+            if earth is None or (source.crs is not None and source.crs.is_geographic):
+                return _terrain(source, earth, path, extent)
+            if source.crs is None:
+                raise InputError(
+                    f"{path}: the raster has no coordinate system; give one that has, such as by "
+                    "gdal_translate -a_srs EPSG:4326"
+                )
+            with WarpedVRT(
+                source, crs=_degrees_around(source), dtype="float64", nodata=np.nan,
+                resampling=package.enums.Resampling.bilinear,
+            ) as warped:  # fmt: skip
+                return _terrain(warped, earth, path, extent)
+    except package.errors.RasterioError as error:
+        raise unreadable(path, error) from None
+
+
+def _degrees_around(source):
+    """Longitude and latitude with the seam of longitudes opposite to a raster."""
+    import pyproj
+
+    left, bottom, right, top = source.bounds
+    back = pyproj.Transformer.from_crs(source.crs.to_wkt(), GEOGRAPHIC, always_xy=True)
+    middle, _ = back.transform((left + right) / 2, (bottom + top) / 2)
+    return f"+proj=longlat +datum=WGS84 +lon_wrap={middle:.0f}" if np.isfinite(middle) else (
+        GEOGRAPHIC
+    )
+
+
+def _terrain(source, earth, path, extent):
+    transform = source.transform
+    if transform.b or transform.d:
+        raise InputError(f"{path}: the raster is turned; bring it north up, by gdalwarp")
+    step = transform.a, transform.e
+    first = (0, 0)
+    if earth is None or extent is None:
+        heights = _heights(source, None)
+    else:
+        heights, first = _cut(source, path, extent)
+    unit = 1.0 if earth is None else np.pi / 180
+    x, y = transform.c + (first[1] + 0.5) * step[0], transform.f + (first[0] + 0.5) * step[1]
+    if not np.isfinite(heights).any():
+        there = "" if extent is None else f" where the image looks, {extent}"
+        raise InputError(f"{path}: no height{there}; give a model that covers the image")
+    return make_terrain(heights, (unit * x, unit * y), (unit * step[0], unit * step[1]), earth)
+
+
+def _cut(source, path, extent):
+    """The heights inside the extent and a cell around it, and the row and column of the first."""
+    (dx, dy), (x0, y0) = (source.transform.a, source.transform.e), source.transform[2:6:3]
+    rows, columns = source.shape
+    bounds = source.bounds
+    y = np.sort([(v - y0) / dy for v in (extent.south, extent.north)])
+    top, bottom = max(int(np.floor(y[0])) - 2, 0), min(int(np.ceil(y[1])) + 2, rows)
+    turn = 360 / abs(dx)
+    # the turn that brings the extent nearest to the raster
+    middle = ((extent.west + extent.east) / 2 - x0) / dx
+    shift = turn * np.round((columns / 2 - middle) / turn)
+    x = np.sort([(v - x0) / dx + shift for v in (extent.west, extent.east)])
+    left, right = int(np.floor(x[0])) - 2, int(np.ceil(x[1])) + 2
+    seam = abs(turn - columns) < 1e-3 and (left < 0 or right > columns)
+    if not (seam and right - left < columns):
+        seam, left, right = False, max(left, 0), min(right, columns)
+    if min(right - left, bottom - top) < 2:
+        covered = Extent(bounds.left, min(bounds[1::2]), bounds.right, max(bounds[1::2]))
+        raise InputError(
+            f"{path}: the model has {covered}; the image looks at {extent}: give a model that "
+            "covers the image"
+        )
+    # the last column of a model of the whole Earth is beside its first
+    parts = [(left % columns, columns), (0, right % columns)] if seam else [(left, right)]
+    heights = [_heights(source, ((top, bottom), part)) for part in parts]
+    return np.concatenate(heights, axis=1), (top, left)
+
+
+def _heights(source, window):
+    return source.read(1, window=window, masked=True).astype(float).filled(np.nan)

@@ -1,0 +1,83 @@
+"""Scenes for simulation: a raster with map coordinates, and the image that is taken of it."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import Ellipsoid
+from jaxbundle.io.rasters.maps import MapSystem
+from jaxbundle.io.rasters.reading import as_type, open_plain, rasterio, unreadable
+from jaxbundle.io.rasters.writing import written_raster
+from jaxbundle.pushbroom.image import PushbroomImage
+from jaxbundle.pushbroom.resample import Resampling
+from jaxbundle.pushbroom.simulate import taken_image
+from jaxbundle.pushbroom.surfaces import Surface
+
+PORTION = 64
+"""Lines that are taken together."""
+
+
+class Scene(NamedTuple):
+    """Bands, their type, and `place(X)`, the row and column of points of the ground."""
+
+    bands: Float[np.ndarray, "bands rows columns"]
+    dtype: str
+    place: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+def read_scene(path: str | Path, earth: Ellipsoid | None) -> Scene:
+    """A raster in any coordinate system; for a local frame its own coordinates are X and Y."""
+    package = rasterio()
+    try:
+        with open_plain(path) as source:
+            bands, transform, crs = source.read().astype(float), source.transform, source.crs
+            dtype = source.dtypes[0]
+    except package.errors.RasterioError as error:
+        raise unreadable(path, error) from None
+    if earth is not None and crs is None:
+        raise InputError(f"{path}: the raster has no coordinate system; give one that has")
+    system = MapSystem(earth, None if earth is None else crs.to_wkt())
+    back = ~transform
+    middle = transform.c + transform.a * bands.shape[2] / 2 + transform.b * bands.shape[1] / 2
+
+    def place(X):
+        x, y = system.from_ground(X)
+        x = system.around(x, middle)
+        column = back.a * x + back.b * y + back.c
+        row = back.d * x + back.e * y + back.f
+        return row - 0.5, column - 0.5
+
+    return Scene(bands, dtype, place)
+
+
+def write_taken(
+    path: Path,
+    image: PushbroomImage,
+    surface: Surface,
+    bands: Float[Array, "bands rows columns"],
+    place: Callable,
+    dtype: np.dtype,
+    resampling: Resampling,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Write the image of a scene, some lines at a time; 0 or NaN where the scene does not reach.
+
+    **Raises:** `InputError` if the scene is nowhere in the image.
+    """
+    seen = False
+    with written_raster(path, image.pixels, image.lines, len(bands), dtype) as target:
+        for first in range(0, image.lines, PORTION):
+            lines = np.arange(first, first + PORTION, dtype=float)
+            inside = np.minimum(lines, image.lines - 1)
+            values = taken_image(image, surface, bands, place, inside, resampling)
+            values = values[:, : image.lines - first]
+            seen |= bool(np.isfinite(values).any())
+            target.write(as_type(values, dtype), first)
+            if progress:
+                progress(first + values.shape[1], image.lines)
+        if not seen:
+            raise InputError("the image shows nothing of the scene: look at track and coordinates")

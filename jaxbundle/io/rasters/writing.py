@@ -1,0 +1,120 @@
+"""GeoTIFFs written whole or not at all: on a full disk the file is named, and its disk.
+
+GDAL keeps blocks in memory and writes some of them when the file is closed; an error there is told
+to nobody, and the file stays short. So every block is read again and compared before the file gets
+its name. What libtiff says of its own accord is silenced: the command line ends in one line.
+"""
+
+import os
+import shutil
+import threading
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.rasters.reading import open_plain, rasterio
+from jaxbundle.io.writing.replacing import disk_of, replaced_file
+
+
+class RasterWriter:
+    """A raster that is being written, block by block, from any thread."""
+
+    def __init__(self, raster):
+        self._raster = raster
+        self._lock = threading.Lock()
+        self.sums: dict[tuple, int] = {}
+        """The checksum of every block, by its window."""
+
+    def write(self, values: np.ndarray, top: int = 0, left: int = 0) -> None:
+        """Write values [band, row, column] from a row and a column on."""
+        window = (top, top + values.shape[1]), (left, left + values.shape[2])
+        with self._lock, _silence:
+            self._raster.write(values, window=window)
+        self.sums[window] = _checksum(values)
+
+    def describe(self, names: Sequence[str]) -> None:
+        """Name the bands."""
+        self._raster.descriptions = tuple(names)
+
+
+@contextmanager
+def written_raster(
+    target: str | Path, width: int, height: int, count: int, dtype: np.dtype | str, **profile
+) -> Iterator[RasterWriter]:
+    """A GeoTIFF to write, which gets its name when all of it is on the disk.
+
+    **Arguments:** as of `rasterio.open`.
+
+    **Raises:** `InputError` if it cannot be written, naming it and its disk.
+    """
+    package = rasterio()
+    needed = width * height * count * np.dtype(dtype).itemsize
+    with suppress(OSError):
+        if needed > shutil.disk_usage(Path(os.path.realpath(target)).parent).free:
+            raise _unwritable(target, f"{needed / 1e6:.6g} MB are needed")
+    with replaced_file(target) as temporary:
+        try:
+            with _silence:
+                raster = open_plain(
+                    temporary, "w", driver="GTiff", width=width, height=height, count=count,
+                    dtype=dtype, BIGTIFF="IF_SAFER", **profile,
+                )  # fmt: skip
+            writer = RasterWriter(raster)
+            try:
+                yield writer
+            finally:
+                with _silence:
+                    raster.close()
+            with _silence, open_plain(temporary) as raster:
+                whole = all(
+                    _checksum(raster.read(window=window)) == sum
+                    for window, sum in writer.sums.items()
+                )
+        except package.errors.RasterioError as error:
+            why = error.__cause__ or error
+            raise _unwritable(target, " ".join(str(why).split()).rstrip(".")) from None
+        if not whole:
+            raise _unwritable(target, "what was written is not on the disk")
+
+
+def _unwritable(target: str | Path, why: str) -> InputError:
+    return InputError(f"{target}: cannot be written: {why}{disk_of(target)}")
+
+
+def _checksum(values: np.ndarray) -> int:
+    return zlib.crc32(np.ascontiguousarray(values).data)
+
+
+class _Silence:
+    """Standard error of the process goes nowhere while any thread is in such a block.
+
+    The line of an interrupt is said all the same: `system.interrupts` keeps a way of its own.
+    """
+
+    def __init__(self):
+        self._lock = threading.Lock()
+        self._blocks = 0
+        self._kept: int | None = None
+
+    def __enter__(self) -> None:
+        with self._lock:
+            self._blocks += 1
+            if self._blocks == 1:
+                with suppress(OSError), open(os.devnull, "wb") as nowhere:
+                    self._kept = os.dup(2)
+                    os.dup2(nowhere.fileno(), 2)
+
+    def __exit__(self, *_) -> None:
+        with self._lock:
+            self._blocks -= 1
+            if self._blocks == 0 and self._kept is not None:
+                os.dup2(self._kept, 2)
+                os.close(self._kept)
+                self._kept = None
+
+
+_silence = _Silence()

@@ -1,0 +1,1 @@
+"""What is written of a result: JSON, tables, drawings, the adjusted project."""

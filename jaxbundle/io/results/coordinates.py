@@ -1,0 +1,51 @@
+"""Points and orientations as tables of comma-separated values.
+
+`NAME.csv` has the points, `NAME_images.csv` the exterior orientations, angles in the network's
+unit; the columns are those of a project's tables, without σ where there are none, and of points the
+mean reprojection error, `error_px` or `error_mm`, which is not read again.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.io.text.csv_tables import write_csv
+from jaxbundle.io.writing.replacing import replaced_files
+from jaxbundle.network.build import IMAGE_COLUMNS, POINT_COLUMNS, POINT_SIGMAS
+from jaxbundle.network.reprojection import point_errors
+from jaxbundle.network.tables import Network
+from jaxbundle.network.units import ANGLE_UNITS
+
+
+def images_path(path: Path) -> Path:
+    """Where the orientations are written beside the points."""
+    return path.with_name(f"{path.stem}_images{path.suffix}")
+
+
+def write_coordinates(network: Network, path: str | Path) -> tuple[str, ...]:
+    """Write both tables; a missing value is an empty cell.
+
+    **Returns:** what is lost, in words.
+    """
+    path = Path(path)
+    images, points = network.images, network.points
+    angles = images.angles / ANGLE_UNITS[network.angle_unit]
+    camera = [network.cameras[c].id for c in images.camera]
+    sigma = np.isfinite(points.sigma).any()
+    errors, unit = point_errors(network)
+    numbers = np.concatenate([points.position, *([points.sigma] if sigma else []),
+                              errors[:, None]], 1)  # fmt: skip
+    header = (*POINT_COLUMNS, *(POINT_SIGMAS if sigma else ()), f"error_{unit}")
+    rows = zip(points.id, points.role, numbers.tolist())
+    with replaced_files(images_path(path), path) as (of_images, of_points):
+        write_csv(
+            of_images, IMAGE_COLUMNS,
+            ((id, c, *_cells(row)) for id, c, row in
+             zip(images.id, camera, np.concatenate([images.position, angles], 1).tolist())),
+        )  # fmt: skip
+        write_csv(of_points, header, ((id, role, *_cells(row)) for id, role, row in rows))
+    return ("interior orientations", "image points")
+
+
+def _cells(numbers):
+    return ("" if x != x else "free" if x == np.inf else repr(x) for x in numbers)

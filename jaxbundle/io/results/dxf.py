@@ -1,0 +1,67 @@
+"""Points and cameras as a DXF drawing, by ezdxf (extra `files`).
+
+Layers: POINTS_TIE, POINTS_CONTROL, POINTS_FIXED, POINTS_CHECK with POINT entities and POINT_NAMES
+with their names; CAMERAS with the pyramids as lines and CAMERA_NAMES.
+"""
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.networks.losses import need_values
+from jaxbundle.io.results.pyramids import pyramids
+from jaxbundle.io.text.csv_tables import write_text
+from jaxbundle.network.tables import ROLES, Network
+
+TEXT_SHARE = 0.01
+"""Height of names, of the extent of the drawing."""
+COLOURS = {"tie": 8, "control": 5, "fixed": 4, "check": 3, "camera": 1}
+"""Numbers of AutoCAD's colour index."""
+
+
+def write_dxf(network: Network, path: str | Path) -> tuple[str, ...]:
+    """Write points and cameras; points without coordinates are left out.
+
+    **Returns:** what is lost, in words.
+
+    **Raises:** `InputError` where ezdxf is not installed.
+    """
+    try:
+        import ezdxf
+        import ezdxf.filemanagement
+    except ImportError:
+        raise InputError("DXF needs ezdxf: pip install 'jaxbundle[files]'") from None
+    need_values(network, points=False)
+    drawing = ezdxf.filemanagement.new("R2010")
+    for role in ROLES:
+        drawing.layers.add(f"POINTS_{role.upper()}", color=COLOURS[role])
+    for layer in ("POINT_NAMES", "CAMERAS", "CAMERA_NAMES"):
+        drawing.layers.add(layer, color=COLOURS["camera" if layer[0] == "C" else "tie"])
+    space = drawing.modelspace()
+    points = network.points
+    known = np.isfinite(points.position).all(1)
+    corners, _ = pyramids(network)
+    everything = np.concatenate([points.position[known], corners.reshape(-1, 3)])
+    height = TEXT_SHARE * float(np.ptp(everything, axis=0).max())
+    for row in np.flatnonzero(known):
+        place = tuple(points.position[row].tolist())
+        space.add_point(place, dxfattribs={"layer": f"POINTS_{points.role[row].upper()}"})
+        _name(space, points.id[row], place, height, "POINT_NAMES")
+    for id, pyramid in zip(network.images.id, corners.tolist()):
+        centre, *base = map(tuple, pyramid)
+        for a, b in [*((centre, c) for c in base), *zip(base, [*base[1:], base[0]])]:
+            space.add_line(a, b, dxfattribs={"layer": "CAMERAS"})
+        _name(space, id, centre, height, "CAMERA_NAMES")
+    text = io.StringIO()
+    drawing.write(text)
+    write_text(Path(path), text.getvalue())
+    lost = ("cameras but for their pyramids", "image points")
+    return lost if known.all() else (*lost, f"{(~known).sum()} points without coordinates")
+
+
+def _name(space, name: str, place, height: float, layer: str) -> None:
+    # control characters would break the lines of the file
+    safe = "".join(c if c.isprintable() else "_" for c in name)
+    space.add_text(safe, height=height, dxfattribs={"layer": layer, "insert": place})

@@ -1,0 +1,136 @@
+"""Results as JSON lines: one object a line, each with a `key`, appended as they come.
+
+An interrupted run leaves whole lines and at most one torn one at the end. `JsonLines` takes up
+where it stopped: it knows the keys that are there, and what their lines were made of.
+"""
+
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import nullcontext
+from pathlib import Path
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.results.result_json import without_nan
+from jaxbundle.io.text.csv_tables import write_bytes
+from jaxbundle.system.temporaries import unbroken
+
+HEAD = ("status", "settings", "data")
+"""What is remembered of a line: how it ended, and what it was made of."""
+
+
+class JsonLines:
+    """A file of results, kept whole and never with a key twice; to be used under its lock.
+
+    `heads`: of every key the fields `HEAD` of its line, as far as it has them.
+
+    **Raises:** `InputError` if the file cannot be read or written, or has other content.
+    """
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+        self._regular = regular = self.path.is_file() or not self.path.exists()
+        # A link stays a link; a pipe of a process has no other name.
+        self._file = Path(os.path.realpath(path)) if regular else self.path
+        self.heads: dict[str, dict] = {}
+        end, twice, whole = 0, False, True
+        for number, line in enumerate(self._lines() if regular else (), 1):
+            row, whole = _row(line), line.endswith(b"\n")
+            if row is None:
+                if not whole and _is_torn(line.rstrip(b"\0")):
+                    break
+                raise InputError(
+                    f"{self.path}, line {number}: not a result of jaxbundle batch; "
+                    "give another file to --json-lines"
+                )
+            end += len(line)
+            twice |= row["key"] in self.heads
+            self.heads.setdefault(row["key"], _head(row))
+        self._write(lambda file: None)
+        if regular and not whole:
+            self._mend(end)
+        if twice:
+            self._keep(self.heads)
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.heads
+
+    def append(self, rows: Iterable[dict]) -> None:
+        """Add rows; they are on the disk when this returns."""
+        rows = list(rows)
+        # A name that is no UTF-8 is escaped, as JSON escapes it.
+        text = "".join(_text(row) + "\n" for row in rows).encode(errors="backslashreplace")
+        self._write(lambda file: file.write(text))
+        self.heads.update((row["key"], _head(row)) for row in rows)
+
+    def drop(self, keys: Iterable[str]) -> None:
+        """Remove the lines of some keys."""
+        gone = set(keys)
+        self.heads = {key: head for key, head in self.heads.items() if key not in gone}
+        self._keep(self.heads)
+
+    def _keep(self, keys: Iterable[str]) -> None:
+        """Rewrite the file with the first line of each of these keys alone."""
+        left, kept = set(keys), []
+        for line in self._lines():
+            row = _row(line)
+            if row is not None and row["key"] in left:
+                left.discard(row["key"])
+                kept.append(line)
+        write_bytes(self._file, kept)
+
+    def _lines(self) -> Iterator[bytes]:
+        try:
+            with self._file.open("rb") as file:
+                yield from file
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            raise InputError(f"{self.path}: cannot be read: {error.strerror}") from None
+
+    def _write(self, write: Callable) -> None:
+        try:
+            # A pipe may take its time: nothing waits for it.
+            with unbroken() if self._regular else nullcontext(), self._file.open("ab") as file:
+                write(file)
+                file.flush()
+                if self._regular:
+                    os.fsync(file.fileno())
+        except OSError as error:
+            raise InputError(f"{self.path}: cannot be written: {error.strerror}") from None
+
+    def _mend(self, end: int) -> None:
+        """Cut off a torn line that begins at `end`, or give the last line its line feed."""
+        if end < self._file.stat().st_size:
+            os.truncate(self._file, end)
+        else:
+            self._write(lambda file: file.write(b"\n"))
+
+
+def _text(row: dict) -> str:
+    try:
+        return json.dumps(row, ensure_ascii=False, allow_nan=False)
+    except ValueError:
+        return json.dumps(without_nan(row), ensure_ascii=False)
+
+
+def _is_torn(line: bytes) -> bool:
+    """Whether a line is the beginning of a row, and not the whole of something else."""
+    begin = b'{"key": "'
+    return begin.startswith(line[: len(begin)]) and _parsed(line) is None
+
+
+def _row(line: bytes) -> dict | None:
+    row = _parsed(line)
+    return row if isinstance(row, dict) and isinstance(row.get("key"), str) else None
+
+
+def _parsed(line: bytes):
+    try:
+        return json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+
+
+def _head(row: dict) -> dict:
+    return {name: row[name] for name in HEAD if name in row}

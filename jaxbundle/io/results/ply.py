@@ -1,0 +1,52 @@
+"""Points and cameras as a PLY file: vertices with colours by role, edges of the cameras' pyramids.
+
+Binary, little endian, coordinates in double precision. `error` is the mean reprojection error of a
+point, NaN where it has none (a comment in the header gives its unit).
+
+Source: Turk (1994), The PLY Polygon File Format.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.io.networks.losses import need_values
+from jaxbundle.io.results.pyramids import pyramids
+from jaxbundle.io.text.csv_tables import write_bytes
+from jaxbundle.network.reprojection import point_errors
+from jaxbundle.network.tables import Network
+
+COLOURS = {"tie": (160, 160, 160), "control": (0, 120, 255), "fixed": (0, 60, 160),
+           "check": (0, 180, 80)}  # fmt: skip
+CAMERA = (220, 40, 40)
+VERTEX = np.dtype([("position", "<f8", 3), ("colour", "u1", 3), ("error", "<f4")])
+
+
+def write_ply(network: Network, path: str | Path) -> tuple[str, ...]:
+    """Write points and cameras; points without coordinates are left out.
+
+    **Returns:** what is lost, in words.
+    """
+    need_values(network, points=False)
+    known = np.all(np.isfinite(network.points.position), axis=1)
+    corners, edges = pyramids(network)
+    vertices = np.zeros(known.sum() + 5 * len(corners), VERTEX)
+    first = int(known.sum())
+    vertices["position"][:first] = network.points.position[known]
+    errors, unit = point_errors(network)
+    vertices["error"][:first], vertices["error"][first:] = errors[known], np.nan
+    vertices["position"][first:] = corners.reshape(-1, 3)
+    roles = [COLOURS[role] for role, there in zip(network.points.role, known) if there]
+    vertices["colour"][:first] = np.array(roles).reshape(-1, 3)
+    vertices["colour"][first:] = CAMERA
+    edges = (edges.reshape(-1, 2) + first).astype("<i4")
+    head = ["ply", "format binary_little_endian 1.0",
+            f"comment error: mean reprojection error in {unit}",
+            f"element vertex {len(vertices)}", *(f"property double {axis}" for axis in "xyz"),
+            *(f"property uchar {name}" for name in ("red", "green", "blue")),
+            "property float error",
+            f"element edge {len(edges)}", "property int vertex1", "property int vertex2",
+            "end_header\n"]  # fmt: skip
+    write_bytes(Path(path), "\n".join(head).encode() + vertices.tobytes() + edges.tobytes())
+    lost = ("names", "cameras but for their pyramids", "image points")
+    return lost if known.all() else (*lost, f"{(~known).sum()} points without coordinates")

@@ -1,0 +1,205 @@
+"""The result of an adjustment as JSON (the fields are listed in docs/result.md).
+
+σ are a posteriori, w uses the a priori σ. A number that does not exist (the σ of a camera parameter
+that is held, the MDB of an uncontrolled observation) is null; the σ of a fixed point and of what is
+held of an exterior orientation are 0.
+"""
+
+import json
+import math
+from collections.abc import Iterator
+
+from jaxbundle.cameras import get_model
+from jaxbundle.errors import NotSolvedError
+from jaxbundle.io.text.csv_tables import in_portions, table_rows
+from jaxbundle.network.tables import EXTERIOR
+
+
+def result_dict(adjustment, brief: bool = False) -> dict:
+    """The result as plain dicts and numbers; `brief` leaves points and residuals out."""
+    counts = adjustment.counts
+    head = {
+        "converged": adjustment.converged,
+        "termination": adjustment.termination,
+        "iterations": adjustment.iterations,
+        "method": adjustment.method,
+        "reduction": adjustment.reduction,
+        "observations": counts.observations,
+        "pseudo_observations": counts.pseudo_observations,
+        "unknowns": counts.unknowns,
+        "datum": adjustment.network.datum,
+        "defect": counts.datum,
+        "redundancy": counts.redundancy,
+        "residual_domain": adjustment.network.residuals,
+        "units": {
+            "object": adjustment.network.object_unit,
+            "image": adjustment.network.image_unit,
+            "angle": adjustment.network.angle_unit,
+            "residuals": {
+                camera.id: get_model(camera.model).unit for camera in adjustment.network.cameras
+            },
+        },
+        "warnings": list(adjustment.warnings),
+    }
+    if not adjustment.converged:
+        return head | {"undetermined": list(adjustment.undetermined)}
+    head |= {"sigma0": adjustment.sigma0, "vtpv": adjustment.vtpv, "sigma": "a posteriori"}
+    head |= {"sigma_factors": adjustment.sigma_factors, "robust": adjustment.robust}
+    head |= {"robust_scale": adjustment.robust_scale}
+    head |= {
+        "cameras": {name: _camera(table) for name, table in adjustment.cameras.items()},
+        "images": _images(adjustment),
+        "further_unknowns": adjustment.further_unknowns,
+        "far_points": _far_points(adjustment),
+        "removed": [
+            {"kind": r.kind, "name": r.name, "test": r.test} for r in adjustment.removed
+        ],
+        "suspects": [
+            {"kind": s.kind, "name": s.name, "test": s.test, "weight": s.weight}
+            for s in adjustment.suspects
+        ],
+        "eliminated": [
+            {"camera": name.id, "parameter": name.parameter} for name in adjustment.eliminated
+        ],
+    }
+    head |= {"check_points": _checks(adjustment)}
+    if brief:
+        return head
+    return head | {
+        "variance_components": _components(adjustment),
+        "points": dict(_points(adjustment.points)),
+        "residuals": list(_residuals(adjustment.residuals)),
+    }
+
+
+def unsolved_text(error: NotSolvedError) -> str:
+    """The JSON text of an adjustment that ended before there was an `Adjustment`."""
+    head = {"converged": False, "termination": str(error), "undetermined": [*error.undetermined]}
+    return json.dumps(head, ensure_ascii=False) + "\n"
+
+
+def result_text(adjustment, brief: bool = False) -> Iterator[str]:
+    """The result as JSON text, one line that ends with a line feed, in pieces: that of 2 000 000
+    image points is of 1 GB."""
+    head = result_dict(adjustment, brief=True)
+    if brief or not adjustment.converged:
+        yield _text(head) + "\n"
+        return
+    yield _text(head | {"variance_components": _components(adjustment)})[:-1]
+    yield ', "points": {'
+    yield from _joined(_text(dict(some))[1:-1] for some in in_portions(_points(adjustment.points)))
+    yield '}, "residuals": ['
+    yield from _joined(_text(some)[1:-1] for some in in_portions(_residuals(adjustment.residuals)))
+    yield "]}\n"
+
+
+def _text(value) -> str:
+    return json.dumps(without_nan(value), ensure_ascii=False)
+
+
+def _joined(pieces: Iterator[str]) -> Iterator[str]:
+    for number, piece in enumerate(pieces):
+        yield ", " + piece if number else piece
+
+
+def without_nan(value):
+    """NaN and infinity do not exist in JSON: null."""
+    if isinstance(value, dict):
+        return {key: without_nan(v) for key, v in value.items()}
+    if isinstance(value, list):
+        return [without_nan(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _camera(table: dict) -> dict:
+    free, C = table["free"], table["correlations"]
+    correlations = {
+        a: {b: float(C[i, j]) for j, b in enumerate(free) if j != i} for i, a in enumerate(free)
+    }
+    return {
+        "model": table["model"],
+        "parameters": table["parameters"],
+        "correlations": correlations,
+    }
+
+
+def _estimate(value, sigma) -> dict:
+    return {"value": value, "sigma": sigma}
+
+
+def _images(adjustment) -> dict:
+    columns = {name: column.tolist() for name, column in adjustment.images.items()}
+    return {
+        image: {name: _estimate(columns[name][i], columns[f"s{name}"][i]) for name in EXTERIOR}
+        | {"rays": columns["rays"][i], "rms": columns["rms"][i]}
+        for i, image in enumerate(columns["id"])
+    }
+
+
+def _components(adjustment) -> dict:
+    return {
+        name: {
+            "observations": c.observations,
+            "redundancy": c.redundancy,
+            "vtpv": c.vtpv,
+            "sigma": c.sigma,
+            "factor": c.factor,
+            "estimated": list(c.estimated),
+        }
+        for name, c in adjustment.variance_components.items()
+    }
+
+
+def _points(table) -> Iterator[tuple[str, dict]]:
+    for row in table_rows(table):
+        point = dict(zip(table, row))
+        estimates = {axis: _estimate(point[axis], point[f"s{axis}"]) for axis in "XYZ"}
+        yield point["id"], {"role": point["role"]} | estimates | {
+            "rays": point["rays"], "rms": point["rms"]
+        }  # fmt: skip
+
+
+def _far_points(adjustment) -> dict:
+    found = adjustment.far_points
+    if found is None:
+        return {}
+    columns = {name: column.tolist() for name, column in adjustment.table("far_points").items()}
+    inverse = zip(found.inverse_distance.tolist(), found.sigma_inverse_distance.tolist())
+    return {
+        "origin": dict(zip("XYZ", found.origin.tolist())),
+        "points": {
+            point: {
+                "direction": {axis: columns[f"u{axis}"][i] for axis in "XYZ"},
+                "sigma_direction": columns["su"][i],
+                "inverse_distance": _estimate(*estimate),
+                "at_infinity": columns["at_infinity"][i],
+            }
+            for i, (point, estimate) in enumerate(zip(columns["id"], inverse))
+        },
+    }
+
+
+def _residuals(table) -> Iterator[dict]:
+    for row in table_rows(table):
+        yield dict(zip(table, row))
+
+
+def _checks(adjustment) -> dict:
+    table = {name: column.tolist() for name, column in adjustment.table("checks").items()}
+    if not table:
+        return {}
+    rms = adjustment.check_points.rms.tolist()
+    return {
+        "rms": dict(zip("XYZ", rms)),
+        "points": {
+            point: {
+                axis: _estimate(table[axis][i], table[f"s{axis}"][i])
+                | {"difference": table[f"d{axis}"][i]}
+                for axis in "XYZ"
+            }
+            | {"rays": table["rays"][i]}
+            for i, point in enumerate(table["id"])
+        },
+    }

@@ -1,0 +1,1 @@
+"""Line scanner images: our file, flights, refinements, and the products of agencies."""

@@ -1,0 +1,111 @@
+"""Line scanners of the Community Sensor Model: support data (ISD) as ALE writes them, model states.
+
+What the fields mean is what usgscsm makes of them:
+
+- lines and samples: (0.5, 0.5) is the centre of the first pixel, here (0, 0);
+- `line_scan_rate`: rows of line L₀, start t₀ after the centre time, period p: line l here is taken
+  at t₀ + p·(l + 1 − L₀);
+- position, pointing and rotation of the body: `csm_trajectory`;
+- focal plane and distortion: `csm_optics`;
+- radii in km, or in their `unit`.
+
+Which way along its line the camera looks is told by the planet: it is in front. No correction is
+set, as usgscsm applies none.
+"""
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import Ellipsoid
+from jaxbundle.io.scanner.csm_optics import optics_of
+from jaxbundle.io.scanner.csm_state import MODEL, is_state, support_data_of
+from jaxbundle.io.scanner.csm_trajectory import ORDER, slerp, states_of, trajectory_of, unit_of
+from jaxbundle.io.scanner.scanner import Scanner
+from jaxbundle.io.text.csv_tables import read_text
+from jaxbundle.io.text.json_fields import JsonFields, read_object
+from jaxbundle.network.columns import shown
+from jaxbundle.network.tables import Source
+from jaxbundle.pushbroom.ancillary import check_times
+from jaxbundle.pushbroom.image import check_size, make_image
+from jaxbundle.pushbroom.scanner import LineTimes
+
+
+def read_csm(path: str | Path, interpolation: str = "usgscsm") -> Scanner:
+    """The pushbroom image of an ISD or a model state.
+
+    **Arguments:** `interpolation` of positions and attitudes: `"usgscsm"`, as usgscsm does it, or
+    `"lagrange"`, through eight rows up to the ends of the tables (`csm_trajectory`).
+
+    **Raises:** `InputError` naming file and field: what is missing, of another kind, not a number,
+    a distortion that is not known here; tables that end too long before the image does.
+    """
+    isd, order = _support_data(Path(path))
+    lines, pixels = (isd.number(key) for key in ("image_lines", "image_samples"))
+    check_size(lines, pixels, f"{path}: image_lines, image_samples")
+    lines, pixels = int(lines), int(pixels)
+    times = _line_times(isd, lines)
+    ends = np.array([float(times.time(line)) for line in (0.0, lines - 1.0)])
+    when = np.linspace(ends[0], ends[1], lines) if times.table is None else np.asarray(times.table)
+    states = states_of(isd, when, interpolation)
+    optics, turn = optics_of(isd, pixels, *_middle(states, ends.mean()))
+    image = make_image(
+        trajectory_of(states, turn, interpolation, order), times, optics, lines, pixels,
+        sources=states.sources,
+    )  # fmt: skip
+    name = str(isd.get("name_sensor") or Path(path).stem)
+    return Scanner(name, image, _earth(isd), states.warnings)
+
+
+def _support_data(path):
+    """The fields of an ISD, also of a state, and the degree of its interpolation."""
+    text = read_text(path)
+    name, brace, _ = text.partition("{")
+    name = name.strip()
+    if name and brace and name.replace("_", "").isalnum():
+        if name != MODEL:
+            raise InputError(f"{path}: a model state of {shown(name)}; {MODEL} is expected")
+        text = text[text.index("{") : text.rindex("}") + 1] if "}" in text else brace
+    isd, order = JsonFields(path, read_object(path, text, "an ISD or a model state")), ORDER
+    if name or is_state(isd.document):
+        document, order = support_data_of(isd)
+        return JsonFields(path, document), order
+    model = isd.get("name_model", MODEL)
+    if model != MODEL:
+        raise InputError(f"{path}: name_model is {shown(model)}; {MODEL} is expected")
+    return isd, order
+
+
+def _earth(isd):
+    unit = unit_of(isd, "radii", "km")
+    a, c = (unit * isd.number(f"radii.{key}") for key in ("semimajor", "semiminor"))
+    if not min(a, c) > 0:
+        raise InputError(f"{isd.path}: radii must be positive")
+    return Ellipsoid(a, a, c)
+
+
+def _line_times(isd, lines):
+    rates = isd.array("line_scan_rate", (None, 3))
+    if not len(rates) or (rates[:, 2] <= 0).any():
+        raise InputError(f"{isd.path}: line_scan_rate needs rows of a positive period")
+    first, start, period = rates.T
+    l = np.arange(lines)
+    row = np.clip(np.searchsorted(first, l + 0.5, side="right") - 1, 0, None)
+    t = start[row] + period[row] * (l + 1 - first[row])
+    if (row == row[0]).all():
+        return LineTimes(jnp.asarray(t[0]), jnp.asarray(period[row[0]]))
+    check_times(t, Source(f"{isd.path}, line_scan_rate", None, "line"))
+    return LineTimes(jnp.zeros(()), jnp.zeros(()), jnp.asarray(t))
+
+
+def _middle(states, middle):
+    """At the middle line, in the camera's frame: the direction down, and that of flight."""
+    here, after = (
+        np.array([np.interp(middle + dt, states.t, p) for p in states.P.T]) for dt in (0, 1e-3)
+    )
+    camera = slerp(states.rows, states.R, np.array([middle]))[0].inv()
+    return camera.apply(-here), camera.apply(after - here)
+
+

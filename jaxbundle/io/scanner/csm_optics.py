@@ -1,0 +1,117 @@
+"""The optics of a line scanner of the Community Sensor Model: focal plane and distortion.
+
+`focal2pixel_lines`, `focal2pixel_samples` lead from millimetres to pixels from `detector_center`;
+the camera looks along the line (x, y, f), here along −z, x along the detectors, y forward.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from numpy.polynomial.polynomial import polyval
+from scipy.spatial.transform import Rotation
+
+from jaxbundle.cameras import get_model
+from jaxbundle.errors import InputError
+from jaxbundle.io.scanner.sight_frames import sight_frame
+from jaxbundle.io.text.json_fields import JsonFields
+from jaxbundle.network.columns import shown, some
+from jaxbundle.pushbroom.scanner import AngleTable, FocalLine, Optics
+
+ALIGNED = 1e-9
+KNOWN = ("radial", "transverse", "lrolrocnac", "kplo_shadowcam", "kaguyalism")
+
+
+def optics_of(
+    isd: JsonFields, pixels: int, down: Float[np.ndarray, "3"], forward: Float[np.ndarray, "3"]
+) -> tuple[Optics, Rotation]:
+    """The optics, and the rotation from its camera frame into that of the ISD.
+
+    `down` and `forward` are the directions to the planet and of flight in the camera's frame.
+    """
+    f = isd.number("focal_length_model.focal_length")
+    if f == 0:
+        raise InputError(f"{isd.path}: focal_length_model.focal_length is 0; millimetres, please")
+    x, y = _focal_plane(isd, np.arange(pixels))
+    kind, undistorted = _distortion(isd, x, y)
+    sights = np.stack([x / f, y / f])
+    frame = sight_frame(sights, down, forward)
+    X, Y = f * frame.slopes(*sights)
+    pitch = (X[-1] - X[0]) / (pixels - 1)
+    straight = np.abs(Y - Y[0]).max() < ALIGNED * max(np.abs(X).max(), abs(f))
+    if kind == "radial" and f > 0 and straight:
+        K = -isd.array("optical_distortion.radial.coefficients", (None,))
+        model = get_model("usgs")
+        given = {"c": f, **{f"K{k}": value for k, value in enumerate(K)}}
+        parameters = jnp.asarray([given.get(name, 0.0) for name in model.parameters])
+        pitch, middle, row = (jnp.asarray(v) for v in (pitch, -X[0] / pitch, Y[0]))
+        return FocalLine(parameters, pitch, middle, row, "usgs"), frame.turn
+    psi = np.arctan(frame.slopes(*undistorted) / f)
+    return AngleTable(*map(jnp.asarray, psi)), frame.turn
+
+
+def _focal_plane(isd, u):
+    """Where the pixels are in the focal plane, mm, x and y of the ISD."""
+    to_line, to_sample = (isd.array(f"focal2pixel_{k}", (3,)) for k in ("lines", "samples"))
+    summing = isd.number("detector_sample_summing", 1)
+    sample = (u + 0.5) * summing + isd.number("starting_detector_sample", 0)
+    line = isd.number("starting_detector_line", 0)
+    A = np.stack([to_line[1:], to_sample[1:]])
+    if abs(np.linalg.det(A)) < 1e-12 * np.abs(A).max() ** 2 or not A.any():
+        raise InputError(f"{isd.path}: focal2pixel_lines and focal2pixel_samples are dependent")
+    offset = np.stack([
+        np.full(len(u), line - isd.number("detector_center.line") - to_line[0]),
+        sample - isd.number("detector_center.sample") - to_sample[0],
+    ])  # fmt: skip
+    return np.linalg.solve(A, offset)
+
+
+def _distortion(isd, x, y):
+    """Its kind, and the coordinates free of it, mm."""
+    given = isd.document.setdefault("optical_distortion", {"radial": {"coefficients": [0.0]}})
+    kind = next(iter(given), None) if isinstance(given, dict) else None
+    if isinstance(given, dict) and len(given) > 1:
+        raise InputError(
+            f"{isd.path}: optical_distortion has {len(given)} kinds ({some(given)}); "
+            "one is expected"
+        )
+    where = f"optical_distortion.{kind}"
+    coefficients = lambda n: isd.array(f"{where}.coefficients", (n,))
+    match kind:
+        case "radial":
+            k = np.r_[coefficients(None), 0, 0, 0]
+            if len(k) > 6:
+                raise InputError(f"{isd.path}: {where}: at most 3 coefficients are known")
+            r2 = x * x + y * y
+            part = 1 - (k[0] + r2 * (k[1] + r2 * k[2]))
+            return kind, (x * part, y * part)
+        case "lrolrocnac":
+            return kind, (x, y / (1 + coefficients(1)[0] * y * y))
+        case "kplo_shadowcam":
+            return kind, (x, y * (1 + coefficients(1)[0] * y * y))
+        case "kaguyalism":
+            r = np.sqrt(x * x + y * y)
+            radial = lambda axis: polyval(r, isd.array(f"{where}.{axis}", (None,)))
+            shift = lambda axis: radial(axis) + isd.number(f"{where}.boresight_{axis}")
+            return kind, (x + shift("x"), y + shift("y"))
+        case "transverse":
+            a, b = (isd.array(f"{where}.{axis}", (None,)) for axis in "xy")
+            a, b = (np.r_[c, np.zeros(10)][:10] for c in (a, b))
+            return kind, _transverse(isd, a, b, x, y)
+    raise InputError(
+        f"{isd.path}: optical_distortion {shown(kind)} is not supported; {', '.join(KNOWN[:-1])} "
+        f"or {KNOWN[-1]} is expected"
+    )
+
+
+def _transverse(isd, a, b, x, y):
+    """The place that the cubic polynomials a and b distort to (x, y)."""
+    u, v = x, y
+    for _ in range(100):
+        terms = np.stack([
+            u**0, u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3,
+        ])  # fmt: skip
+        du, dv = x - a @ terms, y - b @ terms
+        u, v = u + du, v + dv
+        if max(np.abs(du).max(), np.abs(dv).max()) < 1e-13 * (1 + np.abs(x).max()):
+            return u, v
+    raise InputError(f"{isd.path}: optical_distortion.transverse cannot be undone; look at it")

@@ -1,0 +1,115 @@
+"""Model states of usgscsm, which its `getModelState` and other programs write.
+
+The name of the model, then a JSON object of fields `m_…` in metres, seconds and millimetres:
+
+    USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL
+    {"m_nLines": …, "m_positions": […], "m_quaternions": […], …}
+
+Positions and quaternions (scalar last, camera → body) are evenly spaced: it has what the older form
+of an ISD has, and is read as one. Estimated adjustments, `m_currentParameterValue`, must be zero.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.text.json_fields import JsonFields
+from jaxbundle.network.columns import shown
+
+MODEL = "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"
+DISTORTIONS = (
+    "radial", "transverse", "kaguyalism", "dawnfc", "lrolrocnac", "cahvor", "lunarorbiter",
+    "radtan", "kplo_shadowcam",
+)  # fmt: skip
+"""By their number, `m_distortionType`."""
+PLATFORM_ORDERS = {0: 3, 1: 7}
+"""Degree of the interpolation by `m_platformFlag`."""
+
+
+def is_state(document: dict[str, Any]) -> bool:
+    """Whether an object is a model state."""
+    return "m_modelName" in document or "m_nLines" in document
+
+
+def support_data_of(state: JsonFields) -> tuple[dict[str, Any], int]:
+    """A state as an ISD of the older form, and the degree of its interpolation.
+
+    **Raises:** `InputError` naming file and field.
+    """
+    _check(state)
+    number, array = state.number, state.array
+    names = "m_intTimeLines", "m_intTimeStartTimes", "m_intTimes"
+    rates = [array(name, (None,)) for name in names]
+    if len({len(r) for r in rates}) > 1:
+        raise InputError(
+            f"{state.path}: {', '.join(names)} have {', '.join(str(len(r)) for r in rates)} "
+            "numbers; as many of each are expected"
+        )
+    flag = number("m_platformFlag", 1)
+    if flag not in PLATFORM_ORDERS:
+        raise InputError(f"{state.path}: m_platformFlag is {flag:g}; 0 or 1 is expected")
+    isd = {
+        "name_sensor": state.get("m_sensorName") or "", "name_model": MODEL,
+        "image_lines": number("m_nLines"), "image_samples": number("m_nSamples"),
+        "line_scan_rate": np.stack(rates, 1).tolist(),
+        "sensor_position": {"positions": _rows(state, "m_positions", 3), "unit": "m"},
+        "t0_ephemeris": number("m_t0Ephem"), "dt_ephemeris": number("m_dtEphem"),
+        "sensor_orientation": {"quaternions": _rows(state, "m_quaternions", 4)},
+        "t0_quaternion": number("m_t0Quat"), "dt_quaternion": number("m_dtQuat"),
+        # the camera looks along (z·x, z·y, f), which for z = −1 is (x, y, −f) turned round
+        "focal_length_model": {
+            "focal_length": number("m_focalLength") * np.sign(number("m_zDirection", 1))
+        },
+        "focal2pixel_lines": array("m_iTransL", (3,)).tolist(),
+        "focal2pixel_samples": array("m_iTransS", (3,)).tolist(),
+        "detector_center": {
+            "line": number("m_detectorLineOrigin"), "sample": number("m_detectorSampleOrigin"),
+        },
+        "detector_sample_summing": number("m_detectorSampleSumming", 1),
+        "starting_detector_line": number("m_startingDetectorLine", 0),
+        "starting_detector_sample": number("m_startingDetectorSample", 0),
+        "optical_distortion": _distortion(state),
+        "radii": {"semimajor": number("m_majorAxis"), "semiminor": number("m_minorAxis"),
+                  "unit": "m"},
+    }  # fmt: skip
+    return isd, PLATFORM_ORDERS[int(flag)]
+
+
+def _check(state):
+    name = state.get("m_modelName", MODEL)
+    if name != MODEL:
+        raise InputError(f"{state.path}: m_modelName is {shown(name)}; {MODEL} is expected")
+    adjusted = state.array("m_currentParameterValue", (None,), [])
+    if adjusted.any():
+        raise InputError(
+            f"{state.path}: m_currentParameterValue has {np.count_nonzero(adjusted)} adjusted "
+            "parameters, which are not applied here; write them into positions and quaternions"
+        )
+
+
+def _rows(state, key, n):
+    values = state.array(key, (None,))
+    if not len(values) or len(values) % n:
+        raise InputError(f"{state.path}: {key} has {len(values)} numbers; {n} a row are expected")
+    return values.reshape(-1, n).tolist()
+
+
+def _distortion(state):
+    kind = state.number("m_distortionType")
+    if kind not in range(len(DISTORTIONS)):
+        raise InputError(
+            f"{state.path}: m_distortionType {kind:g} is not known; 0 to {len(DISTORTIONS) - 1}"
+        )
+    name = DISTORTIONS[int(kind)]
+    c = state.array("m_opticalDistCoeffs", (None,)).tolist()
+    match name:
+        case "transverse":
+            return {name: {"x": c[: len(c) // 2], "y": c[len(c) // 2 :]}}
+        case "kaguyalism":
+            if len(c) != 10:
+                raise InputError(
+                    f"{state.path}: m_opticalDistCoeffs has {len(c)} numbers; 10 of kaguyalism"
+                )
+            return {name: {"boresight_x": c[0], "x": c[1:5], "boresight_y": c[5], "y": c[6:]}}
+    return {name: {"coefficients": c}}

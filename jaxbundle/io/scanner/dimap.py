@@ -1,0 +1,107 @@
+"""DIMAP metadata of SPOT 5 scenes (level 1A): ephemeris, corrected attitudes, look angles.
+
+By the SPOT 123-4-5 Geometry Handbook (GAEL-P135-DOC-001), with angles in radians:
+
+    u = M·[−tan ψ_Y, tan ψ_X, −1]                                                      (5a)
+    M = Mp·Mr·My,   Rx(−pitch)·Ry(−roll)·Rz(yaw) in the notation used here             (11)
+    X = P + s·[X₂ Y₂ Z₂]·u,    Z₂ = P/|P|,  X₂ = V × Z₂/|…|,  Y₂ = Z₂ × X₂             (7)
+    t = t_centre + period·(line − line_centre)
+
+Its camera frame and its orbital frame are ours; its pitch and roll have the other sign. Lines count
+from 1 there, from 0 here. Positions and velocities by Lagrange's polynomial through eight rows; the
+attitudes, turned into Earth-fixed quaternions at their own times, by slerp. Where they end a little
+before the image does (`ancillary.extrapolation_limit`), the angles go on linearly.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import WGS84
+from jaxbundle.io.scanner.scanner import Scanner
+from jaxbundle.io.text.xml_fields import XmlFields
+from jaxbundle.network.tables import Source
+from jaxbundle.pushbroom.ancillary import (
+    attitude_table,
+    check_covered,
+    check_times,
+    position_table,
+    told_extrapolation,
+)
+from jaxbundle.pushbroom.image import check_size, make_image
+from jaxbundle.pushbroom.interpolation import interpolate
+from jaxbundle.pushbroom.scanner import AngleTable, LineTimes
+from jaxbundle.pushbroom.trajectory import Trajectory, orbital_frame
+
+ORDER = 7
+
+
+def read_dimap(file: XmlFields) -> Scanner:
+    """The pushbroom image of a SPOT 5 scene, `METADATA.DIM`.
+
+    **Raises:** `InputError` naming file, element and its number: what is missing, no number, no
+    time, not as many look angles as pixels, times that do not increase.
+    """
+    path = file.path
+    lines, pixels = (file.number(f"Raster_Dimensions/{n}") for n in ("NROWS", "NCOLS"))
+    check_size(lines, pixels, f"{path}: Raster_Dimensions")
+    lines, pixels = int(lines), int(pixels)
+    setting = "Sensor_Configuration//"
+    period = file.number(f"{setting}LINE_PERIOD")
+    centre = file.number(f"{setting}SCENE_CENTER_LINE") - 1
+    epoch = file.time(f"{setting}SCENE_CENTER_TIME")
+    if period <= 0:
+        raise InputError(f"{path}: LINE_PERIOD is {period:g} s; a positive number is expected")
+    times = LineTimes(jnp.asarray(-period * centre), jnp.asarray(period))
+
+    key = "Ephemeris/Points/Point"
+    t = file.times(key, epoch)
+    orbit = file.columns(key, [f"{a}/{b}" for a in ("Location", "Velocity") for b in "XYZ"])
+    source = points = Source(f"{path}, Ephemeris", None, "point")
+    options = {"method": "lagrange", "order": min(ORDER, len(t) - 1), "gap": np.inf}
+    both = position_table(t, orbit, **options, source=source)
+    position = position_table(t, orbit[:, :3], **options, source=source)
+
+    key = "Corrected_Attitudes/Corrected_Attitude/Angles"
+    rows, angles = file.times(key, epoch), file.columns(key, ["PITCH", "ROLL", "YAW"])
+    source = Source(f"{path}, Corrected_Attitude", None, "row")
+    check_times(rows, source)
+    when = np.asarray(times.time(jnp.arange(lines, dtype=float)))
+    warnings = told_extrapolation(rows, when, source)
+    rows, angles = _continued(rows, angles, when[0], when[-1])
+    check_covered(position, rows, points, "attitude row")
+    state = np.asarray(jax.vmap(lambda at: interpolate(both, at))(rows))
+    frame = np.asarray(jax.vmap(orbital_frame)(state[:, :3], state[:, 3:]))
+    turn = Rotation.from_matrix(frame) * Rotation.from_euler("XYZ", angles * [-1, -1, 1])
+    attitude = attitude_table(rows, np.roll(turn.as_quat(), 1, axis=1), source=source)
+
+    psi = file.columns(
+        "Instrument_Look_Angles_List/Instrument_Look_Angles/Look_Angles_List/Look_Angles",
+        ["PSI_X", "PSI_Y"],
+    )  # fmt: skip
+    if len(psi) != pixels:
+        raise InputError(f"{path}: {len(psi)} Look_Angles for {pixels} columns; one a column")
+    optics = AngleTable(jnp.asarray(-psi[:, 1]), jnp.asarray(psi[:, 0]))
+    image = make_image(
+        Trajectory(position, attitude), times, optics, lines, pixels, sources=(points, source)
+    )
+    name = file.text("Dataset_Id/DATASET_NAME", path.stem)
+    return Scanner(name, image, WGS84, warnings)
+
+
+def _continued(t, angles, first, last):
+    """The rows with more before and after them where these are needed, on straight lines."""
+    if len(t) < 2:
+        return t, angles
+    end = (t[-1], t[-1] - t[-2], angles[-1], angles[-1] - angles[-2], last)
+    start = (t[0], t[0] - t[1], angles[0], angles[0] - angles[1], first)
+    for k, (at, step, value, change, reached) in enumerate((end, start)):
+        steps = 1 + np.arange(max(np.ceil((reached - at) / step), 0))
+        more = at + steps * step, value + steps[:, None] * change
+        if k:
+            t, angles = np.r_[more[0][::-1], t], np.vstack([more[1][::-1], angles])
+        else:
+            t, angles = np.r_[t, more[0]], np.vstack([angles, more[1]])
+    return t, angles

@@ -1,0 +1,157 @@
+"""The flight file: what `jaxbundle pushbroom simulate` simulates.
+
+```toml
+[scanner]                           # as in a scanner file
+lines = 10000
+pixels = 8000
+earth = "WGS84"
+angle_unit = "deg"
+
+[times]
+period = 0.00066
+
+[optics]                            # as in a scanner file, [mounting] too
+c = 700.0
+pitch = 0.0065
+
+[track]                             # height, inclination, node, argument; or state; or start and
+                                    # velocity
+height = 505000.0
+inclination = 97.4
+
+[angles]                            # pitch, roll, yaw: a number, a signal, or a list of them
+roll = { kind = "sine", amplitude = 1.0, period = 135.0 }
+
+[instruments]                       # Hz; how their samples are interpolated
+position_rate = 2.0
+attitude_rate = 4.0
+attitude_interpolation = "spline"
+
+[noise]                             # σ: attitude_… in the unit of angles, position_… in metres
+attitude_white = 0.01               # …_bias, …_drift (a second), …_white (every row)
+
+[simulation]
+seed = 1
+```
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import Ellipsoid
+from jaxbundle.io.scanner.scanner_file import ANGLES, earth_of, mounting_of, optics_of
+from jaxbundle.io.text.sections import Section, TomlFile, read_sections
+from jaxbundle.network.columns import did_you_mean
+from jaxbundle.pushbroom.noise import Noise
+from jaxbundle.pushbroom.signals import KEYS
+from jaxbundle.pushbroom.simulate import Flight
+
+ORBIT = ("height", "inclination", "node", "argument")
+LINE = ("start", "velocity")
+STATE = ("state", "at", "j2")
+RATES = ("position_rate", "attitude_rate")
+METHODS = ("position_interpolation", "attitude_interpolation")
+SECTIONS = {
+    "scanner": ("name", "lines", "pixels", "earth", "angle_unit"),
+    "times": ("period",),
+    "optics": (),
+    "mounting": ANGLES,
+    "track": (*ORBIT, *LINE, *STATE),
+    "angles": ANGLES,
+    "instruments": (*RATES, *METHODS),
+    "noise": Noise._fields,
+    "simulation": ("seed",),
+}
+NEEDED = ("scanner", "times", "optics", "track")
+
+
+class FlightFile(NamedTuple):
+    """A flight file, what it means, and the ellipsoid of its Earth."""
+
+    file: TomlFile
+    flight: Flight
+    earth: Ellipsoid | None
+
+
+def read_flight(path: str | Path) -> FlightFile:
+    """The flight of a file.
+
+    **Raises:** `InputError` naming file, section and key.
+    """
+    file = read_sections(Path(path), SECTIONS, NEEDED)
+    scanner, times = file.section("scanner"), file.section("times")
+    earth = earth_of(scanner)
+    period = times.number("period")
+    if period <= 0:
+        raise InputError(f"{times.where}period is {period}; a positive number is expected")
+    pixels = scanner.whole("pixels")
+    instruments = file.section("instruments")
+    options: dict[str, Any] = {k: instruments.number(k) for k in RATES if k in instruments}
+    for name, rate in options.items():
+        if rate <= 0:
+            raise InputError(f"{instruments.where}{name} is {rate}; a positive number, in Hz")
+    options |= {k: instruments.text(k) for k in METHODS if k in instruments}
+    flight = Flight(
+        scanner.whole("lines"), pixels, period, optics_of(file, pixels), _track(file, earth),
+        {k: _signal(v, file.radians, f"{path}, [angles], {k}: ")
+         for k, v in file.section("angles").values.items()},
+        mounting_of(file), noise=_noise(file),
+        seed=int(file.section("simulation").number("seed", 0)), **options,
+    )  # fmt: skip
+    return FlightFile(file, flight, earth)
+
+
+def _track(file: TomlFile, earth: Ellipsoid | None) -> dict[str, Any]:
+    track = file.section("track")
+    if earth is None:
+        track.check_keys(LINE)
+        return {k: track.numbers(k, 3) for k in LINE}
+    if "state" in track:
+        track.check_keys(STATE)
+        j2 = track.switch("j2") or "j2" not in track
+        return {"state": track.numbers("state", 6), "at": track.number("at", 0.0), "j2": j2}
+    track.check_keys(ORBIT)
+    angles = {k: file.radians * track.number(k, 0.0) for k in ORBIT[1:]}
+    return {"height": track.number("height"), **angles}
+
+
+def _noise(file: TomlFile) -> Noise:
+    section = file.section("noise")
+    return Noise(*(_sigma(section, name, file.radians) for name in Noise._fields))
+
+
+def _sigma(section: Section, name: str, radians: float):
+    unit = radians if name.startswith("attitude") else 1.0
+    if isinstance(section.values.get(name), list):
+        sigma = section.numbers(name, 3)
+    else:
+        sigma = section.number(name, 0.0)
+    if np.any(np.asarray(sigma) < 0):
+        raise InputError(f"{section.where}{name} is negative; a standard deviation is expected")
+    return unit * sigma
+
+
+def _signal(value: Any, unit: float, where: str):
+    """A signal with its angles in radians."""
+    if isinstance(value, list):
+        return [_signal(part, unit, where) for part in value]
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return unit * value
+    if not isinstance(value, Mapping):
+        raise InputError(f"{where}a number or a table such as {{ kind = \"sine\", … }} is expected")
+    kind = value.get("kind", "constant")
+    if kind not in KEYS:
+        raise InputError(f"{where}unknown signal {kind!r}{did_you_mean(str(kind), KEYS)}")
+    section = Section(None, where, dict(value))
+    section.check_keys(("kind", *KEYS[kind]))
+    scaled: dict[str, Any] = {"kind": kind}
+    for key in value:
+        if key in ("times", "values"):
+            scaled[key] = (unit if key == "values" else 1.0) * section.numbers(key)
+        elif key != "kind":
+            scaled[key] = (1.0 if key in ("period", "step") else unit) * section.number(key)
+    return scaled

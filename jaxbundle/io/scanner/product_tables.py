@@ -1,0 +1,65 @@
+"""Positions and attitudes of products made into tables that reach over the whole image."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from jaxbundle.io.scanner.csm_trajectory import slerp
+from jaxbundle.network.tables import Source
+from jaxbundle.pushbroom.ancillary import (
+    attitude_table,
+    extrapolation_limit,
+    position_table,
+    told_extrapolation,
+)
+from jaxbundle.pushbroom.trajectory import Trajectory
+
+ORDER = 7
+
+
+class Tables(NamedTuple):
+    """Positions (metres, Earth-fixed) at t, rotations camera → Earth at rows, seconds; sources."""
+
+    t: Float[np.ndarray, " n"]
+    P: Float[np.ndarray, "n 3"]
+    rows: Float[np.ndarray, " m"]
+    R: Rotation
+    positions: Source
+    attitude: Source
+
+    def directions(self, at: float) -> tuple[np.ndarray, np.ndarray]:
+        """The directions down and of flight in the frame of the camera, about."""
+        here, after = (np.array([np.interp(at + dt, self.t, p) for p in self.P.T])
+                       for dt in (0, 1e-3))  # fmt: skip
+        camera = slerp(self.rows, self.R, np.array([at]))[0].inv()
+        return camera.apply(-here), camera.apply(after - here)
+
+
+def trajectory_of(
+    tables: Tables, turn: Rotation, lines: Float[np.ndarray, " lines"]
+) -> tuple[Trajectory, tuple[str, ...]]:
+    """The trajectory, the camera turned by `turn`, and warnings.
+
+    Lagrange's polynomial through eight rows; a table that ends a little before the lines do is
+    extrapolated on a straight line (`usgscsm` of `pushbroom.interpolation`).
+
+    **Raises:** `InputError` naming the line that is too far outside.
+    """
+    warnings: list[str] = []
+
+    def options(rows, source):
+        told = told_extrapolation(rows, lines, source)
+        warnings.extend(told)
+        return {
+            "method": "usgscsm" if told else "lagrange", "order": min(ORDER, len(rows) - 1),
+            "gap": np.inf, "extrapolate": extrapolation_limit(rows), "source": source,
+        }  # fmt: skip
+
+    q = np.roll((tables.R * turn).as_quat(), 1, axis=1)
+    trajectory = Trajectory(
+        position_table(tables.t, tables.P, **options(tables.t, tables.positions)),
+        attitude_table(tables.rows, q, **options(tables.rows, tables.attitude)),
+    )
+    return trajectory, tuple(warnings)

@@ -1,0 +1,79 @@
+"""DigitalGlobe's support data as text (PVL): NAME.IMD with NAME.EPH, NAME.ATT, NAME.GEO beside it.
+
+    numRows = 600;
+    BEGIN_GROUP = IMAGE_1
+        TLCList = ( (0, 0.0), (600, 4.0) );
+    END_GROUP = IMAGE_1
+
+They have the names of the XML files in other letters, numbered groups, and lists in brackets; read
+as the tree of elements that the XML file is.
+"""
+
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.text.csv_tables import read_text
+
+GROUPS = ("IMD", "EPH", "ATT", "GEO")
+STATEMENT = re.compile(r"\s*([^=;]+?)\s*=\s*")
+ROW = re.compile(r"\(([^()]*)\)")
+
+
+def read_support_data(path: Path) -> ET.Element:
+    """The tree of an IMD file and those beside it.
+
+    **Raises:** `InputError` if one is missing, or is no PVL, naming file and line.
+    """
+    root = ET.Element("isd")
+    beside = {p.suffix.upper(): p for p in path.parent.glob("*") if p.stem == path.stem}
+    for name in GROUPS:
+        file = beside.get(f".{name}")
+        if file is None:
+            raise InputError(
+                f"{path}: {path.stem}.{name} is not beside it; {', '.join(GROUPS)} belong together"
+            )
+        _read(file, ET.SubElement(root, name))
+    return root
+
+
+def _read(path, root):
+    text, at, groups = read_text(path, fallback="latin-1"), 0, [root]
+    wrong = lambda what: InputError(f"{path}, line {text[:at].count(chr(10)) + 1}: {what}")
+    while (rest := text[at:].strip()) and not rest.upper().startswith("END;"):
+        at = len(text) - len(text[at:].lstrip())
+        match = STATEMENT.match(text, at)
+        if match is None:
+            raise wrong("NAME = value; is expected")
+        name = match[1].upper()
+        if name in ("BEGIN_GROUP", "END_GROUP"):
+            line = text.find("\n", match.end())
+            line = len(text) if line < 0 else line
+            tag = re.sub(r"_\d+$", "", text[match.end() : line].strip(" \t\r;").upper())
+            if name == "BEGIN_GROUP":
+                if not re.fullmatch(r"\w+", tag):
+                    raise wrong("the name of a group is expected")
+                groups.append(ET.SubElement(groups[-1], tag))
+            elif len(groups) == 1 or groups.pop().tag != tag:
+                raise wrong(f"the group {tag} ends, but has not begun")
+            at = line
+            continue
+        end = text.find(";", match.end())
+        if end < 0 or not re.fullmatch(r"\w+", name):
+            raise wrong("NAME = value; is expected")
+        _put(groups[-1], name, text[match.end() : end].strip())
+        at = end + 1
+    if len(groups) > 1:
+        raise InputError(f"{path}: the group {groups[-1].tag} does not end")
+
+
+def _put(group, name, value):
+    """A value; a list as NAMEList with NAME for each row."""
+    if not value.startswith("("):
+        ET.SubElement(group, name).text = value.strip('"')
+        return
+    rows = ET.SubElement(group, f"{name}List")
+    inner = value[1 : value.rfind(")")]
+    for row in ROW.findall(inner) if "(" in inner else [inner]:
+        ET.SubElement(rows, name).text = row.strip()

@@ -1,0 +1,86 @@
+"""Any scanner image: our own file, or a product, which its suffix and the root of its XML tell."""
+
+import dataclasses
+from pathlib import Path
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.scanner.csm import read_csm
+from jaxbundle.io.scanner.dimap import read_dimap
+from jaxbundle.io.scanner.dimap2 import MODEL, read_dimap2
+from jaxbundle.io.scanner.pvl import read_support_data
+from jaxbundle.io.scanner.scanner import Scanner
+from jaxbundle.io.scanner.scanner_file import NEEDED, SECTIONS, scanner_of
+from jaxbundle.io.scanner.worldview import read_worldview
+from jaxbundle.io.text.sections import Section, TomlFile, read_sections
+from jaxbundle.io.text.xml_fields import XmlFields, read_xml
+
+PRODUCTS = (".json", ".dim", ".xml", ".imd")
+"""Suffixes of products."""
+WORLDVIEW = "support data of DigitalGlobe with IMD, EPH, ATT, GEO"
+
+
+def read_scanner(path: str | Path) -> Scanner:
+    """The pushbroom image of a scanner file, `.toml`, or of a product.
+
+    **Raises:** `InputError` naming file, section and key, or table and line; for what no reader
+    knows.
+    """
+    path = Path(path)
+    if path.suffix.lower() in PRODUCTS:
+        return _read_product(path)
+    file = read_sections(path, SECTIONS, NEEDED[:1])
+    scanner = file.section("scanner")
+    return _of_product(file, scanner) if "source" in scanner else scanner_of(file)
+
+
+def _of_product(file: TomlFile, scanner: Section) -> Scanner:
+    """The image of the source, with the name, interpolation and corrections of the file."""
+    scanner.check_keys(("source", "name", "interpolation"))
+    for name in file.document:
+        if name not in ("scanner", "corrections"):
+            raise InputError(
+                f"{file.path}, [{name}]: this is read from the source; only [scanner] and "
+                "[corrections] can stand beside it"
+            )
+    choice = scanner.text("interpolation") if "interpolation" in scanner else None
+    found = _read_product(file.path.parent / scanner.text("source"), choice)
+    switches = file.section("corrections")
+    corrections = {name: switches.switch(name) for name in switches.values}
+    corrections = found.image.corrections._replace(**corrections)
+    return dataclasses.replace(
+        found, name=scanner.text("name", found.name),
+        image=dataclasses.replace(found.image, corrections=corrections),
+    )  # fmt: skip
+
+
+def _read_product(path: Path, interpolation: str | None = None) -> Scanner:
+    """The image of a product; `interpolation` is a choice of CSM files only."""
+    suffix = path.suffix.lower()
+    if suffix not in PRODUCTS:
+        raise InputError(f"{path}: the suffix of a scanner file is .toml or {', '.join(PRODUCTS)}")
+    if suffix == ".json":
+        return read_csm(path) if interpolation is None else read_csm(path, interpolation)
+    if interpolation is not None:
+        raise InputError(f"{path}: interpolation can be chosen for CSM files only; leave it away")
+    if suffix == ".imd":
+        return read_worldview(XmlFields(path, read_support_data(path), WORLDVIEW))
+    return _read_xml(path)
+
+
+def _read_xml(path):
+    root = read_xml(path)
+    has = lambda key: root.find(f".//{key}") is not None
+    if root.tag == "Dimap_Document":
+        if has(MODEL):
+            return read_dimap2(XmlFields(path, root, "DIMAP 2 of sensor level"))
+        if has("Rational_Function_Model"):
+            raise InputError(
+                f"{path}: DIMAP of RPC alone; give it to `pushbroom rpc`, or the DIM_….XML here"
+            )
+        return read_dimap(XmlFields(path, root, "DIMAP of SPOT 5"))
+    if has("GEO") and has("EPH") and has("ATT"):
+        return read_worldview(XmlFields(path, root, WORLDVIEW))
+    raise InputError(
+        f"{path}: XML of another kind, <{root.tag[:60]}>; DIMAP of SPOT 5, Pléiades, SPOT 6 or 7, "
+        "or DigitalGlobe's with the groups GEO, EPH, ATT is expected"
+    )

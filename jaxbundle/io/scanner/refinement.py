@@ -1,0 +1,225 @@
+"""The refine file: scanner images, ground points, measurements and unknowns of a refinement.
+
+```toml
+[refine]
+points = "points.csv"               # id,role,X,Y,Z[,sX,sY,sZ], or
+                                    # id,role,longitude,latitude,height[,sE,sN,sh]
+observations = "observations.csv"   # image,point,line,pixel[,sline,spixel]
+frames = "photographs"              # a project of photographs that share points
+sigma = 0.5                         # of line and pixel, where the table has none
+angle_unit = "deg"                  # rad | deg | gon, of this file and of longitude, latitude
+snooping = "pope"                   # none | baarda | pope
+significance = 0.001
+
+[images]                            # scanner files, by the image's id
+A = "a/scanner.toml"
+B = "b/scanner.toml"
+
+[sensors]                           # images of one sensor share focal length, mounting, look angles
+A = "imager"
+B = "imager"
+
+[unknowns]                          # "free", "held", a prior σ, or a list of three of these
+attitude = "free"                   # bias of pitch, roll, yaw
+attitude_rate = 0.001               # drift, a second
+jitter = [0.002, 0.002, "held"]     # σ of the coefficients of the spline
+knot_spacing = 0.25                 # seconds
+position = [10.0, 10.0, 10.0]       # across, along the track, up; metres
+position_rate = "held"              # metres a second
+focal_length = 1e-4                 # relative
+mounting = "held"
+look_across = [0, 1e-6]             # σ of the coefficients of 1, û, û², … (tangents)
+look_along = []
+
+[unknowns.B]                        # of one image, in place of the above
+attitude_rate = "held"
+```
+"""
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed
+from jaxbundle.io.formats import read_network
+from jaxbundle.io.scanner.read import read_scanner
+from jaxbundle.io.text.csv_tables import read_csv
+from jaxbundle.io.text.sections import Section, read_sections
+from jaxbundle.network.columns import Columns, did_you_mean, shown
+from jaxbundle.network.tables import Network, Observations
+from jaxbundle.network.units import ANGLE_UNITS
+from jaxbundle.refinement.freedom import Freedom
+from jaxbundle.refinement.refining import TESTS, east_north_up
+from jaxbundle.refinement.tables import GroundPoints, ScannerImage, check_points_table
+
+SECTIONS = {
+    "refine": (
+        "points", "observations", "frames", "sigma", "angle_unit", "snooping", "significance",
+    ),
+    "images": (), "sensors": (), "unknowns": (),
+}  # fmt: skip
+NEEDED = ("refine", "images", "unknowns")
+WORDS = {"free": math.inf, "held": 0.0}
+TURNING = ("attitude", "attitude_rate", "jitter", "mounting")
+LISTS = ("look_across", "look_along")
+
+
+class RefineFile(NamedTuple):
+    """The arguments of `jaxbundle.refinement.refine`."""
+
+    images: list[ScannerImage]
+    points: GroundPoints
+    observations: Observations
+    frames: Network | None
+    snooping: str
+    significance: float
+    warnings: tuple[str, ...] = ()
+
+
+def read_refinement(path: str | Path) -> RefineFile:
+    """The refinement of a file.
+
+    **Raises:** `InputError` naming file, section and key, or table and line.
+    """
+    path = Path(path)
+    file = read_sections(path, SECTIONS, NEEDED)
+    section = file.section("refine")
+    unit = section.text("angle_unit", "deg")
+    if unit not in ANGLE_UNITS:
+        raise InputError(f"{section.where}angle_unit {unit!r}{did_you_mean(unit, ANGLE_UNITS)}")
+    radians = ANGLE_UNITS[unit]
+    scanners = file.section("images")
+    if not scanners.values:
+        raise InputError(f"{path}, [images]: no image; give id = \"scanner.toml\"")
+    sensors, unknowns = file.section("sensors"), file.section("unknowns")
+    sensors.check_keys(tuple(scanners.values))
+    own = {k: v for k, v in unknowns.values.items() if isinstance(v, dict)}
+    common = {k: v for k, v in unknowns.values.items() if k not in own}
+    for id in own:
+        if id not in scanners.values:
+            raise InputError(
+                f"{path}, [unknowns.{id}]: no such image{did_you_mean(id, scanners.values)}"
+            )
+    images, warnings = [], []
+    for id in scanners.values:
+        scanner = read_scanner(path.parent / scanners.text(id))
+        warnings += scanner.warnings
+        where = f"{path}, [unknowns{'.' + id if id in own else ''}]: "
+        freedom = _freedom(Section(file, where, common | own.get(id, {})), radians)
+        images.append(ScannerImage(id, scanner.image, scanner.earth, freedom, sensors.text(id, id)))
+    earth = images[0].earth
+    for one in images:
+        if one.earth != earth:
+            raise InputError(
+                f"{path}, [images]: {images[0].id!r} and {one.id!r} have different ellipsoids or "
+                "frames; points can be in one only"
+            )
+    frames = None
+    if "frames" in section:
+        frames = read_network(path.parent / section.text("frames"))
+    points = _points(read_csv(path.parent / section.text("points")), earth, radians)
+    # told first: the ids of observations are looked up in it
+    check_points_table(points)
+    ids = {id: k for k, id in enumerate(points.id)}
+    if frames is not None:
+        ids |= {id: k for k, id in enumerate(
+            (id for id in frames.points.id if id not in ids), len(ids)
+        )}  # fmt: skip
+    observations = _observations(
+        read_csv(path.parent / section.text("observations")), ids, [one.id for one in images],
+        section, str(path),
+    )  # fmt: skip
+    snooping = section.text("snooping", "none")
+    if snooping not in TESTS:
+        raise InputError(f"{section.where}snooping {snooping!r}{did_you_mean(snooping, TESTS)}")
+    significance = section.number("significance", 0.001)
+    if not 0 < significance < 1:
+        raise InputError(f"{section.where}significance is {significance}; between 0 and 1, please")
+    return RefineFile(
+        images, points, observations, frames, snooping, significance, tuple(warnings)
+    )
+
+
+def _freedom(section: Section, radians: float) -> Freedom:
+    fields = {f.name for f in dataclasses.fields(Freedom)}
+    section.check_keys(tuple(sorted(fields)))
+    found: dict[str, Any] = {}
+    for key, value in section.values.items():
+        factor = radians if key in TURNING else 1.0
+        if key == "knot_spacing":
+            found[key] = section.number(key)
+            if found[key] <= 0:
+                raise InputError(f"{section.where}{key} must be positive, in seconds")
+        elif key == "focal_length":
+            found[key] = _sigma(section, key, value)
+        elif key in LISTS:
+            values = value if isinstance(value, list) else [value]
+            found[key] = tuple(_sigma(section, key, v) for v in values)
+        else:
+            values = value if isinstance(value, list) else [value] * 3
+            if len(values) != 3:
+                raise InputError(f"{section.where}{key} is {shown(value)}; one value or three")
+            found[key] = tuple(factor * _sigma(section, key, v) for v in values)
+    return Freedom(**found)
+
+
+def _sigma(section: Section, key: str, value: Any) -> float:
+    if isinstance(value, str) and value in WORDS:
+        return WORDS[value]
+    if isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < math.inf:
+        return float(value)
+    raise InputError(
+        f'{section.where}{key} is {shown(value)}; "free", "held" or a prior σ is expected'
+    )
+
+
+def _points(table: Columns, earth: Ellipsoid | None, radians: float) -> GroundPoints:
+    geographic = "longitude" in table.values
+    names = ("longitude", "latitude", "height") if geographic else ("X", "Y", "Z")
+    sigmas = ("sE", "sN", "sh") if geographic else ("sX", "sY", "sZ")
+    table.check_names(("id", "role", *names), sigmas)
+    X = np.stack([table.numbers(n) for n in names], 1)
+    words = {"free": math.inf, "held": 0.0}
+    sigma = np.stack([table.numbers(n, words=words) for n in sigmas], 1)
+    axes = np.tile(np.eye(3), (len(X), 1, 1))
+    if geographic:
+        if earth is None or earth.a != earth.b:
+            raise InputError(
+                f"{table.source.name}: longitudes need an ellipsoid of revolution as [scanner] "
+                "earth; give X, Y, Z"
+            )
+        beyond = np.abs(X[:, 1] * radians) > np.pi / 2 + 1e-12
+        if beyond.any():
+            row = int(beyond.argmax())
+            raise InputError(
+                f"{table.source(row)}: latitude {X[row, 1]:g} is beyond the pole; look at the "
+                "order of columns and at angle_unit"
+            )
+        X = np.stack([np.asarray(v) for v in earth_fixed(
+            earth, (radians * X[:, 0], radians * X[:, 1], X[:, 2])
+        )], 1)  # fmt: skip
+        known = np.isfinite(X).all(1)
+        for k in np.flatnonzero(known):
+            axes[k] = east_north_up(earth, X[k])
+    return GroundPoints(
+        table.ids("id"), table.ids("role"), X, np.nan_to_num(sigma, nan=0.0, posinf=np.inf), axes,
+        ("east", "north", "up") if geographic else ("X", "Y", "Z"), table.source,
+    )  # fmt: skip
+
+
+def _observations(table, ids, images, section, where) -> Observations:
+    table.check_names(("image", "point", "line", "pixel"), ("sline", "spixel"))
+    sigma = section.number("sigma", 1.0)
+    if sigma <= 0:
+        raise InputError(f"{section.where}sigma is {sigma:g}; positive, in lines and pixels")
+    given = np.stack([table.numbers(n) for n in ("sline", "spixel")], 1)
+    return Observations(
+        table.indices("image", "image", {id: k for k, id in enumerate(images)}, where),
+        table.indices("point", "point", ids, section.text("points")),
+        np.stack([table.numbers(n, required=True) for n in ("line", "pixel")], 1),
+        np.where(np.isnan(given), sigma, given), table.source,
+    )  # fmt: skip

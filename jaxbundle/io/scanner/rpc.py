@@ -1,0 +1,236 @@
+"""Files of rational polynomial coefficients (RPC00B): text, RPB, tags of a GeoTIFF, and those of
+products (`rpc_products`).
+
+    LINE_OFF: +003000.50 pixels          text, `…_RPC.TXT`: one value a line, a unit may follow
+    LINE_NUM_COEFF_1: -1.2E-03
+
+    lineOffset = 3000.5;                 RPB, as of DigitalGlobe: coefficients in brackets
+    lineNumCoef = ( -1.2E-03, …);
+
+In all of them line 0, sample 0 is the centre of the first pixel, degrees and metres, as in `Rpc`.
+Errors and limits that a file may tell besides (ERR_BIAS, ERR_RAND, MIN_LONG, …) are passed over,
+and none are written. Scales may be negative, as some providers have them.
+"""
+
+import re
+import shutil
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.rasters.reading import rasterio
+from jaxbundle.io.scanner.rpc_products import from_geom, from_xml
+from jaxbundle.io.text.csv_tables import read_text, write_text
+from jaxbundle.io.text.xml_fields import number_in
+from jaxbundle.io.writing.replacing import disk_of, replaced_file
+from jaxbundle.network.columns import shown
+from jaxbundle.pushbroom.rpc import TERMS, Rpc
+from jaxbundle.system.file_content import check_plain
+
+OFFSETS = {
+    "line": ("LINE", "line"), "sample": ("SAMP", "samp"), "longitude": ("LONG", "long"),
+    "latitude": ("LAT", "lat"), "height": ("HEIGHT", "height"),
+}  # fmt: skip
+"""Names in text and in RPB."""
+UNITS = {
+    "line": "pixels", "sample": "pixels", "longitude": "degrees", "latitude": "degrees",
+    "height": "meters",
+}  # fmt: skip
+ACCEPTED = {"pixels": {"pixels", "pixel"}, "degrees": {"degrees", "degree", "deg"},
+            "meters": {"meters", "metres", "meter", "metre", "m"}}  # fmt: skip
+RASTERS = (".tif", ".tiff", ".ntf", ".vrt")
+FIELDS = {
+    "line_numerator": ("LINE_NUM_COEFF", "lineNumCoef"),
+    "line_denominator": ("LINE_DEN_COEFF", "lineDenCoef"),
+    "sample_numerator": ("SAMP_NUM_COEFF", "sampNumCoef"),
+    "sample_denominator": ("SAMP_DEN_COEFF", "sampDenCoef"),
+}
+RPB = re.compile(r"\s*(\w+)\s*=\s*(.*?)\s*;?\s*$")
+
+
+def read_rpc(path: str | Path) -> Rpc:
+    """The coefficients of a text file, an RPB file, a raster with RPC tags, or of a product.
+
+    **Raises:** `InputError` naming file and line: what is missing, there twice, no number, in
+    another unit, not RPC00B.
+    """
+    path = Path(path)
+    if path.suffix.lower() in RASTERS:
+        values = _from_raster(path)
+    else:
+        text = read_text(path, fallback="latin-1")
+        if text.lstrip().startswith("<"):
+            values = from_xml(path)
+        elif "line_num_coeff_00" in text or path.suffix.lower() == ".geom":
+            values = from_geom(path, text)
+        else:
+            values = _from_rpb(path, text) if "lineOffset" in text else _from_text(path, text)
+    for axis in OFFSETS:
+        if values[f"{axis}_scale"] == 0:
+            raise InputError(f"{path}: the scale of {axis} is 0; another number is expected")
+    for name in ("line_denominator", "sample_denominator"):
+        if values[name][0] == 0:
+            raise InputError(f"{path}: the {name.replace('_', ' ')} begins with 0; 1 is usual")
+    return Rpc(**{name: jnp.asarray(value, float) for name, value in values.items()})
+
+
+def write_rpc(path: str | Path, rpc: Rpc) -> None:
+    """Write coefficients so that `read_rpc` gives them back to the last digit (15 in a GeoTIFF).
+
+    `.rpb`: RPB; `.tif`: the tags of a GeoTIFF that exists; anything else: text.
+    """
+    path = Path(path)
+    match path.suffix.lower():
+        case ".rpb":
+            write_text(path, _rpb_text(rpc))
+        case suffix if suffix in RASTERS:
+            _to_raster(path, rpc)
+        case _:
+            write_text(path, _plain_text(rpc))
+
+
+def _from_text(path, text):
+    found = {}
+    for number, line in enumerate(text.splitlines(), 1):
+        if not line.strip():
+            continue
+        name, colon, value = line.partition(":")
+        if not colon:
+            raise InputError(
+                f"{path}, line {number}: {shown(line.strip())}; NAME: value is expected, such as "
+                "LINE_OFF: 3000.5"
+            )
+        name = name.strip().upper()
+        if name in found:
+            raise InputError(f"{path}, line {number}: {name} is there twice")
+        found[name] = value.split(), number
+
+    def number_of(name, unit=None):
+        if name not in found:
+            raise InputError(f"{path}: {name} is missing; an RPC00B text file is expected")
+        words, line = found[name]
+        value = number_in(words[0] if words else "", f"{path}, line {line}: {name}")
+        if unit and len(words) > 1 and words[1].lower() not in ACCEPTED[unit]:
+            raise InputError(f"{path}, line {line}: {name} is in {words[1]}; {unit} are expected")
+        return value
+
+    values = {}
+    for axis, (name, _) in OFFSETS.items():
+        values[f"{axis}_offset"] = number_of(f"{name}_OFF", UNITS[axis])
+        values[f"{axis}_scale"] = number_of(f"{name}_SCALE", UNITS[axis])
+    for field, (name, _) in FIELDS.items():
+        values[field] = [number_of(f"{name}_{k}") for k in range(1, TERMS + 1)]
+    return values
+
+
+def _from_rpb(path, text):
+    found, name = {}, None
+    for number, line in enumerate(text.splitlines(), 1):
+        if name is None:
+            match = RPB.match(line)
+            if match is None:
+                continue
+            key, value = match.groups()
+            if key in found:
+                raise InputError(f"{path}, line {number}: {key} is there twice")
+            found[key] = [value, number]
+            name = key if "(" in value and ")" not in value else None
+        else:
+            found[name][0] += " " + line.strip().rstrip(";")
+            name = None if ")" in line else name
+    kind = found.get("SpecId", ['"RPC00B"', 0])
+    if kind[0].strip('"') != "RPC00B":
+        raise InputError(
+            f"{path}, line {kind[1]}: SpecId is {kind[0]}; only RPC00B is read, whose terms are "
+            "in another order"
+        )
+
+    def value_of(key):
+        if key not in found:
+            raise InputError(f"{path}: {key} is missing; an RPB file of RPC00B is expected")
+        return found[key][0], f"{path}, line {found[key][1]}: {key}"
+
+    values = {}
+    for axis, (_, key) in OFFSETS.items():
+        values[f"{axis}_offset"] = number_in(*value_of(f"{key}Offset"))
+        values[f"{axis}_scale"] = number_in(*value_of(f"{key}Scale"))
+    for field, (_, key) in FIELDS.items():
+        value, where = value_of(key)
+        numbers = [part for part in value.strip("() \t").split(",") if part.strip()]
+        if len(numbers) != TERMS:
+            raise InputError(f"{where} has {len(numbers)} coefficients; {TERMS} are expected")
+        values[field] = [number_in(part, where) for part in numbers]
+    return values
+
+
+def _from_raster(path):
+    package = rasterio()
+    check_plain(path)
+    try:
+        with package.open(path) as source:
+            tags = source.rpcs
+    except package.errors.RasterioError as error:
+        raise InputError(f"{path}: {' '.join(str(error).split())}") from None
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{path}: the RPC tags are damaged: {error}") from None
+    if tags is None:
+        raise InputError(f"{path}: the raster has no RPC tags; give a file of coefficients")
+    values = {}
+    for axis, (_, key) in OFFSETS.items():
+        values[f"{axis}_offset"] = getattr(tags, f"{key}_off")
+        values[f"{axis}_scale"] = getattr(tags, f"{key}_scale")
+    for field, (name, _) in FIELDS.items():
+        values[field] = getattr(tags, name.lower())
+        if len(values[field]) != TERMS or not np.isfinite(values[field]).all():
+            raise InputError(f"{path}: {name} of the RPC tags: {TERMS} finite numbers are expected")
+    return values
+
+
+def _to_raster(path, rpc):
+    package = rasterio()
+    from rasterio.rpc import RPC
+
+    given = {}
+    for axis, (_, key) in OFFSETS.items():
+        given[f"{key}_off"] = float(getattr(rpc, f"{axis}_offset"))
+        given[f"{key}_scale"] = float(getattr(rpc, f"{axis}_scale"))
+    for field, (name, _) in FIELDS.items():
+        given[name.lower()] = np.asarray(getattr(rpc, field)).tolist()
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; RPC tags are written into a raster that exists")
+    try:
+        with replaced_file(path) as temporary:
+            shutil.copyfile(path, temporary)
+            with package.open(temporary, "r+") as target:
+                target.rpcs = RPC(**given)
+            with package.open(temporary) as target:  # what fails at closing is told to nobody
+                if target.rpcs is None:
+                    raise InputError(f"{path}: cannot be written: no tags arrived{disk_of(path)}")
+    except (OSError, package.errors.RasterioError) as error:
+        raise InputError(f"{path}: cannot be written: {' '.join(str(error).split())}") from None
+
+
+def _plain_text(rpc):
+    lines = []
+    for part in ("OFF", "SCALE"):
+        for axis, (name, _) in OFFSETS.items():
+            value = float(getattr(rpc, f"{axis}_{'offset' if part == 'OFF' else 'scale'}"))
+            lines.append(f"{name}_{part}: {value!r} {UNITS[axis]}")
+    for field, (name, _) in FIELDS.items():
+        for k, value in enumerate(np.asarray(getattr(rpc, field)).tolist(), 1):
+            lines.append(f"{name}_{k}: {value!r}")
+    return "\n".join(lines) + "\n"
+
+
+def _rpb_text(rpc):
+    lines = ['satId = "";', 'bandId = "";', 'SpecId = "RPC00B";', "BEGIN_GROUP = IMAGE"]
+    lines += ["\terrBias = 0.0;", "\terrRand = 0.0;"]
+    for part in ("Offset", "Scale"):
+        for axis, (_, key) in OFFSETS.items():
+            lines.append(f"\t{key}{part} = {float(getattr(rpc, f'{axis}_{part.lower()}'))!r};")
+    for field, (_, key) in FIELDS.items():
+        numbers = ",\n\t\t\t".join(map(repr, np.asarray(getattr(rpc, field)).tolist()))
+        lines.append(f"\t{key} = (\n\t\t\t{numbers});")
+    return "\n".join([*lines, "END_GROUP = IMAGE", "END;"]) + "\n"

@@ -1,0 +1,16 @@
+"""A scanner image as every reader returns it."""
+
+import dataclasses
+
+from jaxbundle.geometry.ellipsoid import Ellipsoid
+from jaxbundle.pushbroom.image import PushbroomImage
+
+
+@dataclasses.dataclass(frozen=True)
+class Scanner:
+    """The image, the ellipsoid of its Earth (None: a local frame), warnings of the reader."""
+
+    name: str
+    image: PushbroomImage
+    earth: Ellipsoid | None
+    warnings: tuple[str, ...] = ()

@@ -1,0 +1,332 @@
+"""The scanner file: a TOML file that describes a pushbroom image, tables in CSV files beside it.
+
+```toml
+[scanner]
+lines = 10000
+pixels = 8000
+epoch = "2024-03-01T10:20:30"       # UTC; all times are seconds since then
+earth = "WGS84"                     # or [a, b, c] in metres, or "local": a plane, Z up
+angle_unit = "deg"                  # rad | deg | gon, of every angle in this file and its tables
+
+[times]                             # of the lines: first and period, or table
+first = 0.0
+period = 0.00066
+
+[position]                          # table, or tle, or circle, or state
+table = "positions.csv"             # t,X,Y,Z[,VX,VY,VZ]
+frame = "ITRF"                      # ITRF | GCRF | J2000 | TEME, or "local"
+interpolation = "lagrange"          # linear | lagrange | usgscsm | hermite | spline
+order = 7
+extrapolate = 0.0                   # seconds beyond the ends of the table
+
+[attitude]
+table = "attitude.csv"              # t,q0,q1,q2,q3 (scalar first) or t,pitch,roll,yaw
+frame = "ITRF"                      # as of positions, or "orbit"
+interpolation = "slerp"             # slerp | linear | lagrange | usgscsm | spline
+
+[optics]                            # a camera model's parameters, or table, or across and along
+model = "brown"
+c = 700.0
+pitch = 0.0065                      # in the model's unit a pixel
+middle = 3999.5                     # the pixel at x = 0
+row = 0.0                           # y of the detectors
+
+[mounting]                          # angles of the camera in the frame of the attitude
+roll = 12.0
+
+[corrections]
+aberration = true                   # light_time, aberration, refraction: false if absent
+
+[earth_orientation]
+ut1_utc = -0.12                     # seconds; x_pole, y_pole in arcseconds
+```
+
+Or the file of a product, with what is to be different from it:
+
+```toml
+[scanner]
+source = "image.json"
+interpolation = "lagrange"          # CSM files: usgscsm | lagrange
+
+[corrections]
+refraction = true
+```
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbundle.cameras import check_parameters, default_parameters, get_model
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid
+from jaxbundle.io.scanner.scanner import Scanner
+from jaxbundle.io.text.sections import Section, TomlFile
+from jaxbundle.network.columns import did_you_mean, shown
+from jaxbundle.network.tables import Source
+from jaxbundle.pushbroom import earth_frames as frames
+from jaxbundle.pushbroom.ancillary import attitude_table, check_times, position_table
+from jaxbundle.pushbroom.corrections import Corrections
+from jaxbundle.pushbroom.image import check_size, make_image
+from jaxbundle.pushbroom.interpolation import Table
+from jaxbundle.pushbroom.orbit import state_orbit
+from jaxbundle.pushbroom.scanner import AnglePolynomial, AngleTable, FocalLine, LineTimes, Optics
+from jaxbundle.pushbroom.trajectory import Attitude, Trajectory
+
+FRAMES = (*frames.FRAMES, "local")
+ANGLES = ("pitch", "roll", "yaw")
+MOST_ROWS = 1_000_000
+INTERPOLATION = ("interpolation", "order", "gap", "extrapolate")
+KINDS = ("table", "tle", "circle", "state")
+SECTIONS = {
+    "scanner": (
+        "name", "lines", "pixels", "epoch", "earth", "angle_unit", "source", "interpolation",
+    ),
+    "times": ("first", "period", "table"),
+    "position": (*KINDS, "at", "j2", "frame", "span", "step", *INTERPOLATION),
+    "attitude": ("table", "frame", *INTERPOLATION),
+    "optics": (),  # depends on its kind
+    "mounting": ANGLES,
+    "corrections": Corrections._fields,
+    "earth_orientation": frames.EarthOrientation._fields,
+}  # fmt: skip
+NEEDED = ("scanner", "times", "position", "attitude", "optics")
+
+
+def scanner_of(file: TomlFile) -> Scanner:
+    """The pushbroom image that the sections of a scanner file describe.
+
+    **Raises:** `InputError` naming file, section and key, or table and line.
+    """
+    file.require(NEEDED)
+    scanner = file.section("scanner")
+    lines, pixels = (scanner.whole(key) for key in ("lines", "pixels"))
+    check_size(lines, pixels, scanner.where.removesuffix(": "))
+    earth = earth_of(scanner)
+    position, positions = _position(file, earth)
+    attitude, attitudes = _attitude(file, earth)
+    mounting = mounting_of(file)
+    switches = file.section("corrections")
+    corrections = Corrections(*(switches.switch(name) for name in Corrections._fields))
+    if corrections.any and earth is None:
+        raise InputError(f"{switches.where}corrections need an Earth; set [scanner] earth")
+    image = make_image(
+        Trajectory(position, attitude), _times(file, lines), optics_of(file, pixels), lines, pixels,
+        mounting, corrections, (positions, attitudes),
+    )  # fmt: skip
+    return Scanner(scanner.text("name", file.path.stem), image, earth)
+
+
+def _orientation(file: TomlFile) -> frames.EarthOrientation:
+    section = file.section("earth_orientation")
+    fields = frames.EarthOrientation._fields
+    return frames.EarthOrientation(*(section.number(name, 0.0) for name in fields))
+
+
+def _epoch(file: TomlFile) -> str:
+    epoch = file.section("scanner").values.get("epoch")
+    if epoch is None:
+        raise InputError(
+            f"{file.path}, [scanner]: epoch is missing; an inertial frame needs the UTC from "
+            'which times count, such as epoch = "2024-03-01T10:20:30"'
+        )
+    return str(epoch)
+
+
+def _options(section: Section, method: str) -> dict[str, Any]:
+    """Interpolation, order, gap, extrapolation."""
+    options: dict[str, Any] = {"method": section.text("interpolation", method)}
+    if "order" in section:
+        options["order"] = int(section.number("order"))
+    if "gap" in section:
+        options["gap"] = section.number("gap")
+        if options["gap"] <= 0:
+            raise InputError(
+                f"{section.where}gap is {options['gap']:g}; the longest step that is "
+                "interpolated, in seconds, is expected, a positive number"
+            )
+    if "extrapolate" in section:
+        options["extrapolate"] = section.number("extrapolate")
+    return options
+
+
+def mounting_of(file: TomlFile) -> tuple[float, float, float]:
+    """Pitch, roll, yaw of the mounting in radians."""
+    section = file.section("mounting")
+    pitch, roll, yaw = (file.radians * section.number(name, 0.0) for name in ANGLES)
+    return pitch, roll, yaw
+
+
+def earth_of(scanner: Section) -> Ellipsoid | None:
+    """The ellipsoid of [scanner] earth; None for a local frame."""
+    value = scanner.values.get("earth", "WGS84")
+    if isinstance(value, list):
+        axes = scanner.numbers("earth", 3)
+        if (axes <= 0).any():
+            raise InputError(f"{scanner.where}earth: the semi-axes must be positive, in metres")
+        return Ellipsoid(*axes.tolist())
+    if value not in ("WGS84", "local"):
+        raise InputError(
+            f'{scanner.where}earth is {shown(value)}; "WGS84", "local" or [a, b, c] is expected'
+        )
+    return WGS84 if value == "WGS84" else None
+
+
+def _times(file: TomlFile, lines: int) -> LineTimes:
+    section = file.section("times")
+    if "table" not in section:
+        period = section.number("period")
+        if period <= 0:
+            raise InputError(f"{section.where}period is {period}; a positive number is expected")
+        return LineTimes(jnp.asarray(section.number("first", 0.0)), jnp.asarray(period))
+    columns = section.table()
+    columns.check_names(("t",), ("line",))
+    t = columns.numbers("t", required=True)
+    check_times(t, columns.source)
+    if lines == 1:
+        raise InputError(f"{section.where}table: one line has no period; give first and period")
+    if len(t) != lines:
+        raise InputError(
+            f"{columns.source.name}: {len(t)} times for {lines} lines; one row a line is expected"
+        )
+    return LineTimes(jnp.zeros(()), jnp.zeros(()), jnp.asarray(t))
+
+
+def _frame(section: Section, earth: Ellipsoid | None, known: Sequence[str]) -> str:
+    frame = section.text("frame", "local" if earth is None else "ITRF")
+    if frame not in known:
+        raise InputError(f"{section.where}unknown frame {frame!r}{did_you_mean(frame, known)}")
+    if (earth is None) != (frame == "local") and frame != "orbit":
+        raise InputError(
+            f'{section.where}frame is {frame!r}, earth is {"local" if earth is None else "given"}; '
+            'a local frame belongs to [scanner] earth = "local", and no other does'
+        )
+    return frame
+
+
+def _position(file: TomlFile, earth: Ellipsoid | None) -> tuple[Table, Source]:
+    section = file.section("position")
+    kinds = [kind for kind in KINDS if kind in section]
+    if len(kinds) != 1:
+        raise InputError(f"{section.where}give one of {', '.join(KINDS)}, not {kinds}")
+    if kinds != ["table"]:
+        return _orbit(file, section, kinds[0], earth)
+    frame = _frame(section, earth, FRAMES)
+    columns = section.table()
+    names, rates = ("X", "Y", "Z"), ("VX", "VY", "VZ")
+    columns.check_names(("t", *names), rates)
+    t = columns.numbers("t", required=True)
+    values = lambda names: np.stack([columns.numbers(n, required=True) for n in names], 1)
+    P, V = values(names), values(rates) if "VX" in columns.values else None
+    if frame in ("GCRF", "J2000", "TEME"):
+        check_times(t, columns.source)
+        R = frames.to_earth(frame, _epoch(file), t, _orientation(file))
+        P, V = frames.turn_positions(R, P, V, _orientation(file))
+    table = position_table(t, P, V, **_options(section, "lagrange"), source=columns.source)
+    return table, columns.source
+
+
+def _orbit(
+    file: TomlFile, section: Section, kind: str, earth: Ellipsoid | None
+) -> tuple[Table, Source]:
+    """Two-line elements, a circle, a state: at the steps of a table from which is interpolated."""
+    start, end = section.numbers("span", 2)
+    step = section.number("step", 1.0)
+    if not (step > 0 and 0 < (end - start) / step <= MOST_ROWS):
+        raise InputError(
+            f"{section.where}span from {start:g} to {end:g} s in steps of {step:g} s; 1 to "
+            f"{MOST_ROWS} steps forward are expected"
+        )
+    t = np.arange(start, end, step)
+    if kind == "tle":
+        lines = section.values["tle"]
+        if not (isinstance(lines, list) and len(lines) == 2):
+            raise InputError(f"{section.where}tle: a list of the two lines is expected")
+        first, second = lines
+        P, V = frames.two_line_orbit(first, second, _epoch(file), t, _orientation(file))
+    elif kind == "state":
+        frame = _frame(section, earth, frames.FRAMES)
+        at = section.number("at", 0.0)
+        state = section.numbers("state", 6)[None]
+        P, V = state[:, :3], state[:, 3:]
+        if frame != "ITRF":
+            R = frames.to_earth(frame, _epoch(file), np.array([at]), _orientation(file))
+            P, V = frames.turn_positions(R, P, V, _orientation(file))
+        try:
+            P, V = state_orbit(t, P[0], V[0], at, section.switch("j2") or "j2" not in section)
+        except InputError as error:
+            raise InputError(f"{section.where}{error}") from None
+    else:
+        circle = Section(file, f"{section.where}circle: ", section.values["circle"])
+        angles = (circle.number(k, 0.0) for k in ("inclination", "node", "argument"))
+        angles = [file.radians * angle for angle in angles]
+        P, V = frames.circular_orbit(t, circle.number("height"), *angles)
+    source = Source(f"{section.where}span")
+    return position_table(t, P, V, **_options(section, "lagrange"), source=source), source
+
+
+def _attitude(file: TomlFile, earth: Ellipsoid | None) -> tuple[Attitude, Source]:
+    section = file.section("attitude")
+    frame = _frame(section, earth, (*FRAMES, "orbit"))
+    columns = section.table()
+    quaternions = "q0" in columns.values
+    names = ("q0", "q1", "q2", "q3") if quaternions else ANGLES
+    columns.check_names(("t", *names))
+    t = columns.numbers("t", required=True)
+    values = np.stack([columns.numbers(n, required=True) for n in names], 1)
+    values = values if quaternions else file.radians * values
+    if frame in ("GCRF", "J2000", "TEME"):
+        if not quaternions:
+            raise InputError(f"{section.where}frame {frame} needs quaternions; give q0, q1, q2, q3")
+        check_times(t, columns.source)
+        # what is not unit is refused below, with its row
+        R = frames.to_earth(frame, _epoch(file), t, _orientation(file))
+        lengths = np.linalg.norm(values, axis=1, keepdims=True)
+        values = lengths * frames.turn_quaternions(R, values)
+    attitude = attitude_table(
+        t, values, **_options(section, "slerp" if quaternions else "linear"),
+        reference="orbit" if frame == "orbit" else "earth", source=columns.source,
+    )  # fmt: skip
+    return attitude, columns.source
+
+
+def optics_of(file: TomlFile, pixels: int) -> Optics:
+    """The optics of the section [optics]."""
+    section = file.section("optics")
+    middle = section.number("middle", (pixels - 1) / 2)
+    if "table" in section:
+        section.check_keys(("table",))
+        columns = section.table()
+        columns.check_names(("across", "along"), ("pixel",))
+        angles = [file.radians * columns.numbers(n, required=True) for n in ("across", "along")]
+        if len(angles[0]) != pixels:
+            raise InputError(
+                f"{columns.source.name}: {len(angles[0])} rows for {pixels} pixels; one row a pixel"
+            )
+        return AngleTable(*(jnp.asarray(a) for a in angles))
+    if "across" in section:
+        section.check_keys(("across", "along", "middle", "half"))
+        half = section.number("half", pixels / 2)
+        return AnglePolynomial(
+            jnp.asarray(section.numbers("across")), jnp.asarray(section.numbers("along")),
+            jnp.asarray(middle), jnp.asarray(half),
+        )  # fmt: skip
+    try:
+        model = get_model(section.text("model", "brown"))
+        section.check_keys(("model", "pitch", "middle", "row", *model.parameters))
+        given = {name: section.number(name) for name in model.parameters if name in section}
+        check_parameters(model, given)
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"{section.where}{error}") from None
+    values = default_parameters(model) | given
+    pitch = section.number("pitch")
+    if pitch == 0:
+        raise InputError(f"{section.where}pitch is 0; the size of a pixel in {model.unit}, please")
+    return FocalLine(
+        jnp.asarray([values[name] for name in model.parameters]), jnp.asarray(pitch),
+        jnp.asarray(middle), jnp.asarray(section.number("row", 0.0)), model.name,
+    )  # fmt: skip

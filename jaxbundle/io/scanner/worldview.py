@@ -1,0 +1,167 @@
+"""Rigorous geometry of WorldView scenes, levels Basic 1B and Stereo 1B: DigitalGlobe's XML or IMD.
+
+`isd`, or the files of `pvl`, holds the groups of the Imagery Support Data: IMD (size, times),
+EPH, ATT, GEO (the camera).
+
+    X = P + R·C + s·R·Q·[x, y, c],     [x, y] = [x₀, y₀] + p·u·[sin θ, −cos θ]
+    t(l) of TLCLIST, linear in between, seconds since TLCTIME
+
+- P (EPHEMLIST) metres, Earth-fixed; R (ATTLIST) of scalar-last quaternions, body → Earth; both at
+  STARTTIME + TIMEINTERVAL·(index − 1);
+- C (PERSPECTIVE_CENTER) metres, in the body; Q (QCS1 … QCS4, scalar last) camera → body;
+- c (PD), the centre of the first detector x₀, y₀ (DETORIGINX, DETORIGINY) and the pitch p of
+  detectors (DETPITCH) in millimetres; θ (DETROTANGLE) degrees; u the pixel, l the line, here both
+  from 0 at the centres of the first.
+
+The attitude is that of the light as it arrives: aberration and light time are switched on, together
+(one without the other is off by a metre). Refraction is left off. Optical distortion, times that go
+backwards, and products resampled to a map are refused.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import WGS84
+from jaxbundle.io.scanner.csm_trajectory import slerp
+from jaxbundle.io.scanner.product_tables import Tables, trajectory_of
+from jaxbundle.io.scanner.scanner import Scanner
+from jaxbundle.io.scanner.sight_frames import polynomial_optics, sight_frame
+from jaxbundle.io.text.xml_fields import XmlFields, number_in, seconds
+from jaxbundle.network.columns import shown
+from jaxbundle.network.tables import Source
+from jaxbundle.pushbroom.ancillary import check_times
+from jaxbundle.pushbroom.corrections import Corrections
+from jaxbundle.pushbroom.image import check_size, make_image
+from jaxbundle.pushbroom.scanner import LineTimes
+
+LEVELS = ("basic1b", "stereo1b")
+EPHEMERIS, ATTITUDE = 7, 5
+"""Numbers of a row that are used: index, position, velocity; index, quaternion."""
+CORRECTIONS = Corrections(light_time=True, aberration=True)
+
+
+def read_worldview(file: XmlFields) -> Scanner:
+    """The pushbroom image of a DigitalGlobe XML file.
+
+    **Raises:** `InputError` naming file and element: what is missing, no number, a product of
+    another level, tables that end too long before the image does.
+    """
+    path = file.path
+    level = file.text("IMD/IMAGEDESCRIPTOR", "Basic1B")
+    if level.lower() not in LEVELS:
+        raise InputError(
+            f"{path}: IMAGEDESCRIPTOR is {shown(level)}; only Basic1B and Stereo1B have the "
+            "geometry of the camera, use the RPC of others"
+        )
+    lines, pixels = file.number("IMD/NUMROWS"), file.number("IMD/NUMCOLUMNS")
+    check_size(lines, pixels, f"{path}: NUMROWS, NUMCOLUMNS")
+    lines, pixels = int(lines), int(pixels)
+    epoch = file.time("IMD/IMAGE/TLCTIME")
+    times = _line_times(file, lines)
+    t, P, _ = _table(file, "EPH", "EPHEMLIST", EPHEMERIS, epoch)
+    rows, values, source = _table(file, "ATT", "ATTLIST", ATTITUDE, epoch)
+    length = np.linalg.norm(values, axis=1)
+    if (bad := ~(np.abs(length - 1) < 1e-4)).any():
+        raise InputError(f"{source(int(bad.argmax()))}: a unit quaternion is expected")
+    R = Rotation.from_quat(values)
+    centre = [file.number(f"GEO/PERSPECTIVE_CENTER/C{axis}") for axis in "XYZ"]
+    P = P[:, :3] + slerp(rows, R, t).apply(centre)
+    lens = [file.number(f"GEO/CAMERA_ATTITUDE/QCS{k}") for k in range(1, 5)]
+    if not abs(np.linalg.norm(lens) - 1) < 1e-4:
+        raise InputError(f"{path}: QCS1 to QCS4 are no unit quaternion, scalar last")
+    x, y, warnings = _detectors(file)
+    tables = Tables(
+        t, P, rows, R * Rotation.from_quat(lens), Source(f"{path}, EPHEMLIST", None, "row"), source
+    )
+    u = np.arange(pixels)
+    down, forward = tables.directions(float(times.time((lines - 1) / 2)))
+    frame = sight_frame(np.stack([np.polyval(p[::-1], u) for p in (x, y)]), down, forward)
+    when = np.asarray(times.time(jnp.arange(lines, dtype=float)))
+    trajectory, told = trajectory_of(tables, frame.turn, when)
+    image = make_image(
+        trajectory, times, polynomial_optics(frame, x, y), lines, pixels, corrections=CORRECTIONS,
+        sources=(tables.positions, tables.attitude),
+    )  # fmt: skip
+    name = file.text("IMD/PRODUCTORDERID", path.stem) or path.stem
+    return Scanner(name, image, WGS84, (*warnings, *told))
+
+
+def _line_times(file, lines):
+    pairs = file.elements("IMD/IMAGE/TLCLISTList/TLCLIST")
+    pairs = np.array([_numbers(file, e, "TLCLIST", 2) for e in pairs])
+    if len(pairs) == 1:
+        rate = file.number("IMD/IMAGE/AVGLINERATE")
+        if file.text("IMD/IMAGE/SCANDIRECTION", "Forward").lower() != "forward":
+            rate = -rate
+        first, t, slope = pairs[0, 0], pairs[0, 1], np.array([1 / rate if rate else np.inf])
+    else:
+        first, t = pairs[:, 0], pairs[:, 1]
+        if (np.diff(first) <= 0).any():
+            raise InputError(f"{file.path}: the lines of TLCLIST do not increase")
+        slope = np.diff(t) / np.diff(first)
+    if not ((slope > 0) & np.isfinite(slope)).all():
+        raise InputError(
+            f"{file.path}: the times of TLCLIST, AVGLINERATE, SCANDIRECTION go backwards; the "
+            "first line must be the first in time"
+        )
+    if np.ptp(slope) <= 1e-9 * slope[0]:
+        start = np.ravel(t)[0] - slope[0] * np.ravel(first)[0]
+        return LineTimes(jnp.asarray(start), jnp.asarray(slope[0]))
+    l = np.arange(lines)
+    k = np.clip(np.searchsorted(first, l, side="right") - 1, 0, len(slope) - 1)
+    return LineTimes(jnp.zeros(()), jnp.zeros(()), jnp.asarray(t[k] + slope[k] * (l - first[k])))
+
+
+def _table(file, group, name, used, epoch):
+    """Seconds since the epoch, the values of the rows, and the source of the table."""
+    rows = file.elements(f"{group}/{name}List/{name}")
+    values = np.array([_numbers(file, e, f"{name} {k}", used) for k, e in enumerate(rows, 1)])
+    start = seconds(file.time(f"{group}/STARTTIME"), epoch)
+    t = start + file.number(f"{group}/TIMEINTERVAL") * (values[:, 0] - 1)
+    source = Source(f"{file.path}, {name}", None, "row")
+    if len(t) < 2:
+        raise InputError(f"{source.name}: {len(t)} row; 2 at least")
+    check_times(t, source)
+    return t, values[:, 1:], source
+
+
+def _numbers(file, element, name, used):
+    """The first numbers of an element, of which there are more."""
+    words = (element.text or "").replace(",", " ").split()
+    if len(words) < used:
+        raise InputError(f"{file.path}: {name} has {len(words)} numbers; {used} are expected")
+    return [number_in(word, f"{file.path}: {name}") for word in words[:used]]
+
+
+def _detectors(file):
+    """x/c and y/c as polynomials of the pixel, and a warning if bands differ."""
+    for name in ("ALIST", "BLIST"):
+        found = file.find(f"GEO/OPTICAL_DISTORTION/{name}List")
+        text = "" if found is None else " ".join(found.itertext()).replace(",", " ")
+        if any(number_in(word, f"{file.path}: {name}") != 0 for word in text.split()):
+            raise InputError(f"{file.path}: OPTICAL_DISTORTION ({name}) is not supported; use RPC")
+    mounting = file.find("GEO/DETECTOR_MOUNTING")
+    bands = [] if mounting is None else [b for b in mounting if b.tag.startswith("BAND_")]
+    if not bands:
+        raise file.missing("GEO/DETECTOR_MOUNTING/BAND_")
+    names = ("DETORIGINX", "DETORIGINY", "DETROTANGLE", "DETPITCH")
+    values = [
+        [
+            number_in(band.findtext(f"DETECTOR_ARRAY/{n}", ""), f"{file.path}: {band.tag}, {n}")
+            for n in names
+        ]
+        for band in bands
+    ]  # fmt: skip
+    x0, y0, angle, pitch = values[0]
+    c = file.number("GEO/PRINCIPAL_DISTANCE/PD")
+    if c == 0 or pitch == 0:
+        raise InputError(f"{file.path}: PD and DETPITCH must not be 0, in millimetres")
+    other = [band.tag for band, v in zip(bands, values) if v != values[0]]
+    warnings = () if not other else (
+        f"{file.path}: the detectors of {', '.join(other)} are elsewhere than those of "
+        f"{bands[0].tag}, which are used",
+    )  # fmt: skip
+    direction = pitch * np.array([np.sin(np.radians(angle)), -np.cos(np.radians(angle))])
+    return np.array([x0, direction[0]]) / c, np.array([y0, direction[1]]) / c, warnings

@@ -1,0 +1,110 @@
+"""The lines of a text file as rows of words; a complaint names the file and the line."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.text.csv_tables import read_text
+from jaxbundle.network.columns import shown
+
+
+class Row:
+    """A line of a file: where it stands, its text, its words."""
+
+    def __init__(self, path: Path, number: int, text: str, separator: str | None = None):
+        self.path, self.number, self.text = path, number, text
+        self.words = [word.strip() for word in text.split(separator)]
+
+    def __len__(self) -> int:
+        return len(self.words)
+
+    def error(self, message: str) -> InputError:
+        """A complaint about this line, to be raised."""
+        return InputError(f"{self.path}, line {self.number}: {message}")
+
+    def numbers(
+        self, what: Sequence[str], first: int = 0, more: bool = False
+    ) -> Float[np.ndarray, " n"]:
+        """The numbers from the word `first` on, called `what`; no others unless `more`."""
+        words = self.words[first:]
+        if len(words) < len(what) or (len(words) > len(what) and not more):
+            raise self.error(
+                f"{len(words)} values where {len(what)} are expected ({', '.join(what)})"
+            )
+        return np.array([self._number(word, name) for word, name in zip(words, what)])
+
+    def all_numbers(self, what: str) -> Float[np.ndarray, " n"]:
+        """All words as numbers; `what` each of them is."""
+        try:
+            numbers = np.array(self.words, float) if self.words else np.zeros(0)
+        except ValueError:
+            numbers = np.array([np.nan])
+        if not np.isfinite(numbers).all() or "_" in self.text:
+            return np.array([self._number(word, what) for word in self.words])
+        return numbers
+
+    def whole(self, k: int, what: str, least: int = 0) -> int:
+        """The whole number that is the k-th word."""
+        word = self.words[k] if k < len(self.words) else ""
+        sign = word.removeprefix("-")
+        if not (sign.isascii() and sign.isdigit() and len(sign) < 19) or int(word) < least:
+            raise self.error(f"{what} is {shown(word)}; a whole number from {least} is expected")
+        return int(word)
+
+    def _number(self, word: str, what: str) -> float:
+        try:
+            number = float(word)
+        except ValueError:
+            number = math.nan
+        if not math.isfinite(number) or "_" in word:
+            raise self.error(f"{what} is {shown(word)}; a number is expected")
+        return number
+
+
+class Rows:
+    """The lines of a file one after the other.
+
+    **Arguments:** `comment` begins lines that do not count; `blank` whether empty lines count;
+    `separator` of the words, blanks if None; `fallback` the encoding of what is not UTF-8.
+    """
+
+    def __init__(
+        self, path: Path, comment: str = "", blank: bool = False, separator: str | None = None,
+        fallback: str = "",
+    ):  # fmt: skip
+        self.path = path
+        self.lines = [
+            (number, line)
+            for number, line in enumerate(read_text(path, fallback).splitlines(), 1)
+            if (blank or line.strip()) and not (comment and line.lstrip().startswith(comment))
+        ]
+        self.separator = separator
+        self.position = 0
+
+    def __iter__(self):
+        while self.more():
+            yield self.take("a line")
+
+    def more(self) -> bool:
+        """Whether there is another line."""
+        return self.position < len(self.lines)
+
+    def take(self, what: str) -> Row:
+        """The next line; `what` it should be.
+
+        **Raises:** `InputError` if the file has ended.
+        """
+        if not self.more():
+            last = self.lines[-1][0] if self.lines else 0
+            raise InputError(f"{self.path}: the file ends after line {last}; {what} is expected")
+        number, text = self.lines[self.position]
+        self.position += 1
+        return Row(self.path, number, text, self.separator)
+
+    def next_words(self) -> list[str]:
+        """The words of the next line without taking it; none at the end of the file."""
+        return self.lines[self.position][1].split(self.separator) if self.more() else []

@@ -1,0 +1,136 @@
+"""TOML files of named sections: what is there, of what type, in the words of one message."""
+
+import dataclasses
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.text.csv_tables import read_csv, read_toml
+from jaxbundle.io.text.toml_text import assignments
+from jaxbundle.network.columns import Columns, did_you_mean, shown
+from jaxbundle.network.units import ANGLE_UNITS
+
+
+@dataclasses.dataclass(frozen=True)
+class TomlFile:
+    """A TOML file as sections of keys."""
+
+    path: Path
+    document: dict[str, Any]
+
+    def section(self, name: str) -> "Section":
+        """A section, empty if it is not there."""
+        return Section(self, f"{self.path}, [{name}]: ", self.document.get(name, {}))
+
+    def require(self, names: Sequence[str]) -> None:
+        """Refuse a file that lacks one of these sections."""
+        for name in names:
+            if name not in self.document:
+                raise InputError(f"{self.path}: the section [{name}] is missing")
+
+    @property
+    def radians(self) -> float:
+        """Radians in one unit of the file's angles."""
+        unit = self.section("scanner").text("angle_unit", "deg")
+        if unit not in ANGLE_UNITS:
+            raise InputError(f"{self.path}: angle_unit {unit!r}{did_you_mean(unit, ANGLE_UNITS)}")
+        return ANGLE_UNITS[unit]
+
+
+def read_sections(
+    path: Path, sections: Mapping[str, Sequence[str]], needed: Sequence[str]
+) -> TomlFile:
+    """A TOML file whose sections and keys are known (an empty list: any key).
+
+    **Raises:** `InputError` for what is unknown or missing.
+    """
+    document = read_toml(path)
+    for key, value in document.items():
+        if key not in sections:
+            raise InputError(f"{path}: unknown section [{key}]{did_you_mean(key, sections)}")
+        if not isinstance(value, dict):
+            raise InputError(f"{path}: {key} must be a section, [{key}]")
+        if sections[key]:
+            Section(None, f"{path}, [{key}]: ", value).check_keys(sections[key])
+    file = TomlFile(path, document)
+    file.require(needed)
+    return file
+
+
+@dataclasses.dataclass(frozen=True)
+class Section:
+    """One section; every getter refuses what is missing or of another type."""
+
+    file: TomlFile | None
+    where: str
+    values: dict[str, Any]
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.values
+
+    def _given(self, key, default, expected, kinds) -> Any:
+        value = self.values.get(key, default)
+        if value is None:
+            raise InputError(f"{self.where}{key} is missing; {expected} is expected")
+        if not isinstance(value, kinds) or isinstance(value, bool) and bool not in kinds:
+            raise InputError(f"{self.where}{key} is {shown(value)}; {expected} is expected")
+        return value
+
+    def check_keys(self, known: Sequence[str]) -> None:
+        """Refuse other keys."""
+        for key in self.values:
+            if key not in known:
+                raise InputError(f"{self.where}unknown key {key!r}{did_you_mean(key, known)}")
+
+    def number(self, key: str, default: float | None = None) -> float:
+        """A finite number."""
+        value = float(self._given(key, default, "a number", (int, float)))
+        if not np.isfinite(value):
+            raise InputError(f"{self.where}{key} is {value}; a finite number is expected")
+        return value
+
+    def whole(self, key: str) -> int:
+        """A whole number, 2 or more."""
+        value = self._given(key, None, "a whole number, 2 or more,", (int,))
+        if value < 2:
+            raise InputError(f"{self.where}{key} is {value}; 2 or more are expected")
+        return value
+
+    def text(self, key: str, default: str | None = None) -> str:
+        """Text."""
+        return self._given(key, default, "text in quotes", (str,))
+
+    def switch(self, key: str) -> bool:
+        """True or false; false if it is not there."""
+        return self._given(key, False, "true or false", (bool,))
+
+    def numbers(self, key: str, count: int | None = None) -> np.ndarray:
+        """A list of numbers, of a given length."""
+        expected = f"a list of {count or 'some'} numbers"
+        values = self._given(key, None, expected, (list,))
+        good = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
+        if not good or not values or count not in (None, len(values)):
+            raise InputError(f"{self.where}{key} is {shown(values)}; {expected} is expected")
+        return np.array(values, float)
+
+    def table(self) -> Columns:
+        """The CSV table of a name, beside the file."""
+        name = self.text("table")
+        if self.file is None:
+            raise InputError(f"{self.where}table = {name!r}: not in a file")
+        path = self.file.path.parent / name
+        if not os.path.isfile(path):
+            raise InputError(f"{self.where}table = {name!r}: no such file {path}")
+        return read_csv(path)
+
+
+def toml_text(document: Mapping[str, Mapping[str, Any]]) -> str:
+    """Sections as text that `read_sections` reads."""
+    parts = []
+    for name, section in document.items():
+        parts.append("\n".join([f"[{name}]", *assignments(section)]))
+    return "\n\n".join(parts) + "\n"

@@ -1,0 +1,134 @@
+"""Elements of an XML document, asked for by their path; what is wrong is said with its place."""
+
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.text.csv_tables import read_text
+from jaxbundle.network.columns import shown
+
+TIME = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d(?:\.\d{1,9})?)\d*Z?")
+"""UTC; digits below a nanosecond are dropped."""
+
+
+class XmlFields:
+    """An XML document whose elements are asked for by their path, anywhere in it.
+
+    `kind` is what the document should be, for messages; names are without namespaces.
+
+    **Raises:** `InputError` naming file and element: what is missing, no number, no time.
+    """
+
+    def __init__(self, path: str | Path, root: ET.Element, kind: str):
+        self.path, self.root, self.kind = Path(path), root, kind
+
+    def find(self, key: str) -> ET.Element | None:
+        """The first element of a path."""
+        return self.root.find(key if self.root.tag == key else f".//{key}")
+
+    def text(self, key: str, default: str | None = None) -> str:
+        """The text of an element."""
+        found = self.find(key)
+        text = default if found is None else (found.text or "")
+        if text is None:
+            raise self.missing(key)
+        return text.strip()
+
+    def number(self, key: str, default: float | None = None) -> float:
+        """A finite number."""
+        text = self.text(key, None if default is None else repr(default))
+        return number_in(text, f"{self.path}: {key}")
+
+    def numbers(self, key: str, count: int | None = None) -> np.ndarray:
+        """The numbers in the text of an element, separated by blanks or commas."""
+        words = self.text(key).replace(",", " ").split()
+        if count is not None and len(words) != count:
+            raise InputError(f"{self.path}: {key} has {len(words)} numbers; {count} are expected")
+        return np.array([number_in(word, f"{self.path}: {key}") for word in words])
+
+    def time(self, key: str) -> np.datetime64:
+        """A date and time, UTC."""
+        return time_in(self.text(key), f"{self.path}: {key}")
+
+    def elements(self, key: str) -> list[ET.Element]:
+        """Elements that stand there again and again; of the first list of them."""
+        parent, _, last = key.rpartition("/")
+        found = self.find(parent)
+        elements = [] if found is None else found.findall(last)
+        if not elements:
+            raise self.missing(key)
+        return elements
+
+    def columns(self, key: str, names: Sequence[str]) -> np.ndarray:
+        """The numbers of names [elements, names] in elements that stand there again and again."""
+        last = key.rpartition("/")[2]
+        return np.array([
+            [number_in(e.findtext(name, ""), f"{self.path}: {last} {k}, {name}") for name in names]
+            for k, e in enumerate(self.elements(key), 1)
+        ])
+
+    def times(self, key: str, epoch: np.datetime64, name: str = "TIME") -> np.ndarray:
+        """Seconds since the epoch of elements that stand there again and again."""
+        last = key.rpartition("/")[2]
+        times = [
+            time_in(e.findtext(name, ""), f"{self.path}: {last} {k}, {name}")
+            for k, e in enumerate(self.elements(key), 1)
+        ]
+        return np.array([seconds(t, epoch) for t in times])
+
+    def missing(self, key: str) -> InputError:
+        """What to raise where an element is not there."""
+        return InputError(f"{self.path}: {key} is missing; {self.kind} is expected")
+
+
+def read_xml(path: str | Path) -> ET.Element:
+    """The root of a document, namespaces removed.
+
+    **Raises:** `InputError` if it cannot be read, is not XML, or defines entities.
+    """
+    text = read_text(Path(path), fallback="latin-1")
+    if "<!ENTITY" in text:
+        raise InputError(f"{path}: entities are not expected in this file")
+    try:
+        root = ET.fromstring(text)
+        for element in root.iter():
+            if isinstance(element.tag, str):
+                element.tag = element.tag.rpartition("}")[2]
+    except (ET.ParseError, ValueError) as error:
+        raise InputError(f"{path}: not valid XML: {error}") from None
+    except RecursionError:
+        raise InputError(f"{path}: not valid XML: elements are nested too deeply") from None
+    return root
+
+
+def number_in(text: str, where: str) -> float:
+    """A finite number of a text."""
+    try:
+        value = float(text)
+        good = np.isfinite(value) and "_" not in text
+    except ValueError:
+        good = False
+    if not good:
+        raise InputError(f"{where} is {shown(text)}; a finite number is expected")
+    return value
+
+
+def time_in(text: str, where: str) -> np.datetime64:
+    """A time of a text, to the nanosecond."""
+    try:
+        if match := TIME.fullmatch(text.strip()):
+            return np.datetime64("T".join(match.groups()), "ns")
+    except ValueError:  # a 13th month
+        pass
+    raise InputError(
+        f"{where} is {shown(text)}; a time such as 2008-03-04T12:31:03.081912 is expected"
+    )
+
+
+def seconds(time: np.datetime64, epoch: np.datetime64) -> float:
+    """The seconds from an epoch to a time."""
+    return float((time - epoch) / np.timedelta64(1, "ns") * 1e-9)

@@ -1,0 +1,83 @@
+"""Short fingerprints of what a result was made of: the same content, the same 16 hex digits."""
+
+import hashlib
+import os
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.networks.project import project_file
+from jaxbundle.io.text.csv_tables import read_toml
+from jaxbundle.system.file_content import is_plain
+
+OF_A_MODEL = {".bin", ".csv", ".dat", ".toml", ".txt"}
+"""Files of a folder that hold a network (COLMAP, BINGO); photographs do not count."""
+
+_hash = partial(hashlib.blake2b, digest_size=8)
+
+
+def of_arrays(*arrays: np.ndarray) -> str:
+    """The fingerprint of numbers in their shapes; their type does not count."""
+    found = _hash()
+    for array in arrays:
+        found.update(repr(array.shape).encode())
+        found.update(np.ascontiguousarray(array, "<f8").tobytes())
+    return found.hexdigest()
+
+
+def of_input(path: str | Path) -> str:
+    """The fingerprint of an input of `read_network`: of its files, not of where they are.
+
+    What cannot be read counts as empty.
+    """
+    found = _hash()
+    path = Path(path)
+    project = project_file(path)
+    for file in _files(project if project.is_file() else path):
+        found.update(file.name.encode(errors="surrogateescape"))
+        try:
+            if not is_plain(file):
+                continue
+            with file.open("rb") as stream:
+                found.update(hashlib.file_digest(stream, _hash).digest())
+        except OSError:
+            continue
+    return found.hexdigest()
+
+
+def files_read(path: str | Path) -> list[Path]:
+    """An input in TOML, the files it names, and those that these name."""
+    found, left = {}, [Path(path)]
+    while left:
+        file = left.pop()
+        if (real := os.path.realpath(file)) not in found:
+            found[real] = file
+            left += _files(file)
+    return [*found.values()]
+
+
+def _files(path: Path) -> Iterator[Path]:
+    """A file and those it names, or the files of a folder."""
+    if path.is_dir():
+        yield from sorted(file for file in path.iterdir() if file.suffix.lower() in OF_A_MODEL)
+        return
+    yield path
+    if path.suffix.lower() == ".toml":
+        try:
+            document = read_toml(path)
+        except InputError:
+            return
+        for text in _texts(document):
+            if os.path.isfile(path.parent / text):
+                yield path.parent / text
+
+
+def _texts(value) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | list):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from _texts(part)

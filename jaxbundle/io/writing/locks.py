@@ -1,0 +1,100 @@
+"""A file that one process at a time writes.
+
+The lock is an empty file beside it, `.NAME.lock`, that the operating system keeps locked (flock; on
+Windows its first byte) until the process ends, however it ends: one left behind by a killed process
+hinders nobody. The file itself may be renamed over meanwhile.
+"""
+
+import errno
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from jaxbundle.errors import InputError
+from jaxbundle.system.temporaries import temporary, unbroken
+
+NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
+"""Errors of a file system that has no locks."""
+
+
+@contextmanager
+def locked(
+    path: str | Path, named: str | Path | None = None, needed: bool = True
+) -> Iterator[None]:
+    """Hold the lock of a file, which need not exist; devices and pipes have none.
+
+    **Arguments:** `named`: what messages say is being written, the file by default; `needed`:
+    whether a file system without locks is an error.
+
+    **Raises:** `InputError` if another process holds it, or no lock can be had.
+    """
+    if os.path.exists(path) and not os.path.isfile(path):
+        yield
+        return
+    real, told = Path(os.path.realpath(path)), path if named is None else named
+    if not real.parent.is_dir():
+        raise InputError(f"{told}: there is no folder {real.parent}")
+    lock = real.with_name(f".{real.name}.lock")
+    with ExitStack() as held:
+        with unbroken():  # A lock is removed by the process that has it, and by no other.
+            held.enter_context(_taken(lock, told, needed))
+            # Gone before it is let go: nobody else gets a lock on a file that is about to vanish.
+            # Windows removes no open file: there it stays.
+            held.enter_context(temporary(lock))
+        yield
+
+
+def _taken(lock: Path, told: str | Path, needed: bool) -> BinaryIO:
+    """The locked file.
+
+    **Raises:** `InputError` as `locked`."""
+    try:
+        while (stream := _opened(lock, needed)) is None:
+            pass
+    except BlockingIOError:
+        raise InputError(
+            f"{told}: another run is writing it; wait for its end, or give another name"
+        ) from None
+    except OSError as error:
+        raise InputError(
+            f"{told}: its lock {lock} cannot be made: {error.strerror}; the folder must take files"
+        ) from None
+    return stream
+
+
+def _opened(lock: Path, needed: bool) -> BinaryIO | None:
+    """The file, locked; None if it vanished meanwhile.
+
+    **Raises:** `BlockingIOError` if somebody else has the lock."""
+    stream = open(lock, "ab")
+    try:
+        try:
+            _lock(stream)
+        except OSError as error:
+            if needed or error.errno not in NO_LOCKS:
+                raise
+        if os.path.samestat(os.fstat(stream.fileno()), os.stat(lock)):
+            return stream
+    except FileNotFoundError:
+        pass
+    except BaseException:
+        stream.close()
+        raise
+    stream.close()
+    return None
+
+
+def _lock(stream: BinaryIO) -> None:
+    try:
+        import fcntl
+    except ImportError:
+        import msvcrt
+
+        try:
+            msvcrt.locking(stream.fileno(), msvcrt.LK_NBLCK, 1)
+        except OSError as error:
+            raise BlockingIOError(error.errno, error.strerror) from None
+    else:
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)

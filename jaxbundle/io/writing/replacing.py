@@ -1,0 +1,78 @@
+"""Files replaced whole or not at all: written under a temporary name beside, then renamed."""
+
+import errno
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from jaxbundle.errors import InputError
+from jaxbundle.system.temporaries import temporary, unbroken
+
+FULL = (errno.ENOSPC, errno.EDQUOT)
+LONGEST_STEM = 60
+"""Characters of a name that its temporary name has: the whole of it may be too long."""
+
+
+@contextmanager
+def replaced_file(path: str | Path) -> Iterator[Path]:
+    """The temporary name of one file, as `replaced_files`."""
+    with replaced_files(path) as (temporary,):
+        yield temporary
+
+
+@contextmanager
+def replaced_files(*paths: str | Path) -> Iterator[tuple[Path, ...]]:
+    """Temporary names, beside some files, to write to; at the end they are renamed to those.
+
+    Where writing fails, none is renamed and the temporary files are removed; the files that were
+    there stay as they are. Of several, the renames follow each other: where the system refuses a
+    later one (a file that must not be changed), the earlier files are the new ones and the message
+    names that one. A link stays a link: what it leads to is replaced.
+
+    **Raises:** `InputError` for an error of the disk, and for what is there and no file.
+    """
+    real = [Path(os.path.realpath(path)) for path in paths]
+    for path, target in zip(paths, real):
+        if target.exists() and not target.is_file():
+            raise InputError(f"{path}: cannot be written: it is not a file; give another name")
+    names = tuple(
+        target.with_name(f".{target.stem[:LONGEST_STEM]}.{os.getpid()}{target.suffix}")
+        for target in real
+    )
+    with ExitStack() as until:
+        for name in names:
+            until.enter_context(temporary(name))
+        try:
+            yield names
+            with unbroken():
+                for name, target in zip(names, real):
+                    os.replace(name, target)
+        except OSError as error:
+            at = dict(zip(map(str, names), paths))
+            raise unwritable(at.get(str(error.filename), paths[0]), error) from None
+        except InputError as error:
+            said = str(error)
+            for name, path in zip(names, paths):
+                said = said.replace(str(name), str(path))
+            raise InputError(said) from None
+
+
+def unwritable(path: str | Path, error: OSError) -> InputError:
+    """Why a file or folder cannot be written, in one line; of a full disk, which it is."""
+    why = error.strerror or " ".join(str(error).split())
+    return InputError(
+        f"{path}: cannot be written: {why}{disk_of(path) if error.errno in FULL else ''}"
+    )
+
+
+def disk_of(path: str | Path) -> str:
+    """The disk a file is on, and what is free there, as the end of a message."""
+    place = Path(os.path.realpath(path))
+    while not place.exists():
+        place = place.parent
+    free = shutil.disk_usage(place).free
+    while not os.path.ismount(place):
+        place = place.parent
+    return f"; {free / 1e6:.6g} MB are free on the disk at {place}"

@@ -1,0 +1,75 @@
+"""The network of a planned block: photographs over a grid of tie points, control at the edges."""
+
+import math
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.network.tables import Camera, Network
+from jaxbundle.planning.simulate import simulate
+from jaxbundle.planning.stations import aerial_block
+from jaxbundle.planning.vertical_photographs import BlockDesign
+
+LEAST = 5
+"""Rows and columns of tie points, at least; odd, so that control finds the middles."""
+RELIEF = 0.02
+"""Heights of tie points vary by this part of the flying height, either way."""
+MARGIN = 0.03
+"""Of the footprint: how far inside the area points stand, or relief moves their images out."""
+
+
+def planned_network(
+    design: BlockDesign,
+    camera: Camera,
+    image_format: tuple[float, float],
+    area: tuple[float, float],
+    sigma_image: float,
+    control_sigma: float,
+    control_every: int | None = None,
+    seed: int = 0,
+) -> Network:
+    """A simulated network of the block, datum by control.
+
+    Tie points stand half a base apart along the strips and half a strip spacing across. Control
+    points are the nine at the corners of the area, the middles of its edges and its centre, or,
+    with `control_every`, one every so many bases along and strips across.
+
+    **Arguments:** `camera` of a model in mm; `image_format` and `sigma_image` in mm; `area` as in
+    `design_block`; `control_sigma` object unit.
+    """
+    counts = [_odd(length / step * 2) for length, step in zip(area, (design.base, design.spacing))]
+    columns, rows = counts
+    x, y = (
+        np.linspace(-0.5, 0.5, n) * (length - 2 * MARGIN * side)
+        for n, length, side in zip(counts, area, design.footprint)
+    )
+    grid = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    heights = np.random.default_rng(seed).uniform(-1, 1, len(grid)) * RELIEF * design.height
+    targets = np.concatenate([grid, heights[:, None]], axis=1)
+    along, across = (_control(n, control_every) for n in counts)
+    control = [row * columns + column for row in across for column in along]
+    stations = aerial_block(
+        design.strips, design.photographs_per_strip, height=design.height,
+        footprint=design.footprint, forward_overlap=design.forward_overlap,
+        side_overlap=design.side_overlap,
+    )  # fmt: skip
+    return simulate(
+        stations, targets, camera, noise=sigma_image, seed=seed, datum="control",
+        image_format=image_format, control=control, control_sigma=control_sigma, min_rays=2,
+        name="planned block",
+    )  # fmt: skip
+
+
+def _control(points: int, every: int | None) -> list[int]:
+    """Which of a row of points, two a base, are control points; the last is one."""
+    if every is None:
+        return [0, points // 2, points - 1]
+    if every < 1:
+        raise InputError(f"control every {every} bases: a number from 1 is expected")
+    return sorted({*range(0, points, 2 * every), points - 1})
+
+
+def _odd(steps: float) -> int:
+    """An odd number of points for at least so many steps."""
+    n = max(LEAST, math.ceil(steps - 1e-9) + 1)
+    return n + (n + 1) % 2

@@ -1,0 +1,416 @@
+"""Simulated networks: stations and targets in, a network with noise out, in one call.
+
+    stations = jaxbundle.ring_of_stations(8, radius=3.0, height=2.0, roll_every=2)
+    targets = jaxbundle.grid_of_targets(9, 9, 0.2, relief=0.1)
+    camera = jaxbundle.Camera("cam", "brown", {"c": 24.0, "K1": -1e-4}, free=("c", "x0", "K1"))
+    result = jaxbundle.adjust(
+        jaxbundle.simulate(stations, targets, camera, noise=0.001, seed=1, image_format=(36, 24))
+    )
+
+A target is imaged where its image lies inside the format and the ray of that image leads back to
+it. So nothing behind a camera is imaged, and nothing beyond the radius where a distortion formula
+turns back (`jaxbundle.cameras.turning_radius`). Nothing is hidden by anything else.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxbundle.arguments import numeric_array, positive, shown, text, whole
+from jaxbundle.cameras import default_parameters, get_model, image_ray, project
+from jaxbundle.errors import InputError
+from jaxbundle.float64 import require_x64
+from jaxbundle.geometry import matrix_from_omega_phi_kappa
+from jaxbundle.leastsquares.indices import rounded
+from jaxbundle.network.build import make_cameras
+from jaxbundle.network.rules import CHOICES, check_choice
+from jaxbundle.network.tables import (
+    Camera,
+    Distances,
+    Images,
+    Network,
+    Observations,
+    Points,
+    Source,
+)
+from jaxbundle.planning.stations import LARGEST_SEED, Stations, rows_of_three
+
+RAYS_AT_ONCE = 2_000_000
+"""Rays projected in one call, so that memory does not grow with stations × targets."""
+LEAST_STATIONS, LEAST_TARGETS = 16, 128
+"""So many at least are filled up, and so small networks share one program."""
+
+SAME_DIRECTION = 1e-6
+"""Largest distance of two unit vectors taken for one direction (rounding gives 1e-12)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Simulation:
+    """A simulated network and the truth behind it.
+
+    `truth` is the same network (same rows) with true cameras, exterior orientation, object
+    coordinates and distances, and image coordinates without noise.
+    """
+
+    network: Network
+    truth: Network
+
+
+def simulate(
+    stations: Stations,
+    targets: Float[np.ndarray, "points 3"],
+    camera: Camera | Sequence[Camera],
+    *,
+    noise: float | tuple[float, float],
+    seed: int = 0,
+    **options: Any,
+) -> Network:
+    """A simulated network, ready for `jaxbundle.adjust`.
+
+    Arguments and errors are those of `simulate_with_truth`, which returns the truth as well.
+    """
+    return simulate_with_truth(
+        stations, targets, camera, noise=noise, seed=seed, **options
+    ).network
+
+
+def simulate_with_truth(
+    stations: Stations,
+    targets: Float[np.ndarray, "points 3"],
+    camera: Camera | Sequence[Camera],
+    *,
+    noise: float | tuple[float, float],
+    seed: int = 0,
+    datum: str = "inner",
+    residuals: str = "corrected",
+    image_format: tuple[float, float] | None = None,
+    camera_of_station: Sequence[int] | None = None,
+    start: Camera | Sequence[Camera] | None = None,
+    disturb: float | tuple[float, float, float] = 0.0,
+    control: Sequence[int] = (),
+    control_sigma: float | tuple[float, float, float] = 0.0,
+    check: Sequence[int] = (),
+    distances: Sequence[tuple[int, int]] = (),
+    distance_sigma: float = 1e-3,
+    normals: Float[np.ndarray, "points 3"] | Sequence[float] | None = None,
+    max_incidence: float | None = None,
+    max_rays: int | None = None,
+    min_rays: int = 2,
+    name: str = "simulation",
+    object_unit: str = "m",
+) -> Simulation:
+    """A simulated network, ready for `jaxbundle.adjust`, and its truth.
+
+    **Arguments:**
+
+    - `stations`: exterior orientations, see `Stations`, `stations_looking_at`,
+      `ring_of_stations`, `aerial_block`.
+    - `targets`: object points [P, 3], object unit; the k-th has the id `str(k + 1)`.
+    - `camera`: with its TRUE parameters; what is `free` and its prior σ are taken over. Several
+      cameras: one for each station, or as `camera_of_station` [I] says (indices).
+    - `noise`: σ of the image coordinates (or of x and y), in the unit of the camera's model;
+      also their σ in the network. 0: exact coordinates, with σ 1.
+    - `seed`: of `numpy.random.default_rng`; equal arguments give equal networks.
+    - `image_format`: (width, height) of the image in the unit of the model, centred on the image
+      origin (pixel models with v down: from −½ to width − ½). Default: the camera's `image_size`
+      and `pixel_size`; unlimited where it has none.
+    - `start`: cameras with the start values of the parameters, default the true ones; what they
+      say is free, and their priors, go first.
+    - `disturb`: σ of the errors of the start values: positions, angles, points (object unit,
+      radians, object unit); or one fraction f, for f times the mean length of a ray, f radians
+      and f times the mean length again. Only tie points are disturbed.
+    - `control`: indices of control points, known with `control_sigma` (object unit, an error is
+      drawn; 0: fixed, without error); `check`: indices of check points.
+    - `distances`: pairs of indices of points with a measured distance of `distance_sigma`.
+    - `max_incidence`: largest angle, radians, between a target's normal (`normals`, [P, 3] or one
+      for all) and the direction to the camera.
+    - `max_rays`: of a point; which ones is drawn at random. Tie and check points with fewer than
+      `min_rays` rays are left out.
+
+    **Returns:** a `Simulation`: network and truth, with the `datum` and the domain of `residuals`
+    given.
+
+    **Raises:** `InputError` for impossible arguments, and where no target is imaged.
+    """
+    require_x64()
+    check_choice("datum", datum, CHOICES["datum"])
+    check_choice("residuals", residuals, CHOICES["residuals"])
+    if not isinstance(stations, Stations):
+        raise InputError(
+            f"stations must be Stations, but is {shown(stations)}: ring_of_stations, aerial_block "
+            "or stations_looking_at give them"
+        )
+    targets = rows_of_three(targets, "targets")
+    seed = whole("seed", seed, least=0, most=LARGEST_SEED)
+    min_rays = whole("min_rays", min_rays, least=0)
+    max_rays = None if max_rays is None else whole("max_rays", max_rays)
+    if max_incidence is not None:
+        max_incidence = positive("max_incidence", max_incidence)
+    distance_sigma = positive("distance_sigma", distance_sigma)
+    if normals is not None:
+        normals = _normals(normals, targets)
+    for key, value in (("name", name), ("object_unit", object_unit)):
+        text(key, value)
+    cameras = make_cameras(camera)
+    of_station = _camera_of_station(cameras, camera_of_station, len(stations))
+    begin = cameras if start is None else make_cameras(start, "start: ")
+    if len(begin) != len(cameras):
+        raise InputError(f"start has {len(begin)} cameras, camera {len(cameras)}; give as many")
+    role = _roles(len(targets), control, control_sigma, check)
+    sigma_xy = _not_negative(noise, 2, "noise")
+
+    image, point, xy = _look(stations, targets, cameras, of_station, image_format)
+    rng = np.random.default_rng(seed)
+    keep = np.ones(len(image), bool)
+    if max_incidence is not None:
+        keep = _facing(stations, targets, normals, image, point) >= np.cos(max_incidence)
+    if max_rays is not None:
+        keep[keep] = _at_most(point[keep], max_rays, rng)
+    need = np.where(np.isin(role, ("tie", "check")), min_rays, 1)
+    used = np.bincount(point[keep], minlength=len(targets)) >= need
+    keep &= used[point]
+    if not keep.any():
+        raise InputError(
+            "no target is imaged often enough; check the format, the units, and where the "
+            "stations look"
+        )
+    image, point, xy = image[keep], point[keep], xy[keep]
+
+    row = np.cumsum(used) - 1
+    point, true, role = row[point], targets[used], role[used]
+    sigma = np.full((len(true), 3), np.nan)
+    if "control" in role:
+        sigma[role == "control"] = np.broadcast_to(control_sigma, 3)
+    ends = _ends(distances, len(targets), used, row)
+    true_length = np.linalg.norm(true[ends[:, 0]] - true[ends[:, 1]], axis=1)
+    truth = Network(
+        cameras=cameras,
+        images=Images(
+            id=tuple(str(i + 1) for i in range(len(stations))),
+            camera=of_station,
+            position=stations.position,
+            angles=stations.angles,
+            sigma=np.full((len(stations), 6), np.nan),
+            source=Source("stations", None, "station"),
+        ),
+        points=Points(
+            tuple(str(k + 1) for k in np.flatnonzero(used)),
+            tuple(role.tolist()),
+            true,
+            sigma,
+            Source("targets", np.flatnonzero(used) + 1, "target"),
+        ),
+        observations=Observations(
+            image, point, xy,
+            np.broadcast_to(np.where(sigma_xy > 0, sigma_xy, 1.0), xy.shape).copy(),
+            Source("image points"),
+        ),
+        distances=Distances(
+            ends, true_length, np.full(len(ends), float(distance_sigma)), Source("distances")
+        ),
+        datum=datum,
+        residuals=residuals,
+        name=name,
+        object_unit=object_unit,
+        image_unit=get_model(cameras[0].model).unit,
+    )
+    disturbance = _disturbance(disturb, stations.position[image] - true[point])
+    return Simulation(_measured(truth, begin, sigma_xy, disturbance, rng), truth)
+
+
+def _measured(truth: Network, begin, noise, disturb, rng) -> Network:
+    """The network as observed: noise, errors of given coordinates, disturbed start values."""
+    images, points, distances = truth.images, truth.points, truth.distances
+    observations = truth.observations
+    xy = observations.xy + noise * rng.standard_normal(observations.xy.shape)
+    value = distances.value + distances.sigma * rng.standard_normal(len(distances))
+    error = rng.standard_normal(points.position.shape)
+    scale = np.where(points.has_role("tie")[:, None], disturb[2], np.nan_to_num(points.sigma))
+    position = images.position + disturb[0] * rng.standard_normal(images.position.shape)
+    angles = images.angles + disturb[1] * rng.standard_normal(images.angles.shape)
+    return truth.replace(
+        cameras=begin,
+        images=dataclasses.replace(images, position=position, angles=angles),
+        points=dataclasses.replace(points, position=points.position + scale * error),
+        observations=dataclasses.replace(observations, xy=xy),
+        distances=dataclasses.replace(distances, value=value),
+    )
+
+
+def _camera_of_station(cameras, given, stations: int) -> Int[np.ndarray, " images"]:
+    if given is None:
+        if len(cameras) not in (1, stations):
+            raise InputError(
+                f"{len(cameras)} cameras for {stations} stations; give camera_of_station, the "
+                "index of the camera of every station"
+            )
+        return np.arange(stations) % len(cameras)
+    given = numeric_array("camera_of_station", given, "indices of cameras")
+    if given.shape != (stations,) or not np.isin(given, np.arange(len(cameras))).all():
+        raise InputError(
+            f"camera_of_station must be {stations} indices below {len(cameras)}, one a station"
+        )
+    return given.astype(np.int64)
+
+
+def _roles(points: int, control, control_sigma, check):
+    role = np.full(points, "tie", dtype=object)
+    sigma = _not_negative(control_sigma, 3, "control_sigma")
+    if (sigma == 0).any() and (sigma > 0).any():
+        raise InputError("control_sigma: 0 (fixed) must stand for all three axes or for none")
+    for name, chosen, word in (
+        ("control", control, "fixed" if (sigma == 0).all() else "control"),
+        ("check", check, "check"),
+    ):
+        chosen = _indices(name, chosen)
+        if chosen.ndim != 1:
+            raise InputError(f"{name} must be a list of indices, but is {shown(chosen.tolist())}")
+        if not np.isin(chosen, np.arange(points)).all():
+            raise InputError(f"{name} holds an index that is not among the {points} targets")
+        if (role[chosen] != "tie").any():
+            raise InputError("a target cannot be a control point and a check point at once")
+        role[chosen] = word
+    return role
+
+
+def _indices(name: str, values):
+    """Indices of targets; none may be given as []."""
+    array = numeric_array(name, values, "indices of targets")
+    if array.size and array.dtype.kind not in "iu":
+        raise InputError(f"{name} must be indices of targets, whole numbers, but is "
+                         f"{shown(array.tolist())}")  # fmt: skip
+    return array.astype(int)
+
+
+def _not_negative(value, size: int, name: str):
+    value = numeric_array(name, value, f"0 or positive, one number or {size}").astype(float)
+    if value.shape not in ((), (size,)) or not (np.isfinite(value) & (value >= 0)).all():
+        raise InputError(f"{name} is {value}; it must be 0 or positive, one number or {size}")
+    return np.broadcast_to(value, size)
+
+
+def _disturbance(disturb, rays):
+    """σ of the start values of positions, angles and points."""
+    if numeric_array("disturb", disturb, "a fraction, or three σ").ndim == 0:
+        length = float(np.linalg.norm(rays, axis=1).mean())
+        disturb = (disturb * length, disturb, disturb * length)
+    return _not_negative(disturb, 3, "disturb")
+
+
+def _ends(distances, targets: int, used, row):
+    """The ends of the distances as rows of the points used."""
+    ends = _indices("distances", distances)
+    if ends.shape != (0,) and (ends.ndim != 2 or ends.shape[1] != 2 or (ends[:, 0] == ends[:, 1])
+                               .any()):  # fmt: skip
+        raise InputError(
+            "distances must be pairs of indices of two different targets, but is "
+            f"{shown(ends.tolist())}"
+        )
+    ends = ends.reshape(-1, 2)
+    if not np.isin(ends, np.arange(targets)).all():
+        raise InputError(f"distances name an index that is not among the {targets} targets")
+    for a, b in ends[~used[ends].all(1)][:1]:
+        raise InputError(f"the distance from target {a + 1} to {b + 1}: too few images show it")
+    return row[ends]
+
+
+def _facing(stations, targets, normals, image, point):
+    """Cosine of the angle between a target's normal and the direction to the camera."""
+    if normals is None:
+        raise InputError("max_incidence needs the normals of the targets; give normals [P, 3]")
+    ray = stations.position[image] - targets[point]
+    return (ray * normals[point]).sum(1) / np.linalg.norm(ray, axis=1)
+
+
+def _normals(normals, targets):
+    """Unit vectors [P, 3]."""
+    normals = numeric_array("normals", normals, "directions X, Y, Z").astype(float)
+    if normals.shape not in ((3,), targets.shape):
+        raise InputError(
+            f"normals must have the shape [3] or {list(targets.shape)}, but has {normals.shape}"
+        )
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    if not (np.isfinite(length) & (length > 0)).all():
+        raise InputError("normals must be finite directions, none of them 0, 0, 0")
+    return np.broadcast_to(normals / length, targets.shape)
+
+
+def _at_most(point, max_rays: int, rng):
+    """A mask that keeps at most so many rays of every point, drawn at random."""
+    order = np.lexsort((rng.random(len(point)), point))
+    sorted_point = point[order]
+    first = np.searchsorted(sorted_point, sorted_point)
+    keep = np.empty(len(point), bool)
+    keep[order] = np.arange(len(point)) - first < max_rays
+    return keep
+
+
+def _look(stations, targets, cameras, of_station, image_format):
+    """All images of targets inside the format: image, point [rays], true coordinates [rays, 2]."""
+    found, number = [], len(targets)
+    wide = max(LEAST_TARGETS, rounded(number))
+    targets = np.pad(targets, [(0, wide - number), (0, 0)], mode="edge")
+    for c, camera in enumerate(cameras):
+        model = get_model(camera.model)
+        values = {**default_parameters(model), **camera.parameters}
+        p = tuple(float(values[name]) for name in model.parameters)
+        low, high = _format(camera, image_format)
+        index = np.flatnonzero(of_station == c)
+        some = max(LEAST_STATIONS, rounded(len(index)))
+        at_once = int(np.clip(RAYS_AT_ONCE // wide, 1, some))
+        for begin in range(0, len(index), at_once):
+            # The last batch is filled up, so that all have one shape and compile once.
+            batch = np.resize(index[begin : begin + at_once], at_once)
+            xy, back = _images_of(
+                model, p, stations.position[batch], stations.angles[batch], targets
+            )
+            xy, back = np.asarray(xy)[:, :number], np.asarray(back)[:, :number]
+            inside = ((xy >= low) & (xy <= high)).all(-1) & back
+            inside[len(index) - begin :] = False
+            i, k = np.nonzero(inside)
+            found.append((batch[i], k, xy[i, k]))
+    image, point, xy = (np.concatenate(columns) for columns in zip(*found))
+    order = np.lexsort((point, image))
+    return image[order], point[order], xy[order]
+
+
+@partial(jax.jit, static_argnums=0)
+def _images_of(model, p, position, angles, targets):
+    """Image coordinates [i, P, 2], and whether their rays lead back to the targets [i, P]."""
+    matrices = jax.vmap(matrix_from_omega_phi_kappa)(angles)
+
+    def one(M, centre, X, Y, Z):
+        X, Y, Z = X - centre[0], Y - centre[1], Z - centre[2]
+        ray = tuple(M[k, 0] * X + M[k, 1] * Y + M[k, 2] * Z for k in range(3))
+        x, y = project(model, p, *ray)
+        length = jnp.sqrt(sum(r * r for r in ray))
+        square = sum((a - b / length) ** 2 for a, b in zip(image_ray(model, p, x, y), ray))
+        return jnp.stack([x, y]), square < SAME_DIRECTION**2
+
+    points = jax.vmap(one, (None, None, 0, 0, 0))
+    return jax.vmap(points, (0, 0, None, None, None))(matrices, position, *targets.T)
+
+
+def _format(camera: Camera, image_format):
+    """Lowest and highest image coordinates, in the unit and axes of the camera's model."""
+    model = get_model(camera.model)
+    size = image_format
+    if size is None and camera.image_size is not None:
+        if model.unit == "px":
+            size = camera.image_size
+        elif camera.pixel_size is not None:
+            size = np.array(camera.image_size) * camera.pixel_size
+    if size is None:
+        return np.full(2, -np.inf), np.full(2, np.inf)
+    size = numeric_array("image_format", size, "(width, height)").astype(float)
+    if size.shape != (2,) or not (np.isfinite(size) & (size > 0)).all():
+        raise InputError(f"image_format is {size}; expected (width, height), both positive")
+    if model.axes == "down":
+        return np.full(2, -0.5), size - 0.5
+    return -size / 2, size / 2

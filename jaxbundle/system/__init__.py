@@ -1,0 +1,1 @@
+"""The machine: files, temporary files, interrupts, and how JAX is to work."""

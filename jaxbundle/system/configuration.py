@@ -1,0 +1,162 @@
+"""How JAX is to work: cores, kept programs, processes; only when it is asked for."""
+
+import os
+import re
+import socket
+import sys
+import time
+from typing import NoReturn
+
+from jaxbundle.errors import InputError
+from jaxbundle.system.temporaries import watch_cache
+
+WORTH_KEEPING = 0.02
+"""Programs that took so many seconds to compile are kept; a small network has a dozen of them."""
+
+
+def use_cores(number: int | None = None) -> None:
+    """Let the cores of the processor (all, or so many) share the work on big networks, as devices
+    of JAX; call it before the first JAX computation."""
+    import jax
+
+    from jaxbundle.arguments import whole
+
+    cores = available_cores() if number is None else whole("number", number)
+    jax.config.update("jax_num_cpu_devices", cores)
+
+
+def keep_programs(folder: str | os.PathLike | None = None) -> bool:
+    """Keep compiled programs in a folder, so that later processes start without compiling; call it
+    before the first JAX computation.
+
+    `folder`: if not given, that of the environment variable JAX_COMPILATION_CACHE_DIR, else
+    `jaxbundle` among the user's caches.
+
+    **Returns:** whether the folder takes files; if not, nothing is kept.
+    """
+    import jax
+
+    from jaxbundle.arguments import path
+
+    folder = None if folder is None else path("folder", folder)
+    variable = "JAX_COMPILATION_CACHE_DIR"
+    if folder is None:
+        home = os.path.join(os.path.expanduser("~"), ".cache")
+        caches = os.environ.get("XDG_CACHE_HOME") or home
+        folder = os.environ.get(variable) or os.path.join(caches, "jaxbundle")
+    try:
+        os.makedirs(folder, exist_ok=True)
+        usable = os.access(folder, os.W_OK | os.X_OK)
+    except OSError:
+        usable = False
+    # JAX has read the variable by itself, and would complain of a bad folder at every program.
+    jax.config.update("jax_compilation_cache_dir", os.fspath(folder) if usable else None)
+    if not usable:
+        return False
+    watch_cache(folder)
+    if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", WORTH_KEEPING)
+    return True
+
+
+def join_processes(
+    address: str | None = None,
+    processes: int | None = None,
+    process: int | None = None,
+    *,
+    lost_after_seconds: int = 30,
+    wait_seconds: int = 60,
+) -> bool:
+    """Adjust together with other processes, on this machine or others, which all run the same
+    program on the same files; call it before the first JAX computation.
+
+    **Arguments:**
+
+    - `address`: `host:port` of process 0, the same for all; `processes`: how many there are;
+      `process`: which one this is, from 0. Under SLURM or on TPUs JAX finds all three by itself:
+      give none of them.
+    - `lost_after_seconds`: a process not heard of for so long has ended, and the others end too.
+    - `wait_seconds`: so long the processes wait for one another to come.
+
+    **Returns:** whether this is process 0, the one that should write the results. All of them have
+    the result.
+
+    **Raises:** `InputError` if the processes cannot be told, or process 0 is not found. Process 0
+    that waits in vain for the others is aborted by JAX.
+    """
+    import jax
+
+    from jaxbundle.arguments import whole
+
+    expected = (
+        "expected: host:port of process 0, the number of processes, and which one this is, from 0; "
+        "none of them under SLURM"
+    )
+    for name, value in (("processes", processes), ("process", process)):
+        if value is not None:
+            whole(name, value, least=0)
+    whole("lost_after_seconds", lost_after_seconds)
+    whole("wait_seconds", wait_seconds)
+    if address is not None:
+        parts = re.fullmatch(r"(\S+):(\d{1,5})", str(address))
+        if not parts or not 0 < int(parts[2]) < 65536:
+            raise InputError(f"the processes cannot be joined at {address!r}; {expected}")
+        if processes is not None and process is not None and not 0 <= process < processes:
+            raise InputError(f"process {process} of {processes} cannot be joined; {expected}")
+        _check_address(parts[1].strip("[]"), int(parts[2]), process, wait_seconds)
+    jax.config.update("jax_cpu_collectives_implementation", "gloo")
+    # The service would keep SIGTERM to itself, and the process would run on.
+    jax.config.update("jax_enable_preemption_service", False)
+    try:
+        jax.distributed.initialize(
+            address, processes, process,
+            heartbeat_timeout_seconds=lost_after_seconds, initialization_timeout=wait_seconds,
+        )  # fmt: skip
+    except (ValueError, TypeError, RuntimeError) as error:
+        why = " ".join(str(error).split())[:300]
+        if address is None and not any(name.startswith("SLURM_") for name in os.environ):
+            why = "no SLURM variables were found"
+        raise InputError(f"the processes cannot be joined: {why}; {expected}") from None
+    return jax.process_index() == 0
+
+
+def _check_address(host: str, port: int, process: int | None, wait_seconds: int) -> None:
+    """Process 0 needs its port, the others process 0; JAX would abort where they are missing."""
+    try:
+        socket.getaddrinfo(host, port)
+    except (OSError, UnicodeError):
+        raise InputError(f"there is no machine {host!r} to join processes at") from None
+    if process == 0:
+        try:
+            socket.create_server(("", port)).close()
+        except OSError as error:
+            why = os.strerror(error.errno or 0)
+            raise InputError(f"port {port}: {why}; take another") from None
+        return
+    end = time.monotonic() + wait_seconds
+    while process:
+        try:
+            return socket.create_connection((host, port), timeout=5).close()
+        except OSError:
+            if time.monotonic() > end:
+                raise InputError(
+                    f"no process 0 at {host}:{port} after {wait_seconds} seconds"
+                ) from None
+            time.sleep(0.1)
+
+
+def leave(status: int) -> NoReturn:
+    """End this process; one of several joined at once, for an orderly exit waits for the others."""
+    jax = sys.modules.get("jax")
+    if jax and jax.distributed.is_initialized():
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+    sys.exit(status)
+
+
+def available_cores() -> int:
+    """Cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

@@ -1,0 +1,159 @@
+"""Ctrl-C and SIGTERM on the command line: one line, status 130 or 143, nothing half-written.
+
+Python's own handler raises an exception in the main thread. That is not enough. In a destructor, a
+callback of the garbage collector or of C++ the exception is swallowed, and the run goes on; in the
+middle of an import it turns into another error; and while the main thread compiles or computes in
+C++, which takes minutes for a large network, it is not raised at all.
+
+So nothing is raised. The handler removes what is temporary and ends the process. Python calls it
+between two steps of the main thread, wherever that is. Where it is not called within `GRACE`, for
+the main thread is in C++ or in a block `unbroken`, a thread that the signal wakes does the same.
+
+Nothing of this is set up by importing jaxbundle: only the command line calls `handle_interrupts`.
+"""
+
+import os
+import signal
+import sys
+import time
+
+TYPE_CHECKING = False  # typing would be imported for nothing else
+if TYPE_CHECKING:
+    from typing import NoReturn
+
+GRACE = 0.3
+"""Seconds the main thread has to take notice of a signal."""
+
+PATIENCE = 10.0
+"""Seconds for what must not be cut in two; a disk that does not answer holds nobody longer."""
+
+WORDS: dict[int, str] = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
+if os.name == "posix":
+    WORDS[signal.SIGHUP] = "the terminal is gone"
+
+_advice = ""
+_status = 1
+_screen = 2
+"""Standard error: from `handle_interrupts` on a second way to it, for a writer of rasters silences
+the first."""
+_ending = _temporaries = None
+"""A lock, and the module that knows what is temporary: once they are imported."""
+
+
+def handle_interrupts() -> None:
+    """End this process by the rules above, from now on; what is ignored stays ignored (nohup).
+
+    At its end the process leaves without taking the interpreter apart, which takes JAX up to a
+    second in which a signal would end it in other ways.
+    """
+    global _ending, _screen, _temporaries
+    for number in WORDS:
+        if signal.getsignal(number) in (signal.default_int_handler, signal.SIG_DFL):
+            try:
+                signal.signal(number, _handle)
+            except ValueError:  # Only the main thread may.
+                return
+    # After that and not before: these imports take as long as the start of Python.
+    import atexit
+    import threading
+
+    from jaxbundle.system import temporaries
+
+    _ending = threading.RLock()
+    _temporaries = temporaries
+    _open_standard_streams()
+    _screen = os.dup(2)
+    atexit.register(_leave)  # the first to be registered is the last to be called
+    if os.name == "posix":
+        reader, writer = os.pipe()
+        os.set_blocking(writer, False)
+        signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+        threading.Thread(target=_watch, args=(reader,), daemon=True).start()
+
+
+def advise(words: str) -> None:
+    """Say at an interrupt what to do to go on."""
+    global _advice
+    _advice = words
+
+
+def set_status(status: int) -> None:
+    """The exit status of the process, if nothing interrupts it any more."""
+    global _status
+    _status = status
+
+
+def _handle(number: int, frame: object) -> None:
+    if _temporaries is None:  # Then nothing is.
+        _say_and_exit(number)
+    if not _temporaries.put_off(lambda: _end(number)):
+        _end(number)
+
+
+def _watch(reader: int) -> None:
+    """Wait for the byte that Python writes for a signal, whatever the main thread does."""
+    import threading
+
+    number = 0
+    while number not in WORDS:
+        number = os.read(reader, 1)[0]
+    time.sleep(GRACE)
+    last = threading.Timer(2 * PATIENCE, _say_and_exit, (number,))  # The disk does not answer.
+    last.daemon = True
+    last.start()
+    _end(number)
+
+
+def _end(number: int) -> None:
+    """Tidy up, say so, and end; a thread that comes second waits here for the end."""
+    if _ending is None or _temporaries is None:
+        _say_and_exit(number)
+    _ending.acquire()
+    _become_deaf()
+    _temporaries.remove_temporaries(PATIENCE)
+    _say_and_exit(number)
+
+
+def _become_deaf() -> None:
+    """In the main thread, which runs the handlers: a second signal changes nothing.
+
+    Not "ignore": Python tells of a signal that it had taken note of, and that is now ignored.
+    """
+    try:
+        for number in WORDS:
+            if signal.getsignal(number) is _handle:
+                signal.signal(number, lambda *_: None)
+    except ValueError:
+        pass  # another thread; the main thread would come to wait in `_end`
+
+
+def _say_and_exit(number: int) -> "NoReturn":
+    line = f"jaxbundle: {WORDS[number]}" + (_advice and f"; {_advice}") + "\n"
+    try:
+        if os.isatty(_screen):  # There may be a bar of progress, which hides the cursor.
+            line = "\r\x1b[2K\x1b[?25h" + line
+        os.write(_screen, line.encode())
+    except OSError:
+        pass  # Nobody listens.
+    os._exit(128 + number)
+
+
+def _leave() -> None:
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, ValueError):
+            pass  # Nobody reads.
+    os._exit(_status)
+
+
+def _open_standard_streams() -> None:
+    """Give a closed standard stream (`>&-`) the null device: the next file that is opened would
+    have its number, and get what is said to the user."""
+    for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))

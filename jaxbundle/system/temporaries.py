@@ -1,0 +1,96 @@
+"""Files and folders that no interrupted run leaves behind, and steps that are not cut in two.
+
+In a notebook or a program an interrupt is an exception, and the blocks below tidy up as after any
+other. The command line ends without one (`system.interrupts`): it calls `remove_temporaries`.
+"""
+
+import os
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+_temporaries: dict[str, bool] = {}
+"""By name, whether its content goes with it."""
+_caches: set[str] = set()
+_lock = threading.RLock()
+_inside: list[int] = []
+"""The thread in blocks `unbroken`, once for each of them."""
+_put_off: list[Callable[[], None]] = []
+
+
+@contextmanager
+def temporary(path: str | os.PathLike, content: bool = True) -> Iterator[Path]:
+    """A file or folder, not made yet, that is removed at the end of the block if it is there.
+
+    `content`: a folder goes with what is in it; else it goes if it is empty.
+    """
+    name = os.path.abspath(path)
+    with _lock:
+        _temporaries[name] = content
+    try:
+        yield Path(path)
+    finally:
+        _remove(name, content)
+        _temporaries.pop(name, None)
+
+
+@contextmanager
+def unbroken() -> Iterator[None]:
+    """An interrupt of the command line waits for the end of this block: for a few calls of the
+    system that belong together, such as two renames, never for work."""
+    _lock.acquire()
+    _inside.append(threading.get_ident())
+    try:
+        yield
+    finally:
+        _inside.pop()
+        _lock.release()
+        if _put_off and threading.get_ident() not in _inside:
+            _put_off[0]()
+
+
+def put_off(action: Callable[[], None]) -> bool:
+    """Whether this thread is in a block `unbroken`; then the action is called at its end."""
+    if threading.get_ident() not in _inside:
+        return False
+    _put_off.append(action)
+    return True
+
+
+def watch_cache(folder: str | os.PathLike) -> None:
+    """Name a folder into which a library writes files under their own names: one that is open at an
+    interrupt is removed, for its beginning would be taken for the whole."""
+    _caches.add(os.path.realpath(folder))
+
+
+def remove_temporaries(patience: float) -> None:
+    """Remove what is temporary; the process must end at once, for no block `unbroken` begins after
+    this. A thread in such a block may finish it, for so many seconds."""
+    _lock.acquire(timeout=patience)
+    for name, content in reversed(list(_temporaries.items())):
+        _remove(name, content)
+    _remove_open_files(_caches)
+
+
+def _remove(name: str, content: bool) -> None:
+    with suppress(OSError):
+        if os.path.islink(name) or not os.path.isdir(name):
+            os.unlink(name)
+            return
+        for folder, folders, files in os.walk(name, topdown=False) if content else ():
+            for one in (*files, *folders):
+                path = os.path.join(folder, one)
+                with suppress(OSError):
+                    os.unlink(path) if one in files or os.path.islink(path) else os.rmdir(path)
+        os.rmdir(name)
+
+
+def _remove_open_files(folders: set[str]) -> None:
+    """Remove the files directly in the folders that are open (known on Linux)."""
+    descriptors = "/proc/self/fd"
+    for one in os.listdir(descriptors) if folders and os.path.isdir(descriptors) else ():
+        with suppress(OSError):
+            path = os.readlink(os.path.join(descriptors, one))
+            if os.path.dirname(path) in folders:
+                os.unlink(path)
