@@ -26,6 +26,7 @@ LAYERS = (
     "statistics",
     "refinement",
     "io",
+    "surface",
     "plotting",
     "report",
     "bundle",

@@ -27,10 +27,14 @@ NO_NUMBERS = (bool, np.bool_, complex, np.complexfloating, type(np.ma.masked))
 
 @dataclasses.dataclass(frozen=True)
 class Columns:
-    """Columns of equal length: text or numbers; None, NaN and empty text are missing values."""
+    """Columns of equal length: text or numbers; None, NaN and empty text are missing values.
+
+    `may_be_empty`: whether a table without rows is accepted.
+    """
 
     values: Mapping[str, Column]
     source: Source
+    may_be_empty: bool = False
 
     def __len__(self) -> int:
         return min((len(column) for column in self.values.values()), default=0)
@@ -49,7 +53,7 @@ class Columns:
                     f"{self.source.name}: column {name!r} is missing; expected columns: "
                     f"{', '.join(required)}"
                 )
-        if len(self) == 0:
+        if len(self) == 0 and not self.may_be_empty:
             raise InputError(f"{self.source.name}: the table is empty; give at least one row")
 
     def ids(self, name: str) -> tuple[str, ...]:

@@ -29,6 +29,7 @@ Small tables may stand in the file itself, one `[[image]]`, `[[point]]`, `[[obse
 `[[distance]]` a row.
 """
 
+import dataclasses
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -63,6 +64,7 @@ from jaxbundle.network.build import (
 from jaxbundle.network.columns import Columns, as_columns, did_you_mean
 from jaxbundle.network.further import KINDS, SECTIONS, Further
 from jaxbundle.network.further.base import among
+from jaxbundle.network.rules import AXES
 from jaxbundle.network.tables import Camera, Network, Source, require_network
 from jaxbundle.network.units import ANGLE_UNITS, to_image_unit
 from jaxbundle.system.file_content import check_plain
@@ -78,23 +80,38 @@ INLINE = {
 }  # fmt: skip
 """The tables and the name of one of their rows in the TOML file."""
 
+WITHOUT = {"points": ("id", "role", *AXES), "observations": ("image", "point", "x", "y")}
+"""Tables that a network of oriented images can do without, and their columns."""
+
 
 def read_project(
-    path: str | Path, overrides: Sequence[str] = (), models: Sequence[CameraModel] = ()
-) -> Network:
+    path: str | Path, overrides: Sequence[str] = (), models: Sequence[CameraModel] = (),
+    oriented: bool = False,
+) -> Network:  # fmt: skip
     """The network of a project file, or of the one in a folder (`project_file`).
 
     `overrides` are settings `KEY=VALUE` that replace those of the file, see
-    `jaxbundle.io.networks.settings`; `models` own camera models that the file may name.
+    `jaxbundle.io.networks.settings`; `models` own camera models that the file may name;
+    `oriented`: cameras and images are enough, without points and observations.
 
     **Raises:** `InputError` naming file, line and column.
     """
     path = project_file(Path(path))
     document = apply_overrides(_read_document(path), overrides, (*SETTINGS, *TABLES))
     document["project"].setdefault("name", path.resolve().parent.name)
-    tables = {table: _read_table(document, table, path) for table in TABLES}
+    tables = {table: _read_table(document, table, path) for table in TABLES
+              if not (oriented and table in WITHOUT and _is_absent(document, table))}  # fmt: skip
+    for table, columns in WITHOUT.items() if oriented else ():
+        found = tables.get(table)
+        if found is None:
+            found = Columns(dict.fromkeys(columns, ()), Source(table))
+        tables[table] = dataclasses.replace(found, may_be_empty=True)
     return network_of(document, {k: v for k, v in tables.items() if v is not None}, str(path),
                       models)  # fmt: skip
+
+
+def _is_absent(document: Document, table: str) -> bool:
+    return document["project"].get(table) is None and document.get(INLINE.get(table, "")) is None
 
 
 def project_file(path: Path) -> Path:

@@ -1,0 +1,66 @@
+"""A cloud of points, each with its covariance, number of rays, and the pixel it was found from."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from jaxbundle.errors import InputError
+
+
+@dataclasses.dataclass(frozen=True)
+class Cloud:
+    """Points X [n, 3] with covariance, object unit; `rays`; `image`, index into `images`, and `uv`,
+    the pixel of that base image; `colour` red, green, blue. `system`: coordinate system, where it
+    is one of maps."""
+
+    X: Float[np.ndarray, "n 3"]
+    covariance: Float[np.ndarray, "n 3 3"]
+    rays: Int[np.ndarray, " n"]
+    image: Int[np.ndarray, " n"]
+    uv: Float[np.ndarray, "n 2"]
+    images: tuple[str, ...]
+    colour: UInt8[np.ndarray, "n 3"] | None = None
+    system: str | None = None
+
+    def __post_init__(self):
+        n = len(self.X)
+        shapes = {"X": (n, 3), "covariance": (n, 3, 3), "rays": (n,), "image": (n,), "uv": (n, 2)}
+        for name, shape in shapes.items():
+            if np.shape(getattr(self, name)) != shape:
+                raise InputError(
+                    f"cloud: {name} has the shape {np.shape(getattr(self, name))}, expected {shape}"
+                )
+
+    def __len__(self) -> int:
+        return len(self.X)
+
+    @property
+    def sigma(self) -> Float[np.ndarray, "n 3"]:
+        """σX, σY, σZ; NaN where they are not known."""
+        with np.errstate(invalid="ignore"):
+            return np.sqrt(np.einsum("nii->ni", self.covariance))
+
+    def take(self, rows) -> "Cloud":
+        """Some of the points (a mask or indices)."""
+        fields = ("X", "covariance", "rays", "image", "uv")
+        some = {name: getattr(self, name)[rows] for name in fields}
+        colour = None if self.colour is None else self.colour[rows]
+        return dataclasses.replace(self, **some, colour=colour)
+
+
+def merge(clouds: Sequence[Cloud]) -> Cloud:
+    """All points of several clouds of one system."""
+    clouds = [c for c in clouds if len(c)] or list(clouds[:1])
+    if not clouds:
+        raise InputError("no clouds to merge")
+    names = tuple(dict.fromkeys(name for c in clouds for name in c.images))
+    number = [np.array([names.index(n) for n in c.images] or [0]) for c in clouds]
+    join = lambda field: np.concatenate([getattr(c, field) for c in clouds])
+    colours = [c.colour for c in clouds]
+    return Cloud(
+        join("X"), join("covariance"), join("rays"),
+        np.concatenate([k[c.image] for k, c in zip(number, clouds)]).astype(int), join("uv"),
+        names, None if any(c is None for c in colours) else join("colour"), clouds[0].system,
+    )  # fmt: skip

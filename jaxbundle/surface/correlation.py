@@ -1,0 +1,187 @@
+"""Normalised cross-correlation along segments, in many images at once.
+
+Both windows are sampled on grids whose first axis is the epipolar line. Then all windows along a
+segment are parts of one strip, of which column k + x of row y is sampled once:
+
+    ρ(k) = Σ t(x, y)·s(k + x, y)/√(Σt²·Σ(s − s̄ₖ)²),    Σt = 0
+
+Positions are one window pixel apart; between them ρ is a parabola. The place to a fraction of a
+pixel is the business of least squares matching.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.measure.opencv import need_opencv
+from jaxbundle.surface.segments import Segments, Windows, positions
+from jaxbundle.surface.views import OrientedImage
+from jaxbundle.system.configuration import available_cores
+
+TOGETHER = 256
+"""Points whose strips stay in the cache."""
+FLAT = 1e-3
+"""Standard deviation of a window, grey values, below which it has no contrast."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Pyramid:
+    """An image and its means over 2 × 2, 4 × 4, … pixels (with a slight blur), as float32."""
+
+    levels: tuple[Float[np.ndarray, "rows columns"], ...]
+
+    def sample(self, level: int, uv: Float[np.ndarray, "rows columns 2"]):
+        """Grey values at places given in pixels of the full image; NaN outside."""
+        cv2 = need_opencv()
+        place = ((uv + 0.5) / 2**level - 0.5).astype(np.float32)
+        return cv2.remap(
+            self.levels[level], place[..., 0], place[..., 1], cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"),
+        )  # fmt: skip
+
+
+def make_pyramid(grey: Float[np.ndarray, "rows columns"], levels: int) -> Pyramid:
+    """The image and so many coarser ones."""
+    cv2 = need_opencv()
+    found = [np.ascontiguousarray(grey, np.float32)]
+    for _ in range(levels):
+        a = found[-1]
+        rows, columns = (max(n // 2, 1) for n in a.shape)
+        half = cv2.resize(
+            a[: 2 * rows, : 2 * columns], (columns, rows), interpolation=cv2.INTER_AREA
+        )
+        found.append(np.asarray(half, np.float32))
+    return Pyramid(tuple(found))
+
+
+def correlate(
+    pair: tuple[OrientedImage, OrientedImage],
+    pyramids: tuple[Pyramid, Pyramid],
+    uv: Float[np.ndarray, "n 2"],
+    segment: Segments,
+    shape: Windows,
+    *,
+    level: int,
+    half: int,
+    steps: int,
+) -> tuple[Float[np.ndarray, "n steps"], Float[np.ndarray, "n steps"]]:
+    """ρ at positions along segments about their middle, and q of the positions.
+
+    **Arguments:** base and other image, and their pyramids; `uv`: points in the base; `level` of
+    the pyramids; windows of 2·`half` + 1 pixels of it, and as many positions as `steps`, as far
+    apart as the pixels of the window. ρ is NaN outside the other image.
+    """
+    scale = 2.0**level
+    spacing = scale * np.linalg.norm(shape.other_along, axis=1)
+    k = np.arange(steps) - (steps - 1) / 2
+    with np.errstate(invalid="ignore", divide="ignore"):
+        # in the order of q, though the epipolar axis may be opposite
+        length = segment.length[:, None] / 2 + k * spacing[:, None]
+        q = segment.parameter(length)
+    place = positions(*pair, uv, q)
+    forward = np.sum((place[:, -1] - place[:, 0]) * shape.other_along, axis=1) >= 0
+    sign = np.where(forward, 1.0, -1.0)[:, None]
+
+    def of_rows(first):
+        rows = slice(first, first + TOGETHER)
+        template = _template(pyramids[0], uv[rows], sign[rows] * shape.along[rows],
+                             np.sign(sign[rows]), half, level)  # fmt: skip
+        strip = _strip(pyramids[1], place[rows], sign[rows] * scale * shape.other_along[rows],
+                       scale * shape.other_across[rows], half, level)  # fmt: skip
+        return slide(template, strip)
+
+    with ThreadPoolExecutor(available_cores()) as pool:
+        parts = list(pool.map(of_rows, range(0, len(uv), TOGETHER)))
+    rho = np.concatenate(parts) if parts else np.zeros((0, steps), np.float32)
+    return np.where(shape.usable[:, None], rho, np.nan), q
+
+
+def slide(
+    template: Float[np.ndarray, "n w w"], strip: Float[np.ndarray, "n w columns"]
+) -> Float[np.ndarray, "n steps"]:
+    """ρ of a window with all windows of a strip; −1 where one has no contrast."""
+    n, w, columns = strip.shape
+    steps = columns - w + 1
+    t = template - template.mean((1, 2), keepdims=True)
+    norm = np.sqrt(np.einsum("nyx,nyx->n", t, t))
+    outside = np.isnan(strip)
+    lost = _sliding_sum(outside.any(1).astype(np.float64), w) > 0
+    s = np.where(outside, 0, strip)
+    s -= s.sum((1, 2), keepdims=True) / np.maximum((~outside).sum((1, 2), keepdims=True), 1)
+    s[outside] = 0
+    cross, product = np.zeros((n, steps), np.float32), np.empty((n, steps), np.float32)
+    for y in range(w):
+        for x in range(w):
+            np.multiply(s[:, y, x : x + steps], t[:, y, x, None], out=product)
+            cross += product
+    total, square = (_sliding_sum(a.sum(1, dtype=np.float64), w) for a in (s, s * s))
+    spread = np.sqrt(np.maximum(square - total**2 / w**2, 0))
+    flat = (norm[:, None] <= FLAT * w) | (spread <= FLAT * w)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rho = np.where(flat, -1.0, cross / (norm[:, None] * spread))
+    return np.where(lost | ~np.isfinite(norm)[:, None], np.nan, rho)
+
+
+def top(rho: Float[np.ndarray, "n k"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The greatest ρ of each row, its fractional index, and the greatest of the others that is no
+    neighbour of it; NaN where there is none."""
+    filled = np.where(np.isfinite(rho), rho, -np.inf)
+    best = filled.argmax(1)
+    rows, last = np.arange(len(rho)), rho.shape[1] - 1
+    peak = filled[rows, best]
+    left, right = filled[rows, np.maximum(best - 1, 0)], filled[rows, np.minimum(best + 1, last)]
+    with np.errstate(invalid="ignore"):
+        bend = left - 2 * peak + right
+        inner = (best > 0) & (best < last) & np.isfinite(bend) & (bend < 0)
+        shift = np.where(inner, 0.5 * (left - right) / np.where(inner, bend, 1.0), 0.0)
+    away = np.abs(np.arange(rho.shape[1]) - best[:, None]) > 2
+    second = np.where(away, filled, -np.inf).max(1)
+    none = lambda a: np.where(np.isfinite(a), a, np.nan)
+    return none(peak), np.where(np.isfinite(peak), best + shift, np.nan), none(second)
+
+
+def combine(
+    curves: Sequence[Float[np.ndarray, "n k"]],
+) -> Float[np.ndarray, "n k"]:
+    """ρ of several images at common positions: the mean of the better half of them, rounded up, so
+    that an image in which the point is hidden does not spoil the others; NaN: in no image."""
+    if len(curves) == 1:
+        return curves[0]
+    stacked = np.sort(np.where(np.isfinite(curves), curves, -2.0), axis=0)[::-1]
+    there = stacked > -2
+    number = there.sum(0)
+    used = there & (np.arange(len(curves))[:, None, None] < (number + 2) // 2)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(used, stacked, 0).sum(0) / used.sum(0)
+
+
+def _template(pyramid, uv, along, sign, half, level):
+    """Windows about places in the base, axes e and e⊥; `sign` −1 where e is turned round."""
+    offset = 2.0**level * np.arange(-half, half + 1)
+    across = sign * np.stack([-along[:, 1], along[:, 0]], 1)
+    grid = (
+        uv[:, None, None] + offset[None, None, :, None] * along[:, None, None]
+        + offset[None, :, None, None] * across[:, None, None]
+    )  # fmt: skip
+    n, w = len(uv), len(offset)
+    return pyramid.sample(level, grid.reshape(n * w, w, 2)).reshape(n, w, w)
+
+
+def _strip(pyramid, place, along, across, half, level):
+    """All windows along segments: rows across, columns along, half a window more at both ends."""
+    n, steps = place.shape[:2]
+    beyond = np.arange(1, half + 1)
+    before = place[:, :1] - beyond[::-1, None] * along[:, None]
+    after = place[:, -1:] + beyond[:, None] * along[:, None]
+    middle = np.concatenate([before, place, after], axis=1)
+    grid = middle[:, None] + np.arange(-half, half + 1)[:, None, None] * across[:, None, None]
+    w = 2 * half + 1
+    return pyramid.sample(level, grid.reshape(n * w, -1, 2)).reshape(n, w, -1)
+
+
+def _sliding_sum(a, w):
+    total = np.cumsum(np.pad(a, ((0, 0), (1, 0))), axis=1)
+    return total[:, w:] - total[:, :-w]

@@ -1,0 +1,82 @@
+"""Clouds as files: CSV with σ and the pixel of the base image; the report as a dictionary."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxbundle.io.text.csv_tables import read_csv, table_rows, write_csv
+from jaxbundle.surface.accuracy import accuracy_of
+from jaxbundle.surface.cloud import Cloud
+from jaxbundle.surface.reconstruct import Surface
+
+COLUMNS = ("X", "Y", "Z", "sX", "sY", "sZ", "rays", "image", "u", "v")
+NEEDED = COLUMNS[:3]
+
+
+def write_cloud_csv(cloud: Cloud, path: str | Path) -> None:
+    """A row for each point, columns `COLUMNS`; σ that are not known are left empty."""
+    names = np.array([*cloud.images, ""], dtype=object)
+    values = [*cloud.X.T, *cloud.sigma.T, cloud.rays, names[cloud.image], *cloud.uv.T]
+    rows = table_rows(dict(zip(COLUMNS, values)))
+    empty = lambda row: tuple("" if v != v else v for v in row)
+    write_csv(Path(path), COLUMNS, map(empty, rows))
+
+
+def read_cloud_csv(path: str | Path) -> Cloud:
+    """A cloud from a table X,Y,Z[,sX,sY,sZ,rays,image,u,v]; other columns are passed over.
+
+    **Raises:** `InputError` naming file, line and column.
+    """
+    table = read_csv(Path(path))
+    X = np.stack([table.numbers(name, required=True) for name in NEEDED], axis=1)
+    n = len(X)
+    column = lambda name, default: (
+        table.numbers(name) if name in table.values else np.full(n, default)
+    )
+    sigma = np.stack([column(name, np.nan) for name in COLUMNS[3:6]], axis=1)
+    covariance = np.zeros((n, 3, 3))
+    covariance[:, [0, 1, 2], [0, 1, 2]] = sigma**2
+    ids = list(table.values["image"]) if "image" in table.values else [""] * n
+    names = tuple(dict.fromkeys(ids)) or ("",)
+    index = {name: k for k, name in enumerate(names)}
+    image = np.array([index[i] for i in ids], int).reshape(n)
+    uv = np.stack([column("u", np.nan), column("v", np.nan)], axis=1)
+    rays = np.nan_to_num(column("rays", 0)).astype(int)
+    return Cloud(X, covariance, rays, image, uv, names)
+
+
+def report_of(surface: Surface, warnings: Sequence[str] = ()) -> dict[str, Any]:
+    """Counts and accuracy, for JSON."""
+    cloud = surface.cloud
+    number = np.bincount(cloud.rays) if len(cloud) else np.zeros(0, int)
+    return {
+        "points": len(cloud),
+        "rays": {str(k): int(n) for k, n in enumerate(number) if n},
+        "images": [dict(row) for row in surface.bases],
+        "accuracy": accuracy_of(cloud),
+        "warnings": [*warnings, *surface.messages],
+    }
+
+
+def text_of(report: Mapping[str, Any]) -> str:
+    """The report in lines."""
+    found = report["accuracy"]
+    lines = [f"{report['points']} points, by rays: "
+             + ", ".join(f"{k}: {n}" for k, n in report["rays"].items())]  # fmt: skip
+    for row in report["images"]:
+        factor = row["variance_factor"]
+        said = "" if factor is None else f", variance factor {factor:.3g}"
+        lines.append(f"{row['image']} with {', '.join(row['with'])}: {row['matched']} of "
+                     f"{row['points']} points{said}")  # fmt: skip
+        lines += [f"    {n:8} {reason}" for reason, n in row["rejected"].items()]
+    for axis in "XYZ":
+        s = found[f"s{axis}"]
+        if s:
+            lines.append(f"σ{axis}  mean {s['mean']:.4g}  smallest {s['smallest']:.4g}  "
+                         f"largest {s['largest']:.4g}")  # fmt: skip
+    for c in found["classes"]:
+        upper = "∞" if c["to"] is None else f"{c['to']:g}"
+        lines.append(f"σ from {c['from']:g} to {upper}: {c['points']} points")
+    return "\n".join(lines)

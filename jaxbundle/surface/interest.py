@@ -1,0 +1,44 @@
+"""Which points of a base image are matched: every n-th pixel, edges, corners.
+
+Whole pixels, since the windows of least squares matching have a pixel in their middle.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.measure.opencv import need_opencv
+
+KINDS = ("grid", "edges", "corners")
+WEAKEST_CORNER = 1e-3
+"""Least eigenvalue of a corner, as a part of that of the strongest."""
+
+
+def interest_points(
+    grey: Float[np.ndarray, "rows columns"], kind: str, step: int
+) -> Float[np.ndarray, "n 2"]:
+    """Places (u, v), about `step` pixels apart: on a `grid`, on `edges` (Canny, thresholds by the
+    median gradient), on `corners` (Shi and Tomasi, 1994).
+
+    **Raises:** `InputError` for another kind.
+    """
+    if kind == "grid":
+        rows, columns = grey.shape
+        v, u = np.mgrid[0:rows:step, 0:columns:step].reshape(2, -1)
+        return np.stack([u, v], 1).astype(float)
+    if kind not in KINDS:
+        raise InputError(f"points {kind!r}: one of {', '.join(KINDS)} is expected")
+    cv2 = need_opencv()
+    low, high = np.percentile(grey, [1, 99])
+    eight = np.clip((grey - low) * (255 / max(high - low, 1e-9)), 0, 255).astype(np.uint8)
+    if kind == "corners":
+        found = cv2.goodFeaturesToTrack(eight, 0, WEAKEST_CORNER, step)
+        places = np.zeros((0, 2)) if found is None else found.reshape(-1, 2)
+        return np.unique(np.rint(places).astype(float), axis=0)
+    smooth = cv2.GaussianBlur(eight, (0, 0), 1.0)
+    slope = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
+    strong = float(np.percentile(slope, 85)) + 1.0
+    v, u = np.nonzero(cv2.Canny(smooth, 0.4 * strong, strong))
+    # the first edge point of every cell
+    _, first = np.unique(np.stack([v // step, u // step], 1), axis=0, return_index=True)
+    return np.stack([u[first], v[first]], 1).astype(float)

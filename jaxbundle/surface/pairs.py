@@ -1,0 +1,68 @@
+"""Which images are matched with which: those that see the same, from directions that differ."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.network.columns import did_you_mean
+from jaxbundle.surface.bounds import Bounds, angle_at
+from jaxbundle.surface.views import OrientedImage, is_inside
+
+LOOKS = 9
+"""Places a side of the base image at which the overlap is looked at."""
+LEAST_OVERLAP = 0.1
+NARROWEST, BEST, WIDEST = np.radians([1.0, 14.0, 60.0])
+"""Angles between lines of sight: useless below, best, and where windows are no longer alike."""
+
+
+def choose_partners(
+    views: Sequence[OrientedImage], bounds: Sequence[Bounds], most: int = 3
+) -> dict[int, list[int]]:
+    """For every image the others it is matched with, best first; none where there are none."""
+    found = {}
+    for i, view in enumerate(views):
+        scores = [(score(view, bounds[i], o), j) for j, o in enumerate(views) if j != i]
+        good = sorted((s for s in scores if s[0] > 0), reverse=True)[:most]
+        if good:
+            found[i] = [j for _, j in good]
+    return found
+
+
+def score(view: OrientedImage, bounds: Bounds, other: OrientedImage) -> float:
+    """Overlap times what the angle of intersection is worth, 0 to 1; 0: no pair."""
+    u, v = (np.linspace(0.05, 0.95, LOOKS) * (n - 1) for n in view.size)
+    uv = np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
+    q = bounds(uv)
+    best = 0.0
+    for share in (0.25, 0.5, 0.75):
+        X = view.points(uv, q[:, 0] + share * (q[:, 1] - q[:, 0]))
+        seen = is_inside(other, other.project(X))
+        if seen.mean() < LEAST_OVERLAP:
+            continue
+        angle = float(np.median(angle_at((view, other), X[seen])))
+        if NARROWEST <= angle <= WIDEST:
+            worth = min(angle / BEST, 1.0) * min(1.0, (WIDEST - angle) / (WIDEST - 2 * BEST))
+            best = max(best, float(seen.mean()) * worth)
+    return best
+
+
+def given_partners(pairs: Sequence[str], names: Sequence[str]) -> dict[int, list[int]]:
+    """Pairs as texts BASE,OTHER[,OTHER…] of image names, as indices.
+
+    **Raises:** `InputError`."""
+    found: dict[int, list[int]] = {}
+    for text in pairs:
+        parts = [part.strip() for part in text.split(",") if part.strip()]
+        if len(parts) < 2:
+            raise InputError(f"--pairs {text!r}: BASE,OTHER[,OTHER…], names of images, is expected")
+        for part in parts:
+            if part not in names:
+                raise InputError(
+                    f"--pairs {text!r}: no image {part!r}{did_you_mean(part, list(names))}"
+                )
+        base, *others = (list(names).index(part) for part in parts)
+        if base in others:
+            raise InputError(f"--pairs {text!r}: an image cannot be matched with itself")
+        found.setdefault(base, []).extend(j for j in others if j not in found.get(base, []))
+    return found

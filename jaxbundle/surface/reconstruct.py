@@ -1,0 +1,195 @@
+"""From oriented images to a cloud: pairs, guides, points, matches, one base image after the other.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.surface.bounds import Bounds, by_geometry, by_points
+from jaxbundle.surface.cloud import Cloud, merge
+from jaxbundle.surface.correlation import Pyramid, make_pyramid
+from jaxbundle.surface.guide import Guide, coarsest_level, make_guide
+from jaxbundle.surface.interest import interest_points
+from jaxbundle.surface.matching import Matches, Settings, match_points
+from jaxbundle.surface.pairs import choose_partners
+from jaxbundle.surface.segments import segments, visible_range
+from jaxbundle.surface.views import OrientedImage
+
+KEPT = 6
+"""Pyramids kept at a time."""
+POINTS = 40_000
+"""Points of a base image where no step is given."""
+
+Tell = Callable[[str, int, int], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Surface:
+    """A cloud, what became of the points of each base image, and messages."""
+
+    cloud: Cloud
+    bases: tuple[Mapping[str, Any], ...]
+    messages: tuple[str, ...]
+
+
+def find_bounds(
+    views: Sequence[OrientedImage],
+    tie: Float[np.ndarray, "n 3"],
+    heights: tuple[float, float] | None = None,
+) -> tuple[tuple[Bounds, ...], tuple[str, ...]]:
+    """The bounds of every image: heights, where given; tie points; else the geometry, with a
+    message."""
+    found, messages = [], []
+    low, high = heights or (None, None)
+    guessed = []
+    for view in views:
+        others = [o for o in views if o is not view]
+        q = by_points(view, tie) if heights is None and len(tie) else None
+        if q is None:
+            wide = by_geometry(view, others)
+            if wide is None:
+                raise InputError(
+                    f"{view.name}: all images are at one place: a surface needs a base"
+                )
+            # given heights are looked for at any distance
+            q = wide if heights is None else (1e-2 * wide[0], 1e2 * wide[1])
+            guessed.append((view.name, q))
+        found.append(Bounds(view, q, low, high))
+    if guessed and heights is None:
+        name, q = guessed[0]
+        messages.append(
+            f"no tie points in {len(guessed)} image(s): distances from {1 / q[1]:.4g} to "
+            f"{1 / q[0]:.4g} are searched ({name}); give --zmin and --zmax"
+        )
+    return tuple(found), tuple(messages)
+
+
+class _Pyramids:
+    """Pyramids of the images, the last few of them kept."""
+
+    def __init__(self, views, levels):
+        self.views, self.levels, self.kept = views, levels, {}
+
+    def __getitem__(self, k) -> Pyramid:
+        if k in self.kept:
+            self.kept[k] = self.kept.pop(k)
+        else:
+            while len(self.kept) >= KEPT:
+                self.kept.pop(next(iter(self.kept)))
+            self.kept[k] = make_pyramid(self.views[k].grey, self.levels)
+        return self.kept[k]
+
+
+def reconstruct(
+    views: Sequence[OrientedImage],
+    bounds: Sequence[Bounds],
+    partners: Mapping[int, Sequence[int]] | None = None,
+    *,
+    points: str = "grid",
+    step: int | None = None,
+    settings: Settings | None = None,
+    tell: Tell | None = None,
+) -> Surface:
+    """The cloud of all base images.
+
+    **Arguments:** `partners`: indices of the images each base is matched with, chosen if not given;
+    `points`, `step`: see `interest_points`; `tell(stage, done, total)`.
+
+    **Raises:** `NotSolvedError` where no images see the same, or nothing matches.
+    """
+    partners = dict(partners or choose_partners(views, bounds))
+    if not partners:
+        raise NotSolvedError(
+            "no two images see the same part of the surface from different directions: look at the "
+            "orientation and its units, and at --zmin and --zmax"
+        )
+    tell = tell or (lambda *_: None)
+    levels = max(_level(views, bounds[i], i, others) for i, others in partners.items())
+    pyramids = _Pyramids(views, levels)
+    guides = _guides(views, bounds, partners, pyramids, tell)
+    clouds, told = [], []
+    for done, (i, others) in enumerate(partners.items()):
+        tell("matching", done, len(partners))
+        guide = guides.get(i)
+        uv = interest_points(views[i].grey, points, step or _step(views[i]))
+        row: dict[str, Any] = {"image": views[i].name, "with": [views[j].name for j in others],
+                               "points": len(uv)}  # fmt: skip
+        if guide is not None:
+            found = match_points(
+                views[i], [views[j] for j in others],
+                (pyramids[i], [pyramids[j] for j in others]), guide, uv,
+                [guides.get(j) for j in others], settings or Settings(),
+            )  # fmt: skip
+            clouds.append(_cloud(views[i], found))
+            row |= {"matched": len(found.X), "variance_factor": found.factor,
+                    "rejected": found.rejected}  # fmt: skip
+        else:
+            row |= {"matched": 0, "variance_factor": None, "rejected": {}}
+        told.append(row)
+    tell("matching", len(partners), len(partners))
+    if not any(len(c) for c in clouds):
+        raise NotSolvedError(
+            "no point was matched: the photographs have too little texture in common, or the "
+            "orientation or the bounds of the heights are not theirs"
+        )
+    return Surface(merge(clouds), tuple(told), ())
+
+
+def _guides(views, bounds, partners, pyramids, tell) -> dict[int, Guide]:
+    """Of every base, and of every image that one is matched with."""
+    with_whom = {i: list(others) for i, others in partners.items()}
+    for i, others in partners.items():
+        for j in others:
+            if j not in partners:
+                with_whom.setdefault(j, []).append(i)
+    guides = {}
+    for done, (i, others) in enumerate(with_whom.items()):
+        tell("depths", done, len(with_whom))
+        guide = make_guide(
+            views[i], [views[j] for j in others], (pyramids[i], [pyramids[j] for j in others]),
+            bounds[i],
+        )
+        if guide is not None:
+            guides[i] = guide
+    tell("depths", len(with_whom), len(with_whom))
+    return guides
+
+
+def _level(views, bounds, i, others):
+    """The coarsest level that a base image needs."""
+    u, v = (np.linspace(0.1, 0.9, 5) * (n - 1) for n in views[i].size)
+    uv = np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
+    q = bounds(uv)
+    lengths = [
+        segments(views[i], views[j], uv, visible_range(views[i], views[j], uv, q)).length
+        for j in others
+    ]
+    seen = np.concatenate(lengths)
+    seen = seen[np.isfinite(seen)]
+    return coarsest_level(views[i].size, float(np.max(seen)) if len(seen) else 0.0)
+
+
+def _step(view):
+    columns, rows = view.size
+    return max(2, int(np.ceil(np.sqrt(columns * rows / POINTS))))
+
+
+def _cloud(view, found: Matches) -> Cloud:
+    n = len(found.X)
+    return Cloud(
+        found.X, found.covariance, found.rays, np.zeros(n, int), found.uv, (view.name,),
+        _colour(view, found.uv),
+    )  # fmt: skip
+
+
+def _colour(view, uv):
+    place = np.rint(uv).astype(int)
+    grey = np.asarray(view.grey[place[:, 1], place[:, 0]])
+    if grey.dtype != np.uint8:
+        low, high = np.percentile(view.grey, [0.5, 99.5])
+        grey = np.clip((grey - low) * (255 / max(high - low, 1e-9)), 0, 255).astype(np.uint8)
+    return np.repeat(grey[:, None], 3, axis=1)

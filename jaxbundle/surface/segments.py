@@ -1,0 +1,131 @@
+"""Where a point of the base image may be in another: the segment between two ends of its line of
+sight (vertical line locus, epipolar segment), curved as distortion and scanners have it.
+
+    λ(x) = α·x/(1 + γ·x),    x = (q − q₁)/(q₂ − q₁)
+
+is the length along the segment; exact for perspective images, and of three of its points,
+for the others it spaces positions nearly evenly, whose places are projected each by itself.
+
+`Windows` hold how a window of the base image lies in the other one, by way of the local plane: its
+axes are e, along the epipolar line in the base, and e⊥; the other image has them at A·e, which is
+along its segment, and A·e⊥.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxbundle.surface.views import OrientedImage, is_inside, line_of_sight, over_plane
+
+LOOKS = 17
+"""Places along a line of sight at which it is looked whether the other image has them."""
+LEAST_STRETCH, MOST_STRETCH = 0.25, 4.0
+"""Ratio of lengths in the other image and in the base within which windows are compared."""
+FLATTEST = 0.2
+"""Sine of the angle between a plane and a line of sight, below which the plane is not followed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Windows:
+    """Axes of the windows: e [n, 2] in the base, A·e and A·e⊥ [n, 2] in the other image; `A`;
+    `usable`: the plane is seen by both, at similar scales."""
+
+    along: Float[np.ndarray, "n 2"]
+    other_along: Float[np.ndarray, "n 2"]
+    other_across: Float[np.ndarray, "n 2"]
+    A: Float[np.ndarray, "n 2 2"]
+    usable: Bool[np.ndarray, " n"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Segments:
+    """Segments [n] in the other image: q at both ends, α and γ of their length, pixels."""
+
+    q: Float[np.ndarray, "n 2"]
+    alpha: Float[np.ndarray, " n"]
+    gamma: Float[np.ndarray, " n"]
+
+    @property
+    def length(self) -> Float[np.ndarray, " n"]:
+        """Pixels of the other image; NaN where it does not see the line of sight."""
+        return self.alpha / (1 + self.gamma)
+
+    def parameter(self, length: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+        """q at lengths along the segments."""
+        x = length / (self.alpha[:, None] - self.gamma[:, None] * length)
+        return self.q[:, :1] + x * (self.q[:, 1:] - self.q[:, :1])
+
+    def along(self, q: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+        """Lengths along the segments at q."""
+        x = (q - self.q[:, :1]) / (self.q[:, 1:] - self.q[:, :1])
+        return self.alpha[:, None] * x / (1 + self.gamma[:, None] * x)
+
+
+def visible_range(
+    base: OrientedImage, other: OrientedImage, uv: Float[np.ndarray, "n 2"],
+    q: Float[np.ndarray, "n 2"], margin: float = 0.0,
+) -> Float[np.ndarray, "n 2"]:
+    """The part of a range of q that the other image sees, to about 1/`LOOKS` of it; NaN: none."""
+    x = np.linspace(0, 1, LOOKS)
+    sampled = q[:, :1] + x * (q[:, 1:] - q[:, :1])
+    places = other.project(_points(base, uv, sampled))
+    inside = np.asarray(is_inside(other, places, margin)).reshape(-1, LOOKS)
+    first = np.maximum(np.argmax(inside, axis=1) - 1, 0)
+    last = np.minimum(LOOKS - np.argmax(inside[:, ::-1], axis=1), LOOKS - 1)
+    rows = np.arange(len(q))
+    found = np.stack([sampled[rows, first], sampled[rows, last]], axis=1)
+    return np.where(np.any(inside, axis=1)[:, None], found, np.nan)
+
+
+def segments(
+    base: OrientedImage, other: OrientedImage, uv: Float[np.ndarray, "n 2"],
+    q: Float[np.ndarray, "n 2"],
+) -> Segments:
+    """The segments of lines of sight between two parameters."""
+    three = np.stack([q[:, 0], q.mean(1), q[:, 1]], axis=1)
+    a, b, c = np.moveaxis(other.project(_points(base, uv, three)).reshape(-1, 3, 2), 1, 0)
+    half = np.linalg.norm(b - a, axis=1)
+    whole = half + np.linalg.norm(c - b, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        gamma = np.where(whole > half, (2 * half - whole) / (whole - half), 0.0)
+    return Segments(q, whole * (1 + gamma), gamma)
+
+
+def positions(
+    base: OrientedImage, other: OrientedImage, uv: Float[np.ndarray, "n 2"],
+    q: Float[np.ndarray, "n k"],
+) -> Float[np.ndarray, "n k 2"]:
+    """Places in the other image of points along lines of sight."""
+    return other.project(_points(base, uv, q)).reshape(*q.shape, 2)
+
+
+def windows(
+    base: OrientedImage, other: OrientedImage, X: Float[np.ndarray, "n 3"],
+    normal: Float[np.ndarray, "n 3"] | None = None,
+) -> Windows:
+    """How windows around points X lie in both images, on planes with these normals; None: planes
+    across the mean of both lines of sight."""
+    J, K = base.derivative(X), other.derivative(X)
+    d, f = line_of_sight(J), line_of_sight(K)
+    d, f = (a * np.sign(np.sum(a * (d if a is f else d), 1, keepdims=True)) for a in (d, f))
+    across = d + f
+    across = across / np.linalg.norm(across, axis=1, keepdims=True)
+    if normal is not None:
+        steep = np.minimum(np.abs(np.sum(normal * d, 1)), np.abs(np.sum(normal * f, 1)))
+        across = np.where((steep > FLATTEST)[:, None], normal, across)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        A = K @ over_plane(J, across)
+        e = np.einsum("nij,nj->ni", J, f)
+        e = e / np.linalg.norm(e, axis=1, keepdims=True)
+        along = np.einsum("nij,nj->ni", A, e)
+        beside = np.einsum("nij,nj->ni", A, np.stack([-e[:, 1], e[:, 0]], 1))
+        singular = np.linalg.svd(np.nan_to_num(A), compute_uv=False)
+        usable = (singular[:, 1] > LEAST_STRETCH) & (singular[:, 0] < MOST_STRETCH)
+    usable &= np.isfinite(e).all(1)
+    return Windows(e, along, beside, A, usable)
+
+
+def _points(base, uv, q):
+    """Points [n·k, 3] of lines of sight at q [n, k]."""
+    return base.points(np.repeat(uv, q.shape[1], axis=0), q.ravel())

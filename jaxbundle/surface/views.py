@@ -1,0 +1,214 @@
+"""Oriented images of any kind by one face: photographs, line scanners, rational polynomials.
+
+Every pixel has a line of sight X(q), with a parameter q along which places in another image move
+about evenly: the inverse distance 1/s of a photograph, the height of a scanner's image.
+
+| | photograph | line scanner, RPC |
+|---|---|---|
+| q | 1/s, s from the projection centre | height |
+| X | object coordinates | east, north of a point in the scene, height; metres |
+
+What the matching needs of a view follows from J = ∂(u, v)/∂X [2, 3]: the direction of its line of
+sight is the null vector J₁ × J₂, and the affine transformation from one image to another, by way of
+a plane with the normal n, is
+
+    A = J'·T,        [J; nᵀ]·T = [I; 0].
+
+Arrays go in and out as NumPy's; points are filled up to few sizes, so that few programs serve all.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Protocol
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbundle.cameras import CameraModel, default_parameters, get_model, image_ray, project
+from jaxbundle.cameras.pixel_frame import pixel_frame
+from jaxbundle.errors import InputError
+from jaxbundle.geometry import matrix_from_omega_phi_kappa
+from jaxbundle.network.tables import Camera
+
+LANES = 1 << 14
+"""Points of one call; fewer are filled up to a power of 4."""
+BEYOND = 1.02
+"""A ray farther from the axis than the farthest of the image, times this, is outside."""
+
+Points = Float[np.ndarray, "n 3"]
+Places = Float[np.ndarray, "n 2"]
+
+
+class OrientedImage(Protocol):
+    """An image whose orientation is known; (0, 0) is the centre of its upper-left pixel.
+
+    `size`: columns, rows. `grey`: its grey values.
+    """
+
+    name: str
+    size: tuple[int, int]
+    grey: Float[np.ndarray, "rows columns"]
+
+    def points(self, uv: Places, q: Float[np.ndarray, " n"]) -> Points:
+        """The points of lines of sight."""
+        ...
+
+    def parameter(self, X: Points) -> Float[np.ndarray, " n"]:
+        """q of points."""
+        ...
+
+    def project(self, X: Points) -> Places:
+        """Where points are; NaN: outside the camera's field of view."""
+        ...
+
+    def derivative(self, X: Points) -> Float[np.ndarray, "n 2 3"]:
+        """∂(u, v)/∂X."""
+        ...
+
+    def bounds(self, uv: Places, low: float, high: float) -> Float[np.ndarray, "n 2"]:
+        """q, ascending, between which the height Z is from `low` to `high`."""
+        ...
+
+
+class FrameView:
+    """A photograph: camera, projection centre, rotation M from object to camera."""
+
+    def __init__(self, name: str, grey, camera: Camera, X0, M):
+        self.name, self.grey = name, grey
+        self.size = (grey.shape[1], grey.shape[0])
+        model = get_model(camera.model)
+        if camera.image_size is not None and tuple(camera.image_size) != self.size:
+            raise InputError(
+                f"{name}: the photograph has {self.size[0]} × {self.size[1]} pixels, camera "
+                f"{camera.id} {camera.image_size[0]} × {camera.image_size[1]}; give the photograph "
+                "the camera was calibrated for"
+            )
+        try:
+            origin, step = pixel_frame(model, self.size, camera.pixel_size)
+        except ValueError as error:
+            raise InputError(f"camera {camera.id}: {error}") from None
+        given = {**default_parameters(model), **camera.parameters}
+        self.camera, self.X0, self.M = camera, np.asarray(X0, float), np.asarray(M, float)
+        p = np.array([float(given.get(n, 0.0)) for n in model.parameters])
+        self._frame = _Frame(model, *map(jnp.asarray, (p, self.X0, self.M, origin, step)))
+        edge = self._edge()
+        axis = self.points(edge, np.ones(len(edge))) - self.X0
+        self._farthest = BEYOND * float(np.nanmax(np.arccos(np.clip(-axis @ self.M[2], -1, 1))))
+
+    def _edge(self) -> Places:
+        u, v = (np.linspace(-0.5, n - 0.5, 17) for n in self.size)
+        return np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
+
+    def points(self, uv, q):
+        return _in_lanes(_points, self._frame, uv, q)
+
+    def parameter(self, X):
+        return 1 / np.linalg.norm(X - self.X0, axis=1)
+
+    def project(self, X):
+        d = X - self.X0
+        with np.errstate(invalid="ignore", divide="ignore"):
+            angle = np.arccos(np.clip(-(d @ self.M[2]) / np.linalg.norm(d, axis=1), -1, 1))
+        uv = _in_lanes(_project, self._frame, X)
+        return np.where((angle <= self._farthest)[:, None], uv, np.nan)
+
+    def derivative(self, X):
+        return _in_lanes(_derivative, self._frame, X)
+
+    def bounds(self, uv, low, high):
+        d = self.points(uv, np.ones(len(uv))) - self.X0
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = np.sort((np.array([low, high]) - self.X0[2]) / d[:, 2:], axis=1)
+            return 1 / np.where(t[:, ::-1] > 0, t[:, ::-1], [np.nan, 0.0])
+
+
+class _Frame(eqx.Module):
+    """What the image coordinates of a photograph depend on."""
+
+    model: CameraModel = eqx.field(static=True)
+    p: Float[Array, " parameters"]
+    X0: Float[Array, "3"]
+    M: Float[Array, "3 3"]
+    origin: Float[Array, "2"]
+    step: Float[Array, "2"]
+
+
+def frame_views(
+    network, greys: Sequence[np.ndarray]
+) -> tuple[FrameView, ...]:
+    """The oriented photographs of a network, a view for each of its images."""
+    M = jax.vmap(matrix_from_omega_phi_kappa)(jnp.asarray(network.images.angles))
+    return tuple(
+        FrameView(name, grey, network.cameras[c], X0, m)
+        for name, grey, c, X0, m in zip(
+            network.images.id, greys, network.images.camera, network.images.position, np.asarray(M)
+        )
+    )
+
+
+def line_of_sight(J: Float[np.ndarray, "n 2 3"]) -> Float[np.ndarray, "n 3"]:
+    """Directions, of length 1, in which the image of a point does not move."""
+    d = np.cross(J[:, 0], J[:, 1])
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def over_plane(
+    J: Float[np.ndarray, "n 2 3"], normal: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3 2"]:
+    """T: how far on a plane a step of one pixel leads."""
+    stacked = np.concatenate([J, normal[:, None]], axis=1)
+    return np.linalg.inv(stacked)[:, :, :2]
+
+
+def is_inside(view: OrientedImage, uv: Places, margin: float = 0.0) -> np.ndarray:
+    """Which places are in the image, at least `margin` pixels from its edge."""
+    columns, rows = view.size
+    with np.errstate(invalid="ignore"):
+        return (
+            (uv[:, 0] >= margin) & (uv[:, 0] <= columns - 1 - margin)
+            & (uv[:, 1] >= margin) & (uv[:, 1] <= rows - 1 - margin)
+        )  # fmt: skip
+
+
+def _in_lanes(program: Callable, frame, *arrays):
+    """The program of arrays [n, …], by `LANES`, what is missing filled up."""
+    n = len(arrays[0])
+    lanes = LANES if n > LANES // 4 else max(64, 4 ** int(np.ceil(np.log(max(n, 1)) / np.log(4))))
+    parts = []
+    for first in range(0, max(n, 1), lanes):
+        chosen = np.minimum(np.arange(first, first + lanes), max(n - 1, 0))
+        if n == 0:
+            arrays = tuple(np.zeros((1, *np.shape(a)[1:])) for a in arrays)
+            chosen = np.zeros(lanes, int)
+        parts.append(np.asarray(program(frame, *(np.asarray(a)[chosen] for a in arrays))))
+    return np.concatenate(parts)[:n]
+
+
+def _point(frame, uv, q):
+    xy = (uv - frame.origin) / frame.step
+    ray = jnp.stack(image_ray(frame.model, tuple(frame.p), xy[0], xy[1]))
+    return frame.X0 + frame.M.T @ ray / q
+
+
+def _pixel(frame, X):
+    r, s, q = frame.M @ (X - frame.X0)
+    xy = jnp.stack(project(frame.model, tuple(frame.p), r, s, q))
+    return frame.origin + frame.step * xy
+
+
+@eqx.filter_jit
+def _points(frame, uv, q):
+    return jax.vmap(partial(_point, frame))(uv, q)
+
+
+@eqx.filter_jit
+def _project(frame, X):
+    return jax.vmap(partial(_pixel, frame))(X)
+
+
+@eqx.filter_jit
+def _derivative(frame, X):
+    return jax.vmap(jax.jacfwd(partial(_pixel, frame)))(X)
