@@ -21,6 +21,7 @@ LAYERS = (
     "planning",
     "orientation",
     "pushbroom",
+    "photographs",
     "measure",
     "adjustment",
     "statistics",
@@ -31,6 +32,8 @@ LAYERS = (
     "report",
     "bundle",
     "batch",
+    "tiepoints",
+    "reconstruction",
     "calibration",
     "cli",
     "__main__",
@@ -39,6 +42,7 @@ PACKAGE = Path(__file__).parent.parent / "jaxbundle"
 FILES = sorted(p for p in PACKAGE.rglob("*.py") if p != PACKAGE / "__init__.py")
 OPTIONAL = {
     "matplotlib", "pandas", "cv2", "pyproj", "rasterio", "erfa", "sgp4", "ezdxf", "laspy", "plotly",
+    "PIL",
 }  # fmt: skip
 LIGHT = {"geometry", "cameras"}
 

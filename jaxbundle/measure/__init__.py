@@ -20,7 +20,6 @@ from jaxbundle.measure.least_squares_matching import match_least_squares as matc
 from jaxbundle.measure.matching import Match as Match
 from jaxbundle.measure.matching import correlation as correlation
 from jaxbundle.measure.matching import find_match as find_match
-from jaxbundle.measure.photographs import read_photograph as read_photograph
 from jaxbundle.measure.targets import Target as Target
 from jaxbundle.measure.targets import centre_by_ellipse as centre_by_ellipse
 from jaxbundle.measure.targets import centre_by_grey_values as centre_by_grey_values
@@ -33,3 +32,4 @@ from jaxbundle.measure.views import BoardViews as BoardViews
 from jaxbundle.measure.views import measure_boards as measure_boards
 from jaxbundle.network.units import image_from_pixel as image_from_pixel
 from jaxbundle.network.units import pixel_from_image as pixel_from_image
+from jaxbundle.photographs import read_photograph as read_photograph

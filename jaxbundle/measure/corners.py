@@ -14,8 +14,8 @@ from jaxtyping import Float, UInt8
 
 from jaxbundle.errors import InputError
 from jaxbundle.measure.boards import LEAST, MARKER, Board
-from jaxbundle.measure.opencv import need_opencv
 from jaxbundle.measure.targets import centre_by_ellipse
+from jaxbundle.photographs.opencv import need_opencv
 
 Grey = UInt8[np.ndarray, "rows columns"]
 

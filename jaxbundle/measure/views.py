@@ -15,7 +15,7 @@ from jaxbundle.arguments import numeric_array
 from jaxbundle.errors import InputError
 from jaxbundle.measure.boards import Board, require_board
 from jaxbundle.measure.corners import find_board, largest_chessboard, other_sizes
-from jaxbundle.measure.photographs import read_photograph
+from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.system.configuration import available_cores
 from jaxbundle.system.file_content import read_content
 

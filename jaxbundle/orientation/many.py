@@ -43,7 +43,7 @@ def resect(
     """X0, M of images, and the part of their points that agree within `tolerance` (c = 1); 0: no
     pose."""
     rows = [spread(len(a)) for a in xy]
-    return _in_lanes(
+    return in_lanes(
         _resect, LANES, _filled(xy, rows, SLOTS), _filled(X, rows, SLOTS),
         _weights(rows, SLOTS), tolerance,
     )  # fmt: skip
@@ -52,7 +52,7 @@ def resect(
 def refine(poses, xy, X, weights):
     """X0, M of images improved from start values by points of weight > 0."""
     rows = [spread(len(a)) for a in xy]
-    return _in_lanes(
+    return in_lanes(
         _refine, LANES, *poses, _filled(xy, rows, SLOTS), _filled(X, rows, SLOTS),
         _filled(weights, rows, SLOTS),
     )  # fmt: skip
@@ -62,7 +62,7 @@ def orient_pairs(xy1, xy2, tolerance):
     """M, b of pairs of images, the part of the points that agree within `tolerance`, and the
     median angle of intersection (radians)."""
     rows = [spread(len(a)) for a in xy1]
-    return _in_lanes(
+    return in_lanes(
         _orient_pair, LANES, _filled(xy1, rows, SLOTS), _filled(xy2, rows, SLOTS),
         _weights(rows, SLOTS), tolerance,
     )  # fmt: skip
@@ -70,13 +70,13 @@ def orient_pairs(xy1, xy2, tolerance):
 
 def intersect(X0, rays, weights):
     """X, angle of intersection and status of points with up to `RAYS` rays, [n, RAYS, …]."""
-    return _in_lanes(_intersect, POINT_LANES, X0, rays, weights)
+    return in_lanes(_intersect, POINT_LANES, X0, rays, weights)
 
 
 def similarity(source, target, weights):
     """A = exp(s)·R and t of X' = A·X + t between two lists of points; None of points on a line."""
     rows = [spread(len(source))]
-    A, t, status = _in_lanes(
+    A, t, status = in_lanes(
         _similarity, 1, _filled([source], rows, SLOTS), _filled([target], rows, SLOTS),
         _filled([weights], rows, SLOTS) * _weights(rows, SLOTS),
     )  # fmt: skip
@@ -88,23 +88,23 @@ def similarity_by_rays(X, X0, rays, A, t):
     misclosure of every ray, the tangent of its angle."""
     rows = [spread(len(X))]
     filled = (_filled([a], rows, SLOTS) for a in (X, X0, rays))
-    A, t, off = _in_lanes(_similarity_by_rays, 1, *filled, _weights(rows, SLOTS), A[None], t[None])
+    A, t, off = in_lanes(_similarity_by_rays, 1, *filled, _weights(rows, SLOTS), A[None], t[None])
     return A[0], t[0], off[0][: len(rows[0])]
 
 
 def matrices(angles):
     """M of ω, φ, κ."""
-    return _in_lanes(_matrix, POINT_LANES, angles)[0]
+    return in_lanes(_matrix, POINT_LANES, angles)[0]
 
 
 def matrices_of_quaternions(q):
     """M of unit quaternions."""
-    return _in_lanes(_matrix_of_quaternion, POINT_LANES, q)[0]
+    return in_lanes(_matrix_of_quaternion, POINT_LANES, q)[0]
 
 
 def angles(M):
     """ω, φ, κ of M."""
-    return _in_lanes(_angles, POINT_LANES, M)[0]
+    return in_lanes(_angles, POINT_LANES, M)[0]
 
 
 def spread(number: int, most: int = SLOTS) -> np.ndarray:
@@ -213,7 +213,7 @@ def _weights(rows, slots):
     return np.stack([(np.arange(slots) < len(r)).astype(float) for r in rows])
 
 
-def _in_lanes(program, lanes, *arrays):
+def in_lanes(program, lanes, *arrays):
     """The program applied to items, `lanes` at a time; missing ones repeat the last."""
     number = len(arrays[0])
     parts = []

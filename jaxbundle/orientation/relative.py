@@ -86,7 +86,7 @@ def relative_orientation(
     M, b = (a.reshape(-1, *a.shape[2:]) for a in jax.vmap(orientations)(E))
     data = (xy1, xy2, jnp.sqrt(p))
     chosen, score = _refined_best(M, b, stop_gradient(data), p)
-    fit = finish(_misclosures, _retract, chosen, data, 5)
+    fit = finish(_misclosures, retract, chosen, data, 5)
     M, b = fit.estimate
     front = _in_front((M, b), xy1, xy2, p)
     vtpv = stop_gradient(fit.vtpv)
@@ -133,7 +133,7 @@ def _refined_best(M, b, data, p):
 
     first = lambda M, b: score((M, b), jnp.sum(_misclosures((M, b), *data) ** 2))
     _, best = jax.lax.top_k(-jax.vmap(first)(M, b), REFINED)
-    refine = lambda M, b: minimise(_misclosures, _retract, (M, b), data, 5, STEPS)
+    refine = lambda M, b: minimise(_misclosures, retract, (M, b), data, 5, STEPS)
     refined, squares = jax.vmap(refine)(M[best], b[best])
     scores = jax.vmap(score)(refined, squares)
     k = jnp.argmin(scores)
@@ -152,7 +152,8 @@ def _misclosures(pair, xy1, xy2, root):
     return root * jax.vmap(sampson_distance, (None, None, 0, 0))(M, b, xy1, xy2)
 
 
-def _retract(pair, delta):
+def retract(pair, delta):
+    """A pair (M, b) turned by δ[:3] in the frame of the second camera, its base moved by δ[3:]."""
     M, b = pair
     M = matrix_from_rotation_vector(delta[:3]) @ M
     b = b + delta[3:] @ _across(b)

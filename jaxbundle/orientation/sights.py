@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbundle.cameras import default_parameters, get_model, image_ray
-from jaxbundle.network.tables import Network
+from jaxbundle.network.tables import Camera, Network
 
 STEEPEST = -0.15
 """Least −q of a unit ray that counts as in front of the camera."""
@@ -60,10 +60,7 @@ def sights(network: Network) -> Sights:
         rows = np.flatnonzero(camera_of_ray == c)
         if not len(rows):
             continue
-        model = get_model(camera.model)
-        given = {**default_parameters(model), **camera.parameters}
-        p = np.array([given[name] for name in model.parameters])
-        xy[rows] = _pictures(model, p, rays.xy[rows])
+        xy[rows] = ideal_points(camera, rays.xy[rows])
         radius = np.linalg.norm(xy[rows], axis=1)
         extent[images.camera == c] = np.nanquantile(radius, 0.95) if len(radius) else 1.0
     rows = np.flatnonzero(np.isfinite(xy).all(1))
@@ -74,8 +71,12 @@ def sights(network: Network) -> Sights:
     )
 
 
-def _pictures(model, p, xy):
-    """x, y with c = 1 of measured points; NaN for those to the side of the camera."""
+def ideal_points(camera: Camera, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    """x, y with c = 1, y up, of points measured in the unit and axes of the camera's model; NaN for
+    those to the side of the camera."""
+    model = get_model(camera.model)
+    given = {**default_parameters(model), **camera.parameters}
+    p = np.array([given[name] for name in model.parameters])
     portions = -(-len(xy) // PORTION)
     filled = np.resize(xy, (portions * PORTION, 2)).reshape(portions, PORTION, 2)
     found = np.concatenate([np.asarray(_portion(model, p, part)) for part in filled])

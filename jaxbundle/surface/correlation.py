@@ -16,7 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.measure.opencv import need_opencv
+from jaxbundle.photographs.opencv import need_opencv
 from jaxbundle.surface.segments import Segments, Windows, positions
 from jaxbundle.surface.views import OrientedImage
 from jaxbundle.system.configuration import available_cores

@@ -10,9 +10,9 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.io.formats import read_network, recognised_format
 from jaxbundle.io.networks.project import read_project
-from jaxbundle.measure.photographs import read_photograph
 from jaxbundle.network.columns import some
 from jaxbundle.network.tables import Network
+from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.surface.views import FrameView, frame_views
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.errors import InputError
-from jaxbundle.measure.opencv import need_opencv
+from jaxbundle.photographs.opencv import need_opencv
 
 KINDS = ("grid", "edges", "corners")
 WEAKEST_CORNER = 1e-3

@@ -15,7 +15,7 @@ from jaxbundle.io.networks.photomodeler_camera import header_camera
 from jaxbundle.io.text.csv_tables import read_text, read_toml
 from jaxbundle.io.text.rows import Row
 from jaxbundle.io.writing.fingerprints import of_input
-from jaxbundle.measure.photographs import read_photograph
+from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.system.file_content import check_plain, parse_json, parse_toml, read_content
 
 BINARY = ("colmap", "camera-stack")

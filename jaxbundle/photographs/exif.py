@@ -1,0 +1,150 @@
+"""What the file of a photograph says of its camera, its time and its place (EXIF, by Pillow).
+
+Every value may be missing, and those of some cameras are wrong: they are start values and priors.
+"""
+
+import dataclasses
+import datetime
+import math
+from pathlib import Path
+
+from jaxbundle.photographs.reading import open_image
+from jaxbundle.photographs.sensors import sensor_width
+
+MAKE, MODEL, ORIENTATION, DATE = 0x010F, 0x0110, 0x0112, 0x0132
+DETAILS, GPS = 0x8769, 0x8825
+FOCAL_LENGTH, FOCAL_LENGTH_35, DATE_TAKEN, FRACTION = 0x920A, 0xA405, 0x9003, 0x9291
+PLANE_X, PLANE_UNIT = 0xA20E, 0xA210
+FILM_DIAGONAL = math.hypot(36, 24)
+"""mm: what focal lengths equivalent to those of 35 mm film refer to."""
+MM = {2: 25.4, 3: 10.0, 4: 1.0}
+"""Units of the resolution in the focal plane."""
+UPRIGHT = 1
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """Latitude and longitude in degrees (WGS 84), height in metres; what the height is above is not
+    known for sure (EXIF: above sea level); `sigma` of the position in metres, if it is stated."""
+
+    latitude: float
+    longitude: float
+    height: float | None = None
+    sigma: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Exif:
+    """Size in pixels; the camera; focal length in mm, and that which gives the same picture on
+    35 mm film; pixels for a mm of the focal plane; orientation (1: as the sensor saw it); time."""
+
+    size: tuple[int, int]
+    make: str = ""
+    model: str = ""
+    focal_length: float | None = None
+    focal_length_35: float | None = None
+    resolution: float | None = None
+    orientation: int = UPRIGHT
+    time: datetime.datetime | None = None
+    place: Place | None = None
+
+    @property
+    def camera(self) -> str:
+        """Make and model, as one would say them."""
+        first = self.make.split()[:1]
+        repeated = first and self.model.lower().startswith(first[0].lower())
+        return (self.model if repeated else f"{self.make} {self.model}").strip()
+
+    def principal_distance(self) -> tuple[float, str] | None:
+        """The principal distance in pixels and where it is from; None where nothing tells it."""
+        long = max(self.size)
+        width = sensor_width(self.make, self.model)
+        if self.focal_length and width:
+            return self.focal_length / width * long, "focal length and sensor"
+        if self.focal_length_35:
+            return (self.focal_length_35 / FILM_DIAGONAL * math.hypot(*self.size),
+                    "focal length equivalent to 35 mm film")  # fmt: skip
+        if self.focal_length and self.resolution:
+            return self.focal_length * self.resolution, "focal length and resolution"
+        return None
+
+
+def read_exif(path: str | Path) -> Exif:
+    """What the head of a file says.
+
+    **Raises:** `InputError` if it is no image.
+    """
+    image = open_image(path)
+    try:
+        head = image.getexif()
+        details, gps = head.get_ifd(DETAILS), head.get_ifd(GPS)
+    except Exception:  # whatever a damaged head makes of its reader
+        return Exif(image.size)
+    resolution = _positive(details.get(PLANE_X))
+    unit = MM.get(details.get(PLANE_UNIT, 2))
+    return Exif(
+        size=image.size,
+        make=_text(head.get(MAKE)),
+        model=_text(head.get(MODEL)),
+        focal_length=_positive(details.get(FOCAL_LENGTH)),
+        focal_length_35=_positive(details.get(FOCAL_LENGTH_35)),
+        resolution=resolution / unit if resolution and unit else None,
+        orientation=_whole(head.get(ORIENTATION), UPRIGHT),
+        time=_time(details.get(DATE_TAKEN) or head.get(DATE), details.get(FRACTION)),
+        place=_place(gps),
+    )
+
+
+def _text(value) -> str:
+    return value.replace("\0", " ").strip() if isinstance(value, str) else ""
+
+
+def _number(value) -> float | None:
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _positive(value) -> float | None:
+    number = _number(value)
+    return number if number and number > 0 else None
+
+
+def _whole(value, otherwise: int) -> int:
+    number = _number(value)
+    return otherwise if number is None or not 1 <= number <= 8 else int(number)
+
+
+def _time(value, fraction) -> datetime.datetime | None:
+    try:
+        time = datetime.datetime.strptime(_text(value)[:19], "%Y:%m:%d %H:%M:%S")
+        part = _text(fraction)
+        return time.replace(microsecond=int(float(f"0.{part}") * 1e6)) if part else time
+    except ValueError:
+        return None
+
+
+def _place(gps) -> Place | None:
+    latitude, longitude = _angle(gps.get(2), gps.get(1)), _angle(gps.get(4), gps.get(3))
+    if latitude is None or longitude is None or (latitude == 0 and longitude == 0):
+        return None
+    height = _number(gps.get(6))
+    below = gps.get(5) in (1, b"\x01")
+    return Place(
+        latitude, longitude, None if height is None else -height if below else height,
+        _positive(gps.get(31)),
+    )  # fmt: skip
+
+
+def _angle(parts, reference) -> float | None:
+    """Degrees, minutes, seconds as degrees; negative to the south and west."""
+    try:
+        degrees, minutes, seconds = (float(part) for part in parts)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    angle = degrees + minutes / 60 + seconds / 3600
+    if not math.isfinite(angle) or abs(angle) > 180:
+        return None
+    return -angle if _text(reference)[:1].upper() in ("S", "W") else angle

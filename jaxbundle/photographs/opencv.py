@@ -1,0 +1,25 @@
+"""OpenCV and Pillow (extra `images`), where they are needed."""
+
+from jaxbundle.errors import InputError
+
+
+def need_opencv():
+    """The module cv2, or what to install."""
+    try:
+        import cv2
+    except ImportError:
+        raise InputError(
+            "photographs and boards need OpenCV: pip install 'jaxbundle[images]'"
+        ) from None
+    return cv2
+
+
+def need_pillow():
+    """The module PIL.Image, or what to install."""
+    try:
+        from PIL import Image
+    except ImportError:
+        raise InputError(
+            "the heads of photographs need Pillow: pip install 'jaxbundle[images]'"
+        ) from None
+    return Image

@@ -1,0 +1,124 @@
+"""Photographs as arrays of grey values or colours, 8 bits.
+
+The pixels are taken as the sensor wrote them: a note in the file that the photograph is to be shown
+turned (EXIF orientation) is not obeyed, since turning it would turn the camera's own axes. What has
+more than 8 bits is stretched over them.
+"""
+
+import os
+import warnings
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from jaxbundle.errors import InputError
+from jaxbundle.photographs.opencv import need_opencv, need_pillow
+from jaxbundle.system.file_content import check_plain, read_content
+
+SUFFIXES = (".jpg", ".jpeg", ".tif", ".tiff", ".png")
+"""Files of a folder that are taken for photographs."""
+MOST_PIXELS = 2**30
+"""OpenCV decodes no more."""
+BRIGHT = 99.8
+"""Percentile of the grey values of more than 8 bits that becomes white."""
+START, SCAN, END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
+"""Marks of JPEG: start of the file, of a scan, end of the image."""
+
+
+def read_photograph(
+    path: str | Path, colour: bool = False
+) -> UInt8[np.ndarray, "rows columns"] | UInt8[np.ndarray, "rows columns 3"]:
+    """The grey values of a photograph in any format OpenCV reads, or its red, green and blue.
+
+    **Raises:** `InputError` if there is no such file, it is empty, not an image, cut short, or too
+    large.
+    """
+    cv2 = need_opencv()
+    if not os.path.exists(path):
+        raise InputError(f"{path}: no such file")
+    if os.path.isdir(path):
+        raise InputError(f"{path}: is a folder; give its photographs, such as {path}/*.jpg")
+    content = read_content(path, text=False)
+    if not len(content):
+        raise InputError(f"{path}: the file is empty")
+    if _looks_cut(content):
+        _refuse_cut(path)
+    way = cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE
+    flags = way | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        found = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    except cv2.error as error:
+        raise InputError(f"{path}: the image cannot be decoded ({error.err})") from None
+    if found is None:
+        found = _by_pillow(path, colour)
+    elif colour:
+        found = found[..., ::-1]
+    return np.ascontiguousarray(_eight_bits(found))
+
+
+def photograph_size(path: str | Path) -> tuple[int, int]:
+    """(columns, rows) of a photograph, from the head of its file.
+
+    **Raises:** `InputError` if it is no image, or has more than 2³⁰ pixels.
+    """
+    columns, rows = open_image(path).size
+    if columns * rows > MOST_PIXELS:
+        raise InputError(
+            f"{path}: {columns} × {rows} pixels; at most {MOST_PIXELS} can be read: make it smaller"
+        )
+    return columns, rows
+
+
+def open_image(path: str | Path):
+    """The file opened by Pillow, its head read; the pixels are not decoded.
+
+    **Raises:** `InputError` if it cannot be read, or is no image.
+    """
+    Image = need_pillow()
+    check_plain(path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of sizes that might be an attack; ours are checked
+            return Image.open(path)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except Image.DecompressionBombError as error:
+        raise InputError(f"{path}: {error}") from None
+    except OSError as error:
+        if os.path.isfile(path) and not os.path.getsize(path):
+            raise InputError(f"{path}: the file is empty") from None
+        raise InputError(
+            f"{path}: not an image that can be read (JPEG, PNG, TIFF are)"
+            + (f": {error.strerror}" if error.strerror else "")
+        ) from None
+
+
+def _looks_cut(content: bytes) -> bool:
+    """Whether a JPEG file has no end after its last scan, or a PNG file no end."""
+    if content.startswith(START):
+        return content.rfind(END) < content.rfind(SCAN)
+    return content.startswith(b"\x89PNG") and b"IEND" not in content[-64:]
+
+
+def _refuse_cut(path):
+    try:
+        open_image(path).load()
+    except (OSError, SyntaxError, ValueError):
+        raise InputError(f"{path}: the file is cut short; copy it again") from None
+
+
+def _by_pillow(path, colour):
+    try:
+        return np.asarray(open_image(path).convert("RGB" if colour else "L"))
+    except (OSError, SyntaxError, ValueError):
+        raise InputError(f"{path}: not an image that can be read (JPEG, PNG, TIFF, …)") from None
+
+
+def _eight_bits(found):
+    if found.dtype == np.uint8:
+        return found
+    some = found[::8, ::8] if found.size > 2**20 else found
+    low, high = 0.0, float(np.nanpercentile(some, BRIGHT))
+    scale = 255 / (high - low) if high > low else 1.0
+    return np.clip(np.nan_to_num(found * scale), 0, 255).astype(np.uint8)

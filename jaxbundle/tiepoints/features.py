@@ -1,0 +1,144 @@
+"""Features of a photograph: places that look like themselves from elsewhere, with descriptors.
+
+A photograph is reduced to `Detection.side` pixels first, in which OpenCV's SIFT (Lowe, 2004) begins
+with doubling it, so that the finest features are those of twice that side; least squares matching
+measures in the original afterwards. Of the features found, those that stand out most are kept, as
+many of each cell of a grid: photographs are covered evenly, in their dull parts too.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from jaxbundle.arguments import one_of, whole
+from jaxbundle.photographs.opencv import need_opencv
+
+KINDS = ("sift", "akaze", "orb")
+CELLS = 16
+"""Cells of the grid along the longer side."""
+AMPLE = 1.6
+"""Features looked for, as a multiple of those kept."""
+TILE = 2400
+"""Side of the parts in which a large photograph is searched, reduced pixels."""
+OVERLAP = 64
+
+
+@dataclasses.dataclass(frozen=True)
+class Detection:
+    """What features are looked for: `kind`; `number` kept of a photograph; `side`: the longer side
+    to which a photograph is reduced, 0: not at all."""
+
+    kind: str = "sift"
+    number: int = 6000
+    side: int = 1800
+
+    def __post_init__(self):
+        one_of("features", self.kind, KINDS)
+        whole("features: number", self.number)
+
+
+@dataclasses.dataclass(frozen=True)
+class Features:
+    """`xy`: pixels of the original; `size`: diameter, in them; `angle`: radians from x to y;
+    `descriptor`: of unit length for SIFT, bits for the others; the most distinct ones first."""
+
+    xy: Float[np.ndarray, "n 2"]
+    size: Float[np.ndarray, " n"]
+    angle: Float[np.ndarray, " n"]
+    descriptor: Float[np.ndarray, "n 128"] | UInt8[np.ndarray, "n bytes"]
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    def take(self, rows) -> "Features":
+        """The chosen features."""
+        return Features(self.xy[rows], self.size[rows], self.angle[rows], self.descriptor[rows])
+
+
+def find_features(
+    grey: UInt8[np.ndarray, "rows columns"], settings: Detection = Detection()
+) -> Features:
+    """The features of a photograph, evenly spread."""
+    cv2 = need_opencv()
+    rows, columns = grey.shape
+    factor = min(1.0, settings.side / max(rows, columns)) if settings.side else 1.0
+    if factor < 1:
+        size = max(round(columns * factor), 1), max(round(rows * factor), 1)
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    detector = _detector(cv2, settings)
+    found = [_in_tile(detector, grey, *tile) for tile in _tiles(*grey.shape)]
+    points = [p for part, _ in found for p in part]
+    descriptors = [d for _, d in found if d is not None and len(d)]
+    if not points or not descriptors:
+        return Features(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 1), np.uint8))
+    xy, size, angle, response = _columns(points)
+    kept = _spread(xy, size, response, grey.shape, settings.number)
+    scale = np.array([columns / grey.shape[1], rows / grey.shape[0]])
+    xy = (xy[kept] + 0.5) * scale - 0.5
+    descriptor = np.concatenate(descriptors)[kept]
+    if settings.kind == "sift":
+        descriptor = _root(descriptor)
+    return Features(xy, size[kept] * scale.mean(), np.deg2rad(angle[kept]), descriptor)
+
+
+def _detector(cv2, settings: Detection):
+    ample = int(AMPLE * settings.number)
+    if settings.kind == "sift":
+        return cv2.SIFT_create(nfeatures=ample, contrastThreshold=0.02)
+    if settings.kind == "orb":
+        return cv2.ORB_create(nfeatures=ample)
+    return cv2.AKAZE_create(threshold=0.0005)
+
+
+def _tiles(rows: int, columns: int):
+    """(top, left, bottom, right) of parts that overlap, and of what each of them is to give."""
+    tall, wide = (max(1, -(-n // TILE)) for n in (rows, columns))
+    for i in range(tall):
+        for j in range(wide):
+            top, bottom = rows * i // tall, rows * (i + 1) // tall
+            left, right = columns * j // wide, columns * (j + 1) // wide
+            yield top, left, bottom, right
+
+
+def _in_tile(detector, grey, top, left, bottom, right):
+    """Key points within a part, searched with a margin, and their descriptors."""
+    t, l = max(top - OVERLAP, 0), max(left - OVERLAP, 0)
+    part = np.ascontiguousarray(grey[t : bottom + OVERLAP, l : right + OVERLAP])
+    points, descriptors = detector.detectAndCompute(part, None)
+    if descriptors is None:
+        return [], None
+    keep = []
+    for k, point in enumerate(points):
+        x, y = point.pt[0] + l, point.pt[1] + t
+        point.pt = (x, y)
+        if left - 0.5 <= x < right - 0.5 and top - 0.5 <= y < bottom - 0.5:
+            keep.append(k)
+    return [points[k] for k in keep], descriptors[keep]
+
+
+def _columns(points):
+    xy = np.array([p.pt for p in points], float)
+    return xy, *(np.array([getattr(p, name) for p in points]) for name in
+                 ("size", "angle", "response"))  # fmt: skip
+
+
+def _spread(xy, size, response, shape, number):
+    """The rows to keep, the largest features first: of each cell the most distinct ones."""
+    if len(xy) <= number:
+        return np.argsort(-size, kind="stable")
+    side = max(shape) / CELLS
+    cell = (xy[:, 1] // side).astype(int) * (CELLS + 1) + (xy[:, 0] // side).astype(int)
+    order = np.lexsort((-response, cell))
+    first = np.searchsorted(cell[order], cell[order])
+    rank = np.empty(len(xy), int)
+    rank[order] = np.arange(len(xy)) - first
+    kept = np.lexsort((-response, rank))[:number]
+    return kept[np.argsort(-size[kept], kind="stable")]
+
+
+def _root(descriptor):
+    """The roots of descriptors of sum 1: their scalar product is Hellinger's (Arandjelović and
+    Zisserman, 2012)."""
+    total = np.maximum(descriptor.sum(1, keepdims=True), 1e-9)
+    return np.sqrt(descriptor / total).astype(np.float32)

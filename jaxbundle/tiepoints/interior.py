@@ -1,0 +1,155 @@
+"""The principal distance and K1 of a camera from pairs of its photographs, without anything known.
+
+Matches of two photographs fulfil the condition of coplanarity for the right interior orientation
+only. For principal distances over a wide range every pair is oriented relatively, and the distance
+with the least robust sum of Sampson's distances (in pixels) starts an adjustment of
+
+    c, K1, and M, b of every pair
+
+in which matches count the less the worse they agree (Cauchy). Pairs of parallel views hardly know c,
+pairs of a plane neither: their sums say so by being flat, and others decide.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.cameras import get_model, image_ray
+from jaxbundle.network.tables import Camera
+from jaxbundle.orientation import many
+from jaxbundle.orientation.least_squares import minimise
+from jaxbundle.orientation.relative import retract, sampson_distance
+from jaxbundle.orientation.sights import ideal_points
+
+FACTORS = tuple(0.55 * 1.17**k for k in range(12))
+"""Principal distances tried, in parts of the longer side: 85° to 21° of view."""
+PAIRS, SLOTS, PIXELS = 10, 64, 4.0
+"""Pairs and matches used; the misclosure at which a match counts half, for a photograph of 3000
+pixels: lens distortion is not known yet."""
+ROUNDS, STEPS = 4, 8
+FARTHEST = 0.35
+"""|k1| beyond this is not believed."""
+KNOWN = 1.35
+"""A principal distance from the file may be wrong by this factor."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Start:
+    """The camera, how many pairs agree on it, and the misclosure of their matches (median, px)."""
+
+    camera: Camera
+    pairs: int
+    misclosure: float
+
+
+def estimate_interior(
+    camera: Camera,
+    pairs: Sequence[tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]],
+    known: bool,
+) -> Start:
+    """A camera of model `opencv` with the principal distance and K1 that pairs agree on.
+
+    **Arguments:** matches of each pair in pixels, the clearest first, the best pairs first;
+    `known`: whether the principal distance of the camera is one to begin with.
+    """
+    pairs = [(one, other) for one, other in pairs if len(one) >= 24][:PAIRS]
+    if not pairs or camera.image_size is None:
+        return Start(camera, 0, np.nan)
+    size = max(camera.image_size)
+    limit = PIXELS * size / 3000
+    clear = [many.spread(max(int(0.6 * len(a)), 24), SLOTS) for a, _ in pairs]
+    xy1, xy2 = ([pair[i][r] for pair, r in zip(pairs, clear)] for i in (0, 1))
+    tried = [camera.parameters["fx"]] if known else [size * factor for factor in FACTORS]
+    found = [_oriented(_with(camera, f), xy1, xy2, limit) for f in tried]
+    costs = np.array([cost for *_, cost in found])
+    best = int(np.argmin(costs.sum(1)))
+    f, (M, b, part, _) = tried[best], found[best]
+    use = np.flatnonzero(part > 0.3)
+    if not len(use):
+        return Start(_with(camera, f), 0, np.nan)
+    f, k1, e = _adjusted(_with(camera, f), [(xy1[k], xy2[k]) for k in use], M[use], b[use], limit)
+    sane = np.isfinite(f) and 0.3 * size < f < 12 * size and abs(k1) < FARTHEST
+    sane &= not known or 1 / KNOWN < f / tried[0] < KNOWN
+    better = _with(camera, f, k1) if sane else _with(camera, tried[best])
+    return Start(better, len(use), float(np.median(np.abs(e))))
+
+
+def _with(camera, f, k1=0.0):
+    return dataclasses.replace(
+        camera, parameters={**camera.parameters, "fx": f, "fy": f, "k1": k1}
+    )
+
+
+def _oriented(camera, xy1, xy2, limit):
+    """Relative orientations of pairs with a camera, the parts that agree, and robust sums, px²."""
+    one, two = ([ideal_points(camera, xy) for xy in side] for side in (xy1, xy2))
+    f = camera.parameters["fx"]
+    M, b, part, _ = many.orient_pairs(one, two, np.full(len(one), limit / f))
+    costs = np.empty(len(one))
+    for k, (a, c) in enumerate(zip(one, two)):
+        e = f * np.asarray(_sampson(M[k], b[k], _fill(a), _fill(c)))
+        costs[k] = np.log1p((np.nan_to_num(e, nan=1e3) / limit) ** 2).mean()
+    return M, b, part, np.where(part > 0, costs, np.log1p(100.0))
+
+
+def _fill(a):
+    return np.resize(a, (SLOTS, *a.shape[1:]))
+
+
+@jax.jit
+def _sampson(M, b, xy1, xy2):
+    return jax.vmap(sampson_distance, (None, None, 0, 0))(M, b, xy1, xy2)
+
+
+def _adjusted(camera, pairs, M, b, limit):
+    """f, k1 and the misclosures after an adjustment of all pairs together."""
+    rows = np.arange(PAIRS) % len(pairs)
+    there = (np.arange(PAIRS) < len(pairs)).astype(float)
+    xy1, xy2 = (np.stack([_fill(pairs[k][i]) for k in rows]) for i in (0, 1))
+    model = get_model(camera.model)
+    p = np.array([camera.parameters.get(name, 0.0) for name in model.parameters])
+    f, k1, e = _self_calibrate(model, p, M[rows], b[rows], xy1, xy2, there, limit)
+    return float(f), float(k1), np.asarray(e)[: len(pairs)]
+
+
+@partial(jax.jit, static_argnums=0)
+def _self_calibrate(model, p, M, b, xy1, xy2, there, limit):
+    names = model.parameters
+    fx, fy, k1 = (names.index(name) for name in ("fx", "fy", "k1"))
+    size = p[fx]
+
+    def camera(change):
+        f = size * jnp.exp(change[0])
+        return p.at[fx].set(f).at[fy].set(f).at[k1].add(change[1])
+
+    def ideal(q, xy):
+        r, s, w = image_ray(model, tuple(q), xy[0], xy[1])
+        return jnp.stack([-r / w, -s / w])
+
+    def misclosures(state, xy1, xy2, root):
+        change, M, b = state
+        q = camera(change)
+        one, two = (jax.vmap(jax.vmap(lambda xy: ideal(q, xy)))(xy) for xy in (xy1, xy2))
+        e = jax.vmap(jax.vmap(sampson_distance, (None, None, 0, 0)))(M, b, one, two)
+        return (root * q[fx] * e).ravel()
+
+    def move(state, delta):
+        change, M, b = state
+        M, b = jax.vmap(lambda M, b, d: retract((M, b), d))(M, b, delta[2:].reshape(-1, 5))
+        return change + delta[:2], M, b
+
+    def again(_, state):
+        e = misclosures(state, xy1, xy2, jnp.ones(xy1.shape[:2])).reshape(xy1.shape[:2])
+        root = there[:, None] / jnp.sqrt(1 + (jnp.nan_to_num(e, nan=1e6) / limit) ** 2)
+        state, _ = minimise(misclosures, move, state, (xy1, xy2, root), 2 + 5 * len(M), STEPS)
+        return state
+
+    state = jax.lax.fori_loop(0, ROUNDS, again, (jnp.zeros(2), M, b))
+    e = misclosures(state, xy1, xy2, jnp.ones(xy1.shape[:2])).reshape(xy1.shape[:2])
+    q = camera(state[0])
+    return q[fx], q[k1], e

@@ -1,0 +1,67 @@
+"""Which photographs may show the same: pairs worth matching."""
+
+from collections.abc import Callable, Sequence
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.tiepoints.features import Features
+from jaxbundle.tiepoints.matching import number_alike
+
+WAYS = ("auto", "all", "sequence", "place", "alike")
+MANY = 60
+"""Photographs beyond which not all pairs are matched."""
+NEXT = 5
+"""Photographs before and after one in a sequence."""
+NEAREST = 20
+"""Neighbours of a photograph, by place or by likeness."""
+ALIKE = 4
+"""Matches of the largest features that make a pair worth a closer look."""
+
+
+def candidate_pairs(
+    features: Sequence[Features],
+    way: str = "auto",
+    place: Float[np.ndarray, "photographs 3"] | None = None,
+    run: Callable = map,
+) -> list[tuple[int, int]]:
+    """Pairs of photographs to be matched.
+
+    **Arguments:** `way`: `"all"`; `"sequence"`: neighbours in the order given; `"place"`: the
+    nearest by the positions in their files; `"alike"`: those whose largest features match;
+    `"auto"`: all of a few; of many the nearest where all positions are known, else those alike.
+    `place`: positions, NaN: not known; `run`: maps a function over many.
+    """
+    n = len(features)
+    known = place is not None and np.isfinite(place).all()
+    if way == "auto":
+        way = "all" if n <= MANY else "place" if known else "alike"
+    if way == "all":
+        return list(combinations(range(n), 2))
+    if way == "sequence":
+        return [(i, j) for i in range(n) for j in range(i + 1, min(i + NEXT + 1, n))]
+    if way == "place" and known:
+        return _nearest(np.asarray(place))
+    return _alike(features, run)
+
+
+def _nearest(place):
+    from scipy.spatial import cKDTree
+
+    _, rows = cKDTree(place).query(place, k=min(NEAREST + 1, len(place)))
+    pairs = {(min(i, j), max(i, j)) for i, row in enumerate(rows) for j in row.tolist() if i != j}
+    return sorted(pairs)
+
+
+def _alike(features, run):
+    every = list(combinations(range(len(features)), 2))
+    number = list(run(lambda pair: number_alike(features[pair[0]], features[pair[1]]), every))
+    of = [[] for _ in features]
+    for (i, j), found in zip(every, number):
+        if found >= ALIKE:
+            of[i].append((found, j))
+            of[j].append((found, i))
+    pairs = {(min(i, j), max(i, j)) for i, best in enumerate(of)
+             for _, j in sorted(best, reverse=True)[:NEAREST]}  # fmt: skip
+    return sorted(pairs)

@@ -1,0 +1,213 @@
+"""Every measurement of a track by least squares matching, each with its own covariance.
+
+One photograph of a track gives the window, around the pixel nearest to its feature: the point is
+this pixel. In the others it is matched (`measure.least_squares_matching`), starting with the
+similarity of the two features, on the level of the pyramid where the window looks alike. Half of
+the variance of a match belongs to the window, which shifts all of its matches by its own noise: the
+measurement in the first photograph has the mean of these halves, every other one its own.
+
+What is not matched keeps the place of its feature, whose σ is `FEATURE` times its size.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, UInt8
+
+from jaxbundle.measure.least_squares_matching import MatchingStatus, match_least_squares
+from jaxbundle.photographs.opencv import need_opencv
+from jaxbundle.tiepoints.features import Features
+from jaxbundle.tiepoints.tracks import flatten
+
+WINDOW, PIECE = 17, 41
+"""Sides of the window, and of the piece of another photograph in which it is matched."""
+FINEST = 7.0
+"""Diameter, pixels, of the features that are matched in the original; of larger ones in a coarser
+level, where they have about this size."""
+LEVELS = 6
+LANES = 128
+WEAK = 0.75
+"""Correlation below which a match is not believed."""
+SHIFT = 3.0
+"""Farthest a match may lie from its feature, pixels of its level."""
+WORST = 0.4
+"""σ above which a match is not believed, pixels of its level."""
+LEAST_SIGMA = 0.02
+"""σ below this, pixels of its level, is not believed: interpolation and sampling add as much."""
+FEATURE = 0.12
+"""σ of the place of a feature, in parts of its diameter."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Measurements:
+    """Measured places: which track and photograph; `xy`, `sigma`: pixels; `level`: of the pyramid,
+    −1: the place of the feature; `first`: whether it gave the window; `colour`: RGB there."""
+
+    track: Int[np.ndarray, " n"]
+    image: Int[np.ndarray, " n"]
+    xy: Float[np.ndarray, "n 2"]
+    sigma: Float[np.ndarray, "n 2"]
+    level: Int[np.ndarray, " n"]
+    first: Bool[np.ndarray, " n"]
+    colour: UInt8[np.ndarray, "n 3"]
+
+    def __len__(self) -> int:
+        return len(self.track)
+
+    def take(self, rows) -> "Measurements":
+        """The chosen measurements."""
+        return Measurements(*(getattr(self, f.name)[rows] for f in dataclasses.fields(self)))
+
+
+def measure_tracks(
+    tracks: Sequence[Sequence[tuple[int, int]]],
+    features: Sequence[Features],
+    read: Callable[[int], UInt8[np.ndarray, "rows columns 3"]],
+    advance: Callable[[], None] = lambda: None,
+) -> Measurements:
+    """Measure every place of every track; each photograph is read once.
+
+    **Arguments:** `read(k)`: colours of a photograph; `advance`: called after each of them.
+    """
+    track, image, feature = flatten(tracks)
+    n = len(track)
+    xy, size, angle = np.zeros((n, 2)), np.zeros(n), np.zeros(n)
+    for k, found in enumerate(features):
+        rows = image == k
+        xy[rows], size[rows] = found.xy[feature[rows]], found.size[feature[rows]]
+        angle[rows] = found.angle[feature[rows]]
+    first, level = _roles(track, size)
+    window_of = np.flatnonzero(first)[track]
+    scale = 2.0**level
+    centre = np.rint(xy / scale[:, None])
+    start = _starts(xy, size, angle, scale, centre, window_of)
+    corner = np.rint(start[:, :, 2]) - PIECE // 2
+    corner[first] = centre[first] - WINDOW // 2
+    windows, pieces, inside, colour = _cut_out(image, first, level, corner, xy, read, advance)
+    others = np.flatnonzero(~first & inside & inside[window_of])
+    start[:, :, 2] -= corner
+    found = _matched(windows[track[others]], pieces, others, start)
+    return _collect(track, image, xy, size, first, level, corner, colour, others, found)
+
+
+def _roles(track, size):
+    """Which measurement of a track gives the window, that of the middle size; and the levels."""
+    order = np.lexsort((size, track))
+    begin = np.searchsorted(track[order], np.arange(track.max(initial=-1) + 1))
+    length = np.bincount(track)
+    first = np.zeros(len(track), bool)
+    first[order[begin + length // 2]] = True
+    smallest = size[order[begin]]
+    of_window = size[first][np.argsort(track[first])]
+    coarse = np.maximum(np.log2(of_window / FINEST), np.log2(of_window / smallest))
+    base = np.clip(np.rint(coarse), 0, LEVELS).astype(int)
+    level = np.rint(base[track] + np.log2(size / of_window[track]))
+    return first, np.where(first, base[track], np.clip(level, 0, LEVELS)).astype(int)
+
+
+def _starts(xy, size, angle, scale, centre, window_of):
+    """A of every measurement, from the window's pixels to those of its level."""
+    w = window_of
+    turn = angle - angle[w]
+    grown = size / scale / (size[w] / scale[w])
+    c, s = grown * np.cos(turn), grown * np.sin(turn)
+    start = np.zeros((len(xy), 2, 3))
+    start[:, 0, 0], start[:, 0, 1], start[:, 1, 0], start[:, 1, 1] = c, -s, s, c
+    offset = centre[w] - xy[w] / scale[w, None]
+    start[:, :, 2] = xy / scale[:, None] + np.einsum("nij,nj->ni", start[:, :, :2], offset)
+    return start
+
+
+def _cut_out(image, first, level, corner, xy, read, advance):
+    """Windows by track, pieces by measurement, which are inside, and the colours at the places."""
+    cv2 = need_opencv()
+    n = len(image)
+    windows = np.zeros((int(first.sum()), WINDOW, WINDOW), np.uint8)
+    track_of = np.cumsum(first) - 1
+    pieces = np.zeros((n, PIECE, PIECE), np.uint8)
+    inside, colour = np.zeros(n, bool), np.zeros((n, 3), np.uint8)
+    order = np.argsort(image, kind="stable")
+    for k in range(image.max(initial=-1) + 1):
+        rows = order[slice(*np.searchsorted(image[order], [k, k + 1]))]
+        if len(rows):
+            picture = read(k)
+            at = np.clip(np.rint(xy[rows]), 0, np.array(picture.shape[1::-1]) - 1).astype(int)
+            colour[rows] = picture[at[:, 1], at[:, 0]]
+            pyramid = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+            for step in range(level[rows].max() + 1):
+                pyramid = cv2.pyrDown(pyramid) if step else pyramid
+                here = rows[level[rows] == step]
+                for chosen, side in ((here[first[here]], WINDOW), (here[~first[here]], PIECE)):
+                    cut, inside[chosen] = _pieces(pyramid, corner[chosen].astype(int), side)
+                    if side == WINDOW:
+                        windows[track_of[chosen]] = cut
+                    else:
+                        pieces[chosen] = cut
+        advance()
+    return windows, pieces, inside, colour
+
+
+def _pieces(picture, corner, side):
+    """Squares of a photograph, and which of their middles are in it; beyond its edge repeated."""
+    rows, columns = picture.shape
+    offset = np.arange(side)
+    v = np.clip(corner[:, 1, None] + offset, 0, rows - 1)
+    u = np.clip(corner[:, 0, None] + offset, 0, columns - 1)
+    reach = side // 2 if side == WINDOW else side // 2 - WINDOW // 2 - 2
+    middle = corner + side // 2
+    inside = np.all((middle >= reach) & (middle < np.array([columns, rows]) - reach), axis=1)
+    return picture[v[:, :, None], u[:, None, :]], inside
+
+
+@partial(jax.jit)
+def _match(windows: Array, pieces: Array, start: Array):
+    found = jax.vmap(match_least_squares)(
+        windows.astype(np.float32), pieces.astype(np.float32), start
+    )
+    return found.affine, found.covariance, found.correlation, found.status
+
+
+def _matched(windows, pieces, others, start):
+    """A, covariance, correlation and status of the matches."""
+    parts = []
+    for begin in range(0, len(others), LANES):
+        rows = np.minimum(np.arange(begin, begin + LANES), len(others) - 1)
+        some = others[rows]
+        found = _match(windows[rows], pieces[some], start[some].astype(np.float32))
+        parts.append(found)
+    if not parts:
+        return np.zeros((0, 2, 3)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0, int)
+    columns = (np.concatenate([np.asarray(p) for p in column]) for column in zip(*parts))
+    return tuple(column[: len(others)] for column in columns)
+
+
+def _collect(track, image, xy, size, first, level, corner, colour, others, found):
+    affine, covariance, rho, status = found
+    scale = 2.0**level
+    place = affine[:, :, 2] + corner[others]
+    away = np.linalg.norm(place - xy[others] / scale[others, None], axis=1)
+    own = np.sqrt(np.maximum(covariance[:, [0, 1], [0, 1]], 0) / 2)
+    good = (status == int(MatchingStatus.CONVERGED)) & (rho > WEAK) & (away < SHIFT)
+    good &= (own < WORST).all(1)
+    own = np.hypot(own, LEAST_SIGMA)
+    rows = others[good]
+    place_of = xy.copy()
+    sigma = np.repeat(FEATURE * size[:, None], 2, 1)
+    place_of[rows] = place[good] * scale[rows, None]
+    sigma[rows] = own[good] * scale[rows, None]
+    matched = np.zeros(len(track), bool)
+    matched[rows] = True
+    windows = np.flatnonzero(first)
+    number = np.bincount(track[rows], minlength=len(windows))
+    square = np.stack([np.bincount(track[rows], own[good, i] ** 2, len(windows)) for i in (0, 1)], 1)
+    use = number > 0
+    w = windows[use]
+    place_of[w] = (corner[w] + WINDOW // 2) * scale[w, None]
+    sigma[w] = np.sqrt(square[use] / number[use, None]) * scale[w, None]
+    matched[w] = True
+    return Measurements(
+        track, image, place_of, sigma, np.where(matched, level, -1), first, colour
+    )

@@ -1,0 +1,122 @@
+"""Tracks: one point in all the photographs that show it, from matches of pairs.
+
+Matches are joined, the clearest first (union-find); one that would put two places of a photograph
+into a track contradicts the clearer ones and is left out. Of the tracks those are kept that cover
+every photograph evenly, long ones first, and none next to another.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxbundle.tiepoints.features import Features
+from jaxbundle.tiepoints.verification import Pair
+
+CELLS = 10
+"""Cells along the longer side of a photograph."""
+NEAR = 0.0015
+"""Tracks nearer than this part of the longer side, in two photographs, are one point."""
+
+
+def make_tracks(
+    features: Sequence[Features], pairs: Sequence[Pair]
+) -> list[list[tuple[int, int]]]:
+    """Tracks as lists of (photograph, feature), two photographs at least."""
+    first = np.concatenate([[0], np.cumsum([len(f) for f in features])]).astype(int)
+    same = np.concatenate([_first_at_a_place(f.xy) + k for f, k in zip(features, first)] or [[]])
+    rows = [first[list(pair.images)] + pair.matches for pair in pairs if len(pair)]
+    if not rows:
+        return []
+    clarity = np.concatenate([pair.clarity for pair in pairs if len(pair)])
+    edges = same[np.concatenate(rows)[np.argsort(clarity, kind="stable")]]
+    members = _joined(edges, np.searchsorted(first, np.arange(first[-1]), side="right") - 1)
+    tracks = []
+    for nodes in members:
+        images = np.searchsorted(first, nodes, side="right") - 1
+        tracks.append(sorted(zip(images.tolist(), (nodes - first[images]).tolist())))
+    return tracks
+
+
+def _first_at_a_place(xy):
+    """For every feature the first one at its place: SIFT has several directions of one."""
+    _, first, back = np.unique(np.round(xy, 2), axis=0, return_index=True, return_inverse=True)
+    return first[back.ravel()]
+
+
+def _joined(edges, image):
+    """The groups of nodes that edges join, none with two nodes of an image."""
+    parent: dict[int, int] = {}
+    group: dict[int, dict[int, int]] = {}
+
+    def root(node):
+        while parent[node] != node:
+            parent[node] = parent[parent[node]]
+            node = parent[node]
+        return node
+
+    for a, b in edges.tolist():
+        for node in (a, b):
+            if node not in parent:
+                parent[node], group[node] = node, {int(image[node]): node}
+        a, b = root(a), root(b)
+        if a == b or not group[a].keys().isdisjoint(group[b]):
+            continue
+        if len(group[a]) < len(group[b]):
+            a, b = b, a
+        parent[b] = a
+        group[a].update(group.pop(b))
+    return [np.array(sorted(g.values())) for g in group.values() if len(g) > 1]
+
+
+def choose_tracks(
+    tracks: Sequence[Sequence[tuple[int, int]]],
+    xy: Sequence[Float[np.ndarray, "_ 2"]],
+    sizes: Sequence[tuple[int, int]],
+    number: int,
+) -> Bool[np.ndarray, " tracks"]:
+    """Which tracks to keep, for about `number` places in every photograph, evenly spread.
+
+    **Arguments:** `xy`: places of the features of every photograph; `sizes`: columns, rows.
+    """
+    cell, near, shape = _cells(xy, sizes)
+    quota = [max(1, round(number / (nx * ny))) for nx, ny in shape]
+    filled = [np.zeros(nx * ny, int) for nx, ny in shape]
+    taken: list[set] = [set() for _ in xy]
+    kept = np.zeros(len(tracks), bool)
+    for k in np.argsort([-len(track) for track in tracks], kind="stable").tolist():
+        track = tracks[k]
+        wanted = sum(filled[i][cell[i][f]] < quota[i] for i, f in track)
+        double = sum(near[i][f] in taken[i] for i, f in track)
+        if wanted < 2 or double >= 2:
+            continue
+        kept[k] = True
+        for i, f in track:
+            filled[i][cell[i][f]] += 1
+            taken[i].add(near[i][f])
+    return kept
+
+
+def _cells(xy, sizes):
+    """Of every feature its cell of the grid, and that of a fine grid; shape of the grids."""
+    cell, near, shape = [], [], []
+    for places, (columns, rows) in zip(xy, sizes):
+        side = max(columns, rows) / CELLS
+        nx, ny = (max(1, int(np.ceil(n / side))) for n in (columns, rows))
+        column, row = np.clip(places // side, 0, [nx - 1, ny - 1]).astype(int).T
+        cell.append(row * nx + column)
+        shape.append((nx, ny))
+        fine = np.floor(places / (NEAR * max(columns, rows))).astype(int)
+        near.append((fine[:, 1] * 100_000 + fine[:, 0]).tolist())
+    return cell, near, shape
+
+
+def flatten(
+    tracks: Sequence[Sequence[tuple[int, int]]],
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+    """Track, photograph and feature of every measurement."""
+    track = np.repeat(np.arange(len(tracks)), [len(t) for t in tracks])
+    if not len(track):
+        return track, track, track
+    image, feature = np.array([m for t in tracks for m in t], int).T
+    return track, image, feature
