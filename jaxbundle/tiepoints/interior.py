@@ -6,8 +6,8 @@ with the least robust sum of Sampson's distances (in pixels) starts an adjustmen
 
     c, K1, and M, b of every pair
 
-in which matches count the less the worse they agree (Cauchy). Pairs of parallel views hardly know c,
-pairs of a plane neither: their sums say so by being flat, and others decide.
+in which matches count the less the worse they agree (Cauchy). Pairs of parallel views hardly
+know c, pairs of a plane neither: their sums say so by being flat, and others decide.
 """
 
 import dataclasses

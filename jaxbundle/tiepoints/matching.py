@@ -1,8 +1,8 @@
 """Features of two photographs that look alike: each the nearest of the other, clearly so.
 
 Of two descriptors of unit length the distance is √(2 − 2·a·b): one matrix product for all pairs.
-A match is kept if it is the best from both sides and its distance is below `ratio` times that of the
-second best (Lowe, 2004).
+A match is kept if it is the best from both sides and its distance is below `ratio` times that of
+the second best (Lowe, 2004).
 """
 
 import numpy as np

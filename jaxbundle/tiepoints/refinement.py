@@ -202,7 +202,8 @@ def _collect(track, image, xy, size, first, level, corner, colour, others, found
     matched[rows] = True
     windows = np.flatnonzero(first)
     number = np.bincount(track[rows], minlength=len(windows))
-    square = np.stack([np.bincount(track[rows], own[good, i] ** 2, len(windows)) for i in (0, 1)], 1)
+    sums = [np.bincount(track[rows], own[good, i] ** 2, len(windows)) for i in (0, 1)]
+    square = np.stack(sums, 1)
     use = number > 0
     w = windows[use]
     place_of[w] = (corner[w] + WINDOW // 2) * scale[w, None]

@@ -140,14 +140,15 @@ def _fill(a):
 @jax.vmap
 def _refine(M, b, xy1, xy2, weights):
     def misclosures(pair, xy1, xy2, root):
-        return root * jax.vmap(sampson_distance, (None, None, 0, 0))(*pair, xy1, xy2)
+        M, b = pair
+        return root * jax.vmap(sampson_distance, (None, None, 0, 0))(M, b, xy1, xy2)
 
     (M, b), _ = minimise(misclosures, retract, (M, b), (xy1, xy2, weights), 5, STEPS)
     return M, b
 
 
 def _kinds(found, xy1, xy2, tolerance):
-    """Matches, angle and kind of every pair; of one place the matches that the rotation explains."""
+    """Matches, angle and kind of every pair."""
     rows = [np.flatnonzero(good)[many.spread(int(good.sum()), SLOTS)] for good, *_ in found]
     if not found:
         return []
@@ -159,12 +160,10 @@ def _kinds(found, xy1, xy2, tolerance):
     )  # fmt: skip
     kinds = []
     for k, (good, *_) in enumerate(found):
-        number = (weights[k] > 0).sum()
-        part = lambda e: (e[:number] < 2 * tolerance[k]).mean()
-        kind = "rotation" if part(turn[k]) > EXPLAINED else (
-            "plane" if part(plane[k]) > EXPLAINED else "relative"
-        )
-        kinds.append((good, float(angle[k]), kind))
+        number, near = int((weights[k] > 0).sum()), 2 * tolerance[k]
+        by_rotation, by_plane = (float((e[k, :number] < near).mean()) for e in (turn, plane))
+        kind = "plane" if by_plane > EXPLAINED else "relative"
+        kinds.append((good, float(angle[k]), "rotation" if by_rotation > EXPLAINED else kind))
     return kinds
 
 

@@ -1,0 +1,1 @@
+"""Tie points of photographs without targets: features, pairs, matches, tracks, measured places."""
