@@ -16,7 +16,6 @@ from jaxbundle.io.writing.folders import check_folder, replaced_folder
 from jaxbundle.surface.files import report_of, text_of, write_cloud_csv
 from jaxbundle.surface.inputs import read_views, tie_points
 from jaxbundle.surface.interest import KINDS
-from jaxbundle.surface.matching import Settings
 from jaxbundle.surface.pairs import given_partners
 from jaxbundle.surface.reconstruct import find_bounds, reconstruct
 
@@ -37,6 +36,9 @@ def surface(
     step: Annotated[
         int | None, typer.Option(min=1, help="pixels between points of the base images")
     ] = None,
+    dense: Annotated[
+        bool, typer.Option("--dense", help="every pixel of the base images, or every --step-th")
+    ] = False,
     json: Annotated[str, typer.Option(help="counts and accuracy as JSON; - for stdout")] = "",
     force: Force = False,
     quiet: Quiet = False,
@@ -62,7 +64,7 @@ def surface(
             bar.update(tasks[stage], completed=done, total=total)
 
         found = reconstruct(
-            views, bounds, partners, points=points, step=step, settings=Settings(), tell=tell
+            views, bounds, partners, points=points, step=step, dense=dense, tell=tell
         )
     report = report_of(found, (*messages, *more))
     text = json_text.dumps(without_nan(report), ensure_ascii=False) + "\n"

@@ -12,6 +12,7 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.surface.bounds import Bounds, by_geometry, by_points
 from jaxbundle.surface.cloud import Cloud, merge
 from jaxbundle.surface.correlation import Pyramid, make_pyramid
+from jaxbundle.surface.dense_cloud import dense_cloud
 from jaxbundle.surface.guide import Guide, coarsest_level, make_guide
 from jaxbundle.surface.interest import interest_points
 from jaxbundle.surface.matching import Matches, Settings, match_points
@@ -91,13 +92,15 @@ def reconstruct(
     *,
     points: str = "grid",
     step: int | None = None,
+    dense: bool = False,
     settings: Settings | None = None,
     tell: Tell | None = None,
 ) -> Surface:
     """The cloud of all base images.
 
     **Arguments:** `partners`: indices of the images each base is matched with, chosen if not given;
-    `points`, `step`: see `interest_points`; `tell(stage, done, total)`.
+    `points`, `step`: see `interest_points`; `dense`: every pixel (or every `step`-th), by rectified
+    pairs; `tell(stage, done, total)`.
 
     **Raises:** `NotSolvedError` where no images see the same, or nothing matches.
     """
@@ -111,24 +114,28 @@ def reconstruct(
     levels = max(_level(views, bounds[i], i, others) for i, others in partners.items())
     pyramids = _Pyramids(views, levels)
     guides = _guides(views, bounds, partners, pyramids, tell)
-    clouds, told = [], []
+    clouds, told, messages = [], [], []
     for done, (i, others) in enumerate(partners.items()):
         tell("matching", done, len(partners))
-        guide = guides.get(i)
-        uv = interest_points(views[i].grey, points, step or _step(views[i]))
-        row: dict[str, Any] = {"image": views[i].name, "with": [views[j].name for j in others],
-                               "points": len(uv)}  # fmt: skip
-        if guide is not None:
+        row: dict[str, Any] = {"image": views[i].name, "with": [views[j].name for j in others]}
+        if i not in guides:
+            row |= {"points": 0, "matched": 0, "variance_factor": None, "rejected": {}}
+        elif dense:
+            cloud, counts, left_out = _dense(views, i, others, guides[i], step or 1)
+            clouds.append(cloud)
+            row |= counts
+            messages += [f"{views[i].name} with {name}: cannot be rectified, left out"
+                         for name in left_out]  # fmt: skip
+        else:
+            uv = interest_points(views[i].grey, points, step or _step(views[i]))
             found = match_points(
                 views[i], [views[j] for j in others],
-                (pyramids[i], [pyramids[j] for j in others]), guide, uv,
+                (pyramids[i], [pyramids[j] for j in others]), guides[i], uv,
                 [guides.get(j) for j in others], settings or Settings(),
             )  # fmt: skip
             clouds.append(_cloud(views[i], found))
-            row |= {"matched": len(found.X), "variance_factor": found.factor,
+            row |= {"points": len(uv), "matched": len(found.X), "variance_factor": found.factor,
                     "rejected": found.rejected}  # fmt: skip
-        else:
-            row |= {"matched": 0, "variance_factor": None, "rejected": {}}
         told.append(row)
     tell("matching", len(partners), len(partners))
     if not any(len(c) for c in clouds):
@@ -136,7 +143,21 @@ def reconstruct(
             "no point was matched: the photographs have too little texture in common, or the "
             "orientation or the bounds of the heights are not theirs"
         )
-    return Surface(merge(clouds), tuple(told), ())
+    return Surface(merge(clouds), tuple(told), tuple(messages))
+
+
+def _dense(views, i, others, guide, step):
+    """The cloud of most pixels of an image, its counts, images that cannot be rectified with it."""
+    base = views[i]
+    cloud, used, left_out = dense_cloud(base, [views[j] for j in others], guide, step)
+    cloud = dataclasses.replace(cloud, colour=_colour(base, cloud.uv))
+    columns, rows = base.size
+    number = -(-columns // step) * -(-rows // step)
+    factor = float(np.mean([f for _, f in used])) if used else None
+    return cloud, {
+        "points": number, "matched": len(cloud), "variance_factor": factor,
+        "rejected": {"no disparity, or not confirmed by least squares": number - len(cloud)},
+    }, left_out  # fmt: skip
 
 
 def _guides(views, bounds, partners, pyramids, tell) -> dict[int, Guide]:

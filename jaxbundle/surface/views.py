@@ -94,11 +94,12 @@ class FrameView:
         self.camera, self.X0, self.M = camera, np.asarray(X0, float), np.asarray(M, float)
         p = np.array([float(given.get(n, 0.0)) for n in model.parameters])
         self._frame = _Frame(model, *map(jnp.asarray, (p, self.X0, self.M, origin, step)))
-        edge = self._edge()
+        edge = self.edge()
         axis = self.points(edge, np.ones(len(edge))) - self.X0
         self._farthest = BEYOND * float(np.nanmax(np.arccos(np.clip(-axis @ self.M[2], -1, 1))))
 
-    def _edge(self) -> Places:
+    def edge(self) -> Places:
+        """Places along and across the whole image, its edges included."""
         u, v = (np.linspace(-0.5, n - 0.5, 17) for n in self.size)
         return np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
 

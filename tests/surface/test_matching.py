@@ -3,11 +3,14 @@ found where there is nothing to see."""
 
 import numpy as np
 import pytest
-from surface_scenes import F, hills, photographs, two_shapes
+from surface_scenes import CAMERA, F, hills, photographs, two_shapes
 
 from jaxbundle.surface.correlation import slide, top
+from jaxbundle.surface.dense_cloud import combine
 from jaxbundle.surface.reconstruct import find_bounds, reconstruct
-from jaxbundle.surface.views import is_inside, line_of_sight, over_plane
+from jaxbundle.surface.rectification import rectify
+from jaxbundle.surface.views import FrameView, is_inside, line_of_sight, over_plane
+from jaxbundle.types import present
 
 NONE = np.zeros((0, 3))
 
@@ -123,3 +126,47 @@ def test_hidden_points_are_not_found(pair):
     assert hidden.sum() < 0.005 * len(cloud)
     np.testing.assert_allclose(true[true[:, 2] < 1.9][:, 2],
                                hills(*true[true[:, 2] < 1.9].T[:2]), atol=1e-6)  # fmt: skip
+
+
+def test_dense_matching_finds_most_pixels_with_honest_sigma(pair):
+    views, truth, _ = pair
+    bounds, _ = find_bounds(views, NONE, (-1.5, 3.0))
+    cloud = reconstruct(views, bounds, {0: [1]}, dense=True).cloud
+    e, s, _ = errors(cloud, truth[0])
+    seen = is_inside(views[1], views[1].project(truth[0].reshape(-1, 3))).sum()
+    assert len(cloud) > 0.85 * seen
+    w = e / s
+    assert (np.abs(w) > 10).mean() < 0.01
+    assert 0.8 < np.sqrt(np.mean(w[np.abs(w) < 10] ** 2)) < 1.2
+    off = np.linalg.norm(views[1].project(cloud.X) - views[1].project(truth[0][
+        cloud.uv[:, 1].astype(int), cloud.uv[:, 0].astype(int)]), axis=1)  # fmt: skip
+    assert (off < 0.25).mean() > 0.95
+
+
+def test_rectified_points_are_where_they_are(pair):
+    views, truth, _ = pair
+    X = truth[0][::16, ::16].reshape(-1, 3)
+    found, span = present(rectify(*views, X))
+    place, d = found.places(X), found.disparity(X)
+    assert (d > 0).all() and (d < span).all()
+    np.testing.assert_allclose(found.points(place, d), X, atol=1e-9)
+    # the same point is as bright in both rectified images, on one row
+    row, column = np.rint(place[:, 1]).astype(int), np.rint(place[:, 0]).astype(int)
+    assert present(rectify(*views[::-1], X))[0].base == found.base
+    assert np.isfinite(found.left[row, column]).all()
+
+
+def test_one_camera_before_the_other_cannot_be_rectified(pair):
+    views, truth, _ = pair
+    below = FrameView("below", views[0].grey, CAMERA, views[0].X0 - [0, 0, 2], np.eye(3))
+    assert rectify(views[0], below, truth[0].reshape(-1, 3)) is None
+
+
+def test_pairs_that_disagree_are_left_out_where_no_third_decides():
+    q = np.array([[1.0, 1.0, 1.0, np.nan], [1.01, 2.0, 2.0, 1.5], [np.nan, np.nan, 1.01, np.nan]])
+    sigma = np.full(q.shape, 0.01)
+    mean, variance, number = combine(q, sigma)
+    np.testing.assert_allclose(mean, [1.005, np.nan, 1.005, 1.5])
+    assert number.tolist()[0] == 2 and number.tolist()[2:] == [2, 1]
+    # one pair: its σ; of two, the half that is the base image's stays
+    np.testing.assert_allclose(variance[[0, 3]], [0.75e-4, 1e-4])

@@ -1,0 +1,241 @@
+"""Dense matching of rectified pairs: semi-global matching, then least squares at every pixel.
+
+OpenCV's semi-global matching gives disparities to about a quarter of a pixel. At each pixel a
+window then follows the disparities found, R(x, y) = right(x − d(x, y), y), and
+
+    left + v = h₀ + h₁·R + g_x·δ + g_y·ε
+
+is solved for a correction δ of the disparity, a shift ε across the rows, brightness and contrast.
+Rows are aligned, so that ε ought to be 0: what it is, in units of its σ, gives a variance factor
+(the median of ε²/σ² over that of χ²). Third differences of disparities farther apart than a window
+give another, with what the shape of the windows does to them; the greater of both is taken.
+
+Sources: Hirschmüller (2008); Lucas and Kanade (1981); Ackermann (1984).
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage, stats
+
+from jaxbundle.photographs.opencv import need_opencv
+from jaxbundle.surface.rectification import Rectified
+
+BLOCK = 3
+"""Side of the blocks of semi-global matching."""
+UNIQUE = 5
+"""Percent by which the best cost must be below the second."""
+SPECKLE = 80
+"""Pixels of the smallest region of like disparities that is kept."""
+HALF = 4
+"""Half the side of the windows of least squares."""
+ROUNDS = 2
+HOLES, STEP, JUMP = 0.5, 0.3, 2.5
+"""Pixels: σ that a window has of gaps, by the root of their share; and of a step in the surface,
+which is a change of disparities by more than `JUMP`. Found on rendered roofs."""
+NEAR = 0.7
+"""Pixels: by so much disparities of one surface differ within a window, about."""
+MOST_CHANGE = 1.0
+"""Pixels that least squares may move a disparity."""
+LEAST_CORRELATION = 0.5
+MOST_SIGMA = 0.5
+"""σ of a disparity, pixels, above which the texture does not determine it."""
+LEAST_CONTRAST = 1.0
+"""Standard deviation of a window, grey values of 256."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Disparities:
+    """Disparity, its σ (times the root of `factor`), ρ of the window; NaN: none."""
+
+    disparity: Float[np.ndarray, "rows columns"]
+    sigma: Float[np.ndarray, "rows columns"]
+    rho: Float[np.ndarray, "rows columns"]
+    factor: float
+
+
+def match_dense(pair: Rectified, span: int) -> Disparities:
+    """Disparities from 0 to `span` of a rectified pair, at the pixels of its left image."""
+    left, right, inside = _prepared(pair)
+    start = semi_global(left, right, span)
+    start[~inside] = np.nan
+    return refine_disparities(left, right, start)
+
+
+def semi_global(left, right, span: int) -> Float[np.ndarray, "rows columns"]:
+    """Disparities by OpenCV, pixels; NaN where the check of left and right, the uniqueness or the
+    speckle filter took them out."""
+    cv2 = need_opencv()
+    number = max(16, -(-(span + 1) // 16) * 16)
+    matcher = cv2.StereoSGBM.create(
+        minDisparity=0, numDisparities=number, blockSize=BLOCK, P1=8 * BLOCK**2,
+        P2=48 * BLOCK**2, disp12MaxDiff=1, preFilterCap=31, uniquenessRatio=UNIQUE,
+        speckleWindowSize=SPECKLE, speckleRange=2, mode=cv2.STEREO_SGBM_MODE_HH4,
+    )  # fmt: skip
+    eight = [np.clip(np.rint(a), 0, 255).astype(np.uint8) for a in (left, right)]
+    # columns of the left image without a full range of disparities are matched with a margin
+    wide = [cv2.copyMakeBorder(a, 0, 0, number, 0, cv2.BORDER_REPLICATE) for a in eight]
+    found = matcher.compute(*wide)[:, number:].astype(np.float32) / 16
+    return np.where((found >= 0) & (found <= span), found, np.nan)
+
+
+def refine_disparities(left, right, start) -> Disparities:
+    """Least squares at every pixel that has a disparity."""
+    known = np.isfinite(start)
+    shape = _smooth(_without_noise(start, known), known)
+    coefficients = ndimage.spline_filter(right, 3, np.float32)
+    y, x = np.indices(left.shape, dtype=np.float32)
+    found, moved = None, np.zeros(left.shape, np.float32)
+    for last in range(ROUNDS):
+        if last:
+            # a smooth shape and the windows' mean of what is left of it: no bias from curvature
+            shape = _smooth(np.where(known, shape + moved, np.nan), known)
+        warped = ndimage.map_coordinates(
+            coefficients, [y, x - np.where(known, shape, 0)], order=3, prefilter=False,
+            mode="nearest",
+        )  # fmt: skip
+        found = _solve(left, warped)
+        moved = np.clip(np.nan_to_num(found.x), -MOST_CHANGE, MOST_CHANGE).astype(np.float32)
+    assert found is not None
+    with np.errstate(invalid="ignore", divide="ignore"):
+        good = known & (np.abs(shape + moved - start) <= MOST_CHANGE) & (np.abs(found.x) < 0.5)
+        good &= (found.rho >= LEAST_CORRELATION) & found.textured & (found.h1 > 0.2)
+        across = (found.y / found.sigma_y)[good]
+    scatter = _scatter(np.where(good, shape + moved, np.nan), found.sigma_x)
+    factor = max(_factor(across), min(map(_factor, scatter)))
+    sigma = np.sqrt(factor * found.sigma_x**2 + _at_edges(shape + moved, good))
+    with np.errstate(invalid="ignore"):
+        good &= sigma < MOST_SIGMA
+    keep = lambda a: np.where(good, a, np.nan)
+    return Disparities(keep(shape + moved), keep(sigma), keep(found.rho), factor)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Solved:
+    x: np.ndarray
+    y: np.ndarray
+    sigma_x: np.ndarray
+    sigma_y: np.ndarray
+    rho: np.ndarray
+    h1: np.ndarray
+    textured: Bool[np.ndarray, "rows columns"]
+
+
+def _solve(left, warped) -> _Solved:
+    """δ, ε, h₁ and their σ from sums over windows."""
+    cv2 = need_opencv()
+    side = 2 * HALF + 1
+    n = side * side
+    mean = lambda a: cv2.boxFilter(a, cv2.CV_64F, (side, side), borderType=cv2.BORDER_REFLECT_101)
+    both = (left + warped) / 2
+    # the disparity moves the right image against its columns: −∂R/∂x
+    gx = -_gradient(both, 1)
+    gy = _gradient(both, 0)
+    m = {name: mean(a) for name, a in (("L", left), ("R", warped), ("x", gx), ("y", gy))}
+    product = lambda a, b, i, j: n * (mean(a * b) - m[i] * m[j])
+    table = {"R": warped, "x": gx, "y": gy}
+    names = ("x", "y", "R")
+    N = np.empty((*left.shape, 3, 3))
+    g = np.empty((*left.shape, 3))
+    for i, a in enumerate(names):
+        for j, b in enumerate(names[: i + 1]):
+            N[..., i, j] = N[..., j, i] = product(table[a], table[b], a, b)
+        g[..., i] = product(table[a], left, a, "L")
+    LL = product(left, left, "L", "L")
+    RR, LR = N[..., 2, 2], g[..., 2]
+    textured = (LL > n * LEAST_CONTRAST**2) & (RR > n * LEAST_CONTRAST**2)
+    Q, p = _solved(N, g, textured)
+    rest = np.maximum(LL - np.einsum("...i,...i->...", p, g), 0)
+    s2 = rest / (n - 4)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rho = LR / np.sqrt(LL * RR)
+        h1 = p[..., 2]
+        sigma = [np.sqrt(s2 * Q[..., k, k]) for k in (0, 1)]
+    return _Solved(p[..., 0], p[..., 1], sigma[0], sigma[1], rho, h1, textured)
+
+
+def _solved(N, g, textured):
+    """N⁻¹ and N⁻¹·g of symmetric 3 × 3; NaN where there is no texture or one direction has none."""
+    a, b, c = N[..., 0, 0], N[..., 0, 1], N[..., 0, 2]
+    d, e, f = N[..., 1, 1], N[..., 1, 2], N[..., 2, 2]
+    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
+    D, E, F = a * f - c * c, b * c - a * e, a * d - b * b
+    determinant = a * A + b * B + c * C
+    good = textured & (determinant > 1e-9 * a * d * f) & (a * d * f > 0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        Q = np.stack([A, B, C, B, D, E, C, E, F], -1).reshape(*a.shape, 3, 3)
+        Q = np.where(good[..., None, None], Q / determinant[..., None, None], np.nan)
+    return Q, np.einsum("...ij,...j->...i", Q, g)
+
+
+def _gradient(a, axis):
+    """Of the cubic spline through the pixels' neighbours (fourth order central difference)."""
+    kernel = np.array([1, -8, 0, 8, -1], np.float32) / 12
+    return ndimage.correlate1d(a, kernel, axis=axis, mode="nearest")
+
+
+def _at_edges(d, known):
+    """The variance that a window gains which the surface leaves: where it has pixels without
+    disparity, or of another surface."""
+    cv2 = need_opencv()
+    window = (2 * HALF + 1, 2 * HALF + 1)
+    holes = cv2.boxFilter((~known).astype(np.float32), -1, window)
+    high = cv2.dilate(np.where(known, d, -1e4).astype(np.float32), np.ones(window, np.uint8))
+    low = cv2.erode(np.where(known, d, 1e4).astype(np.float32), np.ones(window, np.uint8))
+    return HOLES**2 * holes + STEP**2 * (known & (high - low > JUMP))
+
+
+def _factor(ratio) -> float:
+    """The variance factor of errors in units of their σ; 1 where few are known."""
+    ratio = ratio[np.isfinite(ratio)]
+    return float(np.median(ratio**2) / stats.chi2.median(1)) if len(ratio) > 100 else 1.0
+
+
+def _scatter(d, sigma):
+    """Third differences of disparities, whose windows do not overlap, in units of their σ, along
+    both axes: on smooth surfaces noise alone."""
+    step, weights = 2 * HALF + 1, (1.0, -3.0, 3.0, -1.0)
+    for a, s in ((d, sigma), (d.T, sigma.T)):
+        n = a.shape[1] - 3 * step
+        if n <= 0:
+            yield np.zeros(0)
+            continue
+        parts = [(w, slice(k * step, k * step + n)) for k, w in enumerate(weights)]
+        difference = sum(w * a[:, part] for w, part in parts)
+        square = sum(w * w * s[:, part] ** 2 for w, part in parts)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            yield (difference / np.sqrt(square))[np.isfinite(difference)]
+
+
+def _without_noise(disparity, known):
+    """Medians of 5 × 5, where they are near."""
+    cv2 = need_opencv()
+    median = cv2.medianBlur(np.where(known, disparity, -1e3).astype(np.float32), 5)
+    with np.errstate(invalid="ignore"):
+        return np.where(np.abs(median - disparity) < 1.5, median, disparity)
+
+
+def _smooth(disparity, known):
+    """Means over a window of those disparities that are near."""
+    cv2 = need_opencv()
+    far = np.where(known, disparity, -1e3).astype(np.float32)
+    smooth = cv2.bilateralFilter(far, 2 * HALF + 1, NEAR, float(HALF))
+    return np.where(known, smooth, np.nan).astype(np.float32)
+
+
+def _prepared(pair: Rectified):
+    """Both images between 0 and 255, without gaps, and where both are."""
+    inside = np.isfinite(pair.left)
+    grey = [a[np.isfinite(a)] for a in (pair.left, pair.right)]
+    if not all(len(g) for g in grey):
+        nothing = np.zeros_like(pair.left)
+        return nothing, nothing, np.zeros(pair.left.shape, bool)
+    values = np.concatenate([g[:: max(1, len(g) // 200_000)] for g in grey])
+    low, high = (0.0, 255.0) if values.max() <= 260 and values.min() >= -5 else (
+        np.percentile(values, [0.2, 99.8])
+    )
+    scale = 255 / max(high - low, 1e-9)
+    filled = [np.where(np.isfinite(a), (a - low) * scale, 0).astype(np.float32)
+              for a in (pair.left, pair.right)]  # fmt: skip
+    return *filled, inside

@@ -1,0 +1,127 @@
+"""A cloud of most pixels of a base image, from rectified pairs with one or several others.
+
+In a rectified pair the inverse distance of a pixel is linear in its disparity, q = d/(f·b·l) with l
+the length of [x/f, y/f, 1]. So several pairs are averaged in q, by their σ; what disagrees is left
+out. Half of the variance of a match belongs to the base image, which all pairs share.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+from scipy import ndimage
+
+from jaxbundle.surface.cloud import Cloud
+from jaxbundle.surface.dense import Disparities, match_dense
+from jaxbundle.surface.guide import Guide
+from jaxbundle.surface.rectification import Rectified, rectify
+from jaxbundle.surface.views import FrameView
+
+TOGETHER = 1 << 19
+"""Pixels that are looked up together."""
+ONE_SURFACE = 1.0
+"""Disparities of the four neighbours differ by less, pixels, where they are interpolated."""
+AGREE = 4.0
+"""Values of several pairs agree within so many σ of their difference."""
+
+
+def dense_cloud(
+    base: FrameView, others: Sequence[FrameView], guide: Guide, step: int = 1
+) -> tuple[Cloud, list[tuple[str, float]], list[str]]:
+    """The cloud; name and variance factor of each image used; those that cannot be rectified."""
+    X = guide_points(base, guide)
+    pairs, used, left_out = [], [], []
+    for other in others:
+        rectified = rectify(base, other, X)
+        if rectified is None:
+            left_out.append(other.name)
+            continue
+        pair, span = rectified
+        found = match_dense(pair, span)
+        pairs.append((pair, found))
+        used.append((other.name, found.factor))
+    columns, rows = base.size
+    v, u = np.mgrid[0:rows:step, 0:columns:step].reshape(2, -1)
+    uv = np.stack([u, v], 1).astype(float)
+    parts = [
+        _points(base, pairs, uv[k : k + TOGETHER]) for k in range(0, len(uv), TOGETHER) if pairs
+    ]
+    if not parts:
+        none = np.zeros
+        empty = Cloud(none((0, 3)), none((0, 3, 3)), none(0, int), none(0, int), none((0, 2)),
+                      (base.name,))  # fmt: skip
+        return empty, used, left_out
+    X, covariance, rays, places = (np.concatenate(p) for p in zip(*parts))
+    cloud = Cloud(X, covariance, rays, np.zeros(len(X), int), places, (base.name,))
+    return cloud, used, left_out
+
+
+def guide_points(base: FrameView, guide: Guide) -> Float[np.ndarray, "n 3"]:
+    """The points of a guide's good nodes."""
+    row, column = np.nonzero(guide.good)
+    uv = np.stack([column, row], 1) * guide.step + guide.first
+    return base.points(uv, guide.q[row, column])
+
+
+def _points(base, pairs, uv):
+    """Points of pixels, their covariance, numbers of rays, and the pixels that have one."""
+    d = base.points(uv, np.ones(len(uv))) - base.X0
+    found = [_inverse_distance(base, d, *pair) for pair in pairs]
+    q, s = (np.stack(a) for a in zip(*found))
+    q, variance, number = combine(q, s)
+    good = np.isfinite(q) & (q > 0)
+    uv, d, q, variance, number = uv[good], d[good], q[good], variance[good], number[good]
+    length = 1 / q
+    along = variance / q**4
+    # across the line of sight: that part of a match's error which is the base image's
+    pair = pairs[0][0]
+    pixel = np.sqrt(variance / 2) * pair.base * length
+    dd = d[:, :, None] * d[:, None]
+    covariance = along[:, None, None] * dd + (pixel**2)[:, None, None] * (np.eye(3) - dd)
+    return base.X0 + length[:, None] * d, covariance, number + 1, uv
+
+
+def _inverse_distance(base, d, pair: Rectified, found: Disparities):
+    """q and its σ along directions; NaN where there is no disparity."""
+    place = pair.places(base.X0 + d)
+    rows, columns = found.disparity.shape
+    inside = np.isfinite(place).all(1) & (place >= 0).all(1)
+    inside &= (place[:, 0] <= columns - 1) & (place[:, 1] <= rows - 1)
+    x, y = np.where(inside[:, None], place, 0.0).T
+    j, i = (np.minimum(a.astype(int), n - 2) for a, n in ((x, columns), (y, rows)))
+    four = np.stack([found.disparity[i + a, j + b] for a in (0, 1) for b in (0, 1)])
+    smooth = np.isfinite(four).all(0) & (np.ptp(four, axis=0) < ONE_SURFACE)
+    known = np.where(np.isfinite(found.disparity), found.disparity, 0)
+    between = ndimage.map_coordinates(known, [y, x], order=1, mode="nearest")
+    nearest = np.rint(y).astype(int), np.rint(x).astype(int)
+    disparity = np.where(smooth, between, found.disparity[nearest]) + pair.lowest
+    scale = pair.f * pair.base / (d @ pair.R[2])
+    q = np.where(inside, disparity / scale, np.nan)
+    return q, np.where(inside, found.sigma[nearest] / scale, np.nan)
+
+
+def combine(
+    q: Float[np.ndarray, "pairs n"], sigma: Float[np.ndarray, "pairs n"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], np.ndarray]:
+    """The weighted mean of values that agree, its variance, how many they are. NaN where two
+    disagree and no third decides."""
+    known = np.isfinite(q) & np.isfinite(sigma)
+    if len(q) == 1:
+        return np.where(known[0], q[0], np.nan), sigma[0] ** 2, known[0].astype(int)
+    count = known.sum(0)
+    q, sigma = np.where(known, q, np.nan), np.where(known, sigma, np.nan)
+    with np.errstate(invalid="ignore"):
+        apart = np.abs(q[:, None] - q) / np.hypot(sigma[:, None], sigma)
+        votes = (apart < AGREE).sum(1)
+    best = np.where(known, votes, -1).argmax(0)
+    columns = np.arange(q.shape[1])
+    with np.errstate(invalid="ignore"):
+        use = known & (apart[best, :, columns].T < AGREE)
+    number = use.sum(0)
+    weight = np.where(use, 1 / np.where(use, sigma, 1) ** 2, 0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.where(use, weight * np.where(use, q, 0), 0).sum(0) / weight.sum(0)
+        shared = np.where(use, sigma**2, 0).sum(0) / number / 2
+        variance = shared + 0.5 / weight.sum(0)
+    decided = (number >= 1) & ((count < 2) | (number > 1))
+    return np.where(decided, mean, np.nan), variance, number

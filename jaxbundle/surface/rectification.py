@@ -1,0 +1,131 @@
+"""Epipolar rectification of two photographs: both turned, by a rotation each, to the normal case.
+
+The x axis of the rectified cameras is the base b, z is the mean of both optical axes less its part
+along it; the principal distance f keeps the resolution of the base image. Then lines are rows, and
+
+    d = x − x' = f·b/Z,        X = X0 + Z·Rᵀ·[x/f, y/f, 1].
+
+Distortion is taken out on the way: every rectified pixel is looked up by its ray. Grey values are
+interpolated by cubic splines, since a table of 1/32 pixel would be seen in the heights.
+
+Source: Fusiello, Trucco and Verri (2000), A compact algorithm for rectification of stereo pairs.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+from scipy import ndimage
+
+from jaxbundle.surface.views import FrameView
+
+ROOM, LEAST_ROOM = 0.15, 8.0
+"""Disparities beyond those of the points: a part of their range, and pixels."""
+WIDEST = 1.25
+"""Radians from the axis of the rectified camera to the farthest ray."""
+LARGEST = 5.0
+"""Pixels of the rectified image, as a multiple of those of the base image."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Rectified:
+    """A rectified pair: grey values (NaN outside), `origin` (x, y) of the left image's first pixel
+    in the rectified camera, `lowest`: disparity of equal columns; R, f and base length."""
+
+    left: Float[np.ndarray, "rows columns"]
+    right: Float[np.ndarray, "rows columns"]
+    origin: Float[np.ndarray, "2"]
+    lowest: int
+    X0: Float[np.ndarray, "3"]
+    R: Float[np.ndarray, "3 3"]
+    f: float
+    base: float
+
+    def places(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+        """Columns and rows of points in the left image."""
+        x, y, z = self.R @ (points - self.X0).T
+        with np.errstate(invalid="ignore", divide="ignore"):
+            found = np.stack([self.f * x / z, self.f * y / z], 1) - self.origin
+        return np.where(z[:, None] > 0, found, np.nan)
+
+    def disparity(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """Columns in the left less those in the right image."""
+        return self.f * self.base / (self.R[2] @ (points - self.X0).T) - self.lowest
+
+    def points(
+        self, place: Float[np.ndarray, "n 2"], disparity: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, "n 3"]:
+        """The points of places in the left image; NaN behind infinity."""
+        total = disparity + self.lowest
+        with np.errstate(divide="ignore", invalid="ignore"):
+            Z = np.where(total > 0, self.f * self.base / total, np.nan)
+        xy = (place + self.origin) / self.f
+        return self.X0 + (Z[:, None] * np.column_stack([xy, np.ones(len(xy))])) @ self.R
+
+
+def rectify(
+    base: FrameView, other: FrameView, X: Float[np.ndarray, "n 3"]
+) -> tuple[Rectified, int] | None:
+    """The pair, and the range of its disparities, as wide as points X need, and some more; None
+    where one camera is before the other, or they are at one place."""
+    b = other.X0 - base.X0
+    length = float(np.linalg.norm(b))
+    if not length > 0:
+        return None
+    x = b / length
+    axis = -(base.M[2] + other.M[2])
+    axis = axis - (axis @ x) * x
+    if np.linalg.norm(axis) < 0.2:
+        return None
+    z = axis / np.linalg.norm(axis)
+    R = np.stack([x, np.cross(z, x), z])
+    edge = base.edge()
+    d = (base.points(edge, np.ones(len(edge))) - base.X0) @ R.T
+    if not (d[:, 2] > np.cos(WIDEST)).all():
+        return None
+    f = _resolution(base)
+    low, high = (f * d[:, :2] / d[:, 2:]).min(0), (f * d[:, :2] / d[:, 2:]).max(0)
+    first = np.floor(low)
+    columns, rows = (int(n) for n in np.ceil(high) - first + 1)
+    if columns * rows > LARGEST * base.size[0] * base.size[1]:
+        return None
+    depth = (X - base.X0) @ z
+    depth = depth[depth > 0]
+    if not len(depth):
+        return None
+    d_low, d_high = np.percentile(f * length / depth, [0.3, 99.7])
+    room = ROOM * (d_high - d_low) + LEAST_ROOM
+    lowest = int(np.floor(max(d_low - room, 0.0)))
+    span = int(np.ceil(d_high + room)) - lowest
+    origin = first - [span, 0]
+    shape = (rows, columns + span)
+    left = _looked_up(base, R, f, origin, shape)
+    right = _looked_up(other, R, f, origin - [lowest, 0], shape)
+    return Rectified(left, right, origin, lowest, base.X0, R, f, length), span
+
+
+def _resolution(view: FrameView) -> float:
+    """Pixels per radian in the middle of an image."""
+    middle = np.array([[(n - 1) / 2 for n in view.size]])
+    J = view.derivative(view.points(middle, np.ones(1)))[0]
+    return float(np.sqrt(np.sqrt(np.linalg.det(J @ J.T))))
+
+
+def _looked_up(view, R, f, origin, shape) -> Float[np.ndarray, "rows columns"]:
+    """Grey values at the rays of a rectified camera, NaN outside the image."""
+    rows, columns = shape
+    coefficients = ndimage.spline_filter(np.asarray(view.grey, np.float32), 3, np.float32)
+    out = np.empty(shape, np.float32)
+    x = (np.arange(columns) + origin[0]) / f
+    together = max(1, (1 << 20) // columns)
+    for first in range(0, rows, together):
+        y = (np.arange(first, min(first + together, rows)) + origin[1]) / f
+        d = np.stack([*np.meshgrid(x, y), np.ones((len(y), columns))], -1).reshape(-1, 3)
+        uv = view.project(view.X0 + d @ R)
+        inside = (uv > -0.5).all(1) & (uv < np.array(view.size) - 0.5).all(1)
+        place = np.where(inside[:, None], uv, 0.0)
+        grey = ndimage.map_coordinates(
+            coefficients, [place[:, 1], place[:, 0]], order=3, prefilter=False, mode="nearest"
+        )
+        out[first : first + together] = np.where(inside, grey, np.nan).reshape(len(y), -1)
+    return out
