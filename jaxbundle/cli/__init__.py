@@ -10,8 +10,8 @@ import sys
 from jaxbundle.cli.app import run
 
 COMMANDS = (
-    "orient", "adjust", "calibrate", "batch", "plan", "camera", "compare", "convert", "surface",
-    "pushbroom",
+    "reconstruct", "orient", "adjust", "calibrate", "batch", "plan", "camera", "compare",
+    "convert", "surface", "pushbroom",
 )  # fmt: skip
 
 

@@ -7,9 +7,10 @@ adjusted network as a project.
 import os
 import re
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 
 from jaxbundle import report
 from jaxbundle.bundle.result import Adjustment
@@ -31,6 +32,8 @@ FILES = (
     *(f"{ADJUSTED}/{name}" for name in NETWORK_FILES), *FIGURES,
 )  # fmt: skip
 """What is written into a folder, figures as patterns."""
+
+NOTHING: Mapping = MappingProxyType({})
 
 JSON = re.compile(rb'\s*(\{\s*["}]|\[[\s\[]*([]{"\d-]|true|false|null))')
 """How JSON begins; a table of TOML, `[project]`, does not."""
@@ -150,13 +153,26 @@ def write_targets(
     with written(json, text(brief), out, "adjust", FILES, force) as new:
         if new is None:
             return
-        write_text(new / REPORT, report.text(result) if solved else f"{result}\n")
-        write_text(new / RESULT, text(False))
-        if solved and result.converged:
-            _write_tables(result, new)
-            fill_project(adjusted_network(result), new / ADJUSTED)
-        if plots:
-            draw_figures(result, new)
+        if isinstance(result, Adjustment):
+            fill_results(result, new, plots)
+        else:
+            write_text(new / REPORT, f"{result}\n")
+            write_text(new / RESULT, text(False))
+
+
+def fill_results(
+    result: Adjustment, folder: Path, plots: bool, note: str = "", also: Mapping = NOTHING
+) -> None:
+    """Write report, JSON, tables, the adjusted network and plots of a result into a folder.
+
+    `note`: text before the report; `also`: further entries of the JSON."""
+    write_text(folder / REPORT, note + report.text(result))
+    write_text(folder / RESULT, result_text(result, False, also))
+    if result.converged:
+        _write_tables(result, folder)
+        fill_project(adjusted_network(result), folder / ADJUSTED)
+    if plots:
+        draw_figures(result, folder)
 
 
 def can_plot() -> bool:

@@ -42,3 +42,24 @@ class iterating:
     def __exit__(self, *_):
         if not self.silent:
             self.bar.stop()
+
+
+class staging:
+    """A bar for every stage of long work; as a context gives `tell(stage, done, total)`."""
+
+    def __init__(self, silent: bool):
+        self.bar = counting(silent)
+        self.tasks: dict = {}
+
+    def __enter__(self):
+        self.bar.start()
+        return self.tell
+
+    def tell(self, stage: str, done: int, total: int) -> None:
+        """Move the bar of a stage."""
+        if stage not in self.tasks:
+            self.tasks[stage] = self.bar.add_task(stage, total=total)
+        self.bar.update(self.tasks[stage], completed=done, total=total)
+
+    def __exit__(self, *_):
+        self.bar.stop()

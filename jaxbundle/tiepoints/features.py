@@ -41,12 +41,12 @@ class Detection:
 @dataclasses.dataclass(frozen=True)
 class Features:
     """`xy`: pixels of the original; `size`: diameter, in them; `angle`: radians from x to y;
-    `descriptor`: of unit length for SIFT, bits for the others; the most distinct ones first."""
+    `descriptor`: 128 counts of SIFT, bits of the others; the largest features first."""
 
     xy: Float[np.ndarray, "n 2"]
     size: Float[np.ndarray, " n"]
     angle: Float[np.ndarray, " n"]
-    descriptor: Float[np.ndarray, "n 128"] | UInt8[np.ndarray, "n bytes"]
+    descriptor: UInt8[np.ndarray, "n bytes"]
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -76,9 +76,7 @@ def find_features(
     kept = _spread(xy, size, response, grey.shape, settings.number)
     scale = np.array([columns / grey.shape[1], rows / grey.shape[0]])
     xy = (xy[kept] + 0.5) * scale - 0.5
-    descriptor = np.concatenate(descriptors)[kept]
-    if settings.kind == "sift":
-        descriptor = _root(descriptor)
+    descriptor = np.concatenate(descriptors)[kept].astype(np.uint8)
     return Features(xy, size[kept] * scale.mean(), np.deg2rad(angle[kept]), descriptor)
 
 
@@ -135,10 +133,3 @@ def _spread(xy, size, response, shape, number):
     rank[order] = np.arange(len(xy)) - first
     kept = np.lexsort((-response, rank))[:number]
     return kept[np.argsort(-size[kept], kind="stable")]
-
-
-def _root(descriptor):
-    """The roots of descriptors of sum 1: their scalar product is Hellinger's (Arandjelović and
-    Zisserman, 2012)."""
-    total = np.maximum(descriptor.sum(1, keepdims=True), 1e-9)
-    return np.sqrt(descriptor / total).astype(np.float32)

@@ -1,6 +1,7 @@
 """Features of two photographs that look alike: each the nearest of the other, clearly so.
 
-Of two descriptors of unit length the distance is √(2 − 2·a·b): one matrix product for all pairs.
+Descriptors of SIFT count as the roots of their parts of the sum (Arandjelović and Zisserman, 2012):
+of unit length, so that their distance is √(2 − 2·a·b): one matrix product for all pairs.
 A match is kept if it is the best from both sides and its distance is below `ratio` times that of
 the second best (Lowe, 2004).
 """
@@ -14,6 +15,8 @@ from jaxbundle.tiepoints.features import Features
 RATIO = 0.8
 PORTION = 1024
 """Features whose distances to all others are computed at once."""
+OF_SIFT = 128
+"""Numbers of a descriptor of SIFT."""
 FEW = 800
 """Largest features by which is decided whether two photographs may show the same."""
 
@@ -25,11 +28,14 @@ def match_features(
     the second best."""
     if min(len(one), len(other)) < 2 or one.descriptor.shape[1] != other.descriptor.shape[1]:
         return np.zeros((0, 2), int), np.zeros(0)
-    bits = one.descriptor.dtype == np.uint8
-    nearest = _nearest_bits if bits else _nearest
-    best, found = nearest(one.descriptor, other.descriptor)
+    sift = one.descriptor.shape[1] == OF_SIFT
+    nearest = _nearest if sift else _nearest_bits
+    a, b = (_root(f.descriptor) if sift else f.descriptor for f in (one, other))
+    best, found = nearest(a, b)
     rows = np.flatnonzero(found < ratio)
-    back, _ = nearest(other.descriptor[best[rows]], one.descriptor)
+    if not len(rows):
+        return np.zeros((0, 2), int), np.zeros(0)
+    back, _ = nearest(b[best[rows]], a)
     rows = rows[back == rows]
     rows = rows[np.argsort(found[rows], kind="stable")]
     return np.stack([rows, best[rows]], 1), found[rows]
@@ -39,6 +45,11 @@ def number_alike(one: Features, other: Features) -> int:
     """How many of the largest features match: a quick answer to whether two photographs overlap
     (Wu, 2013, preemptive matching)."""
     return len(match_features(one.take(slice(FEW)), other.take(slice(FEW)))[0])
+
+
+def _root(descriptor):
+    counts = descriptor.astype(np.float32)
+    return np.sqrt(counts / np.maximum(counts.sum(1, keepdims=True), 1e-9))
 
 
 def _nearest(a, b):

@@ -6,6 +6,7 @@ point, NaN where it has none (a comment in the header gives its unit).
 Source: Turk (1994), The PLY Polygon File Format.
 """
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +23,12 @@ CAMERA = (220, 40, 40)
 VERTEX = np.dtype([("position", "<f8", 3), ("colour", "u1", 3), ("error", "<f4")])
 
 
-def write_ply(network: Network, path: str | Path) -> tuple[str, ...]:
+def write_ply(
+    network: Network, path: str | Path, colours: Mapping[str, Sequence[int]] | None = None
+) -> tuple[str, ...]:
     """Write points and cameras; points without coordinates are left out.
+
+    **Arguments:** `colours`: red, green, blue of points by id; the others have that of their role.
 
     **Returns:** what is lost, in words.
     """
@@ -36,7 +41,9 @@ def write_ply(network: Network, path: str | Path) -> tuple[str, ...]:
     errors, unit = point_errors(network)
     vertices["error"][:first], vertices["error"][first:] = errors[known], np.nan
     vertices["position"][first:] = corners.reshape(-1, 3)
-    roles = [COLOURS[role] for role, there in zip(network.points.role, known) if there]
+    own = colours or {}
+    roles = [own.get(id, COLOURS[role]) for id, role, there in
+             zip(network.points.id, network.points.role, known) if there]  # fmt: skip
     vertices["colour"][:first] = np.array(roles).reshape(-1, 3)
     vertices["colour"][first:] = CAMERA
     edges = (edges.reshape(-1, 2) + first).astype("<i4")

@@ -7,7 +7,8 @@ held of an exterior orientation are 0.
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import NotSolvedError
@@ -78,10 +79,12 @@ def unsolved_text(error: NotSolvedError) -> str:
     return json.dumps(head, ensure_ascii=False) + "\n"
 
 
-def result_text(adjustment, brief: bool = False) -> Iterator[str]:
+def result_text(
+    adjustment, brief: bool = False, also: Mapping = MappingProxyType({})
+) -> Iterator[str]:
     """The result as JSON text, one line that ends with a line feed, in pieces: that of 2 000 000
-    image points is of 1 GB."""
-    head = result_dict(adjustment, brief=True)
+    image points is of 1 GB. `also`: further entries."""
+    head = result_dict(adjustment, brief=True) | dict(also)
     if brief or not adjustment.converged:
         yield _text(head) + "\n"
         return

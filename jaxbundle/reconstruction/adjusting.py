@@ -1,0 +1,111 @@
+"""The adjustment of a reconstruction: weights that are honest, gross errors removed.
+
+1. All measurements with the σ of their matching.
+2. The σ of measurements of a kind (least squares matching by level of the pyramid, places of
+   features) are multiplied by the root of the variance component of this kind,
+
+       f² = Σ(v/σ)²/Σr,        r = 1 − 3/(2n) for a point with n rays,
+
+   over residuals below `GROSS`·f.
+3. Data snooping, and 2. again over all that are left, with their own redundancy numbers, until the
+   factors stay.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxbundle.bundle.adjust import adjust
+from jaxbundle.bundle.result import Adjustment
+from jaxbundle.network.tables import Network
+
+GROSS = 4.0
+SETTLED = 0.03
+"""Change of a factor that ends the rounds."""
+ROUNDS = 2
+FEWEST = 60
+"""Measurements of a kind with a factor of its own."""
+SMALLEST, LARGEST = 0.3, 8.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Weighted:
+    """The adjustment, and the factor of the σ of each kind of measurement."""
+
+    adjustment: Adjustment
+    factors: dict[str, float]
+
+
+def adjust_weighted(
+    network: Network,
+    kinds: Int[np.ndarray, " rays"],
+    names: dict[int, str],
+    significance: float,
+    tell: Callable[[str], None],
+) -> Weighted:
+    """Adjust with variance components of the kinds and data snooping.
+
+    **Arguments:** `kinds`: of every observation of the network.
+
+    **Raises:** as `jaxbundle.adjust`.
+    """
+    tell("adjustment")
+    result = adjust(network)
+    total = np.ones(len(network.observations))
+    given = network.observations.sigma
+    if result.converged:
+        factor = _factors(*_of_residuals(result), kinds)
+        total *= factor
+        network = _with_sigma(network, given * total[:, None])
+    for _ in range(ROUNDS):
+        tell("data snooping")
+        result = adjust(network, snooping="pope", significance=significance)
+        if not result.converged:
+            break
+        factor = _factors(*_of_reliability(result), kinds, np.inf)
+        if np.all(np.abs(factor - 1) < SETTLED):
+            break
+        total *= factor
+        network = _with_sigma(network, given * total[:, None])
+    kept = {name: float(np.median(total[kinds == k])) for k, name in names.items()
+            if (kinds == k).any()}  # fmt: skip
+    return Weighted(result, kept)
+
+
+def _with_sigma(network: Network, sigma) -> Network:
+    return network.replace(observations=dataclasses.replace(network.observations, sigma=sigma))
+
+
+def _of_residuals(result: Adjustment):
+    """v/σ of the rays, and their redundancy numbers by the rays of their points."""
+    w = np.asarray(result.inspection.residuals.image)
+    rays = np.bincount(result.problem.point)[result.problem.point]
+    return w, np.repeat(1 - 3 / (2 * rays[:, None]), 2, 1)
+
+
+def _of_reliability(result: Adjustment):
+    found = result.reliability
+    used = np.asarray(result.problem.data.image_weight) > 0
+    return np.where(used, found.residual.image, np.nan), np.asarray(found.redundancy.image)
+
+
+def _factors(
+    w: Float[np.ndarray, "rays 2"], r: Float[np.ndarray, "rays 2"], kinds, gross: float = GROSS
+) -> Float[np.ndarray, " rays"]:
+    """By which the σ of every ray is to be multiplied."""
+    r = np.maximum(r, 1e-3)
+    factor = np.ones(len(w))
+    for kind in np.unique(kinds):
+        rows = kinds == kind
+        length, spare = np.abs(w[rows]) / np.sqrt(r[rows]), r[rows]
+        there = np.isfinite(length) & (spare > 0.05)
+        if there.sum() < 2 * FEWEST:
+            continue
+        scale = 1.4826 * np.median(length[there])
+        for _ in range(5):
+            good = there & (length < gross * max(scale, 1e-9))
+            scale = np.sqrt(np.sum(w[rows][good] ** 2) / np.sum(spare[good]))
+        factor[rows] = np.clip(scale, SMALLEST, LARGEST)
+    return factor

@@ -1,0 +1,164 @@
+"""The photographs of a reconstruction: found, looked at, and put together by camera."""
+
+import dataclasses
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+
+from jaxbundle.errors import InputError
+from jaxbundle.network.columns import some
+from jaxbundle.network.tables import Camera
+from jaxbundle.photographs.exif import UPRIGHT, Exif, read_exif
+from jaxbundle.photographs.reading import SUFFIXES, photograph_size
+from jaxbundle.system.file_content import check_plain, read_content
+
+GUESSED = 1.2
+"""A principal distance nothing is known of, in parts of the longer side."""
+SMALLEST = 64
+"""Pixels of the shorter side."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Photograph:
+    """A file: `name` is unique among all; `fingerprint` of its content; what its head says."""
+
+    path: Path
+    name: str
+    fingerprint: str
+    exif: Exif
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.exif.size
+
+
+def find_photographs(
+    given: Sequence[str | Path],
+) -> tuple[list[Photograph], dict[str, str]]:
+    """The photographs among files and folders, in the order of their names; and what was left out,
+    with the reason.
+
+    **Raises:** `InputError` where fewer than two can be used, or a name is given twice.
+    """
+    paths, left_out = _files(given), {}
+    names = _names(paths)
+    found, first = [], {}
+    for path, name in zip(paths, names):
+        try:
+            check_plain(path)
+            columns, rows = photograph_size(path)
+            if min(columns, rows) < SMALLEST:
+                raise InputError(f"{path}: {columns} × {rows} pixels are too few")
+            content = read_content(path, text=False)
+        except InputError as error:
+            left_out[name] = str(error).removeprefix(f"{path}: ")
+            continue
+        fingerprint = hashlib.blake2b(content, digest_size=8).hexdigest()
+        if fingerprint in first:
+            left_out[name] = f"the same file as {first[fingerprint]}"
+            continue
+        first[fingerprint] = name
+        found.append(Photograph(path, name, fingerprint, read_exif(path)))
+    if len(found) < 2:
+        said = some((f"{name} ({why})" for name, why in left_out.items()), 3, str)
+        raise InputError(
+            f"{len(found)} of {len(paths)} photographs can be used; two or more are needed"
+            + (f": {said}" if left_out else "")
+        )
+    return found, left_out
+
+
+def _files(given) -> list[Path]:
+    paths: list[Path] = []
+    for one in map(Path, given):
+        if one.is_dir():
+            inside = sorted(p for p in one.iterdir() if p.suffix.lower() in SUFFIXES)
+            if not inside:
+                raise InputError(f"{one}: no photographs in this folder ({', '.join(SUFFIXES)})")
+            paths += inside
+        elif not one.exists():
+            raise InputError(f"{one}: no such file")
+        else:
+            paths.append(one)
+    unique = {path.resolve(): path for path in paths}
+    return list(unique.values())
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """File names; with their folder where two are the same."""
+    plain = [path.name for path in paths]
+    double = {name for name in plain if plain.count(name) > 1}
+    return [f"{p.parent.name}/{p.name}" if p.name in double else p.name for p in paths]
+
+
+@dataclasses.dataclass(frozen=True)
+class Cameras:
+    """`cameras`, the one of every photograph (`of`), whether its principal distance is `known` to
+    begin with, and whether it was `given` as calibrated; `notes` in words."""
+
+    cameras: tuple[Camera, ...]
+    of: tuple[int, ...]
+    known: tuple[bool, ...]
+    given: bool
+    notes: tuple[str, ...]
+
+
+def assign_cameras(photographs: Sequence[Photograph], given: Camera | None = None) -> Cameras:
+    """Photographs of one make, model, focal length and size share a camera, of model `opencv`.
+
+    **Arguments:** `given`: a calibrated camera, which then all photographs share.
+
+    **Raises:** `InputError` where the size of the given camera is another.
+    """
+    notes = _turned(photographs)
+    if given is not None:
+        return Cameras((_fits(given, photographs),), (0,) * len(photographs), (True,), True, notes)
+    groups: dict[tuple, list[int]] = {}
+    for k, photograph in enumerate(photographs):
+        exif = photograph.exif
+        focal = round(exif.focal_length or 0.0, 1), round(exif.focal_length_35 or 0.0)
+        groups.setdefault((exif.camera, *focal, exif.size), []).append(k)
+    cameras, known, of = [], [], [0] * len(photographs)
+    for number, rows in enumerate(groups.values()):
+        exif = photographs[rows[0]].exif
+        told = exif.principal_distance()
+        f = told[0] if told else GUESSED * max(exif.size)
+        id = (exif.camera or "camera") + (f" {number + 1}" if len(groups) > 1 else "")
+        cameras.append(_new_camera(id, f, exif.size))
+        known.append(told is not None)
+        for k in rows:
+            of[k] = number
+        where = f"from {told[1]}" if told else "unknown: found from the photographs"
+        notes = (*notes, f"camera {id}: {len(rows)} photographs of {exif.size[0]} × "
+                 f"{exif.size[1]} pixels, principal distance {where}")  # fmt: skip
+    return Cameras(tuple(cameras), tuple(of), tuple(known), False, notes)
+
+
+def _new_camera(id, f, size):
+    columns, rows = size
+    parameters = {"fx": f, "fy": f, "cx": (columns - 1) / 2, "cy": (rows - 1) / 2}
+    return Camera(id, "opencv", parameters, image_size=(columns, rows), tie=(("fx", "fy"),))
+
+
+def _fits(given: Camera, photographs) -> Camera:
+    size = given.image_size
+    for photograph in photographs:
+        if size is None:
+            given = dataclasses.replace(given, image_size=photograph.size)
+            size = photograph.size
+        if tuple(size) != photograph.size:
+            raise InputError(
+                f"{photograph.path}: {photograph.size[0]} × {photograph.size[1]} pixels, but "
+                f"camera {given.id} has {size[0]} × {size[1]}"
+            )
+    return given
+
+
+def _turned(photographs) -> tuple[str, ...]:
+    turned = [p.name for p in photographs if p.exif.orientation != UPRIGHT]
+    if not turned:
+        return ()
+    return (
+        f"{len(turned)} photographs are to be shown turned ({some(turned, 3, str)}); their pixels "
+        "are used as the sensor wrote them, columns and rows counted so",
+    )

@@ -1,0 +1,246 @@
+"""`reconstruct`: photographs in, adjusted networks out.
+
+    photographs ─features─▶ matches ─principal distance by pairs─▶ verified pairs ─▶ parts
+    part ─tracks─▶ measured by least squares matching ─start values─▶ adjusted, weighted, snooped
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.bundle.orient import orient
+from jaxbundle.bundle.result import Adjustment
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.float64 import require_x64
+from jaxbundle.network.columns import count, some
+from jaxbundle.network.tables import Camera, Network
+from jaxbundle.photographs.reading import read_photograph
+from jaxbundle.reconstruction.adjusting import adjust_weighted
+from jaxbundle.reconstruction.network import tie_network
+from jaxbundle.reconstruction.parts import SMALLEST, connected, why_alone
+from jaxbundle.reconstruction.photographs import (
+    Cameras,
+    Photograph,
+    assign_cameras,
+    find_photographs,
+)
+from jaxbundle.reconstruction.settings import Settings
+from jaxbundle.system.configuration import available_cores
+from jaxbundle.tiepoints.features import Features
+from jaxbundle.tiepoints.refinement import Measurements, measure_tracks
+from jaxbundle.tiepoints.search import Tell, detect, match, start_cameras, verify
+from jaxbundle.tiepoints.store import Store
+from jaxbundle.tiepoints.tracks import choose_tracks, make_tracks
+from jaxbundle.tiepoints.verification import Pair
+
+DEFAULT = Settings()
+TEXTURE = 16
+"""Features a photograph needs."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """Photographs that hang together, adjusted: `name`; `colours` of the points by id; `factors`:
+    by which the σ of kinds of measurements were multiplied."""
+
+    name: str
+    adjustment: Adjustment
+    colours: Mapping[str, tuple[int, int, int]]
+    factors: Mapping[str, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Reconstruction:
+    """`parts`, the largest first; photographs that are in none of them, with the reason; notes;
+    `pairs` that were verified, by the names of their photographs."""
+
+    parts: tuple[Part, ...]
+    left_out: Mapping[str, str]
+    notes: tuple[str, ...]
+    pairs: tuple[tuple[str, str, int, int, str], ...]
+
+    def __str__(self) -> str:
+        lines = [
+            f"{part.name}: {count(len(part.adjustment.network.images), 'photograph')}, "
+            f"{count(len(part.adjustment.network.points), 'point')}, "
+            f"σ0 {part.adjustment.sigma0:.3f}" for part in self.parts
+        ]  # fmt: skip
+        lines += [f"left out {name}: {why}" for name, why in self.left_out.items()]
+        return "\n".join([*lines, *self.notes])
+
+
+def reconstruct(
+    given: Sequence[str | Path],
+    camera: Camera | None = None,
+    settings: Settings = DEFAULT,
+    store: Path | None = None,
+    tell: Tell = lambda stage, done, total: None,
+) -> Reconstruction:
+    """Orient photographs by what they show, with self-calibration.
+
+    **Arguments:** `given`: files, and folders of photographs; `camera`: a calibrated one, which all
+    share; `store`: folder in which features and matches are kept; `tell(stage, done, total)`.
+
+    **Raises:** `InputError` where the photographs cannot be used; `NotSolvedError` where no two of
+    them can be oriented.
+    """
+    require_x64()
+    photographs, left_out = find_photographs(given)
+    cameras = assign_cameras(photographs, camera)
+    return _Making(photographs, left_out, cameras, settings, Store(store, settings.detection),
+                   tell).run()  # fmt: skip
+
+
+class _Making:
+    """One reconstruction on its way."""
+
+    def __init__(self, photographs, left_out, cameras: Cameras, settings, store, tell):
+        self.photographs: list[Photograph] = photographs
+        self.left_out: dict[str, str] = dict(left_out)
+        self.cameras, self.settings, self.store, self.tell = cameras, settings, store, tell
+        self.workers = settings.workers or available_cores()
+        self.names = [photograph.name for photograph in photographs]
+        self.notes = list(cameras.notes)
+
+    def run(self) -> Reconstruction:
+        features = self._features()
+        prints = [p.fingerprint for p in self.photographs]
+        matches = match(features, prints, self.settings.pairs, None, self.store, self.workers,
+                        self.tell)  # fmt: skip
+        self.store.drop_unused()
+        self._calibrate(features, matches)
+        pairs = verify(self.cameras.cameras, self.cameras.of, features, matches, self.tell)
+        parts = self._parts(features, matches, pairs)
+        said = tuple((self.names[p.images[0]], self.names[p.images[1]], p.found, len(p), p.kind)
+                     for p in pairs)  # fmt: skip
+        return Reconstruction(tuple(parts), self.left_out, tuple(self.notes), said)
+
+    def _features(self) -> list[Features]:
+        read = [self._reader(p) for p in self.photographs]
+        prints = [p.fingerprint for p in self.photographs]
+        features = detect(read, prints, self.settings.detection, self.store, self.workers,
+                          self.tell)  # fmt: skip
+        bad = {k for k, f in enumerate(features) if len(f) < TEXTURE}
+        for k in sorted(bad):
+            self.left_out.setdefault(
+                self.names[k], f"no texture: {count(len(features[k]), 'feature')} in it"
+            )
+        if len(features) - len(bad) < 2:
+            said = some((f"{n} ({w})" for n, w in self.left_out.items()), 3, str)
+            raise InputError(f"fewer than two photographs can be used: {said}")
+        return features
+
+    def _reader(self, photograph: Photograph):
+        def read():
+            try:
+                return read_photograph(photograph.path)
+            except InputError as error:
+                why = str(error).removeprefix(f"{photograph.path}: ")
+                self.left_out[photograph.name] = why
+                return np.zeros((8, 8), np.uint8)
+
+        return read
+
+    def _calibrate(self, features, matches) -> None:
+        if self.cameras.given:
+            return
+        cameras, notes = start_cameras(
+            self.cameras.cameras, self.cameras.of, self.cameras.known, features, matches
+        )
+        self.cameras = dataclasses.replace(self.cameras, cameras=tuple(cameras))
+        self.notes += notes
+
+    def _parts(self, features, matches, pairs: Sequence[Pair]) -> list[Part]:
+        least = min(SMALLEST, len(self.photographs))
+        waiting = connected(len(self.photographs), pairs)
+        parts: list[Part] = []
+        failed: list[str] = []
+        while waiting:
+            group = waiting.pop(0)
+            if len(group) < least:
+                for k in group:
+                    self.left_out.setdefault(
+                        self.names[k], why_alone(k, self.names, matches, pairs)
+                    )
+                continue
+            try:
+                part, reasons = self._part(group, features, pairs, f"part {len(parts) + 1}")
+            except (InputError, NotSolvedError) as error:
+                failed.append(str(error))
+                for k in group:
+                    self.left_out.setdefault(self.names[k], "its part could not be oriented")
+                continue
+            parts.append(part)
+            rest = [k for k in group if self.names[k] in reasons]
+            among = [p for p in pairs if set(p.images) <= set(rest)]
+            again = [[rest[k] for k in g] for g in connected(
+                len(rest), [dataclasses.replace(p, images=(rest.index(p.images[0]),
+                                                           rest.index(p.images[1])))
+                            for p in among])]  # fmt: skip
+            for g in again:
+                if len(g) >= SMALLEST and len(g) < len(group):
+                    waiting.append(g)
+                else:
+                    self.left_out |= {self.names[k]: reasons[self.names[k]] for k in g}
+        if not parts:
+            raise NotSolvedError(self._why_nothing(pairs, failed), self.names)
+        return sorted(parts, key=lambda part: -len(part.adjustment.network.images))
+
+    def _why_nothing(self, pairs, failed) -> str:
+        turned = [p for p in pairs if p.kind == "rotation"]
+        if pairs and len(turned) == len(pairs):
+            return (
+                "not solved: the photographs were taken from one place, they differ by a rotation "
+                "only; take them from places that lie apart"
+            )
+        if failed:
+            return failed[0] if failed[0].startswith("not solved") else f"not solved: {failed[0]}"
+        said = some((f"{n} ({w})" for n, w in self.left_out.items()), 3, str)
+        return f"not solved: no photographs show the same object: {said}"
+
+    def _part(self, group, features, pairs, name) -> tuple[Part, dict[str, str]]:
+        inside = [p for p in pairs if set(p.images) <= set(group)]
+        tracks = make_tracks(features, inside)
+        sizes = [photograph.size for photograph in self.photographs]
+        kept = choose_tracks(tracks, [f.xy for f in features], sizes, self.settings.points)
+        tracks = [track for track, keep in zip(tracks, kept) if keep]
+        done = iter(range(1, len(features) + 1))
+        measured = measure_tracks(
+            tracks, features, lambda k: read_photograph(self.photographs[k].path, colour=True),
+            lambda: self.tell("least squares matching", next(done), len(features)),
+        )  # fmt: skip
+        network = tie_network(self.photographs, self.cameras, measured, name)
+        self.tell("start values", 0, 1)
+        oriented = orient(network)
+        self.tell("start values", 1, 1)
+        stages = iter(range(1, 10))
+        kinds, named = _kinds(oriented.network, measured, self.names)
+        weighted = adjust_weighted(
+            oriented.network, kinds, named, self.settings.significance,
+            lambda stage: self.tell(stage, next(stages), 4),
+        )  # fmt: skip
+        result = weighted.adjustment
+        if not result.converged:
+            raise NotSolvedError(f"not solved: {result.termination}", list(result.undetermined))
+        colours = _colours(measured)
+        return Part(name, result, colours, weighted.factors), dict(oriented.images)
+
+
+def _kinds(network: Network, measured: Measurements, names: Sequence[str]):
+    """The kind of every observation, and what kinds are called."""
+    columns = (measured.image, measured.track, measured.level)
+    level = {(names[i], str(t)): l for i, t, l in zip(*(c.tolist() for c in columns))}
+    rays, images, points = network.observations, network.images.id, network.points.id
+    kinds = np.array([min(level[images[i], points[p]], 2) for i, p in
+                      zip(rays.image.tolist(), rays.point.tolist())], int)  # fmt: skip
+    words = {-1: "features not matched", 0: "matched in the original",
+             1: "matched at half size", 2: "matched at a quarter or smaller"}  # fmt: skip
+    return kinds, words
+
+
+def _colours(measured: Measurements) -> dict[str, tuple[int, int, int]]:
+    first = measured.first
+    return {str(t): tuple(c) for t, c in
+            zip(measured.track[first].tolist(), measured.colour[first].tolist())}  # fmt: skip

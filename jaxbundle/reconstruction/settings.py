@@ -1,0 +1,23 @@
+"""How a reconstruction is made."""
+
+import dataclasses
+
+from jaxbundle.arguments import one_of, whole
+from jaxbundle.tiepoints.features import Detection
+from jaxbundle.tiepoints.pairs import WAYS
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """`detection`: features; `pairs`: which photographs are matched; `points`: measurements wanted
+    in every photograph; `workers`: threads, all cores if 0; `significance`: of data snooping."""
+
+    detection: Detection = Detection()
+    pairs: str = "auto"
+    points: int = 1500
+    workers: int = 0
+    significance: float = 0.001
+
+    def __post_init__(self):
+        one_of("pairs", self.pairs, WAYS)
+        whole("points", self.points)

@@ -1,0 +1,80 @@
+"""Features and matches kept in a folder, so that an interrupted reconstruction resumes.
+
+A file is named by the fingerprint of the photograph's content and of the settings: of a photograph
+that has changed nothing is found. Files are written under a temporary name and renamed.
+"""
+
+import hashlib
+import os
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+
+from jaxbundle.tiepoints.features import Detection, Features
+
+LENGTH = 16
+
+
+class Store:
+    """Files of features and matches in a folder; of none, nothing is kept."""
+
+    def __init__(self, folder: Path | None, settings: Detection):
+        self.folder, self.settings = folder, repr(settings)
+        self.used: set[str] = set()
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+
+    def name(self, *fingerprints: str) -> str:
+        """The name of a file about these photographs."""
+        text = "\n".join((self.settings, *fingerprints))
+        found = hashlib.blake2b(text.encode(), digest_size=LENGTH // 2).hexdigest()
+        self.used.add(found)
+        return found
+
+    def load_features(self, fingerprint: str) -> Features | None:
+        """The features of a photograph, if they are kept."""
+        found = self._load(self.name(fingerprint))
+        if found is None or set(found) != {"xy", "size", "angle", "descriptor"}:
+            return None
+        return Features(found["xy"], found["size"], found["angle"], found["descriptor"])
+
+    def save_features(self, fingerprint: str, features: Features) -> None:
+        """Keep the features of a photograph."""
+        self._save(
+            self.name(fingerprint), xy=features.xy, size=features.size, angle=features.angle,
+            descriptor=features.descriptor,
+        )  # fmt: skip
+
+    def load_matches(self, one: str, other: str) -> tuple[np.ndarray, np.ndarray] | None:
+        """The matches of two photographs, if they are kept."""
+        found = self._load(self.name(one, other))
+        return None if found is None else (found["matches"], found["clarity"])
+
+    def save_matches(self, one: str, other: str, matches, clarity) -> None:
+        """Keep the matches of two photographs."""
+        self._save(self.name(one, other), matches=matches, clarity=clarity)
+
+    def drop_unused(self) -> None:
+        """Remove the files of photographs that are no longer there."""
+        if self.folder is not None:
+            for path in self.folder.glob("*.npz"):
+                if path.stem not in self.used:
+                    path.unlink(missing_ok=True)
+
+    def _load(self, name):
+        if self.folder is None:
+            return None
+        try:
+            with np.load(self.folder / f"{name}.npz", allow_pickle=False) as found:
+                return dict(found)
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+            return None
+
+    def _save(self, name, **arrays):
+        if self.folder is None:
+            return
+        part = self.folder / f"{name}.part{os.getpid()}"
+        with part.open("wb") as file:
+            np.savez(file, **arrays)
+        part.replace(self.folder / f"{name}.npz")
