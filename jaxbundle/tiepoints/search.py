@@ -26,7 +26,7 @@ and others with fewer, which lie wider apart."""
 
 def detect(
     read: Sequence[Callable[[], UInt8[np.ndarray, "rows columns"]]],
-    fingerprints: Sequence[str],
+    fingerprints: list[str],
     settings: Detection,
     store: Store,
     workers: int,
@@ -46,7 +46,7 @@ def detect(
 
 def match(
     features: Sequence[Features],
-    fingerprints: Sequence[str],
+    fingerprints: list[str],
     way: str,
     place: Float[np.ndarray, "photographs 3"] | None,
     store: Store,
