@@ -1,6 +1,6 @@
 """`adjust`: a network in, an `Adjustment` out."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
 
@@ -57,6 +57,7 @@ def adjust(
     robust: str | None = None,
     snooping: str | None = None,
     significance: float = 0.001,
+    doubtful: Iterable[tuple[str, str]] = (),
     eliminate: bool = False,
     critical_t: float = 2.0,
     estimate_components: bool = False,
@@ -83,6 +84,8 @@ def adjust(
       that of a single observation; also the probability that `robust` suspects anything. Where
       blunders leave no solution to begin with, image points that contradict the start values
       altogether are left out first (also of `robust`).
+    - `doubtful`: (image, point) by id of image points that data snooping begins without; those that
+      pass its test come back.
     - `eliminate`: fix additional parameters with t < `critical_t` at 0, the least significant
       first, adjusting again each time.
     - `estimate_components`: scale the σ of each group of observations until its variance
@@ -142,7 +145,7 @@ def adjust(
     if inspection and (snooping or estimate_components or eliminate):
         if snooping:
             problem, minimum, removed, doubt = snooped(
-                inspection, minimum, again, snooping, significance
+                inspection, minimum, again, snooping, significance, doubtful
             )
         if estimate_components:
             problem, minimum, factors = with_components(problem, minimum, again)

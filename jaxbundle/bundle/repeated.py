@@ -1,6 +1,7 @@
 """Adjustments repeated: robust estimation, data snooping, variance components, elimination."""
 
 import dataclasses
+from collections.abc import Iterable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,18 +18,25 @@ from jaxbundle.leastsquares.robust import residual_lengths, reweight, robust_sca
 from jaxbundle.leastsquares.snooping import Removed, snoop, without
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.network.arrays import Values
-from jaxbundle.statistics.blunders import name_removed
+from jaxbundle.statistics.blunders import image_points_removed, name_removed
 from jaxbundle.statistics.components import groups
 from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.statistics.misfit import contradicts, doubt_of_baarda
 
 
-def snooped(found: Inspection, minimum, again, test: str, significance: float):
+def snooped(
+    found: Inspection, minimum, again, test: str, significance: float, doubtful: Iterable = ()
+):
     """The problem and its minimum without blunders, what was removed, and what is to be said of σ
-    that the test trusts though the data contradict them."""
+    that the test trusts though the data contradict them.
+
+    `doubtful`: image and point, by id, of image points to begin without."""
     problem, whole, doubt = found.problem, found.solution, None
     repeat = _Repeat(problem, again, "after data snooping", minimum)
-    solution, removed = snoop(whole, repeat, test=test, significance=significance)
+    solution, removed = snoop(
+        whole, repeat, test=test, significance=significance,
+        doubtful=image_points_removed(problem, doubtful),
+    )
     removed = [name_removed(problem, r) for r in removed]
     counts = problem.counts
     if test == "baarda" and counts.redundancy > 0:

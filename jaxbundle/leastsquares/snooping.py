@@ -89,6 +89,7 @@ def snoop(
     test: str = "pope",
     significance: float = 0.001,
     limit: int | None = None,
+    doubtful: Sequence[Removed] = (),
 ) -> tuple[Solution, list[Removed]]:
     """Remove blunders, the worst first.
 
@@ -101,6 +102,7 @@ def snoop(
       blunders, with `"baarda"` that of one residual. Observations of one eliminated row that cannot
       be told apart at this level are removed together.
     - `limit`: at most so many removals.
+    - `doubtful`: what is left out to begin with, and comes back if it passes in the end.
 
     **Returns:** the solution without the removed observations, and what was removed in the order
     of removal.
@@ -108,8 +110,10 @@ def snoop(
     **Raises:** `InputError` for another test, or a level that is no probability.
     """
     check_test(test, significance)
-    whole, removed, returned = found.problem, [], set()
+    whole, removed, returned = found.problem, [*doubtful], set()
     touched = _Touched(whole)
+    if removed:
+        found = adjust_from(without(whole, removed), found.values)
     while found.problem.counts.redundancy >= 2:
         unit = found.sigma0 if test == "pope" and found.sigma0 > 0 else 1.0
         counts = found.problem.counts
@@ -129,6 +133,8 @@ def snoop(
             returned |= passing
             removed = kept
         found = readjust(without(whole, removed), found.values, adjust_from)
+    if doubtful:
+        removed = list(_tested(whole, found, removed))
     return adjust_from(found.problem, found.values) if removed else found, removed
 
 
@@ -261,6 +267,15 @@ def _passing(whole: Problem, found: Solution, touched, removed: Sequence[Removed
         (r.set, row, r.residual) for r in removed for row in r.rows
         if np.max(value(r, row)) < critical
     }  # fmt: skip
+
+
+def _tested(whole: Problem, found: Solution, removed: Sequence[Removed]) -> Iterable[Removed]:
+    """The same with the tests of what was doubtful from the beginning."""
+    tests = {o: _finite(t) for o, t in found.predicted_tests(whole.data).items()}
+    for r in removed:
+        yield r if np.isfinite(r.test) else dataclasses.replace(
+            r, test=float(tests[r.set][r.row].max())
+        )
 
 
 def _without_passing(removed: Sequence[Removed], passing) -> Iterable[Removed]:

@@ -74,16 +74,17 @@ def read_exif(path: str | Path) -> Exif:
 
     **Raises:** `InputError` if it is no image.
     """
-    image = open_image(path)
-    try:
-        head = image.getexif()
-        details, gps = head.get_ifd(DETAILS), head.get_ifd(GPS)
-    except Exception:  # whatever a damaged head makes of its reader
-        return Exif(image.size)
+    with open_image(path) as image:
+        size = image.size
+        try:
+            head = image.getexif()
+            details, gps = head.get_ifd(DETAILS), head.get_ifd(GPS)
+        except Exception:  # whatever a damaged head makes of its reader
+            return Exif(size)
     resolution = _positive(details.get(PLANE_X))
     unit = MM.get(details.get(PLANE_UNIT, 2))
     return Exif(
-        size=image.size,
+        size=size,
         make=_text(head.get(MAKE)),
         model=_text(head.get(MODEL)),
         focal_length=_positive(details.get(FOCAL_LENGTH)),

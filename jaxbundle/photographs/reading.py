@@ -62,7 +62,8 @@ def photograph_size(path: str | Path) -> tuple[int, int]:
 
     **Raises:** `InputError` if it is no image, or has more than 2³⁰ pixels.
     """
-    columns, rows = open_image(path).size
+    with open_image(path) as image:
+        columns, rows = image.size
     if columns * rows > MOST_PIXELS:
         raise InputError(
             f"{path}: {columns} × {rows} pixels; at most {MOST_PIXELS} can be read: make it smaller"
@@ -71,7 +72,7 @@ def photograph_size(path: str | Path) -> tuple[int, int]:
 
 
 def open_image(path: str | Path):
-    """The file opened by Pillow, its head read; the pixels are not decoded.
+    """The file opened by Pillow, its head read; the pixels are not decoded. Close it, by `with`.
 
     **Raises:** `InputError` if it cannot be read, or is no image.
     """
@@ -103,14 +104,16 @@ def _looks_cut(content: bytes) -> bool:
 
 def _refuse_cut(path):
     try:
-        open_image(path).load()
+        with open_image(path) as image:
+            image.load()
     except (OSError, SyntaxError, ValueError):
         raise InputError(f"{path}: the file is cut short; copy it again") from None
 
 
 def _by_pillow(path, colour):
     try:
-        return np.asarray(open_image(path).convert("RGB" if colour else "L"))
+        with open_image(path) as image:
+            return np.asarray(image.convert("RGB" if colour else "L"))
     except (OSError, SyntaxError, ValueError):
         raise InputError(f"{path}: not an image that can be read (JPEG, PNG, TIFF, …)") from None
 

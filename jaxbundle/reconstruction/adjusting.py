@@ -21,10 +21,10 @@ from jaxbundle.bundle.adjust import adjust
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.network.tables import Network
 
-GROSS = 4.0
+GROSS, DOUBTFUL = 4.0, 5.0
 SETTLED = 0.03
 """Change of a factor that ends the rounds."""
-ROUNDS = 2
+ROUNDS = 3
 FEWEST = 60
 """Measurements of a kind with a factor of its own."""
 SMALLEST, LARGEST = 0.3, 8.0
@@ -54,24 +54,34 @@ def adjust_weighted(
     tell("adjustment")
     result = adjust(network)
     total = np.ones(len(network.observations))
-    given = network.observations.sigma
+    given, doubtful = network.observations.sigma, []
     if result.converged:
-        factor = _factors(*_of_residuals(result), kinds)
-        total *= factor
-        network = _with_sigma(network, given * total[:, None])
+        w, r = _of_residuals(result)
+        total = _factors(w, r, kinds)
+        beyond = np.abs(w) / np.sqrt(np.maximum(r, 0.1)) > DOUBTFUL * total[:, None]
+        doubtful = _named(result, beyond.any(1))
     for _ in range(ROUNDS):
         tell("data snooping")
-        result = adjust(network, snooping="pope", significance=significance)
+        network = _with_sigma(network, given * total[:, None])
+        result = adjust(network, snooping="pope", significance=significance, doubtful=doubtful)
         if not result.converged:
             break
         factor = _factors(*_of_reliability(result), kinds, np.inf)
         if np.all(np.abs(factor - 1) < SETTLED):
             break
         total *= factor
-        network = _with_sigma(network, given * total[:, None])
+        used = np.asarray(result.problem.data.image_weight) > 0
+        doubtful = _named(result, ~used.any(1))
     kept = {name: float(np.median(total[kinds == k])) for k, name in names.items()
             if (kinds == k).any()}  # fmt: skip
     return Weighted(result, kept)
+
+
+def _named(result: Adjustment, rows) -> list[tuple[str, str]]:
+    """Image and point, by id, of image points."""
+    network, problem = result.network, result.problem
+    return [(network.images.id[i], network.points.id[p]) for i, p in
+            zip(problem.image[rows].tolist(), problem.point[rows].tolist())]  # fmt: skip
 
 
 def _with_sigma(network: Network, sigma) -> Network:

@@ -102,7 +102,7 @@ class _Making:
         self.cameras, self.settings, self.store, self.tell = cameras, settings, store, tell
         self.workers = settings.workers or available_cores()
         self.names = [photograph.name for photograph in photographs]
-        self.notes = list(cameras.notes)
+        self.notes, self.stage = list(cameras.notes), ""
 
     def run(self) -> Reconstruction:
         features = self._features()
@@ -188,6 +188,14 @@ class _Making:
             raise NotSolvedError(self._why_nothing(pairs, failed), self.names)
         return sorted(parts, key=lambda part: -len(part.adjustment.network.images))
 
+    def _begin(self, stage: str) -> None:
+        """A stage whose length is not known begins, and the one before has ended."""
+        if self.stage:
+            self.tell(self.stage, 1, 1)
+        self.stage = stage
+        if stage:
+            self.tell(stage, 0, 1)
+
     def _why_nothing(self, pairs, failed) -> str:
         turned = [p for p in pairs if p.kind == "rotation"]
         if pairs and len(turned) == len(pairs):
@@ -212,15 +220,14 @@ class _Making:
             lambda: self.tell("least squares matching", next(done), len(features)),
         )  # fmt: skip
         network = tie_network(self.photographs, self.cameras, measured, name)
-        self.tell("start values", 0, 1)
+        self._begin("start values")
         oriented = orient(network)
-        self.tell("start values", 1, 1)
-        stages = iter(range(1, 10))
         kinds, named = _kinds(oriented.network, measured, self.names)
         weighted = adjust_weighted(
             oriented.network, kinds, named, self.settings.significance,
-            lambda stage: self.tell(stage, next(stages), 4),
+            self._begin,
         )  # fmt: skip
+        self._begin("")
         result = weighted.adjustment
         if not result.converged:
             raise NotSolvedError(f"not solved: {result.termination}", list(result.undetermined))

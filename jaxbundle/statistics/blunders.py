@@ -1,7 +1,8 @@
 """Blunders and suspects in the words of a network."""
 
 import dataclasses
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.leastsquares import robust, snooping
@@ -44,6 +45,25 @@ def name_removed(problem: Problem, found: snooping.Removed) -> Removed:
     if kind == "control":
         rows = tuple(3 * row + present(found.residual) for row in rows)
     return Removed(kind, rows[0], either_of(names), found.test, rows[1:])
+
+
+def image_points_removed(
+    problem: Problem, named: Iterable[tuple[str, str]]
+) -> list[snooping.Removed]:
+    """Image points, by the ids of image and point, as data snooping removes them."""
+    named = set(named)
+    if not named:
+        return []
+    images, points = problem.network.images.id, problem.network.points.id
+    places = zip(problem.image.tolist(), problem.point.tolist())
+    rows = {k for k, (i, p) in enumerate(places) if (images[i], points[p]) in named}
+    return [
+        snooping.Removed(o, row, None, math.inf)
+        for o, s in enumerate(problem.layout.sets) if s.field == "image"
+        for row, place in enumerate(range(problem.system.observations[o].number)
+                                    if s.rows is None else s.rows.tolist())
+        if place in rows
+    ]  # fmt: skip
 
 
 def either_of(names: Sequence[str]) -> str:

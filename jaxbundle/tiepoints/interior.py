@@ -26,9 +26,9 @@ from jaxbundle.orientation.least_squares import minimise
 from jaxbundle.orientation.relative import retract, sampson_distance
 from jaxbundle.orientation.sights import ideal_points
 
-FACTORS = tuple(0.55 * 1.17**k for k in range(12))
-"""Principal distances tried, in parts of the longer side: 85° to 21° of view."""
-PAIRS, SLOTS, PIXELS = 10, 64, 4.0
+FACTORS = tuple(0.55 * 1.2**k for k in range(10))
+"""Principal distances tried, in parts of the longer side: 85° to 20° of view."""
+PAIRS, SLOTS, PIXELS = 8, 64, 4.0
 """Pairs and matches used; the misclosure at which a match counts half, for a photograph of 3000
 pixels: lens distortion is not known yet."""
 ROUNDS, STEPS = 4, 8
@@ -65,10 +65,9 @@ def estimate_interior(
     clear = [many.spread(max(int(0.6 * len(a)), 24), SLOTS) for a, _ in pairs]
     xy1, xy2 = ([pair[i][r] for pair, r in zip(pairs, clear)] for i in (0, 1))
     tried = [camera.parameters["fx"]] if known else [size * factor for factor in FACTORS]
-    found = [_oriented(_with(camera, f), xy1, xy2, limit) for f in tried]
-    costs = np.array([cost for *_, cost in found])
+    M, b, part, costs = _oriented([_with(camera, f) for f in tried], xy1, xy2, limit)
     best = int(np.argmin(costs.sum(1)))
-    f, (M, b, part, _) = tried[best], found[best]
+    f, M, b, part = tried[best], M[best], b[best], part[best]
     use = np.flatnonzero(part > 0.3)
     if not len(use):
         return Start(_with(camera, f), 0, np.nan)
@@ -85,16 +84,17 @@ def _with(camera, f, k1=0.0):
     )
 
 
-def _oriented(camera, xy1, xy2, limit):
-    """Relative orientations of pairs with a camera, the parts that agree, and robust sums, px²."""
-    one, two = ([ideal_points(camera, xy) for xy in side] for side in (xy1, xy2))
-    f = camera.parameters["fx"]
-    M, b, part, _ = many.orient_pairs(one, two, np.full(len(one), limit / f))
-    costs = np.empty(len(one))
-    for k, (a, c) in enumerate(zip(one, two)):
-        e = f * np.asarray(_sampson(M[k], b[k], _fill(a), _fill(c)))
-        costs[k] = np.log1p((np.nan_to_num(e, nan=1e3) / limit) ** 2).mean()
-    return M, b, part, np.where(part > 0, costs, np.log1p(100.0))
+def _oriented(cameras, xy1, xy2, limit):
+    """Relative orientations of all pairs with each camera, the parts that agree, robust sums."""
+    f = np.repeat([camera.parameters["fx"] for camera in cameras], len(xy1))
+    one, two = ([ideal_points(c, xy) for c in cameras for xy in side] for side in (xy1, xy2))
+    M, b, part, _ = many.orient_pairs(one, two, limit / f)
+    filled = (np.stack([_fill(a) for a in side]) for side in (one, two))
+    e = np.asarray(many.in_lanes(_sampson, many.LANES, M, b, *filled)[0])
+    e = np.nan_to_num(f[:, None] * e, nan=1e3)
+    costs = np.where(part > 0, np.log1p((e / limit) ** 2).mean(1), np.log1p(100.0))
+    by_camera = lambda a: a.reshape(len(cameras), len(xy1), *a.shape[1:])
+    return tuple(by_camera(a) for a in (M, b, part, costs))
 
 
 def _fill(a):
@@ -102,8 +102,9 @@ def _fill(a):
 
 
 @jax.jit
+@jax.vmap
 def _sampson(M, b, xy1, xy2):
-    return jax.vmap(sampson_distance, (None, None, 0, 0))(M, b, xy1, xy2)
+    return (jax.vmap(sampson_distance, (None, None, 0, 0))(M, b, xy1, xy2),)
 
 
 def _adjusted(camera, pairs, M, b, limit):

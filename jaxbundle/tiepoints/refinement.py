@@ -86,7 +86,9 @@ def measure_tracks(
     start = _starts(xy, size, angle, scale, centre, window_of)
     corner = np.rint(start[:, :, 2]) - PIECE // 2
     corner[first] = centre[first] - WINDOW // 2
-    windows, pieces, inside, colour = _cut_out(image, first, level, corner, xy, read, advance)
+    windows, pieces, inside, colour = _cut_out(
+        len(features), image, first, level, corner, xy, read, advance
+    )
     others = np.flatnonzero(~first & inside & inside[window_of])
     start[:, :, 2] -= corner
     found = _matched(windows[track[others]], pieces, others, start)
@@ -121,7 +123,7 @@ def _starts(xy, size, angle, scale, centre, window_of):
     return start
 
 
-def _cut_out(image, first, level, corner, xy, read, advance):
+def _cut_out(photographs, image, first, level, corner, xy, read, advance):
     """Windows by track, pieces by measurement, which are inside, and the colours at the places."""
     cv2 = need_opencv()
     n = len(image)
@@ -130,7 +132,7 @@ def _cut_out(image, first, level, corner, xy, read, advance):
     pieces = np.zeros((n, PIECE, PIECE), np.uint8)
     inside, colour = np.zeros(n, bool), np.zeros((n, 3), np.uint8)
     order = np.argsort(image, kind="stable")
-    for k in range(image.max(initial=-1) + 1):
+    for k in range(photographs):
         rows = order[slice(*np.searchsorted(image[order], [k, k + 1]))]
         if len(rows):
             picture = read(k)

@@ -111,10 +111,10 @@ def _various(own):
     if not own:
         return []
     most = own[0][0]
-    first = [found for found in own if found[0] >= WIDEST * most][:4]
+    first = [found for found in own if found[0] >= WIDEST * most][:3]
     enough = [found for found in own if 60 <= found[0] < WIDEST * most]
-    step = max(1, len(enough) // 6)
-    return first + enough[: 6 * step : step]
+    step = max(1, len(enough) // 5)
+    return first + enough[: 5 * step : step]
 
 
 def verify(

@@ -1,0 +1,114 @@
+"""Rendered photographs of a scene and some that do not belong to it, reconstructed."""
+
+import cv2
+import numpy as np
+import pytest
+from rendered_photographs import SIZE, F, write_photographs
+
+import jaxbundle
+from jaxbundle.errors import InputError
+from jaxbundle.orientation.alignment import similarity
+from jaxbundle.reconstruction.parts import connected
+from jaxbundle.reconstruction.photographs import assign_cameras, find_photographs
+from jaxbundle.reconstruction.reconstruct import reconstruct
+from jaxbundle.reconstruction.settings import Settings
+from jaxbundle.tiepoints.features import Detection
+from jaxbundle.tiepoints.verification import Pair
+
+SETTINGS = Settings(Detection(number=1500), points=250)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Truth, and what was made of eight photographs, one of another scene, one cut short, one that
+    is there twice and one without texture; and the folder of matches."""
+    folder = tmp_path_factory.mktemp("photographs")
+    truth = write_photographs(folder, "a", 8, 1)
+    write_photographs(folder / "other", "c", 1, 11)
+    (folder / "c0.png").write_bytes((folder / "other" / "c0.png").read_bytes())
+    (folder / "cut.png").write_bytes((folder / "a1.png").read_bytes()[:20_000])
+    (folder / "again.png").write_bytes((folder / "a2.png").read_bytes())
+    cv2.imwrite(str(folder / "dull.png"), np.full(SIZE[::-1], 120, np.uint8))
+    stages, store = {}, folder / "kept"
+    found = reconstruct(
+        [folder], settings=SETTINGS, store=store,
+        tell=lambda stage, done, total: stages.update({stage: (done, total)}),
+    )  # fmt: skip
+    return truth, found, stages, store
+
+
+def test_all_photographs_of_a_scene_are_placed_and_foreign_ones_left_out(made):
+    truth, found, _, _ = made
+    (part,) = found.parts
+    same_file = {"a2.png", "again.png"}
+    assert set(part.adjustment.network.images.id) - same_file == set(truth) - same_file
+    why = found.left_out
+    assert set(why) - same_file == {"c0.png", "cut.png", "dull.png"}
+    assert "cut short" in why["cut.png"] and "no texture" in why["dull.png"]
+    assert "the same file as" in why.get("again.png", why.get("a2.png"))
+
+
+def test_centres_and_principal_distance_are_within_their_sigma(made):
+    truth, found, _, _ = made
+    result = found.parts[0].adjustment
+    assert result.converged
+    ids = [id for id in result.network.images.id if id in truth]
+    rows = [result.network.images.id.index(id) for id in ids]
+    X = np.array([truth[id] for id in ids])
+    X0 = result.image_values[rows, :3]
+    A, t = similarity(X0, X)
+    e = X0 @ A.T + t - X
+    C = np.einsum("ij,njk,lk->nil", A, result.image_covariance[rows, :3, :3], A)
+    sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
+    assert np.all(np.abs(e) < 3 * sigma)
+    assert np.linalg.norm(e, axis=1).max() < 0.004
+    c = result.cameras[result.network.cameras[0].id]["parameters"]["fx"]
+    assert abs(c["value"] - F) < 3 * c["sigma"] < 1.0
+
+
+def test_weights_are_those_of_the_residuals(made):
+    part = made[1].parts[0]
+    assert part.adjustment.global_test()["passed"] or abs(part.adjustment.sigma0 - 1) < 0.02
+    assert 0.3 < part.factors["matched in the original"] < 1.6
+    assert len(part.adjustment.removed) < 0.05 * len(part.adjustment.network.observations)
+
+
+def test_stages_end_and_what_was_found_is_kept(made):
+    _, _, stages, store = made
+    assert {"features", "matching", "verification", "start values"} <= set(stages)
+    assert all(done == total for stage, (done, total) in stages.items() if "data" not in stage)
+    assert len(list(store.glob("*.npz"))) > 20 and not list(store.glob("*.part*"))
+
+
+def test_groups_of_connected_photographs():
+    empty = np.zeros((0, 2), int)
+    pair = lambda i, j: Pair((i, j), empty, np.zeros(0), np.eye(3), np.zeros(3), 0.1, "relative", 9)
+    assert connected(6, [pair(4, 5), pair(0, 3), pair(5, 3)]) == [[0, 3, 4, 5], [1], [2]]
+
+
+def test_what_cannot_be_used_is_refused(tmp_path):
+    with pytest.raises(InputError, match="no photographs in this folder"):
+        find_photographs([tmp_path])
+    grey = np.random.default_rng(0).integers(0, 255, (80, 100), np.uint8)
+    for name in ("one.png", "two.png"):
+        cv2.imwrite(str(tmp_path / name), grey)
+    with pytest.raises(InputError, match="1 of 2 photographs can be used.*the same file as one"):
+        find_photographs([tmp_path])
+    with pytest.raises(InputError, match="no such file"):
+        find_photographs([tmp_path / "missing.jpg"])
+    cv2.imwrite(str(tmp_path / "two.png"), grey[:70])
+    found, _ = find_photographs([tmp_path])
+    assert len(assign_cameras(found).cameras) == 2
+    camera = jaxbundle.Camera("cam", "opencv", {"fx": 90.0, "fy": 90.0}, image_size=(100, 80))
+    with pytest.raises(InputError, match="two.png: 100 × 70 pixels, but camera cam has 100 × 80"):
+        assign_cameras(found, camera)
+
+
+def test_the_command_refuses_before_it_writes(tmp_path, command):
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    out = tmp_path / "out"
+    told = command("reconstruct", empty, "--out", out)
+    assert told.status == 2 and "no photographs" in told.err and not out.exists()
+    told = command("reconstruct", empty, "--out", out, "--features", "surf")
+    assert told.status == 2 and "sift, akaze, orb" in told.err
