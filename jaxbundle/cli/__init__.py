@@ -11,7 +11,7 @@ from jaxbundle.cli.app import run
 
 COMMANDS = (
     "reconstruct", "orient", "adjust", "calibrate", "batch", "plan", "camera", "compare",
-    "convert", "surface", "pushbroom",
+    "convert", "surface", "cloud", "pushbroom",
 )  # fmt: skip
 
 

@@ -14,13 +14,13 @@ Sources: Hirschmüller (2008); Lucas and Kanade (1981); Ackermann (1984).
 """
 
 import dataclasses
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage, stats
 
 from jaxbundle.photographs.opencv import need_opencv
-from jaxbundle.surface.rectification import Rectified
 
 BLOCK = 3
 """Side of the blocks of semi-global matching."""
@@ -34,6 +34,8 @@ ROUNDS = 2
 HOLES, STEP, JUMP = 0.5, 0.3, 2.5
 """Pixels: σ that a window has of gaps, by the root of their share; and of a step in the surface,
 which is a change of disparities by more than `JUMP`. Found on rendered roofs."""
+BLOCK_SIDE, SMOOTHEST = 48, 0.25
+"""Pixels of a block whose scatter is looked at; the quantile of the blocks that is taken."""
 NEAR = 0.7
 """Pixels: by so much disparities of one surface differ within a window, about."""
 MOST_CHANGE = 1.0
@@ -43,6 +45,16 @@ MOST_SIGMA = 0.5
 """σ of a disparity, pixels, above which the texture does not determine it."""
 LEAST_CONTRAST = 1.0
 """Standard deviation of a window, grey values of 256."""
+
+
+class RowPair(Protocol):
+    """Two images whose epipolar lines are rows; NaN outside."""
+
+    @property
+    def left(self) -> Float[np.ndarray, "rows columns"]: ...
+
+    @property
+    def right(self) -> Float[np.ndarray, "rows columns"]: ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +67,7 @@ class Disparities:
     factor: float
 
 
-def match_dense(pair: Rectified, span: int) -> Disparities:
+def match_dense(pair: RowPair, span: int) -> Disparities:
     """Disparities from 0 to `span` of a rectified pair, at the pixels of its left image."""
     left, right, inside = _prepared(pair)
     start = semi_global(left, right, span)
@@ -102,8 +114,7 @@ def refine_disparities(left, right, start) -> Disparities:
         good = known & (np.abs(shape + moved - start) <= MOST_CHANGE) & (np.abs(found.x) < 0.5)
         good &= (found.rho >= LEAST_CORRELATION) & found.textured & (found.h1 > 0.2)
         across = (found.y / found.sigma_y)[good]
-    scatter = _scatter(np.where(good, shape + moved, np.nan), found.sigma_x)
-    factor = max(_factor(across), min(map(_factor, scatter)))
+    factor = max(_factor(across), _scatter(np.where(good, shape + moved, np.nan), found.sigma_x))
     sigma = np.sqrt(factor * found.sigma_x**2 + _at_edges(shape + moved, good))
     with np.errstate(invalid="ignore"):
         good &= sigma < MOST_SIGMA
@@ -192,20 +203,29 @@ def _factor(ratio) -> float:
     return float(np.median(ratio**2) / stats.chi2.median(1)) if len(ratio) > 100 else 1.0
 
 
-def _scatter(d, sigma):
-    """Third differences of disparities, whose windows do not overlap, in units of their σ, along
-    both axes: on smooth surfaces noise alone."""
+def _scatter(d, sigma) -> float:
+    """The variance factor that third differences of disparities tell, whose windows do not overlap:
+    on smooth surfaces noise alone. So it is that of the smoothest blocks and of the better axis."""
     step, weights = 2 * HALF + 1, (1.0, -3.0, 3.0, -1.0)
+    found = []
     for a, s in ((d, sigma), (d.T, sigma.T)):
         n = a.shape[1] - 3 * step
-        if n <= 0:
-            yield np.zeros(0)
+        if n <= BLOCK_SIDE:
             continue
         parts = [(w, slice(k * step, k * step + n)) for k, w in enumerate(weights)]
         difference = sum(w * a[:, part] for w, part in parts)
         square = sum(w * w * s[:, part] ** 2 for w, part in parts)
         with np.errstate(invalid="ignore", divide="ignore"):
-            yield (difference / np.sqrt(square))[np.isfinite(difference)]
+            ratio = difference / np.sqrt(square)
+        blocks = [
+            block[np.isfinite(block)]
+            for r in range(0, ratio.shape[0], BLOCK_SIDE) for c in range(0, n, BLOCK_SIDE)
+            if (block := ratio[r : r + BLOCK_SIDE, c : c + BLOCK_SIDE]).size
+        ]  # fmt: skip
+        full = [_factor(block) for block in blocks if len(block) > BLOCK_SIDE**2 / 3]
+        if full:
+            found.append(float(np.quantile(full, SMOOTHEST)))
+    return min(found, default=1.0)
 
 
 def _without_noise(disparity, known):
@@ -224,7 +244,7 @@ def _smooth(disparity, known):
     return np.where(known, smooth, np.nan).astype(np.float32)
 
 
-def _prepared(pair: Rectified):
+def _prepared(pair: RowPair):
     """Both images between 0 and 255, without gaps, and where both are."""
     inside = np.isfinite(pair.left)
     grey = [a[np.isfinite(a)] for a in (pair.left, pair.right)]

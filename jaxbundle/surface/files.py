@@ -55,6 +55,7 @@ def report_of(surface: Surface, warnings: Sequence[str] = ()) -> dict[str, Any]:
         "points": len(cloud),
         "rays": {str(k): int(n) for k, n in enumerate(number) if n},
         "images": [dict(row) for row in surface.bases],
+        "system": cloud.system,
         "accuracy": accuracy_of(cloud),
         "warnings": [*warnings, *surface.messages],
     }

@@ -13,12 +13,14 @@ from jaxbundle.surface.bounds import Bounds, by_geometry, by_points
 from jaxbundle.surface.cloud import Cloud, merge
 from jaxbundle.surface.correlation import Pyramid, make_pyramid
 from jaxbundle.surface.dense_cloud import dense_cloud
+from jaxbundle.surface.dense_ground import dense_ground_cloud
+from jaxbundle.surface.ground import RpcView
 from jaxbundle.surface.guide import Guide, coarsest_level, make_guide
 from jaxbundle.surface.interest import interest_points
 from jaxbundle.surface.matching import Matches, Settings, match_points
 from jaxbundle.surface.pairs import choose_partners
 from jaxbundle.surface.segments import segments, visible_range
-from jaxbundle.surface.views import OrientedImage
+from jaxbundle.surface.views import FrameView, OrientedImage
 
 KEPT = 6
 """Pyramids kept at a time."""
@@ -67,6 +69,25 @@ def find_bounds(
             f"{1 / q[0]:.4g} are searched ({name}); give --zmin and --zmax"
         )
     return tuple(found), tuple(messages)
+
+
+def ground_bounds(
+    views: Sequence[OrientedImage], heights: tuple[float, float] | None
+) -> tuple[tuple[Bounds, ...], tuple[str, ...]]:
+    """The bounds of scanner and RPC images: heights, else those the polynomials were made for.
+
+    **Raises:** `InputError` for scanner images without heights."""
+    messages: tuple[str, ...] = ()
+    if heights is None:
+        ranges = [view.range() for view in views if isinstance(view, RpcView)]
+        if not ranges:
+            raise InputError("line scanner images need --zmin and --zmax, heights of the surface")
+        heights = max(low for low, _ in ranges), min(high for _, high in ranges)
+        messages = (
+            f"heights from {heights[0]:.6g} to {heights[1]:.6g} are searched, those that the "
+            "coefficients were made for; give --zmin and --zmax",
+        )  # fmt: skip
+    return tuple(Bounds(view, heights) for view in views), messages
 
 
 class _Pyramids:
@@ -149,7 +170,8 @@ def reconstruct(
 def _dense(views, i, others, guide, step):
     """The cloud of most pixels of an image, its counts, images that cannot be rectified with it."""
     base = views[i]
-    cloud, used, left_out = dense_cloud(base, [views[j] for j in others], guide, step)
+    match = dense_cloud if isinstance(base, FrameView) else dense_ground_cloud
+    cloud, used, left_out = match(base, [views[j] for j in others], guide, step)
     cloud = dataclasses.replace(cloud, colour=_colour(base, cloud.uv))
     columns, rows = base.size
     number = -(-columns // step) * -(-rows // step)

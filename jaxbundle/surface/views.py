@@ -104,7 +104,7 @@ class FrameView:
         return np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
 
     def points(self, uv, q):
-        return _in_lanes(_points, self._frame, uv, q)
+        return in_lanes(_points, self._frame, uv, q)
 
     def parameter(self, X):
         return 1 / np.linalg.norm(X - self.X0, axis=1)
@@ -113,11 +113,11 @@ class FrameView:
         d = X - self.X0
         with np.errstate(invalid="ignore", divide="ignore"):
             angle = np.arccos(np.clip(-(d @ self.M[2]) / np.linalg.norm(d, axis=1), -1, 1))
-        uv = _in_lanes(_project, self._frame, X)
+        uv = in_lanes(_project, self._frame, X)
         return np.where((angle <= self._farthest)[:, None], uv, np.nan)
 
     def derivative(self, X):
-        return _in_lanes(_derivative, self._frame, X)
+        return in_lanes(_derivative, self._frame, X)
 
     def bounds(self, uv, low, high):
         d = self.points(uv, np.ones(len(uv))) - self.X0
@@ -174,7 +174,7 @@ def is_inside(view: OrientedImage, uv: Places, margin: float = 0.0) -> np.ndarra
         )  # fmt: skip
 
 
-def _in_lanes(program: Callable, frame, *arrays):
+def in_lanes(program: Callable, frame, *arrays):
     """The program of arrays [n, …], by `LANES`, what is missing filled up."""
     n = len(arrays[0])
     lanes = LANES if n > LANES // 4 else max(64, 4 ** int(np.ceil(np.log(max(n, 1)) / np.log(4))))

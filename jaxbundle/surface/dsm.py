@@ -1,0 +1,141 @@
+"""A digital surface model of a cloud: heights on a grid with the σ of every cell.
+
+A cell has the weighted mean of the heights of its points, p = 1/σ_Z², after those that differ from
+their median by more than three times its spread. Its σ is that of the mean, but not less than what
+the points scatter for: σ² = max(1, χ²/(n − 1))/Σp. Small gaps are filled linearly, with σ of the
+points around and the distance to them.
+"""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy import ndimage
+
+from jaxbundle.arguments import positive
+from jaxbundle.errors import InputError
+from jaxbundle.io.rasters.writing import written_raster
+from jaxbundle.surface.cloud import Cloud
+
+MOST_CELLS = 2e9
+ROBUST = 3.0
+"""Robust standard deviations from the median beyond which a height is left out."""
+LEAST_SPREAD = 0.3
+"""Of that spread, as a part of the cell size."""
+SLOPE = 0.3
+"""σ of a filled cell per cell of distance, as a part of the cell size."""
+NO_DATA = -9999.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Dsm:
+    """Heights and σ [rows, columns], north up, NaN: none; `x`, `y`: outer corner of the first cell;
+    numbers of points; coordinate system, None where there is none."""
+
+    height: Float[np.ndarray, "rows columns"]
+    sigma: Float[np.ndarray, "rows columns"]
+    count: Int[np.ndarray, "rows columns"]
+    x: float
+    y: float
+    size: float
+    system: str | None = None
+
+    def place(self, X: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray]:
+        """Row and column, whole numbers at the centres of cells, of points."""
+        return (self.y - X[:, 1]) / self.size - 0.5, (X[:, 0] - self.x) / self.size - 0.5
+
+    def centres(self) -> tuple[np.ndarray, np.ndarray]:
+        """x and y of all cells."""
+        rows, columns = self.height.shape
+        return np.meshgrid(self.x + (np.arange(columns) + 0.5) * self.size,
+                           self.y - (np.arange(rows) + 0.5) * self.size)  # fmt: skip
+
+
+def make_dsm(cloud: Cloud, size: float, fill: int = 2) -> Dsm:
+    """The model with square cells of `size`, their edges at multiples of it; gaps of up to `fill`
+    cells from the next height are filled.
+
+    **Raises:** `InputError` for an empty cloud, or too many cells.
+    """
+    size = positive("size of the cells", size)
+    if not len(cloud):
+        raise InputError("a DSM needs points; the cloud is empty")
+    column, row = np.floor(cloud.X[:, 0] / size), np.floor(-cloud.X[:, 1] / size)
+    left, top = column.min(), row.min()
+    columns, rows = int(column.max() - left) + 1, int(row.max() - top) + 1
+    if rows * columns > MOST_CELLS:
+        raise InputError(f"DSM: {rows} × {columns} cells of {size:g}; give a greater size")
+    cell = ((row - top) * columns + (column - left)).astype(np.int64)
+    height, sigma, count = _means(cell, cloud.X[:, 2], cloud.sigma[:, 2], size, rows * columns)
+    shape = rows, columns
+    found = Dsm(height.reshape(shape), sigma.reshape(shape), count.reshape(shape),
+                float(left * size), float(-top * size), size, cloud.system)  # fmt: skip
+    return _filled(found, fill) if fill else found
+
+
+def write_dsm(dsm: Dsm, path: str | Path, sigma_path: str | Path | None = None) -> None:
+    """GeoTIFFs of heights and of their σ, float32, no-data `NO_DATA`."""
+    from rasterio.transform import Affine
+
+    profile = {"transform": Affine(dsm.size, 0, dsm.x, 0, -dsm.size, dsm.y), "nodata": NO_DATA,
+               "crs": dsm.system, "compress": "deflate"}  # fmt: skip
+    rows, columns = dsm.height.shape
+    given = ((path, dsm.height, "height"), (sigma_path, dsm.sigma, "sigma of height"))
+    for target, values, name in given:
+        if target is not None:
+            with written_raster(target, columns, rows, 1, "float32", **profile) as raster:
+                raster.write(np.nan_to_num(values, nan=NO_DATA).astype(np.float32)[None])
+                raster.describe([name])
+
+
+def _means(cell, Z, sigma, size, number):
+    """Weighted means by cell, their σ and numbers of points."""
+    order = np.lexsort((Z, cell))
+    cell, Z, sigma = cell[order], Z[order], sigma[order]
+    cells, first, count = np.unique(cell, return_index=True, return_counts=True)
+    group = np.repeat(np.arange(len(cells)), count)
+    middle = _sorted_medians(Z, first, count)
+    away = np.abs(Z - middle[group])
+    again = np.lexsort((away, group))
+    spread = 1.4826 * _sorted_medians(away[again], first, count)
+    keep = away <= ROBUST * np.maximum(spread, LEAST_SPREAD * size)[group]
+    weight = np.where(np.isfinite(sigma) & (sigma > 0), 1 / sigma**2, np.nan)
+    known = np.isfinite(weight)
+    weight = np.where(known, weight, np.nanmedian(weight) if known.any() else 1.0) * keep
+    total = np.bincount(group, weight)
+    mean = np.bincount(group, weight * Z) / total
+    n = np.bincount(group, keep)
+    square = np.bincount(group, weight * (Z - mean[group]) ** 2)
+    ratio = np.maximum(1.0, square / np.maximum(n - 1, 1))
+    out = np.full((2, number), np.nan)
+    out[0, cells], out[1, cells] = mean, np.sqrt(ratio / total) if known.any() else np.nan
+    numbers = np.zeros(number, int)
+    numbers[cells] = n
+    return *out, numbers
+
+
+def _sorted_medians(values, first, count):
+    """Medians of groups that are sorted and lie one after the other."""
+    low, high = first + (count - 1) // 2, first + count // 2
+    return (values[low] + values[high]) / 2
+
+
+def _filled(dsm: Dsm, reach: int) -> Dsm:
+    """Gaps near heights filled by the mean of those around, weighted by distance."""
+    known = np.isfinite(dsm.height)
+    if known.all():
+        return dsm
+    distance = np.asarray(ndimage.distance_transform_edt(~known))
+    k = np.arange(-2 * reach, 2 * reach + 1)
+    kernel = 1 / np.maximum(np.hypot(k[:, None], k), 0.5) ** 2
+    weigh = lambda a: ndimage.convolve(np.where(known, a, 0.0), kernel, mode="constant")
+    weight = weigh(1.0 * known)
+    gap = ~known & (distance <= reach) & (weight > 0)
+    # only what has heights on opposite sides, not the outer edge
+    around = ndimage.binary_closing(np.pad(known, 2 * reach), iterations=reach)
+    gap &= around[2 * reach : -2 * reach, 2 * reach : -2 * reach]
+    safe = np.where(weight > 0, weight, 1.0)
+    height = np.where(gap, weigh(dsm.height) / safe, dsm.height)
+    sigma = np.hypot(weigh(dsm.sigma) / safe, SLOPE * dsm.size * distance)
+    return dataclasses.replace(dsm, height=height, sigma=np.where(gap, sigma, dsm.sigma))

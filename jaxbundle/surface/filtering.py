@@ -1,0 +1,94 @@
+"""Clouds filtered and thinned: by cubes, by σ and rays, by the distances of neighbours.
+
+Sources: cubes with a least number of points, replaced by their corner or mean: seed 004's system;
+the statistical filter: Rusu et al. (2008), Towards 3D point cloud based object maps.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+from jaxbundle.arguments import one_of, positive, whole
+from jaxbundle.errors import InputError
+from jaxbundle.surface.cloud import Cloud
+
+PLACES = ("mean", "corner", "best")
+NEIGHBOURS = 8
+
+
+def thin(cloud: Cloud, size: float, least: int = 1, place: str = "mean") -> Cloud:
+    """One point for every cube of side `size` that has at least `least` of them: their `mean`
+    weighted by 1/σ², the lowest `corner` of the cube, or the `best` of them, of least σ.
+
+    Errors of neighbours are much alike, their windows overlap: the mean has the σ of one of its
+    points, the root of the harmonic mean of their variances. A corner has the σ of the best point.
+    Cubes stand on multiples of their side.
+
+    **Raises:** `InputError`."""
+    size, least = positive("size of the cubes", size), whole("least number of points", least)
+    one_of("place", place, PLACES)
+    if not len(cloud):
+        return cloud
+    cube = np.floor(cloud.X / size).astype(np.int64)
+    cubes, group, count = np.unique(cube, axis=0, return_inverse=True, return_counts=True)
+    group = group.ravel()
+    trace = np.einsum("nii->n", cloud.covariance)
+    trace = np.where(np.isfinite(trace) & (trace > 0), trace, np.nan)
+    known = bool(np.isfinite(trace).any())
+    filled = np.where(np.isfinite(trace), trace, np.nanmax(trace) if known else 1.0)
+    order = np.lexsort((filled, group))
+    best = order[np.searchsorted(group[order], np.arange(len(cubes)))]
+    found = cloud.take(best)
+    if place == "corner":
+        found = dataclasses.replace(found, X=cubes * size)
+    elif place == "mean":
+        weight = 1 / filled
+        total = np.bincount(group, weight)
+        mean = lambda a: np.bincount(group, weight * a) / total
+        X = np.stack([mean(a) for a in cloud.X.T], 1)
+        own = count / total
+        C = found.covariance * (own / filled[best])[:, None, None]
+        found = dataclasses.replace(found, X=X, covariance=C if known else found.covariance)
+    return found.take(count >= least)
+
+
+def drop_lonely(
+    cloud: Cloud, neighbours: int = NEIGHBOURS, limit: float = 3.0
+) -> Cloud:
+    """Without the points whose mean distance to their nearest `neighbours` is more than the median
+    of all by `limit` robust standard deviations.
+
+    **Raises:** `InputError`."""
+    neighbours, limit = whole("neighbours", neighbours), positive("limit", limit)
+    if len(cloud) <= neighbours:
+        return cloud
+    distance, _ = cKDTree(cloud.X).query(cloud.X, neighbours + 1)
+    mean = distance[:, 1:].mean(1)
+    middle = np.median(mean)
+    spread = 1.4826 * np.median(np.abs(mean - middle))
+    return cloud.take(mean <= middle + limit * max(float(spread), 0.1 * float(middle)))
+
+
+def drop_weak(
+    cloud: Cloud, most_sigma: float | None = None, least_rays: int | None = None
+) -> Cloud:
+    """Without points of a σ above `most_sigma` on any axis, or of fewer rays than `least_rays`.
+
+    **Raises:** `InputError` where the cloud has no σ."""
+    keep = np.ones(len(cloud), bool)
+    if most_sigma is not None:
+        limit = positive("greatest σ", most_sigma)
+        if len(cloud) and not np.isfinite(cloud.sigma).any():
+            raise InputError("the cloud has no σ: columns sX, sY, sZ are expected")
+        with np.errstate(invalid="ignore"):
+            keep &= (cloud.sigma <= limit).all(1)
+    if least_rays is not None:
+        keep &= cloud.rays >= whole("least number of rays", least_rays)
+    return cloud.take(keep)
+
+
+def inside(cloud: Cloud, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> Cloud:
+    """The points of a box."""
+    return cloud.take(((cloud.X >= low) & (cloud.X <= high)).all(1))

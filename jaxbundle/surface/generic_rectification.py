@@ -1,0 +1,114 @@
+"""Rectification of any two oriented images by a surface of one parameter (a height).
+
+The base image is turned so that its epipolar lines are rows, (a, b). The other image is looked up
+where the points of the base's pixels at the parameter q₀ are in it: what lies there matches without
+a disparity. What lies at another q is along the epipolar line, beside by the disparity δ; so the
+match of (a, b) is, in the other image, where the pixel (a − δ, b) looks at q₀.
+
+Lines of scanners are curved; pieces of the image small enough have straight ones.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+from scipy import ndimage
+
+from jaxbundle.surface.segments import windows
+from jaxbundle.surface.views import OrientedImage
+
+ROOM, LEAST_ROOM = 0.15, 8.0
+"""Disparities beyond those of the points: a part of their range, and pixels."""
+NODES = 33
+"""Places a side at which the rows are projected; in between cubic."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Straightened:
+    """A piece of a pair: grey values (NaN outside), the base's pixel of (a, b) = (0, 0) and its
+    axes [2, 2]; `lowest` disparity, of equal columns; q₀."""
+
+    left: Float[np.ndarray, "rows columns"]
+    right: Float[np.ndarray, "rows columns"]
+    corner: Float[np.ndarray, "2"]
+    axes: Float[np.ndarray, "2 2"]
+    lowest: int
+    q0: float
+
+    def base_places(self, ab: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Pixels of the base at columns and rows."""
+        return self.corner + ab @ self.axes
+
+    def columns_rows(self, uv: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Columns and rows of pixels of the base."""
+        return (uv - self.corner) @ self.axes.T
+
+
+def straighten(
+    base: OrientedImage, other: OrientedImage, window: tuple[int, int, int, int],
+    X: Float[np.ndarray, "n 3"],
+) -> tuple[Straightened, int] | None:
+    """A piece of the base (u₀, v₀, u₁, v₁) with what matches it, for the range of points X in it;
+    and the range of disparities."""
+    u0, v0, u1, v1 = window
+    corners = np.array([[u0, v0], [u1, v0], [u0, v1], [u1, v1]], float)
+    q0 = float(np.median(base.parameter(X)))
+    shape = windows(base, other, X)
+    if not shape.usable.any():
+        return None
+    e = np.median(shape.along[shape.usable], axis=0)
+    e = e / np.linalg.norm(e)
+    axes = np.array([e, [-e[1], e[0]]])
+    uv, q = base.project(X), base.parameter(X)
+    # where the piece's epipolar line sees at q0 what the other image has of X
+    here = other.project(base.points(uv, np.full(len(uv), q0)))
+    there = other.project(X)
+    along = np.sum((there - here) * shape.other_along, 1) / np.sum(shape.other_along**2, 1)
+    # a − δ looks at q0 where X is: its image is there
+    shift = -along[shape.usable & np.isfinite(along) & np.isfinite(q)]
+    if not len(shift):
+        return None
+    low, high = np.percentile(shift, [0.3, 99.7])
+    room = ROOM * (high - low) + LEAST_ROOM
+    lowest, span = int(np.floor(low - room)), int(np.ceil(high + room) - np.floor(low - room))
+    ab = corners @ axes.T
+    first = np.floor(ab.min(0)) - [span, 0]
+    columns, rows = (int(n) for n in np.ceil(ab.max(0)) - first + 1)
+    corner = first @ axes
+    pair = Straightened(np.zeros((0, 0)), np.zeros((0, 0)), corner, axes, lowest, q0)
+    left = _left(base, pair, (rows, columns))
+    right = _right(base, other, pair, (rows, columns))
+    return dataclasses.replace(pair, left=left, right=right), span
+
+
+def _left(base, pair, shape):
+    r, c = np.indices(shape).reshape(2, -1)
+    return _sampled(base, pair.base_places(np.stack([c, r], 1).astype(float))).reshape(shape)
+
+
+def _right(base, other, pair, shape):
+    """Column x of the right image is where the pixel x − lowest of the base looks at q0."""
+    rows, columns = shape
+    r, c = (np.linspace(0, n - 1, NODES) for n in shape)
+    nodes = np.stack(np.meshgrid(c - pair.lowest, r), -1).reshape(-1, 2)
+    uv = pair.base_places(nodes)
+    places = other.project(base.points(uv, np.full(len(uv), pair.q0))).reshape(NODES, NODES, 2)
+    places = np.where(np.isfinite(places), places, -1e4)
+    y, x = np.mgrid[0:rows, 0:columns]
+    at = [y * ((NODES - 1) / max(rows - 1, 1)), x * ((NODES - 1) / max(columns - 1, 1))]
+    fine = [ndimage.map_coordinates(places[..., k], at, order=3, mode="nearest") for k in (0, 1)]
+    return _sampled(other, np.stack(fine, -1).reshape(-1, 2)).reshape(shape)
+
+
+def _sampled(view, uv):
+    """Grey values by cubic splines, NaN outside the image."""
+    inside = (uv > -0.5).all(1) & (uv < np.array(view.size) - 0.5).all(1)
+    if not inside.any():
+        return np.full(len(uv), np.nan, np.float32)
+    low = np.maximum(np.floor(uv[inside].min(0)).astype(int) - 16, 0)
+    high = np.ceil(uv[inside].max(0)).astype(int) + 17
+    piece = np.asarray(view.grey[low[1] : high[1], low[0] : high[0]], np.float32)
+    place = np.where(inside[:, None], uv - low, 0.0)
+    grey = ndimage.map_coordinates(piece, [place[:, 1], place[:, 0]], output=np.float32,
+                                   order=3, mode="nearest")  # fmt: skip
+    return np.where(inside, grey, np.nan)

@@ -1,0 +1,184 @@
+"""Images of line scanners and of rational polynomials as oriented images.
+
+Their points X are metres in the neighbourhood of a place (λ₀, φ₀) on the ellipsoid,
+
+    X = (λ − λ₀)·N·cos φ₀,    Y = (φ − φ₀)·M,    Z = h,
+
+N and M the radii of curvature across and along the meridian: coordinates as smooth as the Earth, in
+which heights are heights. A scanner in a local frame keeps its own coordinates.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, earth_fixed, geodetic
+from jaxbundle.pushbroom.image import PushbroomImage
+from jaxbundle.pushbroom.locate import locate_point
+from jaxbundle.pushbroom.project import make_search, project_near, project_points
+from jaxbundle.pushbroom.rpc import Rpc, locate, project
+from jaxbundle.pushbroom.surfaces import Height, Plane
+from jaxbundle.surface.views import in_lanes
+
+
+class Neighbourhood(eqx.Module):
+    """The place (λ₀, φ₀), radians, and metres per radian of longitude and latitude there."""
+
+    longitude: Float[Array, ""]
+    latitude: Float[Array, ""]
+    scale: Float[Array, "2"]
+
+    def geographic(self, X):
+        """(λ, φ, h) of a point."""
+        return self.longitude + X[0] / self.scale[0], self.latitude + X[1] / self.scale[1], X[2]
+
+    def local(self, longitude, latitude, h):
+        """The point of (λ, φ, h); longitudes may differ by turns."""
+        east = longitude - self.longitude
+        east = east - 2 * jnp.pi * jnp.round(east / (2 * jnp.pi))
+        return jnp.stack([self.scale[0] * east, self.scale[1] * (latitude - self.latitude), h])
+
+
+def neighbourhood(longitude: float, latitude: float, earth: Ellipsoid = WGS84) -> Neighbourhood:
+    """Around a place given in radians."""
+    a, c = float(earth.a), float(earth.c)
+    e2 = 1 - (c / a) ** 2
+    w = np.sqrt(1 - e2 * np.sin(latitude) ** 2)
+    scale = a / w * np.cos(latitude), a * (1 - e2) / w**3
+    return Neighbourhood(jnp.asarray(longitude), jnp.asarray(latitude), jnp.asarray(scale))
+
+
+class _GroundView:
+    """What both kinds share: heights are the parameters of their lines of sight."""
+
+    shift = (0.0, 0.0)
+    """Added to projected places (u, v): the error of the orientation, as far as it was found."""
+    _point: ClassVar[Callable]
+
+    def __init__(self, name: str, grey, frame):
+        self.name, self.grey, self._frame = name, grey, frame
+        self.size = (grey.shape[1], grey.shape[0])
+
+    def points(self, uv, q):
+        return in_lanes(self._point, self._frame, uv - np.array(self.shift), q)
+
+    def parameter(self, X):
+        return X[:, 2]
+
+    def bounds(self, uv, low, high):
+        return np.broadcast_to(np.array([low, high], float), (len(uv), 2)).copy()
+
+
+class RpcView(_GroundView):
+    """An image with rational polynomials."""
+
+    def __init__(self, name: str, grey, rpc: Rpc, around: Neighbourhood):
+        super().__init__(name, grey, (rpc, around))
+        self.rpc, self.around = rpc, around
+
+    _point = staticmethod(lambda frame, uv, q: _rpc_points(frame, uv, q))
+
+    def project(self, X):
+        return in_lanes(_rpc_project, self._frame, X) + np.array(self.shift)
+
+    def derivative(self, X):
+        return in_lanes(_rpc_derivative, self._frame, X)
+
+    def range(self) -> tuple[float, float]:
+        """The heights that the polynomials were made for."""
+        middle, half = float(self.rpc.height_offset), abs(float(self.rpc.height_scale))
+        return middle - half, middle + half
+
+
+class ScannerView(_GroundView):
+    """An image of a line scanner; `around` is None in a local frame."""
+
+    def __init__(self, name: str, grey, image: PushbroomImage, earth: Ellipsoid | None,
+                 around: Neighbourhood | None):  # fmt: skip
+        super().__init__(name, grey, _Scanner(image, around, earth))
+        self.image, self.search = image, make_search(image, earth)
+
+    _point = staticmethod(lambda frame, uv, q: _scanner_points(frame, uv, q))
+
+    def project(self, X):
+        return in_lanes(
+            lambda frame, X: self._places(_ground(frame, X)), self._frame, X
+        ) + np.array(self.shift)
+
+    def _places(self, X):
+        found = project_points(self.image, self.search, X, margin=200.0)
+        return np.stack([np.asarray(found.pixel[0]), np.asarray(found.line[0])], 1)
+
+    def derivative(self, X):
+        places = np.nan_to_num(self.project(X) - np.array(self.shift))
+        return in_lanes(_scanner_derivative, self._frame, X, places)
+
+
+class _Scanner(eqx.Module):
+    image: PushbroomImage
+    around: Neighbourhood | None
+    earth: Ellipsoid | None = eqx.field(static=True)
+
+    def fixed(self, X):
+        """A point in the coordinates of the trajectory."""
+        if self.around is None or self.earth is None:
+            return X
+        return jnp.stack(earth_fixed(self.earth, self.around.geographic(X)))
+
+
+@eqx.filter_jit
+def _rpc_points(frame, uv, q):
+    rpc, around = frame
+
+    def point(uv, h):
+        longitude, latitude, _ = locate(rpc, uv[1], uv[0], h)
+        return around.local(longitude, latitude, h)
+
+    return jax.vmap(point)(uv, q)
+
+
+def _rpc_pixel(frame, X):
+    rpc, around = frame
+    line, sample = project(rpc, *around.geographic(X))
+    return jnp.stack([sample, line])
+
+
+@eqx.filter_jit
+def _rpc_project(frame, X):
+    return jax.vmap(partial(_rpc_pixel, frame))(X)
+
+
+@eqx.filter_jit
+def _rpc_derivative(frame, X):
+    return jax.vmap(jax.jacfwd(partial(_rpc_pixel, frame)))(X)
+
+
+@eqx.filter_jit
+def _scanner_points(frame, uv, q):
+    def point(uv, h):
+        if frame.around is None or frame.earth is None:
+            return jnp.stack(locate_point(frame.image, Plane(h), uv[1], uv[0]))
+        X = locate_point(frame.image, Height(h, frame.earth), uv[1], uv[0])
+        return frame.around.local(*geodetic(frame.earth, X))
+
+    return jax.vmap(point)(uv, q)
+
+
+@eqx.filter_jit
+def _ground(frame, X):
+    return jax.vmap(frame.fixed)(X).T
+
+
+@eqx.filter_jit
+def _scanner_derivative(frame, X, places):
+    def pixel(X, place):
+        line, u = project_near(frame.image, frame.fixed(X), place[1], place[0], frame.earth)
+        return jnp.stack([u, line])
+
+    return jax.vmap(jax.jacfwd(pixel))(X, places)

@@ -1,0 +1,106 @@
+"""The relative error of the orientation of two scanner or RPC images, across their epipolar lines.
+
+Coefficients of two images that were taken minutes apart, or years, miss each other by pixels. What
+of it lies along the epipolar lines is a height, which nothing but control tells; what lies across
+them would keep the images from being matched, and is found from the images themselves: at some
+hundred corners the best correlation along segments is sought at several distances beside them, then
+least squares matching gives the rest.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxbundle.measure.least_squares_matching import MatchingStatus
+from jaxbundle.surface.bounds import Bounds
+from jaxbundle.surface.correlation import Pyramid, make_pyramid
+from jaxbundle.surface.guide import search
+from jaxbundle.surface.interest import interest_points
+from jaxbundle.surface.refinement import refine
+from jaxbundle.surface.segments import positions, visible_range, windows
+
+POINTS = 400
+REACH = 16
+"""Pixels across the epipolar lines that are tried."""
+HALF = 6
+LEVELS = 2
+WORTH_SAYING = 0.1
+"""Pixels that are said."""
+ENOUGH = 12
+"""Matches from which the rest is taken."""
+GOOD = 0.6
+LIKELY = 0.75
+"""ρ of a match that counts."""
+
+
+def align(
+    base, other, pyramids: tuple[Pyramid, Pyramid], bounds: Bounds
+) -> float | None:
+    """Shift the projections of the other image; by how many pixels, None where too little is
+    alike."""
+    grey = base.grey
+    spread = max(8, int(np.sqrt(grey.size / POINTS)))
+    uv = interest_points(grey, "corners", spread)
+    q = visible_range(base, other, uv, bounds(uv), margin=2 * HALF)
+    seen = np.isfinite(q).all(1) & (q[:, 0] < q[:, 1])
+    uv, q = uv[seen][: 2 * POINTS], q[seen][: 2 * POINTS]
+    if len(uv) < ENOUGH:
+        return None
+    shape = windows(base, other, base.points(uv, q.mean(1)))
+    along = np.median(shape.other_along[shape.usable], axis=0)
+    across = np.array([-along[1], along[0]]) / np.linalg.norm(along)
+    first = np.array(other.shift, float)
+    levels = len(pyramids[0].levels) - 1
+    best, step = 0.0, 2.0**levels
+    tries = np.arange(-REACH, REACH + 1, step)
+    for level in range(levels, -1, -1):
+        scores = []
+        for t in tries:
+            other.shift = tuple(first + t * across)
+            _, rho, _ = search(base, [other], (pyramids[0], [pyramids[1]]), uv, q, None, level,
+                               HALF)  # fmt: skip
+            scores.append(float(np.mean(np.nan_to_num(rho) > LIKELY)))
+        best = float(tries[int(np.argmax(scores))])
+        step /= 2
+        tries = best + step * np.arange(-2, 3)
+    other.shift = tuple(first + best * across)
+    for _ in range(2):
+        rest = _rest(base, other, pyramids, uv, q, across)
+        if rest is None:
+            other.shift = tuple(first)
+            return None
+        best += rest
+        other.shift = tuple(first + best * across)
+    return best
+
+
+def _rest(base, other, pyramids, uv, q, across) -> float | None:
+    """The median distance of matches from their epipolar lines."""
+    found, rho, _ = search(base, [other], (pyramids[0], [pyramids[1]]), uv, q, None, 0, HALF)
+    with np.errstate(invalid="ignore"):
+        good = np.isfinite(found) & (rho > GOOD)
+    uv, found = uv[good], found[good]
+    if len(uv) < ENOUGH:
+        return None
+    shape = windows(base, other, base.points(uv, found))
+    start = positions(base, other, uv, found[:, None])[:, 0]
+    match = refine(base, other, uv, start, shape.A, HALF)
+    good = (match.status == int(MatchingStatus.CONVERGED)) & (match.rho > GOOD)
+    if good.sum() < ENOUGH:
+        return None
+    return float(np.median((match.uv - start)[good] @ across))
+
+
+def align_all(views: Sequence, bounds: Sequence[Bounds]) -> tuple[str, ...]:
+    """Align every image with the first; what was done, in words."""
+    said = []
+    pyramids = [make_pyramid(view.grey, LEVELS) for view in views]
+    for k in range(1, len(views)):
+        found = align(views[0], views[k], (pyramids[0], pyramids[k]), bounds[0])
+        pair = f"{views[k].name} and {views[0].name}"
+        if found is None:
+            said.append(f"{pair}: too little is alike to align them across the epipolar lines")
+        elif abs(found) > WORTH_SAYING:
+            said.append(f"{pair}: {found:.3g} pixels between them across the epipolar lines, taken "
+                        "off the second")  # fmt: skip
+    return tuple(said)

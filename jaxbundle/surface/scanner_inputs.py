@@ -1,0 +1,203 @@
+"""Scanner and RPC images from files, in one neighbourhood; and their coordinates in a map system.
+
+An image is given by a raster with RPC tags, by a raster with coefficients beside it
+(`NAME_RPC.TXT`, `NAME.RPB`, `NAME.geom`, `NAME.xml`), by the file of the coefficients, or by a
+scanner file; the raster of the last two has their name and stands beside them, or in the folder of
+--photos.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.ellipsoid import WGS84, geodetic
+from jaxbundle.io.rasters.reading import open_plain, rasterio, unreadable
+from jaxbundle.io.scanner.read import read_scanner
+from jaxbundle.io.scanner.rpc import RASTERS, read_rpc
+from jaxbundle.pushbroom.image import PushbroomImage
+from jaxbundle.pushbroom.locate import locate_point
+from jaxbundle.pushbroom.rpc import Rpc
+from jaxbundle.pushbroom.surfaces import Ground
+from jaxbundle.surface.cloud import Cloud
+from jaxbundle.surface.ground import Neighbourhood, RpcView, ScannerView, neighbourhood
+
+IMAGES = (*RASTERS, ".jp2", ".png", ".jpg")
+BESIDE = ("_RPC.TXT", "_rpc.txt", "_RPC.txt", ".RPB", ".rpb", ".geom", ".xml", ".XML")
+ENDINGS = ("_rpc", "_RPC")
+BANDS = (0.3, 0.59, 0.11)
+"""Weights of red, green and blue."""
+
+View = RpcView | ScannerView
+
+
+def read_ground_views(
+    files: Sequence[Path], folder: Path | None
+) -> tuple[tuple[View, ...], Neighbourhood | None]:
+    """The oriented images and the place their coordinates refer to, None in a local frame.
+
+    **Raises:** `InputError` for a file that is neither, without its raster, or of another size.
+    """
+    found = [_orientation(path, folder) for path in files]
+    earths = [None if isinstance(o, Rpc) else o[1] for o, _ in found]
+    local = [not isinstance(o, Rpc) and o[1] is None for o, _ in found]
+    if any(local) and not all(local):
+        raise InputError(
+            f"{files[local.index(True)]}: is in a local frame, the other images are on the Earth"
+        )
+    around = None if all(local) else _middle(found[0][0])
+    names = [raster.name for _, raster in found]
+    if len({*names}) < len(names):
+        names = [str(raster) for _, raster in found]
+    views = []
+    for name, (orientation, raster), earth in zip(names, found, earths):
+        grey = read_grey(raster)
+        if isinstance(orientation, Rpc):
+            assert around is not None, "an RPC is no local frame"
+            views.append(RpcView(name, grey, orientation, around))
+            continue
+        image = orientation[0]
+        if (image.pixels, image.lines) != (grey.shape[1], grey.shape[0]):
+            raise InputError(
+                f"{raster}: {grey.shape[1]} × {grey.shape[0]} pixels, the scanner file has "
+                f"{image.pixels} × {image.lines}"
+            )
+        views.append(ScannerView(name, grey, image, earth, around))
+    return tuple(views), around
+
+
+def is_ground_image(path: Path) -> bool:
+    """Whether a file may be a scanner image or one with rational polynomials."""
+    name = path.name
+    if path.suffix.lower() in IMAGES or any(name.endswith(end) for end in BESIDE):
+        return True
+    if path.suffix.lower() in (".json", ".dim", ".imd"):
+        return True
+    return path.suffix == ".toml" and path.is_file() and b"[scanner]" in path.read_bytes()
+
+
+def read_grey(path: Path) -> np.ndarray:
+    """The grey values of a raster, float32; of colours their luminance. No-data is 0.
+
+    **Raises:** `InputError` if it cannot be read.
+    """
+    package = rasterio()
+    try:
+        with open_plain(path) as source:
+            bands = source.read(range(1, min(source.count, 3) + 1), masked=True)
+    except package.errors.RasterioError as error:
+        raise unreadable(path, error) from None
+    values = np.ma.filled(bands.astype(np.float32), 0.0)
+    values = np.nan_to_num(values)
+    return values[0] if len(values) < 3 else np.tensordot(
+        np.array(BANDS, np.float32), values, 1
+    )
+
+
+def system_of(around: Neighbourhood, crs: str | None) -> str:
+    """A coordinate system for maps: the one given, or the zone of UTM.
+
+    **Raises:** `InputError` for one that pyproj does not know."""
+    if crs is not None:
+        return crs
+    longitude, latitude = (np.degrees(float(a)) for a in (around.longitude, around.latitude))
+    zone = int((longitude + 180) // 6) % 60 + 1
+    return f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
+
+
+def to_map(
+    cloud: Cloud, around: Neighbourhood, crs: str
+) -> Cloud:
+    """The cloud in a map system, its covariance turned and scaled with it.
+
+    **Raises:** `InputError` for a system that pyproj does not know."""
+    x, y = map_coordinates(cloud.X, around, crs)
+    step = 1.0
+    columns = []
+    for axis in range(2):
+        moved = cloud.X + step * np.eye(3)[axis]
+        dx, dy = map_coordinates(moved, around, crs)
+        columns.append(np.stack([dx - x, dy - y, np.zeros_like(x)], 1) / step)
+    J = np.stack([*columns, np.broadcast_to([0.0, 0, 1], cloud.X.shape)], 2)
+    X = np.stack([x, y, cloud.X[:, 2]], 1)
+    covariance = J @ cloud.covariance @ np.swapaxes(J, 1, 2)
+    return Cloud(X, covariance, cloud.rays, cloud.image, cloud.uv, cloud.images, cloud.colour, crs)
+
+
+def map_coordinates(
+    X: Float[np.ndarray, "n 3"], around: Neighbourhood, crs: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """x and y of points in a map system."""
+    degrees = np.degrees(np.stack([np.asarray(a) for a in around.geographic(X.T)[:2]]))
+    x, y = _transformer(crs).transform(*degrees)
+    return np.asarray(x), np.asarray(y)
+
+
+def from_map(x, y, h, around: Neighbourhood, crs: str) -> Float[np.ndarray, "n 3"]:
+    """Points of places in a map system."""
+    degrees = _transformer(crs).transform(x, y, direction="INVERSE")
+    east, north = np.radians(degrees)
+    return np.asarray(around.local(east, north, np.asarray(h, float))).T
+
+
+def _transformer(crs):
+    try:
+        import pyproj
+        import pyproj.exceptions
+    except ImportError:
+        raise InputError("coordinate systems need pyproj: pip install 'jaxbundle[geo]'") from None
+    try:
+        return pyproj.Transformer.from_crs("EPSG:4326", crs, always_xy=True)
+    except pyproj.exceptions.CRSError as error:
+        raise InputError(f"--crs {crs!r}: {' '.join(str(error).split())}") from None
+
+
+def _orientation(path: Path, folder: Path | None):
+    """The polynomials, or the scanner's image and Earth; and the raster."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    if path.suffix.lower() in IMAGES:
+        beside = [path.with_name(path.stem + end) for end in BESIDE]
+        source = next((p for p in beside if p.is_file()), path)
+        if source is path and path.suffix.lower() not in RASTERS:
+            raise InputError(f"{path}: no coefficients beside it: {path.stem}_RPC.TXT is expected")
+        return read_rpc(source), path
+    scanner = path.suffix.lower() in (".json", ".dim", ".imd") or (
+        path.suffix == ".toml"
+    )
+    if path.suffix.lower() == ".xml":
+        try:
+            return read_rpc(path), _raster_of(path, folder)
+        except InputError:
+            scanner = True
+    if scanner:
+        file = read_scanner(path)
+        return (file.image, file.earth), _raster_of(path, folder)
+    return read_rpc(path), _raster_of(path, folder)
+
+
+def _raster_of(path: Path, folder: Path | None) -> Path:
+    stem = path.stem
+    for end in ENDINGS:
+        stem = stem.removesuffix(end)
+    places = [path.parent, *([folder] if folder else [])]
+    for place in places:
+        for suffix in (*IMAGES, *(s.upper() for s in IMAGES)):
+            if (place / (stem + suffix)).is_file():
+                return place / (stem + suffix)
+    where = f"beside it or in {folder}" if folder else "beside it; --photos names its folder"
+    raise InputError(f"{path}: no raster {stem}.tif {where}")
+
+
+def _middle(orientation) -> Neighbourhood:
+    """Of the first image."""
+    if isinstance(orientation, Rpc):
+        return neighbourhood(np.radians(float(orientation.longitude_offset)),
+                             np.radians(float(orientation.latitude_offset)))  # fmt: skip
+    image: PushbroomImage = orientation[0]
+    earth = orientation[1] or WGS84
+    X = locate_point(image, Ground(earth), (image.lines - 1) / 2, (image.pixels - 1) / 2)
+    longitude, latitude, _ = geodetic(earth, X)
+    return neighbourhood(float(longitude), float(latitude), earth)
