@@ -3,8 +3,9 @@
 Compiled programs are kept in .cache/jax, so that test processes, the command line and notebooks
 share them; a process drops its own when it holds more than `MOST` after a test, or `MOST_AT_END`
 after a file, whose programs serve few others: a worker then stays under 2 GB, and far from the
-65 530 memory maps that Linux allows a process. Programs are compiled with little optimisation: here
-compiling takes longer than running.
+65 530 memory maps that Linux allows a process. Programs are compiled with little optimisation, and
+in one piece (pieces for several threads cost an eighth more): here compiling takes longer than
+running.
 """
 
 import ctypes
@@ -21,7 +22,9 @@ EXAMPLES = ROOT / "examples"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.05")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+os.environ.setdefault(
+    "XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
+)
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
