@@ -14,6 +14,7 @@ Source: Rao (1948), Proceedings of the Cambridge Philosophical Society 44, 50-57
 """
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +22,6 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.cameras import get_model, is_own
-from jaxbundle.leastsquares.spaces import Pose, PoseValue
 from jaxbundle.network.kinds import ImagePoint
 
 AFFINE = ("b1", "b2")
@@ -66,15 +66,8 @@ def left_out(adjustment) -> LeftOut | None:
     if not names or given.pixel_size is None or not adjustment.sigma0 > 0:
         return None
     columns = tuple(model.parameters.index(name) for name in names)
-    problem, solution = adjustment.problem, adjustment.inspection.solution
-    B, v = _slopes(problem, model, columns, adjustment.values)
-
-    def missed(tables):
-        """JᵀB as functions of the unknowns: B·v(unknowns), B held."""
-        values = problem.layout.values(tables)
-        return jnp.asarray(B) @ _residuals(problem, model, values, jnp.zeros(0), ()).ravel()
-
-    S = B @ B.T - solution.propagate(missed)
+    B, v, rows = _score(adjustment.problem, columns, adjustment.values)
+    S = B @ B.T - adjustment.inspection.solution.propagate_rows(rows)
     cofactor = np.linalg.inv(S)
     b = -cofactor @ (B @ v)
     sigma = adjustment.sigma0 * np.sqrt(np.diagonal(cofactor))
@@ -84,27 +77,44 @@ def left_out(adjustment) -> LeftOut | None:
     return LeftOut(names, b, sigma, float(np.abs(b) @ reach / given.pixel_size[0]))
 
 
-def _slopes(problem, model, columns, values):
-    """B [k, n] and v [n]."""
-    of = lambda b: _residuals(problem, model, values, b, columns).ravel()
-    B, v = jax.jit(lambda b: (jax.jacfwd(of)(b), of(b)))(np.zeros(len(columns)))
-    return np.asarray(B).T, np.asarray(v)
+def _score(problem, columns, values):
+    """B [k, 2n], v [2n] and JᵀB: by table [k, rows, width]."""
+    camera = problem.network.cameras[0].model
+    of, declared = ImagePoint(camera, problem.network.residuals), problem.system.declared
+    (name,) = (table.name for table in problem.layout.cameras)
+    tables = problem.layout.tables(values)
+    at = {"image": problem.image, name: problem.camera, "point": problem.point}
+    touched = tuple(jax.tree.map(lambda x, i=i: np.asarray(x)[i], tables[t]) for t, i in at.items())
+    spaces = tuple(declared.spaces[t] for t in at)
+    data = problem.data
+    v, J = _linearise(of, spaces, columns, touched, data.image_xy, data.image_weight)
+    *parts, B = np.split(np.asarray(J), np.cumsum([s.width for s in spaces]), 2)
+    rows = {
+        t.name: np.zeros((len(columns), t.rows, t.space.width)) for t in problem.system.tables
+    }
+    for (t, i), part in zip(at.items(), parts):
+        np.add.at(rows[t].swapaxes(0, 1), i, np.einsum("nrw,nrk->nkw", part, B))
+    return B.reshape(-1, len(columns)).T, np.asarray(v).ravel(), rows
 
 
-def _residuals(problem, model, values, b, columns):
-    """v/σ of all image points of the one camera, some of its parameters changed by b."""
-    p = values.camera[0, : len(model.parameters)]
-    p = p.at[jnp.array(columns, int)].add(b)
-    of = ImagePoint(problem.network.cameras[0].model, problem.network.residuals)
-    space = Pose()
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _linearise(of, spaces, columns, touched, xy, weight):
+    """v/σ [n, 2] of all image points and their derivatives [n, 2, directions]: by the changes of
+    pose, camera and point, and by b."""
+    ends = np.cumsum([s.width for s in spaces])
 
-    def one(position, rotation, point, xy, weight):
-        pose = space.prepare(PoseValue(position, rotation))
-        v = of(pose, tuple(p), tuple(point), tuple(xy))
-        return jnp.where(weight > 0, weight * jnp.stack(v), 0.0)
+    def of_one(touched, xy, weight):
+        def v(change):
+            *changes, b = jnp.split(change, ends)
+            pose, interior, ray = (
+                s.moved(s.prepare(x), tuple(d)) for s, x, d in zip(spaces, touched, changes)
+            )
+            p = dict(enumerate(interior)) | {c: interior[c] + b[k] for k, c in enumerate(columns)}
+            residual = jnp.stack(of(pose, tuple(p.values()), tuple(ray), tuple(xy)))
+            residual = jnp.where(weight > 0, weight * residual, 0.0)
+            return residual, residual
 
-    i, data = problem.image, problem.data
-    return jax.vmap(one)(
-        values.position[i], values.rotation[i], values.point[problem.point], data.image_xy,
-        data.image_weight,
-    )  # fmt: skip
+        J, found = jax.jacfwd(v, has_aux=True)(jnp.zeros(ends[-1] + len(columns)))
+        return found, J
+
+    return jax.vmap(of_one)(touched, xy, weight)

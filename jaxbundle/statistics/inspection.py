@@ -4,13 +4,14 @@ import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.network.arrays import Values
-from jaxbundle.network.declare import Rows
+from jaxbundle.network.declare import Rows, Tables
 
 
 class OfNetwork(NamedTuple):
@@ -20,6 +21,16 @@ class OfNetwork(NamedTuple):
     redundancy: Rows
     w: Rows
     own: Rows
+
+
+class _OfTables(eqx.Module):
+    """A function of a network's values as one of the engine's tables."""
+
+    function: Callable[[Values], Array]
+    values: Callable[[Tables], Values]
+
+    def __call__(self, tables: Tables) -> Array:
+        return self.function(self.values(tables))
 
 
 class Inspection:
@@ -76,9 +87,9 @@ class Inspection:
         return OfNetwork(*(self._rows(getattr(found, name)) for name in OfNetwork._fields))
 
     def propagate(self, function: Callable[[Values], Array]) -> Float[np.ndarray, "n n"]:
-        """The cofactors of any differentiable function (`Values` → [n]) of the unknowns."""
-        layout = self.problem.layout
-        return self.solution.propagate(lambda tables: function(layout.values(tables)))
+        """The cofactors of any differentiable function (`Values` → [n]) of the unknowns; it is
+        compiled, once for the same function (an `equinox.Partial`: of whatever arrays)."""
+        return self.solution.propagate(_OfTables(function, self.problem.layout.values))
 
     def _rows(self, by_set) -> Rows:
         return self.problem.layout.rows(by_set, self.problem.data)

@@ -18,6 +18,7 @@ frames); of the second: the implied rotation of a difference of two calibrations
 
 from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -86,23 +87,25 @@ def images_through_scene(
     **Arguments:** `column`: the camera among those of the network; `views`: indices of its images;
     `distance` from the projection centre in the object unit; infinity as well.
     """
-    number, near = len(model.parameters), 1.0 / distance
     camera, X0 = np.asarray(estimate.camera), np.asarray(estimate.position)[views]
-    matrices = jax.vmap(matrix_from_quaternion)
     directions = _directions(
-        model, camera[column, :number], np.asarray(estimate.rotation)[views], np.asarray(xy, float)
-    )
+        model, camera[column, : len(model.parameters)], np.asarray(estimate.rotation)[views],
+        np.asarray(xy, float),
+    )  # fmt: skip
+    near = np.asarray(1.0 / distance)
+    return eqx.Partial(_images_through_scene, model, column, views, X0, directions, near)
 
-    def images(values: Values):
-        q = tuple(values.camera[column, :number])
-        change = near * (X0 - values.position[views])
-        turned = jnp.einsum(
-            "vij,vnj->vni", matrices(values.rotation[views]), directions + change[:, None]
-        )
-        image = jax.vmap(jax.vmap(lambda ray: jnp.stack(project(model, q, *ray))))(turned)
-        return jnp.mean(image, 0).ravel()
 
-    return images
+def _images_through_scene(model, column, views, X0, directions, near, values: Values):
+    """The images [2n] of the directions [views, n, 3] from X0 to points at the distance 1/near."""
+    q = tuple(values.camera[column, : len(model.parameters)])
+    change = near * (X0 - values.position[views])
+    turned = jnp.einsum(
+        "vij,vnj->vni", jax.vmap(matrix_from_quaternion)(values.rotation[views]),
+        directions + change[:, None],
+    )  # fmt: skip
+    image = jax.vmap(jax.vmap(lambda ray: jnp.stack(project(model, q, *ray))))(turned)
+    return jnp.mean(image, 0).ravel()
 
 
 @partial(jax.jit, static_argnums=0)
