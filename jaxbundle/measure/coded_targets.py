@@ -1,0 +1,181 @@
+"""Coded targets: points that tell their own names.
+
+| kind | points | names |
+|---|---|---|
+| `aruco:DICTIONARY` | the four corners of each marker of an OpenCV dictionary (`DICT_4X4_50`) | number-corner |
+| `apriltag:FAMILY` | the same of AprilTags, `36h11` if no family is given | number-corner |
+| `aprilgrid` | the same of boards of tags 36h11 with a border of two bits | number-corner |
+| `charuco:COLUMNSxROWS` | corners of the squares of a ChArUco board | row-column |
+| `ring12`, `ring14` | centres of ring-coded targets of 12 or 14 bits | the code |
+
+Corners 1 to 4 go clockwise from the upper left one of the marker. A ring-coded target is a light
+disc of radius r on dark ground, and about it a ring from 2·r to 3·r of as many sectors as bits, light
+for 1; the code is the smallest number that its bits give, whatever sector is the first (Schneider
+and Sinnreich, 1992). Its centre is that of the ellipse of the disc (`targets.py`).
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from jaxbundle.errors import InputError
+from jaxbundle.measure.boards import Board
+from jaxbundle.measure.corners import find_board
+from jaxbundle.measure.targets import centre_by_ellipse
+from jaxbundle.network.columns import did_you_mean
+from jaxbundle.photographs.opencv import need_opencv
+
+KINDS = ("aruco", "apriltag", "aprilgrid", "charuco", "ring12", "ring14")
+CORNER = 0.1
+"""σ of a corner, pixels."""
+WITHIN = 3
+"""Half a window in which a corner is refined, pixels."""
+SAMPLES = 20
+"""Places sampled in every sector of a ring."""
+RING = 2.5
+"""Radius in the middle of the ring, in radii of the disc."""
+FEWEST_PIXELS, ROUND = 20, 0.12
+"""Pixels of a disc, and by which part its area may differ from that of its ellipse."""
+CLEAR = 0.25
+"""Part of the contrast by which a sector must be lighter or darker than the middle."""
+
+
+@dataclasses.dataclass(frozen=True)
+class NamedPoints:
+    """Points found in a photograph: names, pixels, σ in pixels."""
+
+    names: tuple[str, ...]
+    xy: Float[np.ndarray, "n 2"]
+    sigma: Float[np.ndarray, "n 2"]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def find_coded_targets(grey: UInt8[np.ndarray, "rows columns"], kind: str) -> NamedPoints:
+    """The coded targets of a photograph; of a name that is there twice none.
+
+    **Raises:** `InputError` for an unknown kind.
+    """
+    name, _, option = kind.partition(":")
+    if name not in KINDS:
+        raise InputError(f"coded targets {kind!r}{did_you_mean(name, KINDS)}")
+    if name in ("ring12", "ring14"):
+        return _unique(_rings(grey, int(name[4:])))
+    if name == "charuco":
+        return _unique(_charuco(grey, option))
+    return _unique(_markers(grey, *_dictionary(name, option)))
+
+
+def _dictionary(name, option):
+    """The name of OpenCV's dictionary, and the bits of the border."""
+    if name == "aruco":
+        return option or "DICT_4X4_50", 1
+    return f"DICT_APRILTAG_{(option or '36h11').upper()}", 2 if name == "aprilgrid" else 1
+
+
+def _unique(found) -> NamedPoints:
+    names = [name for name, *_ in found]
+    kept = [one for one in found if names.count(one[0]) == 1]
+    return NamedPoints(
+        tuple(name for name, *_ in kept),
+        np.array([xy for _, xy, _ in kept], float).reshape(-1, 2),
+        np.array([sigma for *_, sigma in kept], float).reshape(-1, 2),
+    )
+
+
+def _markers(grey, dictionary, border):
+    cv2 = need_opencv()
+    known = {name.upper(): name for name in dir(cv2.aruco) if name.startswith("DICT_")}
+    if dictionary.upper() not in known:
+        raise InputError(f"dictionary {dictionary!r}{did_you_mean(dictionary, known)}")
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.markerBorderBits = border
+    words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, known[dictionary.upper()]))
+    corners, ids, _ = cv2.aruco.ArucoDetector(words, parameters).detectMarkers(grey)
+    found = []
+    for four, id in zip(corners, [] if ids is None else ids.ravel().tolist()):
+        side = np.linalg.norm(np.diff(four[0], axis=0), axis=1).min()
+        half = int(np.clip(side / 8, 1, WITHIN))
+        stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 40, 0.005)
+        xy = cv2.cornerSubPix(grey, four[0].astype(np.float32).copy(), (half, half), (-1, -1), stop)
+        found += [(f"{id}-{k}", place, (CORNER, CORNER)) for k, place in enumerate(xy, 1)]
+    return found
+
+
+def _charuco(grey, option):
+    try:
+        columns, rows = (int(n) for n in option.lower().split(":")[0].split("x"))
+    except ValueError:
+        raise InputError(f"charuco:{option}: COLUMNSxROWS is expected, such as 8x6") from None
+    dictionary = option.split(":")[1] if ":" in option else "DICT_4X4_50"
+    board = Board(columns, rows, 1.0, "charuco", dictionary=dictionary)
+    xy = find_board(grey, board)
+    if xy is None:
+        return []
+    return [(id, place, (CORNER, CORNER)) for id, place in zip(board.ids, xy)
+            if np.isfinite(place).all()]  # fmt: skip
+
+
+def _rings(grey, bits):
+    found = []
+    for near in _discs(grey):
+        try:
+            target = centre_by_ellipse(grey, near)
+        except InputError:
+            continue
+        if target.bright and (code := _code(grey, target, bits)) is not None:
+            found.append((str(code), target.xy, target.sigma))
+    return found
+
+
+def _discs(grey):
+    """Middles of light blobs that fill the ellipse of their outline."""
+    cv2 = need_opencv()
+    side = max(15, (min(grey.shape) // 20) | 1)
+    light = cv2.adaptiveThreshold(
+        grey, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY, side, -8
+    )
+    outlines, _ = cv2.findContours(light, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    for outline in outlines:
+        area = cv2.contourArea(outline)
+        if area < FEWEST_PIXELS or len(outline) < 6:
+            continue
+        middle, axes, _ = cv2.fitEllipse(outline)
+        # the outline goes through the middles of the outermost pixels
+        full = np.pi / 4 * axes[0] * axes[1]
+        if min(axes) > 0.25 * max(axes) and abs(area / max(full, 1e-9) - 1) < ROUND:
+            yield np.array(middle)
+
+
+def _code(grey, target, bits):
+    """The code of the ring about a disc; None where there is none."""
+    from scipy.ndimage import map_coordinates
+
+    n = bits * SAMPLES
+    t = 2 * np.pi * np.arange(n) / n
+    c, s = np.cos(target.angle), np.sin(target.angle)
+    turn = np.array([[c, -s], [s, c]])
+    rim = target.axes * np.stack([np.cos(t), np.sin(t)], 1) @ turn.T
+    places = target.xy + np.array([1.5, RING])[:, None, None] * rim
+    u, v = places[..., 0], places[..., 1]
+    if u.min() < 0 or v.min() < 0 or u.max() > grey.shape[1] - 1 or v.max() > grey.shape[0] - 1:
+        return None
+    gap, ring = map_coordinates(grey.astype(float), [v, u], order=1)
+    dark, light = np.median(gap), np.median(gap) + target.contrast
+    value = (ring - dark) / (light - dark)
+    if np.any((gap - dark) > 0.5 * target.contrast):
+        return None
+    # the sectors begin where the changes are
+    by_start = np.stack([np.roll(value, -k).reshape(bits, SAMPLES) for k in range(SAMPLES)])
+    inner = by_start[:, :, SAMPLES // 5 : -(SAMPLES // 5)]
+    best = int(inner.var(2).sum(1).argmin())
+    means = inner[best].mean(1)
+    if np.any(np.abs(means - 0.5) < CLEAR):
+        return None
+    word = (means > 0.5).astype(int)
+    if not word.any() or word.all():
+        return None
+    weights = 1 << np.arange(bits - 1, -1, -1)
+    return min(int(np.roll(word, -k) @ weights) for k in range(bits))

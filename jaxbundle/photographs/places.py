@@ -1,0 +1,92 @@
+"""Positions in a map system, from what the files of photographs and control say.
+
+Latitude and longitude become coordinates of the zone of UTM in which most of them are. Heights stay
+what they are: EXIF means them above sea level, many drones write them above the ellipsoid or above
+the place of take-off, so that the kind of height is said with them, and not known for sure.
+"""
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.photographs.exif import Place
+
+SIGMA, SIGMA_HEIGHT = 3.0, 6.0
+"""σ of positions by satellites, metres, where none is given."""
+WORTH = 8.0
+"""Positions are used if they are spread over so many σ."""
+
+
+def utm_system(latitude: float, longitude: float) -> str:
+    """The EPSG code of the zone of UTM of a place."""
+    zone = int((longitude + 180) // 6) % 60 + 1
+    return f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
+
+
+def map_positions(
+    places: Sequence[Place | None],
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], str] | None:
+    """Positions (NaN: not known), their σ, and the system in words; None where they are too few, or
+    lie within their own σ."""
+    rows = [k for k, place in enumerate(places) if place is not None]
+    if len(rows) < 3:
+        return None
+    known = [place for place in places if place is not None]
+    latitude = np.array([p.latitude for p in known])
+    longitude = np.array([p.longitude for p in known])
+    system = utm_system(float(np.median(latitude)), float(np.median(longitude)))
+    x, y = _transformer("EPSG:4326", system, "positions").transform(longitude, latitude)
+    height = np.array([np.nan if p.height is None else p.height for p in known])
+    sigma = np.array([p.sigma or SIGMA for p in known])
+    spread = np.hypot(np.ptp(x), np.ptp(y))
+    if not spread > WORTH * np.median(sigma):
+        return None
+    X, s = np.full((len(places), 3), np.nan), np.full((len(places), 3), np.nan)
+    X[rows] = np.stack([x, y, height], 1)
+    s[rows] = np.stack([sigma, sigma, sigma * SIGMA_HEIGHT / SIGMA], 1)
+    s = np.where(np.isfinite(X), s, np.nan)
+    return X, s, f"{system}, heights as the files have them (EXIF: above sea level)"
+
+
+def to_map(
+    X: Float[np.ndarray, "n 3"], system: str, where: str
+) -> tuple[Float[np.ndarray, "n 3"], str]:
+    """Coordinates in a map system; degrees become those of UTM. Returns the system in words.
+
+    **Raises:** `InputError` for a system that pyproj does not know.
+    """
+    if not system:
+        return X, ""
+    zone = re.fullmatch(r"WGS84 +UTM +(\d+) *([NS])", system.strip(), re.IGNORECASE)
+    if zone:
+        return X, f"EPSG:{(32600 if zone[2].upper() == 'N' else 32700) + int(zone[1])}"
+    pyproj = _need_pyproj()
+    try:
+        known = pyproj.CRS.from_user_input("EPSG:4326" if system.upper() == "WGS84" else system)
+    except pyproj.exceptions.CRSError:
+        raise InputError(f"{where}: coordinate system {system!r} is not known") from None
+    if not known.is_geographic:
+        return X, known.to_string()
+    target = utm_system(float(np.median(X[:, 1])), float(np.median(X[:, 0])))
+    x, y = _transformer(known, target, where).transform(X[:, 0], X[:, 1])
+    return np.stack([x, y, X[:, 2]], 1), target
+
+
+def _transformer(source, target, where):
+    pyproj = _need_pyproj()
+    try:
+        return pyproj.Transformer.from_crs(source, target, always_xy=True)
+    except pyproj.exceptions.CRSError as error:
+        raise InputError(f"{where}: {error}") from None
+
+
+def _need_pyproj():
+    try:
+        import pyproj
+        import pyproj.exceptions
+    except ImportError:
+        raise InputError("map coordinates need pyproj: pip install 'jaxbundle[geo]'") from None
+    return pyproj

@@ -1,0 +1,127 @@
+"""Control points with their measurements in photographs.
+
+| file | rows |
+|---|---|
+| `gcp_list.txt` of OpenDroneMap | first line: the coordinate system; then X Y Z u v photograph [name] |
+| table with header | `id`, `X`, `Y`, `Z` [, `sX`, `sY`, `sZ`, `role`], `image`, `u`, `v` [, `suv`] |
+| table without measurements | as `jaxbundle adjust --control`: of coded targets, by their names |
+
+u, v are pixels, (0, 0) the centre of the upper left one. Coordinates in degrees become those of the
+zone of UTM they are in.
+"""
+
+import csv
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.networks.control import read_control
+from jaxbundle.io.text.csv_tables import read_text
+from jaxbundle.network.tables import Points, Source
+from jaxbundle.photographs.places import to_map
+
+MANUAL = 1.0
+"""σ of a measurement by hand, pixels, where none is given."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Control:
+    """Control points, and their places in photographs: rows of (photograph, point); `system` in
+    words."""
+
+    points: Points
+    seen: tuple[tuple[str, str], ...]
+    xy: Float[np.ndarray, "n 2"]
+    sigma: Float[np.ndarray, " n"]
+    system: str = ""
+
+
+def read_control_measurements(path: str | Path) -> Control:
+    """Control points, with their measurements where the file has them.
+
+    **Raises:** `InputError` naming file and line.
+    """
+    path = Path(path)
+    lines = read_text(path).splitlines()
+    rows = [(n, line) for n, line in enumerate(lines, 1)
+            if line.strip() and not line.lstrip().startswith("#")]  # fmt: skip
+    if not rows:
+        raise InputError(f"{path}: the file is empty")
+    head = [cell.strip().lower() for cell in rows[0][1].split(",")]
+    if {"image", "u", "v", "x", "y", "z", "id"} <= set(head):
+        return _table(path, head, rows[1:])
+    first = rows[0][1].strip()
+    if _is_system(first):
+        return _gcp_list(path, first, rows[1:])
+    points = read_control(path)
+    return Control(points, (), np.zeros((0, 2)), np.zeros(0))
+
+
+def _is_system(line: str) -> bool:
+    word = line.upper()
+    return word.startswith(("EPSG:", "WGS84", "+PROJ", "PROJCS", "GEOGCS"))
+
+
+def _gcp_list(path, system, rows) -> Control:
+    records = []
+    for number, line in rows:
+        cells = line.split()
+        try:
+            X, Y, Z, u, v = (float(cell) for cell in cells[:5])
+            image = cells[5]
+        except (ValueError, IndexError):
+            raise InputError(
+                f"{path}, line {number}: X Y Z u v photograph [name] are expected, not {line!r}"
+            ) from None
+        name = cells[6] if len(cells) > 6 else f"{cells[0]},{cells[1]}"
+        records.append((name, (X, Y, Z), image, (u, v), MANUAL, number))
+    return _collect(path, records, system, {})
+
+
+def _table(path, head, rows) -> Control:
+    records, sigmas = [], {}
+    for number, line in rows:
+        cells = dict(zip(head, next(csv.reader([line], skipinitialspace=True))))
+
+        def value(name, otherwise=math.nan, cells=cells, number=number):
+            text = (cells.get(name) or "").strip()
+            try:
+                return float(text) if text else otherwise
+            except ValueError:
+                raise InputError(
+                    f"{path}, line {number}: {name} is {text!r}; a number is expected"
+                ) from None
+
+        id, role = cells["id"].strip(), (cells.get("role") or "control").strip()
+        sigmas[id] = ([value(f"s{axis}") for axis in "xyz"], role)
+        place = (value("u"), value("v"))
+        records.append((id, tuple(value(axis) for axis in "xyz"), cells["image"].strip(), place,
+                        value("suv", MANUAL), number))  # fmt: skip
+    return _collect(path, records, "", sigmas)
+
+
+def _collect(path, records, system, sigmas) -> Control:
+    if not records:
+        raise InputError(f"{path}: no control points in it")
+    position, numbers = {}, {}
+    for name, X, _, place, sigma, number in records:
+        if not np.isfinite([*X, *place, sigma]).all() or sigma <= 0:
+            raise InputError(f"{path}, line {number}: coordinates and pixels must be finite")
+        if name in position and position[name] != X:
+            raise InputError(f"{path}, line {number}: point {name} has other coordinates before")
+        position[name] = X
+        numbers.setdefault(name, number)
+    X, said = to_map(np.array(list(position.values())), system, str(path))
+    sigma = np.array([sigmas.get(n, ([math.nan] * 3, ""))[0] for n in position])
+    roles = tuple(sigmas.get(n, ((), "control"))[1] for n in position)
+    source = Source(str(path), np.array(list(numbers.values())), "line")
+    return Control(
+        Points(tuple(position), roles, X, sigma, source),
+        tuple((image, name) for name, _, image, *_ in records),
+        np.array([place for *_, place, _, _ in records]),
+        np.array([sigma for *_, sigma, _ in records]), said,
+    )  # fmt: skip
