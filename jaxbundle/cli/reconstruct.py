@@ -18,6 +18,10 @@ from jaxbundle.io.results.result_json import result_text
 from jaxbundle.io.results.result_project import adjusted_network
 from jaxbundle.io.text.csv_tables import write_csv
 from jaxbundle.io.writing.folders import read_marker, replaced_folder
+from jaxbundle.measure.coded_targets import KINDS as TARGETS
+from jaxbundle.measure.coded_targets import check_kind
+from jaxbundle.reconstruction.control import read_control_measurements
+from jaxbundle.reconstruction.named import read_distances
 from jaxbundle.reconstruction.photographs import find_photographs
 from jaxbundle.reconstruction.reconstruct import Part, Reconstruction, reconstruct
 from jaxbundle.reconstruction.settings import Settings
@@ -35,6 +39,16 @@ def reconstruct_command(
     out: Annotated[Path, typer.Option(help="folder for report, JSON, tables, COLMAP model, PLY")],
     camera: Annotated[
         str | None, typer.Option(help="calibrated camera of all: FILE or FILE#ID; held as it is")
+    ] = None,
+    control: Annotated[
+        Path | None,
+        typer.Option(help="control points: gcp_list.txt, or a table, with or without measurements"),
+    ] = None,
+    targets: Annotated[
+        str | None, typer.Option(help=f"coded targets: {', '.join(TARGETS)}; :OPTION after it")
+    ] = None,
+    distances: Annotated[
+        Path | None, typer.Option(help="scale bars: table from,to,value,sigma of named points")
     ] = None,
     features: Annotated[str, typer.Option(help=", ".join(KINDS))] = "sift",
     pairs: Annotated[str, typer.Option(help=f"matched: {', '.join(WAYS)}")] = "auto",
@@ -55,15 +69,19 @@ def reconstruct_command(
         raise InputError(f"--pairs {pairs!r}: {', '.join(WAYS)}")
     if surface and not (len(photos) == 1 and photos[0].is_dir()):
         raise InputError("--surface: give one folder of photographs")
-    settings = Settings(detection=Detection(features), pairs=pairs, points=points)
+    if targets is not None:
+        check_kind(targets)
+    settings = Settings(Detection(features), pairs, points, targets=targets)
     given = None if camera is None else camera_given(camera)
-    files = [p for p in photos if p.is_file()]
+    known = None if control is None else read_control_measurements(control)
+    bars = () if distances is None else read_distances(distances)
+    files = [p for p in (*photos, control, distances) if p is not None and p.is_file()]
     check_writable(json, out, BY, FILES, files, force)
     found, _ = find_photographs(photos)
     check_writable(json, out, BY, FILES, [p.path for p in found], force)
     store = _store(out, force)
     with staging(quiet or json == "-") as tell:
-        result = reconstruct(photos, given, settings, store, tell)
+        result = reconstruct(photos, given, settings, store, tell, known, bars)
     _write(result, json, out, brief, plots, force)
     if not quiet and json != "-":
         print(result)

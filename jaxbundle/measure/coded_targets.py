@@ -2,16 +2,16 @@
 
 | kind | points | names |
 |---|---|---|
-| `aruco:DICTIONARY` | the four corners of each marker of an OpenCV dictionary (`DICT_4X4_50`) | number-corner |
+| `aruco:DICTIONARY` | the four corners of markers, of `DICT_4X4_50` if not given | number-corner |
 | `apriltag:FAMILY` | the same of AprilTags, `36h11` if no family is given | number-corner |
 | `aprilgrid` | the same of boards of tags 36h11 with a border of two bits | number-corner |
 | `charuco:COLUMNSxROWS` | corners of the squares of a ChArUco board | row-column |
 | `ring12`, `ring14` | centres of ring-coded targets of 12 or 14 bits | the code |
 
 Corners 1 to 4 go clockwise from the upper left one of the marker. A ring-coded target is a light
-disc of radius r on dark ground, and about it a ring from 2·r to 3·r of as many sectors as bits, light
-for 1; the code is the smallest number that its bits give, whatever sector is the first (Schneider
-and Sinnreich, 1992). Its centre is that of the ellipse of the disc (`targets.py`).
+disc of radius r on dark ground, and about it a ring from 2·r to 3·r of as many sectors as bits,
+light for 1; the code is the smallest number that its bits give, whatever sector is the first
+(Schneider and Sinnreich, 1992). Its centre is that of the ellipse of the disc (`targets.py`).
 """
 
 import dataclasses
@@ -33,12 +33,12 @@ WITHIN = 3
 """Half a window in which a corner is refined, pixels."""
 SAMPLES = 20
 """Places sampled in every sector of a ring."""
-RING = 2.5
-"""Radius in the middle of the ring, in radii of the disc."""
+GAP, RING, BEYOND = 1.5, 2.5, 3.4
+"""Radii in the middle of the dark gap, of the ring, and beyond it, in radii of the disc."""
 FEWEST_PIXELS, ROUND = 20, 0.12
 """Pixels of a disc, and by which part its area may differ from that of its ellipse."""
-CLEAR = 0.25
-"""Part of the contrast by which a sector must be lighter or darker than the middle."""
+CLEAR = 0.3
+"""Part of the contrast by which sectors and the gap may differ from light and dark."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,14 +58,22 @@ def find_coded_targets(grey: UInt8[np.ndarray, "rows columns"], kind: str) -> Na
 
     **Raises:** `InputError` for an unknown kind.
     """
+    check_kind(kind)
     name, _, option = kind.partition(":")
-    if name not in KINDS:
-        raise InputError(f"coded targets {kind!r}{did_you_mean(name, KINDS)}")
     if name in ("ring12", "ring14"):
         return _unique(_rings(grey, int(name[4:])))
     if name == "charuco":
         return _unique(_charuco(grey, option))
     return _unique(_markers(grey, *_dictionary(name, option)))
+
+
+def check_kind(kind: str) -> None:
+    """Refuse a kind that is none.
+
+    **Raises:** `InputError`."""
+    name = kind.partition(":")[0]
+    if name not in KINDS:
+        raise InputError(f"coded targets {kind!r}: {', '.join(KINDS)}{did_you_mean(name, KINDS)}")
 
 
 def _dictionary(name, option):
@@ -158,21 +166,21 @@ def _code(grey, target, bits):
     c, s = np.cos(target.angle), np.sin(target.angle)
     turn = np.array([[c, -s], [s, c]])
     rim = target.axes * np.stack([np.cos(t), np.sin(t)], 1) @ turn.T
-    places = target.xy + np.array([1.5, RING])[:, None, None] * rim
+    places = target.xy + np.array([GAP, RING, BEYOND])[:, None, None] * rim
     u, v = places[..., 0], places[..., 1]
     if u.min() < 0 or v.min() < 0 or u.max() > grey.shape[1] - 1 or v.max() > grey.shape[0] - 1:
         return None
-    gap, ring = map_coordinates(grey.astype(float), [v, u], order=1)
-    dark, light = np.median(gap), np.median(gap) + target.contrast
-    value = (ring - dark) / (light - dark)
-    if np.any((gap - dark) > 0.5 * target.contrast):
+    gap, ring, beyond = map_coordinates(grey.astype(float), [v, u], order=1)
+    dark = np.median(gap)
+    gap, value, beyond = ((a - dark) / target.contrast for a in (gap, ring, beyond))
+    if np.abs(gap).max() > CLEAR or beyond.mean() > 0.5:
         return None
     # the sectors begin where the changes are
     by_start = np.stack([np.roll(value, -k).reshape(bits, SAMPLES) for k in range(SAMPLES)])
     inner = by_start[:, :, SAMPLES // 5 : -(SAMPLES // 5)]
     best = int(inner.var(2).sum(1).argmin())
     means = inner[best].mean(1)
-    if np.any(np.abs(means - 0.5) < CLEAR):
+    if np.any(np.minimum(np.abs(means), np.abs(means - 1)) > CLEAR):
         return None
     word = (means > 0.5).astype(int)
     if not word.any() or word.all():

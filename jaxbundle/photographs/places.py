@@ -31,15 +31,15 @@ def map_positions(
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], str] | None:
     """Positions (NaN: not known), their σ, and the system in words; None where they are too few, or
     lie within their own σ."""
-    rows = [k for k, place in enumerate(places) if place is not None]
-    if len(rows) < 3:
+    there = [(k, p) for k, p in enumerate(places) if p is not None and p.height is not None]
+    if len(there) < 3:
         return None
-    known = [place for place in places if place is not None]
+    rows, known = [k for k, _ in there], [place for _, place in there]
     latitude = np.array([p.latitude for p in known])
     longitude = np.array([p.longitude for p in known])
     system = utm_system(float(np.median(latitude)), float(np.median(longitude)))
     x, y = _transformer("EPSG:4326", system, "positions").transform(longitude, latitude)
-    height = np.array([np.nan if p.height is None else p.height for p in known])
+    height = np.array([p.height for p in known], float)
     sigma = np.array([p.sigma or SIGMA for p in known])
     spread = np.hypot(np.ptp(x), np.ptp(y))
     if not spread > WORTH * np.median(sigma):
@@ -47,7 +47,6 @@ def map_positions(
     X, s = np.full((len(places), 3), np.nan), np.full((len(places), 3), np.nan)
     X[rows] = np.stack([x, y, height], 1)
     s[rows] = np.stack([sigma, sigma, sigma * SIGMA_HEIGHT / SIGMA], 1)
-    s = np.where(np.isfinite(X), s, np.nan)
     return X, s, f"{system}, heights as the files have them (EXIF: above sea level)"
 
 

@@ -2,8 +2,8 @@
 
 | file | rows |
 |---|---|
-| `gcp_list.txt` of OpenDroneMap | first line: the coordinate system; then X Y Z u v photograph [name] |
-| table with header | `id`, `X`, `Y`, `Z` [, `sX`, `sY`, `sZ`, `role`], `image`, `u`, `v` [, `suv`] |
+| `gcp_list.txt` of OpenDroneMap | first the coordinate system; then X Y Z u v photograph [name] |
+| table with header | `id`, `X`, `Y`, `Z`, `image`, `u`, `v` [, `sX`, `sY`, `sZ`, `role`, `suv`] |
 | table without measurements | as `jaxbundle adjust --control`: of coded targets, by their names |
 
 u, v are pixels, (0, 0) the centre of the upper left one. Coordinates in degrees become those of the

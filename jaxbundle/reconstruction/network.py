@@ -5,8 +5,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxbundle.io.networks.control import with_control
 from jaxbundle.network.build import make_network
-from jaxbundle.network.tables import Camera, Network
+from jaxbundle.network.tables import Camera, Network, Points
+from jaxbundle.reconstruction.named import Named
 from jaxbundle.reconstruction.photographs import Cameras, Photograph
 from jaxbundle.tiepoints.refinement import Measurements
 
@@ -14,30 +16,69 @@ PRIORS = {"fx": 0.2, "cx": 0.02, "cy": 0.02}
 """σ of start values, in parts of the principal distance, of the longer side: so wide that they
 count only where photographs determine nothing."""
 K1_PRIOR = 0.3
+UNTIED = 8
+"""Photographs of a camera from which on its pixels need not be square."""
+FEWEST_CONTROL = 3
+"""Control points that a part must show to be put into their frame."""
 BY_NUMBER = ((3, ("fx", "k1")), (4, ("cx", "cy")), (5, ("k2", "p1", "p2")))
 """What is free from how many photographs of a camera on."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Extra:
+    """What a network has besides tie points: named points, control among them, distances between
+    them; positions of the photographs with their σ."""
+
+    named: Named
+    control: Points | None = None
+    distances: tuple[dict, ...] = ()
+    positions: tuple[np.ndarray, np.ndarray] | None = None
+
+
 def tie_network(
-    photographs: Sequence[Photograph], cameras: Cameras, measured: Measurements, name: str
+    photographs: Sequence[Photograph],
+    cameras: Cameras,
+    measured: Measurements,
+    extra: Extra,
+    name: str,
 ) -> Network:
     """The network of the photographs that measurements name; image coordinates in pixels."""
     rows = np.unique(measured.image).tolist()
     of = [cameras.of[k] for k in rows]
     used = sorted(set(of))
     free = [_freed(cameras.cameras[c], of.count(c), cameras.given) for c in used]
-    tracks = np.unique(measured.track)
+    tracks = [track_name(t) for t in np.unique(measured.track).tolist()]
+    named = extra.named.take(np.isin(extra.named.image, rows))
+    points = [*tracks, *dict.fromkeys(named.name)]
     names = np.array([p.name for p in photographs], dtype=object)
-    return make_network(
-        free,
-        {"id": names[rows], "camera": [cameras.cameras[c].id for c in of]},
-        {"id": tracks.astype(str), "role": ["tie"] * len(tracks),
-         **{axis: np.full(len(tracks), np.nan) for axis in "XYZ"}},
-        {"image": names[measured.image], "point": measured.track.astype(str),
-         "x": measured.xy[:, 0], "y": measured.xy[:, 1],
-         "sx": measured.sigma[:, 0], "sy": measured.sigma[:, 1]},
-        datum="inner", image_unit="px", object_unit="unit", name=name,
+    images = {"id": names[rows], "camera": [cameras.cameras[c].id for c in of]}
+    if extra.positions is not None:
+        for values, prefix in zip(extra.positions, ("", "s")):
+            images |= {f"{prefix}{axis}0": values[rows, i] for i, axis in enumerate("XYZ")}
+    xy = np.concatenate([measured.xy, named.xy])
+    sigma = np.concatenate([measured.sigma, named.sigma])
+    there = set(points)
+    distances = [d for d in extra.distances if {d["from"], d["to"]} <= there]
+    network = make_network(
+        free, images,
+        {"id": points, "role": ["tie"] * len(points),
+         **{axis: np.full(len(points), np.nan) for axis in "XYZ"}},
+        {"image": names[np.concatenate([measured.image, named.image])],
+         "point": [*map(track_name, measured.track.tolist()), *named.name],
+         "x": xy[:, 0], "y": xy[:, 1], "sx": sigma[:, 0], "sy": sigma[:, 1]},
+        distances or None, image_unit="px", name=name,
+        datum="inner" if extra.positions is None else "control",
+        object_unit="m" if distances or extra.positions is not None else "unit",
     )  # fmt: skip
+    control = extra.control
+    if control is None or len(there & set(control.id)) < FEWEST_CONTROL:
+        return network
+    return with_control(network, control).replace(object_unit="m")
+
+
+def track_name(track: int) -> str:
+    """The id of a tie point."""
+    return f"t{track}"
 
 
 def _freed(camera: Camera, number: int, given: bool) -> Camera:
@@ -47,6 +88,10 @@ def _freed(camera: Camera, number: int, given: bool) -> Camera:
     f, size = camera.parameters["fx"], max(camera.image_size or (1, 1))
     sigma = {"fx": PRIORS["fx"] * f, "cx": PRIORS["cx"] * size, "cy": PRIORS["cy"] * size,
              "k1": K1_PRIOR}  # fmt: skip
+    if number >= UNTIED:
+        camera, free, sigma["fy"] = dataclasses.replace(camera, tie=()), ("fx", "fy", *free[1:]), (
+            sigma["fx"]
+        )
     return dataclasses.replace(
         camera, free=free, sigma={n: s for n, s in sigma.items() if n in free}
     )

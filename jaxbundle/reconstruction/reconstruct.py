@@ -6,6 +6,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +17,12 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.float64 import require_x64
 from jaxbundle.network.columns import count, some
 from jaxbundle.network.tables import Camera, Network
+from jaxbundle.photographs.places import map_positions
 from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.reconstruction.adjusting import adjust_weighted
-from jaxbundle.reconstruction.network import tie_network
+from jaxbundle.reconstruction.control import Control
+from jaxbundle.reconstruction.named import find_named
+from jaxbundle.reconstruction.network import Extra, tie_network, track_name
 from jaxbundle.reconstruction.parts import SMALLEST, connected, why_alone
 from jaxbundle.reconstruction.photographs import (
     Cameras,
@@ -36,6 +40,8 @@ from jaxbundle.tiepoints.tracks import choose_tracks, make_tracks
 from jaxbundle.tiepoints.verification import Pair
 
 DEFAULT = Settings()
+NAMED = 99
+"""Kind of the measurements of named points."""
 TEXTURE = 16
 """Features a photograph needs."""
 
@@ -77,11 +83,15 @@ def reconstruct(
     settings: Settings = DEFAULT,
     store: Path | None = None,
     tell: Tell = lambda stage, done, total: None,
+    control: Control | None = None,
+    distances: Sequence[dict] = (),
 ) -> Reconstruction:
     """Orient photographs by what they show, with self-calibration.
 
     **Arguments:** `given`: files, and folders of photographs; `camera`: a calibrated one, which all
-    share; `store`: folder in which features and matches are kept; `tell(stage, done, total)`.
+    share; `store`: folder in which features and matches are kept; `tell(stage, done, total)`;
+    `control`: points with coordinates, by the names of coded targets or measured in photographs;
+    `distances`: rows `from`, `to`, `value`, `sigma` between named points.
 
     **Raises:** `InputError` where the photographs cannot be used; `NotSolvedError` where no two of
     them can be oriented.
@@ -89,17 +99,29 @@ def reconstruct(
     require_x64()
     photographs, left_out = find_photographs(given)
     cameras = assign_cameras(photographs, camera)
-    return _Making(photographs, left_out, cameras, settings, Store(store, settings.detection),
-                   tell).run()  # fmt: skip
+    with ThreadPoolExecutor(settings.workers or available_cores()) as pool:
+        named, notes = find_named(photographs, settings.targets, control, pool.map)
+    positions = map_positions([p.exif.place for p in photographs]) if control is None else None
+    if positions is not None:
+        notes.append(f"positions of the photographs by satellites: {positions[2]}")
+    if control is not None and control.system:
+        notes.append(f"control in {control.system}")
+    extra = Extra(named, control and control.points, tuple(distances),
+                  positions and positions[:2])  # fmt: skip
+    kept = Store(store, settings.detection)
+    making = _Making(photographs, left_out, cameras, settings, kept, tell, extra)
+    making.notes += notes
+    return making.run()
 
 
 class _Making:
     """One reconstruction on its way."""
 
-    def __init__(self, photographs, left_out, cameras: Cameras, settings, store, tell):
+    def __init__(self, photographs, left_out, cameras: Cameras, settings, store, tell, extra):
         self.photographs: list[Photograph] = photographs
         self.left_out: dict[str, str] = dict(left_out)
         self.cameras, self.settings, self.store, self.tell = cameras, settings, store, tell
+        self.extra: Extra = extra
         self.workers = settings.workers or available_cores()
         self.names = [photograph.name for photograph in photographs]
         self.notes, self.stage = list(cameras.notes), ""
@@ -219,7 +241,7 @@ class _Making:
             tracks, features, lambda k: read_photograph(self.photographs[k].path, colour=True),
             lambda: self.tell("least squares matching", next(done), len(features)),
         )  # fmt: skip
-        network = tie_network(self.photographs, self.cameras, measured, name)
+        network = tie_network(self.photographs, self.cameras, measured, self.extra, name)
         self._begin("start values")
         oriented = orient(network)
         kinds, named = _kinds(oriented.network, measured, self.names)
@@ -238,16 +260,18 @@ class _Making:
 def _kinds(network: Network, measured: Measurements, names: Sequence[str]):
     """The kind of every observation, and what kinds are called."""
     columns = (measured.image, measured.track, measured.level)
-    level = {(names[i], str(t)): l for i, t, l in zip(*(c.tolist() for c in columns))}
+    level = {(names[i], track_name(t)): l for i, t, l in zip(*(c.tolist() for c in columns))}
     rays, images, points = network.observations, network.images.id, network.points.id
-    kinds = np.array([min(level[images[i], points[p]], 2) for i, p in
+    kinds = np.array([level.get((images[i], points[p]), NAMED) for i, p in
                       zip(rays.image.tolist(), rays.point.tolist())], int)  # fmt: skip
+    kinds[(kinds > 2) & (kinds < NAMED)] = 2
     words = {-1: "features not matched", 0: "matched in the original",
-             1: "matched at half size", 2: "matched at a quarter or smaller"}  # fmt: skip
+             1: "matched at half size", 2: "matched at a quarter or smaller",
+             NAMED: "named points"}  # fmt: skip
     return kinds, words
 
 
 def _colours(measured: Measurements) -> dict[str, tuple[int, int, int]]:
     first = measured.first
-    return {str(t): tuple(c) for t, c in
+    return {track_name(t): tuple(c) for t, c in
             zip(measured.track[first].tolist(), measured.colour[first].tolist())}  # fmt: skip

@@ -10,13 +10,15 @@ from jaxbundle.tiepoints.pairs import WAYS
 @dataclasses.dataclass(frozen=True)
 class Settings:
     """`detection`: features; `pairs`: which photographs are matched; `points`: measurements wanted
-    in every photograph; `workers`: threads, all cores if 0; `significance`: of data snooping."""
+    in every photograph; `workers`: threads, all cores if 0; `significance`: of data snooping;
+    `targets`: kind of coded targets (`measure.coded_targets`)."""
 
     detection: Detection = Detection()
     pairs: str = "auto"
     points: int = 1500
     workers: int = 0
     significance: float = 0.001
+    targets: str | None = None
 
     def __post_init__(self):
         one_of("pairs", self.pairs, WAYS)

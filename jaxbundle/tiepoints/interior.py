@@ -32,6 +32,9 @@ PAIRS, SLOTS, PIXELS = 8, 64, 4.0
 """Pairs and matches used; the misclosure at which a match counts half, for a photograph of 3000
 pixels: lens distortion is not known yet."""
 ROUNDS, STEPS = 4, 8
+USUAL, DOUBT = 1.0, 0.03
+"""The usual principal distance, in parts of the longer side, and by which part a sum must be less
+to believe one that differs by a factor of e."""
 FARTHEST = 0.35
 """|k1| beyond this is not believed."""
 KNOWN = 1.35
@@ -66,7 +69,8 @@ def estimate_interior(
     xy1, xy2 = ([pair[i][r] for pair, r in zip(pairs, clear)] for i in (0, 1))
     tried = [camera.parameters["fx"]] if known else [size * factor for factor in FACTORS]
     M, b, part, costs = _oriented([_with(camera, f) for f in tried], xy1, xy2, limit)
-    best = int(np.argmin(costs.sum(1)))
+    usual = 1 + DOUBT * np.abs(np.log(np.array(tried) / (USUAL * size)))
+    best = int(np.argmin(costs.sum(1) * (1 if known else usual)))
     f, M, b, part = tried[best], M[best], b[best], part[best]
     use = np.flatnonzero(part > 0.3)
     if not len(use):

@@ -66,8 +66,9 @@ class Store:
         if self.folder is None:
             return None
         try:
-            with np.load(self.folder / f"{name}.npz", allow_pickle=False) as found:
-                return dict(found)
+            with (self.folder / f"{name}.npz").open("rb") as file:
+                with np.load(file, allow_pickle=False) as found:
+                    return dict(found)
         except (OSError, ValueError, KeyError, EOFError, BadZipFile):
             return None
 

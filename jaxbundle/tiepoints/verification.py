@@ -32,6 +32,8 @@ CLEAR = 0.6
 """Part of the matches, the clearest ones, from which the orientation is sought."""
 SLOTS, LANES = 192, 8
 ROUNDS, STEPS = 2, 8
+TURNS = 40
+"""Pairs of matches from which a rotation is tried."""
 LOOSE = 3.0
 """The first choice of matches, in tolerances."""
 EXPLAINED = 0.9
@@ -43,7 +45,8 @@ KINDS = ("relative", "plane", "rotation")
 class Pair:
     """Two photographs that show the same: rows of features that match; M from the first camera to
     the second and base b; angle of intersection (median, radians); `kind`: `"relative"`, or what
-    explains the pair as well: `"plane"`, `"rotation"`; `found`: matches before verification."""
+    explains the pair as well: `"plane"`, `"rotation"` (b is then zero or without meaning); `found`:
+    matches before verification."""
 
     images: tuple[int, int]
     matches: Int[np.ndarray, "n 2"]
@@ -84,12 +87,42 @@ def verify_pairs(
         good = _agree(M, b, xy1[k], xy2[k], tolerance[k])
         if good.sum() >= max(LEAST, PART * len(good)):
             found[k] = good, M, b
+    turned = {
+        k: turn for k in usable if found[k] is None
+        and (turn := _by_rotation(xy1[k], xy2[k], tolerance[k])) is not None
+    }  # fmt: skip
     left = [k for k in range(len(found)) if found[k] is not None]
     kinds = _kinds([found[k] for k in left], [xy1[k] for k in left], [xy2[k] for k in left],
                    tolerance[left])  # fmt: skip
     for k, (good, angle, kind) in zip(left, kinds):
         found[k] = (good, *found[k][1:], angle, kind)
+    for k, (good, M) in turned.items():
+        found[k] = good, M, np.zeros(3), 0.0, "rotation"
     return found
+
+
+def _by_rotation(xy1, xy2, tolerance):
+    """The matches that a rotation about the projection centre explains, and M, if most are."""
+    rays = [np.pad(xy, ((0, 0), (0, 1)), constant_values=-1.0) for xy in (xy1, xy2)]
+    one, two = (a / np.linalg.norm(a, axis=1, keepdims=True) for a in rays)
+    rng, best = np.random.default_rng(0), None
+    most = max(LEAST, len(xy1) // 2) - 1
+    for _ in range(TURNS):
+        i, j = rng.choice(len(one), 2, replace=False)
+        frames = [_triad(a[i], a[j]) for a in (one, two)]
+        if any(frame is None for frame in frames):
+            continue
+        M = frames[1].T @ frames[0]
+        good = np.linalg.norm(one @ M.T - two, axis=1) < 2 * tolerance
+        if good.sum() > most:
+            most, best = good.sum(), (good, M)
+    return best
+
+
+def _triad(a, b):
+    normal = np.cross(a, b)
+    length = np.linalg.norm(normal)
+    return None if length < 1e-3 else np.stack([a, normal / length, np.cross(a, normal / length)])
 
 
 def _clear_rows(number):

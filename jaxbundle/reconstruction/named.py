@@ -1,0 +1,96 @@
+"""Points with names in photographs: coded targets, control points, ends of scale bars."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.text.csv_tables import read_csv
+from jaxbundle.measure.coded_targets import find_coded_targets
+from jaxbundle.network.columns import some
+from jaxbundle.photographs.reading import read_photograph
+from jaxbundle.reconstruction.control import Control
+from jaxbundle.reconstruction.photographs import Photograph
+
+
+@dataclasses.dataclass(frozen=True)
+class Named:
+    """Measurements of named points: photograph, name, pixels, σ in pixels."""
+
+    image: Int[np.ndarray, " n"]
+    name: tuple[str, ...]
+    xy: Float[np.ndarray, "n 2"]
+    sigma: Float[np.ndarray, "n 2"]
+
+    def __len__(self) -> int:
+        return len(self.name)
+
+    def take(self, rows) -> "Named":
+        """The chosen measurements (a mask)."""
+        rows = np.flatnonzero(rows)
+        return Named(
+            self.image[rows], tuple(self.name[k] for k in rows), self.xy[rows], self.sigma[rows]
+        )
+
+
+def no_named_points() -> Named:
+    """None at all."""
+    return Named(np.zeros(0, int), (), np.zeros((0, 2)), np.zeros((0, 2)))
+
+
+def find_named(
+    photographs: Sequence[Photograph],
+    targets: str | None,
+    control: Control | None,
+    run: Callable = map,
+) -> tuple[Named, list[str]]:
+    """The coded targets of all photographs and the measurements of control points; notes.
+
+    **Raises:** `InputError` where control points are measured in unknown photographs only.
+    """
+    image, name, xy, sigma, notes = [], [], [], [], []
+    if targets:
+        found = list(run(lambda p: find_coded_targets(read_photograph(p.path), targets),
+                         photographs))  # fmt: skip
+        for k, one in enumerate(found):
+            image += [k] * len(one)
+            name += one.names
+            xy += list(one.xy)
+            sigma += list(one.sigma)
+        notes.append(f"{len(set(name))} coded targets ({targets}) in {len(set(image))} photographs")
+    if control is not None and control.seen:
+        index = {p.name: k for k, p in enumerate(photographs)}
+        unknown = sorted({file for file, _ in control.seen if file not in index})
+        if len(unknown) == len({file for file, _ in control.seen}):
+            raise InputError(
+                f"{control.points.source.name}: measured in none of the photographs, but in "
+                f"{some(unknown, 3, str)}"
+            )
+        if unknown:
+            notes.append(f"control measured in photographs that are not there: {some(unknown)}")
+        for (file, id), place, s in zip(control.seen, control.xy, control.sigma):
+            if file in index:
+                image.append(index[file])
+                name.append(id)
+                xy.append(place)
+                sigma.append((s, s))
+    if not name:
+        return no_named_points(), notes
+    return Named(np.array(image), tuple(name), np.array(xy, float), np.array(sigma, float)), notes
+
+
+def read_distances(path: str | Path) -> list[dict]:
+    """Rows `from`, `to`, `value`, `sigma` of scale bars between named points.
+
+    **Raises:** `InputError`."""
+    table = read_csv(Path(path))
+    lacking = [c for c in ("from", "to", "value", "sigma") if c not in table.values]
+    if lacking:
+        raise InputError(f"{path}: the column {lacking[0]!r} is missing")
+    value = table.numbers("value", required=True)
+    sigma = table.numbers("sigma", required=True)
+    return [{"from": a, "to": b, "value": float(v), "sigma": float(s)}
+            for a, b, v, s in zip(table.ids("from"), table.ids("to"), value, sigma)]  # fmt: skip

@@ -1,0 +1,88 @@
+"""Photographs of every kind: pixels, and what their heads say."""
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from jaxbundle.errors import InputError
+from jaxbundle.photographs import photograph_size, read_exif, read_photograph
+from jaxbundle.photographs.exif import Place
+from jaxbundle.photographs.places import map_positions, to_map, utm_system
+from jaxbundle.photographs.sensors import sensor_width
+
+GREY = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (60, 90), np.uint8), (0, 0), 3)
+
+
+def test_kinds_of_pixels(tmp_path):
+    colour = np.stack([GREY, np.roll(GREY, 9, 1), np.roll(GREY, 17, 0)], -1)
+    Image.fromarray(colour).save(tmp_path / "rgb.png")
+    np.testing.assert_array_equal(read_photograph(tmp_path / "rgb.png", colour=True), colour)
+    luma = colour @ [0.299, 0.587, 0.114]
+    assert np.abs(read_photograph(tmp_path / "rgb.png") - luma).max() <= 1
+    Image.fromarray(colour).convert("CMYK").save(tmp_path / "cmyk.jpg", quality=98)
+    assert np.abs(read_photograph(tmp_path / "cmyk.jpg") - luma).mean() < 8
+    deep = GREY.astype(np.uint16) * 16  # twelve bits in sixteen
+    cv2.imwrite(str(tmp_path / "deep.tif"), deep)
+    found = read_photograph(tmp_path / "deep.tif")
+    assert found.dtype == np.uint8 and found.max() == 255
+    assert np.corrcoef(found.ravel(), GREY.ravel())[0, 1] > 0.999
+
+
+def test_pixels_of_a_turned_photograph_are_those_of_the_sensor(tmp_path):
+    head = Image.Exif()
+    head[0x0112] = 6
+    Image.fromarray(GREY).save(tmp_path / "turned.png", exif=head)
+    np.testing.assert_array_equal(read_photograph(tmp_path / "turned.png"), GREY)
+    assert read_exif(tmp_path / "turned.png").orientation == 6
+    assert photograph_size(tmp_path / "turned.png") == (90, 60)
+
+
+def test_files_cut_short(tmp_path):
+    Image.fromarray(GREY).save(tmp_path / "whole.jpg")
+    content = (tmp_path / "whole.jpg").read_bytes()
+    (tmp_path / "cut.jpg").write_bytes(content[: len(content) // 2])
+    with pytest.raises(InputError, match="cut.jpg: the file is cut short"):
+        read_photograph(tmp_path / "cut.jpg")
+    (tmp_path / "more.jpg").write_bytes(content + b"trailer \xff\xda")
+    assert read_photograph(tmp_path / "more.jpg").shape == GREY.shape
+    (tmp_path / "empty.jpg").write_bytes(b"")
+    with pytest.raises(InputError, match="the file is empty"):
+        photograph_size(tmp_path / "empty.jpg")
+
+
+def test_exif(tmp_path):
+    head = Image.Exif()
+    head[0x010F], head[0x0110] = "NIKON CORPORATION", "NIKON D800"
+    details = head.get_ifd(0x8769)
+    details[0x920A], details[0x9003] = 24.0, "2021:05:03 10:11:12"
+    gps = head.get_ifd(0x8825)
+    gps[1], gps[2], gps[3], gps[4] = "S", (33.0, 30.0, 36.0), "W", (70.0, 45.0, 0.0)
+    gps[5], gps[6] = b"\x00", 512.5
+    Image.fromarray(GREY).save(tmp_path / "a.jpg", exif=head)
+    found = read_exif(tmp_path / "a.jpg")
+    assert found.camera == "NIKON D800" and found.time.minute == 11
+    assert found.principal_distance() == (pytest.approx(24 / 35.9 * 90), "focal length and sensor")
+    assert found.place == Place(pytest.approx(-33.51), pytest.approx(-70.75), 512.5)
+
+
+def test_sensors_are_not_mistaken():
+    assert sensor_width("NIKON CORPORATION", "NIKON D80") == 23.6
+    assert sensor_width("Canon", "Canon EOS 5D Mark II") == 36.0
+    assert sensor_width("DJI", "FC6310") == 13.2
+    assert sensor_width("NIKON", "NIKON D8000") is None
+
+
+def test_positions_in_a_map():
+    assert utm_system(48.2, 16.4) == "EPSG:32633" and utm_system(-33.5, -70.7) == "EPSG:32719"
+    places = [Place(48.0 + 1e-3 * k, 16.0, 200.0 + k) for k in range(4)]
+    X, sigma, said = map_positions([*places, None])
+    # a thousandth of a degree of the meridian at 48° is 111.2 m, times the scale of UTM
+    assert np.allclose(np.diff(X[:4, 1]), 111.2 * 0.9996, atol=0.15)
+    assert np.isnan(X[4]).all() and np.allclose(sigma[0], [3, 3, 6]) and "EPSG:32633" in said
+    near = [Place(48.0 + 1e-6 * k, 16.0, 200.0) for k in range(4)]
+    assert map_positions(near) is None
+    moved, said = to_map(np.array([[16.0, 48.0, 200.0]]), "EPSG:4326", "gcp")
+    assert np.allclose(moved, X[:1], atol=1e-3) and said == "EPSG:32633"
+    with pytest.raises(InputError, match="gcp: coordinate system 'EPSG:1' is not known"):
+        to_map(moved, "EPSG:1", "gcp")

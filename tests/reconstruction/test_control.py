@@ -1,0 +1,66 @@
+"""Control points with their measurements: files of OpenDroneMap, tables, errors by line."""
+
+import numpy as np
+import pytest
+
+from jaxbundle.errors import InputError
+from jaxbundle.reconstruction.control import read_control_measurements
+from jaxbundle.reconstruction.named import read_distances
+
+
+def written(tmp_path, text):
+    path = tmp_path / "control.txt"
+    path.write_text(text)
+    return path
+
+
+def test_gcp_list_of_opendronemap(tmp_path):
+    found = read_control_measurements(written(tmp_path, (
+        "WGS84 UTM 33N\n"
+        "544256.7 5320919.9 5.0 3044 2622 a.jpg gcp1\n"
+        "544256.7 5320919.9 5.0 1022.5 18 b.jpg gcp1 extra\n"
+        "544157.7 5320899.2 5.5 4193 1552 a.jpg\n"
+    )))  # fmt: skip
+    assert found.points.id == ("gcp1", "544157.7,5320899.2") and found.system == "EPSG:32633"
+    assert found.seen[:2] == (("a.jpg", "gcp1"), ("b.jpg", "gcp1"))
+    np.testing.assert_allclose(found.xy[1], [1022.5, 18])
+    assert np.isnan(found.points.sigma).all()
+
+
+def test_degrees_become_metres(tmp_path):
+    found = read_control_measurements(written(tmp_path, (
+        "EPSG:4326\n15 48 200 1 2 a.jpg P\n15.001 48 200 1 2 a.jpg Q\n"
+    )))  # fmt: skip
+    # 15° is the middle of zone 33: easting 500 km; 0.001° of the parallel of 48° is 74.6 m
+    assert found.points.position[0, 0] == pytest.approx(500_000, abs=0.01)
+    assert np.diff(found.points.position[:, 0])[0] == pytest.approx(74.6, abs=0.1)
+
+
+def test_tables_with_and_without_measurements(tmp_path):
+    found = read_control_measurements(written(tmp_path, (
+        "id,X,Y,Z,sX,sY,sZ,image,u,v,suv\nP,1,2,3,0.01,0.01,0.02,a.jpg,10,20,0.5\n"
+        "P,1,2,3,0.01,0.01,0.02,b.jpg,11,21,\n"
+    )))  # fmt: skip
+    np.testing.assert_allclose(found.points.sigma, [[0.01, 0.01, 0.02]])
+    np.testing.assert_allclose(found.sigma, [0.5, 1.0])
+    plain = read_control_measurements(written(tmp_path, "id,X,Y,Z\n45,1,2,3\n"))
+    assert plain.points.id == ("45",) and plain.seen == ()
+
+
+@pytest.mark.parametrize("text, said", [
+    ("", "the file is empty"),
+    ("EPSG:4326\n15 48 200 1 a.jpg\n", "line 2: X Y Z u v photograph"),
+    ("EPSG:32633\n1 2 3 4 5 a.jpg P\n1 2 9 4 5 b.jpg P\n", "line 3: point P has other"),
+    ("EPSG:32633\n", "no control points"),
+    ("id,X,Y,Z,image,u,v\nP,1,2,x,a.jpg,1,2\n", "line 2: z is 'x'"),
+])  # fmt: skip
+def test_what_is_wrong_is_said_with_its_line(tmp_path, text, said):
+    with pytest.raises(InputError, match=said):
+        read_control_measurements(written(tmp_path, text))
+
+
+def test_distances(tmp_path):
+    rows = read_distances(written(tmp_path, "from,to,value,sigma\n45,51,1.25,0.0001\n"))
+    assert rows == [{"from": "45", "to": "51", "value": 1.25, "sigma": 0.0001}]
+    with pytest.raises(InputError, match="'sigma' is missing"):
+        read_distances(written(tmp_path, "from,to,value\n1,2,3\n"))

@@ -1,0 +1,155 @@
+"""Matches of known geometry: principal distance, verification, tracks, what is kept."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import jaxbundle
+from jaxbundle.tiepoints.features import Detection, Features
+from jaxbundle.tiepoints.interior import estimate_interior
+from jaxbundle.tiepoints.matching import match_features
+from jaxbundle.tiepoints.pairs import candidate_pairs
+from jaxbundle.tiepoints.store import Store
+from jaxbundle.tiepoints.tracks import choose_tracks, make_tracks
+from jaxbundle.tiepoints.verification import Pair, verify_pairs
+
+SIZE, F, K1 = (1200, 900), 1000.0, -0.1
+
+
+def seen(X, X0, M):
+    """Ideal coordinates, c = 1, y up, of points."""
+    ray = (X - X0) @ M.T
+    return -ray[:, :2] / ray[:, 2:]
+
+
+def pixels(xy, rng):
+    """What a camera with distortion sees, v down, with noise."""
+    x, y = xy[:, 0], -xy[:, 1]
+    grown = 1 + K1 * (x**2 + y**2)
+    u, v = F * x * grown + SIZE[0] / 2 - 0.5, F * y * grown + SIZE[1] / 2 - 0.5
+    return np.stack([u, v], 1) + 0.3 * rng.normal(size=(len(x), 2))
+
+
+def stations(number, rng):
+    azimuth = np.linspace(-0.6, 0.6, number)
+    for a in azimuth:
+        X0 = 8 * np.array([np.sin(a), 0.2 * np.cos(7 * a), np.cos(a)])
+        z = X0 / np.linalg.norm(X0)
+        x = np.cross([0, 1.0, 0], z)
+        x /= np.linalg.norm(x)
+        M = np.stack([x, np.cross(z, x), z])
+        yield X0, Rotation.from_rotvec(0.1 * rng.normal(size=3)).as_matrix() @ M
+
+
+@pytest.fixture(scope="module")
+def cloud():
+    rng = np.random.default_rng(4)
+    X = rng.uniform(-2.2, 2.2, (160, 3))
+    return rng, X, list(stations(5, rng))
+
+
+def test_principal_distance_and_distortion_from_pairs(cloud):
+    rng, X, views = cloud
+    uv = [pixels(seen(X, *view), rng) for view in views]
+    pairs = [(uv[i].copy(), uv[j].copy()) for i in range(5) for j in range(i + 1, 5)]
+    for _, other in pairs:
+        wrong = rng.random(len(X)) < 0.15
+        other[wrong] = rng.uniform(0, 900, (wrong.sum(), 2))
+    camera = jaxbundle.Camera(
+        "c", "opencv", {"fx": 1440.0, "fy": 1440.0, "cx": 599.5, "cy": 449.5}, image_size=SIZE
+    )
+    found = estimate_interior(camera, pairs, known=False)
+    assert found.camera.parameters["fx"] == pytest.approx(F, rel=0.02)
+    assert found.camera.parameters["k1"] == pytest.approx(K1, abs=0.03)
+    assert found.misclosure < 0.5
+
+
+def test_verification_keeps_true_matches_and_names_what_is_degenerate(cloud):
+    rng, X, views = cloud
+    noise = lambda xy: xy + 3e-4 * rng.normal(size=xy.shape)
+    a, b = (noise(seen(X, *views[k])) for k in (0, 3))
+    wrong = np.arange(len(X)) % 5 == 4
+    b[wrong] = rng.uniform(-0.5, 0.5, (wrong.sum(), 2))
+    X0, M = views[1]
+    turned = noise(seen(X, X0, Rotation.from_rotvec([0.1, 0.05, 0.2]).as_matrix() @ M))
+    flat = X * [1, 1, 0]
+    foreign = rng.uniform(-0.5, 0.5, (2, 60, 2))
+    first = [a, noise(seen(X, X0, M)), noise(seen(flat, *views[0])), foreign[0]]
+    second = [b, turned, noise(seen(flat, *views[2])), foreign[1]]
+    found = verify_pairs(first, second, np.full(4, 2e-3))
+    good, M, base, angle, kind = found[0]
+    assert good[~wrong].mean() > 0.97 and good[wrong].mean() < 0.2
+    true = views[3][1] @ views[0][1].T
+    assert np.linalg.norm(Rotation.from_matrix(M @ true.T).as_rotvec()) < 0.01
+    assert 0.5 < angle < 1.3
+    assert [one and one[4] for one in found] == ["relative", "rotation", "plane", None]
+
+
+def features_at(xy):
+    n = len(xy)
+    rng = np.random.default_rng(n)
+    return Features(xy, np.ones(n), np.zeros(n), rng.integers(0, 255, (n, 128), np.uint8))
+
+
+def paired(i, j, rows, clarity):
+    rows = np.array(rows)
+    return Pair((i, j), rows, np.array(clarity), np.eye(3), np.zeros(3), 0.1, "relative", 9)
+
+
+def test_tracks_without_contradictions():
+    spread = [np.random.default_rng(k).uniform(0, 100, (6, 2)) for k in range(3)]
+    features = [features_at(xy) for xy in spread]
+    pairs = [
+        paired(0, 1, [[0, 0], [1, 1], [2, 2]], [0.1, 0.1, 0.3]),
+        paired(1, 2, [[0, 0], [1, 1]], [0.1, 0.1]),
+        paired(0, 2, [[0, 5], [2, 1]], [0.6, 0.7]),  # both contradict clearer ones
+    ]
+    tracks = sorted(make_tracks(features, pairs))
+    assert tracks == [
+        [(0, 0), (1, 0), (2, 0)], [(0, 1), (1, 1), (2, 1)], [(0, 2), (1, 2)],
+    ]  # fmt: skip
+
+
+def test_chosen_tracks_cover_the_photographs():
+    rng = np.random.default_rng(0)
+    dense = rng.uniform(0, 200, (3000, 2))
+    sparse = rng.uniform(0, 1000, (150, 2))
+    xy = np.concatenate([dense, sparse, dense[:20] + 0.2])
+    tracks = [[(0, k), (1, k)] for k in range(len(xy))]
+    kept = choose_tracks(tracks, [xy, xy], [(1000, 1000)] * 2, 300)
+    assert kept[3000:3150].mean() > 0.7 and kept[:3000].sum() < 100
+    assert not np.any(kept[:20] & kept[3150:])
+
+
+def test_matches_are_those_of_both_sides():
+    rng = np.random.default_rng(1)
+    one = features_at(rng.uniform(0, 100, (80, 2)))
+    order = rng.permutation(80)
+    noisy = np.clip(one.descriptor[order] + rng.integers(-12, 12, (80, 128)), 0, 255)
+    other = Features(one.xy, one.size, one.angle, noisy.astype(np.uint8))
+    rows, ratio = match_features(one, other)
+    assert len(rows) == 80 and np.all(order[rows[:, 1]] == rows[:, 0])
+    assert np.all(np.diff(ratio) >= 0) and ratio.max() < 0.8
+
+
+def test_candidates():
+    none = [features_at(np.zeros((3, 2)))] * 9
+    assert len(candidate_pairs(none, "all")) == 36
+    assert (0, 6) not in candidate_pairs(none, "sequence")
+    place = np.array([[x, 0.0, 0.0] for x in range(9)])
+    assert {(0, 1), (0, 8)} <= set(candidate_pairs(none, "place", place))
+
+
+def test_what_is_kept_is_found_again_for_the_same_content_only(tmp_path):
+    found = features_at(np.arange(12.0).reshape(6, 2))
+    store = Store(tmp_path / "kept", Detection())
+    store.save_features("one", found)
+    again = Store(tmp_path / "kept", Detection())
+    np.testing.assert_array_equal(again.load_features("one").descriptor, found.descriptor)
+    assert again.load_features("changed") is None
+    assert Store(tmp_path / "kept", Detection(number=7)).load_features("one") is None
+    file = next((tmp_path / "kept").glob("*.npz"))
+    file.write_bytes(file.read_bytes()[:100])
+    assert again.load_features("one") is None
+    Store(tmp_path / "kept", Detection()).drop_unused()
+    assert not list((tmp_path / "kept").glob("*.npz"))
