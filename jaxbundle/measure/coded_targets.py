@@ -133,9 +133,15 @@ def _rings(grey, bits):
             target = centre_by_ellipse(grey, near)
         except InputError:
             continue
-        if target.bright and (code := _code(grey, target, bits)) is not None:
-            found.append((str(code), target.xy, target.sigma))
-    return found
+        if target.bright and (read := _code(grey, target, bits)) is not None:
+            found.append((*read, target))
+    kept = []
+    for _, code, target in sorted(found, key=lambda one: one[0]):
+        # a sector of a ring may look like a disc with a ring; the clearer one is right
+        reach = 3 * target.axes[0]
+        if all(np.linalg.norm(target.xy - t.xy) > max(reach, 3 * t.axes[0]) for _, t in kept):
+            kept.append((code, target))
+    return [(str(code), target.xy, target.sigma) for code, target in kept]
 
 
 def _discs(grey):
@@ -158,7 +164,7 @@ def _discs(grey):
 
 
 def _code(grey, target, bits):
-    """The code of the ring about a disc; None where there is none."""
+    """How badly the ring about a disc reads, and its code; None where there is none."""
     from scipy.ndimage import map_coordinates
 
     n = bits * SAMPLES
@@ -180,10 +186,12 @@ def _code(grey, target, bits):
     inner = by_start[:, :, SAMPLES // 5 : -(SAMPLES // 5)]
     best = int(inner.var(2).sum(1).argmin())
     means = inner[best].mean(1)
-    if np.any(np.minimum(np.abs(means), np.abs(means - 1)) > CLEAR):
+    off = np.minimum(np.abs(means), np.abs(means - 1))
+    if np.any(off > CLEAR):
         return None
     word = (means > 0.5).astype(int)
     if not word.any() or word.all():
         return None
     weights = 1 << np.arange(bits - 1, -1, -1)
-    return min(int(np.roll(word, -k) @ weights) for k in range(bits))
+    misfit = float(off.mean() + np.abs(gap).mean())
+    return misfit, min(int(np.roll(word, -k) @ weights) for k in range(bits))
