@@ -9,7 +9,7 @@ ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 APACHE = "cfc7749b96f63bd31c3c42b5c471bf756814053e847c10f3eb003417bc523d30"
 """SHA-256 of LICENSE-2.0.txt as the Apache Software Foundation publishes it."""
-MODULES = {"opencv-python-headless": "cv2", "pyerfa": "erfa"}
+MODULES = {"pillow": "PIL", "opencv-python-headless": "cv2", "pyerfa": "erfa"}
 """Distributions whose module has another name."""
 
 

@@ -141,4 +141,4 @@ def _summary(found: Reconstruction) -> dict:
 def _surface(out: Path, photos: Path, force: bool, quiet: bool) -> None:
     from jaxbundle.cli.surface import surface
 
-    surface(out / "network", out / "surface", photos, force=force, quiet=quiet)
+    surface([out / "network"], out / "surface", photos, force=force, quiet=quiet)

@@ -109,10 +109,10 @@ def _by_rotation(xy1, xy2, tolerance):
     most = max(LEAST, len(xy1) // 2) - 1
     for _ in range(TURNS):
         i, j = rng.choice(len(one), 2, replace=False)
-        frames = [_triad(a[i], a[j]) for a in (one, two)]
-        if any(frame is None for frame in frames):
+        first, second = (_triad(a[i], a[j]) for a in (one, two))
+        if first is None or second is None:
             continue
-        M = frames[1].T @ frames[0]
+        M = second.T @ first
         good = np.linalg.norm(one @ M.T - two, axis=1) < 2 * tolerance
         if good.sum() > most:
             most, best = good.sum(), (good, M)
