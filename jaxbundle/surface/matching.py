@@ -1,10 +1,12 @@
 """Points of a base image matched in others and intersected: from pixels to points with covariance.
 
-    guide → position in all images at once → least squares matching in each → checks → intersection
+    guide → position in all images at once → least squares matching in each → bending taken off
+    → checks → intersection
 
 The residuals across the epipolar lines are errors of the same matching that gives the heights: the
 median of vᵀC⁻¹v over its expectation is the variance factor by which all covariances are
-multiplied. It holds what the matching does not know of, small errors of the orientation included.
+multiplied, unless it is below 1. It holds what the matching does not know of, small errors of the
+orientation included.
 """
 
 import dataclasses
@@ -16,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import stats
 
 from jaxbundle.measure.least_squares_matching import MatchingStatus
+from jaxbundle.surface.bending import corrected, sharpen
 from jaxbundle.surface.correlation import Pyramid
 from jaxbundle.surface.guide import Guide, search
 from jaxbundle.surface.intersection import Intersected, intersect
@@ -96,6 +99,7 @@ def match_points(
     rows = np.flatnonzero(found & ~double)
     uv, q, normal, rate = uv[rows], q[rows], normal[rows], rate[rows]
     X = base.points(uv, q)
+    sharp = sharpen(base, others, guide, settings.fine)
     n, m = len(uv), len(others)
     places, used = np.full((n, m, 2), np.nan), np.zeros((n, m), bool)
     covariance, own = np.zeros((n, m, 2, 2)), np.zeros((n, m, 2, 2))
@@ -104,7 +108,8 @@ def match_points(
         shape = windows(base, other, X, normal)
         start = positions(base, other, uv, q[:, None])[:, 0]
         match = refine(base, other, uv, start, shape.A, settings.fine)
-        places[:, k], covariance[:, k], rhos[:, k] = match.uv, match.covariance, match.rho
+        place, uncertain = corrected((base, other), sharp, uv, q, match, settings.fine)
+        places[:, k], covariance[:, k], rhos[:, k] = place, uncertain, match.rho
         good = shape.usable & (match.status == int(MatchingStatus.CONVERGED))
         good &= match.rho >= settings.least_correlation
         good &= np.linalg.norm(match.uv - start, axis=1) <= STRAYED
@@ -115,7 +120,7 @@ def match_points(
         back = np.linalg.inv(safe)
         own[:, k] = np.where(
             good[:, None, None],
-            back @ np.where(good[:, None, None], match.covariance, 0) @ np.swapaxes(back, 1, 2), 0
+            back @ np.where(good[:, None, None], uncertain, 0) @ np.swapaxes(back, 1, 2), 0
         )  # fmt: skip
         used[:, k] = good
     enough = used.sum(1) + 1 >= settings.least_rays
@@ -147,7 +152,7 @@ class _Rays:
 def _accepted(table, X, uv, rhos, settings, lost) -> Matches:
     """Intersect; rays that do not fit are left out, points that do not fit are rejected."""
     found = table.intersect(X)
-    factor = variance_factor(found.vtpv, found.redundancy)
+    factor = max(1.0, variance_factor(found.vtpv, found.redundancy))
     bad = _misfits(found, factor)
     several = bad & (found.rays > max(settings.least_rays, 2))
     if several.any():

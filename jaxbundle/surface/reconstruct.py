@@ -40,7 +40,7 @@ class Surface:
 
 
 def find_bounds(
-    views: Sequence[OrientedImage],
+    views: Sequence[FrameView],
     tie: Float[np.ndarray, "n 3"],
     heights: tuple[float, float] | None = None,
 ) -> tuple[tuple[Bounds, ...], tuple[str, ...]]:
@@ -51,7 +51,9 @@ def find_bounds(
     guessed = []
     for view in views:
         others = [o for o in views if o is not view]
-        q = by_points(view, tie) if heights is None and len(tie) else None
+        # a view from among the heights is not bounded by them
+        among = heights is not None and low <= view.X0[2] <= high
+        q = by_points(view, tie) if len(tie) and (heights is None or among) else None
         if q is None:
             wide = by_geometry(view, others)
             if wide is None:
@@ -59,14 +61,16 @@ def find_bounds(
                     f"{view.name}: all images are at one place: a surface needs a base"
                 )
             # given heights are looked for at any distance
-            q = wide if heights is None else (1e-2 * wide[0], 1e2 * wide[1])
-            guessed.append((view.name, q))
+            q = wide if heights is None or among else (1e-2 * wide[0], 1e2 * wide[1])
+            if heights is None or among:
+                guessed.append((view.name, q))
         found.append(Bounds(view, q, low, high))
-    if guessed and heights is None:
+    if guessed:
         name, q = guessed[0]
         messages.append(
             f"no tie points in {len(guessed)} image(s): distances from {1 / q[1]:.4g} to "
-            f"{1 / q[0]:.4g} are searched ({name}); give --zmin and --zmax"
+            f"{1 / q[0]:.4g} are searched ({name})"
+            + ("; give --zmin and --zmax" if heights is None else ", the heights are all around it")
         )
     return tuple(found), tuple(messages)
 

@@ -1,0 +1,192 @@
+"""What least squares matching loses where the surface is no plane within the window, given back.
+
+A place d of the window has its match at
+
+    p(d) = p₀ + A·d + ½·Σ p_ij·dᵢ·dⱼ,
+
+by perspective, distortion, and the curvature of the surface, which the guide's nodes show: q about
+each is a polynomial of the second degree. An affine matching of windows finds the p₀ + A·c of
+
+    gᵀ·(B·d + c) + h₀ + h₁·T ≈ gᵀ·A⁻¹·½·Σ p_ij·dᵢ·dⱼ
+
+in the least squares sense, g the gradient of the grey values T. So A·c is taken off the place.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxbundle.measure.least_squares_matching import MatchingStatus
+from jaxbundle.surface.guide import Guide
+from jaxbundle.surface.refinement import refine
+from jaxbundle.surface.segments import positions, windows
+from jaxbundle.surface.views import OrientedImage
+
+REACH = 2
+"""Nodes on each side of one through which the polynomial goes."""
+MOST_MISSING = 4
+"""Of these nodes."""
+MOST_MISFIT = 0.12
+"""RMS of the nodes beside the polynomial, pixels of their level."""
+STEP = 4.0
+"""Pixels of the base over which second differences of places are taken."""
+UNSURE = 0.3
+"""σ of a correction, as a part of it."""
+UNKNOWN = 2.0
+"""Mean squares of the corrections that are added where none is known."""
+MOST = 0.5
+"""Pixels: a correction beyond is of a surface that the polynomial does not describe."""
+NEAR, SURE = 1.5, 0.7
+"""Pixels that least squares matching may move a node, and its ρ at least."""
+TOGETHER = 4096
+
+
+class Bend(NamedTuple):
+    """First and second derivatives of q by u and v [n, 5] (u, v, uu, uv, vv); which are known."""
+
+    derivatives: Float[np.ndarray, "n 5"]
+    known: Bool[np.ndarray, " n"]
+
+
+def bend_at(guide: Guide, uv: Float[np.ndarray, "n 2"]) -> Bend:
+    """Of the polynomial about the nearest node, at places."""
+    columns, rows = guide.q.shape[::-1]
+    place = (uv - guide.first) / guide.step
+    j, i = (np.clip(np.rint(a).astype(int), 0, n - 1) for a, n in zip(place.T, (columns, rows)))
+    k = np.arange(-REACH, REACH + 1)
+    y, x = (a.ravel().astype(float) for a in np.meshgrid(k, k, indexing="ij"))
+    A = np.column_stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2])
+    fit = np.linalg.pinv(A)
+    padded = np.pad(guide.q, REACH, mode="edge")
+    good = np.pad(guide.good, REACH)
+    pick = lambda a: np.stack([a[i + int(b), j + int(c)] for b, c in zip(y + REACH, x + REACH)], 1)
+    values, there = pick(padded), pick(good)
+    middle = values[:, len(x) // 2][:, None]
+    p = (values - middle) @ fit.T
+    misfit = np.sqrt(np.mean(((values - middle) - p @ A.T) ** 2, axis=1)) * guide.rate[i, j]
+    level = guide.step / 4.0
+    known = (there.sum(1) >= len(x) - MOST_MISSING) & (misfit < MOST_MISFIT * level)
+    size = guide.step
+    found = p[:, 1:] / np.array([size, size, size**2, size**2, size**2])
+    # the slope at the place itself, not at the node
+    du, dv = ((place - np.stack([j, i], 1)) * size).T
+    found[:, 0] += found[:, 2] * du + found[:, 3] * dv
+    found[:, 1] += found[:, 3] * du + found[:, 4] * dv
+    return Bend(np.where(known[:, None], found, 0.0), known)
+
+
+def sharpen(base: OrientedImage, others: Sequence[OrientedImage], guide: Guide, half: int) -> Guide:
+    """The guide with its good nodes where least squares matching has them, in the first of the
+    others that sees them: the polynomials need more than correlation gives."""
+    row, column = np.nonzero(guide.good)
+    q, left = guide.q.copy(), np.ones(len(row), bool)
+    uv = np.rint(np.stack([column, row], 1) * guide.step + guide.first)
+    for other in others:
+        k = np.flatnonzero(left)
+        if not len(k):
+            break
+        here, normal = guide.q[row[k], column[k]], guide.normal[row[k], column[k]]
+        # the node's own place is between pixels where the guide ends above the finest level
+        shift = uv[k] - (np.stack([column[k], row[k]], 1) * guide.step + guide.first)
+        slope = bend_at(guide, uv[k]).derivatives[:, :2]
+        here = here + np.sum(slope * shift, 1)
+        shape = windows(base, other, base.points(uv[k], here), normal)
+        ends = here[:, None] * np.array([1.0, 1.0]) + [0.0, 1e-3] / guide.rate[row[k], column[k]][
+            :, None
+        ]
+        places = positions(base, other, uv[k], ends)
+        start, rate = places[:, 0], (places[:, 1] - places[:, 0]) * 1e3
+        match = refine(base, other, uv[k], start, shape.A, half)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            change = np.sum((match.uv - start) * rate, 1) / np.sum(rate**2, 1)
+            good = (match.status == int(MatchingStatus.CONVERGED)) & shape.usable
+            good &= (np.abs(change) < NEAR) & (match.rho > SURE)
+        moved = k[good]
+        step = change[good] / guide.rate[row[moved], column[moved]]
+        q[row[moved], column[moved]] = (here - np.sum(slope * shift, 1))[good] + step
+        left[moved] = False
+    return dataclasses.replace(guide, q=q)
+
+
+def second_differences(
+    base: OrientedImage, other: OrientedImage, uv: Float[np.ndarray, "n 2"],
+    q: Float[np.ndarray, " n"], bend: Bend,
+) -> Float[np.ndarray, "n 3 2"]:
+    """p_uu, p_uv, p_vv: of places in the other image by u and v of the base, pixels⁻¹."""
+    places = {}
+    for a in (-1, 0, 1):
+        for b in (-1, 0, 1):
+            du, dv = STEP * a, STEP * b
+            terms = np.array([du, dv, du * du / 2, du * dv, dv * dv / 2])
+            there = base.points(uv + [du, dv], q + bend.derivatives @ terms)
+            places[a, b] = other.project(there)
+    middle = places[0, 0]
+    uu = places[1, 0] - 2 * middle + places[-1, 0]
+    vv = places[0, 1] - 2 * middle + places[0, -1]
+    mixed = (places[1, 1] - places[1, -1] - places[-1, 1] + places[-1, -1]) / 4
+    return np.stack([uu, mixed, vv], 1) / STEP**2
+
+
+def response(
+    grey: Float[np.ndarray, "rows columns"], uv: Float[np.ndarray, "n 2"],
+    A: Float[np.ndarray, "n 2 2"], second: Float[np.ndarray, "n 3 2"], half: int,
+) -> Float[np.ndarray, "n 2"]:
+    """A·c: by how much the matching of windows of 2·`half` + 1 pixels is beside the place; 0 where
+    that is not determined."""
+    out = np.zeros((len(uv), 2))
+    k = np.arange(-half, half + 1, dtype=float)
+    y, x = (a.ravel() for a in np.meshgrid(k, k, indexing="ij"))
+    squares = np.stack([x * x / 2, x * y, y * y / 2])
+    for first in range(0, len(uv), TOGETHER):
+        part = slice(first, first + TOGETHER)
+        T, gx, gy = _with_gradient(grey, np.rint(uv[part]).astype(int), half)
+        one = np.ones_like(T)
+        G = np.stack([gx, gy, gx * x, gx * y, gy * x, gy * y, one, T], 2)
+        w = np.einsum("nij,nkj->nki", np.linalg.inv(A[part]), second[part])
+        moved = np.einsum("nki,kp->nip", w, squares)
+        away = gx * moved[:, 0] + gy * moved[:, 1]
+        scale = 1 / np.maximum(np.linalg.norm(G, axis=1), 1e-9)
+        G = G * scale[:, None]
+        N = np.swapaxes(G, 1, 2) @ G + 1e-9 * np.eye(8)
+        c = np.linalg.solve(N, np.einsum("npi,np->ni", G, away)[:, :, None])[:, :, 0] * scale
+        found = np.einsum("nij,nj->ni", A[part], c[:, :2])
+        small = np.isfinite(found).all(1) & (np.linalg.norm(found, axis=1) < MOST)
+        out[part] = np.where(small[:, None], found, 0.0)
+    return out
+
+
+def corrected(
+    pair: tuple[OrientedImage, OrientedImage], guide: Guide, uv: Float[np.ndarray, "n 2"],
+    q: Float[np.ndarray, " n"], match, half: int,
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
+    """Places of matches, and their covariances, free of what bending does."""
+    bend = bend_at(guide, uv)
+    base, other = pair
+    second = second_differences(base, other, uv, q, bend)
+    good = bend.known & np.isfinite(second).all((1, 2)) & np.isfinite(match.A).all((1, 2))
+    good &= np.abs(np.linalg.det(np.where(good[:, None, None], match.A, np.eye(2)))) > 0.02
+    rows = np.flatnonzero(good)
+    off = np.zeros((len(uv), 2))
+    off[rows] = response(base.grey, uv[rows], match.A[rows], second[rows], half)
+    squares = off[:, :, None] * off[:, None]
+    # where no polynomial fits, what bending does elsewhere is not known to be less
+    unknown = squares[rows].mean(0) if len(rows) else np.zeros((2, 2))
+    doubt = np.where(good[:, None, None], UNSURE**2 * squares, UNKNOWN * unknown)
+    return match.uv - off, match.covariance + doubt
+
+
+def _with_gradient(grey, uv, half):
+    """Windows, and their gradients by central differences, [n, pixels]."""
+    k = np.arange(-half - 1, half + 2)
+    rows, columns = grey.shape
+    r = np.clip(uv[:, 1, None] + k, 0, rows - 1)
+    c = np.clip(uv[:, 0, None] + k, 0, columns - 1)
+    a = np.asarray(grey[r[:, :, None], c[:, None]], float)
+    n = len(uv)
+    gx = (a[:, 1:-1, 2:] - a[:, 1:-1, :-2]) / 2
+    gy = (a[:, 2:, 1:-1] - a[:, :-2, 1:-1]) / 2
+    T = a[:, 1:-1, 1:-1].reshape(n, -1)
+    return T - T.mean(1, keepdims=True), gx.reshape(n, -1), gy.reshape(n, -1)
