@@ -29,6 +29,7 @@ from jaxbundle.leastsquares.adjust import TableResult, table_result
 from jaxbundle.leastsquares.any_distance import is_at_infinity
 from jaxbundle.leastsquares.components import Component, variance_components
 from jaxbundle.leastsquares.distributions import chi2_quantile
+from jaxbundle.leastsquares.indices import rounded
 from jaxbundle.leastsquares.names import Name
 from jaxbundle.leastsquares.reduction import FACTORS
 from jaxbundle.leastsquares.robust import Reweighted, residual_lengths, robust_scale
@@ -37,6 +38,7 @@ from jaxbundle.leastsquares.stopping import SINGULAR, TERMINATIONS
 from jaxbundle.leastsquares.stopping import converged as reached_minimum
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.columns import some
+from jaxbundle.network.declare import LEAST_IMAGES
 from jaxbundle.network.tables import Network, units_of
 from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.network.units import ANGLE_UNITS
@@ -284,8 +286,12 @@ class Adjustment:
 
     @functools.cached_property
     def _angles(self):
-        """ω, φ, κ of all images, next to the angles that were given, and their Jacobians by δθ."""
-        return _all_angles(self.values.rotation, self.problem.network.images.angles)
+        """ω, φ, κ of all images, next to the angles that were given, and their Jacobians by δθ; by
+        a program that small networks share."""
+        given = self.problem.network.images.angles
+        rows = max(rounded(len(given)), LEAST_IMAGES)
+        wide = (np.resize(x, (rows, x.shape[1])) for x in (self.values.rotation, given))
+        return [np.asarray(x)[: len(given)] for x in _all_angles(*wide)]
 
     @functools.cached_property
     def image_covariance(self) -> Float[np.ndarray, "images 6 6"]:
@@ -483,13 +489,15 @@ class Adjustment:
 
 
 @jax.jit
+@jax.vmap
 def _all_angles(rotation, given):
     """ω, φ, κ of all images near the given ones, and their Jacobians by δθ."""
-    zero = jnp.zeros((rotation.shape[0], 3))
-    return (
-        jax.vmap(angles_near)(rotation, zero, given),
-        jax.vmap(jax.jacfwd(angles_near, 1))(rotation, zero, given),
-    )
+
+    def angles(d_theta):
+        found = angles_near(rotation, d_theta, given)
+        return found, found
+
+    return jax.jacfwd(angles, has_aux=True)(jnp.zeros(3))[::-1]
 
 
 def _of_image_points(problem: Problem, weights) -> Float[np.ndarray, " rays"]:

@@ -45,8 +45,10 @@ class Cofactors(eqx.Module):
     lower_inverse: Float[Array, "rows w w"] | None
 
 
-def cofactors(declared: Declared, values: Values, factor: Factor) -> Cofactors:
-    """All cofactor blocks of a solved problem."""
+def cofactors(
+    declared: Declared, values: Values, factor: Factor, moves: Tangent | None = None
+) -> Cofactors:
+    """All cofactor blocks of a solved problem; `moves`: the generators, where they are known."""
     plan = factor.plan
     Q = _without_held(plan, factor.inverse())
     eliminated, coupled = None, {}
@@ -63,9 +65,8 @@ def cofactors(declared: Declared, values: Values, factor: Factor) -> Cofactors:
         eliminated = jnp.einsum("nji,njk,nkl->nil", L, inner, L)
         eliminated = eliminated * free[:, :, None] * free[:, None, :]
         own[plan.eliminated] = eliminated
-    return Cofactors(
-        _in_datum(declared, values, factor, own), Q, eliminated, coupled, factor.lower_inverse
-    )
+    own = _in_datum(declared, values, factor, own, moves)
+    return Cofactors(own, Q, eliminated, coupled, factor.lower_inverse)
 
 
 def _without_held(plan: Plan, Q: Reduced) -> Reduced:
@@ -107,12 +108,12 @@ def _spread(pairs, a, b, Q, to_first, to_second, within: bool):
     return totals[0], totals[0 if within else 1]
 
 
-def _in_datum(declared, values, factor, own):
+def _in_datum(declared, values, factor, own, moves):
     """The diagonal blocks in the datum of the problem: S·Q·Sᵀ."""
     plan = factor.plan
     if plan.datum is None:
         return own
-    G, B = datum_directions(declared, plan, values)
+    G, B = datum_directions(declared, plan, values, moves)
     H = jax.vmap(lambda b: solve(factor, b), -1, -1)(B)
     M = jnp.linalg.inv(contract(plan, B, G))
     A = {g: h @ M.T for g, h in H.items()}
@@ -137,12 +138,12 @@ def blocks_of_tables(declared: Declared, plan: Plan, own, values: Values):
 
 
 def propagate(
-    declared: Declared, values: Values, factor: Factor, rows: Tangent
+    declared: Declared, values: Values, factor: Factor, rows: Tangent, moves: Tangent | None = None
 ) -> Float[Array, "f f"]:
     """F·Q·Fᵀ in the datum for any linear functions F of the unknowns (first axis of `rows`): one
     structured solve for each function."""
     plan = factor.plan
-    from_datum = jax.vmap(lambda r: s_transform_transposed(declared, plan, values, r))(rows)
+    from_datum = jax.vmap(lambda r: s_transform_transposed(declared, plan, values, r, moves))(rows)
     solved = jax.vmap(lambda r: solve(factor, r))(from_datum)
     products = (jnp.einsum("fni,gni->fg", from_datum[g], solved[g]) for g in from_datum)
     return sum(products, jnp.zeros(()))

@@ -19,11 +19,12 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool
 
 from jaxbundle.implicit import implicit_root, solve_dense
 from jaxbundle.leastsquares.normal import Tangent, total
-from jaxbundle.leastsquares.plan import Plan
+from jaxbundle.leastsquares.plan import Datum, Plan
 from jaxbundle.leastsquares.rows import Declared, Values
 from jaxbundle.types import present
 
@@ -70,21 +71,28 @@ def of_groups(plan: Plan, of_tables) -> Tangent:
     return found
 
 
-def open_directions(declared: Declared, plan: Plan, values: Values) -> Tangent:
-    """G: the directions of the open motions, [rows, w, defect]."""
-    moves, plan = generators(declared, values), leave_held(declared, plan, values)
-    gauge = present(plan.datum).gauge
+def open_directions(
+    declared: Declared, plan: Plan, values: Values, moves: Tangent | None = None
+) -> Tangent:
+    """G: the directions of the open motions, [rows, w, defect]; `moves`: the `generators`, where
+    they are known."""
+    moves = generators(declared, values) if moves is None else moves
+    gauge = present(leave_held(declared, plan, values, moves).datum).gauge
     return {name: rows @ gauge for name, rows in of_groups(plan, moves).items()}
 
 
-def leave_held(declared: Declared, plan: Plan, values: Values) -> Plan:
+def leave_held(
+    declared: Declared, plan: Plan, values: Values, moves: Tangent | None = None
+) -> Plan:
     """The plan with open motions changed least so that what is held stays where it is now: a
-    rotation about a held point goes with the point."""
+    rotation about a held point goes with the point. `moves`: the `generators`, where they are
+    known."""
     datum = present(plan.datum)
     held, gauge = datum.held, datum.gauge
     if not held:
         return plan
-    moves = generators(declared, {name: values[name] for name in held})
+    if moves is None:
+        moves = generators(declared, {name: values[name] for name in held})
     rows = jnp.concatenate([
         (moves[name] * mask[..., None]).reshape(-1, len(gauge)) for name, mask in held.items()
     ])  # fmt: skip
@@ -97,91 +105,113 @@ def leave_held(declared: Declared, plan: Plan, values: Values) -> Plan:
     return dataclasses.replace(plan, datum=moved)
 
 
-def s_transform(declared: Declared, plan: Plan, values: Values, change: Tangent) -> Tangent:
+def s_transform(
+    declared: Declared, plan: Plan, values: Values, change: Tangent, moves: Tangent | None = None
+) -> Tangent:
     """A change with the datum imposed: δ − G(BᵀG)⁻¹Bᵀδ; unchanged where nothing is open."""
     if plan.datum is None:
         return change
-    G, B = datum_directions(declared, plan, values)
+    G, B = datum_directions(declared, plan, values, moves)
     gram = contract(plan, B, G)
     along = jnp.linalg.solve(gram, contract(plan, B, change))
     return {name: d - G[name] @ along for name, d in change.items()}
 
 
-def s_transform_transposed(declared: Declared, plan: Plan, values: Values, row: Tangent) -> Tangent:
+def s_transform_transposed(
+    declared: Declared, plan: Plan, values: Values, row: Tangent, moves: Tangent | None = None
+) -> Tangent:
     """Sᵀ·f: f − B(GᵀB)⁻¹Gᵀf, nothing of which is along the open motions."""
     if plan.datum is None:
         return row
-    G, B = datum_directions(declared, plan, values)
+    G, B = datum_directions(declared, plan, values, moves)
     along = jnp.linalg.solve(contract(plan, G, B), contract(plan, G, row))
     return {name: f - B[name] @ along for name, f in row.items()}
 
 
-def datum_directions(declared: Declared, plan: Plan, values: Values) -> tuple[Tangent, Tangent]:
-    """G and B of all groups, [rows, w, defect]."""
-    G = open_directions(declared, plan, values)
+def datum_directions(
+    declared: Declared, plan: Plan, values: Values, moves: Tangent | None = None
+) -> tuple[Tangent, Tangent]:
+    """G and B of all groups, [rows, w, defect]; `moves`: the `generators`, where they are known."""
+    G = open_directions(declared, plan, values, moves)
     weight = of_groups(plan, zeros_of_tables(declared, values) | present(plan.datum).weight)
     return G, {name: g * weight[name][..., None] for name, g in G.items()}
 
 
 def move_to_datum(
-    declared: Declared, plan: Plan, values: Values, start: Values, newton: bool = True
+    declared: Declared, plan: Plan, values: Values, start: Values
 ) -> tuple[Values, Bool[Array, ""]]:
     """The problem moved along its open motions to where Bᵀ(x − x_start) = 0, and whether it is
     there.
 
-    Gauss–Newton steps, of a radian and a factor e at most; with `newton` Newton's when near, which
-    take long to compile, but reach what is deformed by half. Until rounding: no move at all, or a
-    small one that is no smaller than the one before."""
+    Gauss–Newton steps, of a radian and a factor e at most; Newton's when near, which take long to
+    compile, but reach what is deformed by half (without: `by_table.move_into_datum`). Until
+    rounding: no move at all, or a small one that is no smaller than the one before."""
     if plan.datum is None:
         return values, jnp.asarray(True)
     plan = leave_held(declared, plan, values)
     datum = present(plan.datum)
-    still, curved_ones = jnp.zeros(datum.gauge.shape[1]), present(declared.motions).curved
-    size = _largest(plan, start)
+    still, curved = jnp.zeros(datum.gauge.shape[1]), present(declared.motions).curved
+    size = largest(datum.weight, start)
 
     def moving(state):
-        _, distance, before, count = state
-        falling = (distance > 1e-6 * size) | (distance < 0.5 * before)
-        return (distance > THERE * size) & falling & (count < MOST_MOTIONS)
+        _, *progress = state
+        return moves_on(size, *progress)
 
     def further(state):
         values, before, _, count = state
         missing, slope = _datum_equations(declared, plan, values, start)
-        if newton:
-            near = jax.jacfwd(_missing)(still, (declared, plan), (values, start))
-            slope = jnp.where(before > NEAR * size, slope, near)
-        step = datum.gauge @ -jnp.linalg.solve(slope, missing)
-        curved = jnp.abs(step[jnp.array(curved_ones, int)]).max(initial=0.0)
-        moved = _moved(declared, plan, step / jnp.maximum(curved / LONGEST, 1.0), values)
+        near = jax.jacfwd(_missing)(still, (declared, plan), (values, start))
+        slope = jnp.where(before > NEAR * size, slope, near)
+        step = limited(datum.gauge @ -jnp.linalg.solve(slope, missing), curved)
+        moved = _moved(declared, plan, step, values)
         differences = {name: jax.tree.map(jnp.subtract, moved[name], values[name])
                        for name in datum.weight}  # fmt: skip
-        return moved, _largest(plan, differences), before, count + 1
+        return moved, largest(datum.weight, differences), before, count + 1
 
     begin = values, jnp.asarray(1e300), jnp.asarray(jnp.inf), 0
     values, distance, *_ = jax.lax.while_loop(moving, further, begin)
     return values, distance <= THERE * size
 
 
-def _largest(plan: Plan, tables: Values):
-    """The largest number of the rows that hold the datum."""
-    holding = present(plan.datum).weight
+def moves_on(size, distance, before, count):
+    """Whether a motion into the datum goes on: after steps of `distance`, and `before` that one."""
+    falling = (distance > 1e-6 * size) | (distance < 0.5 * before)
+    return (distance > THERE * size) & falling & (count < MOST_MOTIONS)
+
+
+def limited(step, curved: tuple[int, ...]):
+    """A step of the motions that is not longer than `LONGEST` in any of the curved ones."""
+    longest = abs(step[np.array(curved, int)]).max(initial=0.0)
+    return step / (longest / LONGEST).clip(1.0)
+
+
+def largest(holding: Tangent, tables: Values):
+    """The largest number of the rows that hold the datum; in NumPy of what is NumPy's."""
+    where = np.where if all(isinstance(w, np.ndarray) for w in holding.values()) else jnp.where
     return max(
-        jnp.where(weight.max(1) > 0, jnp.abs(x.reshape(len(weight), -1)).max(1), 0.0).max()
+        where(weight.max(1) > 0, abs(x.reshape(len(weight), -1)).max(1), 0.0).max()
         for name, weight in holding.items() for x in jax.tree.leaves(tables[name])
     )  # fmt: skip
 
 
-def _datum_equations(declared, plan, values, start):
-    """Bᵀ(x − x_start) and BᵀG, over the datum tables."""
-    missing, gram, datum = 0.0, 0.0, present(plan.datum)
-    moves = generators(declared, {name: values[name] for name in datum.weight})
+def equations(datum: Datum, moves: Tangent, away: Tangent):
+    """Bᵀ(x − x_start) and BᵀG, over the datum tables; `away`: x − x_start."""
+    missing, gram = 0.0, 0.0
     for name, weight in datum.weight.items():
         G = moves[name] @ datum.gauge
-        B = G * weight[..., None]
-        x = jax.vmap(declared.spaces[name].difference)(values[name], start[name])
-        missing += jnp.einsum("nwk,nw->k", B, x)
-        gram += jnp.einsum("nwk,nwl->kl", B, G)
+        B = (G * weight[..., None]).reshape(-1, G.shape[-1])
+        missing = missing + B.T @ away[name].ravel()
+        gram = gram + B.T @ G.reshape(B.shape)
     return missing, gram
+
+
+def _datum_equations(declared, plan, values, start):
+    """The same, differentiable, from the tables."""
+    datum = present(plan.datum)
+    moves = generators(declared, {name: values[name] for name in datum.weight})
+    away = {name: jax.vmap(declared.spaces[name].difference)(values[name], start[name])
+            for name in datum.weight}  # fmt: skip
+    return equations(datum, moves, away)
 
 
 def _missing(tau, fixed, given):

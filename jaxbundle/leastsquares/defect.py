@@ -14,18 +14,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxbundle.errors import InputError
-from jaxbundle.leastsquares.datum import HELD, free_of_tables, generators, of_groups
-from jaxbundle.leastsquares.declarations import Motions
+from jaxbundle.leastsquares.by_table import directions_of_motions
+from jaxbundle.leastsquares.datum import HELD, free_of_tables, of_groups
 from jaxbundle.leastsquares.linearise import differentiate
 from jaxbundle.leastsquares.normal import Tangent
 from jaxbundle.leastsquares.plan import Datum, Plan
 from jaxbundle.leastsquares.rows import Data, Declared, lay_out_data, prepare
 from jaxbundle.types import present
 
-HERE = "table"
-"""The name of a table that is looked at alone."""
-LEAST_ROWS = 128
-"""So many rows at least are filled up."""
 OPEN = 1e-10
 """Relative size of J·G below which a direction counts as open (rounding gives about 1e-14)."""
 
@@ -59,21 +55,8 @@ def survey_motions(
     declared: Declared, plan: Plan, data: Data, real: dict[str, Bool[np.ndarray, " rows"]]
 ) -> Survey:
     """See `Survey`; `real`: by table, which of its rows are not filled in."""
-    moves, given = {}, present(declared.motions)
-    for name, value in data.start.items():
-        action = tuple((HERE, act) for table, act in given.actions if table == name)
-        motions = Motions(given.names, action)
-        one = Declared((), ((HERE, declared.spaces[name]),), motions)
-        rows = jax.tree.leaves(value)[0].shape[0]
-        more = max(LEAST_ROWS - rows, 0)
-        wide = lambda x, more=more: np.pad(x, [(0, more), *[(0, 0)] * (x.ndim - 1)], mode="edge")
-        found = _generators(one, {HERE: jax.tree.map(wide, value)})[HERE]
-        moves[name] = np.asarray(found)[:rows]
+    moves = directions_of_motions(declared, data.start)
     return _survey(declared, plan, data, real, moves)
-
-
-_generators = eqx.filter_jit(generators)
-"""Of one table at a time: those of one space and size share the program, all small ones too."""
 
 
 @eqx.filter_jit

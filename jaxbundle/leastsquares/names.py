@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbundle.leastsquares.by_table import directions_of_motions
 from jaxbundle.leastsquares.datum import open_directions
 from jaxbundle.leastsquares.elimination import reduced_system
 from jaxbundle.leastsquares.normal import Normal, normal_equations
@@ -76,18 +77,20 @@ def scaled_system(problem: Problem, values: Values):
     """S scaled by the diagonal it has before anything is eliminated, in the order of
     `kept_unknowns`; V of the eliminated rows (None: there are none); the open directions."""
     plan, data = problem.plan, pad_data(problem, problem.data)
-    found = _scaled(problem.declared, plan, pad_values(problem, values), data)
+    values = pad_values(problem, values)
+    moves = None if plan.datum is None else directions_of_motions(problem.declared, values)
+    found = _scaled(problem.declared, plan, values, data, moves)
     S, V, G = jax.tree.map(np.asarray, found)
     return np.tril(S) + np.tril(S, -1).T, V, G
 
 
 @eqx.filter_jit
-def _scaled(declared: Declared, plan: Plan, values: Values, data: Data):
+def _scaled(declared: Declared, plan: Plan, values: Values, data: Data, moves):
     *_, blocks = normal_equations(declared, plan, values, lay_out_data(plan, data))
     S, scale, *_ = reduced_system(Normal(plan, blocks), regular=False)
     G = jnp.zeros((sum(plan.groups[g].free.size for g in plan.kept), 0))
     if plan.datum is not None:
-        open_ones = open_directions(declared, plan, values)
+        open_ones = open_directions(declared, plan, values, moves)
         rows = [open_ones[g] / scale[g][..., None] for g in plan.kept]
         G = jnp.concatenate([x.reshape(-1, x.shape[-1]) for x in rows])
     return S.matrix(plan, plan.kept), blocks.eliminated, G

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbundle.leastsquares.by_table import directions_of_motions, move_into_datum
 from jaxbundle.leastsquares.cofactors import Cofactors, blocks_of_tables, cofactors, propagate
 from jaxbundle.leastsquares.datum import move_to_datum, of_groups
 from jaxbundle.leastsquares.elimination import PIVOT, Factor, factorise, solve
@@ -108,14 +109,13 @@ def _worth_sharing(problem: Problem, start: Values) -> bool:
 def _move_to_datum(problem: Problem, values: Values, start: Values) -> Values:
     if problem.plan.datum is None:
         return values
-    for newton in (False, True):
-        moved, there = _moved_to_datum(problem.declared, problem.plan, values, start, newton)
-        if there:
-            break
+    moved, there = move_into_datum(problem.declared, problem.plan, values, start)
+    if not there:
+        moved, _ = _move_by_newton(problem.declared, problem.plan, values, start)
     return moved
 
 
-_moved_to_datum = eqx.filter_jit(move_to_datum)
+_move_by_newton = eqx.filter_jit(move_to_datum)
 
 
 def take_step(problem: Problem, values: Values) -> Values:
@@ -184,7 +184,13 @@ class Solution:
     @functools.cached_property
     def cofactors(self) -> Cofactors:
         """Blocks of the cofactor matrix."""
-        return _cofactors(self.problem.declared, self._values, self.factor)
+        return _cofactors(self.problem.declared, self._values, self.factor, self.moves)
+
+    @functools.cached_property
+    def moves(self):
+        """How all tables move along the motions; None where none is open."""
+        declared, plan, values = self.given[:3]
+        return None if plan.datum is None else directions_of_motions(declared, values)
 
     def cofactor(self, table: str) -> Float[np.ndarray, "rows width width"]:
         """The cofactors of every row of a table among themselves; zero where it is held."""
@@ -228,7 +234,7 @@ class Solution:
             t: np.pad(np.asarray(x), ((0, 0), (0, size["table", t] - x.shape[1]), (0, 0)))
             for t, x in rows.items()
         }
-        return np.asarray(_propagate(declared, values, self.factor, wide))
+        return np.asarray(_propagate(declared, values, self.factor, wide, self.moves))
 
     @property
     def given(self):
@@ -297,6 +303,7 @@ def _rows_of(function, declared, values, still):
 
 
 @eqx.filter_jit
-def _propagate(declared, values, factor, rows):
+def _propagate(declared, values, factor, rows, moves):
     plan = factor.plan
-    return propagate(declared, values, factor, jax.vmap(lambda r: of_groups(plan, r))(rows))
+    rows = jax.vmap(lambda r: of_groups(plan, r))(rows)
+    return propagate(declared, values, factor, rows, moves)

@@ -151,21 +151,23 @@ def _sigma_of_weakest(found: Solution, factor: Factor, per_extent):
         directions = np.linalg.qr(directions.T)[0].T
         previous = directions
         declared, _, values, _ = found.given
-        directions = np.asarray(_products(declared, values, factor, per_extent, directions))
+        directions = np.asarray(
+            _products(declared, values, factor, found.moves, per_extent, directions)
+        )
     mu, turn = np.linalg.eigh(previous @ directions.T)
     return np.sqrt(np.maximum(mu, 0) @ (turn.T @ previous) ** 2)
 
 
 @eqx.filter_jit
-def _products(declared, values, factor: Factor, per_extent, directions):
+def _products(declared, values, factor: Factor, moves, per_extent, directions):
     """A times each of the directions [m, reduced]."""
     plan = factor.plan
     still = {name: jnp.zeros(group.free.shape) for name, group in plan.groups.items()}
 
     def product(direction):
         right = still | split(plan, plan.kept, direction * per_extent)
-        right = s_transform_transposed(declared, plan, values, right)
-        change = s_transform(declared, plan, values, solve(factor, right))
+        right = s_transform_transposed(declared, plan, values, right, moves)
+        change = s_transform(declared, plan, values, solve(factor, right), moves)
         return flat(plan.kept, change) * per_extent
 
     return jax.vmap(product)(directions)
