@@ -1,0 +1,159 @@
+"""`jaxbundle surface` and `jaxbundle cloud` from files to files, and what they say of bad input;
+RPC images whose orientation misses by pixels."""
+
+import json
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import rasterio
+from surface_scenes import CAMERA, SIZE, photographs, two_shapes
+
+from jaxbundle.io.scanner.rpc import write_rpc
+from jaxbundle.planning.render import Scene, Sensor, render_rays
+from jaxbundle.planning.shapes import HeightField
+from jaxbundle.planning.texture import Texture
+from jaxbundle.pushbroom.rpc import Rpc
+from jaxbundle.surface.ground import RpcView, neighbourhood
+from jaxbundle.surface.point_files import read_cloud
+from jaxbundle.surface.scanner_inputs import from_map, map_coordinates
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory):
+    """A project of cameras and oriented images alone, and its photographs."""
+    folder = tmp_path_factory.mktemp("project")
+    views, truth = photographs(two_shapes(), [(-1.0, 0, 10), (1.0, 0, 10)])
+    p = CAMERA.parameters
+    values = "\n".join(f"{name} = {value}" for name, value in p.items())
+    (folder / "project.toml").write_text(
+        '[project]\nimage_unit = "px"\nimages = "images.csv"\n[[camera]]\nid = "cam"\n'
+        f'model = "opencv"\nimage_size = {list(SIZE)}\nfree = []\n{values}\n'
+    )
+    rows = [f"{v.name},cam,{','.join(map(str, v.X0))}" + ",0" * 9 for v in views]
+    header = "id,camera,X0,Y0,Z0,omega,phi,kappa,sX0,sY0,sZ0,somega,sphi,skappa"
+    (folder / "images.csv").write_text("\n".join([header, *rows]) + "\n")
+    (folder / "photos").mkdir()
+    for view in views:
+        cv2.imwrite(str(folder / "photos" / view.name), view.grey)
+    return folder, truth
+
+
+def test_a_project_becomes_a_cloud_and_a_dsm(project, tmp_path, command):
+    folder, truth = project
+    out = tmp_path / "out"
+    told = command(
+        "surface", folder, "--photos", folder / "photos", "--out", out, "--zmin", -1.5, "--zmax", 3,
+        "--pairs", "photo_0.png,photo_1.png", "--dense", "--step", 2, "--dsm", 0.25, "--json", "-",
+    )  # fmt: skip
+    assert told.status == 0
+    report = json.loads(told.out)
+    cloud = read_cloud(out / "cloud.csv")
+    assert report["points"] == len(cloud) > 3000
+    v, u = cloud.uv.astype(int).T[::-1]
+    e = cloud.X[:, 2] - truth[0][v, u][:, 2]
+    assert np.median(np.abs(e)) < 0.02 and (np.abs(e) > 0.3).mean() < 0.01
+    with rasterio.open(out / "dsm.tif") as raster:
+        assert raster.res == (0.25, 0.25)
+    thinned = tmp_path / "thin.ply"
+    told = command("cloud", out / "cloud.csv", "--cube", 0.5, "--out", thinned, "--against",
+                   out / "cloud.ply", "--json", "-")  # fmt: skip
+    found = json.loads(told.out)
+    assert found["points"] == len(read_cloud(thinned)) < len(cloud) / 4
+    assert abs(found["comparison"]["median"]) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"--photos": "nowhere"}, "no such folder"),
+        ({"--zmax": "-9"}, "the lower height first"),
+        ({"--pairs": "photo_0.png,phot_1.png"}, "no image 'phot_1.png'"),
+        ({"--points": "stars"}, "grid, edges, corners"),
+    ],
+)
+def test_bad_input_ends_in_one_line(project, tmp_path, command, change, said):
+    folder, _ = project
+    options = {"--photos": folder / "photos", "--out": tmp_path / "out", "--zmin": "-1.5",
+               "--zmax": "3", **change}  # fmt: skip
+    told = command("surface", folder, *(x for pair in options.items() for x in pair))
+    assert told.status == 2 and said in told.err and told.err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_photographs_of_another_size_or_missing_are_named(project, tmp_path, command):
+    folder, _ = project
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    run = lambda: command("surface", folder, "--photos", photos, "--out", tmp_path / "out")
+    assert "photo_0.png, photo_1.png" in run().err
+    for k in (0, 1):
+        cv2.imwrite(str(photos / f"photo_{k}.png"), np.zeros((10, 20), np.uint8))
+    told = run()
+    assert told.status == 2 and "20 × 10" in told.err
+
+
+LINES, SAMPLES = 150, 180
+
+
+def coefficients(by_height):
+    """North up, 2 m a pixel, samples moved by height."""
+    z = np.zeros(20)
+    line, sample, one = z.copy(), z.copy(), z.copy()
+    line[2], line[8], sample[1], sample[3], one[0] = -1, 0.003, 1, by_height, 1
+    scalars = (LINES / 2, LINES / 2, SAMPLES / 2, SAMPLES / 2, 10.0, SAMPLES / 2 * 2.5e-5, 45.0,
+               LINES / 2 * 1.8e-5, 200.0, 200.0)  # fmt: skip
+    return Rpc(*map(jnp.asarray, (line, one, sample, one)), *map(jnp.asarray, map(float, scalars)))
+
+
+def ground(X, Y):
+    return 200 + 12 * np.sin(X / 60) * np.cos(Y / 70)
+
+
+@pytest.fixture(scope="module")
+def satellite(tmp_path_factory):
+    """Two RPC images; the second is moved by 3 lines against its coefficients."""
+    folder = tmp_path_factory.mktemp("satellite")
+    around = neighbourhood(np.radians(10.0), np.radians(45.0))
+    scene = Scene((HeightField(ground, (-600, -600, 600, 600)),), (Texture(1.0, 2, 512),))
+    blank = np.zeros((LINES, SAMPLES), np.float32)
+    for name, by_height, shift in (("a", 0.6, 0.0), ("b", -0.6, 3.0)):
+        view = RpcView(name, blank, coefficients(by_height), around)
+        v, u = np.indices((LINES + 1, SAMPLES + 1)).reshape(2, -1)
+        uv = np.stack([u, v - shift], 1)
+        top, bottom = (view.points(uv, np.full(len(uv), h)) for h in (400.0, 0.0))
+        d = (bottom - top) / np.linalg.norm(bottom - top, axis=1, keepdims=True)
+        o, d = (a.reshape(LINES + 1, SAMPLES + 1, 3) for a in (top, d))
+        shot = render_rays(scene, o, d, Sensor(noise=1.5, seed=len(name)))
+        cv2.imwrite(str(folder / f"{name}.tif"), shot.grey.astype(np.uint16) * 9 + 100)
+        write_rpc(folder / f"{name}_RPC.TXT", coefficients(by_height))
+    return folder, around
+
+
+@pytest.mark.parametrize("dense", [(), ("--dense",)])
+def test_rpc_images_become_a_cloud_in_a_map_system(satellite, tmp_path, command, dense):
+    folder, around = satellite
+    out = tmp_path / "out"
+    told = command(
+        "surface", folder / "a.tif", folder / "b.tif", "--out", out, "--zmin", 170, "--zmax", 230,
+        "--pairs", "a.tif,b.tif", "--step", 3, "--json", "-", *dense,
+    )  # fmt: skip
+    assert told.status == 0, told.err
+    report = json.loads(told.out)
+    assert report["system"] == "EPSG:32632" and "pixels between them" in report["warnings"][0]
+    cloud = read_cloud(out / "cloud.csv")
+    assert len(cloud) > 0.5 * LINES * SAMPLES / 9
+    X = from_map(*cloud.X.T, around, "EPSG:32632")
+    e = cloud.X[:, 2] - ground(X[:, 0], X[:, 1])
+    w = e / cloud.sigma[:, 2]
+    assert (np.abs(w) > 5).mean() < 0.02
+    assert 0.7 < np.sqrt(np.mean(w[np.abs(w) < 5] ** 2)) < 1.3
+
+
+def test_map_coordinates_go_both_ways(satellite):
+    _, around = satellite
+    X = np.array([[100.0, -50, 200], [0, 0, 0]])
+    x, y = map_coordinates(X, around, "EPSG:32632")
+    np.testing.assert_allclose(from_map(x, y, X[:, 2], around, "EPSG:32632"), X, atol=1e-6)
+    assert 0.999 < np.hypot(x[0] - x[1], y[0] - y[1]) / np.hypot(100, 50) < 1.001
