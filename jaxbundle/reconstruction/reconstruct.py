@@ -34,7 +34,7 @@ from jaxbundle.reconstruction.settings import Settings
 from jaxbundle.system.configuration import available_cores
 from jaxbundle.tiepoints.features import Features
 from jaxbundle.tiepoints.refinement import Measurements, measure_tracks
-from jaxbundle.tiepoints.search import Tell, detect, match, start_cameras, verify
+from jaxbundle.tiepoints.search import Tell, detect, match, prepare, start_cameras, verify
 from jaxbundle.tiepoints.store import Store
 from jaxbundle.tiepoints.tracks import choose_tracks, make_tracks
 from jaxbundle.tiepoints.verification import Pair
@@ -127,17 +127,25 @@ class _Making:
         self.notes, self.stage = list(cameras.notes), ""
 
     def run(self) -> Reconstruction:
-        features = self._features()
-        prints = [p.fingerprint for p in self.photographs]
-        matches = match(features, prints, self.settings.pairs, None, self.store, self.workers,
-                        self.tell)  # fmt: skip
-        self.store.drop_unused()
+        with ThreadPoolExecutor(1) as ahead:
+            # compiled while features are searched and matched
+            prepared = ahead.submit(prepare)
+            features, matches = self._matches()
+            prepared.result()
         self._calibrate(features, matches)
         pairs = verify(self.cameras.cameras, self.cameras.of, features, matches, self.tell)
         parts = self._parts(features, matches, pairs)
         said = tuple((self.names[p.images[0]], self.names[p.images[1]], p.found, len(p), p.kind)
                      for p in pairs)  # fmt: skip
         return Reconstruction(tuple(parts), self.left_out, tuple(self.notes), said)
+
+    def _matches(self):
+        features = self._features()
+        prints = [p.fingerprint for p in self.photographs]
+        matches = match(features, prints, self.settings.pairs, None, self.store, self.workers,
+                        self.tell)  # fmt: skip
+        self.store.drop_unused()
+        return features, matches
 
     def _features(self) -> list[Features]:
         read = [self._reader(p) for p in self.photographs]
@@ -219,11 +227,11 @@ class _Making:
             self.tell(stage, 0, 1)
 
     def _why_nothing(self, pairs, failed) -> str:
-        turned = [p for p in pairs if p.kind == "rotation"]
-        if pairs and len(turned) == len(pairs):
+        kinds = {p.kind for p in pairs}
+        if kinds == {"rotation"} or kinds == {"rotation", "plane"}:
             return (
-                "not solved: the photographs were taken from one place, they differ by a rotation "
-                "only; take them from places that lie apart"
+                "not solved: a rotation or a plane explains every pair: the photographs were taken "
+                "from one place, or show a plane only; take them from places that lie apart"
             )
         if failed:
             return failed[0] if failed[0].startswith("not solved") else f"not solved: {failed[0]}"

@@ -82,6 +82,15 @@ def estimate_interior(
     return Start(better, len(use), float(np.median(np.abs(e))))
 
 
+def prepare() -> None:
+    """Compile what `estimate_interior` runs, ahead of its data."""
+    xy = np.random.default_rng(0).uniform(-0.5, 0.5, (PAIRS, SLOTS, 2))
+    many.orient_pairs(list(xy), list(xy), np.full(PAIRS, 1e-3))
+    camera = Camera("camera", "opencv", {"fx": 1.0, "fy": 1.0})
+    M, b = np.tile(np.eye(3), (PAIRS, 1, 1)), np.tile([1.0, 0, 0], (PAIRS, 1))
+    _adjusted(camera, list(zip(xy, xy)), M, b, 1.0)
+
+
 def _with(camera, f, k1=0.0):
     return dataclasses.replace(
         camera, parameters={**camera.parameters, "fx": f, "fy": f, "k1": k1}

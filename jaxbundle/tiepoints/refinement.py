@@ -95,6 +95,13 @@ def measure_tracks(
     return _collect(track, image, xy, size, first, level, corner, colour, others, found)
 
 
+def prepare() -> None:
+    """Compile the matching, ahead of its data."""
+    pieces = np.random.default_rng(0).integers(0, 255, (LANES, PIECE, PIECE), np.uint8)
+    start = np.tile(np.array([[1, 0, PIECE // 2], [0, 1, PIECE // 2]], np.float32), (LANES, 1, 1))
+    _match(pieces[:, :WINDOW, :WINDOW], pieces, start)
+
+
 def _roles(track, size):
     """Which measurement of a track gives the window, that of the middle size; and the levels."""
     order = np.lexsort((size, track))

@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt8
 from jaxbundle.network.tables import Camera
 from jaxbundle.network.units import from_image_unit
 from jaxbundle.orientation.sights import ideal_points
+from jaxbundle.tiepoints import interior, refinement, verification
 from jaxbundle.tiepoints.features import Detection, Features, find_features
 from jaxbundle.tiepoints.interior import estimate_interior
 from jaxbundle.tiepoints.matching import match_features
@@ -22,6 +23,12 @@ TOLERANCE = 0.0012
 WIDEST = 0.6
 """Pairs that determine the principal distance: those with at least this part of the most matches,
 and others with fewer, which lie wider apart."""
+
+
+def prepare() -> None:
+    """Compile the programs of start values, verification and measurement, ahead of their data."""
+    for module in (interior, verification, refinement):
+        module.prepare()
 
 
 def detect(

@@ -101,6 +101,15 @@ def verify_pairs(
     return found
 
 
+def prepare() -> None:
+    """Compile what `verify_pairs` runs, ahead of its data."""
+    xy = np.random.default_rng(0).uniform(-0.5, 0.5, (LANES, SLOTS, 2))
+    M, b = np.tile(np.eye(3), (LANES, 1, 1)), np.tile([1.0, 0, 0], (LANES, 1))
+    weights = np.ones((LANES, SLOTS))
+    many.in_lanes(_refine, LANES, M, b, xy, xy, weights)
+    many.in_lanes(_simpler, LANES, M, b, xy, xy, weights)
+
+
 def _by_rotation(xy1, xy2, tolerance):
     """The matches that a rotation about the projection centre explains, and M, if most are."""
     rays = [np.pad(xy, ((0, 0), (0, 1)), constant_values=-1.0) for xy in (xy1, xy2)]
