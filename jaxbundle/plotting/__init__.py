@@ -18,5 +18,7 @@ from jaxbundle.plotting.images import residual_vectors as residual_vectors
 from jaxbundle.plotting.quality import coverage_map as coverage_map
 from jaxbundle.plotting.quality import uncertainty_curve as uncertainty_curve
 from jaxbundle.plotting.quality import uncertainty_image as uncertainty_image
+from jaxbundle.plotting.surfaces import cloud_perspective as cloud_perspective
+from jaxbundle.plotting.surfaces import dsm_relief as dsm_relief
 from jaxbundle.plotting.views import network_perspective as network_perspective
 from jaxbundle.plotting.views import network_plan as network_plan

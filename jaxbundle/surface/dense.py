@@ -24,6 +24,9 @@ from jaxbundle.photographs.opencv import need_opencv
 
 BLOCK = 3
 """Side of the blocks of semi-global matching."""
+MOST_COSTS = 4e8
+"""Pixels times disparities up to which all costs are held in memory, of 2 bytes and more, and
+paths from below are followed as well."""
 UNIQUE = 5
 """Percent by which the best cost must be below the second."""
 SPECKLE = 80
@@ -40,7 +43,8 @@ NEAR = 0.7
 """Pixels: by so much disparities of one surface differ within a window, about."""
 MOST_CHANGE = 1.0
 """Pixels that least squares may move a disparity."""
-LEAST_CORRELATION = 0.5
+LEAST_CORRELATION, SURE = 0.5, 0.9
+"""ρ of a window at least; and of one beside a step in the surface."""
 MOST_SIGMA = 0.5
 """σ of a disparity, pixels, above which the texture does not determine it."""
 LEAST_CONTRAST = 1.0
@@ -83,7 +87,9 @@ def semi_global(left, right, span: int) -> Float[np.ndarray, "rows columns"]:
     matcher = cv2.StereoSGBM.create(
         minDisparity=0, numDisparities=number, blockSize=BLOCK, P1=8 * BLOCK**2,
         P2=48 * BLOCK**2, disp12MaxDiff=1, preFilterCap=31, uniquenessRatio=UNIQUE,
-        speckleWindowSize=SPECKLE, speckleRange=2, mode=cv2.STEREO_SGBM_MODE_HH4,
+        speckleWindowSize=SPECKLE, speckleRange=2,
+        mode=cv2.STEREO_SGBM_MODE_HH4 if left.size * number < MOST_COSTS
+        else cv2.STEREO_SGBM_MODE_SGBM,
     )  # fmt: skip
     eight = [np.clip(np.rint(a), 0, 255).astype(np.uint8) for a in (left, right)]
     # columns of the left image without a full range of disparities are matched with a margin
@@ -115,8 +121,11 @@ def refine_disparities(left, right, start) -> Disparities:
         good &= (found.rho >= LEAST_CORRELATION) & found.textured & (found.h1 > 0.2)
         across = (found.y / found.sigma_y)[good]
     factor = max(_factor(across), _scatter(np.where(good, shape + moved, np.nan), found.sigma_x))
-    sigma = np.sqrt(factor * found.sigma_x**2 + _at_edges(shape + moved, good))
+    edges = _at_edges(shape + moved, good)
+    sigma = np.sqrt(factor * found.sigma_x**2 + edges)
     with np.errstate(invalid="ignore"):
+        # beside a step the disparities of one side reach over to the other
+        good &= ~(edges >= STEP**2) | (found.rho >= SURE)
         good &= sigma < MOST_SIGMA
     keep = lambda a: np.where(good, a, np.nan)
     return Disparities(keep(shape + moved), keep(sigma), keep(found.rho), factor)

@@ -11,27 +11,36 @@ import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
 
+from jaxbundle.surface.bounds import Bounds
 from jaxbundle.surface.cloud import Cloud
 from jaxbundle.surface.dense import Disparities, match_dense
 from jaxbundle.surface.guide import Guide
-from jaxbundle.surface.rectification import Rectified, rectify
+from jaxbundle.surface.rectification import Rectified, disparity_range, rectify
 from jaxbundle.surface.views import FrameView
 
 TOGETHER = 1 << 19
 """Pixels that are looked up together."""
 ONE_SURFACE = 1.0
 """Disparities of the four neighbours differ by less, pixels, where they are interpolated."""
+MOST_DISPARITIES = 320
+SPREAD = 9
 AGREE = 4.0
 """Values of several pairs agree within so many σ of their difference."""
 
 
 def dense_cloud(
-    base: FrameView, others: Sequence[FrameView], guide: Guide, step: int = 1
+    base: FrameView, others: Sequence[FrameView], guide: Guide, bounds: Bounds, step: int = 1
 ) -> tuple[Cloud, list[tuple[str, float]], list[str]]:
-    """The cloud; name and variance factor of each image used; those that cannot be rectified."""
-    X = guide_points(base, guide)
+    """The cloud; name and variance factor of each image used; those that cannot be rectified.
+
+    All disparities between the bounds are searched, unless they are very many: then those about
+    what the guide has found.
+    """
+    found_points, all_points = guide_points(base, guide), bound_points(base, bounds)
     pairs, used, left_out = [], [], []
     for other in others:
+        span = disparity_range(base, other, all_points)
+        X = all_points if span is not None and span < MOST_DISPARITIES else found_points
         rectified = rectify(base, other, X)
         if rectified is None:
             left_out.append(other.name)
@@ -61,6 +70,15 @@ def guide_points(base: FrameView, guide: Guide) -> Float[np.ndarray, "n 3"]:
     row, column = np.nonzero(guide.good)
     uv = np.stack([column, row], 1) * guide.step + guide.first
     return base.points(uv, guide.q[row, column])
+
+
+def bound_points(base: FrameView, bounds: Bounds) -> Float[np.ndarray, "n 3"]:
+    """Points at both ends of lines of sight spread over an image."""
+    u, v = (np.linspace(0, n - 1, SPREAD) for n in base.size)
+    uv = np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
+    q = bounds(uv)
+    ends = np.concatenate([base.points(uv, np.maximum(q[:, k], 1e-12)) for k in (0, 1)])
+    return ends[np.isfinite(ends).all(1)]
 
 
 def _points(base, pairs, uv):

@@ -146,7 +146,7 @@ def reconstruct(
         if i not in guides:
             row |= {"points": 0, "matched": 0, "variance_factor": None, "rejected": {}}
         elif dense:
-            cloud, counts, left_out = _dense(views, i, others, guides[i], step or 1)
+            cloud, counts, left_out = _dense(views, i, others, guides[i], bounds[i], step or 1)
             clouds.append(cloud)
             row |= counts
             messages += [f"{views[i].name} with {name}: cannot be rectified, left out"
@@ -171,11 +171,14 @@ def reconstruct(
     return Surface(merge(clouds), tuple(told), tuple(messages))
 
 
-def _dense(views, i, others, guide, step):
+def _dense(views, i, others, guide, bounds, step):
     """The cloud of most pixels of an image, its counts, images that cannot be rectified with it."""
     base = views[i]
-    match = dense_cloud if isinstance(base, FrameView) else dense_ground_cloud
-    cloud, used, left_out = match(base, [views[j] for j in others], guide, step)
+    partners = [views[j] for j in others]
+    if isinstance(base, FrameView):
+        cloud, used, left_out = dense_cloud(base, partners, guide, bounds, step)
+    else:
+        cloud, used, left_out = dense_ground_cloud(base, partners, guide, step)
     cloud = dataclasses.replace(cloud, colour=_colour(base, cloud.uv))
     columns, rows = base.size
     number = -(-columns // step) * -(-rows // step)

@@ -104,6 +104,23 @@ def rectify(
     return Rectified(left, right, origin, lowest, base.X0, R, f, length), span
 
 
+def disparity_range(
+    base: FrameView, other: FrameView, X: Float[np.ndarray, "n 3"]
+) -> float | None:
+    """About the range of the disparities of points, pixels; None of cameras at one place."""
+    b = other.X0 - base.X0
+    length = float(np.linalg.norm(b))
+    if not length > 0:
+        return None
+    axis = -(base.M[2] + other.M[2])
+    axis = axis - (axis @ b) * b / length**2
+    depth = (X - base.X0) @ (axis / max(float(np.linalg.norm(axis)), 1e-9))
+    depth = depth[depth > 0]
+    if not len(depth):
+        return None
+    return float(np.ptp(_resolution(base) * length / depth))
+
+
 def _resolution(view: FrameView) -> float:
     """Pixels per radian in the middle of an image."""
     middle = np.array([[(n - 1) / 2 for n in view.size]])

@@ -3,17 +3,23 @@
 import dataclasses
 
 import ezdxf
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import rasterio
+from surface_scenes import hills, photographs, two_shapes
 
+from jaxbundle import plotting
 from jaxbundle.errors import InputError
+from jaxbundle.planning.texture import Texture
 from jaxbundle.surface.accuracy import accuracy_of, at_check_points, to_plane
 from jaxbundle.surface.cloud import Cloud, merge
 from jaxbundle.surface.compare import compare
-from jaxbundle.surface.dsm import NO_DATA, make_dsm, write_dsm
+from jaxbundle.surface.dsm import NO_DATA, Dsm, make_dsm, write_dsm
 from jaxbundle.surface.filtering import drop_lonely, drop_weak, thin
+from jaxbundle.surface.orthophoto import orthophoto
 from jaxbundle.surface.point_files import read_cloud, write_cloud
+from jaxbundle.surface.stereo import StereoPair, stereo_pair
 
 
 def cloud_on_plane(n=4000, noise=0.05, seed=0, system=None):
@@ -138,3 +144,46 @@ def test_clouds_are_compared_along_normals(plane):
     with pytest.raises(InputError, match="nothing in common"):
         compare(Cloud(plane.X + 1e4, *(getattr(plane, n) for n in
                 ("covariance", "rays", "image", "uv", "images"))), other)  # fmt: skip
+
+
+def test_pictures_show_all_points_and_cells(plane):
+    ax = plotting.cloud_perspective(plane)
+    low, high = ax.get_xlim()
+    assert low < plane.X[:, 0].min() and plane.X[:, 0].max() < high
+    dsm = make_dsm(plane, 2.0)
+    picture = plotting.dsm_relief(dsm).images[0]
+    assert picture.get_extent() == [500_000, 500_040, 5_000_000, 5_000_040]
+    # falls to the north-west, away from the light: darker than a plane that rises there
+    rising = dataclasses.replace(dsm, height=-dsm.height)
+    lit = plotting.dsm_relief(rising).images[0].get_array()[..., :3]
+    assert lit.mean() != picture.get_array()[..., :3].mean()
+    plt.close("all")
+
+
+def test_an_orthophoto_shows_what_the_image_sees_and_nothing_behind_a_roof():
+    views, _ = photographs(two_shapes(), [(3.0, 0, 10)], noise=0)
+    x, y = np.meshgrid(np.arange(-3, 3, 0.05) + 0.025, -(np.arange(-3, 3, 0.05) + 0.025))
+    roof = (np.abs(x + 0.2) < 1) & (np.abs(y + 0.2) < 1)
+    dsm = Dsm(np.where(roof, 2.0, hills(x, y)), 0 * x, 0 * x.astype(int), -3.0, 3.0, 0.05)
+    grey, steep = orthophoto(views[0], dsm)
+    texture = Texture(0.02, seed=1, side=512)
+    ground = np.isfinite(grey) & ~roof
+    expected = texture(x[ground], y[ground], np.full(ground.sum(), 0.05)) * 255
+    assert np.corrcoef(grey[ground], expected)[0, 1] > 0.9
+    # the roof's shadow: beyond its edge as seen from X = 3
+    behind = (x < -1.35) & (x > -1.7) & (np.abs(y + 0.2) < 0.8)
+    assert np.isnan(grey[behind]).mean() > 0.9 and np.isfinite(grey[x > 1]).mean() > 0.95
+    assert np.nanmax(steep) <= 1 and steep[20, 110] > steep[20, 30]
+
+
+def test_stereo_formulas_are_those_of_the_normal_case():
+    pair = StereoPair(c=256.0, b=2.0, h=10.0)
+    assert pair.parallax == pytest.approx(51.2) and pair.base_to_height == pytest.approx(0.2)
+    p = pair.parallax + 3.0
+    assert 10 - pair.height(p) == pytest.approx(float(pair.height_difference(3.0)))
+    noise = np.random.default_rng(0).normal(0, 0.05, (2, 20_000))
+    drawn = pair.height(pair.parallax + noise[0] - noise[1])
+    assert drawn.std() == pytest.approx(pair.sigma_height(0.05), rel=0.02)
+    views, _ = photographs(two_shapes(), [(-1.0, 0, 10), (1.0, 0, 10)])
+    made = stereo_pair(views[0], views[1], 0.0)
+    np.testing.assert_allclose([made.c, made.b, made.h], [256, 2, 10], rtol=1e-4)
