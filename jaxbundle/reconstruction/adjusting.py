@@ -22,9 +22,9 @@ from jaxbundle.bundle.result import Adjustment
 from jaxbundle.network.tables import Network
 
 GROSS, DOUBTFUL = 4.0, 5.0
-SETTLED = 0.03
+SETTLED = 0.004
 """Change of a factor that ends the rounds."""
-ROUNDS = 3
+ROUNDS = 4
 FEWEST = 60
 """Measurements of a kind with a factor of its own."""
 SMALLEST, LARGEST = 0.3, 8.0
