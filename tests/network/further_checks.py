@@ -33,15 +33,17 @@ def check_jacobians(problem, values, skip=("image coordinates",)):
                       for s, x, d in zip(spaces, touched, along)]  # fmt: skip
             return jnp.stack(evaluate(kind, blocks, measured))
 
+        @jax.jit
+        @jax.vmap
         def retracted(step, spaces=spaces, touched=touched, along=along, kind=kind,
                       measured=measured):  # fmt: skip
-            blocks = [s.prepare(s.retract(x, jnp.asarray(step * d)))
+            blocks = [s.prepare(s.retract(x, step * d))
                       for s, x, d in zip(spaces, touched, along)]  # fmt: skip
-            return np.asarray(jnp.stack(evaluate(kind, blocks, measured)))
+            return jnp.stack(evaluate(kind, blocks, measured))
 
-        slope = np.asarray(jax.jacfwd(moved)(0.0))
-        h = 5e-5
-        differences = sum(factor / h * retracted(h * step) for step, factor in STENCIL)
+        slope = np.asarray(jax.jit(jax.jacfwd(moved))(0.0))
+        h, (steps, factors) = 5e-5, np.transpose(STENCIL)
+        differences = factors / h @ np.asarray(retracted(h * steps))
         assert np.abs(slope).max() > 1e-6, kind.name
         np.testing.assert_allclose(slope, differences, rtol=1e-7, atol=1e-7, err_msg=kind.name)
 
@@ -50,7 +52,7 @@ def _scalars(x):
     return x if np.ndim(x) == 0 else tuple(map(_scalars, x))
 
 
-def sample(problem, values, tables, draws=60):
+def sample(problem, values, tables, draws=24):
     """Values of tables of vectors, and positions of frames, from that many draws of everything that
     was measured, solved from the values; all by the program that is compiled already."""
     random, data = np.random.default_rng(8), problem.data

@@ -70,18 +70,26 @@ def moderate():
 
 @pytest.mark.parametrize("value", [(3.0, -2, 5, 2), (4e7, 1e8, -6e7, 2), (3.0, -2, 5, 0)])
 def test_a_place_moves_as_its_derivative_says(value):
-    space, value = AnyDistance(), jnp.array(value)
-    change = jnp.array([0.02, -0.03, 0.05])
-    A = derivative(value)
+    value, change = np.array(value), np.array([0.02, -0.03, 0.05])
+    A, slope, moved, there, difference = (np.asarray(x) for x in _of_a_place(value, change))
     scale = np.abs(value).max()
-    retracted = lambda d: space.retract(value, d)[:3]
-    np.testing.assert_allclose(A, jax.jacfwd(retracted)(jnp.zeros(3)), rtol=1e-12, atol=1e-12)
-    moved = jnp.stack(space.moved(space.prepare(value), tuple(change)))
-    np.testing.assert_allclose(moved, retracted(change), rtol=1e-13, atol=1e-13 * scale)
-    there = space.retract(value, change)
-    np.testing.assert_allclose(space.difference(there, value), change, rtol=1e-7)
+    np.testing.assert_allclose(A, slope, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(moved, there[:3], rtol=1e-13, atol=1e-13 * scale)
+    np.testing.assert_allclose(difference, change, rtol=1e-7)
     if value[3] == 0:
-        np.testing.assert_array_equal(there[:3], Vector(3).retract(value[:3], change))
+        np.testing.assert_array_equal(there[:3], Vector(3).retract(jnp.array(value[:3]), change))
+
+
+@jax.jit
+def _of_a_place(value, change):
+    space = AnyDistance()
+    retracted = lambda d: space.retract(value, d)
+    there = retracted(change)
+    return (
+        derivative(value), jax.jacfwd(retracted)(jnp.zeros(3))[:3],
+        jnp.stack(space.moved(space.prepare(value), tuple(change))), there,
+        space.difference(there, value),
+    )  # fmt: skip
 
 
 def test_across_the_ray_only_the_direction_turns_and_along_it_only_the_distance():
@@ -142,15 +150,15 @@ def _distances_of(inspection):
 def test_sigma_of_direction_and_inverse_distance_are_those_of_a_sample(moderate):
     found = moderate[1]
     far = find_far_points(found, 1.0)
-    draws = sample(found.problem, found.adjusted, ("point",), draws=150)["point"][:, NEAR:, :3]
+    draws = sample(found.problem, found.adjusted, ("point",), draws=40)["point"][:, NEAR:, :3]
     inverse = 1 / np.linalg.norm(draws, axis=2)
     ratio = inverse.std(0, ddof=1) / far.sigma_inverse_distance
-    # The σ of a σ from 150 draws is 6 %; eight of them.
-    assert 0.8 < ratio.min() and ratio.max() < 1.22
+    # The σ of a σ from 40 draws is 11 %; eight of them.
+    assert 0.65 < ratio.min() and ratio.max() < 1.35
     u = draws * inverse[..., None]
     off = u - (u * far.direction).sum(2, keepdims=True) * far.direction
     across = np.sqrt((off**2).sum(2).mean(0) / (far.sigma_direction**2).sum(1))
-    assert 0.8 < across.min() and across.max() < 1.22
+    assert 0.75 < across.min() and across.max() < 1.25
 
 
 def test_a_horizon_is_adjusted_and_lies_where_it_is(horizon):
@@ -224,7 +232,7 @@ def test_vtpv_would_fall_beyond_infinity_and_nowhere_else(horizon):
         point = values.point.at[NEAR:].set(X)
         return _vtpv_of_images(problem, dataclasses.replace(values, point=point))
 
-    slope = np.asarray(jax.grad(vtpv)(jnp.zeros(FAR)))
+    slope = np.asarray(jax.jit(jax.grad(vtpv))(jnp.zeros(FAR)))
     sigma = result.far_points.sigma_inverse_distance * problem.layout.lengths[NEAR:]
     # An inverse distance falls where δ grows.
     assert (slope[there] > 0).all()

@@ -130,17 +130,16 @@ def test_sigma_is_that_of_a_sample(simulated, result):
 def test_exact_conditions_hold(simulated):
     """What is exact is the limit of a small σ: points lie on their figures to 1e-7 of the extent.
     (A circle has two conditions a point, a sphere one; boards three.)"""
-    chosen = ("circle", "sphere")
-    figures = [row for row in tables("exact")["figures"] if row["type"] in chosen]
-    exact = jaxbundle.adjust(conditioned(simulated.network, "exact", figures=figures))
+    exact = jaxbundle.adjust(conditioned(simulated.network, "exact", simulated.truth))
     assert exact.converged
     X, first = exact.point_values, 0
     for type, n in SIZES.items():
         origin, M, radius = fit(type, X[first : first + n])
         x, y, z = ((X[first : first + n] - origin) @ M.T).T
         off = {"sphere": np.sqrt(x**2 + y**2 + z**2) - radius,
-               "circle": np.abs(np.hypot(x, y) - radius) + np.abs(z)}  # fmt: skip
-        if type in chosen:
+               "circle": np.abs(np.hypot(x, y) - radius) + np.abs(z),
+               "line": np.hypot(x, y), "plane": z}  # fmt: skip
+        if type in off:  # of a cylinder `fit` only approximates the axis
             assert np.abs(off[type]).max() < 1e-6, type
         first += n
     boards = X[first : first + 4], X[first + 4 : first + 8]
