@@ -15,7 +15,6 @@ from adjustment_checks import adjusted, camera, solved, synthetic, vtpv
 
 import jaxbundle
 from jaxbundle.adjustment.problem import make_problem
-from jaxbundle.adjustment.solve import solve
 from jaxbundle.leastsquares.derivatives import attach_derivatives
 from jaxbundle.leastsquares.problem import given_data, pad_values, without_filling
 
@@ -116,28 +115,6 @@ def resection():
         domain="measured",
     )  # fmt: skip
     return make_problem(network)
-
-
-def test_derivative_of_a_gradient_through_solve(resection):
-    """∂X0/∂xy and its derivative along a direction, forward over reverse, against differences; and
-    where there is no solution. (In a batch: the engine's own tests.)"""
-    data = resection.data
-
-    def X0(xy):
-        given = dataclasses.replace(data, image_xy=xy)
-        return solve(resection, given, atol=1e-10).position[0, 0]
-
-    random = np.random.default_rng(3)
-    u, anywhere = random.normal(size=(2, *data.image_xy.shape))
-    derivatives = jax.jit(lambda xy: jax.jvp(jax.grad(X0), (xy,), (u,)))
-    h = 0.3 / float(data.image_weight[0, 0])
-    of = lambda xy: map(np.asarray, derivatives(xy))
-    at = lambda step: of(data.image_xy + h * step * u)
-    _, second = at(0.0)
-    expected = sum(factor / h * next(at(step)) for step, factor in STENCIL)
-    np.testing.assert_allclose(second, expected, atol=1e-6 * np.abs(expected).max())
-    # Not converged: no derivative, rather than that of the last step.
-    assert all(np.isnan(x).all() for x in of(500 * anywhere))
 
 
 def test_check_gradients_of_an_adjustment(resection):

@@ -98,7 +98,7 @@ def test_a_design_that_determines_nothing_is_nan(problem, program):
 
 
 def test_a_station_moves_the_precision_of_the_principal_distance_in_a_batch(problem):
-    """∂²σ²/∂X0² under vmap, jit and forward over reverse."""
+    """∂σ²/∂X0, forward, under vmap and jit."""
     X0 = problem.data.start.position[1, 0]
 
     def variance(x):
@@ -111,13 +111,11 @@ def test_a_station_moves_the_precision_of_the_principal_distance_in_a_batch(prob
     h = 1e-3
     x = X0 + h * np.array([0, -2, -1, 1, 2])
 
-    slope = lambda x: jax.jvp(jax.value_and_grad(variance), (x,), (1.0,))
-    found = jax.jit(jax.vmap(slope))(x)
-    (value, first), (_, second) = jax.tree.map(np.asarray, found)
+    slope = lambda x: jax.jvp(variance, (x,), (1.0,))
+    value, first = map(np.asarray, jax.jit(jax.vmap(slope))(x))
     assert value[0] == pytest.approx(4 * dense_covariance(problem, problem.data)[0, 0], rel=1e-7)
     stencil = lambda y: (8 * (y[3] - y[2]) - (y[4] - y[1])) / (12 * h)
     assert first[0] == pytest.approx(stencil(value), rel=1e-6)
-    assert second[0] == pytest.approx(stencil(first), rel=1e-6)
 
 
 def test_names_that_are_not_there(problem):
