@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbundle.surface.views import OrientedImage, line_of_sight
 
-STEPS = 4
+STEPS = 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,21 +47,25 @@ def intersect(
     X = start.copy()
     weight = np.zeros((n, m, 2, 2))
     weight[used] = np.linalg.inv(covariance[used])
+    J, v, sights = np.zeros((n, m, 2, 3)), np.zeros((n, m, 2)), np.zeros((n, m, 3))
+    Q = np.full((n, 3, 3), np.nan)
     for step in range(STEPS + 1):
         N, g = np.zeros((n, 3, 3)), np.zeros((n, 3))
-        v, sights = np.zeros((n, m, 2)), np.zeros((n, m, 3))
         for k, view in enumerate(views):
             rows = np.flatnonzero(used[:, k])
-            J = view.derivative(X[rows])
+            if step in (0, STEPS):  # in between they hardly change
+                J[rows, k] = view.derivative(X[rows])
             v[rows, k] = view.project(X[rows]) - uv[rows, k]
-            sights[rows, k] = line_of_sight(J)
-            PJ = weight[rows, k] @ J
-            N[rows] += np.swapaxes(J, 1, 2) @ PJ
+            PJ = weight[rows, k] @ J[rows, k]
+            N[rows] += np.swapaxes(J[rows, k], 1, 2) @ PJ
             g[rows] += np.einsum("nji,nj->ni", PJ, v[rows, k])
         Q = _inverse(N)
         if step < STEPS:
             change = np.einsum("nij,nj->ni", Q, g)
             X = X - change
+    for k in range(m):
+        rows = np.flatnonzero(used[:, k])
+        sights[rows, k] = line_of_sight(J[rows, k])
     square = np.einsum("nki,nkij,nkj->nk", v, weight, v)
     rays = used.sum(1)
     return Intersected(

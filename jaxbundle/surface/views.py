@@ -33,8 +33,9 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.network.tables import Camera
 
-LANES = 1 << 14
-"""Points of one call; fewer are filled up to a power of 4."""
+LANES = 1 << 13
+FEW = 1 << 9
+"""Points of one call; up to so few are filled up to these: two programs serve all numbers."""
 BEYOND = 1.02
 """A ray farther from the axis than the farthest of the image, times this, is outside."""
 
@@ -177,7 +178,7 @@ def is_inside(view: OrientedImage, uv: Places, margin: float = 0.0) -> np.ndarra
 def in_lanes(program: Callable, frame, *arrays):
     """The program of arrays [n, …], by `LANES`, what is missing filled up."""
     n = len(arrays[0])
-    lanes = LANES if n > LANES // 4 else max(64, 4 ** int(np.ceil(np.log(max(n, 1)) / np.log(4))))
+    lanes = LANES if n > FEW else FEW
     parts = []
     for first in range(0, max(n, 1), lanes):
         chosen = np.minimum(np.arange(first, first + lanes), max(n - 1, 0))
