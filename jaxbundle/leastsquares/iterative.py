@@ -11,6 +11,7 @@ where every element of y is a change in units of its conditional σ, so that one
 A problem that may float is singular but consistent, which conjugate gradients do not mind.
 """
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -24,8 +25,12 @@ from jaxtyping import Array, Float
 from jaxbundle.leastsquares.normal import Normal, Tangent, agreed, gather, scatter, times_kept
 from jaxbundle.leastsquares.reduced import Reduced
 
-MOST_STEPS = 2000
-"""Steps of conjugate gradients after which what was found so far is taken."""
+MOST_STEPS, MOST_MORE = 2000, 100
+"""Steps of conjugate gradients, and those that improve what they found."""
+REACHED = 1e-10
+"""A relative residual that rounding allows in one go: below it the search directions are noise, and
+the steps may lead anywhere, above all along what is open. What is to be exact is improved once
+more, and is NaN if even this was not reached."""
 LEAST = 1e-300
 
 
@@ -47,10 +52,25 @@ class ConjugateGradients(eqx.Module):
         right, tag = divided(b), lx.positive_semidefinite_tag
         product = lambda y: divided(self._times(back(y)))
         operator = lx.FunctionLinearOperator(product, jax.eval_shape(lambda: right), tag)
-        # lineax asks for a float, and takes an array
-        limit: Any = jnp.maximum(self.tolerance * optx.two_norm(right), LEAST)
-        method = lx.CG(rtol=0.0, atol=limit, norm=optx.two_norm, max_steps=MOST_STEPS)
-        return back(lx.linear_solve(operator, right, method, throw=False).value)
+
+        def improved(y, left, tolerance, steps):
+            """y with what the residual `left` tells, if that makes it less; and what is left."""
+            # lineax asks for a float, and takes an array
+            limit: Any = jnp.maximum(tolerance * optx.two_norm(left), LEAST)
+            method = lx.CG(rtol=0.0, atol=limit, norm=optx.two_norm, max_steps=steps)
+            change = lx.linear_solve(operator, left, method, throw=False).value
+            better = jax.tree.map(jnp.add, y, change)
+            after = jax.tree.map(jnp.subtract, right, product(better))
+            less = optx.two_norm(after) < optx.two_norm(left)
+            return jax.tree.map(partial(jnp.where, less), (better, after), (y, left))
+
+        nothing, reached = jax.tree.map(jnp.zeros_like, right), max(self.tolerance, REACHED)
+        y, left = improved(nothing, right, reached, MOST_STEPS)
+        if self.tolerance < REACHED:
+            y, left = improved(y, left, self.tolerance / REACHED, MOST_MORE)
+            solved = optx.two_norm(left) <= 2 * REACHED * optx.two_norm(right)
+            y = jax.tree.map(lambda x: jnp.where(solved, x, jnp.nan), y)
+        return back(y)
 
     def inverse(self) -> Reduced:
         raise ValueError("conjugate gradients have no factor to read an inverse from: with_factor")
