@@ -15,6 +15,7 @@ AnyArray = Array | np.ndarray
 Numbers = Sequence[float] | Float[np.ndarray, " n"]
 Column = Sequence[Any] | np.ndarray
 """Cells of a table: numbers, text, or what a file has there."""
+Index = int | np.integer
 Scalar = float | Float[AnyArray, "..."]
 T = TypeVar("T")
 

@@ -28,6 +28,10 @@ os.environ.setdefault(
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
+from jaxtyping import install_import_hook  # noqa: E402
+from type_checker import modules_with_shapes  # noqa: E402
+
+install_import_hook(modules_with_shapes(ROOT / "jaxbundle"), "type_checker.checked")
 
 import jaxbundle  # noqa: E402
 from jaxbundle import cli  # noqa: E402

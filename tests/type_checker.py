@@ -10,12 +10,16 @@ checked = beartype(conf=BeartypeConf(is_pep484_tower=True))
 """Whole numbers count as numbers, as PEP 484 has it."""
 
 
+ROOMS = ("geometry", "cameras", "orientation", "pushbroom", "measure", "statistics", "refinement")
+"""Rooms of formulas. Arrays of the engine stand for others while it plans, and what only passes on
+what a user gives has words of its own for a wrong type."""
+
+
 def modules_with_shapes(package: Path) -> list[str]:
-    """The modules whose annotations have shapes: formulas, arrays, the engine. What only passes on
-    what a user gives has words of its own for a wrong type."""
-    files = [path for path in package.rglob("*.py") if "jaxtyping" in path.read_text()]
-    names = (".".join(path.relative_to(package.parent).with_suffix("").parts) for path in files)
-    return sorted(name.removesuffix(".__init__") for name in names)
+    """The modules of these rooms whose annotations have shapes."""
+    files = [path for room in ROOMS for path in (package / room).glob("*.py")]
+    shaped = [path for path in files if "jaxtyping" in path.read_text()]
+    return sorted(f"{package.name}.{path.parent.name}.{path.stem}" for path in shaped)
 
 
 @contextmanager

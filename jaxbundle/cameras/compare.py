@@ -27,9 +27,8 @@ from jaxbundle.cameras.parameters import default_parameters
 from jaxbundle.cameras.pixel_frame import between_frames
 from jaxbundle.float64 import local_x64
 from jaxbundle.geometry import matrix_from_rotation_vector
+from jaxbundle.leastsquares.small import minimise
 from jaxbundle.types import Numbers
-
-ITERATIONS = 20
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,17 +104,12 @@ def compare_cameras(
         raise ValueError(f"a radius of {radius:g} {source.unit} holds too few points to fit")
     p = np.array([others[name] for name in other.parameters], float)
     rotation = np.zeros(3)
+    target = (xy - shift) / step
     with local_x64():
-        for _ in range(ITERATIONS if rotate else 0):
-            there, slopes = (np.array(part) for part in _turned(other, p, rotation, rays))
-            d = ((shift + step * there) - xy)[near]
-            good = np.isfinite(d).all(1)
-            J = (step[:, None] * slopes)[near][good].reshape(-1, 3)
-            change = np.linalg.lstsq(J, -d[good].ravel(), rcond=None)[0]
-            rotation = rotation + change
-            if np.abs(change).max() < 1e-14:
-                break
-        there = np.array(_turned(other, p, rotation, rays)[0])
+        if rotate:
+            weight = near[:, None] * np.abs(step)
+            rotation = np.array(_best_turn(other, p, rays, target, weight))
+        there = np.array(_turned(other, p, rotation, rays))
     difference = np.where(seen[:, None], shift + step * there - xy, np.nan)
     length = np.linalg.norm(difference, axis=1)
     known = np.isfinite(length)
@@ -159,10 +153,17 @@ def difference_rings(comparison: Comparison, step: float) -> dict[str, np.ndarra
 
 @partial(jax.jit, static_argnums=0)
 def _turned(model, p, rotation, rays):
-    """Images of the turned rays [n, 2], and their derivatives by θ [n, 2, 3]."""
+    """Images of the turned rays [n, 2]."""
+    R = matrix_from_rotation_vector(rotation)
+    return jax.vmap(lambda ray: jnp.stack(project(model, tuple(p), *(R @ ray))))(rays)
 
-    def one(theta, ray):
-        return jnp.stack(project(model, tuple(p), *(matrix_from_rotation_vector(theta) @ ray)))
 
-    images = jax.vmap(one, (None, 0))(rotation, rays)
-    return images, jax.vmap(jax.jacfwd(one), (None, 0))(rotation, rays)
+@partial(jax.jit, static_argnums=0)
+def _best_turn(model, p, rays, xy, weight):
+    """θ that brings the images of the rays nearest to xy; rays of weight 0 may have none."""
+
+    def misclosures(rotation, rays, xy, weight):
+        d = weight * (_turned(model, p, rotation, rays) - xy)
+        return jnp.where((weight > 0) & jnp.isfinite(xy), d, 0.0).ravel()
+
+    return minimise(misclosures, jnp.add, jnp.zeros(3), (rays, xy, weight), 3)[0]

@@ -146,11 +146,12 @@ def quaternion_difference(q1: Float[AnyArray, "4"], q0: Float[AnyArray, "4"]) ->
     return rotation_vector_from_quaternion(quaternion_multiply(q1, quaternion_conjugate(q0)))
 
 
-def _normalise(q: Array) -> Array:
+def _normalise(q: AnyArray) -> Array:
+    q = jnp.asarray(q)
     return q / jnp.sqrt(jnp.sum(q * q))
 
 
-def _horner(coefficients: list[float], x: Array) -> Array:
+def _horner(coefficients: list[float], x: AnyArray) -> Array:
     zero = jnp.zeros_like(x)
     return reduce(lambda total, coefficient: total * x + coefficient, reversed(coefficients), zero)
 
@@ -162,7 +163,7 @@ _ARCTANGENT_SERIES = [(-1) ** k / (2 * k + 1) for k in range(11)]
 
 
 @traced_once
-def _sine_over_angle(square: Array) -> Array:
+def _sine_over_angle(square: AnyArray) -> Array:
     """sin θ/θ as a function of θ², smooth at zero."""
     small = square < 0.1
     angle = jnp.sqrt(jnp.where(small, 1, square))
@@ -170,6 +171,6 @@ def _sine_over_angle(square: Array) -> Array:
     return jnp.where(small, series, jnp.sin(angle) / angle)
 
 
-def _arctangent_series(square: Array) -> Array:
+def _arctangent_series(square: AnyArray) -> Array:
     """(arctan t)/t as a function of t² ≤ 0.01."""
     return _horner(_ARCTANGENT_SERIES, square)

@@ -29,6 +29,7 @@ from jaxtyping import Array, Float
 
 from jaxbundle.cameras import CameraModel, project
 from jaxbundle.orientation.pose import Pose, to_camera
+from jaxbundle.types import AnyArray
 
 RIM = 32
 """Points of a rim."""
@@ -47,7 +48,9 @@ class Ellipse(eqx.Module):
     covariance: Float[Array, "2 2"]
 
 
-def fit_ellipse(xy: Float[Array, "n 2"], weights: Float[Array, " n"] | None = None) -> Ellipse:
+def fit_ellipse(
+    xy: Float[AnyArray, "n 2"], weights: Float[AnyArray, " n"] | None = None
+) -> Ellipse:
     """The ellipse nearest to n > 5 points; differentiable, batched by `jax.vmap`.
 
     **Arguments:** `weights`: 0: the point is absent.
@@ -92,17 +95,15 @@ def fit_ellipse(xy: Float[Array, "n 2"], weights: Float[Array, " n"] | None = No
     axes = jnp.sqrt(depth / values)
     angle = jnp.arctan2(vectors[1, 0], vectors[0, 0])
     angle = jnp.remainder(angle + jnp.pi / 2, jnp.pi) - jnp.pi / 2
-    return Ellipse(
-        middle + size * centre, size * axes, angle, size * sigma0, size**2 * covariance
-    )
+    return Ellipse(middle + size * centre, size * axes, angle, size * sigma0, size**2 * covariance)
 
 
 def circle_centre_shift(
     model: CameraModel,
     p,
     pose: Pose,
-    centre: Float[Array, "3"],
-    normal: Float[Array, "3"],
+    centre: Float[AnyArray, "3"],
+    normal: Float[AnyArray, "3"],
     radius: float,
 ) -> Float[Array, "2"]:
     """Centre of the image of a circle minus image of its centre: the eccentricity of projection.
@@ -125,8 +126,8 @@ def rim_centre_shift(
     model: CameraModel,
     p,
     pose: Pose,
-    centre: Float[Array, "3"],
-    normal: Float[Array, "3"],
+    centre: Float[AnyArray, "3"],
+    normal: Float[AnyArray, "3"],
     radius: float,
 ) -> Float[Array, "2"]:
     """Centre of the ellipse through the image of a circle's rim minus image of its centre: as
@@ -135,9 +136,7 @@ def rim_centre_shift(
     a = jnp.cross(normal, aside)
     a = a / jnp.linalg.norm(a)
     t = 2 * jnp.pi * (jnp.arange(RIM) + 0.5) / RIM
-    rim = centre + radius * (
-        jnp.cos(t)[:, None] * a + jnp.sin(t)[:, None] * jnp.cross(normal, a)
-    )
+    rim = centre + radius * (jnp.cos(t)[:, None] * a + jnp.sin(t)[:, None] * jnp.cross(normal, a))
     image = lambda X: jnp.stack(project(model, tuple(p), *to_camera(pose, X)))
     return fit_ellipse(jax.vmap(image)(rim)).centre - image(centre)
 

@@ -21,8 +21,9 @@ from jaxtyping import Array, Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import affine
+from jaxbundle.leastsquares.small import adjust
 from jaxbundle.network.columns import did_you_mean
-from jaxbundle.orientation.least_squares import adjust
+from jaxbundle.types import AnyArray
 
 UNKNOWNS = {"similarity": 4, "affine": 6, "projective": 8}
 
@@ -55,7 +56,9 @@ class Transformation:
         )
 
 
-def transform(kind: str, p: Float[Array, " u"], point: Float[Array, "2"]) -> Float[Array, "2"]:
+def transform(
+    kind: str, p: Float[AnyArray, " u"], point: Float[AnyArray, "2"]
+) -> Float[Array, "2"]:
     """A point (x, y) of the source in the target."""
     if kind == "similarity":
         a, b, c, d = p
@@ -130,7 +133,7 @@ def _fit(kind, unknowns, source, target, p):
     if kind == "projective":
         first = affine.fit(source, target, p)
         start = jnp.concatenate([first, jnp.zeros(2)])
-    return adjust(residuals, jnp.add, start, (source, target, root), unknowns, 20)
+    return adjust(residuals, jnp.add, start, (source, target, root), unknowns)
 
 
 @partial(jax.jit, static_argnums=0)

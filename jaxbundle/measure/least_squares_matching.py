@@ -23,6 +23,8 @@ import jax.numpy as jnp
 from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Float, Int
 
+from jaxbundle.types import AnyArray
+
 STEPS = 12
 """Evaluations of a matching: two of three end after six."""
 STILL = 0.005
@@ -72,9 +74,9 @@ class LeastSquaresMatch(eqx.Module):
 
 
 def match_least_squares(
-    template: Float[Array, "n n"],
-    image: Float[Array, "rows columns"],
-    start: Float[Array, "2 3"],
+    template: Float[AnyArray, "n n"],
+    image: Float[AnyArray, "rows columns"],
+    start: Float[AnyArray, "2 3"],
     steps: int = STEPS,
 ) -> LeastSquaresMatch:
     """Match a window with another image, from a start within a few pixels; batch it by `jax.vmap`.
@@ -139,7 +141,7 @@ def _status(affine, start, shape, n, textured, known, moving):
     )  # fmt: skip
 
 
-def grey_value(image: Float[Array, "rows columns"], u, v) -> Float[Array, ""]:
+def grey_value(image: Float[AnyArray, "rows columns"], u, v) -> Float[Array, ""]:
     """The grey value of an image at (u, v), by cubic convolution; beyond its edge that of the edge.
 
     Source: Keys (1981), IEEE Trans. Acoustics, Speech, Signal Processing 29(6), equation 15.

@@ -24,6 +24,7 @@ from jaxtyping import Array, Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.measure.transfer import View, ground_point, image_point
+from jaxbundle.types import AnyArray
 
 STEP = 0.5
 """Distance of the heights tried, as pixels of the other image."""
@@ -40,7 +41,7 @@ class Match:
     correlation: float
 
 
-def correlation(a: Float[Array, " n"], b: Float[Array, " n"]) -> Float[Array, ""]:
+def correlation(a: Float[AnyArray, " n"], b: Float[AnyArray, " n"]) -> Float[Array, ""]:
     """Normalised cross-correlation ρ of two windows; −1 where one of them has no contrast."""
     a, b = a - jnp.mean(a), b - jnp.mean(b)
     square = jnp.sum(a * a) * jnp.sum(b * b)

@@ -14,30 +14,32 @@ from jaxtyping import Array, Float
 
 from jaxbundle.cameras import CameraModel, image_ray, project
 from jaxbundle.orientation.pose import Pose, to_camera
+from jaxbundle.types import AnyArray
 
 
 class View(eqx.Module):
     """An oriented image: camera model, its parameters in the model's order, pose."""
 
     model: CameraModel = eqx.field(static=True)
-    parameters: Float[Array, " parameters"]
+    parameters: Float[AnyArray, " parameters"]
     pose: Pose
 
 
-def line_of_sight(view: View, xy: Float[Array, "2"]) -> Float[Array, "3"]:
+def line_of_sight(view: View, xy: Float[AnyArray, "2"]) -> Float[Array, "3"]:
     """The direction in object space, of length 1, of an image point."""
-    return view.pose.M.T @ jnp.stack(image_ray(view.model, tuple(view.parameters), xy[0], xy[1]))
+    ray = image_ray(view.model, tuple(view.parameters), xy[0], xy[1])
+    return jnp.asarray(view.pose.M).T @ jnp.stack(ray)
 
 
-def ground_point(view: View, xy: Float[Array, "2"], Z: float) -> Float[Array, "3"]:
+def ground_point(view: View, xy: Float[AnyArray, "2"], Z: float) -> Float[Array, "3"]:
     """Where the ray of an image point meets the plane of this Z; NaN where it does not."""
     d = line_of_sight(view, xy)
     t = (Z - view.pose.X0[2]) / d[2]
-    point = view.pose.X0 + t * d
+    point = jnp.asarray(view.pose.X0) + t * d
     return jnp.where(t > 0, point.at[2].set(Z), jnp.nan)
 
 
-def image_point(view: View, X: Float[Array, "3"]) -> Float[Array, "2"]:
+def image_point(view: View, X: Float[AnyArray, "3"]) -> Float[Array, "2"]:
     """The image of an object point; NaN behind a perspective camera."""
     r, s, q = to_camera(view.pose, X)
     behind = (q >= 0) & (not view.model.wide)
@@ -46,7 +48,7 @@ def image_point(view: View, X: Float[Array, "3"]) -> Float[Array, "2"]:
 
 
 def image_to_image(
-    view: View, xy: Float[Array, "2"], Z: float, other: View
+    view: View, xy: Float[AnyArray, "2"], Z: float, other: View
 ) -> Float[Array, "2"]:
     """The image point in another image of what lies at the height Z in this one."""
     return image_point(other, ground_point(view, xy, Z))

@@ -18,9 +18,10 @@ from jaxbundle.geometry import (
     rotation_vector_from_quaternion,
     transform_point,
 )
-from jaxbundle.orientation.least_squares import inverse
+from jaxbundle.leastsquares.small import inverse
 from jaxbundle.orientation.linear import extent, normalisation, ones_unless
 from jaxbundle.orientation.status import Status, first_of
+from jaxbundle.types import AnyArray
 
 LINE = 1e-7
 """Points whose second extent is below this part of the first lie on a line."""
@@ -29,17 +30,17 @@ LINE = 1e-7
 class AbsoluteOrientation(eqx.Module):
     """τ = (tx, ty, tz, ωx, ωy, ωz, s), residuals computed − given, vᵀPv, cofactors Q of τ."""
 
-    tau: Float[Array, "7"]
-    residuals: Float[Array, "n 3"]
-    vtpv: Float[Array, ""]
-    cofactor: Float[Array, "7 7"]
-    status: Int[Array, ""]
+    tau: Float[AnyArray, "7"]
+    residuals: Float[AnyArray, "n 3"]
+    vtpv: Float[AnyArray, ""]
+    cofactor: Float[AnyArray, "7 7"]
+    status: Int[AnyArray, ""]
 
 
 def absolute_orientation(
-    source: Float[Array, "n 3"],
-    target: Float[Array, "n 3"],
-    weights: Float[Array, " n"] | None = None,
+    source: Float[AnyArray, "n 3"],
+    target: Float[AnyArray, "n 3"],
+    weights: Float[AnyArray, " n"] | None = None,
 ) -> AbsoluteOrientation:
     """The similarity that takes `source` to `target`, differentiable, without start values.
 
@@ -71,7 +72,7 @@ def absolute_orientation(
 
 
 def rotation_between(
-    x: Float[Array, "n 3"], y: Float[Array, "n 3"], weights: Float[Array, " n"]
+    x: Float[AnyArray, "n 3"], y: Float[AnyArray, "n 3"], weights: Float[AnyArray, " n"]
 ) -> Float[Array, "4"]:
     """The unit quaternion of the rotation that takes directions x nearest to y (Horn, 1987)."""
     S = jnp.einsum("n,ni,nj->ij", weights, x, y)

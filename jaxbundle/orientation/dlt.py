@@ -23,21 +23,21 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxbundle.orientation.least_squares import adjust
+from jaxbundle.leastsquares.small import adjust
 from jaxbundle.orientation.linear import extent, normalisation, null_vector, ones_unless
 from jaxbundle.orientation.pose import Pose, image_of, retract_pose, to_camera
 from jaxbundle.orientation.status import Status, first_of
+from jaxbundle.types import AnyArray
 
 FLAT = 1e-7
 """Extents of points, and second last singular values, below this part of the first are zero."""
-STEPS = 20
 
 
 class Camera(eqx.Module):
     """Interior orientation (fx, fy, s, x0, y0) and radial K1, K2, … in image units, and pose."""
 
-    interior: Float[Array, "5"]
-    radial: Float[Array, " k"]
+    interior: Float[AnyArray, "5"]
+    radial: Float[AnyArray, " k"]
     pose: Pose
 
 
@@ -45,15 +45,15 @@ class RefinedCamera(eqx.Module):
     """A camera, vᵀPv, and the cofactors in the order of `interior`, δX0, δθ (radians), `radial`."""
 
     camera: Camera
-    vtpv: Float[Array, ""]
-    cofactor: Float[Array, "u u"]
-    status: Int[Array, ""]
+    vtpv: Float[AnyArray, ""]
+    cofactor: Float[AnyArray, "u u"]
+    status: Int[AnyArray, ""]
 
 
 def direct_linear_transformation(
-    xy: Float[Array, "n 2"],
-    X: Float[Array, "n 3"],
-    weights: Float[Array, " n"] | None = None,
+    xy: Float[AnyArray, "n 2"],
+    X: Float[AnyArray, "n 3"],
+    weights: Float[AnyArray, " n"] | None = None,
 ) -> tuple[Float[Array, "3 4"], Int[Array, ""]]:
     """P of n ≥ 6 points, with L1 … L11 = P/P₃₄ row by row, differentiable.
 
@@ -84,7 +84,7 @@ def direct_linear_transformation(
     return P / jnp.where(at_mean == 0, 1, at_mean), status
 
 
-def decompose(P: Float[Array, "3 4"]) -> tuple[Camera, Int[Array, ""]]:
+def decompose(P: Float[AnyArray, "3 4"]) -> tuple[Camera, Int[Array, ""]]:
     """The camera without distortion whose projection matrix is P, w > 0 in front of it.
 
     `BEHIND_THE_CAMERA`: the image is mirrored (y down); the camera then sees it from behind.
@@ -108,9 +108,9 @@ def decompose(P: Float[Array, "3 4"]) -> tuple[Camera, Int[Array, ""]]:
 
 def refine_camera(
     camera: Camera,
-    xy: Float[Array, "n 2"],
-    X: Float[Array, "n 3"],
-    weights: Float[Array, " n"] | None = None,
+    xy: Float[AnyArray, "n 2"],
+    X: Float[AnyArray, "n 3"],
+    weights: Float[AnyArray, " n"] | None = None,
     radial: int = 0,
 ) -> RefinedCamera:
     """Eleven parameters, and `radial` ones of distortion, by least squares, differentiable.
@@ -122,7 +122,7 @@ def refine_camera(
     missing = radial - camera.radial.shape[0]
     start = Camera(camera.interior, jnp.pad(camera.radial, (0, missing)), camera.pose)
     data = (xy, X, jnp.sqrt(p))
-    fit = adjust(_misclosures, _retract, start, data, 11 + radial, STEPS)
+    fit = adjust(_misclosures, _retract, start, data, 11 + radial)
     behind = jax.vmap(to_camera, (None, 0))(fit.estimate.pose, X)[:, 2] >= 0
     status = first_of(
         (~fit.determined, Status.UNDETERMINED),
@@ -131,16 +131,16 @@ def refine_camera(
     return RefinedCamera(fit.estimate, fit.vtpv, fit.cofactor, status)
 
 
-def project(camera: Camera, X: Float[Array, "3"]) -> Float[Array, "2"]:
+def project(camera: Camera, X: Float[AnyArray, "3"]) -> Float[Array, "2"]:
     """The image of a point without distortion, relative to the principal point."""
     fx, fy, skew = camera.interior[:3]
     x, y = image_of(camera.pose, X)
     return jnp.stack([fx * x + skew * y, fy * y])
 
 
-def corrected(camera: Camera, xy: Float[Array, "2"]) -> Float[Array, "2"]:
+def corrected(camera: Camera, xy: Float[AnyArray, "2"]) -> Float[Array, "2"]:
     """A measured point relative to the principal point, corrected for radial distortion."""
-    reduced = xy - camera.interior[3:]
+    reduced = jnp.asarray(xy) - camera.interior[3:]
     square = reduced @ reduced
     return reduced * (1 + sum(K * square ** (i + 1) for i, K in enumerate(camera.radial)))
 

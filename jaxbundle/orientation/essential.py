@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float
 
 from jaxbundle.orientation.linear import normalisation, null_space, null_vector, ones_unless
 from jaxbundle.orientation.pose import ray_of
+from jaxbundle.types import AnyArray
 
 REAL = 1e-6
 """A root is real if its imaginary part is below this part of its length."""
@@ -34,7 +35,9 @@ _BASIS = [(2, 0, 0), (1, 1, 0), (0, 2, 0), (1, 0, 1), (0, 1, 1), (0, 0, 2), (1, 
 
 
 def eight_points(
-    xy1: Float[Array, "n 2"], xy2: Float[Array, "n 2"], weights: Float[Array, " n"] | None = None
+    xy1: Float[AnyArray, "n 2"],
+    xy2: Float[AnyArray, "n 2"],
+    weights: Float[AnyArray, " n"] | None = None,
 ) -> tuple[Float[Array, "3 3"], Float[Array, "9"]]:
     """E of n ≥ 8 points, |E|² = 2, and the singular values of the normalised linear system.
 
@@ -49,7 +52,9 @@ def eight_points(
 
 
 def five_points(
-    xy1: Float[Array, "n 2"], xy2: Float[Array, "n 2"], weights: Float[Array, " n"] | None = None
+    xy1: Float[AnyArray, "n 2"],
+    xy2: Float[AnyArray, "n 2"],
+    weights: Float[AnyArray, " n"] | None = None,
 ) -> tuple[Float[Array, "10 3 3"], Bool[Array, "10"]]:
     """Up to ten E of n ≥ 5 points, and which of the ten slots are real solutions, |E|² = 2.
 
@@ -74,7 +79,7 @@ def five_points(
     return jax.vmap(_nearest_essential)(E), valid
 
 
-def orientations(E: Float[Array, "3 3"]) -> tuple[Float[Array, "4 3 3"], Float[Array, "4 3"]]:
+def orientations(E: Float[AnyArray, "3 3"]) -> tuple[Float[Array, "4 3 3"], Float[Array, "4 3"]]:
     """The four pairs (M, b), |b| = 1, of an essential matrix: ±E = M·[b]×."""
     U, _, Vt = jnp.linalg.svd(E)
     U, Vt = U * jnp.linalg.det(U), Vt * jnp.linalg.det(Vt)

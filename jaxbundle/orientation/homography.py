@@ -22,6 +22,7 @@ from jaxtyping import Float, Int
 from jaxbundle.orientation.linear import extent, normalisation, null_vector, ones_unless
 from jaxbundle.orientation.pose import Pose
 from jaxbundle.orientation.status import Status, first_of
+from jaxbundle.types import AnyArray
 
 LINE = 1e-7
 """Points whose second extent is below this part of the first lie on a line."""
@@ -30,9 +31,9 @@ FLAT = 1e-7
 
 
 def homography(
-    source: Float[Array, "n 2"],
-    target: Float[Array, "n 2"],
-    weights: Float[Array, " n"] | None = None,
+    source: Float[AnyArray, "n 2"],
+    target: Float[AnyArray, "n 2"],
+    weights: Float[AnyArray, " n"] | None = None,
 ) -> tuple[Float[Array, "3 3"], Int[Array, ""]]:
     """H from `source` to `target` by the normalised direct linear transformation (Hartley, 1997).
 
@@ -57,16 +58,16 @@ def homography(
     return H / jnp.where(at_mean == 0, 1, at_mean), status
 
 
-def apply_homography(H: Float[Array, "3 3"], point: Float[Array, "2"]) -> Float[Array, "2"]:
+def apply_homography(H: Float[AnyArray, "3 3"], point: Float[AnyArray, "2"]) -> Float[Array, "2"]:
     """The image of a point."""
     x, y, w = H[:, :2] @ point + H[:, 2]
     return jnp.stack([x / w, y / w])
 
 
 def interior_from_homographies(
-    H: Float[Array, "views 3 3"],
+    H: Float[AnyArray, "views 3 3"],
     size: float,
-    weights: Float[Array, " views"] | None = None,
+    weights: Float[AnyArray, " views"] | None = None,
     skew: bool = False,
 ) -> tuple[Float[Array, "5"], Int[Array, ""]]:
     """(fx, fy, s, x0, y0), in the unit of the image, of one camera from views of planes.
@@ -96,7 +97,7 @@ def interior_from_homographies(
     return size * jnp.stack([fx, fy, s, x0, y0]), first_of((bad, Status.PARALLEL_PLANES))
 
 
-def pose_from_homography(H: Float[Array, "3 3"], interior: Float[Array, "5"]) -> Pose:
+def pose_from_homography(H: Float[AnyArray, "3 3"], interior: Float[AnyArray, "5"]) -> Pose:
     """The pose of an image of the plane Z = 0, in the unit of the plane.
 
     `H` with w > 0 at the points, as `homography` gives it; `interior`: (fx, fy, s, x0, y0). The

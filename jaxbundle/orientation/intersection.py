@@ -16,13 +16,13 @@ from jax import Array
 from jax.lax import stop_gradient
 from jaxtyping import Float, Int
 
-from jaxbundle.orientation.least_squares import adjust
+from jaxbundle.leastsquares.small import adjust
 from jaxbundle.orientation.linear import ones_unless
 from jaxbundle.orientation.status import Status, first_of
+from jaxbundle.types import AnyArray
 
 PARALLEL = 1e-7
 """Angle of intersection, in radians, below which rays are parallel."""
-STEPS = 8
 
 
 class Intersection(eqx.Module):
@@ -31,17 +31,17 @@ class Intersection(eqx.Module):
     `angle`: the greatest between two of the rays, seen as lines, at most 90°.
     """
 
-    X: Float[Array, "3"]
-    vtpv: Float[Array, ""]
-    cofactor: Float[Array, "3 3"]
-    angle: Float[Array, ""]
-    status: Int[Array, ""]
+    X: Float[AnyArray, "3"]
+    vtpv: Float[AnyArray, ""]
+    cofactor: Float[AnyArray, "3 3"]
+    angle: Float[AnyArray, ""]
+    status: Int[AnyArray, ""]
 
 
 def intersection(
-    X0: Float[Array, "n 3"],
-    rays: Float[Array, "n 3"],
-    weights: Float[Array, " n"] | None = None,
+    X0: Float[AnyArray, "n 3"],
+    rays: Float[AnyArray, "n 3"],
+    weights: Float[AnyArray, " n"] | None = None,
 ) -> Intersection:
     """The point of n ≥ 2 rays from X0, in the object frame (Mᵀ·(x, y, −1)), differentiable.
 
@@ -61,7 +61,7 @@ def intersection(
     g = jnp.einsum("n,nij,nj->i", p, across, X0 - middle)
     start = jnp.linalg.solve(jnp.where(parallel, jnp.eye(3, dtype=d.dtype), N), g) + middle
     data = (X0, d, jnp.sqrt(p))
-    fit = adjust(_misclosures, jnp.add, start, data, 3, STEPS)
+    fit = adjust(_misclosures, jnp.add, start, data, 3)
     along = jnp.einsum("ni,ni->n", d, fit.estimate - X0)
     status = first_of(
         (parallel, Status.PARALLEL_RAYS),
@@ -84,11 +84,14 @@ def _misclosures(X, X0, d, root):
 
 
 def misclosure(
-    X: Float[Array, "3"], X0: Float[Array, "3"], d: Float[Array, "3"], root: Float[Array, ""]
+    X: Float[AnyArray, "3"],
+    X0: Float[AnyArray, "3"],
+    d: Float[AnyArray, "3"],
+    root: Float[AnyArray, ""],
 ) -> Float[Array, "2"]:
     """√p·v of a point and a ray: tangents of the angles across it; `d` of length 1."""
     axis = jnp.eye(3, dtype=d.dtype)[jnp.argmin(jnp.abs(stop_gradient(d)))]
     e = jnp.cross(d, axis)
     e = e / jnp.linalg.norm(e)
     r, s, t = jnp.stack([e, jnp.cross(d, e), d]) @ (X - X0)
-    return root * jnp.stack([r / t, s / t])
+    return jnp.asarray(root) * jnp.stack([r / t, s / t])

@@ -12,10 +12,11 @@ from jax.lax import stop_gradient
 from jaxtyping import Float
 
 from jaxbundle.implicit import implicit_root, solve_dense
+from jaxbundle.types import AnyArray
 
 
 def null_vector(
-    A: Float[Array, "rows n"],
+    A: Float[AnyArray, "rows n"],
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """h of least |A·h|, |h| = 1, and the singular values, largest first; zero if rows are few."""
     _, s, Vt = _right_singular(stop_gradient(A))
@@ -28,22 +29,22 @@ def _null_equations(root, _, A):
     return A.T @ (A @ h) - eigenvalue * h, 0.5 * (h @ h - 1)
 
 
-def null_space(A: Float[Array, "rows n"], k: int) -> Float[Array, "k n"]:
+def null_space(A: Float[AnyArray, "rows n"], k: int) -> Float[Array, "k n"]:
     """The k right singular vectors of the least singular values, without derivative."""
     return _right_singular(stop_gradient(A))[2][-k:]
 
 
 def normalisation(
-    points: Float[Array, "n d"], weights: Float[Array, " n"]
+    points: Float[AnyArray, "n d"], weights: Float[AnyArray, " n"]
 ) -> tuple[Float[Array, " d"], Float[Array, ""]]:
     """Weighted mean, and the root mean square of a coordinate about it (Hartley, 1997)."""
     total = jnp.sum(weights)
-    mean = weights @ points / total
+    mean = jnp.asarray(weights) @ points / total
     square = weights @ jnp.sum((points - mean) ** 2, 1) / (total * points.shape[1])
     return mean, jnp.sqrt(jnp.where(square > 0, square, 1.0))
 
 
-def extent(points: Float[Array, "n d"], weights: Float[Array, " n"]) -> Float[Array, " d"]:
+def extent(points: Float[AnyArray, "n d"], weights: Float[AnyArray, " n"]) -> Float[Array, " d"]:
     """Extents along the principal axes relative to the largest: (1, 0, 0) of points on a line."""
     mean, _ = normalisation(points, weights)
     rows = stop_gradient(jnp.sqrt(weights)[:, None] * (points - mean))
@@ -51,9 +52,10 @@ def extent(points: Float[Array, "n d"], weights: Float[Array, " n"]) -> Float[Ar
     return s / jnp.where(s[0] > 0, s[0], 1)
 
 
-def ones_unless(weights: Float[Array, " n"] | None, points: Array) -> Float[Array, " n"]:
+def ones_unless(weights: Float[AnyArray, " n"] | None, points: AnyArray) -> Float[Array, " n"]:
     """The weights, one a point if there are none."""
-    return jnp.ones(points.shape[0], points.dtype) if weights is None else weights
+    ones = jnp.ones(points.shape[0], points.dtype)
+    return ones if weights is None else jnp.asarray(weights)
 
 
 def _right_singular(A):

@@ -18,9 +18,9 @@ from jaxbundle.geometry import (
     rotation_vector_from_matrix,
     transform_point,
 )
+from jaxbundle.leastsquares.small import minimise
 from jaxbundle.orientation.absolute import absolute_orientation
 from jaxbundle.orientation.intersection import intersection, misclosure
-from jaxbundle.orientation.least_squares import minimise
 from jaxbundle.orientation.pose import Pose
 from jaxbundle.orientation.resection import refine_resection
 from jaxbundle.orientation.robust import robust_relative_orientation, robust_resection

@@ -41,6 +41,7 @@ from jaxbundle.orientation.growth import (
     place_far_points,
 )
 from jaxbundle.orientation.sights import Sights, sights
+from jaxbundle.types import Index
 
 IN_COMMON = 6
 """Points two images must share to begin with."""
@@ -283,7 +284,7 @@ def _all_pairs(seen: Sights, among):
     return np.stack([common.row, common.col], 1), common.data
 
 
-def _common_points(seen: Sights, image: int, other: int):
+def _common_points(seen: Sights, image: Index, other: Index):
     one, two = seen.of(image), seen.of(other)
     _, k, l = np.intersect1d(seen.point[one], seen.point[two], return_indices=True)
     return seen.xy[one][k], seen.xy[two][l]

@@ -17,13 +17,13 @@ Source: Ma, Soatto, Košecká and Sastry (2004), An Invitation to 3-D Vision, se
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.orientation.homography import homography
 from jaxbundle.orientation.linear import ones_unless
 from jaxbundle.orientation.pose import ray_of
 from jaxbundle.orientation.status import Status, first_of
+from jaxbundle.types import AnyArray
 
 SAME = 1e-9
 """Squares of singular values nearer than this are equal: there is no base."""
@@ -34,17 +34,17 @@ class PlanarOrientations(eqx.Module):
     (nᵀ·Y > 0 on the plane) in the frame of the first; `possible`: the plane is in front of both
     cameras; `status`: `NO_BASE`, or what `homography` says."""
 
-    M: Float[Array, "2 3 3"]
-    b: Float[Array, "2 3"]
-    normal: Float[Array, "2 3"]
-    possible: Bool[Array, " 2"]
-    status: Int[Array, ""]
+    M: Float[AnyArray, "2 3 3"]
+    b: Float[AnyArray, "2 3"]
+    normal: Float[AnyArray, "2 3"]
+    possible: Bool[AnyArray, " 2"]
+    status: Int[AnyArray, ""]
 
 
 def planar_orientations(
-    xy1: Float[Array, "n 2"],
-    xy2: Float[Array, "n 2"],
-    weights: Float[Array, " n"] | None = None,
+    xy1: Float[AnyArray, "n 2"],
+    xy2: Float[AnyArray, "n 2"],
+    weights: Float[AnyArray, " n"] | None = None,
 ) -> PlanarOrientations:
     """Both relative orientations of two images of n ≥ 4 points of a plane.
 

@@ -8,11 +8,11 @@ to the principal point, y up. The ray of an image point is (x, y, −1) in the c
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import Array
 from jaxtyping import Float
 
 from jaxbundle.cameras.perspective import perspective
 from jaxbundle.geometry import matrix_from_rotation_vector
+from jaxbundle.types import AnyArray
 
 _ideal, _ = perspective((0,), up=True)
 
@@ -20,25 +20,25 @@ _ideal, _ = perspective((0,), up=True)
 class Pose(eqx.Module):
     """Exterior orientation: X0 in the object unit, M from object to camera."""
 
-    X0: Float[Array, "3"]
-    M: Float[Array, "3 3"]
+    X0: Float[AnyArray, "3"]
+    M: Float[AnyArray, "3 3"]
 
 
-def to_camera(pose: Pose, X: Float[Array, "3"]) -> Float[Array, "3"]:
+def to_camera(pose: Pose, X: Float[AnyArray, "3"]) -> Float[AnyArray, "3"]:
     """[r, s, q] of a point, in the object unit; q < 0 in front of the camera."""
     return pose.M @ (X - pose.X0)
 
 
-def image_of(pose: Pose, X: Float[Array, "3"]) -> Float[Array, "2"]:
+def image_of(pose: Pose, X: Float[AnyArray, "3"]) -> Float[AnyArray, "2"]:
     """(x, y) of a point by the collinearity equations (Kraus, 2007, section 4.1), c = 1."""
     return jnp.stack(_ideal((1.0,), *to_camera(pose, X)))
 
 
-def ray_of(xy: Float[Array, "2"]) -> Float[Array, "3"]:
+def ray_of(xy: Float[AnyArray, "2"]) -> Float[AnyArray, "3"]:
     """The ray (x, y, −1) of an image point, c = 1, in the camera frame."""
     return jnp.concatenate([xy, -jnp.ones_like(xy[:1])])
 
 
-def retract_pose(pose: Pose, delta: Float[Array, "6"]) -> Pose:
+def retract_pose(pose: Pose, delta: Float[AnyArray, "6"]) -> Pose:
     """X0 + δX0 (object unit), exp([δθ]×)·M (radians, camera frame)."""
     return Pose(pose.X0 + delta[:3], matrix_from_rotation_vector(delta[3:]) @ pose.M)

@@ -22,13 +22,14 @@ from jax.lax import stop_gradient
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.geometry import matrix_from_quaternion, matrix_from_rotation_vector
+from jaxbundle.leastsquares.small import finish, minimise
 from jaxbundle.orientation.absolute import rotation_between
 from jaxbundle.orientation.essential import eight_points, five_points, orientations
 from jaxbundle.orientation.homography import apply_homography, homography
-from jaxbundle.orientation.least_squares import finish, minimise
 from jaxbundle.orientation.linear import ones_unless
 from jaxbundle.orientation.pose import Pose, image_of, ray_of
 from jaxbundle.orientation.status import Status, first_of
+from jaxbundle.types import AnyArray
 
 SIMPLER = 6.0
 """Ratio of variances below which the simpler explanation counts: F(0.99) of a dozen points."""
@@ -36,7 +37,6 @@ EXACT = 1e-20
 """Variance of image coordinates (c = 1) that is rounding."""
 REFINED = 4
 """Candidates that are refined."""
-STEPS = 12
 
 
 class RelativeOrientation(eqx.Module):
@@ -48,19 +48,19 @@ class RelativeOrientation(eqx.Module):
     a second solution, see `planar_orientations`.
     """
 
-    M: Float[Array, "3 3"]
-    b: Float[Array, "3"]
-    vtpv: Float[Array, ""]
-    cofactor: Float[Array, "5 5"]
-    in_front: Float[Array, ""]
-    flat: Bool[Array, ""]
-    status: Int[Array, ""]
+    M: Float[AnyArray, "3 3"]
+    b: Float[AnyArray, "3"]
+    vtpv: Float[AnyArray, ""]
+    cofactor: Float[AnyArray, "5 5"]
+    in_front: Float[AnyArray, ""]
+    flat: Bool[AnyArray, ""]
+    status: Int[AnyArray, ""]
 
 
 def relative_orientation(
-    xy1: Float[Array, "n 2"],
-    xy2: Float[Array, "n 2"],
-    weights: Float[Array, " n"] | None = None,
+    xy1: Float[AnyArray, "n 2"],
+    xy2: Float[AnyArray, "n 2"],
+    weights: Float[AnyArray, " n"] | None = None,
     method: str = "five",
 ) -> RelativeOrientation:
     """The relative orientation of two images of n points, differentiable in all arguments.
@@ -102,17 +102,23 @@ def relative_orientation(
 
 
 def sampson_distance(
-    M: Float[Array, "3 3"], b: Float[Array, "3"], xy1: Float[Array, "2"], xy2: Float[Array, "2"]
+    M: Float[AnyArray, "3 3"],
+    b: Float[AnyArray, "3"],
+    xy1: Float[AnyArray, "2"],
+    xy2: Float[AnyArray, "2"],
 ) -> Float[Array, ""]:
     """Misclosure of coplanarity of one point as a length in the image, c = 1, with a sign."""
     a1, a2 = ray_of(xy1), ray_of(xy2)
     line2, line1 = M @ jnp.cross(b, a1), jnp.cross(M.T @ a2, b)
     length = jnp.sum(line2[:2] ** 2) + jnp.sum(line1[:2] ** 2)
-    return a2 @ line2 / jnp.sqrt(jnp.where(length > 0, length, 1))
+    return jnp.dot(a2, line2) / jnp.sqrt(jnp.where(length > 0, length, 1))
 
 
 def distances_along_rays(
-    M: Float[Array, "3 3"], b: Float[Array, "3"], xy1: Float[Array, "2"], xy2: Float[Array, "2"]
+    M: Float[AnyArray, "3 3"],
+    b: Float[AnyArray, "3"],
+    xy1: Float[AnyArray, "2"],
+    xy2: Float[AnyArray, "2"],
 ) -> Float[Array, "2"]:
     """(s₁, s₂) of the nearest points s₁·a₁ and b + s₂·Mᵀ·a₂ of two rays; positive: in front."""
     a1, a2 = ray_of(xy1), M.T @ ray_of(xy2)
@@ -133,7 +139,7 @@ def _refined_best(M, b, data, p):
 
     first = lambda M, b: score((M, b), jnp.sum(_misclosures((M, b), *data) ** 2))
     _, best = jax.lax.top_k(-jax.vmap(first)(M, b), REFINED)
-    refine = lambda M, b: minimise(_misclosures, retract, (M, b), data, 5, STEPS)
+    refine = lambda M, b: minimise(_misclosures, retract, (M, b), data, 5)
     refined, squares = jax.vmap(refine)(M[best], b[best])
     scores = jax.vmap(score)(refined, squares)
     k = jnp.argmin(scores)

@@ -15,30 +15,30 @@ from jax import Array
 from jax.lax import stop_gradient
 from jaxtyping import Float, Int
 
-from jaxbundle.orientation.least_squares import finish, minimise
+from jaxbundle.leastsquares.small import finish, minimise
 from jaxbundle.orientation.linear import extent, normalisation, ones_unless
 from jaxbundle.orientation.pose import Pose, image_of, ray_of, retract_pose, to_camera
 from jaxbundle.orientation.status import Status, first_of
 from jaxbundle.orientation.three_points import three_points
+from jaxbundle.types import AnyArray
 
 LINE = 1e-7
 """Points whose second extent is below this part of the first lie on a line."""
-STEPS = 10
 
 
 class Resection(eqx.Module):
     """Pose, vᵀPv, and cofactors of (δX0 in the object unit, δθ in radians in the camera frame)."""
 
     pose: Pose
-    vtpv: Float[Array, ""]
-    cofactor: Float[Array, "6 6"]
-    status: Int[Array, ""]
+    vtpv: Float[AnyArray, ""]
+    cofactor: Float[AnyArray, "6 6"]
+    status: Int[AnyArray, ""]
 
 
 def resection(
-    xy: Float[Array, "n 2"],
-    X: Float[Array, "n 3"],
-    weights: Float[Array, " n"] | None = None,
+    xy: Float[AnyArray, "n 2"],
+    X: Float[AnyArray, "n 3"],
+    weights: Float[AnyArray, " n"] | None = None,
 ) -> Resection:
     """The pose of an image of n ≥ 4 known points, differentiable in all arguments.
 
@@ -55,7 +55,7 @@ def resection(
     # with noise, the pose nearest to a solution may be all there is, and a good start
     starts, _ = three_points(jax.vmap(ray_of)(stop_gradient(xy[chosen])), stop_gradient(X[chosen]))
     data = (xy, X, jnp.sqrt(p))
-    refine = lambda start: minimise(_misclosures, retract_pose, start, data, 6, STEPS)
+    refine = lambda start: minimise(_misclosures, retract_pose, start, data, 6)
     poses, squares = jax.vmap(refine)(starts)
     behind = jax.vmap(lambda pose: jnp.sum(jnp.where(p > 0, _behind(pose, X), 0)))(poses)
     worst = jnp.where(jnp.isfinite(squares), behind, jnp.inf)
@@ -73,14 +73,14 @@ def resection(
 
 def refine_resection(
     pose: Pose,
-    xy: Float[Array, "n 2"],
-    X: Float[Array, "n 3"],
-    weights: Float[Array, " n"] | None = None,
+    xy: Float[AnyArray, "n 2"],
+    X: Float[AnyArray, "n 3"],
+    weights: Float[AnyArray, " n"] | None = None,
 ) -> Resection:
     """A pose improved by least squares; arguments and result as in `resection`, n ≥ 3."""
     p = ones_unless(weights, xy)
     data = (xy, X, jnp.sqrt(p))
-    pose, _ = minimise(_misclosures, retract_pose, pose, data, 6, STEPS)
+    pose, _ = minimise(_misclosures, retract_pose, pose, data, 6)
     fit = finish(_misclosures, retract_pose, pose, data, 6)
     status = first_of(
         (extent(X, p)[1] < LINE, Status.COLLINEAR_POINTS),
@@ -90,7 +90,7 @@ def refine_resection(
     return Resection(fit.estimate, fit.vtpv, fit.cofactor, status)
 
 
-def wide_triangle(xy: Float[Array, "n 2"], weights: Float[Array, " n"]) -> Int[Array, "3"]:
+def wide_triangle(xy: Float[AnyArray, "n 2"], weights: Float[AnyArray, " n"]) -> Int[Array, "3"]:
     """Three of the points of weight > 0, far apart: outermost, farthest from it, largest area."""
     xy = stop_gradient(xy)
     most = lambda value: jnp.argmax(jnp.where(weights > 0, value, -1.0))

@@ -37,6 +37,7 @@ from jaxbundle.orientation.relative import (
 from jaxbundle.orientation.resection import Resection, refine_resection
 from jaxbundle.orientation.status import Status
 from jaxbundle.orientation.three_points import three_points
+from jaxbundle.types import AnyArray
 
 FAR = 1e6
 """Error of an observation that contradicts a model altogether (a point behind the camera)."""
@@ -52,8 +53,8 @@ class Consensus(eqx.Module):
     """The best model, the observations that agree with it, and their greatest accepted error."""
 
     model: PyTree
-    inliers: Bool[Array, " n"]
-    threshold: Float[Array, ""]
+    inliers: Bool[AnyArray, " n"]
+    threshold: Float[AnyArray, ""]
 
 
 def samples_needed(size: int, gross: float = 0.4, confidence: float = 0.999) -> int:
@@ -62,14 +63,14 @@ def samples_needed(size: int, gross: float = 0.4, confidence: float = 0.999) -> 
 
 
 def consensus(
-    key: Array,
+    key: AnyArray,
     solve: Callable,
     errors: Callable,
     data: tuple,
     size: int,
     samples: int,
     threshold: float | None = None,
-    weights: Float[Array, " n"] | None = None,
+    weights: Float[AnyArray, " n"] | None = None,
 ) -> Consensus:
     """The best of the models of `samples` random samples of `size` observations.
 
@@ -100,17 +101,17 @@ def consensus(
     return Consensus(model, present & (e <= limit), limit)
 
 
-def robust_limit(e: Float[Array, " n"], present: Bool[Array, " n"], size: int) -> Array:
+def robust_limit(e: Float[AnyArray, " n"], present: Bool[AnyArray, " n"], size: int) -> Array:
     """CUT·σ with σ = 1.4826·(1 + 5/(n − size))·median e (Rousseeuw and Leroy, 1987, p. 202)."""
     spare = jnp.maximum(jnp.sum(present) - size, 1)
     return CUT * jnp.maximum(1.4826 * (1 + 5 / spare) * _median(e, present), ROUNDING)
 
 
 def robust_resection(
-    key: Array,
-    xy: Float[Array, "n 2"],
-    X: Float[Array, "n 3"],
-    weights: Float[Array, " n"] | None = None,
+    key: AnyArray,
+    xy: Float[AnyArray, "n 2"],
+    X: Float[AnyArray, "n 3"],
+    weights: Float[AnyArray, " n"] | None = None,
     samples: int = 60,
     threshold: float | None = None,
 ) -> tuple[Resection, Bool[Array, " n"]]:
@@ -139,10 +140,10 @@ def robust_resection(
 
 
 def robust_relative_orientation(
-    key: Array,
-    xy1: Float[Array, "n 2"],
-    xy2: Float[Array, "n 2"],
-    weights: Float[Array, " n"] | None = None,
+    key: AnyArray,
+    xy1: Float[AnyArray, "n 2"],
+    xy2: Float[AnyArray, "n 2"],
+    weights: Float[AnyArray, " n"] | None = None,
     samples: int = 150,
     threshold: float | None = None,
 ) -> tuple[RelativeOrientation, Bool[Array, " n"]]:
@@ -182,10 +183,10 @@ def robust_relative_orientation(
 
 
 def robust_homography(
-    key: Array,
-    source: Float[Array, "n 2"],
-    target: Float[Array, "n 2"],
-    weights: Float[Array, " n"] | None = None,
+    key: AnyArray,
+    source: Float[AnyArray, "n 2"],
+    target: Float[AnyArray, "n 2"],
+    weights: Float[AnyArray, " n"] | None = None,
     samples: int = 60,
     threshold: float | None = None,
 ) -> tuple[tuple[Float[Array, "3 3"], Array], Bool[Array, " n"]]:
@@ -203,10 +204,10 @@ def robust_homography(
 
 
 def robust_absolute_orientation(
-    key: Array,
-    source: Float[Array, "n 3"],
-    target: Float[Array, "n 3"],
-    weights: Float[Array, " n"] | None = None,
+    key: AnyArray,
+    source: Float[AnyArray, "n 3"],
+    target: Float[AnyArray, "n 3"],
+    weights: Float[AnyArray, " n"] | None = None,
     samples: int = 40,
     threshold: float | None = None,
 ) -> tuple[AbsoluteOrientation, Bool[Array, " n"]]:
@@ -224,10 +225,10 @@ def robust_absolute_orientation(
 
 
 def robust_direct_linear_transformation(
-    key: Array,
-    xy: Float[Array, "n 2"],
-    X: Float[Array, "n 3"],
-    weights: Float[Array, " n"] | None = None,
+    key: AnyArray,
+    xy: Float[AnyArray, "n 2"],
+    X: Float[AnyArray, "n 3"],
+    weights: Float[AnyArray, " n"] | None = None,
     samples: int = 300,
     threshold: float | None = None,
 ) -> tuple[tuple[Float[Array, "3 4"], Array], Bool[Array, " n"]]:
@@ -246,10 +247,10 @@ def robust_direct_linear_transformation(
 
 
 def robust_intersection(
-    key: Array,
-    X0: Float[Array, "n 3"],
-    rays: Float[Array, "n 3"],
-    weights: Float[Array, " n"] | None = None,
+    key: AnyArray,
+    X0: Float[AnyArray, "n 3"],
+    rays: Float[AnyArray, "n 3"],
+    weights: Float[AnyArray, " n"] | None = None,
     samples: int = 30,
     threshold: float | None = None,
 ) -> tuple[Intersection, Bool[Array, " n"]]:

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 
 from jaxbundle.cameras import default_parameters, get_model, image_ray
 from jaxbundle.network.tables import Camera, Network
+from jaxbundle.types import Index
 
 STEEPEST = -0.15
 """Least −q of a unit ray that counts as in front of the camera."""
@@ -40,9 +41,9 @@ class Sights:
     def images(self) -> int:
         return len(self.tolerance)
 
-    def of(self, image: int) -> slice:
+    def of(self, image: Index) -> slice:
         """The rows of an image."""
-        first, last = np.searchsorted(self.image, [image, image + 1])
+        first, last = np.searchsorted(self.image, [int(image), int(image) + 1])
         return slice(first, last)
 
 

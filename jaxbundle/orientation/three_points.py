@@ -18,6 +18,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxbundle.orientation.pose import Pose
+from jaxbundle.types import AnyArray
 
 FITS = 1e-9
 """Greatest misclosure of the law of cosines, in parts of the sum of the squared sides."""
@@ -26,7 +27,7 @@ NEWTON_STEPS = 4
 
 
 def three_points(
-    rays: Float[Array, "3 3"], X: Float[Array, "3 3"]
+    rays: Float[AnyArray, "3 3"], X: Float[AnyArray, "3 3"]
 ) -> tuple[Pose, Bool[Array, "4"]]:
     """The poses (four slots) from which three points X appear along three rays.
 

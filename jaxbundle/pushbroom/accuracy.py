@@ -27,6 +27,7 @@ from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.locate import locate_point
 from jaxbundle.pushbroom.noise import Noise, disturbed, draw, no_errors, sigmas
 from jaxbundle.pushbroom.surfaces import Surface
+from jaxbundle.types import AnyArray
 
 TINY = 1e-300
 """Instead of zero under a fraction."""
@@ -168,6 +169,6 @@ def east_north(surface: Surface, X: Vector) -> Float[Array, "2 3"]:
     return jnp.stack([east, jnp.stack([-z * c, -z * s, jnp.cos(latitude)])])
 
 
-def horizontal(axes: Float[Array, "2 3"], X0: Vector, X: Vector) -> Float[Array, "2"]:
+def horizontal(axes: Float[AnyArray, "2 3"], X0: Vector, X: Vector) -> Float[Array, "2"]:
     """X − X0 along the axes, metres."""
-    return axes @ jnp.stack(difference(X, X0))
+    return jnp.asarray(axes) @ jnp.stack(difference(X, X0))

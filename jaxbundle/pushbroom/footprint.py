@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbundle.geometry.ellipsoid import Ellipsoid, at_height, residual
 from jaxbundle.geometry.vectors import along, difference
@@ -27,6 +27,7 @@ from jaxbundle.pushbroom.passages import ahead, slopes
 from jaxbundle.pushbroom.pieces import CHUNK, Pieces
 from jaxbundle.pushbroom.polynomial import value, value_and_rate
 from jaxbundle.pushbroom.surfaces import Ground, Plane
+from jaxbundle.types import AnyArray
 
 HEIGHTS = -1000.0, 10_000.0
 """Lowest and highest height, metres, if the camera is more than twice as high."""
@@ -51,9 +52,9 @@ class Footprint(eqx.Module):
     `frame`: A and the point −A·D₀ that makes the middle of the footprint zero.
     """
 
-    heights: Float[Array, "2"]
-    frame: Float[Array, "3 4"]
-    coefficients: Float[Array, "2 20"]
+    heights: Float[AnyArray, "2"]
+    frame: Float[AnyArray, "3 4"]
+    coefficients: Float[AnyArray, "2 20"]
 
     def start(self, D):
         """Time and pixel, about, of sights D."""
@@ -71,7 +72,7 @@ class Footprint(eqx.Module):
 
 
 def make_footprint(
-    image, pieces: Pieces, samples: Float[Array, " k"], line: Float[Array, " 6"],
+    image, pieces: Pieces, samples: Float[AnyArray, " k"], line: Float[AnyArray, " 6"],
     earth: Ellipsoid | None,
 ) -> Footprint | None:  # fmt: skip
     """The footprint, or None if it is not sure that every point is seen once."""

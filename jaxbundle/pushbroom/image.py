@@ -12,7 +12,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
@@ -28,7 +28,7 @@ from jaxbundle.pushbroom.trajectory import (
     rotation_at,
     velocity_at,
 )
-from jaxbundle.types import Numbers, Scalar
+from jaxbundle.types import AnyArray, Numbers, Scalar
 
 LONGEST = 10_000_000
 """More lines or pixels than any image has."""
@@ -37,10 +37,10 @@ LONGEST = 10_000_000
 class Offsets(eqx.Module):
     """Small changes of the trajectory: radians, metres, and the same a second."""
 
-    attitude: Float[Array, "3"]
-    attitude_rate: Float[Array, "3"]
-    position: Float[Array, "3"]
-    position_rate: Float[Array, "3"]
+    attitude: Float[AnyArray, "3"]
+    attitude_rate: Float[AnyArray, "3"]
+    position: Float[AnyArray, "3"]
+    position_rate: Float[AnyArray, "3"]
 
 
 def no_offsets() -> Offsets:
@@ -59,7 +59,7 @@ class PushbroomImage(eqx.Module):
     trajectory: Trajectory
     times: LineTimes
     optics: Optics
-    mounting: Float[Array, "3"]
+    mounting: Float[AnyArray, "3"]
     offsets: Offsets
     corrections: Corrections = eqx.field(static=True)
     lines: int = eqx.field(static=True)
@@ -74,9 +74,9 @@ class PushbroomImage(eqx.Module):
 class Pose(NamedTuple):
     """Exterior orientation of a line: P in metres, R camera → object, rate V of P in m/s."""
 
-    P: Float[Array, "3"]
-    R: Float[Array, "3 3"]
-    V: Float[Array, "3"]
+    P: Float[AnyArray, "3"]
+    R: Float[AnyArray, "3 3"]
+    V: Float[AnyArray, "3"]
 
 
 def make_image(
@@ -85,7 +85,7 @@ def make_image(
     optics: Optics,
     lines: int,
     pixels: int,
-    mounting: Numbers | Float[Array, "3"] | None = None,
+    mounting: Numbers | Float[AnyArray, "3"] | None = None,
     corrections: Corrections = Corrections(),  # noqa: B008
     sources: tuple[Source, Source] = (POSITIONS, ATTITUDE),
 ) -> PushbroomImage:
@@ -130,7 +130,7 @@ def given_pose(image: PushbroomImage, t: Scalar) -> Pose:
 
 
 def moved_pose(
-    given: Pose, dt: Scalar, offsets: Offsets, mounting: Float[Array, "3"]
+    given: Pose, dt: Scalar, offsets: Offsets, mounting: Float[AnyArray, "3"]
 ) -> Pose:
     """The pose of the camera, `dt` seconds after the middle line."""
     turn = matrix_from_rotation_vector(offsets.attitude + dt * offsets.attitude_rate)

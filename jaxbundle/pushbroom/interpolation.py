@@ -39,9 +39,9 @@ class Table(eqx.Module):
     seconds beyond its ends that the table still covers.
     """
 
-    times: Float[Array, " rows"]
-    values: Float[Array, "rows k"]
-    rates: Float[Array, "rows k"] | None
+    times: Float[AnyArray, " rows"]
+    values: Float[AnyArray, "rows k"]
+    rates: Float[AnyArray, "rows k"] | None
     gap: float = eqx.field(static=True, default=np.inf)
     method: Method = eqx.field(static=True, default="lagrange")
     order: int = eqx.field(static=True, default=7)
@@ -78,13 +78,13 @@ def interval(table: Table, t: Scalar) -> Int[Array, ""]:
     return jnp.clip(i, 0, len(table.times) - 2)
 
 
-def fraction(table: Table, i: Int[Array, ""], t: Scalar) -> Scalar:
+def fraction(table: Table, i: Int[AnyArray, ""], t: Scalar) -> Scalar:
     """τ, the part of the interval i that has passed at t; beyond 0 and 1 outside the table."""
     start, end = table.times[i], table.times[i + 1]
     return (t - start) / (end - start)
 
 
-def covers(table: Table, i: Int[Array, ""], t: Scalar) -> Bool[AnyArray, "..."]:
+def covers(table: Table, i: Int[AnyArray, ""], t: Scalar) -> Bool[AnyArray, "..."]:
     """Whether the table covers t: between its ends, or near enough to them, and not in a gap."""
     times = table.times
     inside = (t >= times[0] - table.extrapolate) & (t <= times[-1] + table.extrapolate)
@@ -103,7 +103,7 @@ def breaks(table: Table) -> Float[np.ndarray, " rows"]:
 
 
 def spline_rates(
-    times: Float[Array, " rows"], values: Float[Array, "rows k"], gap: float = np.inf
+    times: Float[AnyArray, " rows"], values: Float[AnyArray, "rows k"], gap: float = np.inf
 ) -> Float[Array, "rows k"]:
     """The rates at the rows of the cubic spline that is not-a-knot at both ends.
 

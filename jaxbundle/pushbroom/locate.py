@@ -17,7 +17,7 @@ from jaxbundle.pushbroom.corrections import true_direction as without_aberration
 from jaxbundle.pushbroom.image import Pose, PushbroomImage, pose_at
 from jaxbundle.pushbroom.scanner import Pair, slopes_of
 from jaxbundle.pushbroom.surfaces import Surface
-from jaxbundle.types import Scalar
+from jaxbundle.types import AnyArray, Scalar
 
 TOGETHER = 1000
 """Pixels that are refracted together, layer by layer: 8000 take half as long again."""
@@ -55,8 +55,8 @@ def ground_point(
 def locate_lines(
     image: PushbroomImage,
     surface: Surface,
-    lines: Float[Array, " lines"],
-    pixels: Float[Array, " pixels"],
+    lines: Float[AnyArray, " lines"],
+    pixels: Float[AnyArray, " pixels"],
 ) -> Float[Array, "3 lines pixels"]:
     """The points of all pixels of all lines, coordinates first."""
     slopes = slopes_of(image.optics, pixels)
@@ -79,8 +79,8 @@ def locate_lines(
 def locate_points(
     image: PushbroomImage,
     surface: Surface,
-    lines: Float[Array, " n"],
-    pixels: Float[Array, " n"],
+    lines: Float[AnyArray, " n"],
+    pixels: Float[AnyArray, " n"],
 ) -> Float[Array, "3 n"]:
     """The points of scattered places in the image, a pose for each."""
     return jnp.stack(jax.vmap(lambda l, u: locate_point(image, surface, l, u))(lines, pixels))

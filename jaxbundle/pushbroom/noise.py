@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbundle.geometry import (
     matrix_from_omega_phi_kappa,
@@ -67,7 +67,7 @@ def sigmas(image: PushbroomImage, noise: Noise) -> Errors:
     ))  # fmt: skip
 
 
-def draw(sigma: Errors, key: Array) -> Errors:
+def draw(sigma: Errors, key: AnyArray) -> Errors:
     """Normally distributed errors of these standard deviations (`sigmas`)."""
     keys = jax.random.split(key, len(sigma))
     return Errors(*(s * jax.random.normal(k, s.shape) for s, k in zip(sigma, keys)))

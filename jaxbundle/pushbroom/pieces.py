@@ -12,13 +12,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid, ray_to_ellipsoid
 from jaxbundle.geometry.vectors import turned
 from jaxbundle.pushbroom.image import PushbroomImage, pose_at
 from jaxbundle.pushbroom.interpolation import breaks, span
+from jaxbundle.types import AnyArray
 
 DEGREE = 3
 TOLERANCE = 1e-7
@@ -39,9 +40,9 @@ TO_CHECKS = np.vander(CHECKS, DEGREE + 1, increasing=True) @ TO_COEFFICIENTS
 class Pieces(eqx.Module):
     """Ends of the n pieces in seconds; coefficients of M (rows first) and m in τ from −1 to 1."""
 
-    ends: Float[Array, " n+1"]
-    coefficients: Float[Array, "n 4 12"]
-    origin: Float[Array, "3"]
+    ends: Float[AnyArray, " n+1"]
+    coefficients: Float[AnyArray, "n 4 12"]
+    origin: Float[AnyArray, "3"]
 
 
 def make_pieces(image: PushbroomImage, earth: Ellipsoid | None) -> Pieces:

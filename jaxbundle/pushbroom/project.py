@@ -80,10 +80,10 @@ class Projected(eqx.Module):
     `count`: how many there are. `status`: that of the point, a `Status`.
     """
 
-    line: Float[Array, "most n"]
-    pixel: Float[Array, "most n"]
-    count: Int[Array, " n"]
-    status: Int[Array, " n"]
+    line: Float[AnyArray, "most n"]
+    pixel: Float[AnyArray, "most n"]
+    count: Int[AnyArray, " n"]
+    status: Int[AnyArray, " n"]
 
 
 class Search(eqx.Module):
@@ -91,8 +91,8 @@ class Search(eqx.Module):
 
     pieces: Pieces
     footprint: Footprint | None
-    samples: Float[Array, " k"]
-    along: Float[Array, " 6"]
+    samples: Float[AnyArray, " k"]
+    along: Float[AnyArray, " 6"]
     earth: Ellipsoid | None = eqx.field(static=True)
 
 
@@ -174,7 +174,7 @@ def _misclosure_near(tu, earth, data):
 
 def misclosure(
     image: PushbroomImage,
-    X: Float[Array, "3"],
+    X: Float[AnyArray, "3"],
     t: Scalar,
     u: Scalar,
     earth: Ellipsoid | None,
@@ -187,7 +187,7 @@ def misclosure(
 def misclosure_of(
     pose: Pose,
     slopes: Pair,
-    X: Float[Array, "3"],
+    X: Float[AnyArray, "3"],
     corrections: Corrections,
     earth: Ellipsoid | None,
 ) -> Float[Array, "2"]:

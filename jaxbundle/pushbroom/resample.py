@@ -10,14 +10,16 @@ from typing import Literal, get_args
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxbundle.types import AnyArray
+
 Resampling = Literal["nearest", "bilinear", "cubic"]
 RESAMPLINGS: tuple[Resampling, ...] = get_args(Resampling)
 
 
 def resample(
-    bands: Float[Array, "bands rows columns"],
-    row: Float[Array, "*shape"],
-    column: Float[Array, "*shape"],
+    bands: Float[AnyArray, "bands rows columns"],
+    row: Float[AnyArray, "*shape"],
+    column: Float[AnyArray, "*shape"],
     kind: Resampling = "bilinear",
 ) -> Float[Array, "bands *shape"]:
     """The values of all bands at places in the raster."""

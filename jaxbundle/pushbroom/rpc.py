@@ -69,10 +69,10 @@ _MEANING = {
 class Rpc(eqx.Module):
     """Coefficients of RPC00B, offsets and scales: lines, samples, degrees, metres."""
 
-    line_numerator: Float[Array, "20"]
-    line_denominator: Float[Array, "20"]
-    sample_numerator: Float[Array, "20"]
-    sample_denominator: Float[Array, "20"]
+    line_numerator: Float[AnyArray, "20"]
+    line_denominator: Float[AnyArray, "20"]
+    sample_numerator: Float[AnyArray, "20"]
+    sample_denominator: Float[AnyArray, "20"]
     line_offset: Scalar
     line_scale: Scalar
     sample_offset: Scalar

@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
@@ -27,6 +27,7 @@ from jaxbundle.geometry.vectors import along
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.rpc import MARGIN, Rpc, Scalar, project, project_points
 from jaxbundle.pushbroom.rpc_fit import RpcCheck, RpcTable, check_rpc, fit_rpc
+from jaxbundle.types import AnyArray
 
 MODELS = {"shift": 1, "affine": 3}
 """Unknowns of each axis."""
@@ -40,8 +41,8 @@ GRID = 12
 class Bias(eqx.Module):
     """a₀, a₁, a₂ and b₀, b₁, b₂, in pixels."""
 
-    line: Float[Array, "3"]
-    sample: Float[Array, "3"]
+    line: Float[AnyArray, "3"]
+    sample: Float[AnyArray, "3"]
 
 
 class BiasFit(eqx.Module):

@@ -15,7 +15,6 @@ import abc
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import Array
 from jaxtyping import Float
 
 from jaxbundle.cameras import get_model, image_ray
@@ -28,9 +27,9 @@ Pair = tuple[Scalar, Scalar]
 class LineTimes(eqx.Module):
     """Line l is taken at first + period·l, or at times of a table, linear in between; seconds."""
 
-    first: Float[Array, ""]
-    period: Float[Array, ""]
-    table: Float[Array, " lines"] | None = None
+    first: Float[AnyArray, ""]
+    period: Float[AnyArray, ""]
+    table: Float[AnyArray, " lines"] | None = None
 
     def time(self, line: Scalar) -> Scalar:
         """The time of a line."""
@@ -63,10 +62,10 @@ class FocalLine(Optics):
     x = 0; `row` the y of the line.
     """
 
-    parameters: Float[Array, " p"]
-    pitch: Float[Array, ""]
-    middle: Float[Array, ""]
-    row: Float[Array, ""]
+    parameters: Float[AnyArray, " p"]
+    pitch: Float[AnyArray, ""]
+    middle: Float[AnyArray, ""]
+    row: Float[AnyArray, ""]
     model: str = eqx.field(static=True, default="brown")
 
     def slopes(self, u: Scalar) -> Pair:
@@ -79,8 +78,8 @@ class FocalLine(Optics):
 class AngleTable(Optics):
     """Angles in radians for every pixel."""
 
-    across: Float[Array, " pixels"]
-    along: Float[Array, " pixels"]
+    across: Float[AnyArray, " pixels"]
+    along: Float[AnyArray, " pixels"]
 
     def slopes(self, u: Scalar) -> Pair:
         return jnp.tan(_at(self.across, u)), jnp.tan(_at(self.along, u))
@@ -89,10 +88,10 @@ class AngleTable(Optics):
 class AnglePolynomial(Optics):
     """Tangents ξ and η as polynomials of û, coefficients from the constant upwards."""
 
-    across: Float[Array, " k"]
-    along: Float[Array, " m"]
-    middle: Float[Array, ""]
-    half: Float[Array, ""]
+    across: Float[AnyArray, " k"]
+    along: Float[AnyArray, " m"]
+    middle: Float[AnyArray, ""]
+    half: Float[AnyArray, ""]
 
     def slopes(self, u: Scalar) -> Pair:
         x = (u - self.middle) / self.half

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.pushbroom.ancillary import attitude_table, position_table
@@ -27,6 +27,7 @@ from jaxbundle.pushbroom.scanner import LineTimes, Optics
 from jaxbundle.pushbroom.signals import signal
 from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.pushbroom.trajectory import Trajectory
+from jaxbundle.types import AnyArray
 
 MARGIN = 6
 """Rows of ancillary data before the first line and after the last."""
@@ -108,7 +109,7 @@ def with_errors_in_rows(image: PushbroomImage, errors) -> PushbroomImage:
 def taken_image(
     image: PushbroomImage,
     surface: Surface,
-    scene: Float[Array, "bands rows columns"],
+    scene: Float[AnyArray, "bands rows columns"],
     to_scene,
     lines: Float[np.ndarray, " lines"],
     resampling: Resampling = "bilinear",

@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.lax import stop_gradient
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, at_height, geodetic, ray_to_ellipsoid
@@ -36,7 +36,7 @@ from jaxbundle.geometry.vectors import Scalar, Triple, Vector, along
 from jaxbundle.implicit import implicit_root, solve_dense
 from jaxbundle.pushbroom.polynomial import value, value_and_rate
 from jaxbundle.pushbroom.surfaces import Surface
-from jaxbundle.types import Numbers
+from jaxbundle.types import AnyArray, Numbers
 
 MARGIN = 1.0
 """The traverse begins this far above the highest height and ends as far below the lowest, metres;
@@ -51,7 +51,7 @@ class Terrain(Surface):
     """
 
     iterative: ClassVar[bool] = True
-    heights: Float[Array, "rows columns"]
+    heights: Float[AnyArray, "rows columns"]
     origin: tuple[float, float]
     step: tuple[float, float]
     lowest: float
@@ -131,7 +131,7 @@ def _above_ground(s, _, data):
     return h - bilinear(terrain.heights, x, y)
 
 
-def bilinear(heights: Float[Array, "rows columns"], x: Scalar, y: Scalar) -> Scalar:
+def bilinear(heights: Float[AnyArray, "rows columns"], x: Scalar, y: Scalar) -> Scalar:
     """The height at column x and row y; NaN outside the grid and where a corner has none."""
     cell = _cell(heights, jnp.floor(x), jnp.floor(y))
     return _in_cell(cell, x, y)

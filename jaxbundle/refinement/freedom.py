@@ -67,15 +67,15 @@ class Freedom:
 class Change(NamedTuple):
     """The unknowns of an image, zero where the trajectory and the optics are as given."""
 
-    attitude: Float[Array, "3"]
-    attitude_rate: Float[Array, "3"]
-    jitter: Float[Array, "3 k"]
-    position: Float[Array, "3"]
-    position_rate: Float[Array, "3"]
-    focal_length: Float[Array, ""]
-    mounting: Float[Array, "3"]
-    look_across: Float[Array, " a"]
-    look_along: Float[Array, " b"]
+    attitude: Float[AnyArray, "3"]
+    attitude_rate: Float[AnyArray, "3"]
+    jitter: Float[AnyArray, "3 k"]
+    position: Float[AnyArray, "3"]
+    position_rate: Float[AnyArray, "3"]
+    focal_length: Float[AnyArray, ""]
+    mounting: Float[AnyArray, "3"]
+    look_across: Float[AnyArray, " a"]
+    look_along: Float[AnyArray, " b"]
 
 
 class Sizes(NamedTuple):
@@ -99,7 +99,7 @@ class ChangedOptics(Optics):
     """(ξ, η) of `base` divided by 1 + e, and polynomials added."""
 
     base: Optics
-    relative: Float[Array, ""]
+    relative: Float[AnyArray, ""]
     added: AnglePolynomial
 
     def slopes(self, u):
@@ -131,7 +131,7 @@ class Form(eqx.Module):
     """What is fixed about the unknowns of an image: axes F, spline, and how many numbers each
     unknown has in its vector, which may be more than it uses."""
 
-    axes: Float[Array, "3 3"]
+    axes: Float[AnyArray, "3 3"]
     spline: JitterSpline = eqx.field(static=True)
     sizes: Sizes = eqx.field(static=True)
 
@@ -185,7 +185,7 @@ def changed(
     )  # fmt: skip
 
 
-def changed_offsets(old: Offsets, axes, change: Change, jitter: Float[Array, "3"]) -> Offsets:
+def changed_offsets(old: Offsets, axes, change: Change, jitter: Float[AnyArray, "3"]) -> Offsets:
     """The offsets with attitude and position changed."""
     return Offsets(
         old.attitude + change.attitude + jitter,

@@ -18,6 +18,7 @@ from jaxbundle.leastsquares.stopping import converged
 from jaxbundle.refinement.declare import Declared
 from jaxbundle.refinement.weakness import weaknesses
 from jaxbundle.statistics.blunders import Removed
+from jaxbundle.types import AnyArray
 
 ROUNDS, SAME = 10, 1e-9
 """Solutions, each with the S of the one before, at most; an S that changes by less is the same."""
@@ -38,7 +39,7 @@ class Shared(eqx.Module):
             found = found.at[k].set(change[row, direction])
         return found
 
-    def tables(self, changes: Float[Array, " m"]) -> Values:
+    def tables(self, changes: Float[AnyArray, " m"]) -> Values:
         """The tables after these changes."""
         spaces, moved = dict(self.spaces), {}
         for t, (k, row, direction) in self.at.items():

@@ -105,13 +105,13 @@ class Line(NamedTuple):
     pose: Pose
     dt: Scalar
     offsets: Offsets
-    mounting: Float[Array, "*n 3"]
-    axes: Float[Array, "*n 3 3"]
-    jitter: Float[Array, "*n k"]
-    slopes: Float[Array, "*n 2"]
-    across: Float[Array, "*n a"]
-    along: Float[Array, "*n b"]
-    scale: Float[Array, "*n 2 2"]
+    mounting: Float[AnyArray, "*n 3"]
+    axes: Float[AnyArray, "*n 3 3"]
+    jitter: Float[AnyArray, "*n k"]
+    slopes: Float[AnyArray, "*n 2"]
+    across: Float[AnyArray, "*n a"]
+    along: Float[AnyArray, "*n b"]
+    scale: Float[AnyArray, "*n 2 2"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,7 +136,7 @@ class ScannerPoint:
         return misclosure_of(pose, slopes, X, self.corrections, self.earth)
 
 
-def line_of(image: PushbroomImage, form: Form, origin, place: Float[Array, "2"]) -> Line:
+def line_of(image: PushbroomImage, form: Form, origin, place: Float[AnyArray, "2"]) -> Line:
     """What belongs to a measured (line, pixel), in coordinates relative to an origin; without S."""
     t = image.times.time(place[0])
     pose, (middle, half) = given_pose(image, t), middle_and_half(image)

@@ -142,7 +142,7 @@ def _optics(image, change) -> Optics:
     base, e = image.optics, change.focal_length
     if isinstance(base, FocalLine):
         parameters = base.parameters
-        candidate = dataclasses.replace(base, parameters=parameters.at[0].mul(1 + e))
+        candidate = dataclasses.replace(base, parameters=jnp.asarray(parameters).at[0].mul(1 + e))
     elif isinstance(base, AnglePolynomial):
         candidate = _sum(base, e, wanted.added)
     else:

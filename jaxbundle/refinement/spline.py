@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxbundle.types import Scalar
+from jaxbundle.types import AnyArray, Scalar
 
 FEWEST = 3
 """Intervals between knots: with fewer, nothing is left beside constant and line."""
@@ -51,9 +51,9 @@ class JitterSpline:
         full = np.linalg.qr(np.stack([np.ones_like(k), k], 1).astype(float), mode="complete")[0]
         return full[:, 2:]
 
-    def at(self, z: Float[Array, "3 k"], t: Scalar) -> Float[Array, "3"]:
+    def at(self, z: Float[AnyArray, "3 k"], t: Scalar) -> Float[Array, "3"]:
         """s(t) of three axes; z may have more columns than there are unknowns."""
-        return z[:, : self.unknowns] @ self.weights(t)
+        return jnp.asarray(z)[:, : self.unknowns] @ self.weights(t)
 
     def weights(self, t: Scalar) -> Float[Array, " unknowns"]:
         """How much of every z is in s(t)."""

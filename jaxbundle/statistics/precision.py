@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxbundle import cameras
 from jaxbundle.adjustment.problem import Problem
@@ -27,6 +27,7 @@ from jaxbundle.leastsquares.precision import precision as engine_precision
 from jaxbundle.leastsquares.reduction import FACTORS
 from jaxbundle.leastsquares.spaces import Pose, PoseValue
 from jaxbundle.network.arrays import Data, Values
+from jaxbundle.types import AnyArray
 
 ROUNDING = 1e-14
 """A variance below this fraction of the largest of its kind is that of what the datum holds: 0."""
@@ -39,10 +40,10 @@ class Precision(eqx.Module):
     parameters of the model, in their units; `points`: of X, Y, Z (object unit).
     """
 
-    images: Float[Array, "images 6"]
-    cameras: Float[Array, "cameras parameters"]
-    points: Float[Array, "points 3"]
-    covariance: Float[Array, "names names"]
+    images: Float[AnyArray, "images 6"]
+    cameras: Float[AnyArray, "cameras parameters"]
+    points: Float[AnyArray, "points 3"]
+    covariance: Float[AnyArray, "names names"]
 
 
 def precision(
@@ -50,7 +51,7 @@ def precision(
     data: Data | None = None,
     *,
     names: tuple[tuple[str, str, str], ...] = (),
-    sigma0: float | Float[Array, ""] = 1.0,
+    sigma0: float | Float[AnyArray, ""] = 1.0,
 ) -> Precision:
     """The precision of a design, differentiable to every order in all of it.
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.cameras import CameraModel, get_model, validity_message
 from jaxbundle.network.arrays import Values
+from jaxbundle.types import AnyArray
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,6 +63,6 @@ def farthest_measurements(problem: Problem, values: Values) -> Float[np.ndarray,
 
 
 @partial(jax.jit, static_argnums=0)
-def measured_centre(model: CameraModel, p: Float[Array, " parameters"]) -> Float[Array, "2"]:
+def measured_centre(model: CameraModel, p: Float[AnyArray, " parameters"]) -> Float[Array, "2"]:
     """The measured image of a camera's axis, where its distortion is centred."""
     return jnp.stack(model.from_ideal(tuple(p), 0.0, 0.0))

@@ -1,11 +1,11 @@
-"""Least squares with a few unknowns on a manifold: the refinement of every closed form here.
+"""Least squares with a few unknowns on a manifold, dense: start values, closed forms refined.
 
     v(x) → vᵀv = min,        x ← x ⊞ δ,        (N + λ·diag N)·δ = −Jᵀv,        N = JᵀJ
 
-J = ∂v(x ⊞ δ)/∂δ at δ = 0 by forward differentiation; v contains the roots of the weights. λ
-falls with success and rises with failure (Levenberg, 1944; Marquardt, 1963). The iterations are
-not differentiated: the derivatives, of every order, are those of the root of ∂(vᵀv)/∂δ = 0
-(`jaxbundle.implicit`), curvature of v included.
+J = ∂v(x ⊞ δ)/∂δ at δ = 0 by forward differentiation; v contains the roots of the weights. Steps and
+stopping follow the engine's rules (`loop.py`). The iterations are not differentiated: the
+derivatives, of every order, are those of the root of ∂(vᵀv)/∂δ = 0 (`jaxbundle.implicit`),
+curvature of v included.
 """
 
 from collections.abc import Callable
@@ -19,9 +19,15 @@ from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Float, PyTree
 
 from jaxbundle.implicit import implicit_root, solve_dense
+from jaxbundle.leastsquares.loop import iterate
+from jaxbundle.leastsquares.stopping import Tolerance
 
 DETERMINED = 1e-10
 """Least eigenvalue of the normal matrix scaled to a unit diagonal, below it nothing is solved."""
+MOST = 30
+"""Evaluations."""
+SETTLED = 1e-8
+"""A last step moves no unknown by more than this part of its σ; one more, undamped, follows."""
 
 
 class Fit(eqx.Module):
@@ -40,35 +46,39 @@ class Fit(eqx.Module):
         return self.weakest > DETERMINED
 
 
-def adjust(residuals: Callable, retract: Callable, start, data: tuple, unknowns: int, steps=12):
+def adjust(residuals: Callable, retract: Callable, start, data: tuple, unknowns: int, steps=MOST):
     """`minimise`, then `finish`: from start values to a differentiable `Fit`."""
     estimate, _ = minimise(residuals, retract, start, data, unknowns, steps)
     return finish(residuals, retract, estimate, data, unknowns)
 
 
-def minimise(residuals: Callable, retract: Callable, start, data: tuple, unknowns: int, steps=12):
-    """The estimate after `steps` damped steps, and its vᵀv, without derivative.
+def minimise(residuals: Callable, retract: Callable, start, data: tuple, unknowns: int, steps=MOST):
+    """The estimate where the iterations ended, and its vᵀv, without derivative.
 
-    **Arguments:** `residuals(x, *data)` [n], `retract(x, δ)`; `start`: x to begin with.
+    **Arguments:** `residuals(x, *data)` [n], `retract(x, δ)`; `start`: x to begin with; `steps`:
+    evaluations at most.
     """
     start, data = stop_gradient((start, data))
 
-    def square(x):
-        s = jnp.sum(residuals(x, *data) ** 2)
-        return jnp.where(jnp.isnan(s), jnp.inf, s)
+    def linearise(x):
+        N, g, v = _linearised(residuals, retract, x, data, unknowns)
+        there = jnp.isfinite(N).all() & jnp.isfinite(g).all()
+        return (N, g, jnp.asarray(len(v))), 0.5 * jnp.where(there, jnp.sum(v**2), jnp.nan)
 
-    def improve(_, state):
-        x, least, damping = state
-        N, g = normal_equations(residuals, retract, x, data, unknowns)
-        trial = retract(x, -_solve(N + damping * jnp.diag(jnp.diag(N)), g))
-        now = square(trial)
-        better = now < least
-        x = jax.tree.map(lambda a, b: jnp.where(better, a, b), trial, x)
-        damping = jnp.where(better, damping / 20, jnp.minimum(damping * 8, 1e6))
-        return x, jnp.where(better, now, least), damping
+    def step(equations, damping):
+        N, g, _ = equations
+        D = jnp.diag(N)
+        D = jnp.where(D > 0, D, 1.0)
+        change = -_solve(N + damping * jnp.diag(D), g)
+        return change, -g @ change, D @ change**2
 
-    estimate, vtv, _ = jax.lax.fori_loop(0, steps, improve, (start, square(start), 1e-4))
-    return estimate, vtv
+    def tolerance(equations):
+        N, _, rows = equations
+        zero = jnp.zeros((), N.dtype)
+        return Tolerance(rows - unknowns + zero, jnp.trace(N), zero + SETTLED, zero)
+
+    loop = iterate(linearise, step, retract, start, tolerance, steps)
+    return loop.at, jnp.where(jnp.isfinite(loop.cost), 2 * loop.cost, jnp.inf)
 
 
 def finish(residuals: Callable, retract: Callable, estimate, data: tuple, unknowns: int) -> Fit:
@@ -104,6 +114,11 @@ def _half_gradient(delta, fixed, data):
 
 def normal_equations(residuals, retract, x, data, unknowns):
     """N = JᵀJ and Jᵀv at x."""
+    return _linearised(residuals, retract, x, data, unknowns)[:2]
+
+
+def _linearised(residuals, retract, x, data, unknowns):
+    """N = JᵀJ, Jᵀv and v at x."""
 
     def twice(delta):
         v = residuals(retract(x, delta), *data)
@@ -111,7 +126,7 @@ def normal_equations(residuals, retract, x, data, unknowns):
 
     zero = jnp.zeros(unknowns, jax.tree.leaves(x)[0].dtype)
     J, v = jax.jacfwd(twice, has_aux=True)(zero)
-    return J.T @ J, J.T @ v
+    return J.T @ J, J.T @ v, v
 
 
 def inverse(N: Float[Array, "u u"]) -> Float[Array, "u u"]:
