@@ -29,7 +29,7 @@ os.environ.setdefault(
 import jax  # noqa: E402
 import pytest  # noqa: E402
 from jaxtyping import install_import_hook  # noqa: E402
-from type_checker import modules_with_shapes  # noqa: E402
+from type_checker import modules_with_shapes, unchecked  # noqa: E402
 
 install_import_hook(modules_with_shapes(ROOT / "jaxbundle"), "type_checker.checked")
 
@@ -114,6 +114,13 @@ def drop_after_test():
 def drop_after_file():
     yield
     drop_compiled_programs(MOST_AT_END)
+
+
+@pytest.fixture
+def wrong_types():
+    """For tests that hand over what annotations forbid, to see what the package says of it."""
+    with unchecked():
+        yield
 
 
 class Told(NamedTuple):

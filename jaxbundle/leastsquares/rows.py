@@ -19,7 +19,7 @@ from jaxbundle.leastsquares.plan import Part, Plan
 from jaxbundle.leastsquares.spaces import Space
 from jaxbundle.types import AnyArray
 
-Values = dict[str, PyTree[Float[Array, "rows ..."]]]
+Values = dict[str, PyTree[Float[AnyArray, "rows ..."]]]
 """The rows of every table."""
 
 

@@ -29,7 +29,7 @@ from jaxtyping import Array, Float
 
 from jaxbundle.cameras import CameraModel, project
 from jaxbundle.orientation.pose import Pose, to_camera
-from jaxbundle.types import AnyArray
+from jaxbundle.types import AnyArray, Scalar
 
 RIM = 32
 """Points of a rim."""
@@ -104,7 +104,7 @@ def circle_centre_shift(
     pose: Pose,
     centre: Float[AnyArray, "3"],
     normal: Float[AnyArray, "3"],
-    radius: float,
+    radius: Scalar,
 ) -> Float[Array, "2"]:
     """Centre of the image of a circle minus image of its centre: the eccentricity of projection.
 
@@ -128,7 +128,7 @@ def rim_centre_shift(
     pose: Pose,
     centre: Float[AnyArray, "3"],
     normal: Float[AnyArray, "3"],
-    radius: float,
+    radius: Scalar,
 ) -> Float[Array, "2"]:
     """Centre of the ellipse through the image of a circle's rim minus image of its centre: as
     `circle_centre_shift`, and with the distortion as it is along the rim."""

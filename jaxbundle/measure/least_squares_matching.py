@@ -68,7 +68,7 @@ class LeastSquaresMatch(eqx.Module):
     status: Int[Array, ""]
 
     @property
-    def place(self) -> Float[Array, "2"]:
+    def place(self) -> Float[Array, "*batch 2"]:
         """(u, v) of the centre of the window in the other image."""
         return self.affine[..., 2]
 

@@ -20,7 +20,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Real
 
 from jaxbundle.errors import InputError
 from jaxbundle.measure.transfer import View, ground_point, image_point
@@ -50,8 +50,8 @@ def correlation(a: Float[AnyArray, " n"], b: Float[AnyArray, " n"]) -> Float[Arr
 
 
 def find_match(
-    base: Float[np.ndarray, "rows columns"],
-    other: Float[np.ndarray, "rows columns"],
+    base: Real[np.ndarray, "rows columns"],
+    other: Real[np.ndarray, "other_rows other_columns"],
     view: View,
     other_view: View,
     xy: Float[np.ndarray, "2"],

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from jaxbundle.cameras import CameraModel, image_ray, project
 from jaxbundle.orientation.pose import Pose, to_camera
-from jaxbundle.types import AnyArray
+from jaxbundle.types import AnyArray, Scalar
 
 
 class View(eqx.Module):
@@ -31,7 +31,7 @@ def line_of_sight(view: View, xy: Float[AnyArray, "2"]) -> Float[Array, "3"]:
     return jnp.asarray(view.pose.M).T @ jnp.stack(ray)
 
 
-def ground_point(view: View, xy: Float[AnyArray, "2"], Z: float) -> Float[Array, "3"]:
+def ground_point(view: View, xy: Float[AnyArray, "2"], Z: Scalar) -> Float[Array, "3"]:
     """Where the ray of an image point meets the plane of this Z; NaN where it does not."""
     d = line_of_sight(view, xy)
     t = (Z - view.pose.X0[2]) / d[2]
@@ -48,7 +48,7 @@ def image_point(view: View, X: Float[AnyArray, "3"]) -> Float[Array, "2"]:
 
 
 def image_to_image(
-    view: View, xy: Float[AnyArray, "2"], Z: float, other: View
+    view: View, xy: Float[AnyArray, "2"], Z: Scalar, other: View
 ) -> Float[Array, "2"]:
     """The image point in another image of what lies at the height Z in this one."""
     return image_point(other, ground_point(view, xy, Z))

@@ -37,7 +37,7 @@ from jaxbundle.orientation.relative import (
 from jaxbundle.orientation.resection import Resection, refine_resection
 from jaxbundle.orientation.status import Status
 from jaxbundle.orientation.three_points import three_points
-from jaxbundle.types import AnyArray
+from jaxbundle.types import AnyArray, Scalar
 
 FAR = 1e6
 """Error of an observation that contradicts a model altogether (a point behind the camera)."""
@@ -69,7 +69,7 @@ def consensus(
     data: tuple,
     size: int,
     samples: int,
-    threshold: float | None = None,
+    threshold: Scalar | None = None,
     weights: Float[AnyArray, " n"] | None = None,
 ) -> Consensus:
     """The best of the models of `samples` random samples of `size` observations.
@@ -113,7 +113,7 @@ def robust_resection(
     X: Float[AnyArray, "n 3"],
     weights: Float[AnyArray, " n"] | None = None,
     samples: int = 60,
-    threshold: float | None = None,
+    threshold: Scalar | None = None,
 ) -> tuple[Resection, Bool[Array, " n"]]:
     """Resection of points with up to 40 % gross errors, and which points are good.
 
@@ -145,7 +145,7 @@ def robust_relative_orientation(
     xy2: Float[AnyArray, "n 2"],
     weights: Float[AnyArray, " n"] | None = None,
     samples: int = 150,
-    threshold: float | None = None,
+    threshold: Scalar | None = None,
 ) -> tuple[RelativeOrientation, Bool[Array, " n"]]:
     """Relative orientation of points with up to 40 % gross errors, and which points are good.
 
@@ -188,7 +188,7 @@ def robust_homography(
     target: Float[AnyArray, "n 2"],
     weights: Float[AnyArray, " n"] | None = None,
     samples: int = 60,
-    threshold: float | None = None,
+    threshold: Scalar | None = None,
 ) -> tuple[tuple[Float[Array, "3 3"], Array], Bool[Array, " n"]]:
     """(H, status) of points with up to 40 % gross errors, and which points are good.
 
@@ -209,7 +209,7 @@ def robust_absolute_orientation(
     target: Float[AnyArray, "n 3"],
     weights: Float[AnyArray, " n"] | None = None,
     samples: int = 40,
-    threshold: float | None = None,
+    threshold: Scalar | None = None,
 ) -> tuple[AbsoluteOrientation, Bool[Array, " n"]]:
     """Absolute orientation of points with up to 40 % gross errors, and which points are good.
 
@@ -230,7 +230,7 @@ def robust_direct_linear_transformation(
     X: Float[AnyArray, "n 3"],
     weights: Float[AnyArray, " n"] | None = None,
     samples: int = 300,
-    threshold: float | None = None,
+    threshold: Scalar | None = None,
 ) -> tuple[tuple[Float[Array, "3 4"], Array], Bool[Array, " n"]]:
     """(P, status) of points with up to 40 % gross errors, and which points are good.
 
@@ -252,7 +252,7 @@ def robust_intersection(
     rays: Float[AnyArray, "n 3"],
     weights: Float[AnyArray, " n"] | None = None,
     samples: int = 30,
-    threshold: float | None = None,
+    threshold: Scalar | None = None,
 ) -> tuple[Intersection, Bool[Array, " n"]]:
     """The point of rays of which up to 40 % are wrong, and which rays are good.
 

@@ -11,6 +11,7 @@ from jaxbundle.network.columns import did_you_mean
 from jaxbundle.network.tables import Source
 from jaxbundle.pushbroom.interpolation import METHODS, Table
 from jaxbundle.pushbroom.trajectory import Attitude
+from jaxbundle.types import Numbers
 
 POSITIONS, ATTITUDE = Source("positions"), Source("attitude")
 
@@ -169,7 +170,7 @@ def check_span(rows, extrapolate, times, source, thing="image line") -> None:
 
 
 def check_covered(
-    table: Table, times: Float[np.ndarray, " lines"], source: Source, thing: str = "image line"
+    table: Table, times: Numbers, source: Source, thing: str = "image line"
 ) -> None:
     """Refuse a table that does not reach over the times, or has a gap among them.
 

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import did_you_mean
+from jaxbundle.types import Numbers
 
 FRAMES = ("ITRF", "GCRF", "J2000", "TEME")
 EARTH_RATE = 7.292115e-5
@@ -46,7 +47,7 @@ class EarthOrientation(NamedTuple):
 def to_earth(
     frame: str,
     epoch: str,
-    times: Float[np.ndarray, " rows"],
+    times: Numbers,
     orientation: EarthOrientation = EarthOrientation(),  # noqa: B008
 ) -> Matrices:
     """The matrices R with x_ITRF = R·x_frame.
@@ -118,7 +119,7 @@ def two_line_orbit(
     first: str,
     second: str,
     epoch: str,
-    times: Float[np.ndarray, " rows"],
+    times: Numbers,
     orientation: EarthOrientation = EarthOrientation(),  # noqa: B008
 ) -> tuple[Rows, Rows]:
     """Earth-fixed positions (m) and velocities (m/s) of two-line elements by SGP4.

@@ -72,19 +72,19 @@ def rate(table: Table, t: Scalar) -> Float[Array, " k"]:
     return jax.jvp(lambda t: interpolate(table, t), (t,), (jnp.ones_like(t),))[1]
 
 
-def interval(table: Table, t: Scalar) -> Int[Array, ""]:
+def interval(table: Table, t: Scalar) -> Int[Array, "..."]:
     """The row i with tᵢ ≤ t < tᵢ₊₁; the first or last interval beyond the ends."""
     i = jnp.searchsorted(table.times, t, side="right") - 1
     return jnp.clip(i, 0, len(table.times) - 2)
 
 
-def fraction(table: Table, i: Int[AnyArray, ""], t: Scalar) -> Scalar:
+def fraction(table: Table, i: Int[AnyArray, "..."], t: Scalar) -> Scalar:
     """τ, the part of the interval i that has passed at t; beyond 0 and 1 outside the table."""
     start, end = table.times[i], table.times[i + 1]
     return (t - start) / (end - start)
 
 
-def covers(table: Table, i: Int[AnyArray, ""], t: Scalar) -> Bool[AnyArray, "..."]:
+def covers(table: Table, i: Int[AnyArray, "..."], t: Scalar) -> Bool[AnyArray, "..."]:
     """Whether the table covers t: between its ends, or near enough to them, and not in a gap."""
     times = table.times
     inside = (t >= times[0] - table.extrapolate) & (t <= times[-1] + table.extrapolate)

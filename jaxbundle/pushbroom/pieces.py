@@ -40,7 +40,7 @@ TO_CHECKS = np.vander(CHECKS, DEGREE + 1, increasing=True) @ TO_COEFFICIENTS
 class Pieces(eqx.Module):
     """Ends of the n pieces in seconds; coefficients of M (rows first) and m in τ from −1 to 1."""
 
-    ends: Float[AnyArray, " n+1"]
+    ends: Float[AnyArray, " ends"]
     coefficients: Float[AnyArray, "n 4 12"]
     origin: Float[AnyArray, "3"]
 

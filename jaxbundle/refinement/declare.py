@@ -21,7 +21,7 @@ from jaxbundle.network.tables import EXTERIOR, Distances, Network, Observations,
 from jaxbundle.refinement import kinds
 from jaxbundle.refinement.freedom import Form, Name, make_form, names, of_one_size, priors
 from jaxbundle.refinement.tables import GroundPoints, ScannerImage
-from jaxbundle.types import present
+from jaxbundle.types import Index, present
 
 ARCSEC = math.degrees(1) * 3600
 IMAGE, SENSOR = "scanner image", "sensor"
@@ -58,12 +58,12 @@ class Given:
         frames = () if self.frames is None else self.frames.images.id
         return [*(one.id for one in self.images), *frames]
 
-    def kind(self, i: int) -> kinds.ScannerPoint:
+    def kind(self, i: Index) -> kinds.ScannerPoint:
         """The equations of an image."""
         one = self.images[i]
         return kinds.ScannerPoint(one.image.corrections, one.earth, self.forms[i].sizes)
 
-    def lines(self, i: int, values: Values, X, rows) -> tuple[kinds.Line, np.ndarray]:
+    def lines(self, i: Index, values: Values, X, rows) -> tuple[kinds.Line, np.ndarray]:
         """Of rows of the measurements in image i, of points X: what belongs to their places, and
         v."""
         p = values[IMAGE][i], values[SENSOR][self.sensor[i]]

@@ -20,9 +20,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.cameras import get_model, image_ray
+from jaxbundle.leastsquares.small import minimise
 from jaxbundle.network.tables import Camera
 from jaxbundle.orientation import many
-from jaxbundle.orientation.least_squares import minimise
 from jaxbundle.orientation.relative import retract, sampson_distance
 from jaxbundle.orientation.sights import ideal_points
 

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbundle.geometry import matrix_from_quaternion
+from jaxbundle.leastsquares.small import minimise
 from jaxbundle.orientation import (
     apply_homography,
     homography,
@@ -23,7 +24,6 @@ from jaxbundle.orientation import (
     ray_of,
 )
 from jaxbundle.orientation.absolute import rotation_between
-from jaxbundle.orientation.least_squares import minimise
 from jaxbundle.orientation.relative import retract, sampson_distance
 
 LEAST, PART = 16, 0.2

@@ -96,6 +96,7 @@ def test_derivatives_against_differences():
     assert_jacobians_match_differences(affine.inverse, params)
 
 
+@pytest.mark.usefixtures("wrong_types")
 def test_too_few_points_and_unequal_lists_are_refused():
     with pytest.raises(ValueError, match="at least three points, but 2"):
         affine.fit(POINTS[:2], POINTS[:2])

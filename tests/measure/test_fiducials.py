@@ -74,6 +74,7 @@ def test_points_follow_the_marks_and_weights_count():
     assert "affine transformation of 8 marks" in str(found)
 
 
+@pytest.mark.usefixtures("wrong_types")
 @pytest.mark.parametrize("change, said", [
     (lambda a, b: (a[:2], b[:2]), "2 fiducial marks are too few for the affine"),
     (lambda a, b: (a[:3], b), r"\(3, 2\) and \(8, 2\)"),

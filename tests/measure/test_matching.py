@@ -100,6 +100,7 @@ def test_matching_says_what_is_wrong(pictures):
             find_match(*pictures, *VIEWS, *arguments)
 
 
+@pytest.mark.usefixtures("wrong_types")
 def test_cubes():
     rng = np.random.default_rng(2)
     points = rng.uniform(-3, 3, (4000, 3))

@@ -199,6 +199,7 @@ def broken(array, row, value):
     return array
 
 
+@pytest.mark.usefixtures("wrong_types")
 @pytest.mark.parametrize("make, words", [
     (lambda: position_table(broken(TIMES, 4, TIMES[3]), VALUES, source=SOURCE), ["line 6", "tw"]),
     (lambda: position_table(broken(TIMES, 4, 0.1), VALUES, source=SOURCE), ["line 6", "sort"]),

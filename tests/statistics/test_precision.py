@@ -118,6 +118,7 @@ def test_a_station_moves_the_precision_of_the_principal_distance_in_a_batch(prob
     assert first[0] == pytest.approx(stencil(value), rel=1e-6)
 
 
+@pytest.mark.usefixtures("wrong_types")
 def test_names_that_are_not_there(problem):
     with pytest.raises(KeyError, match="no camera parameter 'c'"):
         jaxbundle.precision(problem, names=(("camera", "cam", "c"),))
