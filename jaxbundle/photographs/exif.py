@@ -1,4 +1,4 @@
-"""What the file of a photograph says of its camera, its time and its place (EXIF, by Pillow).
+"""What the file of a photograph says of its camera, its time, its place (EXIF) and attitude (XMP).
 
 Every value may be missing, and those of some cameras are wrong: they are start values and priors.
 """
@@ -10,9 +10,11 @@ from pathlib import Path
 
 from jaxbundle.photographs.reading import open_image
 from jaxbundle.photographs.sensors import sensor_width
+from jaxbundle.photographs.xmp import Attitude, Xmp, parse_xmp
 
 MAKE, MODEL, ORIENTATION, DATE = 0x010F, 0x0110, 0x0112, 0x0132
-DETAILS, GPS = 0x8769, 0x8825
+DETAILS, GPS, PACKET = 0x8769, 0x8825, 0x02BC
+PNG_PACKET = "XML:com.adobe.xmp"
 FOCAL_LENGTH, FOCAL_LENGTH_35, DATE_TAKEN, FRACTION = 0x920A, 0xA405, 0x9003, 0x9291
 PLANE_X, PLANE_UNIT = 0xA20E, 0xA210
 FILM_DIAGONAL = math.hypot(36, 24)
@@ -25,12 +27,14 @@ UPRIGHT = 1
 @dataclasses.dataclass(frozen=True)
 class Place:
     """Latitude and longitude in degrees (WGS 84), height in metres; what the height is above is not
-    known for sure (EXIF: above sea level); `sigma` of the position in metres, if it is stated."""
+    known for sure (EXIF: above sea level); `sigma` of the position, and of the height, metres, if
+    they are stated."""
 
     latitude: float
     longitude: float
     height: float | None = None
     sigma: float | None = None
+    sigma_height: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,6 +51,7 @@ class Exif:
     orientation: int = UPRIGHT
     time: datetime.datetime | None = None
     place: Place | None = None
+    attitude: Attitude | None = None
 
     @property
     def camera(self) -> str:
@@ -79,10 +84,12 @@ def read_exif(path: str | Path) -> Exif:
         try:
             head = image.getexif()
             details, gps = head.get_ifd(DETAILS), head.get_ifd(GPS)
+            packet = image.info.get("xmp") or image.info.get(PNG_PACKET) or head.get(PACKET) or b""
         except Exception:  # whatever a damaged head makes of its reader
             return Exif(size)
     resolution = _positive(details.get(PLANE_X))
     unit = MM.get(details.get(PLANE_UNIT, 2))
+    xmp = parse_xmp(packet) if isinstance(packet, bytes | str) else Xmp()
     return Exif(
         size=size,
         make=_text(head.get(MAKE)),
@@ -92,7 +99,8 @@ def read_exif(path: str | Path) -> Exif:
         resolution=resolution / unit if resolution and unit else None,
         orientation=_whole(head.get(ORIENTATION), UPRIGHT),
         time=_time(details.get(DATE_TAKEN) or head.get(DATE), details.get(FRACTION)),
-        place=_place(gps),
+        place=_place(gps, xmp),
+        attitude=xmp.attitude,
     )
 
 
@@ -127,7 +135,7 @@ def _time(value, fraction) -> datetime.datetime | None:
         return None
 
 
-def _place(gps) -> Place | None:
+def _place(gps, xmp: Xmp) -> Place | None:
     latitude, longitude = _angle(gps.get(2), gps.get(1)), _angle(gps.get(4), gps.get(3))
     if latitude is None or longitude is None or (latitude == 0 and longitude == 0):
         return None
@@ -135,7 +143,7 @@ def _place(gps) -> Place | None:
     below = gps.get(5) in (1, b"\x01")
     return Place(
         latitude, longitude, None if height is None else -height if below else height,
-        _positive(gps.get(31)),
+        xmp.sigma or _positive(gps.get(31)), xmp.sigma_height,
     )  # fmt: skip
 
 

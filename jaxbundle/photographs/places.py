@@ -7,6 +7,7 @@ the place of take-off, so that the kind of height is said with them, and not kno
 
 import re
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -20,6 +21,16 @@ WORTH = 8.0
 """Positions are used if they are spread over so many σ."""
 
 
+class MapPositions(NamedTuple):
+    """Positions and their σ, metres, NaN: not known; convergence of the meridian there, degrees;
+    the system in words."""
+
+    X: Float[np.ndarray, "n 3"]
+    sigma: Float[np.ndarray, "n 3"]
+    convergence: Float[np.ndarray, " n"]
+    system: str
+
+
 def utm_system(latitude: float, longitude: float) -> str:
     """The EPSG code of the zone of UTM of a place."""
     zone = int((longitude + 180) // 6) % 60 + 1
@@ -28,9 +39,8 @@ def utm_system(latitude: float, longitude: float) -> str:
 
 def map_positions(
     places: Sequence[Place | None],
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], str] | None:
-    """Positions (NaN: not known), their σ, and the system in words; None where they are too few, or
-    lie within their own σ."""
+) -> MapPositions | None:
+    """Positions in the zone of UTM; None where they are too few, or lie within their own σ."""
     there = [(k, p) for k, p in enumerate(places) if p is not None and p.height is not None]
     if len(there) < 3:
         return None
@@ -46,8 +56,13 @@ def map_positions(
         return None
     X, s = np.full((len(places), 3), np.nan), np.full((len(places), 3), np.nan)
     X[rows] = np.stack([x, y, height], 1)
-    s[rows] = np.stack([sigma, sigma, sigma * SIGMA_HEIGHT / SIGMA], 1)
-    return X, s, f"{system}, heights as the files have them (EXIF: above sea level)"
+    high = [p.sigma_height or plane * SIGMA_HEIGHT / SIGMA for p, plane in zip(known, sigma)]
+    s[rows] = np.stack([sigma, sigma, high], 1)
+    turn = np.full(len(places), np.nan)
+    factors = _need_pyproj().Proj(system).get_factors(longitude, latitude)
+    turn[rows] = factors.meridian_convergence
+    words = f"{system}, heights as the files have them (EXIF: above sea level)"
+    return MapPositions(X, s, turn, words)
 
 
 def to_map(

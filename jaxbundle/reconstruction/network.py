@@ -8,6 +8,7 @@ import numpy as np
 from jaxbundle.io.networks.control import with_control
 from jaxbundle.network.build import make_network
 from jaxbundle.network.tables import Camera, Network, Points
+from jaxbundle.reconstruction.attitudes import Attitudes
 from jaxbundle.reconstruction.named import Named
 from jaxbundle.reconstruction.photographs import Cameras, Photograph
 from jaxbundle.tiepoints.refinement import Measurements
@@ -27,12 +28,13 @@ BY_NUMBER = ((3, ("fx", "k1")), (4, ("cx", "cy")), (5, ("k2", "p1", "p2")))
 @dataclasses.dataclass(frozen=True)
 class Extra:
     """What a network has besides tie points: named points, control among them, distances between
-    them; positions of the photographs with their σ."""
+    them; positions of the photographs with their σ, and attitudes."""
 
     named: Named
     control: Points | None = None
     distances: tuple[dict, ...] = ()
     positions: tuple[np.ndarray, np.ndarray] | None = None
+    attitudes: Attitudes | None = None
 
 
 def tie_network(

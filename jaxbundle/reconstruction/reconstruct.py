@@ -20,6 +20,7 @@ from jaxbundle.network.tables import Camera, Network
 from jaxbundle.photographs.places import map_positions
 from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.reconstruction.adjusting import adjust_weighted
+from jaxbundle.reconstruction.attitudes import map_attitudes, with_attitudes
 from jaxbundle.reconstruction.control import Control
 from jaxbundle.reconstruction.named import find_named
 from jaxbundle.reconstruction.network import Extra, tie_network, track_name
@@ -103,11 +104,14 @@ def reconstruct(
         named, notes = find_named(photographs, settings.targets, control, pool.map)
     positions = map_positions([p.exif.place for p in photographs]) if control is None else None
     if positions is not None:
-        notes.append(f"positions of the photographs by satellites: {positions[2]}")
+        notes.append(f"positions of the photographs by satellites: {positions.system}")
     if control is not None and control.system:
         notes.append(f"control in {control.system}")
+    attitudes = None
+    if positions is not None:
+        attitudes = map_attitudes([p.exif.attitude for p in photographs], positions.convergence)
     extra = Extra(named, control and control.points, tuple(distances),
-                  positions and positions[:2])  # fmt: skip
+                  positions and positions[:2], attitudes)  # fmt: skip
     kept = Store(store, settings.detection)
     making = _Making(photographs, left_out, cameras, settings, kept, tell, extra)
     making.notes += notes
@@ -252,9 +256,11 @@ class _Making:
         network = tie_network(self.photographs, self.cameras, measured, self.extra, name)
         self._begin("start values")
         oriented = orient(network)
-        kinds, named = _kinds(oriented.network, measured, self.names)
+        placed, note = with_attitudes(oriented.network, self.names, self.extra.attitudes)
+        self.notes += [note] if note else []
+        kinds, named = _kinds(placed, measured, self.names)
         weighted = adjust_weighted(
-            oriented.network, kinds, named, self.settings.significance,
+            placed, kinds, named, self.settings.significance,
             self._begin,
         )  # fmt: skip
         self._begin("")

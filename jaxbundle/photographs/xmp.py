@@ -1,0 +1,122 @@
+"""What drones write into the XMP packet of a photograph: attitude, and how good the position is.
+
+    DJI (drone-dji:)            GimbalYawDegree, GimbalPitchDegree, GimbalRollDegree,
+                                RtkStdLon, RtkStdLat, RtkStdHgt
+    senseFly, Parrot, others    Yaw, Pitch, Roll, GPSXYAccuracy, GPSZAccuracy,
+    with Pix4D's (Camera:)      IMUYawAccuracy, IMUPitchAccuracy, IMURollAccuracy
+
+All angles are degrees; yaw is the azimuth of the top of the picture, clockwise from true north. A
+camera that looks straight down has DJI's pitch −90 and pitch 0 in the tags of Pix4D; one that
+looks at the horizon 0 and 90. Roll lowers the right side of the picture.
+"""
+
+import dataclasses
+import math
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float
+
+SIGMA_ATTITUDE = 5.0
+"""Degrees, where no σ is given: a gimbal is better about the horizontal axes, a compass worse."""
+MOST_BYTES = 1 << 20
+DJI = ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree")
+PIX4D = ("Yaw", "Pitch", "Roll")
+
+
+@dataclasses.dataclass(frozen=True)
+class Attitude:
+    """Yaw, pitch (−90: straight down, 0: at the horizon), roll and their largest σ, degrees."""
+
+    yaw: float
+    pitch: float
+    roll: float
+    sigma: float = SIGMA_ATTITUDE
+
+
+@dataclasses.dataclass(frozen=True)
+class Xmp:
+    """What a packet says: attitude; σ of the position east and north, and of its height, metres."""
+
+    attitude: Attitude | None = None
+    sigma: float | None = None
+    sigma_height: float | None = None
+
+
+def parse_xmp(packet: bytes | str) -> Xmp:
+    """What a packet says; nothing, if it is damaged or another program's."""
+    fields = _fields(packet)
+    number = lambda name: _number(fields.get(name))
+    attitude = _attitude(number)
+    plane = _largest([number(n) for n in ("RtkStdLon", "RtkStdLat", "GPSXYAccuracy")])
+    height = _largest([number(n) for n in ("RtkStdHgt", "GPSZAccuracy")])
+    positive = lambda x: x if x and x > 0 else None
+    return Xmp(attitude, positive(plane), positive(height))
+
+
+def rotation_of(attitude: Attitude, convergence: float = 0.0) -> Float[np.ndarray, "3 3"]:
+    """M of an attitude, from east, north, up of a map to the camera: x to the right of the picture,
+    y to its top, looking along −z; `convergence`: of the meridian, degrees, grid north less it."""
+    yaw, pitch, roll = np.radians([attitude.yaw - convergence, attitude.pitch, attitude.roll])
+    right = np.array([math.cos(yaw), -math.sin(yaw), 0.0])
+    level = np.array([math.sin(yaw), math.cos(yaw), 0.0])
+    ahead = math.cos(pitch) * level + math.sin(pitch) * np.array([0.0, 0.0, 1.0])
+    top = np.cross(right, ahead)
+    right, top = (
+        math.cos(roll) * right - math.sin(roll) * top,
+        math.sin(roll) * right + math.cos(roll) * top,
+    )
+    return np.stack([right, top, -ahead])
+
+
+def _attitude(number) -> Attitude | None:
+    dji, pix4d = ([number(name) for name in names] for names in (DJI, PIX4D))
+    # A gimbal that is not there, or did not work, is all zeros.
+    if None not in dji and any(dji):
+        yaw, pitch, roll = dji
+    elif None not in pix4d and any(pix4d):
+        yaw, pitch, roll = pix4d
+        pitch -= 90
+    else:
+        return None
+    stated = _largest([number(f"IMU{axis}Accuracy") for axis in PIX4D])
+    return Attitude(yaw, pitch, roll, stated if stated and stated > 0 else SIGMA_ATTITUDE)
+
+
+def _fields(packet: bytes | str) -> Mapping[str, str]:
+    """Attributes and elements by their names without namespace, the first of each."""
+    content = packet if isinstance(packet, bytes) else packet.encode()
+    whole = re.search(rb"<(\w+:)?RDF\b.*</(\w+:)?RDF>", content[:MOST_BYTES], re.DOTALL)
+    head = content[: whole.start()] if whole else b""
+    if whole is None or b"<!DOCTYPE" in head or b"<!ENTITY" in content:
+        return {}
+    spaces = {s.decode(): u.decode() for s, u in re.findall(rb'xmlns:(\w+)="([^"]*)"', head)}
+    text = whole[0].decode(errors="replace")
+    opening = re.match(r"<[\w:]+", text)
+    missing = "".join(f' xmlns:{s}="{u}"' for s, u in spaces.items() if f"xmlns:{s}=" not in text)
+    try:
+        root = ET.fromstring(opening[0] + missing + text[opening.end() :] if opening else text)
+    except ET.ParseError:
+        return {}
+    found: dict[str, str] = {}
+    for element in root.iter():
+        for name, value in (*element.attrib.items(), (element.tag, element.text or "")):
+            if value.strip():
+                found.setdefault(name.rpartition("}")[2], value.strip())
+    return found
+
+
+def _number(text: str | None) -> float | None:
+    try:
+        top, _, bottom = (text or "").partition("/")
+        number = float(top) / float(bottom or 1)
+    except (ValueError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _largest(values) -> float | None:
+    known = [v for v in values if v is not None]
+    return max(known) if known else None
