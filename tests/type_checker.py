@@ -10,7 +10,7 @@ checked = beartype(conf=BeartypeConf(is_pep484_tower=True))
 """Whole numbers count as numbers, as PEP 484 has it."""
 
 
-ROOMS = ("geometry", "cameras", "orientation", "pushbroom", "measure", "statistics", "refinement")
+ROOMS = ("geometry", "cameras")
 """Rooms of formulas. Arrays of the engine stand for others while it plans, and what only passes on
 what a user gives has words of its own for a wrong type."""
 

@@ -20,8 +20,8 @@ _ideal, _ = perspective((0,), up=True)
 class Pose(eqx.Module):
     """Exterior orientation: X0 in the object unit, M from object to camera."""
 
-    X0: Float[AnyArray, "3"]
-    M: Float[AnyArray, "3 3"]
+    X0: Float[AnyArray, "*batch 3"]
+    M: Float[AnyArray, "*batch 3 3"]
 
 
 def to_camera(pose: Pose, X: Float[AnyArray, "3"]) -> Float[AnyArray, "3"]:
