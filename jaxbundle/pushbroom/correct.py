@@ -24,7 +24,7 @@ from jaxbundle.pushbroom.accuracy import east_north, horizontal
 from jaxbundle.pushbroom.image import Pose, PushbroomImage
 from jaxbundle.pushbroom.locate import ground_point
 from jaxbundle.pushbroom.passages import sample
-from jaxbundle.pushbroom.project import Search, project_from, project_points
+from jaxbundle.pushbroom.project import Search, project_from, project_points, scanner_of
 from jaxbundle.pushbroom.surfaces import Ground, Surface
 from jaxbundle.pushbroom.terrain import Terrain, bilinear
 from jaxbundle.types import AnyArray
@@ -85,7 +85,8 @@ def block_places(
     if not seen.any():
         return None
     starts = _filled(starts.reshape(2, *nodes.X.shape[1:]))
-    line, pixel, ground = (np.asarray(v) for v in _places(image, search, surface, nodes, starts))
+    scanner = scanner_of(image)
+    line, pixel, ground = map(np.asarray, _places(scanner, search, surface, nodes, starts))
     lost = np.isnan(line)
     if lost.any():
         # on a rough trajectory the way from between the nodes may not lead there
@@ -94,7 +95,7 @@ def block_places(
     inside = (line >= -0.5) & (line < image.lines - 0.5)
     inside &= (pixel >= -0.5) & (pixel < image.pixels - 0.5)
     if occlusion and isinstance(surface, Terrain):
-        inside &= ~np.asarray(_occluded(image, search, surface, line, pixel, ground))
+        inside &= ~np.asarray(_occluded(scanner, search, surface, line, pixel, ground))
     return Places(np.where(inside, line, np.nan), np.where(inside, pixel, np.nan))
 
 
@@ -119,7 +120,7 @@ def block_errors(
 
     **Arguments:** `truth` with the `search` made of it; `places` of the image to be judged.
     """
-    return np.asarray(_errors(truth, search, surface, nodes, places))
+    return np.asarray(_errors(scanner_of(truth), search, surface, nodes, places))
 
 
 @jax.jit

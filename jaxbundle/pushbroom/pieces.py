@@ -8,6 +8,8 @@ multiplications for each point where interpolation and rotation cost hundreds. D
 pieces than 5, and half as long.
 """
 
+from math import comb
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,6 +19,7 @@ from jaxtyping import Float
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid, ray_to_ellipsoid
 from jaxbundle.geometry.vectors import turned
+from jaxbundle.leastsquares.indices import rounded
 from jaxbundle.pushbroom.image import PushbroomImage, pose_at
 from jaxbundle.pushbroom.interpolation import breaks, span
 from jaxbundle.types import AnyArray
@@ -27,6 +30,9 @@ SHORTEST = 1e-3
 """No piece becomes shorter than this part of a line."""
 CHUNK = 1024
 """Times for which the pose is computed together, always so many: one shape to compile."""
+SHARED = 128
+"""Images of so many pieces at most share their compiled programs with those of nearly as many: of
+more, not all ends are times of the search (`passages`), and halves would make it uneven."""
 SAME = 1e-6
 """Rows of two tables nearer in time than this part of a line are taken as one."""
 
@@ -35,6 +41,11 @@ CHECKS = np.cos(np.pi * np.arange(DEGREE + 2) / (DEGREE + 1))
 """Between the nodes and at the ends, where the polynomial errs most."""
 TO_COEFFICIENTS = np.linalg.inv(np.vander(NODES, increasing=True))
 TO_CHECKS = np.vander(CHECKS, DEGREE + 1, increasing=True) @ TO_COEFFICIENTS
+TO_HALVES = np.array([
+    [[comb(k, j) * side ** (k - j) / 2**k for k in range(DEGREE + 1)] for j in range(DEGREE + 1)]
+    for side in (-1.0, 1.0)
+])  # fmt: skip
+"""Of a polynomial in τ: with τ = (τ' ∓ 1)/2, its coefficients in τ' from −1 to 1."""
 
 
 class Pieces(eqx.Module):
@@ -77,11 +88,22 @@ def make_pieces(image: PushbroomImage, earth: Ellipsoid | None) -> Pieces:
             )
         middle = (left + right) / 2
         left, right = np.r_[left, middle], np.r_[middle, right]
-    found.sort(key=lambda piece: piece[0])
+    more = rounded(len(found)) - len(found) if len(found) <= SHARED else 0
+    found = _halve_some(found, more)
     coefficients = jnp.asarray(np.stack([piece[2] for piece in found]))
     return Pieces(
         jnp.asarray(np.r_[[p[0] for p in found], last]), coefficients, jnp.asarray(origin)
     )
+
+
+def _halve_some(pieces, number: int):
+    """Pieces (start, end, coefficients) in order of time, so many of the longest in halves."""
+    pieces = sorted(pieces, key=lambda piece: piece[1] - piece[0])
+    whole, long = pieces[: len(pieces) - number], pieces[len(pieces) - number :]
+    for start, end, c in long:
+        middle = (start + end) / 2
+        whole += [(start, middle, TO_HALVES[0] @ c), (middle, end, TO_HALVES[1] @ c)]
+    return sorted(whole, key=lambda piece: piece[0])
 
 
 def _numbers(image, origin, left, right, span):

@@ -20,6 +20,7 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.lax import stop_gradient
 from jaxtyping import Array, Float, Int
 
@@ -38,7 +39,7 @@ from jaxbundle.pushbroom.passages import (
     sample_times,
 )
 from jaxbundle.pushbroom.pieces import Pieces, make_pieces
-from jaxbundle.pushbroom.scanner import Pair
+from jaxbundle.pushbroom.scanner import LineTimes, Optics, Pair
 from jaxbundle.types import AnyArray, Scalar
 
 CHUNK = 2048
@@ -96,6 +97,25 @@ class Search(eqx.Module):
     earth: Ellipsoid | None = eqx.field(static=True)
 
 
+class Scanner(eqx.Module):
+    """An image without its trajectory, for which pieces stand: images of one scanner share their
+    compiled programs."""
+
+    times: LineTimes
+    optics: Optics
+    lines: AnyArray
+    pixels: AnyArray
+    corrections: Corrections = eqx.field(static=True)
+
+
+def scanner_of(image: PushbroomImage | Scanner) -> Scanner:
+    """The image without its trajectory."""
+    if isinstance(image, Scanner):
+        return image
+    lines, pixels = np.asarray(float(image.lines)), np.asarray(float(image.pixels))
+    return Scanner(image.times, image.optics, lines, pixels, image.corrections)
+
+
 def make_search(image: PushbroomImage, earth: Ellipsoid | None = WGS84) -> Search:
     """Prepare an image for `project_points`; `earth` is None in a local frame."""
     pieces = make_pieces(image, earth)
@@ -120,7 +140,7 @@ def project_points(
     what is beside the image by up to `margin` lines and pixels is taken as in it. Points inside
     the image are found some ten times as fast as those outside, which must be searched for.
     """
-    return _project_points(image, search, X, most, margin)
+    return _project_points(scanner_of(image), search, X, most, margin)
 
 
 @partial(jax.jit, static_argnames="most")
@@ -130,14 +150,18 @@ def _project_points(image, search, X, most, margin):
     return _in_chunks(find, tuple(X))
 
 
-@jax.jit
 def project_from(
-    image: PushbroomImage, search: Search, X: Vector, line: Scalar, pixel: Scalar
+    image: PushbroomImage | Scanner, search: Search, X: Vector, line: Scalar, pixel: Scalar
 ) -> tuple[Array, Array]:
     """Line and pixel of points near the given places; arrays of any one shape, not searched for.
 
     NaN where Newton's method does not settle.
     """
+    return _project_from(scanner_of(image), search, X, line, pixel)
+
+
+@jax.jit
+def _project_from(image: Scanner, search, X, line, pixel):
     flat = [jnp.ravel(a) for a in jnp.broadcast_arrays(*X, image.times.time(line), pixel * 1.0)]
     place = lambda args: refine(image, search.pieces, search.earth, args[:3], *args[3:])
     t, u, settled = _in_chunks(place, tuple(flat))

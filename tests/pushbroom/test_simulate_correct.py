@@ -123,8 +123,9 @@ def test_a_corrected_image_is_the_scene(tmp_path):
 
 def test_terrain_that_hides_terrain():
     """A ridge seen from the side, against heights along the sights in numpy."""
-    flight = dataclasses.replace(AIRCRAFT, angles={"roll": 0.6})
-    image = measured_image(flight)  # without errors: the program of the image above serves
+    roll = [{"kind": "sine", "amplitude": 0.02, "period": 3.0}, 0.6]
+    flight = dataclasses.replace(AIRCRAFT, angles=AIRCRAFT.angles | {"roll": roll})
+    image = measured_image(flight)  # of as many pieces: the program of the image above serves
     x, y = np.arange(-500.0, -259, 10), np.arange(150.0, 351, 10)
     heights = np.interp(np.abs(x + 385), [0, 20], [60, 0]) + 5 * np.sin(y[:, None] / 15)
     surface = make_terrain(heights, (x[0], y[0]), (10.0, 10.0), None)
