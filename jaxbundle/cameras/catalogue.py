@@ -1,23 +1,57 @@
 """The camera models by name, and a user's own, which are given as objects.
 
-Own models are in no list: a list that grows would let one part of a program change what a name
-means in another.
+Splines have names with numbers, as `spline-12x9-110`, of which there are many: `get_model` makes
+them. Own models are in no list: a list that grows would let one part of a program change what a
+name means in another.
 """
+
+import re
+from collections.abc import Callable
+from functools import partial
 
 from jaxbundle.cameras.bingo import BINGO
 from jaxbundle.cameras.brown import BROWN, BROWN_PROJECTED
+from jaxbundle.cameras.division import DIVISION
+from jaxbundle.cameras.double_sphere import DOUBLE_SPHERE
+from jaxbundle.cameras.equirectangular import EQUIRECTANGULAR
+from jaxbundle.cameras.eucm import EUCM
+from jaxbundle.cameras.fisheye_prism import (
+    KANNALA_BRANDT_TANGENTIAL,
+    RAD_TAN_THIN_PRISM_FISHEYE,
+    THIN_PRISM_FISHEYE,
+)
+from jaxbundle.cameras.fov import FOV
+from jaxbundle.cameras.ideal_fisheyes import EQUIDISTANT, EQUISOLID, ORTHOGRAPHIC, STEREOGRAPHIC
 from jaxbundle.cameras.kannala_brandt import KANNALA_BRANDT
+from jaxbundle.cameras.mei import MEI
 from jaxbundle.cameras.model import CameraModel
 from jaxbundle.cameras.names import closest
 from jaxbundle.cameras.opencv import OPENCV
+from jaxbundle.cameras.radial_spline import radial_spline
+from jaxbundle.cameras.scaramuzza import SCARAMUZZA
 from jaxbundle.cameras.snavely import SNAVELY
+from jaxbundle.cameras.spline import spline
 from jaxbundle.cameras.usgs import USGS
 
 MODELS = {
     model.name: model
-    for model in (BROWN, BROWN_PROJECTED, USGS, BINGO, OPENCV, KANNALA_BRANDT, SNAVELY)
-}
+    for model in (
+        BROWN, BROWN_PROJECTED, USGS, BINGO, OPENCV, SNAVELY, DIVISION, KANNALA_BRANDT,
+        KANNALA_BRANDT_TANGENTIAL, THIN_PRISM_FISHEYE, RAD_TAN_THIN_PRISM_FISHEYE, FOV, EUCM,
+        DOUBLE_SPHERE, MEI, SCARAMUZZA, EQUIDISTANT, STEREOGRAPHIC, EQUISOLID, ORTHOGRAPHIC,
+        EQUIRECTANGULAR,
+    )
+}  # fmt: skip
 MODEL_NAMES: tuple[str, ...] = tuple(MODELS)
+
+_DEGREES = r"(\d+(?:\.\d+)?)"
+FAMILIES: dict[str, tuple[str, Callable[..., CameraModel]]] = {
+    "radial-spline-N-FOV": (
+        rf"radial-spline-(\d+)-{_DEGREES}", lambda n, fov: radial_spline(int(n), float(fov))),
+    "spline-NXxNY-FOV": (
+        rf"spline-(\d+)x(\d+)-{_DEGREES}", lambda x, y, fov: spline(int(x), int(y), float(fov))),
+}  # fmt: skip
+"""Models whose names say numbers: how they read, and who makes them."""
 
 
 def get_model(model: str | CameraModel) -> CameraModel:
@@ -27,25 +61,49 @@ def get_model(model: str | CameraModel) -> CameraModel:
     own model of the name of another.
     """
     if isinstance(model, CameraModel):
-        if MODELS.get(model.name, model) != model:
+        if is_own(model) and _built_in(model.name):
             raise ValueError(
                 f"Camera model {model.name!r} is built in; give your own another name."
             )
         return model
-    if model not in MODELS:
+    found = _built_in(model)
+    if found is None:
         raise ValueError(
-            f"Unknown camera model {model!r}{closest(model, MODEL_NAMES)} "
-            f"The models are {', '.join(MODEL_NAMES)}."
+            f"Unknown camera model {model!r}{closest(model, (*MODEL_NAMES, *FAMILIES))} "
+            f"The models are {', '.join((*MODEL_NAMES, *FAMILIES))}."
         )
-    return MODELS[model]
+    return found
 
 
 def is_own(model: str | CameraModel) -> bool:
     """Whether it is a user's own model, which only an object describes."""
-    return isinstance(model, CameraModel) and MODELS.get(model.name) != model
+    return isinstance(model, CameraModel) and _built_in(model.name) != model
 
 
 def key_of(model: str | CameraModel) -> str | CameraModel:
     """What stands for a model where models are compared: the name of a built-in one, an own one
     itself."""
     return model.name if isinstance(model, CameraModel) and not is_own(model) else model
+
+
+def is_known(name: str) -> bool:
+    """Whether a built-in model has this name, or a family has names of this form."""
+    return name in MODELS or _of_family(name) is not None
+
+
+def _built_in(name: str) -> CameraModel | None:
+    """The model of a name, one of a family made; None if there is none.
+
+    **Raises:** `ValueError` for a name of a family whose numbers are impossible.
+    """
+    if name in MODELS:
+        return MODELS[name]
+    found = _of_family(name)
+    return None if found is None else found()
+
+
+def _of_family(name: str) -> Callable[[], CameraModel] | None:
+    for form, make in FAMILIES.values():
+        if isinstance(name, str) and (found := re.fullmatch(form, name)):
+            return partial(make, *found.groups())
+    return None

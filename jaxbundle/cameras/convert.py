@@ -10,7 +10,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.cameras.convert_exact import NotExact, exact_parameters
+from jaxbundle.cameras.convert_exact import (
+    CORRECTIONS,
+    DISTORTIONS,
+    NotExact,
+    exact_parameters,
+)
 from jaxbundle.cameras.convert_fit import (
     fit_parameters,
     image_grid,
@@ -18,6 +23,7 @@ from jaxbundle.cameras.convert_fit import (
     rays_of,
     start_values,
 )
+from jaxbundle.cameras.convert_wide import exact_wide
 from jaxbundle.cameras.model import CameraModel
 from jaxbundle.cameras.parameters import default_parameters
 from jaxbundle.cameras.pixel_frame import between_frames
@@ -105,18 +111,34 @@ def convert_camera(
             "no image; convert a smaller area, or keep the fisheye model"
         )
     try:
-        found, reason = exact_parameters(source, values, target, sizes, r0), ""
+        found, reason = _exact(source, values, target, sizes, r0), ""
     except NotExact as why:
         reason = str(why)
         starts = start_values(source, values, target, sizes, r0)
         found = fit_parameters(target, rays, wanted, starts, free)
     length = np.linalg.norm(images_of(target, found, rays) - wanted, axis=1)
-    worst = int(np.argmax(np.where(np.isnan(length), np.inf, length)))
+    if not np.isfinite(length).all():
+        raise ValueError(
+            f"model {target.name!r} has no image of {100 * np.isnan(length).mean():.0f} % of the "
+            "image: its field of view ends before; convert a smaller area, or to another model"
+        )
+    worst = int(np.argmax(length))
     return Conversion(
         target.name, {name: float(v) for name, v in found.items()}, not reason,
         float(length[worst]), float(np.sqrt(np.mean(length**2))), target.unit,
         (float(wanted[worst, 0]), float(wanted[worst, 1])), float(there.mean()), reason,
     )  # fmt: skip
+
+
+def _exact(source, values, target, sizes, r0) -> dict[str, float]:
+    """By the formulas of narrow cameras, or those of wide ones.
+
+    **Raises:** `NotExact`.
+    """
+    pair = {source.name, target.name}
+    narrow = source == target or pair <= {*CORRECTIONS} or pair <= {*DISTORTIONS}
+    convert = exact_parameters if narrow else exact_wide
+    return convert(source, values, target, sizes, r0)
 
 
 def image_area(

@@ -24,6 +24,7 @@ from jaxbundle.cameras.convert_exact import (
     inverted_radial,
     normalised_correction,
 )
+from jaxbundle.cameras.convert_wide import as_stereographic
 from jaxbundle.cameras.model import CameraModel, image_ray, project
 from jaxbundle.cameras.parameters import default_parameters
 from jaxbundle.cameras.pixel_frame import between_frames
@@ -104,15 +105,19 @@ def start_values(
     source: CameraModel, values: Values, target: CameraModel, sizes: Sizes, r0: float = 0.0
 ) -> list[dict[str, float]]:
     """Start values of the target: without distortion, and, where the terms have counterparts, with
-    the source's to the first orders."""
+    the source's to the first orders; and as a stereographic camera, which sees beyond 90°."""
     shift, step = between_frames(source, target, *sizes)
     of = lambda names: np.array([values[name] for name in names])
-    focal = of(source.principal_distance) * np.abs(step)
+    focal = of(source.principal_distance) * np.abs(step) * magnification(source, values)
     point = shift + step * (of(source.principal_point) if source.principal_point else 0.0)
     plain = default_parameters(target)
     conventions = {"format_factor": values.get("format_factor")} | ({"r0": r0} if r0 else {})
     plain |= {n: v for n, v in conventions.items() if v and n in target.never_free}
     distances = target.principal_distance
+    both = focal if len(distances) == 2 else [focal.mean()] * 2
+    wide: dict[str, float] = dict(zip(("fx", "fy"), both))
+    wide |= dict(zip(("cx", "cy"), point))
+    focal = focal / magnification(target, plain)
     plain |= dict(zip(distances, focal if len(distances) == 2 else [focal.mean()]))
     plain |= dict(zip(target.principal_point, point))
     plain = {name: plain[name] for name in target.parameters}
@@ -128,7 +133,15 @@ def start_values(
         terms |= {"P1": p2 / c, "P2": -p1 / c}
     else:
         terms = {}
-    return [plain, plain | {n: float(v) for n, v in terms.items() if n in target.parameters}]
+    starts = [plain, plain | {n: float(v) for n, v in terms.items() if n in target.parameters}]
+    return starts + (as_stereographic(wide, target) if target.wide else [])
+
+
+def magnification(model: CameraModel, values: Values) -> float:
+    """The scale of the image on the axis, in principal distances."""
+    if model.magnification is None:
+        return 1.0
+    return float(model.magnification([values.get(name, 1.0) for name in model.parameters]))
 
 
 def _first_orders(source, values):

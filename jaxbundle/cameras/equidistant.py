@@ -21,15 +21,15 @@ def equidistant(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
     first, last = columns[0], columns[-1]
 
     def ideal(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
-        scale = _angle_over_sine(r * r + s * s, q)
+        scale = angle_over_sine(r * r + s * s, q)
         return p[first] * scale * r, p[last] * scale * s if up else -p[last] * scale * s
 
     def ray(p: Parameters, xi: Scalar, yi: Scalar) -> Triple:
         X, Y = xi / p[first], yi / p[last]
         square = X * X + Y * Y
         square = jnp.where(square < jnp.pi**2, square, jnp.nan)
-        scale = _sine_over_angle(square)
-        return scale * X, scale * Y if up else -scale * Y, -_cosine(square)
+        scale = sine_over_angle(square)
+        return scale * X, scale * Y if up else -scale * Y, -cosine(square)
 
     return ideal, ray
 
@@ -41,7 +41,7 @@ def equidistant(columns: Sequence[int], up: bool) -> tuple[OfRay, ToRay]:
 _NEAR = 1e-3
 
 
-def _angle_over_sine(square, q):
+def angle_over_sine(square, q):
     """θ/ρ with ρ² = `square` = r² + s² and θ = atan2(ρ, −q)."""
     near = (square < _NEAR * q * q) & (q < 0)
     t2 = jnp.where(near, square / jnp.where(near, q * q, 1.0), 0.0)
@@ -50,7 +50,7 @@ def _angle_over_sine(square, q):
     return jnp.where(near, series, jnp.arctan2(rho, -q) / rho)
 
 
-def _sine_over_angle(square):
+def sine_over_angle(square):
     """sin θ/θ with θ² = `square`."""
     near = square < _NEAR
     t2 = jnp.where(near, square, 0.0)
@@ -58,7 +58,7 @@ def _sine_over_angle(square):
     return jnp.where(near, 1 - t2 / 6 * (1 - t2 / 20 * (1 - t2 / 42)), jnp.sin(theta) / theta)
 
 
-def _cosine(square):
+def cosine(square):
     """cos θ with θ² = `square`."""
     near = square < _NEAR
     t2 = jnp.where(near, square, 0.0)

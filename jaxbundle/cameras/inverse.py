@@ -26,12 +26,13 @@ a positive determinant and trace: at the principal point J is near the identity,
 that starts there its eigenvalues keep positive real parts.
 """
 
+from collections.abc import Callable
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 
-from jaxbundle.cameras.scalars import Formula
+from jaxbundle.cameras.scalars import Formula, Pair, Parameters, Scalar
 
 
 def implicit_inverse(g: Formula, start: Formula, iterations: int = 6) -> Formula:
@@ -72,6 +73,29 @@ def implicit_inverse(g: Formula, start: Formula, iterations: int = 6) -> Formula
         return inverse(tuple(p), X, Y)
 
     return with_floats
+
+
+def limited(
+    formula: Formula, inside: Callable[[Parameters, Scalar, Scalar], Scalar], start: Formula,
+    iterations: int,
+) -> tuple[Formula, Formula]:  # fmt: skip
+    """A formula and its inverse, NaN outside a region of (x, y).
+
+    Newton's method goes by the formula without the limit: on its way to a point near the edge it
+    may step across.
+    """
+    inverse = implicit_inverse(formula, start, iterations)
+
+    def only(p, at, result) -> Pair:
+        there = inside(p, *at)
+        x, y = (jnp.where(there, value, jnp.nan) for value in result)
+        return x, y
+
+    def back(p, X, Y):
+        xy = inverse(p, X, Y)
+        return only(p, xy, xy)
+
+    return lambda p, x, y: only(p, (x, y), formula(p, x, y)), back
 
 
 def value_and_derivative(g, p, x, y):

@@ -12,16 +12,25 @@ behind it is projected all the same, through the projection centre: the caller l
 """
 
 import dataclasses
-from collections.abc import Mapping
-from typing import Literal
+from collections.abc import Callable, Mapping
+from typing import Any, Literal
+
+import jax.numpy as jnp
 
 from jaxbundle.cameras.equidistant import equidistant
+from jaxbundle.cameras.fisheye_images import equisolid, orthographic, stereographic
 from jaxbundle.cameras.inverse import implicit_inverse
 from jaxbundle.cameras.perspective import perspective
 from jaxbundle.cameras.scalars import Formula, OfRay, Pair, Parameters, Scalar, ToRay, Triple
 
-IMAGES = {"perspective": perspective, "equidistant": equidistant}
-FORMULAS = ("correct", "distort", "project")
+IMAGES = {
+    "perspective": perspective, "equidistant": equidistant, "stereographic": stereographic,
+    "equisolid": equisolid, "orthographic": orthographic,
+}  # fmt: skip
+NARROW = ("perspective", "orthographic")
+"""Ideal images of rays less than 90° from the axis."""
+FORMULAS = ("correct", "distort", "project", "unproject")
+Image = Literal["perspective", "equidistant", "stereographic", "equisolid", "orthographic"]
 PRINCIPAL_DISTANCES = ("c",), ("fx", "fy"), ("f",)
 PRINCIPAL_POINTS = ("x0", "y0"), ("cx", "cy")
 """The names that are known without saying."""
@@ -44,20 +53,26 @@ class CameraModel:
       of all functions below.
     - One formula, a function of scalars, element by element, of arithmetic and `jax.numpy`:
       `correct`, `(p, x, y) -> (xi, yi)`, from the measured to the ideal image; `distort`,
-      `(p, xi, yi) -> (x, y)`, from the ideal to the measured image; or `project`,
-      `(p, r, s, q) -> (x, y)`, from the ray to the measured image. Ideal coordinates are relative
-      to the principal point and on the scale of the principal distance.
+      `(p, xi, yi) -> (x, y)`, from the ideal to the measured image; `project`,
+      `(p, r, s, q) -> (x, y)`, from the ray to the measured image; or `unproject`,
+      `(p, x, y) -> (r, s, q)`, from the measured image to a ray of any length. `unproject` may
+      stand beside `project`, whose inverse it then is. Ideal coordinates are relative to the
+      principal point and on the scale of the principal distance.
     - `inverse`: of `correct`, `distort`, or of `project` as it maps ideal to measured coordinates;
       found by Newton's method with implicit derivatives, in so many `iterations` from `start`,
       `(p, X, Y) -> (x, y)`, if not given.
     - `unit`: of image coordinates, `"mm"` or `"px"`; principal distance and principal point are in
       the same unit. `axes`: `"up"`, x right and y up (of mm if not given); `"down"`, u right and
       v down, the axes of pixels (of px).
-    - `image`: the ideal image, `"perspective"`, or `"equidistant"` for fisheyes, whose rays may be
-      90° and more from the axis.
+    - `image`: the ideal image, `"perspective"`, or, of fisheyes, `"equidistant"`,
+      `"stereographic"` or `"equisolid"`, whose rays may be 90° and more from the axis, or
+      `"orthographic"`. `magnification`, `(p) -> number`: the scale of the image on the axis, in
+      principal distances, where it is not 1.
     - `defaults`: values of parameters that may be left out, where they are not 0.
     - `free`: what is estimated if nothing is said; all if not given. `never_free`: parameters that
-      are conventions, never to be estimated.
+      are conventions, never to be estimated. `ranges`: of parameters that mean something
+      only from a lowest value to below a highest. `prior`: σ of parameters that photographs
+      alone do not determine; `calibrate` observes their start values with it.
     - `principal_distance`: one parameter, or two, along and across, that must be given and
       positive; c, fx and fy, or f if not named. `principal_point`: two parameters, the measured
       image of the axis; x0 and y0, or cx and cy if not named, and none where it has none of these.
@@ -74,15 +89,19 @@ class CameraModel:
     correct: Formula | None = None
     distort: Formula | None = None
     project: OfRay | None = None
+    unproject: ToRay | None = None
     inverse: Formula | None = None
     start: Formula | None = None
     iterations: int = 6
     unit: Literal["mm", "px"] = "mm"
     axes: Literal["up", "down"] | None = None
-    image: Literal["perspective", "equidistant"] = "perspective"
+    image: Image = "perspective"
+    magnification: Callable[[Parameters], Scalar] | None = None
     defaults: Mapping[str, float] | tuple = ()
     free: tuple[str, ...] = ()
     never_free: tuple[str, ...] = ()
+    ranges: Mapping[str, tuple[float, float]] | tuple[Any, ...] = ()
+    prior: Mapping[str, float] | tuple = ()
     principal_distance: tuple[str, ...] = ()
     principal_point: tuple[str, ...] = ()
     own_formula: Literal["to_ideal", "from_ideal"] = dataclasses.field(init=False, compare=False)
@@ -96,26 +115,35 @@ class CameraModel:
             object.__setattr__(self, name, value)
         columns = [self.parameters.index(name) for name in self.principal_distance]
         ideal, ray = IMAGES[self.image](columns, self.axes == "up")
-        formula = self.correct or self.distort or _of_the_ideal_image(self.project, ray)
-        back = self.inverse or implicit_inverse(
+        if self.magnification is not None:
+            ideal, ray = (_magnified(of, columns, self.magnification) for of in (ideal, ray))
+        formula, back = self.correct or self.distort, self.inverse
+        if self.project is not None:
+            formula = _of_the_ideal_image(self.project, ray)
+        if self.unproject is not None:
+            corrected = _to_the_ideal_image(self.unproject, ideal)
+            formula, back = (corrected, back) if formula is None else (formula, corrected)
+        assert formula is not None, "checked by _completed"
+        back = back or implicit_inverse(
             formula, self.start or _less_its_origin(formula), self.iterations
         )
-        own, other = ("to_ideal", "from_ideal")[:: 1 if self.correct else -1]
+        explicit = self.distort or self.project
+        own, other = ("from_ideal", "to_ideal")[:: 1 if explicit else -1]
         made = {"own_formula": own, own: formula, other: back, "ideal": ideal, "ray": ray}
         for name, value in made.items():
             object.__setattr__(self, name, value)
 
     @property
-    def formula(self) -> Formula | OfRay:
+    def formula(self) -> Formula | OfRay | ToRay:
         """The one function the model states."""
-        given = self.correct or self.distort or self.project
+        given = self.correct or self.distort or self.project or self.unproject
         assert given is not None, "checked when the model is made"
         return given
 
     @property
     def wide(self) -> bool:
         """Whether rays may be 90° and more from the axis."""
-        return self.image == "equidistant"
+        return self.image not in NARROW
 
     @property
     def core(self) -> tuple[str, ...]:
@@ -143,12 +171,13 @@ def _completed(model: CameraModel) -> dict:
             f"them {', '.join(TAKEN)}, but are {model.parameters!r:.200}."
         )
     given = [name for name in FORMULAS if getattr(model, name) is not None]
-    if len(given) != 1:
+    if len(given) != 1 and given != ["project", "unproject"]:
         raise ValueError(
-            f"{where}give one formula as correct, distort or project, not "
-            f"{' and '.join(given) or 'none'}; its inverse is inverse."
+            f"{where}give one formula as correct, distort, project or unproject, not "
+            f"{' and '.join(given) or 'none'}; its inverse is inverse, that of project may be "
+            "unproject."
         )
-    for name in (*given, "inverse", "start"):
+    for name in (*given, "inverse", "start", "magnification"):
         if getattr(model, name) is not None and not callable(getattr(model, name)):
             raise ValueError(f"{where}{name} must be a function, not {getattr(model, name)!r:.60}.")
     for name, choices in (("unit", ("mm", "px")), ("axes", ("up", "down", None)),
@@ -164,12 +193,15 @@ def _completed(model: CameraModel) -> dict:
         "axes": model.axes or ("up" if model.unit == "mm" else "down"),
         "defaults": tuple(dict(model.defaults).items()),
         "never_free": tuple(model.never_free),
+        "ranges": tuple((name, tuple(ends)) for name, ends in dict(model.ranges).items()),
+        "prior": tuple(dict(model.prior).items()),
         "principal_distance": tuple(model.principal_distance) or known(PRINCIPAL_DISTANCES),
         "principal_point": tuple(model.principal_point) or known(PRINCIPAL_POINTS),
     }
     kept["free"] = tuple(model.free) or tuple(n for n in parameters if n not in kept["never_free"])
-    for name in ("defaults", "free", "never_free", "principal_distance", "principal_point"):
-        unknown = {*(dict(kept[name]) if name == "defaults" else kept[name])} - {*parameters}
+    tables = ("defaults", "ranges", "prior")
+    for name in (*tables, "free", "never_free", "principal_distance", "principal_point"):
+        unknown = {*(dict(kept[name]) if name in tables else kept[name])} - {*parameters}
         if unknown:
             raise ValueError(f"{where}{name} names {', '.join(unknown)}, which is no parameter.")
     if len(kept["principal_distance"]) not in (1, 2) or len(kept["principal_point"]) not in (0, 2):
@@ -180,10 +212,19 @@ def _completed(model: CameraModel) -> dict:
     return kept
 
 
-def _of_the_ideal_image(project: OfRay | None, ray: ToRay) -> Formula:
+def _of_the_ideal_image(project: OfRay, ray: ToRay) -> Formula:
     """The image of the ray of an ideal coordinate."""
-    assert project is not None, "the one formula that is left"
     return lambda p, xi, yi: project(p, *ray(p, xi, yi))
+
+
+def _to_the_ideal_image(unproject: ToRay, ideal: OfRay) -> Formula:
+    """The ideal coordinate of the ray of an image."""
+    return lambda p, x, y: ideal(p, *unproject(p, x, y))
+
+
+def _magnified(function, columns, magnification) -> Any:
+    """An ideal image, or its rays, at the scale that the image has on the axis."""
+    return lambda p, *at: function({c: p[c] * magnification(p) for c in columns}, *at)
 
 
 def _less_its_origin(formula: Formula) -> Formula:
@@ -208,6 +249,10 @@ def project(model: CameraModel, p: Parameters, r: Scalar, s: Scalar, q: Scalar) 
 
 def image_ray(model: CameraModel, p: Parameters, x: Scalar, y: Scalar) -> Triple:
     """The ray [r, s, q] in the camera frame, of length 1, of measured coordinates (x, y)."""
+    if model.unproject is not None:
+        r, s, q = model.unproject(p, x, y)
+        length = jnp.sqrt(r * r + s * s + q * q)
+        return r / length, s / length, q / length
     return model.ray(p, *model.to_ideal(p, x, y))
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.cameras.inverse import value_and_derivative
-from jaxbundle.cameras.model import CameraModel
+from jaxbundle.cameras.model import FORMULAS, CameraModel
 from jaxbundle.float64 import local_x64
 
 ROUND_TRIP = 1e-9
@@ -53,24 +53,25 @@ def check_own(model: CameraModel, values: Mapping[str, float] | None = None) -> 
 
 @lru_cache(maxsize=64)
 def _check_form(model: CameraModel) -> None:
-    name = next(n for n in ("correct", "distort", "project") if getattr(model, n) is not None)
+    name = next(n for n in FORMULAS if getattr(model, n) is not None)
     arguments = ("r, s, q", 3) if name == "project" else ("x, y", 2)
+    number_of, results = (3, "three") if name == "unproject" else (2, "two")
     number, array = (jax.ShapeDtypeStruct(shape, jnp.result_type(float)) for shape in ((), (7, 11)))
     p = (number,) * len(model.parameters)
     for given in (number, array):
         expected = (
             f"Camera model {model.name!r}: {name}(p, {arguments[0]}) must take the parameters "
-            f"({', '.join(model.parameters)}) as a tuple p and return two numbers, or for arrays "
-            "two arrays, element by element"
+            f"({', '.join(model.parameters)}) as a tuple p and return {results} numbers, or for "
+            f"arrays {results} arrays, element by element"
         )
         try:
             out = jax.eval_shape(model.formula, p, *(given,) * arguments[1])
         except Exception as error:  # whatever a user's function raises
             text = " ".join(str(error).split())
             raise ValueError(f"{expected}; it raised {type(error).__name__}: {text:.160}") from None
-        shapes = [x.shape for x in out] if isinstance(out, tuple | list) and len(out) == 2 and all(
+        shapes = [x.shape for x in out] if isinstance(out, tuple | list) and all(
             hasattr(x, "shape") for x in out) else None  # fmt: skip
-        if shapes != [given.shape] * 2:
+        if shapes != [given.shape] * number_of:
             raise ValueError(f"{expected}; for {given.shape or 'numbers'} it gave {out!r:.160}")
 
 

@@ -26,7 +26,7 @@ def check_parameters(model: CameraModel, given: Mapping[str, float]) -> None:
     """Refuses start values that cannot describe a camera of this model.
 
     **Raises:** `ValueError`, for a name the model does not have, a value that is not a finite
-    number, and a principal distance or format factor that is missing, zero or negative.
+    number or out of its range, and a principal distance that is missing, zero or negative.
     """
     where = f"Camera model {model.name!r}"
     for name, value in given.items():
@@ -45,6 +45,12 @@ def check_parameters(model: CameraModel, given: Mapping[str, float]) -> None:
     for name in (*model.principal_distance, "format_factor"):
         if name in given and given[name] <= 0:
             raise ValueError(f"{where}: {name} must be positive, but is {given[name]!r}.")
+    for name, (low, high) in dict(model.ranges).items():
+        if name in given and not low <= given[name] < high:
+            end = "" if high == math.inf else f" and below {high:g}"
+            raise ValueError(
+                f"{where}: {name} must be at least {low:g}{end}, but is {given[name]!r}."
+            )
 
 
 def _is_finite_number(value) -> bool:

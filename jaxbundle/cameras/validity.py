@@ -57,7 +57,8 @@ def turning_radius(
         middle = (inner + outer) / 2
         good = np.asarray(_along(model, p, azimuth, middle)[0]) > 0
         inner, outer = np.where(good, middle, inner), np.where(good, outer, middle)
-    radius = float(np.min(_along(model, p, azimuth, outer)[1]))
+    # Where the image ends instead of turning back, there is none at `outer`.
+    radius = float(np.min(_along(model, p, azimuth, inner)[1]))
     return radius if radius <= radius_max else None
 
 

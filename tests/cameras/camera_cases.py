@@ -42,6 +42,9 @@ class Case:
         return jnp.asarray(np.vstack([points, self.centre, principal_point]))
 
 
+FISHEYE = dict(fx=380.0, fy=381.0, cx=642.0, cy=478.0)
+WIDE = (639.5, 479.5), (640, 480)
+
 CASES = [
     Case(
         "brown",
@@ -78,6 +81,52 @@ CASES = [
         (639.5, 479.5), (640, 480),
     ),
     Case("snavely", dict(f=500.0, k1=-0.12, k2=0.03), (0, 0), (320, 240)),
+    Case("division", dict(FISHEYE, k=-0.2), *WIDE),
+    Case(
+        "kannala-brandt-tangential",
+        dict(FISHEYE, k1=0.05, k2=-0.02, k3=0.004, k4=-3e-4, p1=1e-3, p2=-2e-3), *WIDE,
+    ),
+    Case(
+        "thin-prism-fisheye",
+        dict(FISHEYE, k1=0.05, k2=-0.02, p1=1e-3, p2=-2e-3, k3=0.004, k4=-3e-4, sx1=1e-3,
+             sy1=-1e-3), *WIDE,
+    ),
+    Case(
+        "rad-tan-thin-prism-fisheye",
+        dict(FISHEYE, k0=0.05, k1=-0.02, k2=0.004, k3=-3e-4, k4=1e-5, k5=-1e-6, p0=-2e-3, p1=1e-3,
+             s0=1e-3, s1=-2e-4, s2=-1e-3, s3=1e-4), *WIDE,
+    ),
+    Case("fov", dict(FISHEYE, omega=0.9), *WIDE),
+    Case("eucm", dict(FISHEYE, alpha=0.6, beta=1.1), *WIDE),
+    Case("double-sphere", dict(FISHEYE, xi=-0.18, alpha=0.59), *WIDE),
+    Case(
+        "mei",
+        dict(fx=800.0, fy=802.0, cx=642.0, cy=478.0, xi=1.2, k1=-0.05, k2=0.01, p1=1e-3, p2=-5e-4),
+        *WIDE,
+    ),
+    Case(
+        "scaramuzza",
+        dict(a0=380.0, cx=642.0, cy=478.0, a2=-5e-4, a3=3e-7, a4=-4e-10, c=1.002, d=3e-4, e=-2e-4),
+        *WIDE,
+    ),
+    Case("equidistant", FISHEYE, *WIDE),
+    Case("stereographic", FISHEYE, *WIDE),
+    Case("equisolid", FISHEYE, (639.5, 479.5), (560, 420)),
+    Case("orthographic", FISHEYE, (639.5, 479.5), (290, 220)),
+    Case("equirectangular", dict(fx=1280 / (2 * np.pi), fy=640 / np.pi, cx=640.5, cy=320.5),
+         (639.5, 319.5), (600, 300)),
+    Case(
+        "radial-spline-4-300",
+        dict(FISHEYE, s1=0.02, s2=0.015, s3=-0.01, s4=-0.06), *WIDE,
+    ),
+    Case(
+        "spline-6x5-160",
+        dict(fx=400.0, fy=401.0, cx=642.0, cy=478.0, **{
+            f"d{k}_{i}_{j}": 0.01 * np.sin(3 * i + 2 * j + (k == "y") + 0.5)
+            for i in range(5) for j in range(6) for k in "xy"
+        }),
+        (639.5, 479.5), (450, 250),
+    ),
 ]
 
 

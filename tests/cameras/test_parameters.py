@@ -5,6 +5,12 @@ import pytest
 
 from jaxbundle.cameras import MODEL_NAMES, check_parameters, default_parameters, get_model
 
+DEFAULTS = {
+    "bingo": {"format_factor": 1.0}, "fov": {"omega": 0.9}, "eucm": {"alpha": 0.5, "beta": 1.0},
+    "double-sphere": {"alpha": 0.5}, "mei": {"xi": 1.0}, "scaramuzza": {"c": 1.0},
+}  # fmt: skip
+"""What a model says where nothing is said, if it is not 0."""
+
 
 @pytest.mark.parametrize("name", MODEL_NAMES)
 def test_defaults_leave_the_principal_distance_open(name):
@@ -12,9 +18,7 @@ def test_defaults_leave_the_principal_distance_open(name):
     defaults = default_parameters(model)
     assert set(model.parameters) - set(defaults) == set(model.principal_distance)
     assert set(model.never_free) < set(model.parameters)
-    assert {k: v for k, v in defaults.items() if v} == (
-        {"format_factor": 1.0} if name == "bingo" else {}
-    )
+    assert {k: v for k, v in defaults.items() if v} == DEFAULTS.get(name, {})
     check_parameters(model, {**defaults, **dict.fromkeys(model.principal_distance, 1)})
 
 
@@ -31,6 +35,8 @@ def test_defaults_leave_the_principal_distance_open(name):
         ("brown", dict(c=0.0), "c must be positive, but is 0.0"),
         ("opencv", dict(fx=500.0, fy=-500.0), "fy must be positive, but is -500.0"),
         ("bingo", dict(c=125.0, format_factor=0), "format_factor must be positive, but is 0"),
+        ("eucm", dict(fx=1, fy=1, alpha=1.0), "alpha must be at least 0 and below 1, but is 1.0"),
+        ("mei", dict(fx=1, fy=1, xi=-0.1), "xi must be at least 0, but is -0.1"),
     ],
 )
 def test_what_is_refused(model, given, message):

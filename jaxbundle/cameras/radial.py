@@ -1,0 +1,31 @@
+"""Radial polynomials r·(1 + k1·r² + k2·r⁴ + …), and how far out they can be trusted.
+
+Past the radius where such a polynomial turns back it gives a wrong image, silently, and farther
+out, where it rises again, another one. `rising` tells whether it rises all the way to a point.
+"""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+
+from jaxbundle.cameras.scalars import Scalar
+
+SAMPLES = 8
+"""Places on the way at which a slope is looked at."""
+
+
+def radial(k: Sequence[Scalar], square: Scalar) -> Scalar:
+    """1 + k1·r² + k2·r⁴ + … of r²."""
+    value = jnp.zeros_like(square)
+    for coefficient in reversed(k):
+        value = square * (coefficient + value)
+    return 1 + value
+
+
+def rising(k: Sequence[Scalar], square: Scalar) -> Scalar:
+    """Whether the slope 1 + 3·k1·r² + 5·k2·r⁴ + … is positive from the axis to r, sampled."""
+    slopes = [(2 * i + 3) * coefficient for i, coefficient in enumerate(k)]
+    good = jnp.ones_like(square, bool)
+    for i in range(1, SAMPLES + 1):
+        good &= radial(slopes, square * (i / SAMPLES)) > 0
+    return good

@@ -1,0 +1,82 @@
+"""`spline-NXxNY-FOV`: a rich model, a grid of cubic B-splines over stereographic coordinates.
+
+    [a, b] = 2·tan(θ/2)·[cos ψ, sin ψ]       θ the angle to the optical axis, ψ the azimuth
+    u = cx + fx·(a + ΣΣ B((a − a_j)/h)·B((b − b_i)/h)·dx_i_j)
+    v = cy + fy·(b + ΣΣ B((a − a_j)/h)·B((b − b_i)/h)·dy_i_j)
+
+with knots a_j = (j − (NX − 1)/2)·h and b_i = (i − (NY − 1)/2)·h, i the row from the top, and the
+spacing h = 4·tan(FOV/4)/(NX − 3): FOV is the field of view along a row, and one knot stands
+outside of it on either side. A point sees 4 × 4 knots only. The inverse is by the implicit
+function. Outside the knots' field, |a| ≤ (NX − 3)·h/2 and |b| ≤ (NY − 3)·h/2, NaN.
+
+It can follow any lens, field curvature and decentred elements included, for 2·NX·NY parameters.
+fx, fy, cx, cy are conventions: the grid takes up what they could. Knots that no point has seen,
+and the turn of the camera frame, which every pose takes up, are left to a weak prior σ of the
+knots (`PRIOR`), about the start values: in `calibrate`, the parametric lens of the start.
+
+`spline-12x9-110` has 12 × 9 knots and a field of view of 110°.
+
+Units: fx, fy, cx, cy in pixels, (0, 0) the centre of the upper-left pixel, u right, v down; dx, dy
+without unit, about radians.
+
+Source: the splined stereographic model of Kogan's mrcal (its documentation, "Splined stereographic
+lens model"), of third order, whose knots and order of parameters these are.
+"""
+
+from functools import lru_cache
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbundle.cameras import opencv
+from jaxbundle.cameras.cubic_splines import basis
+from jaxbundle.cameras.inverse import limited
+from jaxbundle.cameras.model import CameraModel
+from jaxbundle.cameras.scalars import Pair, Parameters, Scalar
+
+CORE = ("fx", "fy", "cx", "cy")
+PRIOR = 0.02
+"""σ of a knot about the parametric lens: some per cent of the radius, many pixels."""
+LEAST, MOST = 4, 40
+
+
+@lru_cache(maxsize=64)
+def spline(columns: int, rows: int, degrees: float) -> CameraModel:
+    """The model with a grid of columns × rows knots over a field of view.
+
+    **Raises:** `ValueError` for a grid that is not 4 to 40 knots either way, a field of view that
+    is not in 0° to 350°.
+    """
+    if not (LEAST <= min(columns, rows) and max(columns, rows) <= MOST and 0 < degrees <= 350):
+        raise ValueError(
+            f"a spline of {columns} × {rows} knots over {degrees:g}°: {LEAST} to {MOST} knots "
+            "either way and a field of view up to 350° are expected, such as spline-12x9-110"
+        )
+    per_unit = float((columns - 3) / (4 * np.tan(np.radians(degrees) / 4)))
+    middle = (columns - 1) / 2, (rows - 1) / 2
+
+    def in_knots(p: Parameters, xi: Scalar, yi: Scalar) -> Pair:
+        return xi / p[0] * per_unit + middle[0], yi / p[1] * per_unit + middle[1]
+
+    def inside(p: Parameters, xi: Scalar, yi: Scalar) -> Scalar:
+        s, t = in_knots(p, xi, yi)
+        return (s >= 1) & (s <= columns - 2) & (t >= 1) & (t <= rows - 2)
+
+    def grid_of_splines(p: Parameters, xi: Scalar, yi: Scalar) -> Pair:
+        fx, fy, cx, cy, *knots = p
+        s, t = in_knots(p, xi, yi)
+        along, across = basis(s, 0, columns), basis(t, 0, rows)
+        grid = jnp.stack(jnp.broadcast_arrays(*knots), -1)
+        grid = grid.reshape(*grid.shape[:-1], rows, columns, 2)
+        da, db = jnp.moveaxis(
+            jnp.einsum("...i,...ijk,...j->...k", across, grid, along), -1, 0
+        )
+        return cx + xi + fx * da, cy + yi + fy * db
+
+    distort, inverse = limited(grid_of_splines, inside, opencv.reduce, 12)
+    knots = tuple(f"d{k}_{i}_{j}" for i in range(rows) for j in range(columns) for k in "xy")
+    return CameraModel(
+        f"spline-{columns}x{rows}-{degrees:g}", (*CORE, *knots), distort=distort,
+        inverse=inverse, unit="px", image="stereographic", free=knots,
+        never_free=CORE, prior=dict.fromkeys(knots, PRIOR),
+    )  # fmt: skip
