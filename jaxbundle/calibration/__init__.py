@@ -1,6 +1,8 @@
 """From photographs of a board to a calibrated camera, and how far to trust it."""
 
 from jaxbundle.calibration.calibrate import calibrate as calibrate
+from jaxbundle.calibration.choice import ModelComparison as ModelComparison
+from jaxbundle.calibration.choice import compare_models as compare_models
 from jaxbundle.calibration.files import write_calibration as write_calibration
 from jaxbundle.calibration.files import write_calibrations as write_calibrations
 from jaxbundle.calibration.result import Calibration as Calibration

@@ -60,7 +60,7 @@ def advice(
             "model or the board does not fit (--model, --board-sigma)"
         )
     weak = [name for name, value in t.items() if value < WEAK and name not in model.core]
-    if weak:
+    if weak and not model.prior:
         found.append(
             f"not significant: {', '.join(f'{n} (t {t[n]:.1f})' for n in weak)}; without "
             f"{'it' if len(weak) == 1 else 'them'} (--free) the others are better determined"

@@ -98,24 +98,13 @@ def calibrate(
     options |= {"robust": robust, "snooping": None if robust else snooping}
     check_options(**options)
     check_test(snooping, options.get("significance", 0.001))
-    if isinstance(photographs, BoardViews):
-        views = photographs
-    else:
-        if board is None:
-            raise InputError("calibrate: give the board that is in the photographs")
-        require_board(board)
-        files = [photographs] if isinstance(photographs, str | Path) else photographs
-        if not isinstance(files, Sequence):
-            raise InputError(
-                "photographs must be a list of files, patterns or folders, or BoardViews, but is "
-                f"{shown(files)}"
-            )
-        views = measure_boards(files, board, progress)
+    views = views_of(photographs, board, progress)
     board = views.board
     start = start_values(views, camera_model, free, pixel_size, given)
     columns, rows = views.image_size
+    prior = {name: s for name, s in dict(camera_model.prior).items() if name in free}
     made = Camera(
-        camera, model, start.parameters, free, image_size=(int(columns), int(rows)),
+        camera, model, start.parameters, free, prior, image_size=(int(columns), int(rows)),
         pixel_size=pixel_size,
     )  # fmt: skip
     network = board_network(
@@ -133,6 +122,22 @@ def calibrate(
             result = adjust(network, **options)
         start = dataclasses.replace(start, views=centred)
     return Calibration(start.views, result, cross_validation)
+
+
+def views_of(photographs, board: Board | None, progress=None) -> BoardViews:
+    """The board measured in photographs; `BoardViews` are it already."""
+    if isinstance(photographs, BoardViews):
+        return photographs
+    if board is None:
+        raise InputError("calibrate: give the board that is in the photographs")
+    require_board(board)
+    files = [photographs] if isinstance(photographs, str | Path) else photographs
+    if not isinstance(files, Sequence):
+        raise InputError(
+            "photographs must be a list of files, patterns or folders, or BoardViews, but is "
+            f"{shown(files)}"
+        )
+    return measure_boards(files, board, progress)
 
 
 def board_network(
@@ -200,13 +205,22 @@ def _shifts(model, p, poses, centres, radius):
     return jax.vmap(jax.vmap(one, (None, 0)), (0, None))(poses, centres)
 
 
-def _model(name: str | CameraModel, free) -> tuple[CameraModel, tuple[str, ...]]:
+def check_model(name: str | CameraModel) -> CameraModel:
+    """The model of this name, or an own one.
+
+    **Raises:** `InputError`.
+    """
     try:
         model = get_model(name)
         if is_own(model):
             check_own(model)
     except ValueError as error:
         raise InputError(str(error)) from None
+    return model
+
+
+def _model(name: str | CameraModel, free) -> tuple[CameraModel, tuple[str, ...]]:
+    model = check_model(name)
     if isinstance(free, str) or not (free is None or isinstance(free, Iterable)):
         raise InputError(f"free must be a list of names, such as ['fx', 'fy'], but is {free!r:.60}")
     free = model.free if free is None else tuple(free)

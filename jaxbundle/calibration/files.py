@@ -7,10 +7,11 @@
 | CAMERA.yaml, colmap/ | the camera for OpenCV; camera, poses and board for COLMAP |
 | network/ | the adjusted network: `jaxbundle adjust FOLDER/network` goes on from it |
 | coverage, uncertainty, uncertainty_far, uncertainty_distance, halves .png | how good it is |
+| models.txt, models.json, difference_MODEL.png | of `--models`: the models side by side |
 | plan, perspective, histogram, residuals_…, distortion_…, correlations_… .png | as of `adjust` |
 
-A model that OpenCV and COLMAP do not have is converted to `opencv` for them; what that costs stands
-as a comment in the TOML.
+A model that OpenCV and COLMAP do not have is converted to `opencv` for them, or to `kannala-brandt`
+where rays may be 90° and more from the axis; what that costs stands as a comment in the TOML.
 """
 
 import json
@@ -22,6 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxbundle.calibration.report import rig_dict
+from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.io import adjusted_network, write_opencv
 from jaxbundle.io.networks.colmap import FILES as COLMAP_FILES
@@ -40,6 +42,8 @@ COMMAND = "calibrate"
 REPORT, RESULT = "report.txt", "result.json"
 COLMAP = "colmap"
 OWN_FIGURES = ("coverage.png", "uncertainty*.png", "halves.png")
+COMPARED = ["models.txt", "models.json", "difference_*.png"]
+"""Of a comparison of models."""
 FOREIGN = ("opencv", "kannala-brandt")
 """Models that OpenCV and COLMAP have."""
 
@@ -105,9 +109,11 @@ def _fill(calibration, folder: Path, plots: bool) -> None:
 def _write_foreign(network: Network, folder: Path, name: str) -> list[str]:
     """The camera for OpenCV and COLMAP; what a conversion of its model cost, in words."""
     remark = []
-    if network.cameras[0].model not in FOREIGN:
+    model = get_model(network.cameras[0].model)
+    if model.name not in FOREIGN:
         try:
-            network, cost = convert_cameras(network, "opencv")
+            nearest = "kannala-brandt" if model.wide else "opencv"
+            network, cost = convert_cameras(network, nearest)
         except InputError as error:
             return [f"not written for OpenCV and COLMAP: {error}"]
         remark = [f"{name}.yaml and {COLMAP}: {conversion}" for conversion in cost.values()]
@@ -155,6 +161,18 @@ def calibrations_dict(found, brief: bool = False) -> dict:
     if found.rig is not None:
         document["rig"] = rig_dict(found.rig, brief)
     return document
+
+
+def fill_comparison(choice, folder: Path, plots: bool) -> None:
+    """Write a comparison of models (`choice.ModelComparison`) beside what is in a folder."""
+    write_text(folder / "models.txt", choice.report())
+    write_text(folder / "models.json", json_text(choice.to_dict()))
+    if plots:
+        write_figures(folder, {
+            f"difference_{file_name(model)}": (
+                (7.5, 6), None, partial(choice.plot_difference, model))
+            for model, apart in choice.differences.items() if apart is not None
+        })  # fmt: skip
 
 
 def save_plots(calibration, folder: Path) -> None:

@@ -205,7 +205,7 @@ def cross_validation(result) -> CrossValidation | None:
     network = result.problem.network
     if len(network.images) < 2 * HELD_OUT_FEWEST:
         return None
-    network = _at(network, result)
+    network = at_result(network, result)
     turns = np.arange(len(network.images)) % 2
     try:
         again = partial(adjust, robust=result.robust)
@@ -242,16 +242,17 @@ def _compared(camera: Camera, halves) -> Comparison | None:
         return None
 
 
-def _at(network: Network, result) -> Network:
-    """The network with the adjusted values for its start values."""
-    name = network.cameras[0].id
-    exterior = result.image_values
+def at_result(network: Network, result, keep=None) -> Network:
+    """The network with the adjusted values for its start values; parameters with a prior keep
+    theirs, which the prior is about. `keep`: rays that stay, those not removed if not given."""
+    camera, exterior = network.cameras[0], result.image_values
+    parameters = result.camera_parameters(camera.id)
+    parameters |= {name: camera.parameters.get(name, 0.0) for name in camera.sigma}
     return network.replace(
-        cameras=(dataclasses.replace(
-            network.cameras[0], parameters=result.camera_parameters(name)),),
+        cameras=(dataclasses.replace(camera, parameters=parameters),),
         images=dataclasses.replace(
             network.images, position=exterior[:, :3], angles=exterior[:, 3:]),
-        observations=network.observations.take(kept_rays(result)),
+        observations=network.observations.take(kept_rays(result) if keep is None else keep),
         warnings=(),
     )  # fmt: skip
 

@@ -145,6 +145,56 @@ def _quality_dict(calibration) -> dict:
 
 
 
+def choice_text(found) -> str:
+    """The models side by side (`choice.ModelComparison`)."""
+    lines = ["Camera models compared", "=" * 100]
+    lines += facts([
+        ("Photographs", f"{len(found.views)}, in {found.folds} folds; "
+         f"{len(found.gross)} points that no model explains are left out"),
+    ])  # fmt: skip
+    low = {name: min(getattr(one, name) for one in found.candidates) for name in ("aic", "bic")}
+    rows = []
+    for one in found.candidates:
+        apart = found.differences.get(one.model)
+        map_of = ("", "", "") if apart is None else (
+            fixed(apart.rms, 3), fixed(apart.largest, 3), fixed(apart.over_sigma, 1))  # fmt: skip
+        rows.append((
+            one.model, str(one.free), fixed(one.sigma0, 3), fixed(one.rms, 4),
+            fixed(one.left_out, 4), fixed(one.aic - low["aic"], 1),
+            fixed(one.bic - low["bic"], 1), *map_of,
+        ))  # fmt: skip
+    head = ("model", "free", "σ0", "RMS", "left out", "ΔAIC", "ΔBIC", "Δ rms", "largest", "/σ")
+    lines += ["", *table(head, rows, "lrrrrrrrrr"), ""]
+    lines += paragraph(
+        f"RMS: residuals of all photographs; left out: of those not used for the camera; Δ: images "
+        f"apart from those of {found.best.model}, over the whole image, rotation removed, and RMS "
+        "over their σ. Pixels."
+    )
+    lines += [f"not compared: {clean(name)}: {clean(why)}" for name, why in found.failed.items()]
+    return "\n".join(line.rstrip() for line in [*lines, "", *paragraph(found.sentence)])
+
+
+def choice_dict(found) -> dict:
+    """The models side by side as a section of JSON."""
+    candidates = {}
+    for one in found.candidates:
+        apart = found.differences.get(one.model)
+        candidates[one.model] = {
+            "free": one.free, "unknowns": one.unknowns, "sigma0": one.sigma0, "rms": one.rms,
+            "left_out": one.left_out, "aic": one.aic, "bic": one.bic,
+            "parameters": one.calibration.parameters, "sigma": one.calibration.sigma,
+            "difference": None if apart is None else {
+                "rms": apart.rms, "largest": apart.largest, "over_sigma": apart.over_sigma,
+            },
+        }  # fmt: skip
+    return {
+        "suffices": found.suffices.model, "best": found.best.model, "sentence": found.sentence,
+        "folds": found.folds, "photographs": list(found.views),
+        "gross": [list(pair) for pair in found.gross], "failed": found.failed,
+        "models": candidates,
+    }  # fmt: skip
+
+
 def _coverage_dict(covered) -> dict:
     return {"part": covered.part, "reach": covered.reach, "corners": covered.corners,
             "counts": covered.counts.tolist()}  # fmt: skip

@@ -5,8 +5,9 @@ pixels. For a model in millimetres that is `opencv` with k1 and k2; to first ord
 
     c = (fx·p_x + fy·p_y)/2,   K1 = ∓k1/c²  (− for a correction, + for a distortion)
 
-The parameters of a user's own model, whose formula is not known here, are those with the same
-images as `opencv` (or `kannala-brandt`), by a fit over the image.
+The parameters of every other model, and of a user's own, are those with the same images as
+`opencv` (or `kannala-brandt`, where rays may be 90° and more from the axis), by a fit over the
+image.
 
 A view whose points do not fit the others (a wrong board, a wrong order of corners) is left out:
 more than a third of its residuals are gross, measured by the median of all; or it looks at the
@@ -30,6 +31,8 @@ GROSS = 12.0
 LEAST_GROSS = 3.0
 """And above so many pixels."""
 PART = 1 / 3
+SOLVED = ("opencv", "kannala-brandt", "snavely")
+"""Models in pixels that `calibrate_batch` solves without a start."""
 SIMPLE = ("fx", "fy", "cx", "cy", "k1", "k2")
 WIDE = tuple(np.radians([60.0, 100.0, 140.0, 180.0]))
 """Fields of view tried where the views alone give no start for a fisheye."""
@@ -52,8 +55,8 @@ def start_values(
 
     **Raises:** `InputError` for too few views; `NotSolvedError` where they determine no camera.
     """
-    fisheye = get_model("kannala-brandt")
-    known, wanted = (fisheye, fisheye.free) if is_own(model) and model.wide else (model, free)
+    fisheye, by_fit = get_model("kannala-brandt"), _by_fit(model)
+    known, wanted = (fisheye, fisheye.free) if by_fit and model.wide else (model, free)
     while True:
         if len(views) < 2:
             raise InputError(
@@ -80,11 +83,16 @@ def start_values(
             )
         views = views.take(~gross, "its points do not fit those of the other photographs")
     given = dict(given or {})
-    if is_own(model):
+    if by_fit:
         parameters = _fitted(views, solved, model, free, pixel_size, given) | given
     else:
         parameters = _parameters(views, solved, model, free, pixel_size) | given
     return Start(views, parameters, solved.position[0], solved.angles[0])
+
+
+def _by_fit(model: CameraModel) -> bool:
+    """Whether its start values come from those of another model."""
+    return is_own(model) or (model.unit == "px" and model.name not in SOLVED)
 
 
 def _why(views):
@@ -93,7 +101,7 @@ def _why(views):
 
 def _solve(views: BoardViews, model: CameraModel, free) -> BatchCalibration:
     """The first attempt with a solution, a weak one as well."""
-    size, direct = views.image_size, model.unit == "px" and not is_own(model)
+    size, direct = views.image_size, model.unit == "px" and not _by_fit(model)
     if direct:
         attempts = [(model.name, free, None)]
         if model.name == "opencv":
@@ -164,21 +172,27 @@ def _parameters(views, solved, model, free, pixel_size) -> dict[str, float]:
 
 
 def _fitted(views, solved, model, free, pixel_size, given) -> dict[str, float]:
-    """Parameters of an own model with the images of the camera as found, where points are."""
+    """Parameters of a model with the images of the camera as found, where points are; of one
+    whose parameters have a prior, these alone, all of them, over the whole image if it can be."""
     source, xy = get_model(solved.model), views.xy[views.visible]
     found = dict(zip(source.parameters, solved.interior[0].tolist()))
     if {*given} - {*model.principal_distance}:
         model = dataclasses.replace(model, defaults=dict(model.defaults) | given)
-    wanted = [n for n in model.parameters if n in (*model.principal_distance, *free)]
-    try:
-        cost = convert_camera(
-            source, found, model, image_size=views.image_size, pixel_size=pixel_size,
-            area=(xy.min(0), xy.max(0)),
-            free=[n for n in wanted if n not in given],
-        )  # fmt: skip
-    except ValueError as error:
-        raise NotSolvedError(
-            f"not solved: no start values of model {model.name!r}: {error}; start with fewer "
-            "parameters (free), or give values (given)"
-        ) from None
-    return dict(cost.parameters)
+    core = () if model.prior else model.principal_distance
+    wanted = [n for n in model.parameters if n in (*core, *free) and n not in given]
+    areas = [(xy.min(0), xy.max(0))]
+    for area in [None, *areas] if model.prior else areas:
+        try:
+            cost = convert_camera(
+                source, found, model, image_size=views.image_size, pixel_size=pixel_size,
+                area=area, free=wanted,
+            )  # fmt: skip
+        except ValueError as error:
+            problem = error
+        else:
+            return dict(cost.parameters)
+    hint = "choose a larger field of view" if "spline" in model.name else (
+        "start with fewer parameters (free), or give values (given)")  # fmt: skip
+    raise NotSolvedError(
+        f"not solved: no start values of model {model.name!r}: {problem}; {hint}"
+    )

@@ -2,26 +2,13 @@
 
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from jaxbundle.calibration import Board, calibrate_cameras
-from jaxbundle.calibration.files import (
-    COMMAND,
-    calibrations_dict,
-    file_name,
-    files_of,
-    fill_calibrations,
-    json_text,
-)
-from jaxbundle.cli.app import Force, Quiet, app
-from jaxbundle.cli.outputs import can_plot, check_writable, name_inside, written
-from jaxbundle.cli.progress import counting
+from jaxbundle.choices import BOARDS, ESTIMATORS, TESTS
+from jaxbundle.cli.app import Force, Quiet, app, choice
 from jaxbundle.errors import InputError, NotSolvedError
-from jaxbundle.io.results.result_json import unsolved_text
-from jaxbundle.leastsquares.snooping import check_test
-from jaxbundle.measure.views import photographs
 
 
 @app.command()
@@ -30,14 +17,13 @@ def calibrate(
         list[str] | None, typer.Argument(help="photographs, patterns or folders of one camera")
     ] = None,
     board: Annotated[
-        str, typer.Option(help="COLUMNSxROWS: inner corners, circles, or squares of charuco")
+        str, typer.Option(help="COLUMNSxROWS: inner corners, circles, or squares of charuco; or a "
+                          "target of Kalibr, FILE.yaml")
     ] = "",
     square: Annotated[
         float | None, typer.Option(help="side of a square, distance of circles, in --unit")
     ] = None,
-    kind: Annotated[
-        str, typer.Option(help="chessboard, circles, asymmetric-circles, charuco")
-    ] = "chessboard",
+    kind: Annotated[str, choice(BOARDS)] = "chessboard",
     camera: Annotated[
         list[str] | None, typer.Option(help="NAME=PATTERN: one of several cameras")
     ] = None,
@@ -45,6 +31,10 @@ def calibrate(
         bool, typer.Option("--rig", help="the cameras are rigidly mounted, photographs in step")
     ] = False,
     model: Annotated[str, typer.Option(help="camera model")] = "opencv",
+    models: Annotated[
+        str, typer.Option(help="a,b,c: camera models to compare; which one suffices?")
+    ] = "",
+    folds: Annotated[int, typer.Option(help="of the photographs, for --models")] = 4,
     free: Annotated[str, typer.Option(help="parameters to estimate: fx,fy,…")] = "",
     given: Annotated[
         list[str] | None, typer.Option(help="NAME=VALUE of a parameter, held if not free")
@@ -65,12 +55,10 @@ def calibrate(
         float, typer.Option(help="a priori σ of an image coordinate, pixels")
     ] = 0.1,
     snooping: Annotated[
-        str, typer.Option(help="removal of gross errors, and epochs of a rig: pope, baarda, none")
+        str, choice((*TESTS, "none"), "removal of gross errors, and epochs of a rig")
     ] = "pope",
     significance: Annotated[float, typer.Option(help="level of the test")] = 0.001,
-    robust: Annotated[
-        str | None, typer.Option(help="instead of removal: huber, cauchy or tukey")
-    ] = None,
+    robust: Annotated[str | None, choice(ESTIMATORS, "instead of removal")] = None,
     cross_validation: Annotated[
         bool, typer.Option(help="calibrate again from halves of the photographs: 4 adjustments")
     ] = True,
@@ -85,16 +73,32 @@ def calibrate(
     plots: Annotated[bool, typer.Option(help="plots in the folder of --out")] = True,
 ) -> None:
     """Calibrate cameras from photographs of a board, and say how far to trust them."""
+    from jaxbundle.calibration import Calibrations, calibrate_cameras, compare_models
+    from jaxbundle.calibration.files import (
+        COMMAND,
+        COMPARED,
+        calibrations_dict,
+        files_of,
+        fill_calibrations,
+        fill_comparison,
+        json_text,
+    )
+    from jaxbundle.cli.outputs import can_plot, check_writable, name_inside, written
+    from jaxbundle.cli.progress import counting
+    from jaxbundle.io.results.result_json import unsolved_text
+    from jaxbundle.leastsquares.snooping import check_test
+    from jaxbundle.measure.views import photographs
+
     test = None if snooping == "none" else snooping
     check_test(test, significance, "--")
-    columns, rows = _size(board)
-    if square is None:
-        raise InputError("--square is missing: the side of a square, or the distance of circles")
-    known = Board(columns, rows, square, kind, diameter, marker, dictionary)
+    known = _board(board, square, kind, diameter, marker, dictionary)
     cameras = _cameras(photos, camera)
     files = [path for paths in cameras.values() for path in photographs(paths)]
     _check_names(cameras)
-    names = files_of([*cameras])
+    compared = _words(models)
+    if compared:
+        _check_compared(compared, cameras, free, rig)
+    names = files_of([*cameras]) + (COMPARED if compared else [])
     check_writable(json, out, COMMAND, names, files, force)
     with counting(quiet or json == "-") as bar:
         task = bar.add_task("searching the board", total=len(files))
@@ -104,27 +108,43 @@ def calibrate(
             if bar.tasks[task].finished:
                 bar.update(task, description="adjusting")
 
+        options: dict[str, Any] = dict(
+            pixel_size=pixel_size, sigma_image=sigma_image, board_sigma=board_sigma,
+            board_free=board_free, snooping=test, significance=significance, robust=robust,
+            object_unit=unit,
+        )  # fmt: skip
+        choice = None
         try:
-            found = calibrate_cameras(
-                cameras, known, rig=rig, model=model, free=_words(free) or None,
-                given=_values(given), pixel_size=pixel_size, sigma_image=sigma_image,
-                board_sigma=board_sigma, board_free=board_free,
-                snooping=test, significance=significance,
-                robust=robust, cross_validation=cross_validation, object_unit=unit,
-                progress=tell,
-            )  # fmt: skip
+            if compared:
+                (name, photographed), = cameras.items()
+                choice = compare_models(
+                    photographed, known, models=compared, folds=folds, camera=name,
+                    progress=lambda *_: tell(), **options,
+                )  # fmt: skip
+                found = Calibrations({name: choice.suffices.calibration})
+            else:
+                found = calibrate_cameras(
+                    cameras, known, rig=rig, model=model, free=_words(free) or None,
+                    given=_values(given), cross_validation=cross_validation, progress=tell,
+                    **options,
+                )  # fmt: skip
         except NotSolvedError as error:
             place = out if name_inside(json, out) else None
             with written(json, unsolved_text(error), place, COMMAND, names, force):
                 pass
             raise
         bar.update(task, description="how good it is")
-        text = json_text(calibrations_dict(found, brief)) if json else ""
-        report = "" if quiet or json == "-" else found.report()
+        document = calibrations_dict(found, brief) if json else {}
+        if choice is not None and json:
+            document["models"] = choice.to_dict()
+        text = json_text(document) if json else ""
+        report = "" if quiet or json == "-" else (choice or found).report()
         bar.update(task, description="writing")
         with written(json, text, out, COMMAND, names, force) as new:
             if new is not None:
                 fill_calibrations(found, new, plots and can_plot())
+                if choice is not None:
+                    fill_comparison(choice, new, plots and can_plot())
     if report:
         print(report)
     failed = [name for name, one in found.cameras.items() if not one.converged]
@@ -137,8 +157,36 @@ def calibrate(
         )
 
 
+def _board(board: str, square: float | None, *more):
+    """The board, or the target, that the options name."""
+    from jaxbundle.calibration import Board
+    from jaxbundle.io.boards.targets import read_target
+
+    if board.endswith((".yaml", ".yml")):
+        if square is not None:
+            raise InputError(f"--square: {board} says how large the board is; leave it out")
+        return read_target(board)
+    columns, rows = _size(board)
+    if square is None:
+        raise InputError("--square is missing: the side of a square, or the distance of circles")
+    return Board(columns, rows, square, *more)
+
+
+def _check_compared(models, cameras, free, rig) -> None:
+    """Refuse what does not go with --models."""
+    for given, option in ((rig, "--rig"), (free, "--free"), (len(cameras) > 1, "--camera")):
+        if given:
+            raise InputError(
+                f"--models compares the usual parameters of one camera: leave {option} out"
+            )
+    if len({*models}) < 2:
+        raise InputError("--models: give two different models or more, such as opencv,brown")
+
+
 def _check_names(cameras) -> None:
     """Refuse cameras whose results would have one folder."""
+    from jaxbundle.calibration.files import file_name
+
     folders: dict[str, str] = {}
     for name in cameras:
         other = folders.setdefault(file_name(name).casefold(), name)

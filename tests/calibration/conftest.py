@@ -11,7 +11,7 @@ from jaxbundle.calibration import calibrate
 VIEWS = 12
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def folder(tmp_path_factory):
     """Twelve photographs of a chessboard, and six files that cannot be used."""
     folder = tmp_path_factory.mktemp("photographs")
@@ -28,6 +28,6 @@ def folder(tmp_path_factory):
     return folder
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def calibration(folder):
     return calibrate([folder], taken.BOARD)

@@ -58,7 +58,7 @@ def test_start_values_of_any_formula():
     """Nothing of the formula is known but its images: a fit to those of `opencv`, or of
     `kannala-brandt`."""
     views = simulated()
-    model = CameraModel("division", ("c", "x0", "y0", "L"), correct=division)
+    model = CameraModel("division-mm", ("c", "x0", "y0", "L"), correct=division)
     found = start_values(views, model, model.free, (0.01, 0.01)).parameters
     assert found["c"] == pytest.approx(0.01 * TRUTH["fx"], rel=0.01)
     assert found["x0"] == pytest.approx(0.01 * (TRUTH["cx"] - 239.5), abs=0.03)
@@ -72,8 +72,8 @@ def test_start_values_of_any_formula():
 
 def test_what_is_refused():
     views = simulated()
-    model = CameraModel("division", ("c", "x0", "y0", "L"), correct=division)
-    with pytest.raises(InputError, match="model 'division' is in mm; a batch needs"):
+    model = CameraModel("division-mm", ("c", "x0", "y0", "L"), correct=division)
+    with pytest.raises(InputError, match="model 'division-mm' is in mm; a batch needs"):
         calibrate_batch(taken.BOARD.points, views.xy[None], (480, 360), model)
     with pytest.raises(InputError, match="'wrong': distort.*must take the parameters"):
         calibrate(views, model=CameraModel("wrong", ("f",), distort=lambda x: x, unit="px"))

@@ -1,0 +1,297 @@
+r"""Which camera model suffices? Several models calibrated from the same views of a board.
+
+**Cross-validation.** The views fall into folds. For each the camera is estimated from the other
+folds, and the poses of its own views with that camera; their residuals are what the model leaves
+in photographs it has not seen. It is one adjustment a fold, in which the σ of its views are
+`FAINT` times as large: they say nothing about the camera, and determine their own poses only.
+
+**Information criteria**, for n image coordinates with the weighted sum of squares S, and k
+parameters as the trace of n·I less their redundancy numbers (unknowns with a prior count in part):
+
+    AIC = n·ln(S/n) + 2·k        BIC = n·ln(S/n) + k·ln(n)
+
+**Difference.** How far the images of two calibrations are apart, the rotation that every pose takes
+up removed (`cameras.compare`), against the σ of the difference of two such calibrations.
+
+**The choice**: the model of fewest parameters whose mean square residual of a view left out exceeds
+the best model's by no more than the standard error of that excess over the views.
+
+Source: Akaike (1974), IEEE Transactions on Automatic Control 19(6); Schwarz (1978), Annals of
+Statistics 6(2); Breiman, Friedman, Olshen and Stone (1984), Classification and Regression Trees,
+section 3.4.3, the rule of one standard error.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxbundle import plotting
+from jaxbundle.arguments import shown, whole
+from jaxbundle.bundle.adjust import adjust
+from jaxbundle.calibration.calibrate import calibrate, check_model, views_of
+from jaxbundle.calibration.pixels import unit_size
+from jaxbundle.calibration.quality import at_result, kept_rays, part, residuals_in_pixels
+from jaxbundle.calibration.result import Calibration
+from jaxbundle.cameras import CameraModel, Comparison, compare_cameras, get_model
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.measure.boards import Board
+from jaxbundle.measure.views import BoardViews
+from jaxbundle.network.tables import Camera, Network
+from jaxbundle.statistics.difference import expected_difference
+
+FAINT = 1e3
+FEWEST = 4
+"""Photographs of a fold's camera and, at least, folds' worth of them."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """A model, calibrated from the common observations.
+
+    **Fields:** `calibration`, as `calibrate` gives it; `free` parameters of the camera; `unknowns`:
+    k of the criteria, poses included; `sigma0` of the image coordinates; `rms` of their residuals,
+    and `left_out` of those of views left out, pixels (|v| of a point); `by_view`: mean squares of
+    the latter [views]; `aic`, `bic`.
+    """
+
+    model: str
+    calibration: Calibration
+    free: int
+    unknowns: float
+    sigma0: float
+    rms: float
+    left_out: float
+    by_view: Float[np.ndarray, " views"]
+    aic: float
+    bic: float
+
+    @property
+    def given(self):
+        """The model and its parameters."""
+        return get_model(self.calibration.camera.model), self.calibration.parameters
+
+
+@dataclasses.dataclass(frozen=True)
+class Difference:
+    """How far a model's images are from those of the best: the map, its lengths in pixels, and the
+    RMS of the lengths over the σ of the difference."""
+
+    comparison: Comparison
+    covariance: Float[np.ndarray, "rows columns 2 2"]
+    rms: float
+    largest: float
+    over_sigma: float
+
+
+class ModelComparison:
+    """The models side by side. Print it for the table and the sentence.
+
+    **Attributes:** `candidates`, in the order given; `failed`: model and reason; `folds`; `views`
+    compared; `gross`: (image, point) that no model explains, left out for all; `best`: the
+    candidate with the least left-out RMS; `suffices`: the one to take; `differences` from the best
+    by model (None: nothing to compare).
+    """
+
+    def __init__(self, candidates, failed, folds, views, gross):
+        self.candidates: tuple[Candidate, ...] = tuple(candidates)
+        self.failed: dict[str, str] = dict(failed)
+        self.folds, self.views, self.gross = folds, tuple(views), tuple(gross)
+        self.best = min(self.candidates, key=lambda one: one.left_out)
+        enough = [one for one in self.candidates if self.excess(one)[0] <= self.excess(one)[1]]
+        self.suffices = min(enough, key=lambda one: (one.free, one.left_out))
+
+    def excess(self, one: Candidate) -> tuple[float, float]:
+        """The mean square residual of a view left out beyond the best model's, and its standard
+        error over the views, pixels²."""
+        d = one.by_view - self.best.by_view
+        return float(d.mean()), float(d.std(ddof=1) / np.sqrt(len(d)))
+
+    @cached_property
+    def differences(self) -> dict[str, Difference | None]:
+        others = (one for one in self.candidates if one is not self.best)
+        return {one.model: _difference(self.best, one) for one in others}
+
+    @property
+    def sentence(self) -> str:
+        """Which model suffices, and why."""
+        chosen, best = self.suffices, self.best
+        text = (
+            f"{chosen.model} suffices: in photographs left out it leaves an RMS of "
+            f"{chosen.left_out:.4g} px with {chosen.free} parameters"
+        )
+        if chosen is best:
+            text += ", the least of all"
+        else:
+            text += (
+                f", no worse than {best.model} ({best.left_out:.4g} px, {best.free} parameters) "
+                "within the scatter of the photographs"
+            )
+        simpler = [one for one in self.candidates if one.free < chosen.free]
+        if simpler:
+            worse = ", ".join(f"{one.model} ({one.left_out:.4g} px)" for one in simpler)
+            text += f"; {worse} {'is' if len(simpler) == 1 else 'are'} simpler and worse"
+        return text + "."
+
+    def plot_difference(self, model: str, ax=None):
+        """The map of a model's difference from the best; matplotlib axes."""
+        found = self.differences[model]
+        if found is None:
+            raise ValueError(f"{model} and {self.best.model} have no part of the image in common")
+        return plotting.difference_map(found.comparison, ax, f"{model} − {self.best.model}")
+
+    def report(self) -> str:
+        """Table and sentence as text."""
+        from jaxbundle.calibration.report import choice_text
+
+        return choice_text(self)
+
+    def to_dict(self) -> dict:
+        """The same as plain dicts and numbers, as in JSON."""
+        from jaxbundle.calibration.report import choice_dict
+
+        return choice_dict(self)
+
+    def __str__(self) -> str:
+        return self.report()
+
+
+def compare_models(
+    photographs: Sequence[str | Path] | BoardViews,
+    board: Board | None = None,
+    *,
+    models: Sequence[str | CameraModel],
+    folds: int = 4,
+    progress: Callable[[int, int], None] | None = None,
+    **options,
+) -> ModelComparison:
+    """Calibrate one camera by several models and say which suffices.
+
+    **Arguments:** `models`: names or `CameraModel`s, two or more; `folds` of the cross-validation;
+    the others and `options` as of `calibrate`. Each model estimates its usual parameters.
+
+    **Returns:** a `ModelComparison`. A model that cannot be calibrated is listed with the reason.
+
+    **Raises:** `InputError` for models that do not exist, and too few photographs for the folds;
+    `NotSolvedError` where no model can be calibrated.
+    """
+    if isinstance(models, str) or not isinstance(models, Iterable) or len({*models}) < 2:
+        raise InputError(
+            "models: give two different ones or more, such as ['opencv', 'kannala-brandt'], not "
+            f"{shown(models)}"
+        )
+    folds = whole("folds", folds, 2)
+    names = [check_model(model).name for model in models]
+    views = views_of(photographs, board, progress)
+    found, failed = {}, {}
+    for name, model in zip(names, models):
+        try:
+            one = calibrate(views, model=model, cross_validation=False, **options)
+        except (InputError, NotSolvedError) as error:
+            failed[name] = str(error)
+            continue
+        if one.converged:
+            found[name] = one
+        else:
+            failed[name] = f"not solved: {one.adjustment.termination}"
+    if not found:
+        raise NotSolvedError(
+            "not solved: none of the models: "
+            + "; ".join(f"{name}: {why}" for name, why in failed.items())
+        )
+    together = set.intersection(*({*one.views.names} for one in found.values()))
+    common = [name for name in views.names if name in together]
+    if len(common) < folds + FEWEST:
+        raise InputError(
+            f"{len(common)} photographs can be used by all models; {folds} folds need "
+            f"{folds + FEWEST} at least: give more, or fewer folds"
+        )
+    gross = set.intersection(*(_removed(one) for one in found.values()))
+    candidates = []
+    for name, one in found.items():
+        candidate = _candidate(name, one, common, gross, folds)
+        if isinstance(candidate, str):
+            failed[name] = candidate
+        else:
+            candidates.append(candidate)
+    if not candidates:
+        raise NotSolvedError(f"not solved: {'; '.join(failed.values())}")
+    return ModelComparison(candidates, failed, folds, common, sorted(gross))
+
+
+def _removed(calibration: Calibration) -> set[tuple[str, str]]:
+    """Image and point of what was removed as a gross error."""
+    adjustment = calibration.adjustment
+    ids = _ids(adjustment.problem.network)
+    return {ids[i] for i in np.flatnonzero(~kept_rays(adjustment))}
+
+
+def _ids(network: Network) -> list[tuple[str, str]]:
+    rays = network.observations
+    return [
+        (network.images.id[i], network.points.id[p]) for i, p in zip(rays.image, rays.point)
+    ]
+
+
+def _candidate(name, calibration, common, gross, folds) -> Candidate | str:
+    """A model with its statistics; or why it has none."""
+    result = calibration.adjustment
+    network = result.problem.network
+    keep = np.array([pair not in gross for pair in _ids(network)])
+    network = at_result(network, result, keep)
+    network = part(network, np.isin(np.array(network.images.id, object), common))
+    camera = network.cameras[0]
+    again = adjust(network)
+    if not again.converged:
+        return f"{name}: all observations together: {again.termination}"
+    squares = np.zeros(len(network.observations))
+    turns = np.arange(len(network.images)) % folds
+    for fold in range(folds):
+        left = turns[network.observations.image] == fold
+        one = adjust(_faint(network, left))
+        if not one.converged:
+            return f"{name}: the photographs without those of fold {fold + 1}: {one.termination}"
+        squares[left] = _squares(one, camera)[left]
+    v = again.inspection.residuals.image
+    redundancy = float(again.reliability.redundancy.image.sum())
+    n, S = v.size, float(np.square(v).sum())
+    k = n - redundancy
+    sums, counts = (np.bincount(network.observations.image, w) for w in (squares, None))
+    return Candidate(
+        name, calibration, len(camera.free), k, float(np.sqrt(S / redundancy)),
+        float(np.sqrt(_squares(again, camera).mean())), float(np.sqrt(squares.mean())),
+        sums / counts, n * np.log(S / n) + 2 * k, n * np.log(S / n) + k * np.log(n),
+    )  # fmt: skip
+
+
+def _faint(network: Network, left: Bool[np.ndarray, " rays"]) -> Network:
+    """The network with some rays that say nothing about the camera."""
+    rays = network.observations
+    sigma = np.where(left[:, None], FAINT * rays.sigma, rays.sigma)
+    return network.replace(observations=dataclasses.replace(rays, sigma=sigma))
+
+
+def _squares(adjustment, camera: Camera) -> Float[np.ndarray, " rays"]:
+    """|v|² of every point, pixels²."""
+    return np.square(residuals_in_pixels(adjustment, camera)[0]).sum(1)
+
+
+def _difference(best: Candidate, one: Candidate) -> Difference | None:
+    camera = best.calibration.camera
+    sizes = {"image_size": camera.image_size, "pixel_size": camera.pixel_size}
+    try:
+        comparison = compare_cameras(best.given, one.given, **sizes)
+    except ValueError:
+        return None
+    of = lambda c: c.calibration.adjustment.camera_covariance(c.calibration.name)
+    C = expected_difference(comparison, best.given, one.given, (of(best), of(one)), **sizes)
+    size = unit_size(best.given[0], camera.pixel_size)[0]
+    sigma = np.sqrt(np.trace(C, axis1=2, axis2=3))
+    ratio = comparison.length / sigma
+    return Difference(
+        comparison, C, comparison.rms / size, comparison.largest / size,
+        float(np.sqrt(np.nanmean(ratio**2))),
+    )  # fmt: skip
