@@ -12,17 +12,19 @@ from pathlib import Path
 from jaxbundle.arguments import path as given_path
 from jaxbundle.cameras import CameraModel, Conversion, key_of
 from jaxbundle.errors import InputError
-from jaxbundle.io.cameras.camera_files import (
-    chosen_camera,
-    is_camera_file,
-    read_cameras,
-    write_cameras,
-)
+from jaxbundle.io.cameras.camera_files import chosen_camera, is_camera_file, read_cameras
 from jaxbundle.io.cameras.nearest_camera import fits_told
-from jaxbundle.io.cameras.opencv_file import SUFFIXES, write_opencv
-from jaxbundle.io.formats import PIXEL_MODELS, TARGETS, check_own_models, read_network
+from jaxbundle.io.formats import (
+    CAMERA_KINDS,
+    TARGETS,
+    check_own_models,
+    has_model,
+    read_network,
+    recognised_target,
+)
+from jaxbundle.io.networks.assemble import network_of_cameras
 from jaxbundle.io.networks.bundler import LIST
-from jaxbundle.io.networks.colmap import write_colmap_cameras
+from jaxbundle.io.networks.jaicov import BESIDE
 from jaxbundle.io.networks.project import FILE_NAME
 from jaxbundle.io.results.coordinates import images_path
 from jaxbundle.io.writing.folders import check_folder, replaced_folder
@@ -32,10 +34,6 @@ from jaxbundle.network.outside import outside_warnings
 from jaxbundle.network.rules import check_camera
 from jaxbundle.network.tables import Camera, Network
 
-CAMERA_KINDS = {
-    "opencv": "NAME.yaml, .yml, .json", "cameras": "NAME.toml", "colmap-cameras": "cameras.txt"
-}  # fmt: skip
-"""Outputs that hold cameras alone."""
 MOST_SHOWN = 8
 """Conversions told one by one, the worst first."""
 
@@ -101,6 +99,9 @@ def convert(
         _keep_camera_file(input, output)
         _keep_others(output, kind, force)
         cameras = _sized(read_cameras(input, models), image_size, pixel_size)
+        if kind in TARGETS and TARGETS[kind].alone:
+            network = network_of_cameras(cameras, str(input)).warn(*fits_told(cameras))
+            return _convert_network(network, output, kind, model, measured, force)
         made = _convert_cameras(input, cameras, output, kind, model, camera)
         return dataclasses.replace(
             made, warnings=(*fits_told(cameras), *outside_warnings(cameras))
@@ -120,6 +121,13 @@ def convert(
         return dataclasses.replace(made, lost=("images and points",), warnings=network.warnings)
     if camera is not None:
         raise InputError(f"--camera {camera}: {kind} holds all cameras; leave it out")
+    return _convert_network(network, output, kind, model, measured, force)
+
+
+def _convert_network(
+    network: Network, output: Path, kind: str, model: str | CameraModel | None, measured: bool,
+    force: bool,
+) -> Converted:  # fmt: skip
     network, costs = _with_model(network, kind, model, measured)
     folder, files = _folder(output, kind), TARGETS[kind].files
     if folder is None:
@@ -131,18 +139,12 @@ def convert(
 
 
 def _kind(output: Path, to: str | None) -> str:
-    kinds = {**{name: target.looks for name, target in TARGETS.items()}, **CAMERA_KINDS}
+    kinds = {name: target.looks for name, target in (*TARGETS.items(), *CAMERA_KINDS.items())}
     if to is not None:
         if to not in kinds:
             raise InputError(f"--to {to}: cannot be written{did_you_mean(to, kinds)}")
         return to
-    if output.suffix.lower() in SUFFIXES:
-        return "opencv"
-    if output.name.lower() == "cameras.txt":
-        return "colmap-cameras"
-    found = next((name for name, target in TARGETS.items() if target.recognises(output)), None)
-    if found is None and output.suffix.lower() == ".toml":
-        return "cameras"
+    found = recognised_target(output)
     if found is None:
         known = "; ".join(f"{name}: {looks}" for name, looks in kinds.items())
         raise InputError(f"{output}: what to write is not recognised; give --to or a name: {known}")
@@ -210,7 +212,8 @@ def _keep_others(output: Path, kind: str, force: bool) -> None:
     if folder is not None:
         names = TARGETS[kind].files
         return check_folder(folder, "convert", names, force=force, option="")
-    beside = {"csv": [images_path(output)], "bundler": [output.parent / LIST]}
+    beside = {"csv": [images_path(output)], "bundler": [output.parent / LIST],
+              "jaicov": [output.with_suffix(suffix) for suffix in BESIDE]}  # fmt: skip
     there = [path for path in (output, *beside.get(kind, [])) if os.path.lexists(path)]
     if there and not force:
         raise InputError(
@@ -225,10 +228,10 @@ def _with_model(
     """The network with cameras the output has, and by camera what that cost."""
     models = TARGETS[kind].models
     if model is not None:
-        if models and model not in models:
+        if not has_model(models, model):
             raise InputError(f"--model {model}: {kind} has {' and '.join(models)} only")
         return convert_cameras(network, model, measured=measured)
-    foreign = [c.id for c in network.cameras if models and c.model not in models]
+    foreign = [c.id for c in network.cameras if not has_model(models, c.model)]
     if not foreign:
         return network, {}
     converted, costs = convert_cameras(network, models[0], only=foreign, measured=measured)
@@ -253,25 +256,22 @@ def _convert_cameras(
 ) -> Converted:  # fmt: skip
     if kind not in CAMERA_KINDS:
         raise InputError(
-            f"{input}: holds cameras alone; they can be written as {', '.join(CAMERA_KINDS)}, not "
+            f"{input}: holds cameras alone; they can be written as "
+            f"{', '.join((*CAMERA_KINDS, *(name for name, t in TARGETS.items() if t.alone)))}, not "
             f"as {kind}"
         )
-    if kind == "opencv" or id is not None:
+    written = CAMERA_KINDS[kind]
+    if written.one or id is not None:
         cameras = [chosen_camera(cameras, id, str(input))]
     costs, made = {}, []
     for camera in cameras:
-        foreign = kind != "cameras" and camera.model not in PIXEL_MODELS
-        target = model or ("opencv" if foreign else camera.model)
+        foreign = not has_model(written.models, camera.model)
+        target = model or (written.models[0] if foreign else camera.model)
         if target != camera.model:
             converted, costs[camera.id] = convert_one(camera, target)
             if model is None:
                 _refuse_inexact(cameras, camera.id, kind, costs[camera.id])
             camera = converted
         made.append(camera)
-    if kind == "opencv":
-        write_opencv(made[0], output)
-    elif kind == "colmap-cameras":
-        write_colmap_cameras(made, output)
-    else:
-        write_cameras(made, output)
+    written.write(made, output)
     return Converted(kind, output, costs, (), ())

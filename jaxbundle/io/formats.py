@@ -3,6 +3,7 @@
 import dataclasses
 import os
 from collections.abc import Callable, Sequence
+from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
 
@@ -10,25 +11,47 @@ from jaxbundle.arguments import path as given_path
 from jaxbundle.arguments import shown
 from jaxbundle.cameras import CameraModel
 from jaxbundle.errors import InputError
-from jaxbundle.io.cameras.camera_files import is_camera_file
+from jaxbundle.io.cameras.camera_files import is_camera_file, write_cameras
+from jaxbundle.io.cameras.opencv_file import YAML, write_opencv, write_ros
 from jaxbundle.io.networks.bal import OPENERS, is_bal, read_bal, write_bal
 from jaxbundle.io.networks.bingo import is_bingo, read_bingo
 from jaxbundle.io.networks.bundler import is_bundler, read_bundler, write_bundler
 from jaxbundle.io.networks.colmap import FILES as COLMAP_FILES
-from jaxbundle.io.networks.colmap import fill_colmap, is_colmap, read_colmap
+from jaxbundle.io.networks.colmap import fill_colmap, is_colmap, read_colmap, write_colmap_cameras
+from jaxbundle.io.networks.colmap_models import COLMAP_MODELS
 from jaxbundle.io.networks.column_map import is_column_map, read_column_map
 from jaxbundle.io.networks.control import read_control, with_control
+from jaxbundle.io.networks.jaicov import is_jaicov, read_jaicov, write_jaicov
+from jaxbundle.io.networks.kalibr import OFFERED as KALIBR_MODELS
+from jaxbundle.io.networks.kalibr import is_kalibr, read_kalibr, write_kalibr
+from jaxbundle.io.networks.losses import PIXEL_MODELS
 from jaxbundle.io.networks.metashape import is_metashape, read_metashape
+from jaxbundle.io.networks.micmac import FILES as MICMAC_FILES
+from jaxbundle.io.networks.micmac import fill_micmac, is_micmac, read_micmac
+from jaxbundle.io.networks.micmac_camera import MODELS as MICMAC_MODELS
+from jaxbundle.io.networks.micmac_camera import write_autocal
+from jaxbundle.io.networks.mrcal import FILES as MRCAL_FILES
+from jaxbundle.io.networks.mrcal import OFFERED as MRCAL_MODELS
+from jaxbundle.io.networks.mrcal import fill_mrcal, is_mrcal, read_mrcal, write_cameramodel
+from jaxbundle.io.networks.openmvg import is_openmvg, read_openmvg, write_openmvg
+from jaxbundle.io.networks.opensfm import FILES as OPENSFM_FILES
+from jaxbundle.io.networks.opensfm import (
+    fill_opensfm,
+    is_opensfm,
+    read_opensfm,
+    write_opensfm_cameras,
+)
 from jaxbundle.io.networks.photo_list import read_photo_list
 from jaxbundle.io.networks.photomodeler import is_photomodeler, read_photomodeler
 from jaxbundle.io.networks.project import FILE_NAME, fill_project, project_file, read_project
 from jaxbundle.io.networks.project import FILES as PROJECT_FILES
+from jaxbundle.io.networks.transforms import is_transforms, read_transforms, write_transforms
 from jaxbundle.io.results.coordinates import write_coordinates
 from jaxbundle.io.results.dxf import write_dxf
 from jaxbundle.io.results.ply import write_ply
 from jaxbundle.network.columns import count, did_you_mean, some
 from jaxbundle.network.rules import check_unique, model_of
-from jaxbundle.network.tables import Network, Source
+from jaxbundle.network.tables import Camera, Network, Source
 from jaxbundle.system.file_content import is_plain
 
 FIRST_LINES = 100_000
@@ -52,8 +75,9 @@ class Format:
 class Target:
     """A kind of output: names it is recognised by, who writes it, and the camera models it has.
 
-    `write` returns what is not kept, in words; no `models`: all. `files`: names of what is written
-    into a folder; none: a file is written.
+    `write` returns what is not kept, in words; no `models`: all, a name with * is a family.
+    `files`: names of what is written into a folder; none: a file is written. `alone`: cameras
+    without images can be written.
     """
 
     recognises: Callable[[Path], bool]
@@ -61,6 +85,20 @@ class Target:
     looks: str
     models: tuple[str, ...] = ()
     files: tuple[str, ...] = ()
+    alone: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraTarget:
+    """A kind of output that holds cameras alone: as `Target`; `one`: a single camera; `broad`: the
+    name is as that of other kinds, which come first."""
+
+    recognises: Callable[[Path], bool]
+    write: Callable[[Sequence[Camera], Path], None]
+    looks: str
+    models: tuple[str, ...] = ()
+    one: bool = False
+    broad: bool = False
 
 
 def _is_project(path: Path) -> bool:
@@ -101,6 +139,17 @@ FORMATS: dict[str, Format] = {
         adjusted=True,
     ),
     "bundler": Format(is_bundler, read_bundler, 'a file that begins with "# Bundle file"'),
+    "openmvg": Format(is_openmvg, read_openmvg, "openMVG's sfm_data.json"),
+    "opensfm": Format(
+        is_opensfm, read_opensfm, "OpenSfM's reconstruction.json, or a folder that has it"
+    ),
+    "transforms": Format(
+        is_transforms, read_transforms, "transforms.json of nerfstudio or instant-ngp"
+    ),
+    "kalibr": Format(is_kalibr, read_kalibr, "a .yaml file of Kalibr with cam0: …"),
+    "micmac": Format(is_micmac, read_micmac, "a folder of MicMac with Orientation-….xml"),
+    "jaicov": Format(is_jaicov, read_jaicov, "a .phc file of AICON, with .ior beside it"),
+    "mrcal": Format(is_mrcal, read_mrcal, "a .cameramodel of mrcal, or a folder of them"),
 }
 
 
@@ -113,17 +162,30 @@ def _ends(*suffixes: str) -> Callable[[Path], bool]:
     return lambda path: path.suffix.lower() in suffixes
 
 
-def _is_colmap_name(path: Path) -> bool:
-    return not path.suffix and any(
-        word in part.lower() for part in path.parts[-2:] for word in ("colmap", "sparse")
+def _folder_of(*words: str) -> Callable[[Path], bool]:
+    """A name without suffix that has one of these words, or whose folder has."""
+    return lambda path: not path.suffix and any(
+        word in part.lower() for part in path.parts[-2:] for word in words
     )
+
+
+def _file_of(word: str, *suffixes: str) -> Callable[[Path], bool]:
+    return lambda path: word in path.stem.lower() and path.suffix.lower() in suffixes
+
+
+def _is_named(name: str) -> Callable[[Path], bool]:
+    return lambda path: path.name.lower() == name
+
+
+def _first(write: Callable[[Camera, Path], None]) -> Callable[[Sequence[Camera], Path], None]:
+    """Writes the one camera that there is."""
+    return lambda cameras, path: write(cameras[0], path)
 
 
 def _is_bal_name(path: Path) -> bool:
     return path.suffix.lower() in (".txt", ".bal", *OPENERS)
 
 
-PIXEL_MODELS = ("opencv", "kannala-brandt")
 TARGETS: dict[str, Target] = {
     "ply": Target(_ends(".ply"), write_ply, "NAME.ply"),
     "dxf": Target(_ends(".dxf"), write_dxf, "NAME.dxf"),
@@ -131,23 +193,96 @@ TARGETS: dict[str, Target] = {
     "bundler": Target(_ends(".out"), write_bundler, "NAME.out", ("snavely",)),
     "bal": Target(_is_bal_name, write_bal, "NAME.txt, .bal, .gz, .bz2", ("snavely",)),
     "colmap": Target(
-        _is_colmap_name, partial(fill_colmap, text=False), "a folder with colmap or sparse in its "
-        "name", PIXEL_MODELS, COLMAP_FILES,
+        _folder_of("colmap", "sparse"), partial(fill_colmap, text=False),
+        "a folder with colmap or sparse in its name", COLMAP_MODELS, COLMAP_FILES,
     ),
     "colmap-text": Target(
-        lambda path: False, partial(fill_colmap, text=True), "by --to only", PIXEL_MODELS,
+        lambda path: False, partial(fill_colmap, text=True), "by --to only", COLMAP_MODELS,
         COLMAP_FILES,
+    ),
+    "openmvg": Target(
+        _file_of("sfm_data", ".json"), write_openmvg, "NAME.json with sfm_data in its name",
+        PIXEL_MODELS,
+    ),
+    "opensfm": Target(
+        _folder_of("opensfm"), fill_opensfm, "a folder with opensfm in its name", PIXEL_MODELS,
+        OPENSFM_FILES,
+    ),
+    "transforms": Target(
+        _file_of("transforms", ".json"), write_transforms, "NAME.json with transforms in its name",
+        PIXEL_MODELS, alone=True,
+    ),
+    "kalibr": Target(
+        _file_of("camchain", *YAML), write_kalibr, "NAME.yaml with camchain in its name",
+        KALIBR_MODELS, alone=True,
+    ),
+    "micmac": Target(
+        lambda path: path.name.startswith("Ori-"), fill_micmac, "a folder Ori-NAME",
+        MICMAC_MODELS, MICMAC_FILES,
+    ),
+    "jaicov": Target(_ends(".phc"), write_jaicov, "NAME.phc", ("brown-projected",)),
+    "mrcal": Target(
+        _folder_of("mrcal"), fill_mrcal, "a folder with mrcal in its name", MRCAL_MODELS,
+        MRCAL_FILES, alone=True,
     ),
     "project": Target(
         lambda path: not path.suffix or path.is_dir() or path.name == FILE_NAME, _write_project,
         "another folder", files=PROJECT_FILES,
     ),
 }  # fmt: skip
+CAMERA_KINDS: dict[str, CameraTarget] = {
+    "colmap-cameras": CameraTarget(
+        _is_named("cameras.txt"), write_colmap_cameras, "cameras.txt", COLMAP_MODELS
+    ),
+    "opensfm-cameras": CameraTarget(
+        _is_named("camera_models.json"), write_opensfm_cameras, "camera_models.json", PIXEL_MODELS
+    ),
+    "ros": CameraTarget(
+        _file_of("camera_info", *YAML), _first(write_ros), "NAME.yaml with camera_info in its name",
+        PIXEL_MODELS, one=True,
+    ),
+    "cameramodel": CameraTarget(
+        _ends(".cameramodel"), _first(write_cameramodel), "NAME.cameramodel", MRCAL_MODELS,
+        one=True,
+    ),
+    "autocal": CameraTarget(
+        _file_of("autocal", ".xml"), _first(write_autocal), "NAME.xml with autocal in its name",
+        MICMAC_MODELS, one=True,
+    ),
+    "opencv": CameraTarget(
+        _ends(*YAML, ".json"), _first(write_opencv), "NAME.yaml, .yml, .json", PIXEL_MODELS,
+        one=True, broad=True,
+    ),
+    "cameras": CameraTarget(_ends(".toml"), write_cameras, "NAME.toml", broad=True),
+}
+"""Outputs that hold cameras alone."""
+
+
+def has_model(models: Sequence[str], model: str | CameraModel) -> bool:
+    """Whether a kind of output with these models has one; without any it has all."""
+    return not models or any(isinstance(model, str) and fnmatchcase(model, m) for m in models)
+
+
+def recognised_target(path: Path) -> str | None:
+    """The kind of an output, from its name."""
+    kinds = (
+        *((name, kind) for name, kind in CAMERA_KINDS.items() if not kind.broad),
+        *TARGETS.items(), *CAMERA_KINDS.items(),
+    )  # fmt: skip
+    return next((name for name, kind in kinds if kind.recognises(path)), None)
 
 
 def recognised_format(path: Path) -> str | None:
     """The kind of an input, from its name and content; None where none fits."""
     return next((name for name, kind in FORMATS.items() if kind.recognises(path)), None)
+
+
+def read_oriented(path: str | Path) -> Network:
+    """The network of an input in any known format; of a project cameras and images are enough.
+
+    **Raises:** `InputError`."""
+    is_project = os.path.exists(path) and recognised_format(Path(path)) == "project"
+    return read_project(path, oriented=True) if is_project else read_network(path)
 
 
 def read_network(

@@ -67,6 +67,38 @@ def made(kind: str, folder: Path) -> Path:
 
             text = xml(transform=True).replace("<b1>", "<b2>2.5</b2><b1>")
             (folder / "cameras.xml").write_text(text.replace("<calibration", PIXEL, 1))
+        case "openmvg":
+            from test_openmvg import scene
+
+            (folder / "sfm_data.json").write_text(json.dumps(scene(), indent=1))
+        case "opensfm":
+            from test_opensfm import files, write
+
+            write(folder, *files(gps=True))
+        case "transforms":
+            from test_transforms import OPENCV, frames
+
+            document = {**OPENCV, "frames": frames(k1=0.1)}
+            (folder / "transforms.json").write_text(json.dumps(document, indent=1))
+        case "kalibr":
+            from test_kalibr import chain
+
+            text = chain(("pinhole", "radtan"), ("pinhole", "equi"))
+            (folder / "camchain.yaml").write_text(text)
+        case "mrcal":
+            from test_mrcal import model
+
+            (folder / "left.cameramodel").write_text(model("OPENCV8"))
+        case "micmac":
+            from test_micmac import folder as oriented
+
+            for file in oriented(folder).iterdir():
+                file.rename(folder / file.name)
+            (folder / "Ori-Test").rmdir()
+        case "jaicov":
+            from test_jaicov import write
+
+            write(folder)
         case "column-map":
             from test_column_map import write
 
@@ -101,10 +133,12 @@ def read(kind: str, folder: Path):
             return [camera for camera, _ in read_calibrated(folder / "result.json")]
         case "colmap-text":
             return read_network(folder, "colmap")
-        case "colmap" | "project" | "bingo":
+        case "colmap" | "project" | "bingo" | "opensfm" | "micmac":
             return read_network(folder, kind)
         case "column-map":
             return read_network(folder / "map.toml", kind)
+        case "jaicov":
+            return read_network(folder / "project.phc", kind)
         case _:
             (file,) = (p for p in folder.iterdir() if p.name != "list.txt")
             settings = ["sigma_image=1"] if kind == "photo-list" else []
@@ -113,7 +147,8 @@ def read(kind: str, folder: Path):
 
 
 KINDS = ("colmap", "colmap-text", "bal", "bundler", "project", "photo-list", "opencv", "json",
-         "photomodeler", "bingo", "metashape", "column-map", "camera-stack", "result")  # fmt: skip
+         "photomodeler", "bingo", "metashape", "openmvg", "opensfm", "transforms", "kalibr",
+         "mrcal", "micmac", "jaicov", "column-map", "camera-stack", "result")  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", KINDS)

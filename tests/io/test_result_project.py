@@ -49,4 +49,5 @@ def test_it_is_written_with_the_result_and_read_from_its_folder(convergent4, tmp
     with pytest.raises(jaxbundle.InputError, match="part of the input and would be overwritten"):
         check_targets(tmp_path / "network" / "project.toml", network, "", tmp_path)
     write_targets(jaxbundle.NotSolvedError("why"), "", tmp_path, brief=True, plots=False)
-    assert {p.name for p in tmp_path.iterdir()} == {".jaxbundle", "report.txt", "result.json"}
+    left = {".jaxbundle", "report.txt", "report.html", "result.json"}
+    assert {p.name for p in tmp_path.iterdir()} == left

@@ -6,7 +6,11 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.cameras.opencv_file import is_opencv
+from jaxbundle.io.cameras.camera_files import is_camera_file
+from jaxbundle.io.cameras.kalibr_results import is_kalibr_results, read_kalibr_results
+from jaxbundle.io.networks.openmvg import is_openmvg
+from jaxbundle.io.networks.opensfm import is_opensfm
+from jaxbundle.io.networks.transforms import is_transforms
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.network.build import make_cameras
 from jaxbundle.network.tables import Camera
@@ -17,8 +21,11 @@ Calibrated = tuple[Camera, tuple[list[str], Float[np.ndarray, "k k"]]]
 
 
 def is_result(path: Path) -> bool:
-    """Whether a file may be the result of an adjustment or a calibration."""
-    return path.suffix.lower() == ".json" and path.is_file() and not is_opencv(path)
+    """Whether a file may be the result of an adjustment or a calibration, ours or of Kalibr."""
+    return is_kalibr_results(path) or (
+        path.suffix.lower() == ".json" and path.is_file() and not is_camera_file(path)
+        and not any(recognises(path) for recognises in (is_openmvg, is_opensfm, is_transforms))
+    )  # fmt: skip
 
 
 def read_calibrated(path: str | Path) -> list[Calibrated]:
@@ -26,6 +33,8 @@ def read_calibrated(path: str | Path) -> list[Calibrated]:
 
     **Raises:** `InputError` where it is not solved, or entries are missing or wrong.
     """
+    if is_kalibr_results(Path(path)):
+        return read_kalibr_results(path)
     try:
         document = parse_json(path, read_text(Path(path)))
         if document["converged"] is not True:

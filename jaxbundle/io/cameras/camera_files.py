@@ -5,6 +5,8 @@
 | `.yaml`, `.yml`, `.json` of OpenCV | its camera | one, of model `opencv` or `kannala-brandt` |
 | `.toml` with `[[camera]]` entries, a project file among them | its cameras | all cameras |
 | `cameras.txt`, `cameras.bin` of COLMAP | its cameras | all, as `cameras.txt` |
+| `camera_models.json` of OpenSfM | its cameras | all |
+| `AutoCal….xml` of MicMac | its camera | one, of model `opencv`, `brown`, `brown-projected` |
 | any input of `jaxbundle adjust` | its cameras | |
 """
 
@@ -16,6 +18,8 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.opencv_file import is_opencv, read_opencv
 from jaxbundle.io.networks.colmap import read_colmap_cameras
 from jaxbundle.io.networks.column_map import is_column_map
+from jaxbundle.io.networks.micmac_camera import is_autocal, read_autocal
+from jaxbundle.io.networks.opensfm import is_opensfm_cameras, read_opensfm_cameras
 from jaxbundle.io.networks.project import cameras_text
 from jaxbundle.io.text.csv_tables import read_toml, write_text
 from jaxbundle.network.build import make_cameras
@@ -24,8 +28,8 @@ from jaxbundle.network.tables import Camera
 
 COLMAP_FILES = ("cameras.txt", "cameras.bin")
 LOOKS = (
-    "OpenCV's .yaml, .yml or .json; a .toml with [[camera]] entries; cameras.txt or cameras.bin of "
-    "COLMAP"
+    "OpenCV's or ROS's .yaml, .yml or .json; a .toml with [[camera]] entries; cameras.txt or "
+    "cameras.bin of COLMAP; camera_models.json of OpenSfM; AutoCal….xml of MicMac"
 )
 """Camera files in words."""
 
@@ -34,8 +38,9 @@ def is_camera_file(path: Path) -> bool:
     """Whether a file holds cameras and nothing else."""
     if path.name.lower() in COLMAP_FILES and path.is_file():
         return True
-    return is_opencv(path) or (_is_toml(path) and not is_column_map(path) and
-                               "project" not in read_toml(path))  # fmt: skip
+    if _is_toml(path):
+        return not is_column_map(path) and "project" not in read_toml(path)
+    return is_opencv(path) or is_opensfm_cameras(path) or is_autocal(path)
 
 
 def read_cameras(path: str | Path, models: Sequence[CameraModel] = ()) -> tuple[Camera, ...]:
@@ -56,7 +61,9 @@ def read_cameras(path: str | Path, models: Sequence[CameraModel] = ()) -> tuple[
         if not isinstance(cameras, list) or not all(isinstance(c, dict) for c in cameras):
             raise InputError(f"{path}: write [[camera]] in double brackets, one for each camera")
         return make_cameras(cameras, f"{path}, ", models)
-    return (read_opencv(path),)
+    if is_opensfm_cameras(path):
+        return read_opensfm_cameras(path)
+    return (read_autocal(path) if is_autocal(path) else read_opencv(path),)
 
 
 def write_cameras(cameras: Sequence[Camera], path: str | Path) -> None:

@@ -44,13 +44,15 @@ from jaxbundle.cameras.model import project
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.nearest_camera import FittedCamera, Foreign, fitted_camera
 from jaxbundle.io.networks.assemble import all_parameters
+from jaxbundle.io.networks.losses import size_of, the_rest_is_0
 from jaxbundle.io.text.csv_tables import read_text, write_text
 from jaxbundle.network.columns import shown
 from jaxbundle.network.rules import check_camera
 from jaxbundle.network.tables import Camera
-from jaxbundle.system.file_content import is_plain, parse_json
+from jaxbundle.system.file_content import beginning, parse_json
 
-SUFFIXES = (".yaml", ".yml", ".json")
+YAML = (".yaml", ".yml")
+SUFFIXES = (*YAML, ".json")
 MATRIX = ("camera_matrix", "cameraMatrix", "K")
 COEFFICIENTS = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "D")
 ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
@@ -63,10 +65,7 @@ _INNER = re.compile(r"\s+([A-Za-z_]\w*)\s*:\s*(.*)")
 
 def is_opencv(path: Path) -> bool:
     """Whether a file has a name of this kind and mentions a camera matrix."""
-    if path.suffix.lower() not in SUFFIXES or not is_plain(path):
-        return False
-    with path.open("rb") as file:
-        text = file.read(1_000_000)
+    text = beginning(path, 1_000_000) if path.suffix.lower() in SUFFIXES else b""
     return any(re.search(rb"^[\s{]*\"?%s\"?\s*:" % name.encode(), text, re.M) for name in MATRIX)
 
 
@@ -174,14 +173,40 @@ def write_opencv(camera: Camera, path: str | Path) -> None:
     write_text(path, opencv_text(camera, path.suffix.lower() == ".json"))
 
 
-def _as_yaml(entries: Mapping) -> str:
-    lines = ["%YAML:1.0", "---"]
+def ros_text(camera: Camera) -> str:
+    """The text of a camera_info file of ROS for a camera of model `opencv` or `kannala-brandt`.
+
+    **Raises:** `InputError` for another model, a thin prism, and without image size.
+    """
+    fisheye = camera.model == "kannala-brandt"
+    names = ("k1", "k2", "k3", "k4") if fisheye else ORDER[:8]
+    p, (w, h) = the_rest_is_0(camera, "ROS", names), size_of(camera, "ROS")
+    rational = any(p[name] for name in names[5:])
+    kind = "equidistant" if fisheye else "rational_polynomial" if rational else "plumb_bob"
+    values = [p[name] for name in (names if fisheye or rational else names[:5])]
+    K = [p["fx"], 0.0, p["cx"], 0.0, p["fy"], p["cy"], 0.0, 0.0, 1.0]
+    P = [*K[:3], 0.0, *K[3:6], 0.0, *K[6:], 0.0]
+    return _as_yaml({
+        "image_width": w, "image_height": h, "camera_name": camera.id, "camera_matrix": (3, 3, K),
+        "distortion_model": kind, "distortion_coefficients": (1, len(values), values),
+        "rectification_matrix": (3, 3, np.eye(3).ravel()), "projection_matrix": (3, 4, P),
+    }, ros=True)  # fmt: skip
+
+
+def write_ros(camera: Camera, path: str | Path) -> None:
+    """Write a camera as ROS's camera_info, in YAML."""
+    write_text(Path(path), ros_text(camera))
+
+
+def _as_yaml(entries: Mapping, ros: bool = False) -> str:
+    lines = [] if ros else ["%YAML:1.0", "---"]
+    tag, dt = ("", []) if ros else (" !!opencv-matrix", ["   dt: d"])
     for key, value in entries.items():
         if isinstance(value, tuple):
             rows, columns, data = value
             numbers = ", ".join(map(repr, map(float, data)))
-            lines += [f"{key}: !!opencv-matrix", f"   rows: {rows}", f"   cols: {columns}",
-                      "   dt: d", f"   data: [ {numbers} ]"]  # fmt: skip
+            lines += [f"{key}:{tag}", f"   rows: {rows}", f"   cols: {columns}", *dt,
+                      f"   data: [ {numbers} ]"]  # fmt: skip
         else:
             lines.append(f"{key}: {json.dumps(value)}")
     return "\n".join(lines) + "\n"
@@ -285,7 +310,7 @@ def _coefficients(path: Path, entries: Mapping) -> list[float]:
 
 
 def _image_size(path: Path, entries: Mapping) -> tuple[int, int] | None:
-    given = [entries.get(name) for name in ("image_width", "image_height")]
+    given = [entries.get(f"image_{n}", entries.get(n)) for n in ("width", "height")]
     if given == [None, None]:
         size = entries.get("image_size", entries.get("image_Size"))
         if size is None:

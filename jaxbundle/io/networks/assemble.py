@@ -82,6 +82,16 @@ def _without_points(cameras: Sequence[Camera], images: Columns, project: Mapping
     ).warn("there are no image points: nothing can be adjusted")  # fmt: skip
 
 
+def network_of_cameras(cameras: Sequence[Camera], where: str) -> Network:
+    """Cameras with an image each, called as they are, at the origin and not turned."""
+    names, none = [camera.id for camera in cameras], np.zeros((len(cameras), 3, 3))
+    images = image_columns(
+        Source(where, None, "camera"), names, names, none + np.eye(3), none[:, 0]
+    )
+    project = {"datum": "inner", "residuals": "measured", "object_unit": "model"}
+    return _without_points(cameras, images, project).replace(warnings=())
+
+
 def image_columns(
     source: Source,
     ids: Sequence,
@@ -93,6 +103,13 @@ def image_columns(
     values = np.concatenate([np.reshape(X0, (-1, 3)), angles_of(M)], 1)
     columns = {"id": ids, "camera": cameras, **dict(zip(EXTERIOR, values.T))}
     return Columns(columns, source)
+
+
+def entry_of(camera: Camera) -> dict:
+    """A camera as an entry of a document."""
+    sizes = {"image_size": camera.image_size, "pixel_size": camera.pixel_size}
+    tie = {"tie": camera.tie} if camera.tie else {}
+    return {"id": camera.id, "model": camera.model, **sizes, **tie, **camera.parameters}
 
 
 def all_parameters(camera: Camera) -> dict[str, float]:

@@ -26,26 +26,22 @@ from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import bundler_pose, exterior_from_bundler
 from jaxbundle.io.networks.assemble import all_parameters, assemble, foreign_document, image_columns
 from jaxbundle.io.networks.losses import need_values, what_is_lost
-from jaxbundle.io.networks.poses import matrices_of
+from jaxbundle.io.networks.poses import check_rotations, matrices_of
 from jaxbundle.io.text.csv_tables import read_text
-from jaxbundle.io.text.rows import Row, Rows
+from jaxbundle.io.text.rows import Rows
 from jaxbundle.io.writing.replacing import replaced_files
 from jaxbundle.network.columns import Columns, count, some
 from jaxbundle.network.tables import Network, Source
+from jaxbundle.system.file_content import beginning
 
 HEAD = "# Bundle file v0.3"
 LIST = "list.txt"
 FREE = ["f", "k1", "k2"]
-ORTHOGONAL = 1e-4
-"""How far R·Rᵀ may be from the identity: files have six digits or so."""
 
 
 def is_bundler(path: Path) -> bool:
     """Whether a file begins as Bundler's output does."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(13) == b"# Bundle file"
+    return beginning(path, 13) == b"# Bundle file"
 
 
 def read_bundler(path: str | Path, overrides: Sequence[str] = ()) -> Network:
@@ -107,14 +103,9 @@ def _cameras(rows: Rows, number: int):
         R.append(np.array(matrix))
         t.append(rows.take(f"t of {thing}").numbers(["t"] * 3))
         if interior[-1][0] != 0:
-            _check_rotation(row, R[-1], thing)
+            check_rotations(R[-1], f"{row.place}: R of {thing}")
     return (np.array(interior).reshape(-1, 3), np.array(R).reshape(-1, 3, 3),
             np.array(t).reshape(-1, 3), np.array(lines, np.int64))  # fmt: skip
-
-
-def _check_rotation(row: Row, R, thing: str) -> None:
-    if abs(R @ R.T - np.eye(3)).max() > ORTHOGONAL or np.linalg.det(R) < 0:
-        raise row.error(f"R of {thing} is not a rotation matrix")
 
 
 def _points(rows: Rows, number: int, cameras: int):

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.cameras.nearest_camera import NoPlaceError
 from jaxbundle.io.networks.colmap_binary import binary_files, read_binary_cameras, read_binary_model
 from jaxbundle.io.networks.colmap_model import from_network, numbers_of, to_network
 from jaxbundle.io.networks.colmap_text import (
@@ -54,16 +53,11 @@ def read_colmap(path: str | Path, overrides: Sequence[str] = ()) -> Network:
 def read_colmap_cameras(path: str | Path) -> tuple[Camera, ...]:
     """The cameras of a cameras.bin or cameras.txt, called by number.
 
-    **Raises:** `InputError`; for a camera that none of ours comes near too.
+    **Raises:** `InputError`.
     """
     path = Path(path)
     read = read_binary_cameras if path.suffix.lower() == ".bin" else read_text_cameras
-    cameras = []
-    for camera in read(path).values():
-        if isinstance(camera, NoPlaceError):
-            raise camera
-        cameras.append(camera)
-    return tuple(cameras)
+    return tuple(read(path).values())
 
 
 def write_colmap_cameras(cameras: Sequence[Camera], path: str | Path) -> None:
@@ -77,7 +71,7 @@ def write_colmap(
 ) -> tuple[str, ...]:
     """Write a sparse model into a folder.
 
-    Cameras must be of model `opencv` or `kannala-brandt` and have an image size.
+    Cameras must be of one of `COLMAP_MODELS` and have an image size.
 
     **Arguments:** `force`: replace a model that this function has not written, in either form.
 

@@ -16,24 +16,22 @@ from pathlib import Path
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.cameras.nearest_camera import NoPlaceError
 from jaxbundle.io.networks.colmap_model import (
     ColmapImage,
     ColmapModel,
     check_unique,
-    model_of,
     rows_of_points,
     tracks,
 )
 from jaxbundle.io.networks.colmap_models import (
     MODELS,
     NAMES,
-    camera_or_why_not,
+    from_colmap,
     parameter_names,
-    size_of,
     to_colmap,
 )
 from jaxbundle.io.networks.colmap_text import GREY
+from jaxbundle.io.networks.losses import size_of
 from jaxbundle.network.tables import Camera, Source
 from jaxbundle.system.file_content import read_content
 
@@ -99,11 +97,11 @@ def read_binary_model(folder: Path) -> ColmapModel:
     cameras = read_binary_cameras(folder / "cameras.bin")
     images = _images(folder / "images.bin")
     ids, points, source = _points(folder / "points3D.bin", {image.id for image in images})
-    return model_of(cameras, images, ids, points, source)
+    return ColmapModel(cameras, images, ids, points, source)
 
 
-def read_binary_cameras(path: Path) -> dict[int, Camera | NoPlaceError]:
-    """The cameras of a cameras.bin by number, or why one has no place."""
+def read_binary_cameras(path: Path) -> dict[int, Camera]:
+    """The cameras of a cameras.bin by number."""
     file, cameras = _Bytes(path), {}
     for k in range(file.count("cameras", 24)):
         file.what = f"camera {k + 1}"
@@ -114,7 +112,7 @@ def read_binary_cameras(path: Path) -> dict[int, Camera | NoPlaceError]:
         values = file.numbers(len(parameter_names(name, file.error)), "parameters")
         if not (0 < width < 10**9 and 0 < height < 10**9):
             raise file.error(f"the image size {width} × {height} is impossible")
-        cameras[id] = camera_or_why_not(str(id), name, (width, height), values, f"{path}, ")
+        cameras[id] = from_colmap(str(id), name, (width, height), values)
     file.end()
     return cameras
 
@@ -168,7 +166,7 @@ def binary_files(model: ColmapModel) -> dict[str, bytes]:
     """The three binary files by name."""
     cameras = [struct.pack("<Q", len(model.cameras))]
     for number, camera in model.cameras.items():
-        (name, values), (width, height) = to_colmap(camera), size_of(camera)
+        (name, values), (width, height) = to_colmap(camera), size_of(camera, "COLMAP")
         head = struct.pack("<IiQQ", number, MODELS[name][0], width, height)
         cameras.append(head + np.array(values, "<f8").tobytes())
     images = [struct.pack("<Q", len(model.images))]

@@ -7,7 +7,7 @@ whole pose in `images`; without them COLMAP makes trivial ones.
 """
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +15,7 @@ from jaxtyping import Float, Int
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import cv_pose, exterior_from_cv
-from jaxbundle.io.cameras.nearest_camera import NoPlaceError, fits_told
-from jaxbundle.io.networks.assemble import assemble, foreign_document, image_columns
+from jaxbundle.io.networks.assemble import assemble, entry_of, foreign_document, image_columns
 from jaxbundle.io.networks.colmap_models import HALF, to_colmap
 from jaxbundle.io.networks.losses import need_values, what_is_lost
 from jaxbundle.io.networks.poses import matrices_of, matrices_of_quaternions, quaternions_of
@@ -45,10 +44,7 @@ class ColmapImage:
 
 @dataclasses.dataclass(frozen=True)
 class ColmapModel:
-    """The contents of `cameras`, `images` and `points3D`; `errors` of points: only written.
-
-    `no_place` says why of the cameras that have none here.
-    """
+    """The contents of `cameras`, `images` and `points3D`; `errors` of points: only written."""
 
     cameras: dict[int, Camera]
     images: Sequence[ColmapImage]
@@ -56,14 +52,6 @@ class ColmapModel:
     points: Float[np.ndarray, "points 3"]
     points_source: Source
     errors: Float[np.ndarray, " points"] | None = None
-    no_place: Mapping[int, NoPlaceError] = dataclasses.field(default_factory=dict)
-
-
-def model_of(cameras: Mapping[int, Camera | NoPlaceError], *rest) -> ColmapModel:
-    """The contents of the three files, with what was read of the cameras."""
-    known = {k: c for k, c in cameras.items() if not isinstance(c, NoPlaceError)}
-    lost = {k: c for k, c in cameras.items() if isinstance(c, NoPlaceError)}
-    return ColmapModel(known, *rest, no_place=lost)
 
 
 def rows_of_points(model: ColmapModel) -> Iterator[tuple[int, np.ndarray, float]]:
@@ -83,8 +71,7 @@ def check_unique(ids: Sequence[int], place, thing: str) -> None:
 def to_network(path: Path, model: ColmapModel, overrides: Sequence[str]) -> Network:
     """The network of a sparse model; cameras are called by number, images by name.
 
-    Nothing of the cameras is free, σ is 1 px, the datum inner. Images of a camera that has no place
-    here are left out.
+    Nothing of the cameras is free, σ is 1 px, the datum inner.
 
     **Raises:** `InputError` for ids that are not there.
     """
@@ -92,15 +79,13 @@ def to_network(path: Path, model: ColmapModel, overrides: Sequence[str]) -> Netw
     if not images:
         raise InputError(f"{path}: the model has no images")
     for image in images:
-        if image.camera not in model.cameras and image.camera not in model.no_place:
+        if image.camera not in model.cameras:
             raise InputError(
                 f"{image.place}: image {image.name!r} has the camera {image.camera}, which is "
                 "not in cameras"
             )
         if not np.any(image.q):
             raise InputError(f"{image.place}: image {image.name!r}: the quaternion is 0")
-    model, told = _with_place(path, model)
-    images = model.images
     names = [image.name for image in images]
     if len(set(names)) < len(names):
         twice = next(name for k, name in enumerate(names) if name in names[:k])
@@ -111,7 +96,7 @@ def to_network(path: Path, model: ColmapModel, overrides: Sequence[str]) -> Netw
     numbers = np.arange(1, len(images) + 1)
     return assemble(
         path,
-        foreign_document(path.resolve().name, [_entry(c) for c in model.cameras.values()]),
+        foreign_document(path.resolve().name, map(entry_of, model.cameras.values())),
         overrides,
         image_columns(
             Source(str(path), numbers, "image"), names, [i.camera for i in images], M, X0
@@ -120,27 +105,8 @@ def to_network(path: Path, model: ColmapModel, overrides: Sequence[str]) -> Netw
             {"id": model.point_ids, "role": ["tie"] * len(model.points),
              **dict(zip("XYZ", model.points.T))}, model.points_source,
         ),
-        observed, (*told, *warnings, *fits_told(model.cameras.values())),
+        observed, warnings,
     )  # fmt: skip
-
-
-def _with_place(path: Path, model: ColmapModel) -> tuple[ColmapModel, list[str]]:
-    """The model without cameras that have no place here and their images, and what to tell."""
-    images = [image for image in model.images if image.camera in model.cameras]
-    told = []
-    for number, error in model.no_place.items():
-        if not images:
-            raise error
-        lost = [image.name for image in model.images if image.camera == number]
-        why = str(error).removeprefix(f"{path}/")
-        told.append(f"{why}; left out {count(len(lost), 'image')}: {some(lost)}")
-    return dataclasses.replace(model, images=images), told
-
-
-def _entry(camera: Camera) -> dict:
-    sizes = {"image_size": camera.image_size, "pixel_size": camera.pixel_size}
-    tie = {"tie": camera.tie} if camera.tie else {}
-    return {"id": camera.id, "model": camera.model, **sizes, **tie, **camera.parameters}
 
 
 def _observations(path: Path, model: ColmapModel):

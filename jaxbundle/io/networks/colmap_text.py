@@ -14,21 +14,19 @@ from pathlib import Path
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.cameras.nearest_camera import NoPlaceError
 from jaxbundle.io.networks.colmap_model import (
     ColmapImage,
     ColmapModel,
     check_unique,
-    model_of,
     rows_of_points,
     tracks,
 )
 from jaxbundle.io.networks.colmap_models import (
-    camera_or_why_not,
+    from_colmap,
     parameter_names,
-    size_of,
     to_colmap,
 )
+from jaxbundle.io.networks.losses import size_of
 from jaxbundle.io.text.rows import Row, Rows
 from jaxbundle.network.tables import Camera, Source
 
@@ -41,12 +39,12 @@ def read_text_model(folder: Path) -> ColmapModel:
     cameras = read_text_cameras(folder / "cameras.txt")
     images = _images(folder / "images.txt")
     ids, points, source = _points(folder / "points3D.txt", {image.id for image in images})
-    return model_of(cameras, images, ids, points, source)
+    return ColmapModel(cameras, images, ids, points, source)
 
 
-def read_text_cameras(path: Path) -> dict[int, Camera | NoPlaceError]:
-    """The cameras of a cameras.txt by number, or why one has no place."""
-    cameras: dict[int, Camera | NoPlaceError] = {}
+def read_text_cameras(path: Path) -> dict[int, Camera]:
+    """The cameras of a cameras.txt by number."""
+    cameras: dict[int, Camera] = {}
     for row in Rows(path, "#"):
         number = row.whole(0, "CAMERA_ID")
         if number in cameras:
@@ -54,8 +52,8 @@ def read_text_cameras(path: Path) -> dict[int, Camera | NoPlaceError]:
         model = row.words[1] if len(row) > 1 else ""
         names = parameter_names(model, row.error)
         size = [row.whole(k, what, 1) for k, what in ((2, "WIDTH"), (3, "HEIGHT"))]
-        values, where = row.numbers(names, 4), f"{path}, line {row.number}: "
-        cameras[number] = camera_or_why_not(str(number), model, size, values, where)
+        values = row.numbers(names, 4)
+        cameras[number] = from_colmap(str(number), model, size, values)
     return cameras
 
 
@@ -134,7 +132,7 @@ def camera_lines(cameras: Mapping[int, Camera]) -> list[str]:
     """The lines of a cameras.txt."""
     lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     for number, camera in cameras.items():
-        (name, values), (width, height) = to_colmap(camera), size_of(camera)
+        (name, values), (width, height) = to_colmap(camera), size_of(camera, "COLMAP")
         lines.append(f"{number} {name} {width} {height} {_join(values)}")
     return lines
 

@@ -49,7 +49,7 @@ import numpy as np
 from jaxbundle import geometry
 from jaxbundle.cameras import CameraModel
 from jaxbundle.errors import InputError
-from jaxbundle.io.networks.poses import angles_of, batched
+from jaxbundle.io.networks.poses import angles_of, are_rotations, batched
 from jaxbundle.io.networks.settings import SETTINGS, TABLES, apply_overrides, network_of
 from jaxbundle.io.text.csv_tables import read_toml
 from jaxbundle.io.text.rows import Rows
@@ -70,7 +70,6 @@ ROTATIONS: dict[str, tuple[tuple[str, ...], Callable | None]] = {
     "azimuth-tilt-swing": (("azimuth", "tilt", "swing"), geometry.matrix_from_azimuth_tilt_swing),
     "matrix": (MATRIX, None),
 }
-ORTHOGONAL = 1e-4
 
 
 def is_column_map(path: Path) -> bool:
@@ -209,8 +208,7 @@ def _rotated(where: str, entry: Mapping, columns: Columns, radians: float) -> Co
     given = np.stack([columns.numbers(name, required=True) for name in names], 1)
     if formula is None:
         M = given.reshape(-1, 3, 3)
-        bad = np.abs(M @ M.mT - np.eye(3)).max((1, 2)) > ORTHOGONAL
-        for row in np.flatnonzero(bad | (np.linalg.det(M) < 0))[:1]:
+        for row in np.flatnonzero(~are_rotations(M))[:1]:
             raise InputError(f"{columns.source(row)}: m11 … m33 are not a rotation matrix")
     else:
         M = batched(formula, given * radians, (3,), (3, 3))

@@ -1,9 +1,16 @@
 """What a writer needs of a network, and what its format has no place for."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.network.tables import Network
+from jaxbundle.io.networks.assemble import all_parameters
+from jaxbundle.network.tables import Camera, Network
+
+PIXEL_MODELS = ("opencv", "kannala-brandt")
+"""What formats of computer vision have in common."""
+CORE = ("fx", "fy", "cx", "cy")
 
 
 def need_values(network: Network, model: str = "", format: str = "", points: bool = True) -> None:
@@ -53,3 +60,43 @@ def what_is_lost(
 
 def _numbered(*ids) -> bool:
     return all(list(names) == [str(k) for k in range(len(names))] for names in ids)
+
+
+def the_rest_is_0(camera: Camera, format: str, coefficients: Sequence[str]) -> dict[str, float]:
+    """All parameters of a camera of one of the `PIXEL_MODELS`, of which a format has some
+    coefficients.
+
+    **Raises:** `InputError` for another model, and for a coefficient that it has not.
+    """
+    where = f"camera {camera.id!r}: {format} has no"
+    if camera.model not in PIXEL_MODELS:
+        raise InputError(f"{where} model {str(camera.model)!r}; convert it with --model opencv")
+    p = all_parameters(camera)
+    rest = [name for name, value in p.items()
+            if value and name not in (*CORE, *coefficients)]  # fmt: skip
+    if rest:
+        raise InputError(f"{where} {', '.join(rest)}; adjust the camera without")
+    return p
+
+
+def one_focal_length(camera: Camera, format: str) -> float:
+    """fx, which must be fy.
+
+    **Raises:** `InputError`.
+    """
+    p = all_parameters(camera)
+    if p["fx"] != p["fy"]:
+        raise InputError(
+            f"camera {camera.id!r}: {format} has one focal length, but fx is {p['fx']:.9g} and fy "
+            f'{p["fy"]:.9g}; adjust the camera with tie = [["fx", "fy"]]'
+        )
+    return p["fx"]
+
+
+def size_of(camera: Camera, format: str) -> tuple[int, int]:
+    """The size of its images.
+
+    **Raises:** `InputError` without one."""
+    if camera.image_size is None:
+        raise InputError(f"camera {camera.id!r}: {format} needs the image size; give image_size")
+    return camera.image_size

@@ -38,13 +38,13 @@ from jaxbundle.io.networks.metashape_camera import (
     numbers_of,
     sensor_camera,
 )
+from jaxbundle.io.networks.poses import check_rotations
 from jaxbundle.io.text.csv_tables import read_text
 from jaxbundle.io.text.xml_fields import number_in
 from jaxbundle.network.columns import Columns, count, some
 from jaxbundle.network.tables import Network, Points, Source
+from jaxbundle.system.file_content import beginning
 
-ROTATION = 1e-4
-"""How far a rotation may be from orthogonal: files have six digits or more."""
 LEAST_CONTROL = 3
 ACCURACY = 0.005
 """Metashape's own σ of markers, where a file has none."""
@@ -53,10 +53,7 @@ LOCAL = "LOCAL_CS"
 
 def is_metashape(path: Path) -> bool:
     """Whether an XML file begins with a `document` that has a `chunk`."""
-    if path.suffix.lower() != ".xml" or not path.is_file():
-        return False
-    with path.open("rb") as file:
-        head = file.read(4000)
+    head = beginning(path, 4000) if path.suffix.lower() == ".xml" else b""
     return b"<document" in head and b"<chunk" in head
 
 
@@ -164,8 +161,7 @@ def _pose(where: str, camera: ET.Element, chunk: ET.Element):
         t = numbers_of(f"{of}, translation", transform.findtext("translation"), 3)
         scale = number_in(transform.findtext("scale", ""), f"{of}, scale")
         to_chunk, centre = R @ to_chunk, scale * (R @ centre) + t
-    if abs(to_chunk @ to_chunk.T - np.eye(3)).max() > ROTATION or np.linalg.det(to_chunk) < 0:
-        raise InputError(f"{where}: the transform is not a rotation and a shift")
+    check_rotations(to_chunk, f"{where}: the transform")
     return flip_rows(to_chunk.T), centre
 
 

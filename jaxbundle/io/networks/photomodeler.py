@@ -62,6 +62,7 @@ from jaxbundle.io.networks.settings import apply_overrides
 from jaxbundle.io.text.rows import Row, Rows
 from jaxbundle.network.columns import Columns, count, some
 from jaxbundle.network.tables import Network, Source
+from jaxbundle.system.file_content import beginning
 
 TITLE = "Bundle Soln"
 OUTER = ("X", "Y", "Z", "kappa", "phi", "omega")
@@ -71,10 +72,8 @@ RAY = ("u", "v", "σu", "σv")
 
 def is_photomodeler(path: Path) -> bool:
     """Whether a text file begins as the export does."""
-    if path.suffix.lower() != ".txt" or not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(100).removeprefix(b"\xef\xbb\xbf").lstrip().startswith(TITLE.encode())
+    head = beginning(path, 100) if path.suffix.lower() == ".txt" else b""
+    return head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(TITLE.encode())
 
 
 def read_photomodeler(path: str | Path, overrides: Sequence[str] = ()) -> Network:

@@ -7,12 +7,15 @@ from functools import partial
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxbundle import geometry
+from jaxbundle.errors import InputError
 from jaxbundle.float64 import local_x64
 
 AT_ONCE = 256
+ORTHOGONAL = 1e-4
+"""How far R·Rᵀ of a file may be from the identity: they have six digits or so."""
 
 Matrices = Float[np.ndarray, "images 3 3"]
 Triples = Float[np.ndarray, "images 3"]
@@ -47,6 +50,20 @@ def rotation_vectors_of(M: Matrices) -> Triples:
 def matrices_of_rotation_vectors(v: Triples) -> Matrices:
     """M = exp([v]×)."""
     return batched(geometry.matrix_from_rotation_vector, v, (3,), (3, 3))
+
+
+def are_rotations(R: Float[np.ndarray, "*images 3 3"]) -> Bool[np.ndarray, "*images"]:
+    """Which matrices of a file are rotations."""
+    off = np.abs(R @ R.mT - np.eye(3)).max((-2, -1))
+    return np.asarray((off <= ORTHOGONAL) & (np.linalg.det(R) > 0))
+
+
+def check_rotations(R: Float[np.ndarray, "*images 3 3"], where: str) -> None:
+    """Refuse what is no rotation matrix.
+
+    **Raises:** `InputError` beginning with `where`."""
+    if not are_rotations(R).all():
+        raise InputError(f"{where} is not a rotation matrix")
 
 
 @partial(jax.jit, static_argnums=0)

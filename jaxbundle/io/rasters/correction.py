@@ -8,6 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from jaxbundle.choices import Resampling
 from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.map_blocks import write_map
 from jaxbundle.io.rasters.maps import MapGrid, MapSystem, contiguous, grid_around
@@ -16,7 +17,7 @@ from jaxbundle.pushbroom.correct import BLOCK, block_places
 from jaxbundle.pushbroom.image import PushbroomImage
 from jaxbundle.pushbroom.locate import locate_lines
 from jaxbundle.pushbroom.project import Search
-from jaxbundle.pushbroom.resample import Resampling, resample
+from jaxbundle.pushbroom.resample import resample
 from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.pushbroom.terrain import Terrain
 

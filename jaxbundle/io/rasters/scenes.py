@@ -7,13 +7,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbundle.choices import Resampling
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import Ellipsoid
 from jaxbundle.io.rasters.maps import MapSystem
 from jaxbundle.io.rasters.reading import as_type, open_plain, rasterio, unreadable
 from jaxbundle.io.rasters.writing import written_raster
 from jaxbundle.pushbroom.image import PushbroomImage
-from jaxbundle.pushbroom.resample import Resampling
 from jaxbundle.pushbroom.simulate import taken_image
 from jaxbundle.pushbroom.surfaces import Surface
 

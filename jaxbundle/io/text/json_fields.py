@@ -1,5 +1,7 @@
-"""Fields of a JSON document, asked for by their path; what is wrong is said with file and field."""
+"""Fields of a JSON document, or of another of the same parts (YAML, a Python dictionary), asked for
+by their path; what is wrong is said with file and field."""
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +42,7 @@ class JsonFields:
             raise InputError(f"{self.path}: {key} is missing")
         try:
             array = np.array(value, float)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             array = np.array(np.nan)
         fits = array.ndim == len(shape) and all(
             n in (None, m) for n, m in zip(shape, array.shape)
@@ -51,9 +53,73 @@ class JsonFields:
             raise InputError(f"{self.path}: {key} is {shown(value)}; {kind} is expected")
         return array
 
+    def whole(self, key: str, default: int | None = None, least: int = 0) -> int:
+        """A whole number that is not less than `least`."""
+        value = self.number(key, default)
+        if not (value.is_integer() and least <= value < 2**53):
+            raise InputError(
+                f"{self.path}: {key} is {value:g}; a whole number from {least} is expected"
+            )
+        return int(value)
+
+    def text(self, key: str, default: str | None = None) -> str:
+        """A text; a number is the text of it."""
+        value = self.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, str | int | float) or value == "":
+            said = "missing" if value in (None, "") else f"{shown(value)}; a text is expected"
+            raise InputError(f"{self.path}: {key} is {said}")
+        return str(value)
+
+    def of(self, key: str) -> "JsonFields":
+        """The object that is a field."""
+        value = self.get(key)
+        if not isinstance(value, dict):
+            said = "missing" if value is None else f"{shown(value)}; an object is expected"
+            raise InputError(f"{self.path}: {key} is {said}")
+        return JsonFields(f"{self.path}, {key}", value)
+
+    def objects(self, key: str) -> dict[str, "JsonFields"]:
+        """The objects in a field that is an object of them; none where it is missing."""
+        fields = self.of(key) if self.get(key) is not None else JsonFields(self.path, {})
+        return {
+            id: _object(f"{self.path}, {key} {shown(id)}", value)
+            for id, value in fields.document.items()
+        }
+
+    def rows(self, key: str) -> list["JsonFields"]:
+        """The objects in a list, counted from 0 in messages; none where it is missing."""
+        value = self.get(key, [])
+        if not isinstance(value, list):
+            raise InputError(f"{self.path}: {key} is {shown(value)}; a list is expected")
+        return [_object(f"{self.path}, {key}[{k}]", row) for k, row in enumerate(value)]
+
     def source(self, key: str) -> Source:
         """Names the rows of a table in messages."""
         return Source(f"{self.path}, {key}")
+
+
+def _object(where: str, value: Any) -> JsonFields:
+    if not isinstance(value, dict):
+        raise InputError(f"{where} is {shown(value)}; an object is expected")
+    return JsonFields(where, value)
+
+
+def stacked(
+    values: Sequence[Any], size: int, place: Callable[[int], tuple[str, str]]
+) -> np.ndarray:
+    """Many lists of numbers as one array [len(values), size]; of the k-th, `place(k)` names file
+    and field.
+
+    **Raises:** `InputError` for the first that is none.
+    """
+    try:
+        array = np.array(values, float).reshape(len(values), size)
+    except (TypeError, ValueError, OverflowError):
+        array = np.full((1, 1), np.nan)
+    if np.isfinite(array).all():
+        return array
+    rows = ((*place(k), value) for k, value in enumerate(values))
+    return np.array([JsonFields(path, {key: v}).array(key, (size,)) for path, key, v in rows])
 
 
 def read_object(path: str | Path, text: str, kind: str) -> dict[str, Any]:

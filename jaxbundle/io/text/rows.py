@@ -22,9 +22,14 @@ class Row:
     def __len__(self) -> int:
         return len(self.words)
 
+    @property
+    def place(self) -> str:
+        """File and line."""
+        return f"{self.path}, line {self.number}"
+
     def error(self, message: str) -> InputError:
         """A complaint about this line, to be raised."""
-        return InputError(f"{self.path}, line {self.number}: {message}")
+        return InputError(f"{self.place}: {message}")
 
     def numbers(
         self, what: Sequence[str], first: int = 0, more: bool = False

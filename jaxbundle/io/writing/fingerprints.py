@@ -34,9 +34,7 @@ def of_input(path: str | Path) -> str:
     What cannot be read counts as empty.
     """
     found = _hash()
-    path = Path(path)
-    project = project_file(path)
-    for file in _files(project if project.is_file() else path):
+    for file in input_files(path):
         found.update(file.name.encode(errors="surrogateescape"))
         try:
             if not is_plain(file):
@@ -46,6 +44,12 @@ def of_input(path: str | Path) -> str:
         except OSError:
             continue
     return found.hexdigest()
+
+
+def input_files(path: str | Path) -> Iterator[Path]:
+    """The files of an input of `read_network`: itself and what it names, or those of its folder."""
+    project = project_file(Path(path))
+    return _files(project if project.is_file() else Path(path))
 
 
 def files_read(path: str | Path) -> list[Path]:

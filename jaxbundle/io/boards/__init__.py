@@ -1,0 +1,1 @@
+"""Boards, and their image points, from files of other programs."""

@@ -1,0 +1,106 @@
+"""Corners of a board in many photographs: the `.vnl` tables of mrcal and mrgingham.
+
+    # filename x y level
+    frame0.jpg 1234.5 678.25 0
+    frame1.jpg - - -
+
+A row for each point, those of a photograph together, row after row of the board from the upper
+left, as `Board.ids`; pixels, the centre of the first one is (0, 0). A photograph without a board
+has one row of "-", a point not found one of its own. The column `level` is how often the
+photograph was reduced by 2 to find the point; in its place there may be a `weight`. Points of a
+negative level, or without weight, do not count.
+
+Source: mrcal's documentation, "How to run a calibration", "corners.vnl"; vnlog's, "the format".
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.text.csv_tables import write_text
+from jaxbundle.io.text.rows import Row, Rows
+from jaxbundle.measure.boards import Board, require_board
+from jaxbundle.measure.views import BoardViews
+from jaxbundle.network.columns import count, some
+
+COLUMNS = ("filename", "x", "y")
+QUALITY = ("level", "weight")
+NOTHING = "-"
+
+
+def read_corners(path: str | Path, board: Board, image_size: Sequence[int]) -> BoardViews:
+    """What was measured of a board, to be given to `calibrate`.
+
+    **Arguments:** `board`: its grid is that of the points; `image_size`: columns and rows, which
+    the table has not.
+
+    **Raises:** `InputError` naming file, line and photograph.
+    """
+    path, number = Path(path), len(require_board(board).ids)
+    at, views, reduced = None, {}, {}
+    for row in Rows(path):
+        if row.text.startswith("#"):
+            at = _legend(row) if at is None and not row.text.startswith(("##", "#!")) else at
+            continue
+        if at is None:
+            raise row.error("a line '# filename x y …' is expected before the first point")
+        if len(row) != len(at):
+            raise row.error(f"{len(row)} values where {len(at)} are expected ({', '.join(at)})")
+        given = dict(zip(at, row.words))
+        views.setdefault(given["filename"], []).append(_point(row, given))
+        if given.get("level", "0").isdigit() and int(given.get("level", "0")) > 0:
+            reduced[given["filename"]] = None
+    failed = [name for name, points in views.items()
+              if len(points) == 1 < number and np.isnan(points).all()]  # fmt: skip
+    for name, points in views.items():
+        if name not in failed and len(points) != number:
+            raise InputError(
+                f"{path}: photograph {name!r} has {len(points)} points; the board, {board}, has "
+                f"{number}"
+            )
+    names = [name for name in views if name not in failed]
+    xy = np.array([views[name] for name in names], float).reshape(-1, number, 2)
+    w, h = (int(n) for n in image_size)
+    told = [f"{count(len(reduced), 'photograph')} with points found in a reduced image, which are "
+            f"less precise: {some(reduced)}"] if reduced else []  # fmt: skip
+    return BoardViews(board, tuple(names), (w, h), xy,
+                      tuple((name, "no board found") for name in failed), tuple(told))  # fmt: skip
+
+
+def _legend(row: Row) -> list[str]:
+    names = row.text.lstrip("#").split()
+    if not {*COLUMNS} <= {*names}:
+        raise row.error(f"columns {' '.join(names)}; {', '.join(COLUMNS)} are expected")
+    return names
+
+
+def _point(row: Row, given: dict[str, str]) -> tuple[float, float]:
+    """A point; NaN where it was not found, or does not count."""
+    if NOTHING in (given["x"], given["y"]):
+        return np.nan, np.nan
+    own = Row(row.path, row.number, f"{given['x']} {given['y']}")
+    x, y = own.numbers(("x", "y"))
+    for name in QUALITY:
+        if given.get(name, NOTHING) != NOTHING:
+            (value,) = Row(row.path, row.number, given[name]).numbers((name,))
+            if value < 0 or (name == "weight" and value == 0):
+                return np.nan, np.nan
+    return float(x), float(y)
+
+
+def write_corners(views: BoardViews, path: str | Path) -> None:
+    """Write what was measured of a board.
+
+    **Raises:** `InputError` for names with blanks.
+    """
+    failed = [name for name, _ in views.failed]
+    for name in (*views.names, *failed):
+        if any(character.isspace() for character in name) or name.startswith("#"):
+            raise InputError(f"{path}: photograph {name!r}: a name cannot have blanks, nor begin #")
+    lines = [f"# {' '.join(COLUMNS)} level"]
+    for name, points in zip(views.names, views.xy.tolist()):
+        lines += [f"{name} - - -" if x != x else f"{name} {x!r} {y!r} 0" for x, y in points]
+    lines += [f"{name} - - -" for name in failed]
+    write_text(Path(path), "\n".join(lines) + "\n")

@@ -1,0 +1,65 @@
+"""Boards of Kalibr: the YAML of a target.
+
+    target_type: checkerboard    targetCols, targetRows: inner corners; rowSpacingMeters,
+                                 colSpacingMeters, which must be equal
+    target_type: circlegrid      targetCols, targetRows, spacingMeters, asymmetricGrid
+    target_type: aprilgrid       tagCols, tagRows, tagSize, tagSpacing: refused, not found here
+
+Of an asymmetric grid the spacing is that of neighbouring rows, as `Board.square`. Metres.
+
+Source: Kalibr's wiki, "Calibration targets".
+"""
+
+from pathlib import Path
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.text.csv_tables import read_text, write_text
+from jaxbundle.io.text.json_fields import JsonFields
+from jaxbundle.io.text.yaml_text import parse_yaml
+from jaxbundle.measure.boards import Board
+from jaxbundle.network.columns import shown
+
+TYPES = ("checkerboard", "circlegrid")
+CIRCLES = {False: "circles", True: "asymmetric-circles"}
+
+
+def read_target(path: str | Path) -> Board:
+    """The board of a file.
+
+    **Raises:** `InputError` naming file and key, also for a grid of AprilTags.
+    """
+    fields = JsonFields(path, parse_yaml(path, read_text(Path(path))))
+    kind = fields.text("target_type")
+    if kind not in TYPES:
+        more = "a grid of AprilTags is not found here; " if kind == "aprilgrid" else ""
+        raise InputError(f"{path}: target_type {kind}: {more}{' or '.join(TYPES)} is expected")
+    columns, rows = (fields.whole(key, least=1) for key in ("targetCols", "targetRows"))
+    if kind == "circlegrid":
+        asymmetric = fields.get("asymmetricGrid", False)
+        if asymmetric not in CIRCLES:
+            raise InputError(f"{path}: asymmetricGrid is {shown(asymmetric)}; True or False")
+        return Board(columns, rows, fields.number("spacingMeters"), CIRCLES[asymmetric])
+    across, along = fields.number("rowSpacingMeters"), fields.number("colSpacingMeters")
+    if across != along:
+        raise InputError(
+            f"{path}: rowSpacingMeters {across:g} and colSpacingMeters {along:g}: squares are "
+            "expected"
+        )
+    return Board(columns, rows, along)
+
+
+def write_target(board: Board, path: str | Path) -> None:
+    """Write a board whose unit is the metre.
+
+    **Raises:** `InputError` for ChArUco, which Kalibr has not.
+    """
+    if board.kind == "charuco":
+        raise InputError(f"{path}: Kalibr has no board of kind charuco")
+    lines = [f"targetCols: {board.columns}", f"targetRows: {board.rows}"]
+    if board.kind == "chessboard":
+        lines = ["target_type: 'checkerboard'", *lines, f"rowSpacingMeters: {board.square!r}",
+                 f"colSpacingMeters: {board.square!r}"]  # fmt: skip
+    else:
+        lines = ["target_type: 'circlegrid'", *lines, f"spacingMeters: {board.square!r}",
+                 f"asymmetricGrid: {board.kind == CIRCLES[True]}"]  # fmt: skip
+    write_text(Path(path), "\n".join(lines) + "\n")

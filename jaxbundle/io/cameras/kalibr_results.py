@@ -1,0 +1,88 @@
+"""Results of Kalibr: the text of `…-results-cam.txt`, cameras with the σ of their parameters.
+
+    cam0 (/cam0/image_raw):
+        type: <class '….DistortedPinholeCameraGeometry'>
+        distortion: [k1 k2 p1 p2] +- [σ …]
+        projection: [fu fv pu pv] +- [σ …]
+
+The kind is in the name of the class: Pinhole, Omni, ExtendedUnified, DoubleSphere; Equidistant,
+Fov, Distorted. The file has no correlations, which are taken as 0, and no image size.
+
+Source: Kalibr's wiki, "Multiple camera calibration"; its results.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.networks.kalibr import MODELS
+from jaxbundle.io.text.csv_tables import read_text
+from jaxbundle.io.text.rows import Row
+from jaxbundle.network.build import make_cameras
+from jaxbundle.system.file_content import beginning
+
+HEAD = b"Camera-system parameters"
+CAMERA = re.compile(r"^\s*(cam\d+)\s*\(.*\):\s*$", re.M)
+VALUES = r"{}:\s*\[([^\]]*)\]\s*\+-\s*\[([^\]]*)\]"
+CAMERAS = {"Omni": "omni", "ExtendedUnified": "eucm", "DoubleSphere": "ds", "Pinhole": "pinhole"}
+DISTORTIONS = {"Equidistant": "equi", "Fov": "fov", "Distorted": "radtan", "": "none"}
+
+
+def is_kalibr_results(path: Path) -> bool:
+    """Whether a text has the parameters of Kalibr's cameras."""
+    return path.suffix.lower() == ".txt" and HEAD in beginning(path, 10_000)
+
+
+def read_kalibr_results(path: str | Path) -> list:
+    """The cameras of a file: each with the names of its parameters and their covariance.
+
+    **Raises:** `InputError` naming file and camera.
+    """
+    path = Path(path)
+    text = read_text(path)
+    found = list(CAMERA.finditer(text))
+    ends = [one.start() for one in found[1:]] + [len(text)]
+    if not found:
+        raise InputError(f"{path}: there is no camera cam0 in it")
+    return [_camera(path, one[1], text[one.end() : end]) for one, end in zip(found, ends)]
+
+
+def _camera(path: Path, id: str, text: str):
+    where = f"{path}, {id}"
+    line = re.search(r"type:.*?(\w+)'?>", text)
+    if line is None:
+        raise InputError(f"{where}: type is missing")
+    name = line[1]
+    kind = (next((k for word, k in CAMERAS.items() if word in name), name),
+            next(k for word, k in DISTORTIONS.items() if word in name))  # fmt: skip
+    if kind not in MODELS:
+        raise InputError(f"{where}: cameras of type {name} are not known here")
+    model, core, coefficients = MODELS[kind]
+    values, sigma = _values(where, "projection", text, core)
+    if coefficients:
+        more = _values(where, "distortion", text, coefficients)
+        values, sigma = values | more[0], sigma | more[1]
+    (camera,) = make_cameras([{"id": id, "model": model, **values}], f"{path}, ")
+    return camera, (list(sigma), np.diag(np.square([*sigma.values()])))
+
+
+def _values(where: str, what: str, text: str, names) -> tuple[dict, dict]:
+    """Values and σ of a line."""
+    found = re.search(VALUES.format(what), text)
+    if found is None:
+        raise InputError(f"{where}: {what}: [values] +- [σ] is missing")
+    numbers = []
+    for part in found.groups():
+        words = part.replace(",", " ").split()
+        if len(words) != len(names):
+            raise InputError(
+                f"{where}: {what} has {len(words)} numbers; {len(names)} are expected"
+            )
+        row = Row(Path(where), 0, " ".join(words))
+        try:
+            numbers.append(dict(zip(names, row.numbers(names).tolist())))
+        except InputError:
+            raise InputError(f"{where}: {what}: finite numbers are expected") from None
+    return numbers[0], numbers[1]

@@ -1,0 +1,268 @@
+"""Projects of AICON 3D Studio, as JAiCov reads them: tables of numbers beside each other.
+
+    NAME.phc    image point x y sx sy vx vy method active parameter      image points, mm
+    NAME.ior    five lines for each camera:                              interior orientation
+                number parameter −c x0 y0 A1 A2 R0;  A3;  B1 B2;  C1 C2;
+                width and height of the sensor (mm), columns, rows
+    NAME.eor    image camera X0 Y0 Z0 ω φ κ order active state           exterior orientation
+    NAME.obc    point X Y Z [sX sY sZ rays active new datum]             object points
+    NAME.scale  number "name" point point length σ active                distances
+
+Columns are separated by blanks, lines that begin with # are comments. Angles are radians, M as
+ours; the axes of the image are x right, y up, from its centre. The file has −c. The camera is
+`brown-projected` (distortion at the projected point) with K_i = A_i, r0 = R0, P_i = B_i, b_i = C_i.
+What is not active is left out; images whose rotation is of another order than 0, or whose state is
+1, have no orientation. `datum` marks the points of the inner datum; all points are tie points, as
+JAiCov takes them. Without .eor and .obc there are no orientations and coordinates.
+
+Source: Loesler, JAiCov (Java Aicon Covariance), the columns its readers name; Luhmann (2023),
+Nahbereichsphotogrammetrie, eq. 2.31, for the rotation.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.networks.assemble import all_parameters, assemble, foreign_document, image_columns
+from jaxbundle.io.networks.losses import need_values, size_of, what_is_lost
+from jaxbundle.io.networks.poses import matrices_of
+from jaxbundle.io.text.rows import Row, Rows
+from jaxbundle.io.writing.replacing import replaced_files
+from jaxbundle.network.columns import Columns, count, some
+from jaxbundle.network.tables import Camera, Distances, Network, Source
+
+SUFFIX = ".phc"
+BESIDE = (".ior", ".eor", ".obc", ".scale")
+CAP = 0
+"""The order of rotations ω, φ, κ."""
+NOT_ORIENTED = 1
+"""State of an image; 2: approximately, 3: by bundle adjustment."""
+INTERIOR = (
+    ("number", "parameter", "c", "x0", "y0", "K1", "K2", "r0"), ("K3",), ("P1", "P2"),
+    ("b1", "b2"), ("width", "height", "columns", "rows"),
+)  # fmt: skip
+
+
+def is_jaicov(path: Path) -> bool:
+    """Whether a file is called as image points of AICON are."""
+    return path.suffix.lower() == SUFFIX and path.is_file()
+
+
+def read_jaicov(path: str | Path, overrides: Sequence[str] = ()) -> Network:
+    """The network of a project; nothing of the cameras is free.
+
+    **Raises:** `InputError` naming file and line.
+    """
+    path = Path(path)
+    beside = {suffix: path.with_suffix(suffix) for suffix in BESIDE}
+    cameras = _cameras(beside[".ior"])
+    images, angles, position, camera, told = _images(beside[".eor"])
+    points, at, datum = _points(beside[".obc"])
+    rays, lines, more = _rays(path, points if beside[".obc"].is_file() else None)
+    for image in rays["image"]:
+        images.setdefault(image, len(images))
+    for point in rays["point"]:
+        points.setdefault(point, len(points))
+    none = np.full((len(images), 3), np.nan)
+    none[: len(position)], turned = position, none.copy()
+    turned[: len(angles)] = angles
+    of = camera + [str(next(iter(cameras)))] * (len(images) - len(camera))
+    where = np.full((len(points), 3), np.nan)
+    where[: len(at)] = at
+    network = assemble(
+        path,
+        foreign_document(path.stem, cameras.values(), image_unit="mm", object_unit="mm",
+                         datum_points=datum),
+        overrides,
+        image_columns(Source(str(beside[".eor"]), None, "image"), list(images), of,
+                      matrices_of(turned), none),
+        Columns({"id": list(points), "role": ["tie"] * len(points), **dict(zip("XYZ", where.T))},
+                Source(str(beside[".obc"]), None, "point")),
+        Columns(rays, Source(str(path), np.array(lines, np.int64), "line")), (*told, *more),
+    )  # fmt: skip
+    return _with_distances(network, beside[".scale"])
+
+
+def _cameras(file: Path) -> dict[str, dict]:
+    """The entries of cameras by number."""
+    rows, cameras = Rows(file, comment="#"), {}
+    while rows.more():
+        given, first = {}, None
+        for names in INTERIOR:
+            row = rows.take(f"{', '.join(names)} of a camera")
+            given |= dict(zip(names, row.numbers(names, more=True).tolist()))
+            first = first or row
+        assert first is not None
+        size = given["columns"], given["rows"]
+        if not (given["c"] < 0 and min(given["width"], given["height"], *size) > 0):
+            raise row.error("c must be negative, the sizes of the sensor positive")
+        id = first.words[0]
+        if id in cameras:
+            raise first.error(f"camera {id} stands there twice")
+        values = {name: given[name] for name in ("x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1",
+                                                 "b2", "r0")}  # fmt: skip
+        cameras[id] = {
+            "id": id, "model": "brown-projected", "c": -given["c"], **values,
+            "image_size": list(size),
+            "pixel_size": [given["width"] / size[0], given["height"] / size[1]],
+        }  # fmt: skip
+    if not cameras:
+        raise InputError(f"{file}: there is no camera in it")
+    return cameras
+
+
+def _images(file: Path):
+    """Row of each image, angles, positions, cameras, and what is to be told."""
+    images: dict[str, int] = {}
+    angles, position, camera, other = [], [], [], []
+    for row in Rows(file, comment="#") if file.is_file() else ():
+        names = ("X0", "Y0", "Z0", "omega", "phi", "kappa", "order", "active", "state")
+        given = dict(zip(names, row.numbers(names, 2, more=True).tolist()))
+        if given["active"] == 0:
+            continue
+        _new(row, images, "image")
+        good = given["order"] == CAP and given["state"] != NOT_ORIENTED
+        if given["order"] != CAP:
+            other.append(row.words[0])
+        values = [given[name] if good else np.nan for name in names[:6]]
+        position.append(values[:3])
+        angles.append(values[3:])
+        camera.append(row.words[1])
+    told = [f"{count(len(other), 'image')} whose rotation is of another order than 0: without "
+            f"orientation: {some(other)}"] if other else []  # fmt: skip
+    return (images, np.reshape(angles, (-1, 3)), np.reshape(position, (-1, 3)), camera, told)
+
+
+def _points(file: Path):
+    """Row of each point, coordinates, and the ids of the datum."""
+    points: dict[str, int] = {}
+    at, datum = [], []
+    for row in Rows(file, comment="#") if file.is_file() else ():
+        values = row.numbers(("X", "Y", "Z"), 1, more=True)
+        if len(row) >= 11 and row.words[8] == "0":
+            continue
+        _new(row, points, "point")
+        at.append(values)
+        if len(row) >= 11 and row.words[10] != "0":
+            datum.append(row.words[0])
+    return points, np.reshape(at, (-1, 3)), datum
+
+
+def _new(row: Row, table: dict[str, int], thing: str) -> None:
+    if row.words[0] in table:
+        raise row.error(f"{thing} {row.words[0]} stands there twice")
+    table[row.words[0]] = len(table)
+
+
+def _rays(file: Path, points: dict | None):
+    """The columns of image points, their lines, and what is to be told."""
+    columns: dict[str, list] = {name: [] for name in ("image", "point", "x", "y", "sx", "sy")}
+    lines, unknown = [], []
+    names = ("x", "y", "sx", "sy", "vx", "vy", "method", "active")
+    for row in Rows(file, comment="#"):
+        values = row.numbers(names, 2, more=True)
+        image, point = row.words[:2]
+        if values[-1] <= 0:
+            continue
+        if points is not None and point not in points:
+            unknown.append(point)
+            continue
+        for name, value in zip(columns, (image, point, *values[:4].tolist())):
+            columns[name].append(value)
+        lines.append(row.number)
+    if not lines:
+        raise InputError(f"{file}: there are no active image points")
+    what = "left out {} of points that are not in .obc, or not active there: {}"
+    told = [what.format(count(len(unknown), "image point"), some(dict.fromkeys(unknown)))]
+    return columns, lines, told if unknown else []
+
+
+def _with_distances(network: Network, file: Path) -> Network:
+    """The network with the active distances of a file, between points it has."""
+    index, lines = {id: k for k, id in enumerate(network.points.id)}, []
+    ends, values = [], []
+    for row in Rows(file, comment="#") if file.is_file() else ():
+        rest = Row(row.path, row.number, row.text.rpartition('"')[2] if '"' in row.text
+                   else " ".join(row.words[1:]))  # fmt: skip
+        length, sigma, active = rest.numbers(("length", "σ", "active"), 2, more=True)
+        if active == 0 or not {*rest.words[:2]} <= {*index}:
+            continue
+        if not (length > 0 and sigma > 0):
+            raise row.error("length and σ must be positive")
+        ends.append([index[id] for id in rest.words[:2]])
+        values.append((length, sigma))
+        lines.append(row.number)
+    if not ends:
+        return network
+    value, sigma = np.array(values).T
+    source = Source(str(file), np.array(lines), "line")
+    return network.replace(distances=Distances(np.array(ends), value, sigma, source))
+
+
+def write_jaicov(network: Network, path: str | Path) -> tuple[str, ...]:
+    """Write a project: NAME.phc and NAME.ior, .eor, .obc, .scale beside it.
+
+    Cameras must be of model `brown-projected`, with image and pixel size; images and cameras become
+    numbers where their ids are none.
+
+    **Returns:** what the format has no place for, in words.
+    """
+    path = Path(path)
+    need_values(network, "brown-projected", "AICON")
+    images, points, rays = network.images, network.points, network.observations
+    if any(character.isspace() or character in '"#' for id in points.id for character in id):
+        raise InputError(f"{path}: names of points cannot have blanks, quotes or #")
+    image_ids, camera_ids = _numbers(images.id), _numbers([c.id for c in network.cameras])
+    datum = {*network.datum_points} or {id for id, r in zip(points.id, points.role) if r == "tie"}
+    number = np.bincount(rays.point, minlength=len(points)).tolist()
+    content = {
+        path: [
+            f"{image_ids[i]} {points.id[p]} {_join(xy)} {_join(s)} 0 0 0 1 0"
+            for i, p, xy, s in zip(rays.image, rays.point, rays.xy, rays.sigma)
+        ],
+        path.with_suffix(".ior"): [
+            line for id, c in zip(camera_ids, network.cameras) for line in _interior(id, c)
+        ],
+        path.with_suffix(".eor"): [
+            f"{id} {camera_ids[c]} {_join(at)} {_join(angles)} {CAP} 1 3"
+            for id, c, at, angles in zip(image_ids, images.camera, images.position, images.angles)
+        ],
+        path.with_suffix(".obc"): [
+            f"{id} {_join(at)} 0 0 0 {n} 1 1 {int(id in datum)}"
+            for id, at, n in zip(points.id, points.position, number)
+        ],
+        path.with_suffix(".scale"): [
+            f'{k} "" {points.id[a]} {points.id[b]} {_join((value, sigma))} 1'
+            for k, ((a, b), value, sigma) in enumerate(zip(
+                network.distances.points, network.distances.value, network.distances.sigma
+            ))
+        ],
+    }  # fmt: skip
+    with replaced_files(*content) as temporary:
+        for place, lines in zip(temporary, content.values()):
+            place.write_bytes("".join(f"{line}\n" for line in lines).encode())
+    lost = [what for what in what_is_lost(network)
+            if what not in ("distances", "σ of image points")]  # fmt: skip
+    renamed = image_ids != list(images.id) or camera_ids != [c.id for c in network.cameras]
+    return (*lost, *(("names of images and cameras, which are numbered",) if renamed else ()))
+
+
+def _numbers(ids: Sequence[str]) -> list[str]:
+    plain = all(id.isascii() and id.isdigit() and len(id) < 19 for id in ids)
+    return list(ids) if plain else [str(k) for k in range(1, len(ids) + 1)]
+
+
+def _join(values) -> str:
+    return " ".join(repr(float(value)) for value in values)
+
+
+def _interior(id: str, camera: Camera) -> list[str]:
+    p, (w, h) = all_parameters(camera), size_of(camera, "AICON")
+    if camera.pixel_size is None:
+        raise InputError(f"camera {camera.id!r}: AICON needs the sensor's size; give pixel_size")
+    given = p | {"c": -p["c"]}
+    lines = [_join(given[name] for name in names if name in given) for names in INTERIOR[:4]]
+    sensor = _join((w * camera.pixel_size[0], h * camera.pixel_size[1]))
+    return [f"{id} 0 {lines[0]}", *lines[1:], f"{sensor} {w} {h}"]

@@ -1,0 +1,212 @@
+"""Camera chains of Kalibr: `camchain.yaml`.
+
+    cam0:
+      camera_model: pinhole           pinhole, omni, eucm, ds
+      intrinsics: [fu, fv, pu, pv]    omni: ξ before; eucm: α, β; ds: ξ, α
+      distortion_model: radtan        radtan, equi (equidistant), fov, none
+      distortion_coeffs: [k1, k2, p1, p2]    equi: k1 … k4; fov: ω
+      resolution: [w, h]
+      rostopic: /cam0/image_raw
+    cam1:
+      T_cn_cnm1:                      4 × 4, from the frame of cam0 to that of cam1
+      …
+
+    pinhole     radtan, none `opencv`; equi `kannala-brandt`; fov `fov`
+    omni        radtan, none `mei`
+    eucm, ds    none `eucm`, `double-sphere`
+
+Camera frames have x right, y down, z forward; the centre of the first pixel is (0, 0). A chain
+becomes an image of every camera, taken at one moment by a rig: the first at the origin, looking
+along Z with Y down. Where the cameras are not coupled (no T_cn_cnm1) they are in no rig.
+Of a network the mounting is that of the first moment at which all cameras have an image, or of the
+images where each camera has one. T_cam_imu and time shifts are not read.
+
+Source: Kalibr's wiki, "yaml formats", "Supported models".
+"""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.pose_conventions import cv_pose, exterior_from_cv
+from jaxbundle.io.networks.assemble import (
+    all_parameters,
+    assemble,
+    entry_of,
+    foreign_document,
+    image_columns,
+)
+from jaxbundle.io.networks.losses import need_values, size_of, what_is_lost
+from jaxbundle.io.networks.poses import check_rotations, matrices_of
+from jaxbundle.io.text.csv_tables import read_text, write_text
+from jaxbundle.io.text.json_fields import JsonFields
+from jaxbundle.io.text.yaml_text import parse_yaml
+from jaxbundle.network.columns import Columns
+from jaxbundle.network.further import Rigs
+from jaxbundle.network.tables import Camera, Network, Source
+from jaxbundle.system.file_content import beginning
+
+CORE = ("fx", "fy", "cx", "cy")
+RADTAN = ("k1", "k2", "p1", "p2")
+EQUI = ("k1", "k2", "k3", "k4")
+MODELS: dict[tuple[str, str], tuple[str, tuple[str, ...], tuple[str, ...]]] = {
+    ("pinhole", "radtan"): ("opencv", CORE, RADTAN),
+    ("pinhole", "equi"): ("kannala-brandt", CORE, EQUI),
+    ("pinhole", "fov"): ("fov", CORE, ("omega",)),
+    ("pinhole", "none"): ("opencv", CORE, ()),
+    ("omni", "radtan"): ("mei", ("xi", *CORE), RADTAN),
+    ("omni", "none"): ("mei", ("xi", *CORE), ()),
+    ("eucm", "none"): ("eucm", ("alpha", "beta", *CORE), ()),
+    ("ds", "none"): ("double-sphere", ("xi", "alpha", *CORE), ()),
+}
+"""Our model, what the intrinsics are and the coefficients; of one model the first is written."""
+OFFERED = tuple(dict.fromkeys(model for model, *_ in MODELS.values()))
+RIG, MOMENT = "rig", "0"
+
+
+def is_kalibr(path: Path) -> bool:
+    """Whether a YAML file has cameras `cam0`, … with a `camera_model`."""
+    if path.suffix.lower() not in (".yaml", ".yml"):
+        return False
+    head = beginning(path, 100_000)
+    return re.search(rb"^cam\d+\s*:", head, re.M) is not None and b"camera_model" in head
+
+
+def read_kalibr(path: str | Path, overrides: Sequence[str] = ()) -> Network:
+    """The cameras of a chain, each with an image; nothing can be adjusted.
+
+    **Raises:** `InputError` naming file, camera and key.
+    """
+    path = Path(path)
+    chain = JsonFields(path, {"": parse_yaml(path, read_text(path))}).objects("")
+    chain = {id: JsonFields(f"{path}, {id}", chain[id].document)
+             for id in sorted(chain, key=_number) if re.fullmatch(r"cam\d+", id)}  # fmt: skip
+    if not chain:
+        raise InputError(f"{path}: there is no camera cam0")
+    cameras = [_camera(id, fields) for id, fields in chain.items()]
+    R, t = np.eye(3), np.zeros(3)
+    poses, mounted, told = [], [], []
+    for k, (id, fields) in enumerate(chain.items()):
+        if k and fields.get("T_cn_cnm1") is not None:
+            T = fields.array("T_cn_cnm1", (4, 4))
+            check_rotations(T[:3, :3], f"{fields.path}: T_cn_cnm1")
+            R, t = T[:3, :3] @ R, T[:3, :3] @ t + T[:3, 3]
+            mounted.append(id)
+        elif k:
+            R, t = np.eye(3), np.zeros(3)
+        poses.append((R, t))
+    if 0 < len(mounted) < len(chain) - 1:
+        raise InputError(f"{path}: T_cn_cnm1 is missing at some of the cameras")
+    unread = [key for key in ("T_cam_imu", "T_imu_cam", "timeshift_cam_imu")
+              if any(fields.get(key) is not None for fields in chain.values())]  # fmt: skip
+    if unread:
+        told.append(f"not read: {', '.join(unread)}")
+    M, X0 = exterior_from_cv(*(np.stack(part) for part in zip(*poses)))
+    source = Source(str(path), None, "camera")
+    network = assemble(
+        path, foreign_document(path.stem, map(entry_of, cameras), object_unit="m"), overrides,
+        image_columns(source, list(chain), list(chain), M, X0), warnings=told,
+    )  # fmt: skip
+    if not mounted:
+        return network
+    columns = {"rig": [RIG] * len(chain), "epoch": [MOMENT] * len(chain), "image": list(chain)}
+    return network.replace(further=(Rigs.of(Columns(columns, source), {}, 1.0),))
+
+
+def _number(id: str) -> int:
+    digits = id.removeprefix("cam")
+    return int(digits) if digits.isascii() and digits.isdigit() and len(digits) < 9 else -1
+
+
+def _camera(id: str, fields: JsonFields) -> Camera:
+    kind = fields.text("camera_model"), fields.text("distortion_model", "none").lower()
+    kind = kind[0], "equi" if kind[1] == "equidistant" else kind[1]
+    if kind not in MODELS:
+        known = ", ".join("-".join(names) for names in MODELS)
+        raise InputError(
+            f"{fields.path}: camera_model {kind[0]} with distortion_model {kind[1]}; one of "
+            f"{known} is expected"
+        )
+    model, core, coefficients = MODELS[kind]
+    values = fields.array("intrinsics", (len(core),))
+    more = fields.array("distortion_coeffs", (len(coefficients),)) if coefficients else ()
+    w, h = fields.array("resolution", (2,))
+    size = JsonFields(f"{fields.path}: resolution", {"w": w, "h": h})
+    parameters = dict(zip((*core, *coefficients), map(float, (*values, *more))))
+    return Camera(id, model, parameters,
+                  image_size=(size.whole("w", least=1), size.whole("h", least=1)))  # fmt: skip
+
+
+def write_kalibr(network: Network, path: str | Path) -> tuple[str, ...]:
+    """Write the cameras of a network, called cam0, cam1, …, with the mountings of a rig.
+
+    **Returns:** what the format has no place for, in words.
+
+    **Raises:** `InputError` for a camera that Kalibr has no model for, and without image size.
+    """
+    mountings, lost = _mountings(network)
+    lines = []
+    for k, camera in enumerate(network.cameras):
+        lines += [f"cam{k}:", *(f"  {line}" for line in _camera_lines(camera, k))]
+        if mountings is not None and k:
+            lines += ["  T_cn_cnm1:", *(f"  - {_list(row)}" for row in mountings[k - 1])]
+    write_text(Path(path), "\n".join(lines) + "\n")
+    lost += [what for what in what_is_lost(network, rays=True) if what != Rigs.TABLE]
+    lost += ["points"] if len(network.points) else []
+    own = any(camera.id != f"cam{k}" for k, camera in enumerate(network.cameras))
+    return (*lost, *(["names of cameras"] if own else []))
+
+
+def _list(values) -> str:
+    return f"[{', '.join(repr(float(value)) for value in values)}]"
+
+
+def _camera_lines(camera: Camera, k: int) -> list[str]:
+    """The entries of a camera, by the first model of Kalibr that holds it."""
+    p, (w, h) = all_parameters(camera), size_of(camera, "Kalibr")
+    for (kind, distortion), (model, core, coefficients) in MODELS.items():
+        named = {*core, *coefficients}
+        if model == camera.model and not any(p[name] for name in p if name not in named):
+            values = _list(p[name] for name in coefficients)
+            return [
+                f"camera_model: {kind}", f"intrinsics: {_list(p[name] for name in core)}",
+                f"distortion_model: {distortion}", f"distortion_coeffs: {values}",
+                f"resolution: [{w}, {h}]", f"rostopic: /cam{k}/image_raw",
+            ]  # fmt: skip
+    known = [names for model, *names in MODELS.values() if model == camera.model]
+    if not known:
+        raise InputError(
+            f"camera {camera.id!r}: Kalibr has no model {str(camera.model)!r}; convert it with "
+            "--model opencv"
+        )
+    most = {name for names in known for part in names for name in part}
+    rest = ", ".join(name for name, value in p.items() if value and name not in most)
+    raise InputError(f"camera {camera.id!r}: Kalibr has no {rest}; adjust the camera without")
+
+
+def _mountings(network: Network) -> tuple[np.ndarray | None, list[str]]:
+    """T from each camera to the next [cameras − 1, 4, 4]; None, and what is lost, without."""
+    images, number = network.images, len(network.cameras)
+    if number == 1:
+        return None, ["orientations"] if len(images) > 1 else []
+    moments: dict = {}
+    for one in (one for one in network.further if isinstance(one, Rigs)):
+        row = {id: i for i, id in enumerate(images.id)}
+        for rig, epoch, image in zip(one.rig, one.epoch, one.image):
+            moments.setdefault((rig, epoch), []).append(row[image])
+    if not moments and len(images) == number:
+        moments = {0: list(range(number))}
+    whole = [rows for rows in moments.values()
+             if len({*images.camera[rows].tolist()}) == number == len(rows)]  # fmt: skip
+    if not whole or not np.isfinite(images.position[whole[0]]).all():
+        return None, ["mountings of the cameras"]
+    need_values(network.replace(images=images.take(np.array(whole[0]))), points=False)
+    rows = np.array(whole[0])[np.argsort(images.camera[whole[0]])]
+    R, t = cv_pose(matrices_of(images.angles[rows]), images.position[rows])
+    T = np.tile(np.eye(4), (number - 1, 1, 1))
+    T[:, :3, :3] = R[1:] @ R[:-1].transpose(0, 2, 1)
+    T[:, :3, 3] = t[1:] - np.einsum("nij,nj->ni", T[:, :3, :3], t[:-1])
+    return T, ["orientations"] if len(images) > number else []

@@ -1,0 +1,157 @@
+"""Orientations of MicMac: a folder `Ori-…` with a file for every image, and calibrations.
+
+    Orientation-IMAGE.xml: OrientationConique
+        OrIntImaM2C           must be the identity
+        TypeProj              eProjStenope
+        FileInterne           the calibration (`micmac_camera.py`), or Interne, the same inside
+        Externe               Centre; ParamRotation/CodageMatr: L1, L2, L3; KnownConv
+        ConvOri               KnownConv
+
+L1, L2, L3 are the rows of the rotation from the camera frame (x right, y down, z forward) to the
+world, so that R = [L1; L2; L3]ᵀ, M = D·R; Centre is X0. Calibrations are looked for beside, and
+from the folder above. Angles (CodageAngulaire) and other conventions are refused. Tie points
+(Homol) and measurements of control are in other files, which are not read.
+
+Source: MicMac's documentation, "Orientation"; its conventions eConvApero_DistM2C, eConvOriLib.
+"""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from pathlib import Path
+from xml.sax.saxutils import escape
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.pose_conventions import flip_rows
+from jaxbundle.io.cameras.nearest_camera import fits_told
+from jaxbundle.io.networks.assemble import assemble, entry_of, foreign_document, image_columns
+from jaxbundle.io.networks.losses import need_values, what_is_lost
+from jaxbundle.io.networks.micmac_camera import C2M, M2C, calibration, calibration_lines, document
+from jaxbundle.io.networks.poses import check_rotations, matrices_of
+from jaxbundle.io.text.csv_tables import write_text
+from jaxbundle.io.text.xml_fields import XmlFields, read_xml
+from jaxbundle.io.writing.folders import replaced_folder
+from jaxbundle.network.tables import Camera, Network, Source
+
+ORIENTATION, CALIBRATION = "Orientation-", "AutoCal_"
+FILES = (f"{ORIENTATION}*.xml", f"{CALIBRATION}*.xml")
+IDENTITY = {"I00": (0.0, 0.0), "V10": (1.0, 0.0), "V01": (0.0, 1.0)}
+
+
+def is_micmac(path: Path) -> bool:
+    """Whether a folder has orientations of MicMac."""
+    return path.is_dir() and any(path.glob(FILES[0]))
+
+
+def read_micmac(path: str | Path, overrides: Sequence[str] = ()) -> Network:
+    """The cameras and images of a folder, called as the files; nothing can be adjusted.
+
+    **Raises:** `InputError` naming file and element.
+    """
+    path = Path(path)
+    files = sorted(path.glob(FILES[0]))
+    if not files:
+        raise InputError(f"{path}: there is no {FILES[0]} in it")
+    cameras: dict[Path, Camera] = {}
+    names, used, rotations, centres = [], [], [], []
+    for file in files:
+        xml = XmlFields(file, read_xml(file), "an orientation of MicMac")
+        where, root = _calibration(file, xml)
+        if where not in cameras:
+            id = where.stem.removeprefix(CALIBRATION if where != file else ORIENTATION)
+            cameras[where] = calibration(where, root, id)
+        C2W, X0 = _pose(xml)
+        names.append(file.stem.removeprefix(ORIENTATION))
+        used.append(cameras[where].id)
+        rotations.append(C2W.T)
+        centres.append(X0)
+    images = image_columns(Source(str(path), None, "file"), names, used,
+                           flip_rows(np.array(rotations)), np.array(centres))  # fmt: skip
+    made = foreign_document(path.name, map(entry_of, cameras.values()), object_unit="m")
+    return assemble(path, made, overrides, images, warnings=fits_told(cameras.values()))
+
+
+def _calibration(file: Path, xml: XmlFields) -> tuple[Path, ET.Element]:
+    """The file of the calibration of an image, and its document."""
+    if xml.find("FileInterne") is None:
+        if xml.find("Interne") is None:
+            raise xml.missing("FileInterne")
+        return file, xml.root
+    name = xml.text("FileInterne")
+    places = (file.parent / name, file.parent.parent / name, file.parent / Path(name).name)
+    for place in places:
+        if place.is_file():
+            return place, read_xml(place)
+    raise InputError(f"{file}: FileInterne {name}: there is no such file beside it, nor above")
+
+
+def _pose(xml: XmlFields) -> tuple[np.ndarray, np.ndarray]:
+    """The rotation from camera to world, and the projection centre."""
+    kind = xml.text("TypeProj", "eProjStenope")
+    external = xml.find("Externe")
+    if external is None:
+        raise xml.missing("Externe")
+    own = XmlFields(xml.path, external, xml.kind)
+    convention = own.text("KnownConv", xml.text("ConvOri/KnownConv", M2C[0]))
+    for name, value, known in (("TypeProj", kind, ("eProjStenope",)),
+                               ("KnownConv", convention, (*M2C, *C2M))):  # fmt: skip
+        if value not in known:
+            raise InputError(f"{xml.path}: {name} is {value}; {', '.join(known)} is expected")
+    if xml.find("OrIntImaM2C") is not None:
+        for name, wanted in IDENTITY.items():
+            if tuple(xml.numbers(f"OrIntImaM2C/{name}", 2)) != wanted:
+                raise InputError(f"{xml.path}: OrIntImaM2C must be the identity, but {name} is not")
+    rows = [own.numbers(f"ParamRotation/CodageMatr/L{i}", 3) for i in (1, 2, 3)]
+    check_rotations(np.array(rows), f"{xml.path}: CodageMatr")
+    return np.array(rows), own.numbers("Centre", 3)
+
+
+def write_micmac(network: Network, folder: str | Path, force: bool = False) -> tuple[str, ...]:
+    """Write the orientations and calibrations of a network into a folder.
+
+    Cameras must be of model `opencv` with one focal length, without k4 and beyond, or
+    `brown-projected` or `brown` with square pixels, and have an image size.
+
+    **Arguments:** `force`: replace a folder that this function has not written.
+
+    **Returns:** what the format has no place for, in words.
+
+    **Raises:** `InputError` where the folder may not or cannot be written
+    (`jaxbundle.io.writing.folders`).
+    """
+    with replaced_folder(folder, "write_micmac", FILES, force) as new:
+        return fill_micmac(network, new)
+
+
+def fill_micmac(network: Network, folder: Path) -> tuple[str, ...]:
+    """Write orientations beside what is in a folder, or a new one; as `write_micmac`."""
+    need_values(network, points=False)
+    images = network.images
+    for id in (*images.id, *(camera.id for camera in network.cameras)):
+        if "/" in id or not id.strip("."):
+            raise InputError(f"{folder}: {id!r} cannot be part of the name of a file")
+    calibrations = {camera.id: document(calibration_lines(camera)) for camera in network.cameras}
+    C2W = flip_rows(matrices_of(images.angles)).transpose(0, 2, 1)
+    folder.mkdir(exist_ok=True)
+    for id, text in calibrations.items():
+        write_text(folder / f"{CALIBRATION}{id}.xml", text)
+    for k, id in enumerate(images.id):
+        camera = network.cameras[images.camera[k]].id
+        lines = _orientation(f"{CALIBRATION}{camera}.xml", C2W[k], images.position[k])
+        write_text(folder / f"{ORIENTATION}{id}.xml", document(lines))
+    return (*what_is_lost(network, rays=True), *(("points",) if len(network.points) else ()))
+
+
+def _orientation(file: str, C2W: np.ndarray, X0: np.ndarray) -> list[str]:
+    text = lambda values: " ".join(repr(float(value)) for value in values)
+    rows = [f"<L{i}>{text(row)}</L{i}>" for i, row in enumerate(C2W, 1)]
+    return [
+        "<OrientationConique>", "<OrIntImaM2C>",
+        *(f"<{name}>{text(values)}</{name}>" for name, values in IDENTITY.items()),
+        "</OrIntImaM2C>", "<TypeProj>eProjStenope</TypeProj>",
+        f"<FileInterne>{escape(file)}</FileInterne>", "<RelativeNameFI>true</RelativeNameFI>",
+        "<Externe>", f"<KnownConv>{M2C[0]}</KnownConv>", f"<Centre>{text(X0)}</Centre>",
+        "<ParamRotation>", "<CodageMatr>", *rows, "</CodageMatr>", "</ParamRotation>", "</Externe>",
+        "<ConvOri>", f"<KnownConv>{M2C[0]}</KnownConv>", "</ConvOri>", "</OrientationConique>",
+    ]  # fmt: skip

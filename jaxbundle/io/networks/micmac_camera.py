@@ -1,0 +1,225 @@
+"""Calibrations of MicMac: `AutoCal….xml`, a `CalibrationInternConique`.
+
+    KnownConv         eConvApero_DistM2C, eConvOriLib: the distortion leads from the world to the
+                      camera; eConvApero_DistC2M: from the camera to the world
+    PP  F  SzIm       principal point, principal distance, pixels; size of the image
+    CalibDistortion   ModNoDist
+        ModRad        CDist, CoeffDist …: centre C, R3, R5, R7, … (CoeffDistInv is not read)
+        ModPhgrStd    RadialePart (the same), P1, P2, b1, b2
+
+    q = PP + F·[X/Z, Y/Z]                x right, y down, z forward
+    D(q) = q + [dx·R + P1·(ρ² + 2dx²) + 2·P2·dx·dy + b1·dx + b2·dy,
+                dy·R + P2·(ρ² + 2dy²) + 2·P1·dx·dy]
+    [dx, dy] = q − C   ρ² = dx² + dy²   R = R3·ρ² + R5·ρ⁴ + …
+
+The image is D(q) (M2C), or the point that D takes to q (C2M). M2C with C = PP, b1 = b2 = 0 and
+three coefficients or fewer is exactly `opencv`, with fx and fy tied,
+
+    k1 = R3·F²   k2 = R5·F⁴   k3 = R7·F⁶   p1 = P2·F   p2 = P1·F
+
+With an affinity b1, b2 it is `brown-projected`, and C2M is `brown`, exactly, P2 and b2 with the
+other sign. These are in mm: the pixel size, which the file has not, is taken as `PIXEL`; another
+would scale c and coefficients, and change nothing in pixels. With more coefficients, or C beside
+PP, the nearest of ours is fitted. ModUnif (Ebner, Brown's 14 parameters, fisheyes) is refused by
+name, and so is an affine part of its own (OrIntGlob). Which point of the first pixel is (0, 0) is
+not published; it is taken for its centre. Another choice would shift image points and principal
+point alike, so that no ray changes.
+
+Source: MicMac's documentation, "Camera models"; the formula of its `cDistModStdPhpgr`.
+"""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+
+import jax.numpy as jnp
+
+from jaxbundle.cameras.inverse import implicit_inverse
+from jaxbundle.cameras.scalars import Formula, Pair, Parameters, Scalar
+from jaxbundle.errors import InputError
+from jaxbundle.io.cameras.nearest_camera import FittedCamera, Foreign, fitted_camera
+from jaxbundle.io.networks.assemble import all_parameters
+from jaxbundle.io.networks.losses import one_focal_length, size_of, the_rest_is_0
+from jaxbundle.io.text.csv_tables import write_text
+from jaxbundle.io.text.xml_fields import XmlFields, number_in, read_xml
+from jaxbundle.network.tables import Camera
+from jaxbundle.system.file_content import beginning
+
+CALIBRATION = "CalibrationInternConique"
+M2C = ("eConvApero_DistM2C", "eConvOriLib")
+C2M = ("eConvApero_DistC2M",)
+ITERATIONS = 12
+"""Newton's method for the image where the distortion leads to the world."""
+PIXEL = 0.005
+"""mm."""
+MODELS = ("opencv", "brown-projected", "brown")
+"""What can be written."""
+LONGEST = 5
+"""Coefficients CoeffDist of MicMac's models."""
+AFFINE = ("P1", "P2", "b1", "b2")
+COEFFICIENTS = (*(f"R{i}" for i in range(1, LONGEST + 1)), *AFFINE)
+
+
+def is_autocal(path: Path) -> bool:
+    """Whether an XML file holds a calibration of MicMac."""
+    head = beginning(path, 100_000) if path.suffix.lower() == ".xml" else b""
+    return f"<{CALIBRATION}>".encode() in head and b"<OrientationConique>" not in head
+
+
+def read_autocal(path: str | Path) -> Camera:
+    """The camera of a calibration; its id is the name of the file.
+
+    **Raises:** `InputError` naming file and element.
+    """
+    path = Path(path)
+    return calibration(path, read_xml(path), path.stem)
+
+
+def calibration(path: Path, root: ET.Element, id: str) -> Camera:
+    """The camera of the calibration in a document."""
+    whole = XmlFields(path, root, "a calibration of MicMac")
+    found = whole.find(CALIBRATION)
+    if found is None:
+        raise whole.missing(CALIBRATION)
+    xml = XmlFields(path, found, "a calibration of MicMac")
+    direction = xml.text("KnownConv", M2C[0])
+    if direction not in (*M2C, *C2M):
+        known = ", ".join((*M2C, *C2M))
+        raise InputError(f"{path}: KnownConv is {direction}; one of {known} is expected")
+    if xml.find("OrIntGlob") is not None:
+        raise InputError(f"{path}: OrIntGlob, an affine part of its own, is not offered here")
+    f, (cx, cy), (w, h) = xml.number("F"), xml.numbers("PP", 2), xml.numbers("SzIm", 2)
+    if not (f > 0 and w > 0 and h > 0 and w.is_integer() and h.is_integer()):
+        raise InputError(f"{path}: F and SzIm must be positive, SzIm whole, not {f:g}, {w:g} {h:g}")
+    core = {"fx": f, "fy": f, "cx": float(cx), "cy": float(cy)}
+    p = core | _distortion(xml, core)
+    start = core | {f"k{i}": p[f"R{i}"] * f ** (2 * i) for i in (1, 2, 3)}
+    start |= {"p1": p["P2"] * f, "p2": p["P1"] * f}
+    odd = {"more than three coefficients": p["R4"] or p["R5"],
+           "a centre of distortion of its own": (p["x"], p["y"]) != (p["cx"], p["cy"])}
+    has = " and ".join(what for what, there in odd.items() if there)
+    size = int(w), int(h)
+    if has:
+        foreign = Foreign(FORMULAS[direction in C2M], p, start, size, (PIXEL, PIXEL))
+        return fitted_camera(id, foreign, str(path), f"has {has}")
+    if not (p["b1"] or p["b2"] or (direction in C2M and any(p[name] for name in COEFFICIENTS))):
+        return Camera(id, "opencv", start, image_size=size, tie=(("fx", "fy"),))
+    model, told = MODELS[1 + (direction in C2M)], f"the pixel size is taken as {PIXEL:g} mm"
+    return FittedCamera(
+        id, model, _in_mm(p, size), image_size=size, pixel_size=(PIXEL, PIXEL),
+        told=f"camera {id!r} is {model}, which is in mm: {told}; in pixels it changes nothing",
+    )
+
+
+def _in_mm(p: Mapping[str, float], size: tuple[int, int]) -> dict[str, float]:
+    """The parameters of Brown's model with a pixel of `PIXEL`, y up."""
+    found = {f"K{i}": p[f"R{i}"] / PIXEL ** (2 * i) for i in (1, 2, 3)}
+    x0, y0 = (PIXEL * (p[c] - (n - 1) / 2) for c, n in zip(("cx", "cy"), size))
+    return found | {
+        "c": p["fx"] * PIXEL, "x0": x0, "y0": -y0, "P1": p["P1"] / PIXEL, "P2": -p["P2"] / PIXEL,
+        "b1": p["b1"], "b2": -p["b2"],
+    }
+
+
+def _distortion(xml: XmlFields, core: Mapping[str, float]) -> dict[str, float]:
+    """R1 … R5, the centre x, y, and P1, P2, b1, b2, of the one distortion that is none but in name.
+
+    **Raises:** `InputError` for a kind that is not offered, and for several."""
+    none = dict.fromkeys(COEFFICIENTS, 0.0)
+    kinds = [kind for part in xml.root.iter("CalibDistortion") for kind in part]
+    kinds = [kind for kind in kinds if kind.tag != "ModNoDist"]
+    for kind in kinds:
+        if kind.tag not in ("ModRad", "ModPhgrStd") or len(kinds) > 1:
+            name = kind.findtext("TypeModele", "").strip()
+            raise InputError(
+                f"{xml.path}: CalibDistortion {kind.tag} {name}".rstrip()
+                + f" of {len(kinds)}; one of ModNoDist, ModRad, ModPhgrStd is expected"
+            )
+    if not kinds:
+        return none | {"x": core["cx"], "y": core["cy"]}
+    part = XmlFields(xml.path, kinds[0], f"a {kinds[0].tag} of MicMac")
+    x, y = part.numbers("CDist", 2)
+    R = [number_in(e.text or "", f"{xml.path}: CoeffDist") for e in kinds[0].iter("CoeffDist")]
+    if any(R[LONGEST:]):
+        raise InputError(f"{xml.path}: {len(R)} coefficients CoeffDist; {LONGEST} are known")
+    found = none | {f"R{i}": r for i, r in enumerate(R[:LONGEST], 1)}
+    found |= {name: part.number(name, 0.0) for name in AFFINE}
+    return found | {"x": float(x), "y": float(y)}
+
+
+def _distorted(p: Parameters, x: Scalar, y: Scalar) -> Pair:
+    """D of a point, relative to the centre of distortion."""
+    R1, R2, R3, R4, R5, P1, P2, b1, b2 = p
+    r2 = x * x + y * y
+    R = r2 * (R1 + r2 * (R2 + r2 * (R3 + r2 * (R4 + r2 * R5))))
+    dx = x * R + P1 * (r2 + 2 * x * x) + 2 * P2 * x * y + b1 * x + b2 * y
+    return x + dx, y + y * R + P2 * (r2 + 2 * y * y) + 2 * P1 * x * y
+
+
+_from_world = implicit_inverse(_distorted, lambda p, x, y: (x, y), ITERATIONS)
+
+
+def _image(direction: Formula, p: Mapping, X, Y, Z):
+    """The image of a ray: `direction` takes the ideal image there."""
+    x, y = p["fx"] * X / Z + p["cx"] - p["x"], p["fy"] * Y / Z + p["cy"] - p["y"]
+    x, y = direction(tuple(p[name] for name in COEFFICIENTS), x, y)
+    return jnp.stack([x + p["x"], y + p["y"]])
+
+
+FORMULAS = (partial(_image, _distorted), partial(_image, _from_world))
+"""Where the distortion leads to the camera, and where it leads to the world."""
+
+
+def calibration_lines(camera: Camera) -> list[str]:
+    """The element of a camera of one of the `MODELS`.
+
+    **Raises:** `InputError` for another camera, and without image size.
+    """
+    w, h = size_of(camera, "MicMac")
+    p = _of_brown(camera, w, h) if camera.model in MODELS[1:] else _of_opencv(camera)
+    centre = f"{p['cx']!r} {p['cy']!r}"
+    radial = [f"<CDist>{centre}</CDist>"]
+    radial += [f"<CoeffDist>{p[f'R{i}']!r}</CoeffDist>" for i in (1, 2, 3)]
+    radial += ["<PPaEqPPs>true</PPaEqPPs>"]
+    kind = ["<ModRad>", *radial, "</ModRad>"]
+    if any(p[name] for name in AFFINE):
+        kind = ["<ModPhgrStd>", "<RadialePart>", *radial, "</RadialePart>",
+                *(f"<{name}>{p[name]!r}</{name}>" for name in AFFINE), "</ModPhgrStd>"]  # fmt: skip
+    direction = C2M[0] if camera.model == "brown" else M2C[0]
+    return [
+        f"<{CALIBRATION}>", f"<KnownConv>{direction}</KnownConv>", f"<PP>{centre}</PP>",
+        f"<F>{p['fx']!r}</F>", f"<SzIm>{w} {h}</SzIm>", "<CalibDistortion>", *kind,
+        "</CalibDistortion>", f"</{CALIBRATION}>",
+    ]  # fmt: skip
+
+
+def _of_opencv(camera: Camera) -> dict[str, float]:
+    p = the_rest_is_0(camera, "MicMac", ("k1", "k2", "k3", "p1", "p2"))
+    if camera.model != MODELS[0]:
+        raise InputError(f"camera {camera.id!r}: a fisheye is not written for MicMac")
+    f = one_focal_length(camera, "MicMac")
+    radial = {f"R{i}": p[f"k{i}"] / f ** (2 * i) for i in (1, 2, 3)}
+    return p | radial | {"P1": p["p2"] / f, "P2": p["p1"] / f, "b1": 0.0, "b2": 0.0}
+
+
+def _of_brown(camera: Camera, w: int, h: int) -> dict[str, float]:
+    p, (px, py) = all_parameters(camera), camera.pixel_size or (0.0, 1.0)
+    if px != py or p["r0"]:
+        raise InputError(
+            f"camera {camera.id!r}: MicMac needs square pixels (pixel_size) and r0 = 0"
+        )
+    return {f"R{i}": p[f"K{i}"] * px ** (2 * i) for i in (1, 2, 3)} | {
+        "fx": p["c"] / px, "cx": (w - 1) / 2 + p["x0"] / px, "cy": (h - 1) / 2 - p["y0"] / px,
+        "P1": p["P1"] * px, "P2": -p["P2"] * px, "b1": p["b1"], "b2": -p["b2"],
+    }
+
+
+def document(lines: list[str]) -> str:
+    """The text of a file of MicMac with these elements."""
+    return "\n".join(['<?xml version="1.0" ?>', "<ExportAPERO>", *lines, "</ExportAPERO>"]) + "\n"
+
+
+def write_autocal(camera: Camera, path: str | Path) -> None:
+    """Write a calibration."""
+    write_text(Path(path), document(calibration_lines(camera)))

@@ -1,0 +1,316 @@
+"""Scenes of openMVG: `sfm_data.json`, version 0.2 and later.
+
+    views            key, value: ptr_wrapper/data: local_path, filename, width, height, id_view,
+                     id_intrinsic, id_pose
+    intrinsics       key, value: polymorphic_id, polymorphic_name, ptr_wrapper/data: width, height,
+                     focal_length, principal_point, and the coefficients of the kind
+    extrinsics       key, value: rotation (three rows), center
+    structure        key, value: X, observations: key (of the view), value: id_feat, x
+    control_points   the same
+
+The name of a kind stands at its first intrinsic only; later ones repeat its number. Some versions
+wrap what a kind has of another in "value0". Of kinds
+
+    pinhole, pinhole_radial_k1, pinhole_radial_k3    disto_k1, disto_k3: k1, k2, k3
+    pinhole_brown_t2                                 disto_t2: k1, k2, k3, t1, t2
+    fisheye                                          fisheye: k1 … k4
+
+the first are `opencv` with p1 = t1, p2 = t2, the last `kannala-brandt`; fx = fy = focal_length.
+Views of a spherical camera are left out. x_camera = R·(X − center), x right, y down, z forward.
+Which point of the first pixel is (0, 0) is not published; it is taken for its centre. Another
+choice would shift image points and principal point alike, so that no ray changes.
+
+Source: openMVG documentation, "SfM_Data", "cameras"; the serialisation of its cameras.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.pose_conventions import flip_rows
+from jaxbundle.io.networks.assemble import assemble, foreign_document, image_columns
+from jaxbundle.io.networks.control import with_control
+from jaxbundle.io.networks.losses import (
+    need_values,
+    one_focal_length,
+    size_of,
+    the_rest_is_0,
+    what_is_lost,
+)
+from jaxbundle.io.networks.poses import check_rotations, matrices_of
+from jaxbundle.io.text.csv_tables import read_text, write_text
+from jaxbundle.io.text.json_fields import JsonFields, read_object, stacked
+from jaxbundle.network.columns import Columns, count, some
+from jaxbundle.network.tables import Camera, Network, Points, Source
+from jaxbundle.system.file_content import beginning
+
+KINDS = {
+    "pinhole": ("opencv", "", ()),
+    "pinhole_radial_k1": ("opencv", "disto_k1", ("k1",)),
+    "pinhole_radial_k3": ("opencv", "disto_k3", ("k1", "k2", "k3")),
+    "pinhole_brown_t2": ("opencv", "disto_t2", ("k1", "k2", "k3", "p1", "p2")),
+    "fisheye": ("kannala-brandt", "fisheye", ("k1", "k2", "k3", "k4")),
+}
+"""Our model, the field of the coefficients, and what they are here."""
+SPHERICAL = "spherical"
+NONE = 2**32 - 1
+"""openMVG's index of what is not there."""
+FIRST = 2**31
+"""The bit of a number that is new; what it stands for follows."""
+ALIKE = 2**30
+"""The number of what is of the declared class itself."""
+
+
+def is_openmvg(path: Path) -> bool:
+    """Whether a JSON file begins with a version of openMVG's scene."""
+    return path.suffix.lower() == ".json" and b'"sfm_data_version"' in beginning(path, 1000)
+
+
+def read_openmvg(path: str | Path, overrides: Sequence[str] = ()) -> Network:
+    """The network of a scene; cameras and points are called by number, images by file.
+
+    Nothing of the cameras is free, σ is 1 px, the datum inner; control points are held. Views
+    without pose have no orientation, or are left out where they have no image point.
+
+    **Raises:** `InputError` naming file, entry and field.
+    """
+    path = Path(path)
+    scene = JsonFields(path, read_object(path, read_text(path), "openMVG's scene"))
+    scene.text("sfm_data_version")
+    cameras, spherical = _cameras(scene)
+    views, left = _views(scene, cameras, spherical)
+    poses = {key: pose for key, pose in _entries(scene, "extrinsics").items()}
+    tie, rays = _structure(scene, "structure", views)
+    control, clicks = _structure(scene, "control_points", views)
+    names = {key: _control_name(key, tie) for key in control}
+    seen = {view for view, *_ in (*rays, *clicks)}
+    posed = {key for key, view in views.items() if view.get("id_pose") in poses}
+    lost = [_name(views[key]) for key in views if key not in posed and key not in seen]
+    views = {key: view for key, view in views.items() if key in posed or key in seen}
+    if not views:
+        raise InputError(f"{path}: no view has a pose or an image point")
+    told = [f"left out {count(len(ids), 'view')} {why}: {some(ids)}" for ids, why in (
+        (left, "of spherical cameras or without intrinsics"),
+        (lost, "without pose and image points"),
+    ) if ids]  # fmt: skip
+    if any(view.get("use_pose_center_prior") for view in views.values()):
+        told.append("priors of projection centres (use_pose_center_prior) are not read")
+    image_ids = _unique({key: _name(view) for key, view in views.items()})
+    network = assemble(
+        path, foreign_document(path.stem, cameras.values()), overrides,
+        _images(path, views, image_ids, poses),
+        _points(path, tie, [names[key] for key in control]),
+        Columns({
+            "image": [image_ids[view] for view, *_ in (*rays, *clicks)],
+            "point": [*(str(key) for _, key, _ in rays), *(names[key] for _, key, _ in clicks)],
+            **dict(zip("xy", _image_points(path, (*rays, *clicks)).T)),
+        }, Source(str(path), None, "observation")),
+        told,
+    )  # fmt: skip
+    if control and len(network.points):
+        at = stacked(list(control.values()), 3, lambda k: (f"{path}, control_points[{k}]", "X"))
+        datum = any(text.partition("=")[0].strip() == "datum" for text in overrides)
+        unknown = np.full((len(control), 3), np.nan)
+        table = Points(tuple(names.values()), ("control",) * len(control), at, unknown,
+                       Source(str(path), None, "control point"))  # fmt: skip
+        network = with_control(network, table, datum=not datum)
+    return network
+
+
+def _entries(scene: JsonFields, name: str) -> dict[int, JsonFields]:
+    """The values of a list of keys and values."""
+    found: dict[int, JsonFields] = {}
+    for row in scene.rows(name):
+        key = row.whole("key")
+        if key in found:
+            raise InputError(f"{row.path}: key {key} stands there twice")
+        found[key] = row.of("value")
+    return found
+
+
+def _data(value: JsonFields) -> JsonFields:
+    """What a pointer leads to, with what its class has of another."""
+    data = value.of("ptr_wrapper.data")
+    fields, more = {}, data.document
+    while isinstance(more, dict):
+        fields = {**more, **fields}
+        more = more.get("value0")
+    return JsonFields(data.path, fields)
+
+
+def _cameras(scene: JsonFields) -> tuple[dict[int, dict], set[int]]:
+    """The entries of cameras by number, and the numbers of spherical ones."""
+    names: dict[int, str] = {}
+    cameras, spherical = {}, set()
+    for key, value in _entries(scene, "intrinsics").items():
+        number = value.whole("polymorphic_id", ALIKE)
+        if value.get("polymorphic_name") is not None:
+            names[number % FIRST] = value.text("polymorphic_name")
+        name = names.get(number % FIRST, "")
+        if name == SPHERICAL:
+            spherical.add(key)
+            continue
+        if name not in KINDS:
+            raise InputError(
+                f"{value.path}: the kind of camera is {name or 'not named'}; one of "
+                f"{', '.join((*KINDS, SPHERICAL))} is expected"
+            )
+        model, field, coefficients = KINDS[name]
+        data = _data(value)
+        f, (cx, cy) = data.number("focal_length"), data.array("principal_point", (2,))
+        given = data.array(field, (len(coefficients),)).tolist() if field else ()
+        cameras[key] = {
+            "id": str(key), "model": model, "tie": [["fx", "fy"]],
+            "image_size": [data.whole("width", least=1), data.whole("height", least=1)],
+            "fx": f, "fy": f, "cx": float(cx), "cy": float(cy), **dict(zip(coefficients, given)),
+        }  # fmt: skip
+    return cameras, spherical
+
+
+def _views(scene: JsonFields, cameras: Mapping, spherical: set[int]):
+    """The views that have a camera, by number, and the names of the others."""
+    views, left = {}, []
+    for key, value in _entries(scene, "views").items():
+        view = _data(value)
+        camera = view.whole("id_intrinsic", NONE)
+        if camera in cameras:
+            views[key] = view
+        elif camera in spherical or camera == NONE:
+            left.append(_name(view))
+        else:
+            raise InputError(f"{view.path}: id_intrinsic {camera} is not among the intrinsics")
+    if not views:
+        raise InputError(f"{scene.path}: no view has a camera that can be read")
+    return views, left
+
+
+def _name(view: JsonFields) -> str:
+    return "/".join(filter(None, (view.get("local_path"), view.text("filename"))))
+
+
+def _unique(names: Mapping[int, str]) -> dict[int, str]:
+    """The names, those that stand twice with their number."""
+    given = list(names.values())
+    return {k: f"{name}#{k}" if given.count(name) > 1 else name for k, name in names.items()}
+
+
+def _images(path: Path, views: Mapping, names: Mapping, poses: Mapping) -> Columns:
+    R, X0 = (np.full((len(views), *shape), np.nan) for shape in ((3, 3), (3,)))
+    for k, view in enumerate(views.values()):
+        pose = poses.get(view.get("id_pose"))
+        if pose is not None:
+            R[k], X0[k] = pose.array("rotation", (3, 3)), pose.array("center", (3,))
+            check_rotations(R[k], f"{pose.path}: rotation")
+    cameras = [view.whole("id_intrinsic") for view in views.values()]
+    source = Source(str(path), np.array(list(views)), "view")
+    return image_columns(source, list(names.values()), cameras, flip_rows(R), X0)
+
+
+def _structure(scene: JsonFields, name: str, views: Mapping):
+    """X of the points by number, and (view, point, x) of the image points."""
+    points, rays = {}, []
+    for key, value in _entries(scene, name).items():
+        points[key] = value.get("X")
+        for row in value.rows("observations"):
+            view = row.whole("key")
+            if view in views:
+                rays.append((view, key, row.get("value.x")))
+    return points, rays
+
+
+def _image_points(path: Path, rays: Sequence) -> np.ndarray:
+    def place(k: int) -> tuple[str, str]:
+        return f"{path}, point {rays[k][1]}, view {rays[k][0]}", "x"
+
+    return stacked([x for *_, x in rays], 2, place).reshape(-1, 2)
+
+
+def _points(path: Path, tie: Mapping, control: Sequence[str]) -> Columns:
+    place = lambda k: (f"{path}, structure[{k}]", "X")
+    known = stacked(list(tie.values()), 3, place).reshape(-1, 3)
+    position = np.concatenate([known, np.full((len(control), 3), np.nan)])
+    columns = {"id": [*map(str, tie), *control], "role": ["tie"] * len(position)}
+    return Columns(columns | dict(zip("XYZ", position.T)), Source(str(path), None, "point"))
+
+
+def _control_name(key: int, tie: Mapping) -> str:
+    return f"control {key}" if key in tie else str(key)
+
+
+def write_openmvg(network: Network, path: str | Path) -> tuple[str, ...]:
+    """Write a scene. Cameras must be of model `opencv` or `kannala-brandt`, with one principal
+    distance, and have an image size; control and fixed points become `control_points`.
+
+    **Returns:** what the format has no place for, in words.
+    """
+    need_values(network)
+    images, points, rays = network.images, network.points, network.observations
+    sizes = [network.cameras[c].image_size or (0, 0) for c in images.camera.tolist()]
+    views = [
+        _entry(i, {"polymorphic_id": ALIKE, "ptr_wrapper": {"id": FIRST + i + 1, "data": {
+            "local_path": "", "filename": id, "width": w, "height": h, "id_view": i,
+            "id_intrinsic": c, "id_pose": i,
+        }}}) for i, (id, c, (w, h)) in enumerate(zip(images.id, images.camera.tolist(), sizes))
+    ]  # fmt: skip
+    R = flip_rows(matrices_of(images.angles))
+    extrinsics = [
+        _entry(i, {"rotation": R[i].tolist(), "center": images.position[i].tolist()})
+        for i in range(len(images))
+    ]
+    seen: list[list[dict]] = [[] for _ in points.id]
+    features = np.zeros(len(images), int)
+    for i, p, xy in zip(rays.image.tolist(), rays.point.tolist(), rays.xy.tolist()):
+        seen[p].append(_entry(i, {"id_feat": int(features[i]), "x": xy}))
+        features[i] += 1
+    held = points.has_role("control", "fixed")
+    numbers = _numbers(points.id)
+    tables = [
+        [_entry(numbers[p], {"X": points.position[p].tolist(), "observations": seen[p]})
+         for p in np.flatnonzero(mask).tolist()] for mask in (~held, held)
+    ]  # fmt: skip
+    scene = {
+        "sfm_data_version": "0.3", "root_path": "", "views": views,
+        "intrinsics": _intrinsics(network.cameras, FIRST + len(images) + 1),
+        "extrinsics": extrinsics, "structure": tables[0], "control_points": tables[1],
+    }  # fmt: skip
+    write_text(Path(path), json.dumps(scene, indent=1) + "\n")
+    lost = [what for what in what_is_lost(network) if not what.startswith("roles")]
+    lost += ["σ of control points, check points"] if held.any() or "check" in points.role else []
+    return (*lost, *(("names of points",) if list(map(str, numbers)) != list(points.id) else ()))
+
+
+def _entry(key: int, value: dict) -> dict:
+    return {"key": key, "value": value}
+
+
+def _numbers(ids: Sequence[str]) -> list[int]:
+    """The ids where all are numbers, else 0, 1, 2, …"""
+    plain = all(id.isascii() and id.isdigit() and len(id) < 10 and str(int(id)) == id for id in ids)
+    return [int(id) for id in ids] if plain else list(range(len(ids)))
+
+
+def _intrinsics(cameras: Sequence[Camera], first: int) -> list[dict]:
+    entries, numbers = [], {}
+    for k, camera in enumerate(cameras):
+        name, data = _intrinsic(camera)
+        kind = {"polymorphic_id": numbers.get(name, 0)}
+        if name not in numbers:
+            numbers[name] = len(numbers) + 1
+            kind = {"polymorphic_id": FIRST + numbers[name], "polymorphic_name": name}
+        entries.append(_entry(k, kind | {"ptr_wrapper": {"id": first + k, "data": data}}))
+    return entries
+
+
+def _intrinsic(camera: Camera) -> tuple[str, dict]:
+    """The smallest kind that holds a camera, and its fields."""
+    kinds = {n: (field, c) for n, (model, field, c) in KINDS.items() if model == camera.model}
+    most = max((c for _, c in kinds.values()), key=len, default=())
+    p = the_rest_is_0(camera, "openMVG", most)
+    (w, h), f = size_of(camera, "openMVG"), one_focal_length(camera, "openMVG")
+    name = next(n for n, (_, c) in kinds.items() if not any(p[k] for k in most if k not in c))
+    field, names = kinds[name]
+    data = {"width": w, "height": h, "focal_length": f, "principal_point": [p["cx"], p["cy"]]}
+    return name, data | ({field: [p[k] for k in names]} if field else {})

@@ -1,0 +1,399 @@
+"""Reconstructions of OpenSfM: `reconstruction.json`, with `tracks.csv` and `reference_lla.json`.
+
+    [{"cameras": {id: {projection_type, width, height, …}},
+      "shots": {image: {camera, rotation, translation, gps_position, gps_dop}},
+      "points": {id: {coordinates, color}}}, …]
+
+The image points are in the tracks, one a line, separated by tabs: image, track, feature, x, y, …;
+the header names the version, of which 0 has none. They and the parameters of cameras are counted
+from the middle of the image, x right, y down, in units of its larger side s,
+
+    u = s·x + (w − 1)/2   v = s·y + (h − 1)/2   fx = s·focal_x   cx = s·c_x + (w − 1)/2
+
+    perspective, simple_radial, radial, brown    `opencv`: k1, k2, k3, p1, p2
+    fisheye, fisheye_opencv                      `kannala-brandt`: k1 … k4
+    fisheye62, fisheye624                        `kannala-brandt-tangential`, `thin-prism-fisheye`
+                                                 where k5, k6, s1, s3 are 0, else fitted
+    spherical, equirectangular                   `equirectangular`, fx = fy = s/(2π)
+    dual                                         fitted: l·tan θ + (1 − l)·θ for θ of fisheye
+
+x_camera = R·X + t, x right, y down, z forward; `rotation`
+is the vector of R. `gps_position`, with σ `gps_dop` on every axis, are observed projection centres,
+in the frame of the points, which is topocentric about `reference_lla.json`.
+
+Source: OpenSfM documentation, "Geometric Models", "Dataset Structure"; its formulas for 2x², 2y² in
+the tangential part, where the page has 2x, 2y.
+"""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.geometry.pose_conventions import cv_pose, exterior_from_cv
+from jaxbundle.io.cameras.nearest_camera import (
+    Foreign,
+    NoPlaceError,
+    fits_told,
+    fitted_camera,
+    root,
+)
+from jaxbundle.io.networks.assemble import assemble, entry_of, foreign_document, image_columns
+from jaxbundle.io.networks.losses import (
+    need_values,
+    one_focal_length,
+    size_of,
+    the_rest_is_0,
+    what_is_lost,
+)
+from jaxbundle.io.networks.poses import (
+    matrices_of,
+    matrices_of_rotation_vectors,
+    rotation_vectors_of,
+)
+from jaxbundle.io.text.csv_tables import read_text, write_text
+from jaxbundle.io.text.json_fields import JsonFields, read_object, stacked
+from jaxbundle.io.text.rows import Rows
+from jaxbundle.io.writing.folders import replaced_folder
+from jaxbundle.network.columns import Columns, count, some
+from jaxbundle.network.further import Antennas
+from jaxbundle.network.tables import Camera, Network, Source
+from jaxbundle.system.file_content import beginning, parse_json
+
+RECONSTRUCTION, TRACKS, MODELS, REFERENCE = (
+    "reconstruction.json", "tracks.csv", "camera_models.json", "reference_lla.json",
+)  # fmt: skip
+FILES = (RECONSTRUCTION, TRACKS, MODELS)
+HEAD = "OPENSFM_TRACKS_VERSION_v"
+VERSION = 2
+DOP = 15.0
+"""OpenSfM's σ of a position where a shot has none, metres."""
+LEAST_POSITIONS = 3
+"""Fewer do not define a datum."""
+ONE = ("focal",)
+TWO = ("focal_x", "focal_y")
+KINDS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
+    "perspective": ("opencv", ONE, ("k1", "k2")),
+    "simple_radial": ("opencv", TWO, ("k1",)),
+    "radial": ("opencv", TWO, ("k1", "k2")),
+    "brown": ("opencv", TWO, ("k1", "k2", "k3", "p1", "p2")),
+    "fisheye": ("kannala-brandt", ONE, ("k1", "k2")),
+    "fisheye_opencv": ("kannala-brandt", TWO, ("k1", "k2", "k3", "k4")),
+}
+"""Our model, focal lengths, coefficients."""
+PRISM = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s0", "s1", "s2", "s3")
+FITTED = ("fisheye62", "fisheye624", "dual")
+SPHERICAL = ("spherical", "equirectangular")
+
+
+def is_opensfm(path: Path) -> bool:
+    """Whether it is a reconstruction, or a folder that has one."""
+    if path.is_dir():
+        return (path / RECONSTRUCTION).is_file()
+    return _has_cameras(path, b"[")
+
+
+def is_opensfm_cameras(path: Path) -> bool:
+    """Whether it is a JSON file of cameras alone, such as `camera_models.json`."""
+    return _has_cameras(path, b"{")
+
+
+def _has_cameras(path: Path, begin: bytes) -> bool:
+    head = beginning(path, 100_000).lstrip() if path.suffix.lower() == ".json" else b""
+    return head.startswith(begin) and b'"projection_type"' in head
+
+
+def read_opensfm_cameras(path: str | Path) -> tuple[Camera, ...]:
+    """The cameras of `camera_models.json`.
+
+    **Raises:** `InputError` naming file, camera and field.
+    """
+    path = Path(path)
+    document = JsonFields(path, {"": read_object(path, read_text(path), "OpenSfM's cameras")})
+    return tuple(_camera(id, fields) for id, fields in document.objects("").items())
+
+
+def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
+    """The network of a reconstruction, of several the largest.
+
+    Nothing of the cameras is free, σ is 1 px; the datum is given by the positions of GPS
+    where three shots have one, else inner.
+
+    **Raises:** `InputError` naming file, entry and field.
+    """
+    path = Path(path)
+    file = path / RECONSTRUCTION if path.is_dir() else path
+    scene, told = _largest(file)
+    cameras, refused = _cameras(scene)
+    shots, lost = {}, []
+    for id, shot in scene.objects("shots").items():
+        camera = shot.text("camera")
+        if camera in cameras:
+            shots[id] = shot
+        elif camera in refused:
+            lost.append(id)
+        else:
+            raise InputError(f"{shot.path}: camera {camera!r} is not among the cameras")
+    if not shots:
+        raise next(iter(refused.values()), InputError(f"{file}: there are no shots"))
+    if lost:
+        why = "; ".join(str(error).removeprefix(f"{file}, ") for error in refused.values())
+        told.append(f"{why}; left out {count(len(lost), 'shot')}: {some(lost)}")
+    gps = _positions(shots)
+    points = scene.objects("points")
+    at = stacked([p.get("coordinates") for p in points.values()], 3,
+                 lambda k: (str([*points.values()][k].path), "coordinates")).reshape(-1, 3)
+    rays, missing = _tracks(file.parent / TRACKS, cameras, shots, points)
+    if missing:
+        told.append(f"left out {count(missing, 'image point')} of tracks that have no point")
+    if (file.parent / REFERENCE).is_file():
+        told.append(_reference(file.parent / REFERENCE))
+    datum = {"datum": "control"} if gps else {}
+    network = assemble(
+        file,
+        foreign_document(file.parent.name, map(entry_of, cameras.values()), object_unit="m",
+                         **datum),
+        overrides, _images(file, shots),
+        Columns({"id": list(points), "role": ["tie"] * len(points), **dict(zip("XYZ", at.T))},
+                Source(str(file), None, "point")),
+        rays, (*told, *fits_told(cameras.values())),
+    )  # fmt: skip
+    return network.replace(further=gps)
+
+
+def _largest(file: Path) -> tuple[JsonFields, list[str]]:
+    """The reconstruction with the most shots, and what is to be told of the others."""
+    scenes = JsonFields(file, {"": parse_json(file, read_text(file))}).rows("")
+    if not scenes:
+        raise InputError(f"{file}: there is no reconstruction in it")
+    sizes = [len(scene.get("shots") or ()) for scene in scenes]
+    largest = int(np.argmax(sizes))
+    scene = JsonFields(file, scenes[largest].document)
+    others = sum(sizes) - sizes[largest]
+    if len(scenes) == 1:
+        return scene, []
+    return scene, [f"the largest of {len(scenes)} reconstructions is read; the others have "
+                   f"{count(others, 'shot')}"]  # fmt: skip
+
+
+def _cameras(scene: JsonFields) -> tuple[dict[str, Camera], dict[str, NoPlaceError]]:
+    cameras, refused = {}, {}
+    for id, fields in scene.objects("cameras").items():
+        try:
+            cameras[id] = _camera(id, fields)
+        except NoPlaceError as error:
+            refused[id] = error
+    return cameras, refused
+
+
+def _camera(id: str, fields: JsonFields) -> Camera:
+    """A camera of ours; **Raises:** `NoPlaceError` where no model comes near."""
+    kind = fields.text("projection_type", "perspective")
+    size = fields.whole("width", least=1), fields.whole("height", least=1)
+    if kind in SPHERICAL:
+        f = max(size) / (2 * np.pi)
+        middle = {"cx": (size[0] - 1) / 2, "cy": (size[1] - 1) / 2}
+        return Camera(id, "equirectangular", {"fx": f, "fy": f} | middle, image_size=size)
+    if kind not in (*KINDS, *FITTED):
+        known = ", ".join((*KINDS, *FITTED, *SPHERICAL))
+        raise InputError(f"{fields.path}: projection_type is {kind}; one of {known} is expected")
+    one = kind in ("perspective", "fisheye", "dual")
+    f = [max(size) * fields.number(name) for name in ("focal", "focal") if one] or [
+        max(size) * fields.number(name) for name in TWO]  # fmt: skip
+    c = [max(size) * (0.0 if one else fields.number(name, 0.0)) + (n - 1) / 2
+         for name, n in zip(("c_x", "c_y"), size)]  # fmt: skip
+    core: dict[str, float] = dict(zip(("fx", "fy", "cx", "cy"), (*f, *c)))
+    if kind in KINDS:
+        model, _, names = KINDS[kind]
+        given = {name: fields.number(name, 0.0) for name in names}
+        tie = (("fx", "fy"),) if one else ()
+        return Camera(id, model, core | given, image_size=size, tie=tie)
+    if kind == "dual":
+        own = {"l": fields.number("transition", 0.5)}
+        own |= {name: fields.number(name, 0.0) for name in ("k1", "k2")}
+        formula = _dual
+    else:
+        own = {name: fields.number(name, 0.0) for name in PRISM}
+        exact = {"sx1": own["s0"], "sy1": own["s2"]} if own["s0"] or own["s2"] else {}
+        if not any(own[name] for name in ("k5", "k6", "s1", "s3")):
+            model = "thin-prism-fisheye" if exact else "kannala-brandt-tangential"
+            p = {name: own[name] for name in ("k1", "k2", "k3", "k4", "p1", "p2")}
+            return Camera(id, model, core | p | exact, image_size=size)
+        formula = _prism
+    foreign = Foreign(formula, core | own, core, size, fisheye=True)
+    return fitted_camera(id, foreign, str(fields.path), f"is of projection_type {kind}")
+
+
+def _prism(p: Mapping, X, Y, Z):
+    """fisheye624: decentring and thin prism are of the image of the angle, as the radial part."""
+    off = root(X * X + Y * Y)
+    scale = jnp.where(off > 0, jnp.arctan2(off, Z) / jnp.where(off > 0, off, 1.0), 1 / Z)
+    x, y = X * scale, Y * scale
+    t2 = x * x + y * y
+    radial = 1 + sum(p[f"k{i}"] * t2**i for i in range(1, 7))
+    xd = x * radial + 2 * p["p1"] * x * y + p["p2"] * (t2 + 2 * x * x)
+    yd = y * radial + 2 * p["p2"] * x * y + p["p1"] * (t2 + 2 * y * y)
+    xd, yd = xd + t2 * (p["s0"] + t2 * p["s1"]), yd + t2 * (p["s2"] + t2 * p["s3"])
+    return jnp.stack([p["fx"] * xd + p["cx"], p["fy"] * yd + p["cy"]])
+
+
+def _dual(p: Mapping, X, Y, Z):
+    """Between a perspective image and one of the angle."""
+    off = root(X * X + Y * Y)
+    angle = jnp.arctan2(off, Z)
+    fish = jnp.where(off > 0, angle / jnp.where(off > 0, off, 1.0), 1 / Z)
+    scale = p["l"] / Z + (1 - p["l"]) * fish
+    x, y = X * scale, Y * scale
+    r2 = x * x + y * y
+    radial = 1 + r2 * (p["k1"] + r2 * p["k2"])
+    return jnp.stack([p["fx"] * x * radial + p["cx"], p["fy"] * y * radial + p["cy"]])
+
+
+def _images(file: Path, shots: Mapping[str, JsonFields]) -> Columns:
+    paths = [str(shot.path) for shot in shots.values()]
+    turn, t = (
+        stacked([shot.get(name) for shot in shots.values()], 3, lambda k, n=name: (paths[k], n))
+        for name in ("rotation", "translation")
+    )
+    M, X0 = exterior_from_cv(matrices_of_rotation_vectors(turn), t)
+    cameras = [shot.text("camera") for shot in shots.values()]
+    return image_columns(Source(str(file), None, "shot"), list(shots), cameras, M, X0)
+
+
+def _positions(shots: Mapping[str, JsonFields]) -> tuple[Antennas, ...]:
+    """The observed projection centres, where they define a datum."""
+    given = {id: shot for id, shot in shots.items() if shot.get("gps_position") is not None}
+    if len(given) < LEAST_POSITIONS:
+        return ()
+    at = np.array([shot.array("gps_position", (3,)) for shot in given.values()])
+    sigma = np.array([shot.number("gps_dop", DOP) for shot in given.values()])
+    sigma = np.where(sigma > 0, sigma, DOP)
+    columns = {"image": list(given), **dict(zip("XYZ", at.T)),
+               **{f"s{axis}": sigma for axis in "XYZ"}}  # fmt: skip
+    return (Antennas.of(Columns(columns, Source("shots", None, "gps_position")), {}, 1.0),)
+
+
+def _tracks(file: Path, cameras: Mapping, shots: Mapping, points: Mapping):
+    """The table of image points, None without tracks; how many there are of no point."""
+    if not file.is_file():
+        return None, 0
+    columns: dict[str, list] = {name: [] for name in ("image", "point", "x", "y")}
+    lines, missing = [], 0
+    for row in Rows(file, separator="\t"):
+        if row.text.startswith(HEAD):
+            version = row.text.removeprefix(HEAD).strip()
+            if version not in ("1", "2", "3"):
+                raise row.error(f"tracks of version {version[:20]}; 0, 1, 2 and 3 are known")
+            continue
+        if len(row) < 5:
+            raise row.error(f"{len(row)} columns; image, track, feature, x, y, … are expected")
+        image, point = row.words[:2]
+        if image not in shots:
+            continue
+        if point not in points:
+            missing += 1
+            continue
+        x, y = row.numbers(("x", "y"), 3, more=True)
+        w, h = cameras[shots[image].text("camera")].image_size
+        values = (image, point, max(w, h) * x + (w - 1) / 2, max(w, h) * y + (h - 1) / 2)
+        for column, value in zip(columns.values(), values):
+            column.append(value)
+        lines.append(row.number)
+    return Columns(columns, Source(str(file), np.array(lines, np.int64), "line")), missing
+
+
+def _reference(file: Path) -> str:
+    fields = JsonFields(file, read_object(file, read_text(file), "a reference"))
+    at = ", ".join(f"{name} {fields.number(name):.9g}"
+                   for name in ("latitude", "longitude", "altitude"))  # fmt: skip
+    return f"coordinates are topocentric about {at} ({REFERENCE})"
+
+
+def write_opensfm(network: Network, folder: str | Path, force: bool = False) -> tuple[str, ...]:
+    """Write a reconstruction, its tracks and its cameras into a folder.
+
+    Cameras must be of model `opencv` or `kannala-brandt` and have an image size.
+
+    **Arguments:** `force`: replace a folder that this function has not written.
+
+    **Returns:** what the format has no place for, in words.
+
+    **Raises:** `InputError` where the folder may not or cannot be written
+    (`jaxbundle.io.writing.folders`).
+    """
+    with replaced_folder(folder, "write_opensfm", FILES, force) as new:
+        return fill_opensfm(network, new)
+
+
+def fill_opensfm(network: Network, folder: Path) -> tuple[str, ...]:
+    """Write a reconstruction beside what is in a folder, or a new one; as `write_opensfm`."""
+    need_values(network)
+    images, points = network.images, network.points
+    cameras = {camera.id: _camera_fields(camera) for camera in network.cameras}
+    R, t = cv_pose(matrices_of(images.angles), images.position)
+    turn = rotation_vectors_of(R)
+    used = [network.cameras[c] for c in images.camera.tolist()]
+    shots = {
+        id: {"camera": camera.id, "rotation": v, "translation": at}
+        for id, camera, v, at in zip(images.id, used, turn.tolist(), t.tolist())
+    }
+    measured = [one for one in network.further if isinstance(one, Antennas) and not one.settings]
+    for one in measured:
+        for id, at, C in zip(one.image, one.position.tolist(), one.covariance):
+            shots[id] |= {"gps_position": at, "gps_dop": float(np.sqrt(np.trace(C) / 3))}
+    scene = {"cameras": cameras, "shots": shots, "points": {
+        id: {"coordinates": at, "color": [128.0, 128.0, 128.0]}
+        for id, at in zip(points.id, points.position.tolist())
+    }}  # fmt: skip
+    folder.mkdir(exist_ok=True)
+    write_text(folder / RECONSTRUCTION, json.dumps([scene], indent=1) + "\n")
+    write_text(folder / MODELS, json.dumps(cameras, indent=1) + "\n")
+    write_text(folder / TRACKS, _track_lines(network, [c.image_size or (1, 1) for c in used]))
+    rest = tuple(one for one in network.further if not any(one is m for m in measured))
+    return what_is_lost(network.replace(further=rest))
+
+
+def _track_lines(network: Network, sizes: Sequence[tuple[int, int]]) -> Iterable[str]:
+    images, points, rays = network.images, network.points, network.observations
+    for id in (*images.id, *points.id):
+        if any(character in id for character in "\t\n\r"):
+            raise InputError(f"{TRACKS}: {id!r}: names of images and points cannot have tabs")
+    yield f"{HEAD}{VERSION}\n"
+    for k, (i, p, (u, v)) in enumerate(
+        zip(rays.image.tolist(), rays.point.tolist(), rays.xy.tolist())
+    ):
+        (w, h), s = sizes[i], max(sizes[i])
+        x, y = (u - (w - 1) / 2) / s, (v - (h - 1) / 2) / s
+        yield (f"{images.id[i]}\t{points.id[p]}\t{k}\t{x!r}\t{y!r}\t{1 / s!r}\t128\t128\t128"
+               "\t-1\t-1\n")  # fmt: skip
+
+
+def write_opensfm_cameras(cameras: Sequence[Camera], path: str | Path) -> None:
+    """Write cameras as `camera_models.json`."""
+    fields = {camera.id: _camera_fields(camera) for camera in cameras}
+    write_text(Path(path), json.dumps(fields, indent=1) + "\n")
+
+
+def _camera_fields(camera: Camera) -> dict:
+    """The fields of a camera, of the smallest kind that holds it."""
+    kinds = {name: rest for name, (model, *rest) in KINDS.items() if model == camera.model}
+    most = max((names for _, names in kinds.values()), key=len, default=())
+    p = the_rest_is_0(camera, "OpenSfM", most)
+    w, h = size_of(camera, "OpenSfM")
+    s = max(w, h)
+    c = [(p["cx"] - (w - 1) / 2) / s, (p["cy"] - (h - 1) / 2) / s]
+    centred = c == [0, 0] and p["fx"] == p["fy"]
+    name = next(
+        name for name, (focal, names) in kinds.items()
+        if (centred or focal == TWO) and not any(p[k] for k in most if k not in names)
+    )  # fmt: skip
+    focal, names = kinds[name]
+    fields = {"projection_type": name, "width": w, "height": h}
+    if focal == ONE:
+        fields["focal"] = one_focal_length(camera, "OpenSfM") / s
+    else:
+        fields |= {"focal_x": p["fx"] / s, "focal_y": p["fy"] / s, "c_x": c[0], "c_y": c[1]}
+    return fields | {name: p[name] for name in names}

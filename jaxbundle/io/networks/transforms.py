@@ -1,0 +1,185 @@
+"""Cameras of nerfstudio and instant-ngp: `transforms.json`.
+
+    camera_model      OPENCV, PINHOLE, SIMPLE_PINHOLE, OPENCV_FISHEYE; OPENCV without it
+    fl_x fl_y cx cy w h k1 k2 k3 k4 p1 p2       of all frames, or of each; or camera_angle_x, the
+                                                angle of view, in radians, for fl_x
+    frames            file_path, transform_matrix
+
+The transform is camera → world, 4 × 4, x right, y up, the camera looks along −z, as ours: M = Rᵀ,
+X0 = its last column. Pixels count from the corner of the first one: cx = cx_file − ½. Without fl_y
+it is fl_x, without cx, cy the middle of the image. Of OPENCV k4 is the coefficient of r⁸, which has
+no place in ours: where it is not 0 the nearest camera is fitted. `is_fisheye` of instant-ngp is
+OPENCV_FISHEYE. The point cloud (`ply_file_path`), masks and depths are not read. Coordinates are
+those of the file: what was done to them before (`applied_transform`, `scale`, `offset`) is not
+undone.
+
+Source: nerfstudio documentation, "Data conventions"; instant-ngp, "Tips for training NeRF models".
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.cameras.nearest_camera import Foreign, NoPlaceError, fits_told, fitted_camera
+from jaxbundle.io.networks.assemble import assemble, entry_of, foreign_document, image_columns
+from jaxbundle.io.networks.losses import need_values, size_of, the_rest_is_0, what_is_lost
+from jaxbundle.io.networks.poses import check_rotations, matrices_of
+from jaxbundle.io.text.csv_tables import read_text, write_text
+from jaxbundle.io.text.json_fields import JsonFields, read_object
+from jaxbundle.network.columns import count, some
+from jaxbundle.network.tables import Camera, Network, Source
+from jaxbundle.system.file_content import beginning
+
+HALF = 0.5
+"""A pixel's centre seen from its corner."""
+MODELS = {
+    "OPENCV": ("opencv", ("k1", "k2", "k3", "p1", "p2")),
+    "PINHOLE": ("opencv", ()),
+    "SIMPLE_PINHOLE": ("opencv", ()),
+    "OPENCV_FISHEYE": ("kannala-brandt", ("k1", "k2", "k3", "k4")),
+}
+INTRINSICS = ("camera_model", "is_fisheye", "camera_angle_x", "camera_angle_y", "fl_x", "fl_y",
+              "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2")  # fmt: skip
+UNDONE = ("applied_transform", "applied_scale", "scale", "offset")
+
+
+def is_transforms(path: Path) -> bool:
+    """Whether a JSON file has frames with transforms."""
+    head = beginning(path, 100_000) if path.suffix.lower() == ".json" else b""
+    return b'"transform_matrix"' in head and b'"frames"' in head
+
+
+def read_transforms(path: str | Path, overrides: Sequence[str] = ()) -> Network:
+    """The cameras and images of a file; frames of the same intrinsics share a camera.
+
+    Nothing can be adjusted: there are no image points.
+
+    **Raises:** `InputError` naming file, frame and field.
+    """
+    path = Path(path)
+    file = JsonFields(path, read_object(path, read_text(path), "transforms"))
+    cameras: dict[str, Camera] = {}
+    names, used, M, X0, lost = [], [], [], [], []
+    why = None
+    for frame in file.rows("frames"):
+        name, fields = frame.text("file_path"), _intrinsics(file, frame)
+        key = json.dumps(fields.document, sort_keys=True)
+        try:
+            if key not in cameras:
+                cameras[key] = _camera(str(len(cameras) + 1), fields)
+        except NoPlaceError as error:
+            why, lost = error, [*lost, name]
+            continue
+        T = frame.array("transform_matrix", (None, 4))
+        if len(T) not in (3, 4):
+            raise InputError(f"{frame.path}: transform_matrix has {len(T)} rows; 4 are expected")
+        check_rotations(T[:3, :3], f"{frame.path}: transform_matrix")
+        names.append(name)
+        used.append(cameras[key].id)
+        M.append(T[:3, :3].T)
+        X0.append(T[:3, 3])
+    if not names:
+        raise why or InputError(f"{path}: there are no frames")
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice:
+        raise InputError(f"{path}: two frames have the file_path {twice!r}")
+    told = [f"{why}; left out {count(len(lost), 'frame')}: {some(lost)}"] if lost else []
+    undone = [name for name in UNDONE if file.get(name) is not None]
+    if undone:
+        told.append(f"coordinates are those of the file; not undone: {', '.join(undone)}")
+    images = image_columns(Source(str(path), None, "frame"), names, used, np.array(M), np.array(X0))
+    document = foreign_document(path.stem, map(entry_of, cameras.values()))
+    return assemble(path, document, overrides, images,
+                    warnings=(*told, *fits_told(cameras.values())))  # fmt: skip
+
+
+def _intrinsics(file: JsonFields, frame: JsonFields) -> JsonFields:
+    """What a frame says of its camera, and of what it does not say the file."""
+    own = any(name in frame.document for name in INTRINSICS)
+    given = {name: value for source in (file, frame) for name in INTRINSICS
+             if (value := source.get(name)) is not None}  # fmt: skip
+    return JsonFields(frame.path if own else file.path, given)
+
+
+def _camera(id: str, fields: JsonFields) -> Camera:
+    fisheye = "OPENCV_FISHEYE" if fields.get("is_fisheye") is True else "OPENCV"
+    kind = fields.text("camera_model", fisheye)
+    if kind not in MODELS:
+        raise NoPlaceError(
+            f"{fields.path}: cameras of camera_model {kind} are not offered here; these are: "
+            f"{', '.join(MODELS)}"
+        )
+    model, names = MODELS[kind]
+    size = None
+    if fields.get("w") is not None or fields.get("h") is not None:
+        size = fields.whole("w", least=1), fields.whole("h", least=1)
+    fx = _focal_length(fields, "x", size and size[0], None)
+    fy = _focal_length(fields, "y", size and size[1], fx)
+    middle = (size[0] / 2, size[1] / 2) if size else (None, None)
+    c = [fields.number(f"c{axis}", n) - HALF for axis, n in zip("xy", middle)]
+    core = dict(zip(("fx", "fy", "cx", "cy"), (fx, fy, *c)))
+    given = {name: fields.number(name, 0.0) for name in names}
+    k4 = fields.number("k4", 0.0) if kind == "OPENCV" else 0.0
+    if k4 == 0:
+        tie = (("fx", "fy"),) if fields.get("fl_y") is None and fx == fy else ()
+        return Camera(id, model, core | given, image_size=size, tie=tie)
+    if size is None:
+        raise InputError(f"{fields.path}: w is missing; k4 is not 0: a fit needs the image size")
+    foreign = Foreign(polynomial, core | given | {"k4": k4}, core | given, size)
+    return fitted_camera(id, foreign, str(fields.path), f"has k4 {k4:g}")
+
+
+def _focal_length(fields: JsonFields, axis: str, size: int | None, other: float | None) -> float:
+    """Along an axis: given, from the angle of view, or the other one."""
+    if fields.get(f"fl_{axis}") is None and fields.get(f"camera_angle_{axis}") is not None:
+        if size is None:
+            raise InputError(f"{fields.path}: w and h are missing, which camera_angle_{axis} needs")
+        return size / 2 / np.tan(fields.number(f"camera_angle_{axis}") / 2)
+    return fields.number(f"fl_{axis}", other)
+
+
+def polynomial(p: Mapping, X, Y, Z):
+    """The distortion of OPENCV with k4."""
+    x, y = X / Z, Y / Z
+    r2 = x * x + y * y
+    radial = 1 + r2 * (p["k1"] + r2 * (p["k2"] + r2 * (p["k3"] + r2 * p["k4"])))
+    xd = x * radial + 2 * p["p1"] * x * y + p["p2"] * (r2 + 2 * x * x)
+    yd = y * radial + 2 * p["p2"] * x * y + p["p1"] * (r2 + 2 * y * y)
+    return jnp.stack([p["fx"] * xd + p["cx"], p["fy"] * yd + p["cy"]])
+
+
+def write_transforms(network: Network, path: str | Path) -> tuple[str, ...]:
+    """Write the cameras and images of a network; one camera's intrinsics stand for all frames.
+
+    Cameras must be of model `opencv` or `kannala-brandt` and have an image size.
+
+    **Returns:** what the format has no place for, in words.
+    """
+    need_values(network, points=False)
+    images, one = network.images, len(network.cameras) == 1
+    fields = [_fields(camera) for camera in network.cameras]
+    T = np.tile(np.eye(4), (len(images), 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = matrices_of(images.angles).transpose(0, 2, 1), images.position
+    frames = [
+        {"file_path": id, "transform_matrix": t, **({} if one else fields[c])}
+        for id, t, c in zip(images.id, T.tolist(), images.camera.tolist())
+    ]
+    document = (fields[0] if one else {}) | {"frames": frames}
+    write_text(Path(path), json.dumps(document, indent=1) + "\n")
+    return (*what_is_lost(network, rays=True), *(("points",) if len(network.points) else ()))
+
+
+def _fields(camera: Camera) -> dict:
+    fisheye = camera.model == "kannala-brandt"
+    kind = "OPENCV_FISHEYE" if fisheye else "OPENCV"
+    names = MODELS[kind][1]
+    p = the_rest_is_0(camera, "nerfstudio", names)
+    w, h = size_of(camera, "nerfstudio")
+    return {
+        "camera_model": kind, "w": w, "h": h, "fl_x": p["fx"], "fl_y": p["fy"],
+        "cx": p["cx"] + HALF, "cy": p["cy"] + HALF, **{name: p[name] for name in names},
+    }  # fmt: skip

@@ -1,0 +1,54 @@
+"""The result of a design as JSON (the fields are listed in docs/design.md)."""
+
+import json
+
+from jaxbundle.io.results.result_json import without_nan
+from jaxbundle.network.tables import EXTERIOR
+from jaxbundle.network.units import ANGLE_UNITS
+from jaxbundle.network_design.proof import Proof
+from jaxbundle.network_design.result import Design, State
+
+
+def design_dict(designed: Design, proof: Proof | None = None) -> dict:
+    """A design as plain dicts and numbers."""
+    network = designed.network
+    return {
+        "order": designed.order,
+        "aim": str(designed.aim),
+        "units": {"object": network.object_unit, "angle": network.angle_unit},
+        "before": _state(designed.before),
+        "after": _state(designed.after),
+        "gain": designed.gain,
+        "converged": designed.converged,
+        "path": [{"softness": s.softness, "aim": s.aim} for s in designed.path],
+        "stations": _stations(designed),
+        "bound": designed.bound,
+        "weights": designed.weights,
+        "dropped": list(designed.dropped),
+        "added": list(designed.added),
+        "proof": None if proof is None else {
+            "predicted": proof.predicted, "found": proof.found, "ratio": proof.ratio,
+            "limit": proof.limit, "draws": proof.draws, "failed": proof.failed,
+            "agrees": bool(proof.agrees),
+        },
+    }  # fmt: skip
+
+
+def design_text(designed: Design, proof: Proof | None = None) -> str:
+    """The same as text."""
+    return json.dumps(without_nan(design_dict(designed, proof)), ensure_ascii=False) + "\n"
+
+
+def _state(state: State) -> dict:
+    return {
+        "aim": state.aim, "photographs": state.photographs, "image_points": state.rays,
+        "lost": list(state.lost),
+    }  # fmt: skip
+
+
+def _stations(designed: Design) -> dict:
+    images, unit = designed.network.images, ANGLE_UNITS[designed.network.angle_unit]
+    return {
+        id: dict(zip(EXTERIOR, [*X0.tolist(), *(angles / unit).tolist()]))
+        for id, X0, angles in zip(images.id, images.position, images.angles)
+    }
