@@ -1,0 +1,103 @@
+"""`jaxbundle design`: stations, photographs, a datum that make σ smallest."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from jaxbundle.choices import AIMS, DESIGNED, ORDERS
+from jaxbundle.cli.app import Force, Quiet, app, choice
+
+SIX = "Xmin,Ymin,Zmin,Xmax,Ymax,Zmax"
+
+
+@app.command()
+def design(
+    project: Annotated[Path, typer.Argument(help="cameras, targets, stations to start from")],
+    aim: Annotated[str, choice(AIMS, "what is to be small")] = "mean",
+    of: Annotated[
+        list[str] | None,
+        typer.Option(help="σ of points, cameras, or of an unknown KIND:ID:NAME, such as "
+                     "camera:cam:c; may be repeated"),
+    ] = None,
+    order: Annotated[
+        str, choice(ORDERS, "datum, configuration, weights or densification")
+    ] = "first",
+    free: Annotated[
+        str, typer.Option(help=f"of first order: some of {','.join(DESIGNED)}")
+    ] = ",".join(DESIGNED[:3]),
+    stations: Annotated[str, typer.Option(help="ids of the images that move, A,B; all")] = "",
+    photographs: Annotated[
+        int | None, typer.Option(help="second order: how many are taken; third: how many more")
+    ] = None,
+    sigma_image: Annotated[
+        float | None, typer.Option(help="σ of image coordinates, in the unit of the cameras")
+    ] = None,
+    room: Annotated[str, typer.Option(help=f"where cameras can stand: {SIX}")] = "",
+    distance: Annotated[str, typer.Option(help="shortest,longest ray")] = "",
+    focus: Annotated[str, typer.Option(help="smallest,largest depth in focus")] = "",
+    edge: Annotated[float, typer.Option(help="part of the format not used, each side")] = 0.0,
+    incidence: Annotated[
+        float | None, typer.Option(help="largest angle between normal and ray, degrees")
+    ] = None,
+    normals: Annotated[
+        str, typer.Option(help="of targets: NX,NY,NZ, or a table id,NX,NY,NZ")
+    ] = "",
+    apart: Annotated[float, typer.Option(help="smallest distance of two stations")] = 0.0,
+    obstacle: Annotated[
+        list[str] | None, typer.Option(help=f"a box that hides: {SIX}; may be repeated")
+    ] = None,
+    targets: Annotated[str, typer.Option(help=f"box of targets that move: {SIX}")] = "",
+    starts: Annotated[int, typer.Option(help="searches, all but one from random stations")] = 1,
+    iterations: Annotated[int, typer.Option(min=1, help="of a round of the search")] = 60,
+    draws: Annotated[
+        int, typer.Option(help="networks simulated and adjusted as a proof; 0: none")
+    ] = 200,
+    seed: Annotated[int, typer.Option(min=0, help="of what is random")] = 0,
+    out: Annotated[
+        Path | None, typer.Option(help="folder: designed project, report, JSON, figures")
+    ] = None,
+    json: Annotated[str, typer.Option(help="file for the result as JSON, - for stdout")] = "",
+    plots: Annotated[bool, typer.Option(help="figures in the folder")] = True,
+    force: Force = False,
+    quiet: Quiet = False,
+) -> None:  # fmt: skip
+    """Design a network: where to photograph from, or which photographs to take."""
+    import numpy as np
+
+    from jaxbundle.cli.cameras_given import pair
+    from jaxbundle.cli.design_files import FILES, fill_design
+    from jaxbundle.cli.design_given import aimed_at, box_of, normals_of, sigma_of, words_of
+    from jaxbundle.cli.outputs import can_plot, check_writable, network_files, written
+    from jaxbundle.io.formats import read_oriented
+    from jaxbundle.io.results.design_json import design_text
+    from jaxbundle.network_design.aims import Aim
+    from jaxbundle.network_design.conditions import Conditions
+    from jaxbundle.network_design.design import design as design_network
+    from jaxbundle.types import present
+
+    network = read_oriented(project)
+    check_writable(json, out, "design", FILES, network_files(project, network), force)
+    conditions = Conditions(
+        room=box_of("--room", room),
+        distance=pair("--distance", distance), focus=pair("--focus", focus), edge=edge,
+        incidence=None if incidence is None else np.radians(incidence),
+        normals=normals_of(normals, network), apart=apart,
+        obstacles=tuple(present(box_of("--obstacle", text)) for text in obstacle or ()),
+        targets=box_of("--targets", targets),
+    )  # fmt: skip
+    designed = design_network(
+        network, Aim(aim, aimed_at(of)), order=order, conditions=conditions, free=words_of(free),
+        stations=words_of(stations) if stations else None, photographs=photographs,
+        sigma_image=sigma_of(project, network) if sigma_image is None else sigma_image,
+        starts=starts, max_iterations=iterations, seed=seed,
+    )  # fmt: skip
+    proof = designed.prove(draws, seed) if draws else None
+    report = f"{designed}\n" + (f"proof: {proof}\n" if proof else "")
+    text = design_text(designed, proof)
+    with written(json, text, out, "design", FILES, force) as folder:
+        if folder is not None:
+            fill_design(folder, designed, report, text, plots and can_plot())
+    if not quiet and json != "-":
+        sys.stdout.write(report)

@@ -1,0 +1,100 @@
+"""What the options of `jaxbundle design` say."""
+
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.arguments import positive, shown
+from jaxbundle.errors import InputError
+from jaxbundle.io.formats import recognised_format
+from jaxbundle.io.networks.project import project_file
+from jaxbundle.io.text.csv_tables import read_csv, read_toml
+from jaxbundle.network.columns import Columns
+from jaxbundle.network.tables import Network, units_of
+from jaxbundle.network_design.conditions import Box
+
+
+def sigma_of(project: Path, network: Network) -> float | None:
+    """`sigma_image` of a project without image points; None where they say it, or nothing does."""
+    if len(network.observations) or recognised_format(project) != "project":
+        return None
+    given = read_toml(project_file(project))["project"].get("sigma_image")
+    if given is None or network.image_unit != units_of(network.cameras):
+        return None
+    return positive("sigma_image", given)
+
+
+def aimed_at(given: list[str] | None):
+    """What the aim is about.
+
+    **Raises:** `InputError`.
+    """
+    if not given:
+        return "points"
+    if len(given) == 1 and ":" not in given[0]:
+        return given[0]
+    names = []
+    for text in given:
+        kind, _, rest = text.partition(":")
+        id, mark, name = rest.rpartition(":")
+        if not mark:
+            raise InputError(f"--of {text!r}: points, cameras, or KIND:ID:NAME is expected, such "
+                             "as camera:cam:c or point:7:Z")  # fmt: skip
+        names.append((kind, id, name))
+    return tuple(names)
+
+
+def box_of(option: str, text: str) -> Box | None:
+    """The box of an option; None where it is not given.
+
+    **Raises:** `InputError`.
+    """
+    if not text:
+        return None
+    a, b, c, d, e, f = _numbers(option, text, 6).tolist()
+    return (a, b, c), (d, e, f)
+
+
+def words_of(text: str) -> tuple[str, ...]:
+    """Words with commas between."""
+    return tuple(word.strip() for word in text.split(",") if word.strip())
+
+
+def _numbers(option: str, text: str, size: int) -> np.ndarray:
+    """Numbers of an option, separated by commas.
+
+    **Raises:** `InputError`."""
+    try:
+        found = np.array([float(word) for word in text.split(",")])
+    except ValueError:
+        found = np.zeros(0)
+    if len(found) != size:
+        raise InputError(f"{option} {text!r}: {size} numbers with commas between are expected")
+    return found
+
+
+def normals_of(text: str, network: Network):
+    """The normal of all targets, or of each by a table.
+
+    **Raises:** `InputError`.
+    """
+    if not text:
+        return None
+    if not Path(text).is_file():
+        return _numbers("--normals", text, 3)
+    table: Columns = read_csv(Path(text))
+    columns = ("id", "NX", "NY", "NZ")
+    if set(table.values) != set(columns):
+        raise InputError(f"{text}: the columns {', '.join(columns)} are expected, but there are "
+                         f"{', '.join(table.values)}")  # fmt: skip
+    rows = dict(zip(table.values["id"], zip(*(table.values[name] for name in columns[1:]))))
+    points = network.points
+    used = [id for id, role in zip(points.id, points.role) if role != "check"]
+    missing = [id for id in used if id not in rows]
+    if missing:
+        raise InputError(f"{text}: there is no row for point {missing[0]!r}; give the normal of "
+                         "every target")  # fmt: skip
+    try:
+        return np.array([[float(x) for x in rows[id]] for id in used])
+    except ValueError as error:
+        raise InputError(f"{text}: a normal is no number: {shown(str(error))}") from None

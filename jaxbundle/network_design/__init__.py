@@ -1,0 +1,1 @@
+"""Design of networks by gradient: datum, configuration, weights, the next photograph."""

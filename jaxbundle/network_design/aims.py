@@ -1,0 +1,283 @@
+r"""Aims of a design: one number that is to be small.
+
+With the covariances C of n coordinates of points or of other functions, σ² their diagonals:
+
+    mean          √(Σσ²/n)                  A-optimality; of points Fraser's mean σ
+    worst         (Σ(tr C_k/3)^q)^(1/2q)    the worst point, a few percent above its σ
+    determinant   (Π det C_k)^(1/2n)        D-optimality: mean radius of the error ellipsoids
+    reliability   (Σ r^(−q))^(1/2q)         1/√r of the smallest redundancy number: of the MDB
+
+of what is not a point all of C, as one block.
+
+Sources: Grafarend (1974); Fraser (1984), Photogrammetric Engineering and Remote Sensing 50(8);
+Baarda (1968) for r.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.unknowns import named, value_of
+from jaxbundle.arguments import one_of
+from jaxbundle.choices import AIMS
+from jaxbundle.errors import InputError
+from jaxbundle.geometry import matrix_from_quaternion, retract_quaternion
+from jaxbundle.geometry.quaternions import quaternion_from_rotation_vector
+from jaxbundle.leastsquares.normal import zero_tangent
+from jaxbundle.leastsquares.plan import Plan
+from jaxbundle.leastsquares.precision import covariances, redundancy
+from jaxbundle.leastsquares.problem import pad_data, without_filling
+from jaxbundle.leastsquares.reduction import FACTORS
+from jaxbundle.leastsquares.retraction import retract
+from jaxbundle.leastsquares.rows import Data as EngineData
+from jaxbundle.leastsquares.rows import Declared, diagonal_of
+from jaxbundle.network.arrays import Values
+from jaxbundle.types import AnyArray
+
+Name = tuple[str, str, str]
+Functions = Callable[[Values], Float[Array, " functions"]]
+POWER = 12
+"""The q of smooth maxima."""
+COUNTS = 1e-3
+"""Of the largest weight 1/σ: what has less is next to nothing, and its control does not count."""
+INVARIANT = 1e-7
+"""A change by an open motion, relative to the sizes of its terms, below which there is none."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Aim:
+    """What is to be small.
+
+    **Arguments:**
+
+    - `measure`: "mean", "worst", "determinant" of the σ, or "reliability": of the image coordinate
+      with the smallest redundancy number, which is the one with the largest MDB.
+    - `of`: the σ of what: "points" (the tie points), "cameras" (all free parameters of cameras),
+      names such as `(("camera", "cam", "c"),)`, or any function of the unknowns, `Values ->
+      [functions]`. Object coordinates in `Values` are relative to the middle of the points.
+
+    **Raises:** `InputError` for another measure.
+    """
+
+    measure: str = "mean"
+    of: str | Sequence[Name] | Functions = "points"
+
+    def __post_init__(self):
+        one_of("aim", self.measure, AIMS)
+        if isinstance(self.of, str):
+            one_of("aim: of", self.of, ("points", "cameras"))
+        elif not callable(self.of) and not len(self.of):
+            raise InputError("aim: of names nothing; give names, \"points\" or \"cameras\"")
+
+    @property
+    def convex(self) -> bool:
+        """Whether the square of the aim is convex in the weights of photographs."""
+        return self.measure != "reliability"
+
+    def __str__(self) -> str:
+        if self.measure == "reliability":
+            return "1/√r of the worst controlled image coordinate"
+        what = self.of if isinstance(self.of, str) else "functions" if callable(self.of) else (
+            ", ".join(" ".join(name) for name in self.of)
+        )
+        return f"{self.measure} σ of {what}"
+
+
+def functions_of(problem: Problem, aim: Aim) -> Functions | None:
+    """What the aim is about, as a function of the unknowns; None for points and reliability.
+
+    **Raises:** `InputError` where no camera has a free parameter, `KeyError` for unknown names."""
+    of = aim.of
+    if aim.measure != "reliability" and of == "points" and not of_interest(problem).any():
+        raise InputError("aim: all points are held, and their σ is 0; aim at the cameras")
+    if aim.measure == "reliability" or of == "points":
+        return None
+    if callable(of):
+        return lambda values: jnp.ravel(of(values))
+    if isinstance(of, str):
+        of = [("camera", c.id, name) for c in problem.network.cameras for name in c.unknowns]
+        if not of:
+            raise InputError("aim: no camera has a free parameter; say what is free, or aim at "
+                             "points")  # fmt: skip
+        if aim.measure != "determinant" and len({name for *_, name in of}) > 1:
+            raise InputError(
+                f"aim: the {aim.measure} σ of camera parameters of different units; choose the "
+                "determinant, or name one parameter"
+            )
+    wanted = named(problem, of)
+    return lambda values: jnp.stack([value_of(problem, name, values) for name in wanted])
+
+
+def of_interest(problem: Problem) -> Bool[np.ndarray, " points"]:
+    """The points whose σ is aimed at: tie points, without any all that are not held."""
+    points = problem.network.points
+    tie = points.has_role("tie")
+    return tie if tie.any() else ~points.has_role("fixed")
+
+
+class Task(NamedTuple):
+    """An aim for the engine: `functions` of its tables, None for points and reliability; `mask`:
+    of the points aimed at, filled as the tables are; `measure`: its number among `AIMS`;
+    `image_sets`: the first sets of observations, which are image coordinates."""
+
+    declared: Declared
+    plan: Plan
+    functions: Callable | None
+    reliability: bool
+    measure: Int[np.ndarray, ""]
+    mask: Float[np.ndarray, " points"]
+    image_sets: int
+
+
+def task_of(problem: Problem, aim: Aim) -> Task:
+    """The aim for the engine.
+
+    **Raises:** `InputError` where no factor of the network fits into memory."""
+    problem = problem.with_factor()
+    system, functions = problem.system, functions_of(problem, aim)
+    if problem.reduction not in FACTORS:
+        raise InputError("design: the network is too large for its covariance; take part of it")
+    of = None
+    if functions is not None:
+        of = lambda tables: functions(problem.layout.values(without_filling(system, tables)))
+    rows = of_interest(problem)
+    mask = np.zeros(system.sizes["table", "point"])
+    mask[: len(rows)] = rows
+    index = np.asarray(AIMS.index(aim.measure))
+    reliable = aim.measure == "reliability"
+    return Task(system.declared, system.plan, of, reliable, index, mask, _image_sets(problem))
+
+
+@eqx.filter_jit
+def log_aim(task: Task, data: EngineData) -> tuple[Float[Array, ""], EngineData]:
+    """The logarithm of the aim and its gradient by all numbers of a design, which are filled to the
+    sizes of the plan; NaN where the design does not determine everything. Designs of one shape
+    share the program."""
+    declared, plan = task.declared, task.plan
+
+    def value(data):
+        if task.reliability:
+            r = redundancy(declared, plan, data)
+            weights = [diagonal_of(w) for w in data.weight[: task.image_sets]]
+            inverse = [_masked(1 / jnp.maximum(r[o], 1e-12), w > COUNTS * jnp.max(w)).ravel()
+                       for o, w in enumerate(weights)]  # fmt: skip
+            return jnp.log(_norm(jnp.concatenate(inverse), POWER)) / 2
+        functions, still = task.functions, zero_tangent(plan)
+        if functions is None:
+            none = jax.tree.map(lambda x: x[None][:0], still)
+            own, _ = covariances(declared, plan, data, none)
+            return _log_measure(task.measure, own["point"], task.mask)
+        of = lambda change: functions(retract(declared, plan, data.start, change))
+        _, C = covariances(declared, plan, data, jax.jacrev(of)(still))
+        return _log_measure(task.measure, C[None], jnp.ones(1))
+
+    return jax.value_and_grad(value)(data)
+
+
+def aim_of(problem: Problem, aim: Aim) -> float:
+    """The aim of a network at its start values, by its own weights; NaN where it is not
+    determined."""
+    data = pad_data(problem.system, problem.layout.data(problem.data))
+    return float(jnp.exp(log_aim(task_of(problem, aim), data)[0]))
+
+
+def smallest_redundancy(problem: Problem) -> float:
+    """The smallest redundancy number of an image coordinate."""
+    system = problem.with_factor().system
+    data = pad_data(system, problem.layout.data(problem.data))
+    found = redundancy(system.declared, system.plan, data)
+    there = {o: diagonal_of(data.weight[o]) > 0 for o in range(_image_sets(problem))}
+    return min(float(found[o][used].min()) for o, used in there.items())
+
+
+def _image_sets(problem: Problem) -> int:
+    return sum(s.field == "image" for s in problem.layout.sets)
+
+
+def measure(aim: Aim, blocks: Float[AnyArray, "blocks k k"]) -> float:
+    """The measure of covariance blocks of the σ."""
+    index = np.asarray(AIMS.index(aim.measure))
+    return float(jnp.exp(_log_measure(index, jnp.asarray(blocks), jnp.ones(len(blocks)))))
+
+
+def _log_measure(index, blocks, mask):
+    """The logarithm of the measure of this number, of the blocks whose mask is 1."""
+    size = jnp.sum(mask) * blocks.shape[1]
+    there = mask[:, None, None] > 0
+    blocks = jnp.where(there, blocks, jnp.eye(blocks.shape[1]))
+    variances = jnp.diagonal(blocks, axis1=1, axis2=2)
+    single = len(blocks) == 1
+
+    def mean():
+        return jnp.log(jnp.sum(_masked(variances, there[..., 0])) / size) / 2
+
+    def worst():
+        of_blocks = variances if single else variances.mean(1, keepdims=True)
+        return jnp.log(_norm(_masked(of_blocks, there[..., 0]), POWER)) / 2
+
+    def determinant():
+        scale = jnp.sqrt(variances)
+        correlation = blocks / (scale[:, :, None] * scale[:, None, :])
+        log = jnp.linalg.slogdet(correlation)[1] / 2 + jnp.log(scale).sum(1)
+        return jnp.sum(_masked(log, mask > 0)) / size
+
+    return jax.lax.switch(index, [mean, worst, determinant])
+
+
+def _masked(x, there):
+    return jnp.where(there, x, 0.0)
+
+
+def _norm(x, power: int):
+    """(Σx^q)^(1/q) of numbers from 0."""
+    largest = jnp.max(jax.lax.stop_gradient(x))
+    return largest * jnp.sum((x / largest) ** power) ** (1 / power)
+
+
+def refuse_arbitrary(aim: Aim, problem: Problem) -> None:
+    """Refuse an aim that the datum decides.
+
+    **Raises:** `InputError`."""
+    datum = problem.system.plan.datum
+    if datum is None or aim.measure == "reliability":
+        return
+    functions, defect = functions_of(problem, aim), int(np.asarray(datum.gauge).shape[1])
+    if functions is None:
+        if problem.network.datum == "minimal":
+            raise InputError(
+                "aim: the datum is minimal, so that the σ of points depend on which coordinates "
+                'hold it; choose inner constraints (datum = "inner"), the datum of smallest mean σ '
+                "(design of order zero), or control points"
+            )
+        return
+    start = problem.data.start
+    move = lambda t: functions(_moved(start, t))
+    slope = np.asarray(jax.jacfwd(move)(jnp.zeros(7)))
+    change = np.abs(slope @ np.asarray(datum.gauge))
+    size = np.abs(slope) @ np.abs(np.asarray(datum.gauge)) + np.abs(functions(start))[:, None]
+    if (change > INVARIANT * size).any():
+        raise InputError(
+            f"aim: {defect} of 7 datum parameters are open, and the datum decides the {aim}: a "
+            "coordinate is known only relative to the points that hold the datum. Aim at what no "
+            "datum changes (a parameter of a camera; a ratio of distances, or a distance where "
+            "there is a scale), at the σ of all points under inner constraints, or give control "
+            "points"
+        )
+
+
+def _moved(values: Values, t: Float[AnyArray, "7"]) -> Values:
+    """The unknowns after a small similarity: shifts, rotations, scale."""
+    turn = matrix_from_quaternion(quaternion_from_rotation_vector(t[3:6]))
+    moved = lambda x: (1 + t[6]) * (x @ turn.T) + t[:3]
+    in_camera = jax.vmap(lambda q: retract_quaternion(q, -matrix_from_quaternion(q) @ t[3:6]))
+    return Values(
+        values.camera, moved(values.position), in_camera(jnp.asarray(values.rotation)),
+        moved(values.point), values.other,
+    )  # fmt: skip

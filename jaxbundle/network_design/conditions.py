@@ -1,0 +1,125 @@
+"""What a design must keep to: where cameras can stand, and when they image a target.
+
+A condition of a *ray* says whether a station measures a target: field of view, length of the ray,
+depth in focus, angle of incidence, nothing in between. A condition of a *station* says where it can
+stand: in the room, outside of obstacles, apart from the others.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.arguments import at_least_zero, number, numeric_array, positive, shown
+from jaxbundle.errors import InputError
+from jaxbundle.types import Numbers
+
+Box = tuple[tuple[float, float, float], tuple[float, float, float]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Conditions:
+    """Conditions of stations and rays; lengths in the object unit, angles in radians.
+
+    **Arguments:**
+
+    - `room`: lowest and highest X, Y, Z of projection centres. Without one they stay within three
+      times the largest distance of a start station from the middle of the targets.
+    - `distance`: shortest and longest ray, from the projection centre to a target.
+    - `focus`: smallest and largest depth along the optical axis that is in focus.
+    - `edge`: part of the format, on each side, that is not used.
+    - `incidence`: largest angle between the normal of a target and the ray; needs `normals`, [P, 3]
+      in the order of the points or one [3] for all.
+    - `apart`: smallest distance of two stations.
+    - `obstacles`: boxes with edges along X, Y, Z, (lowest corner, highest corner), that hide what
+      is behind them and in which no camera stands; a wall or table is a thin box.
+    - `targets`: box in which targets may be moved, where they are free.
+
+    **Raises:** `InputError` for what is empty or no number.
+    """
+
+    room: Box | None = None
+    distance: tuple[float, float] | None = None
+    focus: tuple[float, float] | None = None
+    edge: float = 0.0
+    incidence: float | None = None
+    normals: Float[np.ndarray, "points 3"] | Numbers | None = None
+    apart: float = 0.0
+    obstacles: tuple[Box, ...] = ()
+    targets: Box | None = None
+
+    def __post_init__(self):
+        put = lambda name, value: object.__setattr__(self, name, value)
+        for name in ("room", "targets"):
+            if getattr(self, name) is not None:
+                put(name, box(name, getattr(self, name)))
+        put("obstacles", tuple(box("obstacles", given) for given in self.obstacles))
+        for name in ("distance", "focus"):
+            if getattr(self, name) is not None:
+                put(name, interval(name, getattr(self, name)))
+        number("edge", self.edge, "a part of the format from 0, below 0.5", lambda x: 0 <= x < 0.5)
+        at_least_zero("apart", self.apart)
+        if self.incidence is not None:
+            positive("incidence", self.incidence)
+            if self.normals is None:
+                raise InputError(
+                    "incidence needs the normals of the targets: give normals, [P, 3] or one [3]"
+                )
+        if self.normals is not None:
+            put("normals", unit_vectors(self.normals))
+
+    def of_points(self, points: int) -> Float[np.ndarray, "points 3"] | None:
+        """The normal of every target, None where none are given.
+
+        **Raises:** `InputError` where there are others than the network has points."""
+        if self.normals is None:
+            return None
+        normals = np.asarray(self.normals)
+        if normals.ndim == 2 and len(normals) != points:
+            raise InputError(
+                f"normals: {len(normals)} directions for {points} points; give one for each "
+                "in the order of the points, or one for all"
+            )
+        return np.broadcast_to(normals, (points, 3))
+
+
+def box(name: str, given) -> Box:
+    """Lowest and highest corner of a box.
+
+    **Raises:** `InputError`."""
+    corners = numeric_array(name, given, "two corners X, Y, Z").astype(float)
+    if corners.shape != (2, 3) or not np.isfinite(corners).all():
+        raise InputError(f"{name}: two corners X, Y, Z are expected, but given is {shown(given)}")
+    if not (corners[0] < corners[1]).all():
+        raise InputError(
+            f"{name}: the box from {corners[0].tolist()} to {corners[1].tolist()} is empty; the "
+            "first corner must be below the second in X, Y and Z"
+        )
+    low, high = corners.tolist()
+    return tuple(low), tuple(high)
+
+
+def interval(name: str, given) -> tuple[float, float]:
+    """A smallest and a largest length; the largest may be infinite.
+
+    **Raises:** `InputError`."""
+    ends = numeric_array(name, given, "a smallest and a largest length").astype(float)
+    if ends.shape != (2,) or not (0 <= ends[0] < ends[1]):
+        raise InputError(
+            f"{name}: a smallest and a larger largest length are expected, but given is "
+            f"{shown(given)}"
+        )
+    return float(ends[0]), float(ends[1])
+
+
+def unit_vectors(given) -> np.ndarray:
+    """Directions of length 1.
+
+    **Raises:** `InputError`."""
+    normals = numeric_array("normals", given, "directions X, Y, Z").astype(float)
+    if normals.ndim not in (1, 2) or normals.shape[-1] != 3:
+        raise InputError(f"normals must have the shape [3] or [points, 3], not {normals.shape}")
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    if not (np.isfinite(length) & (length > 0)).all():
+        raise InputError("normals must be finite directions, none of them 0, 0, 0")
+    return normals / length

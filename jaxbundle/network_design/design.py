@@ -1,0 +1,337 @@
+"""`design`: the network with the smallest σ that conditions allow.
+
+    network = jaxbundle.simulate(stations, targets, camera, noise=0.002)
+    room = jaxbundle.Conditions(room=((-4, -4, 0), (4, 4, 3)), distance=(1, 6), apart=0.5)
+    designed = jaxbundle.design(network, "mean", conditions=room)
+    print(designed, designed.proof)
+
+The orders are those of Grafarend (1974), in the words of Fraser (1984): zero, the datum; first, the
+configuration; second, the weights of observations, here of whole photographs; third, the
+densification of a network that exists.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxbundle.arguments import one_of, positive, shown, whole
+from jaxbundle.choices import DESIGNED, ORDERS
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.float64 import require_x64
+from jaxbundle.network.arrays import Values
+from jaxbundle.network.columns import did_you_mean
+from jaxbundle.network.sightings import keep_images, split_check_points
+from jaxbundle.network.tables import Images, Network, require_network
+from jaxbundle.network_design.aims import Aim, aim_of
+from jaxbundle.network_design.conditions import Conditions
+from jaxbundle.network_design.feasible import (
+    check_feasible,
+    lost_targets,
+    room_of,
+    start_at,
+    targets_of,
+    try_stations,
+)
+from jaxbundle.network_design.pairs import FEWEST_TARGETS, Pairs, make_pairs
+from jaxbundle.network_design.realise import problem_of, realise
+from jaxbundle.network_design.result import Design, State
+from jaxbundle.network_design.search import Step, configuration, kept, make_program, search
+from jaxbundle.network_design.variables import Start, bounds, choose_variables
+from jaxbundle.network_design.weights import select
+
+ROLLED = 0.1
+"""Radians, at random: by which a search begins rolled, for without it no roll is often a saddle."""
+CANDIDATES, REFINED = 48, 2
+"""Places tried for a further photograph, and how many of the best are followed."""
+ROUGH = 0.1
+"""Softness of the conditions with which they are compared."""
+
+
+def design(
+    network: Network,
+    aim: str | Aim = "mean",
+    *,
+    order: str = "first",
+    conditions: Conditions | None = None,
+    free: Sequence[str] = DESIGNED[:3],
+    stations: Sequence[str] | None = None,
+    photographs: int | None = None,
+    sigma_image: float | None = None,
+    starts: int = 1,
+    max_iterations: int = 60,
+    seed: int = 0,
+) -> Design:
+    """Design a network: make an aim as small as conditions allow.
+
+    **Arguments:**
+
+    - `network`: cameras with their `image_size`, targets, and stations to start from; image points
+      are needed where a network that exists is to get a further photograph, others do not count.
+    - `aim`: "mean", "worst", "determinant" of the σ of points, "reliability", or an `Aim`.
+    - `order`: "zero": the datum of smallest mean σ. "first": where stations stand and look, their
+      roll, where targets are (`free`: some of "position", "direction", "roll", "targets"), of all
+      stations or those in `stations`; for a calibration these are the poses of the board
+      (`Design.board_poses`). "second": which `photographs` of the candidates given are taken.
+      "third": where so many further `photographs` are taken, 1 if not given, with the last camera.
+    - `sigma_image`: σ of image coordinates to come, in the unit of the cameras' models; the median
+      of those of the network if not given.
+    - `starts`: searches of first order, the further ones from stations at random in the room.
+    - `max_iterations`: of a round of the search; `seed`: of all that is random.
+
+    **Returns:** a `Design`. Both states in it are as stations see targets, without softness.
+
+    **Raises:** `InputError` for conditions that no station keeps, targets that none sees, an aim
+    that the datum decides; `NotSolvedError` where no network that determines the aim was found.
+    """
+    require_x64()
+    one_of("order", order, tuple(ORDERS))
+    aim = aim if isinstance(aim, Aim) else Aim(aim)
+    if conditions is not None and not isinstance(conditions, Conditions):
+        raise InputError(f"conditions must be Conditions, but is {shown(conditions)}")
+    conditions = Conditions() if conditions is None else conditions
+    network = split_check_points(require_network(network))[0]
+    sigma = _sigma(network, sigma_image)
+    whole("starts", starts)
+    if order == "zero":
+        return _design_datum(network, aim, conditions, sigma, seed)
+    if order == "second":
+        return _design_weights(network, aim, conditions, sigma, photographs, max_iterations, seed)
+    if order == "third":
+        more = 1 if photographs is None else whole("photographs", photographs)
+        return _add_photographs(network, aim, conditions, sigma, more, max_iterations, seed)
+    if photographs is not None:
+        raise InputError("photographs: their number is designed by order \"second\" or \"third\"")
+    return _design_configuration(
+        network, aim, conditions, sigma, tuple(free), stations, starts, max_iterations, seed
+    )
+
+
+def _design_configuration(
+    network, aim, conditions, sigma, free, stations, starts, max_iterations, seed
+) -> Design:
+    pairs = make_pairs(network, aim, conditions, sigma)
+    check_feasible(pairs)
+    moving = _rows_of(stations, pairs.problem.network.images.id)
+    tie = np.flatnonzero(pairs.problem.network.points.has_role("tie"))
+    start = start_at(pairs)
+    targets = tie if "targets" in free else np.zeros(0, int)
+    variables = choose_variables(start.values, free, moving, targets)
+    boxes = room_of(conditions, pairs), targets_of(conditions, pairs)
+    ends = lambda start: bounds(variables, start, *boxes)
+    program = make_program(pairs, configuration(pairs, variables))
+    before = _state(pairs, network, start.values, seed)
+    best, path, converged = None, [], True
+    for attempt in range(starts):
+        begin = _rolled(start if attempt == 0 else _elsewhere(pairs, start, moving, seed + attempt),
+                        variables, seed + attempt)  # fmt: skip
+        end, steps, done = search(pairs, variables, begin, program, ends, max_iterations)
+        if not kept(conditions, variables, pairs.problem.origin, end):
+            continue
+        after = _state(pairs, network, end.values, seed)
+        if best is None or _better(after, best):
+            best, path, converged = after, steps, done
+    if best is None:
+        raise NotSolvedError(
+            "design: the stations cannot be brought to keep their conditions (apart, obstacles); "
+            "give a larger room, or more starts"
+        )
+    best = before if _better(before, best) and _keeps(conditions, pairs, variables, start) else best
+    _require_determined(best)
+    return Design("first", aim, conditions, before, best, tuple(path), converged)
+
+
+def _design_weights(network, aim, conditions, sigma, photographs, max_iterations, seed) -> Design:
+    if photographs is None:
+        raise InputError("photographs: order \"second\" needs how many of the candidates are taken")
+    candidates = network.images.id
+    pairs = make_pairs(network, aim, conditions, sigma)
+    values = start_at(pairs).values
+    rays = np.bincount(pairs.problem.image[pairs.measured(values)],
+                       minlength=len(network.images))  # fmt: skip
+    seeing = rays >= FEWEST_TARGETS
+    if seeing.any() and not seeing.all():
+        network = keep_images(network, seeing)
+        pairs = make_pairs(network, aim, conditions, sigma)
+        values = start_at(pairs).values
+    lost = lost_targets(pairs, pairs.measured(values))
+    if lost:
+        raise InputError(f"targets {', '.join(lost[:10])}: fewer than two of the candidates see "
+                         "them; give further candidates, or leave these targets out")  # fmt: skip
+    before = _state(pairs, network, values, seed)
+    found = select(pairs, whole("photographs", photographs), max_iterations)
+    ids = network.images.id
+    taken = pairs.measured(values) & found.chosen[pairs.problem.image]
+    after = _state(pairs, network, values, seed, taken)
+    _require_determined(after)
+    path = tuple(Step(0.0, aim, np.zeros((0, 3))) for aim in found.aims)
+    return Design(
+        "second", aim, conditions, before, after, path, found.converged,
+        bound=found.bound or None,
+        dropped=tuple(id for id in candidates if id not in after.network.images.id),
+        weights=dict(zip(ids, found.weight.tolist())),
+    )  # fmt: skip
+
+
+def _add_photographs(network, aim, conditions, sigma, more, max_iterations, seed) -> Design:
+    states, path, added, tried, converged = [], [], [], [], True
+    for k in range(more):
+        measured = bool(len(network.observations))
+        network, id = _with_another(network)
+        new = np.arange(len(network.images)) == len(network.images) - 1
+        pairs = make_pairs(network, aim, conditions, sigma, new if measured else None)
+        check_feasible(pairs)
+        start, steps, done, places = _best_place(pairs, new, max_iterations, seed + k)
+        path += steps
+        converged = converged and done
+        added.append(id)
+        tried.append(places)
+        if not states:
+            without = pairs.measured(start.values) & ~new[pairs.problem.image]
+            states.append(_state(pairs, network, start.values, seed, without))
+        states.append(_state(pairs, network, start.values, seed))
+        _require_determined(states[-1])
+        network = states[-1].network
+    return Design("third", aim, conditions, states[0], states[-1], tuple(path), converged,
+                  tried=tried[0], added=tuple(added))  # fmt: skip
+
+
+def _best_place(pairs: Pairs, new, max_iterations: int, seed: int):
+    """Places at random compared, the best of them followed."""
+    moving = np.flatnonzero(new)
+    start = start_at(pairs)
+    variables = choose_variables(start.values, DESIGNED[:3], moving, np.zeros(0, int))
+    program = make_program(pairs, configuration(pairs, variables))
+    position, rotation, target = try_stations(pairs, CANDIDATES, seed)
+    begins = [_placed(pairs, start, moving, p, q, t) for p, q, t in zip(position, rotation, target)]
+    aims = np.array([program(variables.vector(s), s, ROUGH)[0] for s in begins])
+    boxes = room_of(pairs.conditions, pairs), targets_of(pairs.conditions, pairs)
+    ends = lambda start: bounds(variables, start, *boxes)
+    best = None
+    for k in np.argsort(aims)[:REFINED]:
+        end, steps, done = search(pairs, variables, begins[k], program, ends, max_iterations)
+        value = program(variables.vector(end), end, 0.03)[0]
+        if kept(pairs.conditions, variables, pairs.problem.origin, end) and (
+            best is None or value < best[0]
+        ):
+            best = value, end, steps, done
+    if best is None:
+        raise NotSolvedError("design: no place for a further photograph keeps the conditions")
+    return *best[1:], (position + pairs.problem.origin, np.exp(aims))
+
+
+def _design_datum(network, aim, conditions, sigma, seed) -> Design:
+    """Inner constraints on all object points, the datum of the smallest mean σ of them (Meissl
+    1969), against the datum that the network has."""
+    if aim.measure == "reliability" or aim.of != "points":
+        raise InputError("order \"zero\": the datum is designed for the σ of points")
+    if network.datum == "control":
+        raise InputError(
+            "order \"zero\": the datum of this network is given by control points and priors; "
+            "datum = \"minimal\" or \"inner\" leaves it to be chosen"
+        )
+    inner = network.replace(datum="inner", datum_points=())
+    pairs = make_pairs(inner, aim, conditions, sigma)
+    values = start_at(pairs).values
+    after = _state(pairs, inner, values, seed)
+    _require_determined(after)
+    given = {"datum": network.datum, "datum_points": network.datum_points}
+    noisy, exact = after.network.replace(**given), after.exact.replace(**given)
+    problem = problem_of(exact)
+    before = State(noisy, exact, np.nan if problem is None else aim_of(problem, aim), after.lost)
+    return Design("zero", aim, conditions, before, after)
+
+
+def _state(pairs: Pairs, network: Network, values: Values, seed: int, measured=None) -> State:
+    """What the stations see at these values."""
+    measured = pairs.measured(values) if measured is None else measured
+    exact = realise(pairs, values, measured, None, network.residuals)
+    lost, aim = lost_targets(pairs, measured), float("nan")
+    if not lost:
+        aim = pairs.aim_at(measured, values)
+    if not np.isfinite(aim) and (problem := problem_of(exact)) is not None:
+        aim = aim_of(problem, pairs.aim)  # Of what is left.
+    noisy = realise(pairs, values, measured, seed, network.residuals)
+    return State(noisy, exact, aim, lost)
+
+
+def _better(a: State, b: State) -> bool:
+    """Fewer lost targets first, then the smaller aim."""
+    value = lambda state: state.aim if np.isfinite(state.aim) else np.inf
+    return (len(a.lost), value(a)) < (len(b.lost), value(b))
+
+
+def _keeps(conditions, pairs, variables, start) -> bool:
+    """Whether the start keeps the conditions of stations."""
+    low, high = room_of(conditions, pairs)
+    inside = ((start.values.position >= low) & (start.values.position <= high)).all()
+    return bool(inside) and kept(conditions, variables, pairs.problem.origin, start)
+
+
+def _require_determined(state: State) -> None:
+    if not np.isfinite(state.aim):
+        raise NotSolvedError(
+            "design: no network that determines the aim was found; give more stations, more "
+            "starts, or weaker conditions"
+        )
+
+
+def _rolled(start: Start, variables, seed: int) -> Start:
+    """A little roll, so that the search leaves a symmetrical start."""
+    x = variables.vector(start)
+    if "roll" not in variables.sizes:
+        return start
+    random = np.random.default_rng(seed)
+    part = variables.parts(np.arange(len(x)))["roll"].ravel()
+    x[part] = ROLLED * random.standard_normal(len(part))
+    return variables.placed(start, x)
+
+
+def _elsewhere(pairs: Pairs, start: Start, moving, seed: int) -> Start:
+    """The moving stations at random in the room."""
+    position, rotation, target = try_stations(pairs, len(moving), seed)
+    for row, p, q, t in zip(moving, position, rotation, target):
+        start = _placed(pairs, start, np.array([row]), p, q, t)
+    return start
+
+
+def _placed(pairs: Pairs, start: Start, rows, position, rotation, target: int) -> Start:
+    """Some stations elsewhere."""
+    values = start.values
+    positions, rotations, look = (
+        np.array(x) for x in (values.position, values.rotation, start.look)
+    )
+    positions[rows], rotations[rows] = position, rotation
+    look[rows] = np.asarray(values.point)[target]
+    return Start(Values(values.camera, positions, rotations, values.point, values.other), look)
+
+
+def _with_another(network: Network) -> tuple[Network, str]:
+    """The network with one more image, of the last camera, at the place of the last one."""
+    images, number = network.images, len(network.images) + 1
+    while (id := f"new {number}") in images.id:
+        number += 1
+    again = lambda x: np.concatenate([x, x[-1:]])
+    more = Images(
+        (*images.id, id), again(images.camera), again(images.position), again(images.angles),
+        np.concatenate([images.sigma, np.full((1, 6), np.nan)]), images.source,
+    )  # fmt: skip
+    return network.replace(images=more), id
+
+
+def _rows_of(ids: Sequence[str] | None, known: tuple[str, ...]) -> np.ndarray:
+    if ids is None:
+        return np.arange(len(known))
+    for id in ids:
+        if id not in known:
+            raise InputError(f"stations: there is no image {id!r}{did_you_mean(id, known)}")
+    return np.array([known.index(id) for id in ids], int)
+
+
+def _sigma(network: Network, given: float | None) -> float:
+    if given is not None:
+        return positive("sigma_image", given)
+    sigma = network.observations.sigma
+    if not len(sigma) or not np.isfinite(sigma).any():
+        raise InputError("sigma_image: the network has no image points; say how well they will be "
+                         "measured")  # fmt: skip
+    return float(np.nanmedian(sigma))

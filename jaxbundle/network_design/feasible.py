@@ -1,0 +1,140 @@
+"""Whether any station can keep the conditions: places tried all over the room.
+
+What cannot be designed is refused by name before anything is searched.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.network.arrays import Values
+from jaxbundle.network.columns import some
+from jaxbundle.network_design.conditions import Conditions
+from jaxbundle.network_design.pairs import FEWEST_RAYS, Pairs
+from jaxbundle.network_design.variables import Start, looked_at, turned
+from jaxbundle.network_design.visibility import margins, visible
+
+TRIED = 1024
+"""Places in the room."""
+REACH = 3.0
+"""Without a room, stations stay within so many times the largest distance of the start."""
+
+
+def room_of(conditions: Conditions, pairs: Pairs) -> Float[np.ndarray, "2 3"]:
+    """The box of projection centres, relative to the origin of the network."""
+    if conditions.room is not None:
+        return np.array(conditions.room) - pairs.problem.origin
+    start = pairs.problem.data.start
+    middle = np.asarray(start.point).mean(0)
+    reach = np.linalg.norm(np.asarray(start.position) - middle, axis=1).max()
+    return middle + REACH * reach * np.array([[-1.0] * 3, [1.0] * 3])
+
+
+def targets_of(conditions: Conditions, pairs: Pairs) -> Float[np.ndarray, "2 3"]:
+    """The box of targets that move: that of the conditions, or of all points."""
+    if conditions.targets is not None:
+        return np.array(conditions.targets) - pairs.problem.origin
+    points = np.asarray(pairs.problem.data.start.point)
+    return np.stack([points.min(0), points.max(0)])
+
+
+_turned = jax.jit(jax.vmap(turned))
+
+
+def try_stations(
+    pairs: Pairs, number: int, seed: int = 0
+) -> tuple[Float[np.ndarray, "tried 3"], Float[np.ndarray, "tried 4"], np.ndarray]:
+    """Stations at random in the room that look at a target each, outside of obstacles.
+
+    **Returns:** positions, rotations, and the targets."""
+    random = np.random.default_rng(seed)
+    room, values = room_of(pairs.conditions, pairs), pairs.problem.data.start
+    position = random.uniform(room[0], room[1], (number, 3))
+    for low, high in np.array(pairs.conditions.obstacles).reshape(-1, 2, 3) - pairs.problem.origin:
+        inside = ((position > low) & (position < high)).all(1)
+        position = position[~inside]
+    if not len(position):
+        raise InputError("conditions: no station is possible: the obstacles fill the whole room")
+    targets = np.resize(np.arange(len(values.point)), len(position))
+    away = np.asarray(values.point)[targets] - position
+    upright = np.tile([1.0, 0.0, 0.0, 0.0], (len(position), 1))
+    return position, np.asarray(_turned(upright, away)), targets
+
+
+def check_feasible(pairs: Pairs, tried: int = TRIED) -> None:
+    """Refuse conditions that no station keeps, and targets that none sees.
+
+    **Raises:** `InputError` that names the condition, or the targets."""
+    start = pairs.problem.data.start
+    position, rotation, _ = try_stations(pairs, tried)
+    position = np.concatenate([position, start.position])
+    rotation = np.concatenate([rotation, start.rotation])
+    found = {}
+    for c in range(len(pairs.views)):
+        seen = _seen(pairs, c, start, position, rotation)
+        for name, rows in seen.items():
+            found[name] = found.get(name, False) | rows
+        both = np.logical_and.reduce(list(seen.values()))
+        found["all"] = found.get("all", False) | both
+    everything = found.pop("all")
+    interest = np.flatnonzero(pairs.interest)
+    if not everything.any():
+        raise InputError(_why(found, len(position)))
+    known = pairs.problem.point[np.nan_to_num(pairs.kept) > 0]
+    measured = np.bincount(known, minlength=len(pairs.interest)) >= FEWEST_RAYS
+    hidden = ~everything[:, interest].any(0) & ~measured[interest]
+    if hidden.any():
+        ids = [pairs.problem.network.points.id[interest[k]] for k in np.flatnonzero(hidden)]
+        raise InputError(
+            f"conditions: {len(ids)} of {len(interest)} targets can be measured from nowhere in "
+            f"the room ({len(position)} places tried): {some(ids)}. Widen the conditions, or leave "
+            "these targets out"
+        )
+
+
+def _why(found, tried: int) -> str:
+    """Which condition no ray keeps, or that they contradict each other."""
+    places = f"({tried} places in the room tried)"
+    if "obstacles" in found and not found["obstacles"].any():
+        return f"conditions: all targets are hidden by the obstacles from everywhere {places}"
+    for name, rows in found.items():
+        if not rows.any():
+            return (f"conditions: no station can satisfy the condition \"{name}\" for any target "
+                    f"{places}; widen it, or the room")  # fmt: skip
+    names = ", ".join(found)
+    without = [
+        name for name in found
+        if np.logical_and.reduce([rows for other, rows in found.items() if other != name]).any()
+    ] if len(found) > 1 else []  # fmt: skip
+    hint = f"; without \"{without[0]}\" they could" if without else ""
+    return (f"conditions: no station can satisfy {names} together for any target {places}{hint}")
+
+
+def _seen(pairs: Pairs, c: int, start: Values, position, rotation):
+    """Which conditions are kept by stations of a camera, [stations, points] each."""
+    view = pairs.views[c]
+    interior = jnp.asarray(start.camera)[c, : len(view.model.parameters)]
+
+    def one(p, q, X, n):
+        return visible(margins(view, pairs.rules, p, q, interior, X, n))
+
+    of_points = jax.vmap(one, (None, None, 0, None if pairs.normals is None else 0))
+    of_all = jax.jit(jax.vmap(of_points, (0, 0, None, None)))
+    found = of_all(jnp.asarray(position), jnp.asarray(rotation), jnp.asarray(start.point),
+                   None if pairs.normals is None else jnp.asarray(pairs.normals))  # fmt: skip
+    return {name: np.asarray(rows) for name, rows in found.items()}
+
+
+def start_at(pairs: Pairs) -> Start:
+    """The configuration to begin with."""
+    values = jax.tree.map(np.asarray, pairs.problem.data.start)
+    return Start(values, looked_at(values))
+
+
+def lost_targets(pairs: Pairs, measured) -> tuple[str, ...]:
+    """The ids of targets of interest with too few rays to be determined."""
+    rays = np.bincount(pairs.problem.point[measured], minlength=len(pairs.interest))
+    lost = pairs.interest & (rays < FEWEST_RAYS)
+    return tuple(pairs.problem.network.points.id[k] for k in np.flatnonzero(lost))

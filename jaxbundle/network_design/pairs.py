@@ -1,0 +1,202 @@
+"""The network in which every station may see every target: the problem whose precision is designed.
+
+Measured image points stay as they are where they are kept (`kept`); every other pair of a station
+and a target is an observation whose weight is 1/σ times its visibility.
+"""
+
+import dataclasses
+from functools import cached_property, partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxbundle.adjustment.problem import Problem, make_problem
+from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.problem import fill_data
+from jaxbundle.leastsquares.rows import Data as EngineData
+from jaxbundle.network.arrays import Values
+from jaxbundle.network.check import check_tables
+from jaxbundle.network.tables import Network, Observations, Source, require_network
+from jaxbundle.network_design.aims import (
+    Aim,
+    Task,
+    log_aim,
+    of_interest,
+    refuse_arbitrary,
+    task_of,
+)
+from jaxbundle.network_design.conditions import Conditions
+from jaxbundle.network_design.visibility import (
+    Rules,
+    View,
+    image_of,
+    margins,
+    rules_of,
+    view_of,
+    visibility,
+    visible,
+)
+from jaxbundle.types import AnyArray
+
+FEWEST_RAYS = 2
+"""Of a target, to determine it."""
+FEWEST_TARGETS = 3
+"""Of a photograph that takes part."""
+IDLE = 3e-4
+"""The factor of the weights 1/σ of a photograph that takes no part: 1e-7 of its information."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Pairs:
+    """A problem of all pairs, its aim and its conditions.
+
+    `kept`: the weights of rays that do not depend on what is designed, 1 for those that were
+    measured, 0 for those that were not; NaN for all others. `views`: the image of every camera;
+    `rules`: the conditions of rays; `normals`: of all points; `interest`: the points aimed at.
+    """
+
+    problem: Problem
+    aim: Aim
+    task: Task
+    conditions: Conditions
+    kept: Float[np.ndarray, " rays"]
+    views: tuple[View, ...]
+    rules: Rules
+    normals: Float[np.ndarray, "points 3"] | None
+    interest: Bool[np.ndarray, " points"]
+
+    @property
+    def soft(self) -> Bool[np.ndarray, " rays"]:
+        """Which rays depend on what is designed."""
+        return np.isnan(self.kept)
+
+    def of_camera(self, c: int) -> Int[np.ndarray, " rows"]:
+        """The rays of a camera."""
+        return np.flatnonzero(self.problem.camera == c)
+
+    def each_ray(self, function, values: Values):
+        """`function(view, position, rotation, interior, point, normal)` of every ray, stacked in
+        their order."""
+        image, point, found, order = self.problem.image, self.problem.point, [], []
+        for c, view in enumerate(self.views):
+            rows = self.of_camera(c)
+            interior = jnp.asarray(values.camera)[c, : len(view.model.parameters)]
+            normal = None if self.normals is None else jnp.asarray(self.normals)[point[rows]]
+            axes = 0, 0, None, 0, None if normal is None else 0
+            mapped = jax.vmap(partial(function, view), axes)
+            at = lambda x, index, rows=rows: jnp.asarray(x)[index[rows]]
+            found.append(mapped(at(values.position, image), at(values.rotation, image), interior,
+                                at(values.point, point), normal))  # fmt: skip
+            order.append(rows)
+        back = np.argsort(np.concatenate(order))
+        return jax.tree.map(lambda *x: jnp.concatenate(x)[back], *found)
+
+    def weights(self, values: Values, softness) -> Float[Array, " rays"]:
+        """The visibility of every ray, 0 to 1."""
+        one = lambda view, p, q, interior, X, n: visibility(
+            margins(view, self.rules, p, q, interior, X, n, softness), softness
+        )
+        return jnp.where(self.soft, self.each_ray(one, values), np.nan_to_num(self.kept))
+
+    def data(self, values: Values, weight: Float[AnyArray, " rays"]) -> EngineData:
+        """The numbers of the design, filled to the sizes of the plan: weights are 1/σ times
+        `weight`, image coordinates those of the values."""
+        xy, data = self.predicted(values), self.problem.data
+        weight = jnp.asarray(data.image_weight) * jnp.asarray(weight)[:, None]
+        at = lambda d: (d.start, d.image_xy, d.image_weight)
+        data = eqx.tree_at(at, data, (values, xy, weight))
+        return fill_data(self.problem.system, self.problem.layout.data(data))
+
+    def aim_at(self, measured: Bool[np.ndarray, " rays"], values: Values) -> float:
+        """The aim with these rays; NaN where they do not determine it. Photographs with too few of
+        them take no part: their rays have next to no weight, so that they stay determined."""
+        image = self.problem.image
+        rays = np.bincount(image[measured], minlength=len(self.problem.network.images))
+        weight = np.where(rays[image] < FEWEST_TARGETS, IDLE, np.asarray(measured, float))
+        data = self._filled(values, weight)
+        return float(jnp.exp(log_aim(self.task, data)[0]))
+
+    @cached_property
+    def _filled(self):
+        return jax.jit(self.data)
+
+    def seen(self, values: Values) -> dict[str, Bool[np.ndarray, " rays"]]:
+        """Which rays keep which conditions, as they are."""
+        return {k: np.asarray(v) for k, v in self._seen(values).items()}
+
+    @cached_property
+    def _seen(self):
+        one = lambda view, p, q, interior, X, n: visible(
+            margins(view, self.rules, p, q, interior, X, n)
+        )
+        return jax.jit(lambda values: self.each_ray(one, values))
+
+    @cached_property
+    def predicted(self):
+        """The image coordinates of all rays at given values, [rays, 2]."""
+        one = lambda view, p, q, interior, X, n: image_of(view, p, q, interior, X)
+        return jax.jit(lambda values: self.each_ray(one, values))
+
+    def measured(self, values: Values) -> Bool[np.ndarray, " rays"]:
+        """Which rays are measured: those that keep all conditions, and those that were."""
+        seen = np.logical_and.reduce(list(self.seen(values).values()))
+        return np.where(self.soft, seen, self.kept > 0)
+
+
+def make_pairs(
+    network: Network, aim: Aim, conditions: Conditions, sigma: float,
+    new: Bool[np.ndarray, " images"] | None = None,
+) -> Pairs:
+    """The problem of all pairs of a network without check points.
+
+    **Arguments:** `sigma`: of image coordinates to come, in the unit of the cameras' models; `new`:
+    images to be designed, whose rays are not measured; all if not given, and then no measured image
+    point counts.
+
+    **Raises:** `InputError` for a network that cannot be designed, an aim that the datum decides.
+    """
+    _refuse(require_network(network))
+    images, points, rays = network.images, network.points, network.observations
+    shape = len(images), len(points)
+    new = np.ones(len(images), bool) if new is None else new
+    kept, xy = np.zeros(shape), np.zeros((*shape, 2))
+    sigmas = np.full((*shape, 2), sigma)
+    kept[rays.image, rays.point], xy[rays.image, rays.point] = 1.0, rays.xy
+    sigmas[rays.image, rays.point] = rays.sigma
+    kept[new], xy[new], sigmas[new] = np.nan, 0.0, sigma
+    i, p = np.indices(shape).reshape(2, -1)
+    observations = Observations(i, p, xy.reshape(-1, 2), sigmas.reshape(-1, 2), Source("pairs"))
+    full = check_tables(network.replace(observations=observations, residuals="corrected"))
+    problem = make_problem(full)
+    refuse_arbitrary(aim, problem)
+    return Pairs(
+        problem, aim, task_of(problem, aim), conditions, kept.ravel(),
+        views=tuple(view_of(c, conditions.edge) for c in problem.network.cameras),
+        rules=rules_of(conditions, problem.origin), normals=conditions.of_points(len(points)),
+        interest=of_interest(problem),
+    )  # fmt: skip
+
+
+def _refuse(network: Network) -> None:
+    """Refuse what a design cannot start from.
+
+    **Raises:** `InputError`."""
+    images, points = network.images, network.points
+    poses = np.concatenate([images.position, images.angles], 1)
+    for table, rows, words in ((images, poses, "position and angles of every station"),
+                               (points, points.position, "coordinates of every target")):
+        bad = ~np.isfinite(rows).all(1)
+        if bad.any():
+            row = int(np.argmax(bad))
+            raise InputError(f"{table.source(row)}: {table.id[row]!r} has no start values; a "
+                             f"design starts from {words}")  # fmt: skip
+    if network.further:
+        raise InputError(
+            f"{network.further[0].source.name}: a design knows image points, distances, control "
+            "points and priors; leave the other observations out"
+        )
+    if len(network.points) < 3 or len(network.images) < 1:
+        raise InputError("a design needs three targets and a station to start from")

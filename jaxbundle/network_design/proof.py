@@ -1,0 +1,109 @@
+r"""A design proved: many networks simulated, adjusted, and compared with what was predicted.
+
+The draws are adjusted one after the other, by the programs that `adjust` uses: for networks of this
+size that takes less time than one program for all of them takes to be compiled. The deviations from
+the truth, in the datum of the network, give covariances C̃ = Σ d·dᵀ/n, of which the aim is formed as
+of the predicted ones. With n draws the σ of a single unknown is known to 1/√(2n) of itself.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from jaxbundle.adjustment.problem import Problem
+from jaxbundle.arguments import whole
+from jaxbundle.errors import NotSolvedError
+from jaxbundle.leastsquares.problem import with_data
+from jaxbundle.leastsquares.solution import find_minimum
+from jaxbundle.leastsquares.stopping import converged
+from jaxbundle.network.arrays import Data, Values
+from jaxbundle.network_design.aims import Aim, aim_of, functions_of, measure, of_interest
+
+FIELDS = ("image", "control", "exterior", "interior", "distance")
+
+
+@dataclasses.dataclass(frozen=True)
+class Proof:
+    """The aim as predicted and as found from `draws` adjustments of simulated measurements."""
+
+    predicted: float
+    found: float
+    draws: int
+    failed: int
+
+    @property
+    def ratio(self) -> float:
+        """Found over predicted: 1 but for chance."""
+        return self.found / self.predicted
+
+    @property
+    def limit(self) -> float:
+        """How far the ratio of one σ may be from 1 by chance: three times its σ."""
+        return 3 / np.sqrt(2 * (self.draws - self.failed))
+
+    @property
+    def agrees(self) -> bool:
+        """Whether prediction and simulation agree."""
+        return not self.failed and abs(self.ratio - 1) <= self.limit
+
+    def __str__(self) -> str:
+        failed = f", {self.failed} of them not solved" if self.failed else ""
+        return (
+            f"{self.found:.4g} from {self.draws} simulated networks{failed}, {self.predicted:.4g} "
+            f"predicted: ratio {self.ratio:.3f} (limit 1 ± {self.limit:.3f}) "
+            f"{'agrees' if self.agrees else 'DOES NOT AGREE'}"
+        )
+
+
+def prove(problem: Problem, aim: Aim, draws: int = 200, seed: int = 0) -> Proof:
+    """Simulate and adjust a network whose image coordinates are exact.
+
+    **Arguments:** `problem`: its start values are the truth.
+
+    **Raises:** `NotSolvedError` where no draw can be adjusted."""
+    draws = whole("draws", draws, least=2, most=100_000)
+    truth, exact = problem.data.start, problem.data
+    functions = functions_of(problem, aim)
+    interest = np.flatnonzero(of_interest(problem))
+    of = _points_of(interest) if functions is None else lambda values: functions(values)[None]
+    random = np.random.default_rng(seed)
+    found = []
+    for _ in range(draws):
+        values = _adjusted(problem, _measured(exact, random))
+        if values is not None:
+            found.append(np.asarray(of(values)) - np.asarray(of(truth)))
+    if not found:
+        raise NotSolvedError("design: none of the simulated networks could be adjusted")
+    d = np.array(found)
+    shape = aim if aim.measure != "reliability" else Aim("mean")
+    blocks = np.einsum("nki,nkj->kij", d, d) / len(d)
+    return Proof(aim_of(problem, shape), measure(shape, blocks), draws, draws - len(d))
+
+
+def _points_of(interest):
+    return lambda values: np.asarray(values.point)[interest]
+
+
+def _measured(exact: Data, random: np.random.Generator) -> Data:
+    """The data as they would be measured."""
+    noisy = {
+        name: np.asarray(exact.measured(name))
+        + random.standard_normal(exact.measured(name).shape) * _sigma(exact.weight(name))
+        for name in FIELDS
+    }  # fmt: skip
+    xy = noisy.pop("image")
+    return dataclasses.replace(exact, image_xy=xy, **noisy)
+
+
+def _adjusted(problem: Problem, data: Data) -> Values | None:
+    """The adjusted values, in the datum of the problem; None where there is no solution."""
+    system = with_data(problem.system, problem.layout.data(data))
+    minimum = find_minimum(system)
+    if not bool(converged(minimum.termination)):
+        return None
+    return problem.layout.values(minimum.values)
+
+
+def _sigma(weight):
+    weight = np.asarray(weight)
+    return np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0), 0.0)

@@ -1,0 +1,73 @@
+"""A design as a network that can be adjusted: what its stations see, measured with noise."""
+
+import dataclasses
+
+import jax
+import numpy as np
+from jaxtyping import Bool
+
+from jaxbundle.adjustment.problem import Problem, make_problem
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.geometry import matrix_from_quaternion, omega_phi_kappa_from_matrix
+from jaxbundle.network.arrays import Values
+from jaxbundle.network.check import check_network
+from jaxbundle.network.sightings import keep_images
+from jaxbundle.network.tables import Network, Observations, Source
+from jaxbundle.network_design.pairs import FEWEST_TARGETS, Pairs
+
+_angles = jax.jit(
+    jax.vmap(lambda q: omega_phi_kappa_from_matrix(matrix_from_quaternion(q)))
+)
+
+
+def realise(
+    pairs: Pairs, values: Values, measured: Bool[np.ndarray, " rays"], seed: int | None = 0,
+    residuals: str = "corrected",
+) -> Network:
+    """The network of a design with simulated measurements; stations that see fewer than three
+    targets are left out.
+
+    **Arguments:** `measured`: which rays; `seed`: of the noise of those that are simulated, those
+    that were measured stay as they are; None: all rays without noise."""
+    network, origin = pairs.problem.network, pairs.problem.origin
+    images = dataclasses.replace(
+        network.images, position=np.asarray(values.position) + origin,
+        angles=np.asarray(_angles(np.asarray(values.rotation))),
+    )  # fmt: skip
+    points = dataclasses.replace(network.points, position=np.asarray(values.point) + origin)
+    rays = network.observations
+    xy = np.asarray(pairs.predicted(values))
+    if seed is not None:
+        noise = np.random.default_rng(seed).standard_normal(xy.shape)
+        xy = np.where(pairs.soft[:, None], xy + rays.sigma * noise, rays.xy)
+    rows = np.flatnonzero(measured)
+    observations = Observations(
+        rays.image[rows], rays.point[rows], xy[rows], rays.sigma[rows],
+        Source("simulated image points"),
+    )
+    moved = network.replace(
+        images=images, points=points, observations=observations, residuals=residuals,
+        distances=_distances(network, points.position, seed),
+    )
+    seen = np.bincount(rays.image[rows], minlength=len(images))
+    return keep_images(moved, seen >= FEWEST_TARGETS)
+
+
+def _distances(network: Network, points, seed: int | None):
+    """Distances as they would be measured where a target has moved."""
+    given = network.distances
+    ends = points[given.points], network.points.position[given.points]
+    length, before = (np.linalg.norm(e[:, 0] - e[:, 1], axis=1) for e in ends)
+    moved = np.abs(length - before) > 1e-12 * before
+    noise = np.zeros(len(given)) if seed is None else (
+        given.sigma * np.random.default_rng([seed, 1]).standard_normal(len(given))
+    )
+    return dataclasses.replace(given, value=np.where(moved, length + noise, given.value))
+
+
+def problem_of(network: Network) -> Problem | None:
+    """The problem of a network as designed; None where it cannot be adjusted."""
+    try:
+        return make_problem(check_network(network))
+    except (InputError, NotSolvedError):
+        return None

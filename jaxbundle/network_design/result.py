@@ -1,0 +1,156 @@
+"""A designed network: what it was, what it became, what that gains, and the proof."""
+
+import dataclasses
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.choices import ORDERS
+from jaxbundle.errors import NotSolvedError
+from jaxbundle.network.columns import some
+from jaxbundle.network.tables import Network
+from jaxbundle.network_design.aims import Aim, smallest_redundancy
+from jaxbundle.network_design.conditions import Conditions
+from jaxbundle.network_design.proof import Proof, prove
+from jaxbundle.network_design.realise import problem_of
+from jaxbundle.network_design.search import Step
+from jaxbundle.types import present
+
+
+@dataclasses.dataclass(frozen=True)
+class State:
+    """A network as its stations see it: `network` with simulated measurements, `exact` without
+    noise; the `aim`, NaN where it is not determined; targets `lost`, with fewer than two rays."""
+
+    network: Network
+    exact: Network
+    aim: float
+    lost: tuple[str, ...] = ()
+
+    @cached_property
+    def smallest_redundancy(self) -> float:
+        """Of an image coordinate; NaN where the network cannot be adjusted."""
+        problem = problem_of(self.exact)
+        return np.nan if problem is None else smallest_redundancy(problem)
+
+    @property
+    def rays(self) -> int:
+        """Measured image points."""
+        return len(self.network.observations)
+
+    @property
+    def photographs(self) -> int:
+        """Stations that see something."""
+        return len(self.network.images)
+
+
+@dataclasses.dataclass(frozen=True)
+class Design:
+    """A designed network.
+
+    `order`: "zero", "first", "second", "third"; `path`: the aim by iteration, and the projection
+    centres; `converged`: whether the last round of the search did; `bound`: no selection of as many
+    photographs has a smaller aim (second order); `dropped`: ids of photographs that are not taken;
+    `weights`: of all candidates; `tried`: places [n, 3] and the aim with a photograph there (third
+    order).
+    """
+
+    order: str
+    aim: Aim
+    conditions: Conditions
+    before: State
+    after: State
+    path: tuple[Step, ...] = ()
+    converged: bool = True
+    bound: float | None = None
+    dropped: tuple[str, ...] = ()
+    weights: dict[str, float] = dataclasses.field(default_factory=dict)
+    tried: tuple[Float[np.ndarray, "tried 3"], Float[np.ndarray, " tried"]] | None = None
+    added: tuple[str, ...] = ()
+
+    @property
+    def network(self) -> Network:
+        """The designed network with simulated measurements, ready for `jaxbundle.adjust`."""
+        return self.after.network
+
+    @property
+    def gain(self) -> float:
+        """How many times smaller the aim is; NaN where the start determined nothing."""
+        return self.before.aim / self.after.aim
+
+    @cached_property
+    def proof(self) -> Proof:
+        """200 networks simulated and adjusted (`prove`)."""
+        return self.prove()
+
+    def prove(self, draws: int = 200, seed: int = 0) -> Proof:
+        """Simulate and adjust the designed network so often, and compare with the prediction.
+
+        **Raises:** `NotSolvedError` where it cannot be adjusted."""
+        problem = problem_of(self.after.exact)
+        if problem is None:
+            raise NotSolvedError("design: the designed network cannot be adjusted")
+        return prove(problem, self.aim, draws, seed)
+
+    @property
+    def board_poses(self) -> Float[np.ndarray, "images 4 4"]:
+        """The targets' frame in that of the camera, for every photograph: where a board is to be
+        held before a camera that stands still. In the axes of a camera with z towards the scene and
+        y down."""
+        from jaxbundle.geometry import matrix_from_omega_phi_kappa
+
+        images, flip = self.network.images, np.diag([1.0, -1.0, -1.0])
+        found = np.tile(np.eye(4), (len(images), 1, 1))
+        for pose, X0, angles in zip(found, images.position, images.angles):
+            M = flip @ np.asarray(matrix_from_omega_phi_kappa(angles))
+            pose[:3, :3], pose[:3, 3] = M, -M @ X0
+        return found
+
+    def __str__(self) -> str:
+        unit = self._unit
+        lines = [f"Design of {ORDERS[self.order]}", f"aim: {self.aim}", ""]
+        lines.append(f"{'':22}{'before':>14}{'after':>14}")
+        rows = [
+            (f"aim{unit}", self.before.aim, self.after.aim),
+            ("photographs", self.before.photographs, self.after.photographs),
+            ("image points", self.before.rays, self.after.rays),
+        ]
+        if self.aim.measure == "reliability":
+            states = self.before, self.after
+            rows.append(("smallest redundancy", *(state.smallest_redundancy for state in states)))
+        for name, a, b in rows:
+            show = lambda x: f"{x:14d}" if isinstance(x, int) else f"{x:14.4g}"
+            lines.append(f"{name:22}{show(a)}{show(b)}")
+        lines += ["", *self._remarks()]
+        return "\n".join(lines)
+
+    @property
+    def _unit(self) -> str:
+        points = self.aim.of == "points" and self.aim.measure != "reliability"
+        return f" [{self.after.network.object_unit}]" if points else ""
+
+    def _remarks(self):
+        if np.isnan(self.before.aim):
+            yield "gain: the start determines nothing that the aim needs"
+        elif self.gain > 1 + 1e-9:
+            yield f"gain: the aim is {self.gain:.3g} times smaller"
+        else:
+            yield "gain: none; the start is as good as any found"
+        for name, state in (("before", self.before), ("after", self.after)):
+            if state.lost:
+                yield (f"{name}: {len(state.lost)} targets have fewer than two rays and take no "
+                       f"part: {some(state.lost)}")  # fmt: skip
+        if self.bound:
+            yield (f"no {self.after.photographs} photographs of these have an aim below "
+                   f"{self.bound:.4g} ({100 * (self.after.aim / self.bound - 1):.2g} % less)")
+        if self.dropped:
+            yield f"not needed: {some(self.dropped)}"
+        for id in self.added:
+            images = self.after.network.images
+            X0 = images.position[images.id.index(id)]
+            yield f"new photograph {id}: {X0[0]:.4g}, {X0[1]:.4g}, {X0[2]:.4g}"
+        if not self.converged:
+            yield "the search did not converge; give more iterations"
+        if "proof" in self.__dict__:
+            yield f"proof: {present(self.proof)}"

@@ -1,0 +1,170 @@
+r"""The variables of a design of first order: where cameras stand, where they look, how they are
+rolled, where targets are.
+
+Lengths are in units of the size of the network, angles in radians. A station looks at a point, so
+that it turns as it moves: from the start attitude M by the smallest rotation that brings the axis
+to the point, then by the roll ρ about it,
+
+    M' = R3(ρ)·exp([δ]×)·M,   δ from d × (0, 0, −1), d the direction of the point in the camera.
+"""
+
+import dataclasses
+from functools import cached_property
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxbundle.choices import DESIGNED
+from jaxbundle.errors import InputError
+from jaxbundle.geometry import matrix_from_quaternion, retract_quaternion
+from jaxbundle.network.arrays import Values
+from jaxbundle.types import AnyArray
+
+AXIS = np.array([0.0, 0.0, -1.0])
+ROOM_OF_SIGHT = 0.25
+"""By this part of their extent the points looked at may be beyond the targets."""
+
+
+class Start(eqx.Module):
+    """What the variables change: values of the network, and the points looked at, relative to its
+    origin."""
+
+    values: Values
+    look: Float[AnyArray, "images 3"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Variables:
+    """Which rows move and how the vector of variables is cut; `unit`: of lengths."""
+
+    images: np.ndarray
+    points: np.ndarray
+    free: tuple[str, ...]
+    unit: float
+
+    @property
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """Rows and columns of every part of the vector."""
+        i, p = len(self.images), len(self.points)
+        every = {"position": (i, 3), "direction": (i, 3), "roll": (i, 1), "targets": (p, 3)}
+        return {name: every[name] for name in DESIGNED if name in self.free and every[name][0]}
+
+    def parts(self, x) -> dict[str, Array]:
+        """The vector by name, [rows, columns]."""
+        found, begin = {}, 0
+        for name, (rows, columns) in self.sizes.items():
+            found[name] = x[begin : begin + rows * columns].reshape(rows, columns)
+            begin += rows * columns
+        return found
+
+    def vector(self, start: Start) -> Float[np.ndarray, " variables"]:
+        """The variables of the start: roll 0."""
+        rows = {
+            "position": np.asarray(start.values.position)[self.images] / self.unit,
+            "direction": np.asarray(start.look)[self.images] / self.unit,
+            "roll": np.zeros((len(self.images), 1)),
+            "targets": np.asarray(start.values.point)[self.points] / self.unit,
+        }
+        return np.concatenate([np.zeros(0), *(rows[name].ravel() for name in self.sizes)])
+
+    def positions(
+        self, start: Start, x: Float[np.ndarray, " variables"]
+    ) -> Float[np.ndarray, "images 3"]:
+        """Projection centres at these variables."""
+        found = np.array(start.values.position)
+        if "position" in self.sizes:
+            found[self.images] = self.parts(x)["position"] * self.unit
+        return found
+
+    @cached_property
+    def placed(self):
+        """`place`, compiled."""
+        return jax.jit(lambda start, x: self.place(start, x))
+
+    def place(self, start: Start, x: Float[AnyArray, " variables"]) -> Start:
+        """The network at these variables."""
+        parts, values = self.parts(x), start.values
+        position, look = (jnp.asarray(rows) for rows in (values.position, start.look))
+        rotation, point = jnp.asarray(values.rotation), jnp.asarray(values.point)
+        if "position" in parts:
+            position = position.at[self.images].set(parts["position"] * self.unit)
+        if "direction" in parts:
+            look = look.at[self.images].set(parts["direction"] * self.unit)
+            away = (look - position)[self.images]
+            rotation = rotation.at[self.images].set(jax.vmap(turned)(rotation[self.images], away))
+        if "roll" in parts:
+            rolled = jax.vmap(_rolled)(rotation[self.images], parts["roll"][:, 0])
+            rotation = rotation.at[self.images].set(rolled)
+        if "targets" in parts:
+            point = point.at[self.points].set(parts["targets"] * self.unit)
+        return Start(Values(values.camera, position, rotation, point, values.other), look)
+
+
+def turned(q: Float[AnyArray, "4"], away: Float[AnyArray, "3"]) -> Float[Array, "4"]:
+    """The attitude turned so that the axis has the direction `away` (object space)."""
+    d = matrix_from_quaternion(q) @ away
+    d = d / jnp.sqrt(jnp.sum(d**2))
+    axis, cosine = jnp.cross(d, AXIS), d @ AXIS
+    square = jnp.sum(axis**2)
+    small = square < 1e-12
+    sine = jnp.sqrt(jnp.where(small, 1.0, square))
+    times = jnp.where(small, 1.0 + square / 6, jnp.arctan2(sine, cosine) / sine)
+    return retract_quaternion(q, times * axis)
+
+
+def _rolled(q, roll):
+    return retract_quaternion(q, jnp.zeros(3).at[2].set(roll))
+
+
+def choose_variables(
+    values: Values, free: tuple[str, ...], images: np.ndarray, points: np.ndarray
+) -> Variables:
+    """The variables of these rows.
+
+    **Raises:** `InputError` for what cannot be free."""
+    for name in free:
+        if name not in DESIGNED:
+            raise InputError(f"free: {name!r} is not one of {', '.join(DESIGNED)}")
+    if not free:
+        raise InputError(f"free: nothing is to be designed; give some of {', '.join(DESIGNED)}")
+    reach = np.asarray(values.position) - np.asarray(values.point).mean(0)
+    return Variables(images, points, tuple(free), float(np.linalg.norm(reach, axis=1).mean()))
+
+
+_axes = jax.jit(jax.vmap(lambda q: matrix_from_quaternion(q).T @ AXIS))
+
+
+def looked_at(values: Values) -> Float[np.ndarray, "images 3"]:
+    """The points on the axes of all images at the depth of the middle of the targets."""
+    position, middle = np.asarray(values.position), np.asarray(values.point).mean(0)
+    axis = np.asarray(_axes(np.asarray(values.rotation)))
+    depth = ((middle - position) * axis).sum(1)
+    size = np.linalg.norm(middle - position, axis=1)
+    return position + np.maximum(depth, 0.1 * size)[:, None] * axis
+
+
+def bounds(
+    variables: Variables, start: Start, room: Float[np.ndarray, "2 3"],
+    targets: Float[np.ndarray, "2 3"],
+) -> tuple[Float[np.ndarray, " variables"], Float[np.ndarray, " variables"]]:
+    """The smallest and largest values of the variables; boxes relative to the origin."""
+    points = np.concatenate([np.asarray(start.values.point), start.look])
+    low, high = points.min(0), points.max(0)
+    spare = ROOM_OF_SIGHT * max((high - low).max(), 1e-9)
+    boxes = {
+        "position": room, "targets": targets,
+        "direction": np.stack([low - spare, high + spare]),
+    }  # fmt: skip
+    ends = []
+    for end in (0, 1):
+        parts = [np.zeros(0)]
+        for name, (rows, _) in variables.sizes.items():
+            if name == "roll":
+                parts.append(np.full(rows, (-np.pi, np.pi)[end]))
+            else:
+                parts.append(np.tile(boxes[name][end] / variables.unit, rows))
+        ends.append(np.concatenate(parts))
+    return ends[0], ends[1]

@@ -1,0 +1,191 @@
+r"""Whether a station measures a target: as a smooth weight, and as yes or no.
+
+Every condition of a ray is a margin m, 0 at its limit and about 1 well inside: of the format the
+distance from an edge in half formats, of lengths in half their range. The weight is
+
+    v = Π 1/(1 + exp(−m/s))
+
+with the softness s. It is differentiable, and for s → 0 it is 1 where all margins are positive, 0
+elsewhere. What is hidden is a length: that of the ray within an obstacle, which is widened by 3·s
+so that a thin wall hides as well, and 4·s of which do not count so that targets on its surface are
+seen.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxbundle.cameras import CameraModel, default_parameters, get_model, project
+from jaxbundle.cameras.convert import image_area
+from jaxbundle.cameras.field_of_view import field_of_view_of_rays
+from jaxbundle.errors import InputError
+from jaxbundle.geometry import matrix_from_quaternion
+from jaxbundle.network.tables import Camera
+from jaxbundle.network_design.conditions import Conditions
+from jaxbundle.types import AnyArray
+
+WIDE = np.radians(70.0)
+"""Off the axis, rays of narrower cameras are compared by their tangents, others by the angle."""
+STEEPEST = np.radians(87.0)
+"""Angles off the axis whose tangents are compared; beyond, the angle is added."""
+AT_CORNERS = 1e-6
+"""By which a ray may be beyond the corner of the image: rounding."""
+WIDENED, SPARED = 3.0, 4.0
+TOUCHED = 1e-9
+"""Margins above this below zero are kept: rounding, and targets on the surface of an obstacle."""
+
+
+class View(NamedTuple):
+    """The image of a camera: its model, the corners of what may be used of its format, and the
+    largest angle off the axis (radians)."""
+
+    model: CameraModel
+    low: tuple[float, float]
+    high: tuple[float, float]
+    angle: float
+
+
+class Rules(eqx.Module):
+    """The conditions of rays as arrays, relative to the origin of the network; None: not given."""
+
+    distance: Float[AnyArray, "2"] | None
+    focus: Float[AnyArray, "2"] | None
+    cos_incidence: Float[AnyArray, ""] | None
+    obstacles: Float[AnyArray, "obstacles 2 3"] | None
+
+
+def view_of(camera: Camera, edge: float) -> View:
+    """The image of a camera.
+
+    **Raises:** `InputError` where its format is not known."""
+    model = get_model(camera.model)
+    try:
+        low, high = image_area(model, camera.image_size, camera.pixel_size)
+        size = present_size(camera)
+        given = {**default_parameters(model), **camera.parameters}
+        field = field_of_view_of_rays(model, given, size, camera.pixel_size)
+    except ValueError as error:
+        raise InputError(
+            f"camera {camera.id}: its field of view is not known: {error}; a design needs "
+            "image_size, and pixel_size of a model in mm"
+        ) from None
+    if not np.isfinite(field.diagonal):
+        raise InputError(f"camera {camera.id}: there is no ray to the corners of its image; a "
+                         "design needs a camera whose distortion holds to the corners")  # fmt: skip
+    inner = edge * (high - low)
+    low, high = (tuple(map(float, corner)) for corner in (low + inner, high - inner))
+    return View(model, low, high, field.diagonal / 2)
+
+
+def present_size(camera: Camera) -> tuple[int, int]:
+    """The image size of a camera that has one.
+
+    **Raises:** `ValueError`."""
+    if camera.image_size is None:
+        raise ValueError("image_size is not given")
+    return camera.image_size
+
+
+def rules_of(conditions: Conditions, origin: Float[np.ndarray, "3"]) -> Rules:
+    """The conditions of rays of a network with this origin."""
+    pair = lambda given: None if given is None else np.array(given)
+    incidence, boxes = conditions.incidence, conditions.obstacles
+    return Rules(
+        pair(conditions.distance), pair(conditions.focus),
+        None if incidence is None else np.asarray(np.cos(incidence)),
+        np.array(boxes) - origin if boxes else None,
+    )
+
+
+def image_of(
+    view: View, position: Float[AnyArray, "3"], rotation: Float[AnyArray, "4"],
+    interior: Float[AnyArray, " parameters"], point: Float[AnyArray, "3"],
+) -> Float[Array, "2"]:
+    """The image of a target; of one outside the field of view that of the nearest ray inside, as a
+    distorted camera may have none of its own."""
+    x, y, z = matrix_from_quaternion(rotation) @ (point - position)
+    return _image(view, interior, x, y, -z)[0]
+
+
+def margins(
+    view: View, rules: Rules, position: Float[AnyArray, "3"], rotation: Float[AnyArray, "4"],
+    interior: Float[AnyArray, " parameters"], point: Float[AnyArray, "3"],
+    normal: Float[AnyArray, "3"] | None, softness: float | Float[AnyArray, ""] = 0.0,
+) -> dict[str, Float[Array, " margins"]]:
+    """The margins of one ray by condition; of obstacles at this softness, 0: as they are."""
+    away = point - position
+    length = jnp.sqrt(jnp.sum(away**2))
+    x, y, z = matrix_from_quaternion(rotation) @ away
+    found: dict[str, Array] = {"field of view": _in_view(view, interior, x, y, -z)}
+    if rules.distance is not None:
+        found["distance"] = _within(length, rules.distance)
+    if rules.focus is not None:
+        found["focus"] = _within(-z, rules.focus)
+    if rules.cos_incidence is not None and normal is not None:
+        cosine = -(away @ normal) / length
+        found["incidence"] = jnp.asarray(cosine - rules.cos_incidence)[None]
+    if rules.obstacles is not None:
+        hidden = lambda box: _outside(box, point, position, softness)
+        found["obstacles"] = jax.vmap(hidden)(rules.obstacles)
+    return found
+
+
+def visibility(found: dict[str, Array], softness) -> Float[Array, ""]:
+    """The smooth weight of a ray, 0 to 1, of its margins at this softness."""
+    spared = lambda name: SPARED if name == "obstacles" else 0.0
+    return jnp.exp(sum(jnp.sum(jax.nn.log_sigmoid(m / softness + spared(name)))
+                       for name, m in found.items()))  # fmt: skip
+
+
+def visible(found: dict[str, Array]) -> dict[str, Bool[Array, ""]]:
+    """Which conditions a ray keeps, by its margins."""
+    return {name: jnp.all(m >= -TOUCHED) for name, m in found.items()}
+
+
+def _in_view(view: View, interior, x, y, depth):
+    """Margins of the four edges of the format and of the angle off the axis."""
+    xy, angle = _image(view, interior, x, y, depth)
+    low, high = jnp.array(view.low), jnp.array(view.high)
+    half = (high - low) / 2
+    if view.angle < WIDE:
+        flat = jnp.minimum(angle, STEEPEST)
+        off = (jnp.tan(flat) + angle - flat) / np.tan(view.angle)
+    else:
+        off = angle / view.angle
+    return jnp.concatenate([(xy - low) / half, (high - xy) / half, (1 + AT_CORNERS - off)[None]])
+
+
+def _image(view: View, interior, x, y, depth):
+    """The image of a ray, or of the nearest one inside the field of view, and its angle off the
+    axis."""
+    across = jnp.sqrt(x * x + y * y + 1e-18 * (x * x + y * y + depth * depth))
+    angle = jnp.arctan2(across, depth)
+    inside = jnp.minimum(angle, view.angle)
+    aside = jnp.sin(inside) / across
+    xy = project(view.model, interior, x * aside, y * aside, -jnp.cos(inside))
+    return jnp.stack(xy), angle
+
+
+def _within(x, ends):
+    """Margins of a length between two ends, the second of which may be infinite."""
+    low, high = ends[0], ends[1]
+    scale = jnp.where(jnp.isfinite(high), (high - low) / 2, jnp.maximum(low, 1e-12))
+    return jnp.stack([x - low, jnp.where(jnp.isfinite(high), high - x, scale)]) / scale
+
+
+def _outside(box, point, position, softness):
+    """The length of the ray within a box, negative, in its half mean edges; where the ray misses
+    the box, a positive measure of how far."""
+    scale = jnp.mean(box[1] - box[0]) / 2
+    wider = WIDENED * softness * scale
+    direction = position - point
+    length = jnp.sqrt(jnp.sum(direction**2))
+    safe = jnp.where(jnp.abs(direction) < 1e-12 * length, 1e-12 * length, direction)
+    first, second = (box[0] - wider - point) / safe, (box[1] + wider - point) / safe
+    enters = jnp.maximum(jnp.max(jnp.minimum(first, second)), 0.0)
+    leaves = jnp.minimum(jnp.min(jnp.maximum(first, second)), 1.0)
+    return (enters - leaves) * length / scale

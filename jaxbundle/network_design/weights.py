@@ -1,0 +1,111 @@
+r"""Design of second order: which of many photographs are worth taking.
+
+Every candidate has a weight 0 ≤ w ≤ 1 with Σw = n, which multiplies the weights of its image
+coordinates. The square of the aim is convex in w (Pukelsheim 1993, Optimal Design of Experiments),
+so that the minimum over all weights is one, most of them are 0 or 1 there, and for every selection
+
+    aim² ≥ T(w) + min over w' of ∇T·(w' − w)
+
+is a bound that no choice of n photographs can fall below. The largest weights are chosen, and
+photographs exchanged while that makes the aim smaller (Fedorov 1972).
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.network_design.pairs import IDLE, Pairs
+from jaxbundle.network_design.search import WORST, make_program
+
+NOTHING = IDLE**2
+"""The weight of a photograph that is not taken, so that its orientation stays determined."""
+MOST_EXCHANGES = 50
+
+
+class Selection(NamedTuple):
+    """`weight` of the relaxed problem; `chosen`; `aims`: by iteration; `bound`: on the aim of any
+    selection (0 where there is none)."""
+
+    weight: Float[np.ndarray, " images"]
+    chosen: Bool[np.ndarray, " images"]
+    aims: list[float]
+    bound: float
+    converged: bool
+
+
+def select(pairs: Pairs, photographs: int, max_iterations: int = 100) -> Selection:
+    """The photographs to be taken.
+
+    **Raises:** `InputError` for a number that is not possible, `NotSolvedError` where no selection
+    determines the network."""
+    from scipy.optimize import minimize
+
+    images = len(pairs.problem.network.images)
+    if not 1 <= photographs < images:
+        raise InputError(f"photographs must be from 1 to {images - 1}, one less than there are "
+                         f"candidates, but is {photographs}")  # fmt: skip
+    program = _program(pairs)
+    start = np.full(images, photographs / images)
+    aims: list[float] = []
+
+    def keep(w):
+        aims.append(float(np.exp(min(program(w)[0] / 2, 700.0))))
+
+    keep(start)
+    if program(start)[0] >= 2 * WORST:
+        raise NotSolvedError("design: all candidates together do not determine the network")
+    found = minimize(
+        program, start, jac=True, method="SLSQP", bounds=[(NOTHING, 1.0)] * images, callback=keep,
+        constraints=[{"type": "eq", "fun": lambda w: w.sum() - photographs,
+                      "jac": lambda w: np.ones_like(w)}],
+        options={"maxiter": max_iterations, "ftol": 1e-8},
+    )  # fmt: skip
+    weight = np.clip(found.x, NOTHING, 1.0)
+    chosen = np.zeros(images, bool)
+    chosen[np.argsort(-weight, kind="stable")[:photographs]] = True
+    chosen = _exchange(program, chosen)
+    value, slope = program(weight)
+    square, slope = np.exp(value), np.exp(value) * slope
+    lowest = square + np.sort(slope)[:photographs].sum() - slope @ weight
+    bound = float(np.sqrt(max(lowest, 0.0))) if pairs.aim.convex else 0.0
+    return Selection(np.where(weight > 10 * NOTHING, weight, 0.0), chosen, aims, bound,
+                     bool(found.success))  # fmt: skip
+
+
+def _program(pairs: Pairs):
+    """`weights -> (log aim², gradient)`."""
+    values = pairs.problem.data.start
+    seen = pairs.measured(values).astype(float)
+    image = pairs.problem.image
+    program = make_program(pairs, lambda w: (values, seen * jnp.sqrt(w)[image]))
+
+    def squared(w):
+        value, slope = program(np.maximum(w, NOTHING))
+        return 2 * value, 2 * slope
+
+    return squared
+
+
+def _exchange(program, chosen):
+    """Photographs exchanged, the best pair at a time, while the aim falls."""
+    aim = lambda chosen: program(chosen.astype(float))[0]
+    best = aim(chosen)
+    for _ in range(MOST_EXCHANGES):
+        found = best, chosen
+        slope = program(np.maximum(chosen.astype(float), 1e-3))[1]
+        # Those whose weight is worth most come in, those worth least go.
+        coming = np.flatnonzero(~chosen)[np.argsort(slope[~chosen])][:8]
+        for new in coming:
+            for old in np.flatnonzero(chosen):
+                tried = chosen.copy()
+                tried[[new, old]] = True, False
+                value = aim(tried)
+                if value < found[0] - 1e-9:
+                    found = value, tried
+        if found[1] is chosen:
+            return chosen
+        best, chosen = found
+    return chosen

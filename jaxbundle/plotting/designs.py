@@ -1,0 +1,147 @@
+"""A designed network: its stations before and after, the path of the search, places tried."""
+
+import numpy as np
+
+from jaxbundle.cameras import get_model
+from jaxbundle.cameras.convert import image_area
+from jaxbundle.cameras.convert_fit import rays_of
+from jaxbundle.cameras.parameters import default_parameters
+from jaxbundle.geometry import matrix_from_omega_phi_kappa
+from jaxbundle.network_design.result import Design
+from jaxbundle.plotting.style import (
+    BLUE,
+    GREY,
+    INK,
+    PALE,
+    RUST,
+    axes,
+    axes_3d,
+    extent,
+    label,
+    legend,
+    quiet,
+    title,
+)
+
+EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))
+SIZE = 0.12
+"""Of a camera, as part of the network."""
+
+
+def network_view(designed: Design, ax=None, after: bool = True):
+    """The stations in perspective, before or after the design, with the way they took.
+
+    **Returns:** matplotlib 3D `Axes`, in the object unit."""
+    ax = axes_3d(ax, (7.5, 6.5))
+    from mpl_toolkits.mplot3d.art3d import Line3DCollection
+
+    both = designed.before.network, designed.after.network
+    boxes = np.array(designed.conditions.obstacles).reshape(-1, 2, 3)
+    places = [x for n in both for x in (n.points.position, n.images.position)]
+    everything = np.concatenate([*places, *boxes])
+    centre, size = extent(everything)
+    network = both[after]
+    new = np.isin(np.array(network.images.id, dtype=object), designed.added)
+    for chosen, colour, name in ((~new, INK, "stations"), (new, RUST, "new photograph")):
+        if chosen.any():
+            lines = camera_lines(network, SIZE * size)[chosen].reshape(-1, 2, 3)
+            ax.add_collection3d(Line3DCollection(lines, colors=colour, linewidths=0.8))
+            ax.scatter(*network.images.position[chosen].T, s=9, color=colour, label=name,
+                       depthshade=False)  # fmt: skip
+    ways = [s.position for s in designed.path if len(s.position)]
+    if after and designed.order == "first" and ways:
+        for way in np.stack(ways, 1):
+            ax.plot(*way.T, color=BLUE, linewidth=0.7, alpha=0.7)
+    ax.scatter(*network.points.position.T, s=9, color=BLUE, label="targets", depthshade=False)
+    for box in boxes:
+        ax.add_collection3d(Line3DCollection(_box_edges(box), colors=GREY, linewidths=0.8))
+    low, high = everything.min(0), everything.max(0)
+    half = 0.55 * max((high - low).max(), size * SIZE)
+    for name, middle in zip("xyz", (low + high) / 2):
+        getattr(ax, f"set_{name}lim")(middle - half, middle + half)
+        label(ax, name, name.upper(), network.object_unit)
+        axis = getattr(ax, f"{name}axis")
+        axis.set_pane_color((1, 1, 1, 0))
+        axis._axinfo["grid"].update(color=PALE, linewidth=0.6)
+        ax.tick_params(axis=name, labelsize=7, colors=INK, pad=0)
+    ax.set_box_aspect((1, 1, 1), zoom=0.95)
+    ax.view_init(elev=24, azim=-58)
+    state = designed.after if after else designed.before
+    title(ax, "after" if after else "before", f"{designed.aim}: {state.aim:.3g}")
+    legend(ax, frameon=False, loc="upper right")
+    return ax
+
+
+def camera_lines(network, size: float) -> np.ndarray:
+    """The edges of a pyramid for every image, [images, 8, 2, 3]; slanted ones are `size` long."""
+    corners = []
+    for camera in network.cameras:
+        model = get_model(camera.model)
+        low, high = image_area(model, camera.image_size, camera.pixel_size)
+        xy = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
+        rays = rays_of(model, {**default_parameters(model), **camera.parameters}, xy)
+        corners.append(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    images = network.images
+    M = np.array([matrix_from_omega_phi_kappa(a) for a in images.angles])
+    ends = images.position[:, None] + size * np.array(corners)[images.camera] @ M
+    places = np.concatenate([images.position[:, None], ends], 1)
+    return places[:, np.array(EDGES)]
+
+
+def aim_path(designed: Design, ax=None):
+    """The aim by iteration; conditions are sharper in every round.
+
+    **Returns:** matplotlib `Axes`."""
+    ax = axes(ax, (6.5, 4.0))
+    steps = np.arange(len(designed.path))
+    softness = np.array([s.softness for s in designed.path])
+    aims = np.array([s.aim for s in designed.path])
+    for value in dict.fromkeys(softness.tolist()):
+        chosen = softness == value
+        name = f"conditions soft to {value:g}" if value else "weights between 0 and 1"
+        ax.plot(steps[chosen], aims[chosen], ".-", linewidth=1, markersize=3, label=name)
+    ax.axhline(designed.after.aim, color=INK, linewidth=0.8, linestyle="--", label="designed")
+    if np.isfinite(designed.before.aim):
+        ax.axhline(designed.before.aim, color=GREY, linewidth=0.8, linestyle="--", label="before")
+    ax.set_yscale("log")
+    quiet(ax)
+    label(ax, "x", "iteration")
+    label(ax, "y", str(designed.aim))
+    title(ax, "path of the search")
+    legend(ax)
+    return ax
+
+
+def places_tried(designed: Design, ax=None):
+    """Where a further photograph was tried, from above, coloured by the aim with it; the places
+    chosen.
+
+    **Raises:** `ValueError` for a design of another order. **Returns:** matplotlib `Axes`."""
+    if designed.tried is None:
+        raise ValueError("places are tried in a design of third order")
+    ax = axes(ax, (6.5, 5.5))
+    from matplotlib.colors import LogNorm
+
+    position, aims = designed.tried
+    network, good = designed.network, aims < 1e3 * np.min(aims)
+    marks = ax.scatter(*position[good, :2].T, c=aims[good], norm=LogNorm(), s=26, cmap="viridis_r")
+    ax.figure.colorbar(marks, ax=ax, label=f"{designed.aim} with a photograph there")
+    new = np.isin(np.array(network.images.id, dtype=object), designed.added)
+    ax.scatter(*network.points.position[:, :2].T, s=9, color=BLUE, label="targets")
+    ax.scatter(*network.images.position[~new, :2].T, s=34, color=INK, marker="^", label="stations")
+    ax.scatter(*network.images.position[new, :2].T, s=120, color=RUST, marker="*", label="chosen")
+    ax.set_aspect("equal")
+    quiet(ax)
+    label(ax, "x", "X", network.object_unit)
+    label(ax, "y", "Y", network.object_unit)
+    title(ax, "where should the next photograph be taken?")
+    legend(ax)
+    return ax
+
+
+def _box_edges(box):
+    """The twelve edges of a box, [12, 2, 3]."""
+    corners = np.array([[box[i, 0], box[j, 1], box[k, 2]]
+                        for i in (0, 1) for j in (0, 1) for k in (0, 1)])  # fmt: skip
+    pairs = [(a, b) for a in range(8) for b in range(a) if bin(a ^ b).count("1") == 1]
+    return corners[np.array(pairs)]
