@@ -14,6 +14,7 @@ from jaxbundle.surface.cloud import Cloud
 
 CLASSES = (0.0, 0.1, 0.5, 1.0, 2.0, 4.0, np.inf)
 """Bounds of σ in the object unit."""
+AROUND = 4.0
 AXES = ("X", "Y", "Z")
 
 
@@ -39,11 +40,14 @@ def accuracy_of(cloud: Cloud) -> dict[str, Any]:
 
 
 def at_check_points(
-    cloud: Cloud, check: Float[np.ndarray, "m 3"], radius: float, least: int = 6
+    cloud: Cloud, check: Float[np.ndarray, "m 3"], radius: float | None = None, least: int = 6
 ) -> dict[str, Any]:
-    """RMS of heights at check points: Z of the plane through the points within `radius` in X and Y.
-    """
+    """RMS of heights at check points: Z of the plane through the points within `radius` in X and Y,
+    from `least` on; by default `AROUND` spacings of the cloud."""
     tree = cKDTree(cloud.X[:, :2])
+    if radius is None:
+        some = cloud.X[:: max(1, len(cloud) // 10_000), :2]
+        radius = AROUND * float(np.median(tree.query(some, 2)[0][:, 1])) if len(cloud) > 1 else 0.0
     misclosure = []
     for place in np.asarray(check, float):
         near = tree.query_ball_point(place[:2], radius)

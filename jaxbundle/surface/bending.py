@@ -25,10 +25,12 @@ from jaxbundle.surface.refinement import refine
 from jaxbundle.surface.segments import positions, windows
 from jaxbundle.surface.views import OrientedImage
 
-REACH = 2
-"""Nodes on each side of one through which the polynomial goes."""
-MOST_MISSING = 4
-"""Of these nodes."""
+REACHES = 4, 2
+"""Nodes on each side of one through which the polynomial goes. The wide one has the errors of the
+nodes, which are those of the matches about it, an eighth as large; the narrow one is for surfaces
+the wide one does not fit."""
+MOST_MISSING = 0.16
+"""Part of these nodes."""
 MOST_MISFIT = 0.12
 """RMS of the nodes beside the polynomial, pixels of their level."""
 STEP = 4.0
@@ -52,23 +54,29 @@ class Bend(NamedTuple):
 
 
 def bend_at(guide: Guide, uv: Float[np.ndarray, "n 2"]) -> Bend:
-    """Of the polynomial about the nearest node, at places."""
+    """Of the widest polynomial about the nearest node that fits, at places."""
+    wide, narrow = (_polynomials(guide, uv, reach) for reach in REACHES)
+    derivatives = np.where(wide.known[:, None], wide.derivatives, narrow.derivatives)
+    return Bend(derivatives, wide.known | narrow.known)
+
+
+def _polynomials(guide, uv, reach):
     columns, rows = guide.q.shape[::-1]
     place = (uv - guide.first) / guide.step
     j, i = (np.clip(np.rint(a).astype(int), 0, n - 1) for a, n in zip(place.T, (columns, rows)))
-    k = np.arange(-REACH, REACH + 1)
+    k = np.arange(-reach, reach + 1)
     y, x = (a.ravel().astype(float) for a in np.meshgrid(k, k, indexing="ij"))
     A = np.column_stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2])
     fit = np.linalg.pinv(A)
-    padded = np.pad(guide.q, REACH, mode="edge")
-    good = np.pad(guide.good, REACH)
-    pick = lambda a: np.stack([a[i + int(b), j + int(c)] for b, c in zip(y + REACH, x + REACH)], 1)
+    padded = np.pad(guide.q, reach, mode="edge")
+    good = np.pad(guide.good, reach)
+    pick = lambda a: np.stack([a[i + int(b), j + int(c)] for b, c in zip(y + reach, x + reach)], 1)
     values, there = pick(padded), pick(good)
     middle = values[:, len(x) // 2][:, None]
     p = (values - middle) @ fit.T
     misfit = np.sqrt(np.mean(((values - middle) - p @ A.T) ** 2, axis=1)) * guide.rate[i, j]
     level = guide.step / 4.0
-    known = (there.sum(1) >= len(x) - MOST_MISSING) & (misfit < MOST_MISFIT * level)
+    known = (there.sum(1) >= (1 - MOST_MISSING) * len(x)) & (misfit < MOST_MISFIT * level)
     size = guide.step
     found = p[:, 1:] / np.array([size, size, size**2, size**2, size**2])
     # the slope at the place itself, not at the node

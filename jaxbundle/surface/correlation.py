@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 
 from jaxbundle.photographs.opencv import need_opencv
 from jaxbundle.surface.segments import Segments, Windows, positions
@@ -23,38 +23,61 @@ from jaxbundle.system.configuration import available_cores
 
 TOGETHER = 256
 """Points whose strips stay in the cache."""
+STRIP = 512
+"""Lines of a coarser image that are made together."""
 FLAT = 1e-3
 """Standard deviation of a window, grey values, below which it has no contrast."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Pyramid:
-    """An image and its means over 2 × 2, 4 × 4, … pixels (with a slight blur), as float32."""
+    """An image, as it is given, and its means over 2 × 2, 4 × 4, … pixels, as float32."""
 
-    levels: tuple[Float[np.ndarray, "rows columns"], ...]
+    levels: tuple[Shaped[np.ndarray, "rows columns"], ...]
 
     def sample(self, level: int, uv: Float[np.ndarray, "rows columns 2"]):
         """Grey values at places given in pixels of the full image; NaN outside."""
         cv2 = need_opencv()
-        place = ((uv + 0.5) / 2**level - 0.5).astype(np.float32)
+        place = (uv + 0.5) / 2**level - 0.5
+        grey = self.levels[level]
+        # of large images the part that is looked at: OpenCV has coordinates of 15 bits
+        low, high = _extent(place, grey.shape)
+        part = grey[low[1] : high[1], low[0] : high[0]].astype(np.float32)
+        place = (place - low).astype(np.float32)
         return cv2.remap(
-            self.levels[level], place[..., 0], place[..., 1], cv2.INTER_LINEAR,
+            part, place[..., 0], place[..., 1], cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"),
         )  # fmt: skip
 
 
-def make_pyramid(grey: Float[np.ndarray, "rows columns"], levels: int) -> Pyramid:
+def make_pyramid(grey: Shaped[np.ndarray, "rows columns"], levels: int) -> Pyramid:
     """The image and so many coarser ones."""
-    cv2 = need_opencv()
-    found = [np.ascontiguousarray(grey, np.float32)]
+    found = [np.asarray(grey)]
     for _ in range(levels):
-        a = found[-1]
-        rows, columns = (max(n // 2, 1) for n in a.shape)
-        half = cv2.resize(
-            a[: 2 * rows, : 2 * columns], (columns, rows), interpolation=cv2.INTER_AREA
-        )
-        found.append(np.asarray(half, np.float32))
+        found.append(_halved(found[-1]))
     return Pyramid(tuple(found))
+
+
+def _halved(a):
+    """Means over 2 × 2 pixels, by strips."""
+    rows, columns = (max(n // 2, 1) for n in a.shape)
+    out = np.empty((rows, columns), np.float32)
+    high, wide = (2 if n > 1 else 1 for n in a.shape)
+    for first in range(0, rows, STRIP):
+        last = min(first + STRIP, rows)
+        part = a[high * first : high * last, : wide * columns].astype(np.float32)
+        part = part.reshape(last - first, high, columns, wide)
+        out[first:last] = part.mean((1, 3))
+    return out
+
+
+def _extent(place, shape):
+    """The corner (u, v) of the part of an image that has places, and the one after its last."""
+    finite = np.where(np.isfinite(place), place, 0.0).reshape(-1, 2)
+    size = np.array(shape[::-1])
+    low = np.clip(np.floor(finite.min(0)).astype(int) - 1, 0, size - 1)
+    high = np.clip(np.ceil(finite.max(0)).astype(int) + 2, low + 1, size)
+    return low, high
 
 
 def correlate(

@@ -14,13 +14,16 @@ Sources: Hirschmüller (2008); Lucas and Kanade (1981); Ackermann (1984).
 """
 
 import dataclasses
+from concurrent.futures import ThreadPoolExecutor
 from typing import Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy import ndimage, stats
+from scipy import ndimage
 
 from jaxbundle.photographs.opencv import need_opencv
+from jaxbundle.surface.scatter import robust_factor, scatter_factor
+from jaxbundle.system.configuration import available_cores
 
 BLOCK = 3
 """Side of the blocks of semi-global matching."""
@@ -34,11 +37,17 @@ SPECKLE = 80
 HALF = 4
 """Half the side of the windows of least squares."""
 ROUNDS = 2
+BAND, MARGIN = 128, 32
+"""Rows that are refined together, and those above and below that their windows reach over."""
 HOLES, STEP, JUMP = 0.5, 0.3, 2.5
 """Pixels: σ that a window has of gaps, by the root of their share; and of a step in the surface,
 which is a change of disparities by more than `JUMP`. Found on rendered roofs."""
 BLOCK_SIDE, SMOOTHEST = 48, 0.25
 """Pixels of a block whose scatter is looked at; the quantile of the blocks that is taken."""
+COARSER, REPEATED, REPETITION, SMALL = 4, 4, 0.8, 0.02
+"""At a resolution so much coarser, windows of half this side are compared with others of the image
+itself; their correlation from which a texture repeats itself; the part of the image which a surface
+of such a texture must have."""
 NEAR = 0.7
 """Pixels: by so much disparities of one surface differ within a window, about."""
 MOST_CHANGE = 1.0
@@ -47,6 +56,9 @@ LEAST_CORRELATION, SURE = 0.5, 0.9
 """ρ of a window at least; and of one beside a step in the surface."""
 MOST_SIGMA = 0.5
 """σ of a disparity, pixels, above which the texture does not determine it."""
+INNER, OVER_NOISE = 2, 1.9
+"""Half the side of the middle of a window, which must have texture of its own: three σ more than
+the variance of noise; else a window tells of what is beside its pixel."""
 LEAST_CONTRAST = 1.0
 """Standard deviation of a window, grey values of 256."""
 
@@ -76,6 +88,7 @@ def match_dense(pair: RowPair, span: int) -> Disparities:
     left, right, inside = _prepared(pair)
     start = semi_global(left, right, span)
     start[~inside] = np.nan
+    start[ambiguous(left, start, span)] = np.nan
     return refine_disparities(left, right, start)
 
 
@@ -98,11 +111,73 @@ def semi_global(left, right, span: int) -> Float[np.ndarray, "rows columns"]:
     return np.where((found >= 0) & (found <= span), found, np.nan)
 
 
+def ambiguous(
+    left: Float[np.ndarray, "rows columns"], disparity: Float[np.ndarray, "rows columns"], span: int
+) -> Bool[np.ndarray, "rows columns"]:
+    """Pixels whose texture repeats itself along the row within the range of disparities, on a small
+    surface of its own: what one image sees alone matches the repetition in the other."""
+    cv2 = need_opencv()
+    rows, columns = (n // COARSER for n in left.shape)
+    coarse = cv2.resize(left, (columns, rows), interpolation=cv2.INTER_AREA)
+    repeated = _likeness(coarse, span // COARSER) > REPETITION
+    if not repeated.any():
+        return np.zeros(left.shape, bool)
+    repeated = cv2.resize(repeated.astype(np.uint8), left.shape[::-1],
+                          interpolation=cv2.INTER_NEAREST) > 0  # fmt: skip
+    known = np.isfinite(disparity)
+    whole = np.where(known, 16 * np.nan_to_num(disparity), -16).astype(np.int16)
+    kept, _ = cv2.filterSpeckles(whole, -16, int(SMALL * left.size), 16)
+    return known & repeated & (kept < 0)
+
+
+def _likeness(a, farthest):
+    """The greatest correlation of each window with one on its row, no farther away."""
+    cv2 = need_opencv()
+    side = (2 * REPEATED + 1, 2 * REPEATED + 1)
+    mean = lambda x: cv2.boxFilter(x, -1, side)
+    a = a - a.mean()
+    m = mean(a)
+    spread = np.sqrt(np.maximum(mean(a * a) - m * m, 1e-3))
+    best = np.full(a.shape, -1.0, np.float32)
+    for lag in range(REPEATED, farthest + 1):
+        rho = mean(a[:, lag:] * a[:, :-lag]) - m[:, lag:] * m[:, :-lag]
+        rho /= spread[:, lag:] * spread[:, :-lag]
+        np.maximum(best[:, lag:], rho, out=best[:, lag:])
+        np.maximum(best[:, :-lag], rho, out=best[:, :-lag])
+    return best
+
+
 def refine_disparities(left, right, start) -> Disparities:
     """Least squares at every pixel that has a disparity."""
+    coefficients = ndimage.spline_filter(right, 3, np.float32)
+    rows = len(left)
+
+    def of_rows(first):
+        low, high = max(first - MARGIN, 0), min(first + BAND + MARGIN, rows)
+        found = _refined(left[low:high], coefficients[low:high], start[low:high])
+        return [a[first - low : first - low + BAND] for a in found]
+
+    with ThreadPoolExecutor(available_cores()) as pool:
+        bands = list(pool.map(of_rows, range(0, rows, BAND)))
+    d, sigma, rho, across = (np.concatenate(parts) for parts in zip(*bands))
+    good = np.isfinite(d)
+    smooth = scatter_factor(d, sigma, 2 * HALF + 1, BLOCK_SIDE, SMOOTHEST)
+    factor = max(robust_factor(across[good]), min(smooth, default=1.0))
+    edges = _at_edges(np.where(good, d, 0), good)
+    sigma = np.sqrt(factor * sigma**2 + edges)
+    with np.errstate(invalid="ignore"):
+        # beside a step the disparities of one side reach over to the other
+        good &= ~(edges >= STEP**2) | (rho >= SURE)
+        good &= sigma < MOST_SIGMA
+    keep = lambda a: np.where(good, a, np.nan)
+    return Disparities(keep(d), keep(sigma), keep(rho), factor)
+
+
+def _refined(left, coefficients, start):
+    """Disparities (NaN: none), their σ, ρ, and shifts across the rows over their σ, of some rows;
+    `coefficients`: of the spline through the right image."""
     known = np.isfinite(start)
     shape = _smooth(_without_noise(start, known), known)
-    coefficients = ndimage.spline_filter(right, 3, np.float32)
     y, x = np.indices(left.shape, dtype=np.float32)
     found, moved = None, np.zeros(left.shape, np.float32)
     for last in range(ROUNDS):
@@ -119,16 +194,11 @@ def refine_disparities(left, right, start) -> Disparities:
     with np.errstate(invalid="ignore", divide="ignore"):
         good = known & (np.abs(shape + moved - start) <= MOST_CHANGE) & (np.abs(found.x) < 0.5)
         good &= (found.rho >= LEAST_CORRELATION) & found.textured & (found.h1 > 0.2)
-        across = (found.y / found.sigma_y)[good]
-    factor = max(_factor(across), _scatter(np.where(good, shape + moved, np.nan), found.sigma_x))
-    edges = _at_edges(shape + moved, good)
-    sigma = np.sqrt(factor * found.sigma_x**2 + edges)
-    with np.errstate(invalid="ignore"):
-        # beside a step the disparities of one side reach over to the other
-        good &= ~(edges >= STEP**2) | (found.rho >= SURE)
-        good &= sigma < MOST_SIGMA
-    keep = lambda a: np.where(good, a, np.nan)
-    return Disparities(keep(shape + moved), keep(sigma), keep(found.rho), factor)
+        across = found.y / found.sigma_y
+    d = np.where(good, shape + moved, np.nan).astype(np.float32)
+    return d, found.sigma_x.astype(np.float32), found.rho.astype(np.float32), across.astype(
+        np.float32
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,14 +235,25 @@ def _solve(left, warped) -> _Solved:
     LL = product(left, left, "L", "L")
     RR, LR = N[..., 2, 2], g[..., 2]
     textured = (LL > n * LEAST_CONTRAST**2) & (RR > n * LEAST_CONTRAST**2)
+    inner = _variance(left, INNER)
     Q, p = _solved(N, g, textured)
     rest = np.maximum(LL - np.einsum("...i,...i->...", p, g), 0)
     s2 = rest / (n - 4)
+    # half of s² is the noise of the left image
+    textured &= inner > LEAST_CONTRAST**2 + OVER_NOISE * s2 / 2
     with np.errstate(invalid="ignore", divide="ignore"):
         rho = LR / np.sqrt(LL * RR)
         h1 = p[..., 2]
         sigma = [np.sqrt(s2 * Q[..., k, k]) for k in (0, 1)]
     return _Solved(p[..., 0], p[..., 1], sigma[0], sigma[1], rho, h1, textured)
+
+
+def _variance(a, half):
+    """Of the grey values of windows."""
+    cv2 = need_opencv()
+    side = (2 * half + 1, 2 * half + 1)
+    mean = lambda x: cv2.boxFilter(x, cv2.CV_64F, side, borderType=cv2.BORDER_REFLECT_101)
+    return mean(a * a) - mean(a) ** 2
 
 
 def _solved(N, g, textured):
@@ -204,37 +285,6 @@ def _at_edges(d, known):
     high = cv2.dilate(np.where(known, d, -1e4).astype(np.float32), np.ones(window, np.uint8))
     low = cv2.erode(np.where(known, d, 1e4).astype(np.float32), np.ones(window, np.uint8))
     return HOLES**2 * holes + STEP**2 * (known & (high - low > JUMP))
-
-
-def _factor(ratio) -> float:
-    """The variance factor of errors in units of their σ; 1 where few are known."""
-    ratio = ratio[np.isfinite(ratio)]
-    return float(np.median(ratio**2) / stats.chi2.median(1)) if len(ratio) > 100 else 1.0
-
-
-def _scatter(d, sigma) -> float:
-    """The variance factor that third differences of disparities tell, whose windows do not overlap:
-    on smooth surfaces noise alone. So it is that of the smoothest blocks and of the better axis."""
-    step, weights = 2 * HALF + 1, (1.0, -3.0, 3.0, -1.0)
-    found = []
-    for a, s in ((d, sigma), (d.T, sigma.T)):
-        n = a.shape[1] - 3 * step
-        if n <= BLOCK_SIDE:
-            continue
-        parts = [(w, slice(k * step, k * step + n)) for k, w in enumerate(weights)]
-        difference = sum(w * a[:, part] for w, part in parts)
-        square = sum(w * w * s[:, part] ** 2 for w, part in parts)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            ratio = difference / np.sqrt(square)
-        blocks = [
-            block[np.isfinite(block)]
-            for r in range(0, ratio.shape[0], BLOCK_SIDE) for c in range(0, n, BLOCK_SIDE)
-            if (block := ratio[r : r + BLOCK_SIDE, c : c + BLOCK_SIDE]).size
-        ]  # fmt: skip
-        full = [_factor(block) for block in blocks if len(block) > BLOCK_SIDE**2 / 3]
-        if full:
-            found.append(float(np.quantile(full, SMOOTHEST)))
-    return min(found, default=1.0)
 
 
 def _without_noise(disparity, known):

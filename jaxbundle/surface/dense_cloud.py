@@ -2,7 +2,9 @@
 
 In a rectified pair the inverse distance of a pixel is linear in its disparity, q = d/(f·b·l) with l
 the length of [x/f, y/f, 1]. So several pairs are averaged in q, by their σ; what disagrees is left
-out. Half of the variance of a match belongs to the base image, which all pairs share.
+out. Half of the variance of a match belongs to the base image, which all pairs share: a shift ε of
+its window, in any direction, changes the disparity of a pair by eₖ·ε, with eₖ its epipolar line. So
+the errors of pairs k and l have the covariance ½·σₖ·σₗ·eₖ·eₗ.
 """
 
 from collections.abc import Sequence
@@ -15,6 +17,7 @@ from jaxbundle.surface.bounds import Bounds
 from jaxbundle.surface.cloud import Cloud
 from jaxbundle.surface.dense import Disparities, match_dense
 from jaxbundle.surface.guide import Guide
+from jaxbundle.surface.orientation import orientation_covariance
 from jaxbundle.surface.rectification import Rectified, disparity_range, rectify
 from jaxbundle.surface.views import FrameView
 
@@ -37,7 +40,7 @@ def dense_cloud(
     what the guide has found.
     """
     found_points, all_points = guide_points(base, guide), bound_points(base, bounds)
-    pairs, used, left_out = [], [], []
+    pairs, partners, used, left_out = [], [], [], []
     for other in others:
         span = disparity_range(base, other, all_points)
         X = all_points if span is not None and span < MOST_DISPARITIES else found_points
@@ -48,12 +51,14 @@ def dense_cloud(
         pair, span = rectified
         found = match_dense(pair, span)
         pairs.append((pair, found))
+        partners.append(other)
         used.append((other.name, found.factor))
     columns, rows = base.size
     v, u = np.mgrid[0:rows:step, 0:columns:step].reshape(2, -1)
     uv = np.stack([u, v], 1).astype(float)
     parts = [
-        _points(base, pairs, uv[k : k + TOGETHER]) for k in range(0, len(uv), TOGETHER) if pairs
+        _points((base, *partners), pairs, uv[k : k + TOGETHER])
+        for k in range(0, len(uv), TOGETHER) if pairs
     ]
     if not parts:
         none = np.zeros
@@ -61,7 +66,7 @@ def dense_cloud(
                       (base.name,))  # fmt: skip
         return empty, used, left_out
     X, covariance, rays, places = (np.concatenate(p) for p in zip(*parts))
-    cloud = Cloud(X, covariance, rays, np.zeros(len(X), int), places, (base.name,))
+    cloud = Cloud(X, covariance, rays, np.zeros(len(X), np.int16), places, (base.name,))
     return cloud, used, left_out
 
 
@@ -81,14 +86,18 @@ def bound_points(base: FrameView, bounds: Bounds) -> Float[np.ndarray, "n 3"]:
     return ends[np.isfinite(ends).all(1)]
 
 
-def _points(base, pairs, uv):
+def _points(views, pairs, uv):
     """Points of pixels, their covariance, numbers of rays, and the pixels that have one."""
+    base = views[0]
     d = base.points(uv, np.ones(len(uv))) - base.X0
     found = [_inverse_distance(base, d, *pair) for pair in pairs]
     q, s = (np.stack(a) for a in zip(*found))
-    q, variance, number = combine(q, s)
+    across = np.stack([pair.R[0] for pair, _ in pairs])
+    across = across - (across @ base.M[2])[:, None] * base.M[2]
+    across = across / np.linalg.norm(across, axis=1, keepdims=True)
+    q, variance, number = combine(q, s, across @ across.T)
     good = np.isfinite(q) & (q > 0)
-    uv, d, q, variance, number = uv[good], d[good], q[good], variance[good], number[good]
+    uv, d, q, variance, number = (a[good] for a in (uv, d, q, variance, number))
     length = 1 / q
     along = variance / q**4
     # across the line of sight: that part of a match's error which is the base image's
@@ -96,7 +105,10 @@ def _points(base, pairs, uv):
     pixel = np.sqrt(variance / 2) * pair.base * length
     dd = d[:, :, None] * d[:, None]
     covariance = along[:, None, None] * dd + (pixel**2)[:, None, None] * (np.eye(3) - dd)
-    return base.X0 + length[:, None] * d, covariance, number + 1, uv
+    X = base.X0 + length[:, None] * d
+    used = np.concatenate([np.ones((1, len(X)), bool), np.isfinite(s[:, good])]).T
+    covariance += orientation_covariance(views, X, used)
+    return X, covariance.astype(np.float32), (number + 1).astype(np.int16), uv.astype(np.float32)
 
 
 def _inverse_distance(base, d, pair: Rectified, found: Disparities):
@@ -119,10 +131,12 @@ def _inverse_distance(base, d, pair: Rectified, found: Disparities):
 
 
 def combine(
-    q: Float[np.ndarray, "pairs n"], sigma: Float[np.ndarray, "pairs n"]
+    q: Float[np.ndarray, "pairs n"], sigma: Float[np.ndarray, "pairs n"],
+    cosine: Float[np.ndarray, "pairs pairs"] | None = None,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], np.ndarray]:
     """The weighted mean of values that agree, its variance, how many they are. NaN where two
-    disagree and no third decides."""
+    disagree and no third decides. `cosine`: of the angles between epipolar lines, all one if not
+    given."""
     known = np.isfinite(q) & np.isfinite(sigma)
     if len(q) == 1:
         return np.where(known[0], q[0], np.nan), sigma[0] ** 2, known[0].astype(int)
@@ -139,7 +153,8 @@ def combine(
     weight = np.where(use, 1 / np.where(use, sigma, 1) ** 2, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = np.where(use, weight * np.where(use, q, 0), 0).sum(0) / weight.sum(0)
-        shared = np.where(use, sigma**2, 0).sum(0) / number / 2
-        variance = shared + 0.5 / weight.sum(0)
+        pull = np.where(use, weight * np.where(use, sigma, 0), 0) / weight.sum(0)
+        cosine = np.ones((len(q), len(q))) if cosine is None else cosine
+        variance = np.einsum("kn,kl,ln->n", pull, cosine, pull) / 2 + 0.5 / weight.sum(0)
     decided = (number >= 1) & ((count < 2) | (number > 1))
     return np.where(decided, mean, np.nan), variance, number

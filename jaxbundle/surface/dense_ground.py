@@ -91,6 +91,8 @@ def _intersected(base, other, pair, uv, ab, d, sigma):
     used = np.ones((len(uv), 2), bool) & np.isfinite(match).all(1)[:, None]
     found = intersect((base, other), np.stack([uv, match], 1), covariance, used, start)
     good = np.isfinite(found.covariance).all((1, 2)) & np.isfinite(found.X).all(1)
-    n = int(good.sum())
-    return Cloud(found.X[good], found.covariance[good], found.rays[good], np.zeros(n, int),
-                 uv[good], (base.name,))  # fmt: skip
+    return Cloud(
+        found.X[good], found.covariance[good].astype(np.float32),
+        found.rays[good].astype(np.int16), np.zeros(int(good.sum()), np.int16),
+        uv[good].astype(np.float32), (base.name,),
+    )  # fmt: skip

@@ -11,10 +11,10 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from jaxbundle.arguments import one_of, positive, whole
+from jaxbundle.choices import CUBE_POINTS
 from jaxbundle.errors import InputError
 from jaxbundle.surface.cloud import Cloud
 
-PLACES = ("mean", "corner", "best")
 NEIGHBOURS = 8
 
 
@@ -28,7 +28,7 @@ def thin(cloud: Cloud, size: float, least: int = 1, place: str = "mean") -> Clou
 
     **Raises:** `InputError`."""
     size, least = positive("size of the cubes", size), whole("least number of points", least)
-    one_of("place", place, PLACES)
+    one_of("place", place, CUBE_POINTS)
     if not len(cloud):
         return cloud
     cube = np.floor(cloud.X / size).astype(np.int64)

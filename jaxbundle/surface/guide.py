@@ -75,16 +75,18 @@ def make_guide(
     others: Sequence[OrientedImage],
     pyramids: tuple[Pyramid, Sequence[Pyramid]],
     bounds,
+    most: int = MOST_NODES,
 ) -> Guide | None:
     """The guide of an image by others; None where no other sees what it does.
 
-    **Arguments:** `bounds(uv)`: q between which every pixel's surface is, [n, 2], ascending.
+    **Arguments:** `bounds(uv)`: q between which every pixel's surface is, [n, 2], ascending;
+    `most`: nodes.
     """
     coarsest = len(pyramids[0].levels) - 1
     guide = None
     for level in range(coarsest, -1, -1):
         uv, shape = _nodes(base, level)
-        if guide is not None and len(uv) > MOST_NODES:
+        if guide is not None and len(uv) > most:
             break
         q = bounds(uv)
         if guide is None:

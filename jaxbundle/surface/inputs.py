@@ -1,19 +1,20 @@
 """Oriented photographs from files: a project, a COLMAP folder or another network, and the
 photographs its images are named after."""
 
-import os
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from jaxbundle.errors import InputError
-from jaxbundle.io.formats import read_network, recognised_format
-from jaxbundle.io.networks.project import read_project
+from jaxbundle.io.formats import read_oriented
 from jaxbundle.network.columns import some
 from jaxbundle.network.tables import Network
-from jaxbundle.photographs.reading import read_photograph
+from jaxbundle.photographs.reading import SUFFIXES, read_photograph
 from jaxbundle.surface.views import FrameView, frame_views
+
+IMAGES = (*SUFFIXES, ".bmp", ".ppm", ".pgm", ".webp", ".jp2")
 
 
 def read_views(
@@ -24,8 +25,7 @@ def read_views(
     **Raises:** `InputError` where fewer than two images are oriented, a photograph is missing, or
     is not of the size of its camera.
     """
-    is_project = os.path.exists(path) and recognised_format(Path(path)) == "project"
-    network = read_project(path, oriented=True) if is_project else read_network(path)
+    network = read_oriented(path)
     images = network.images
     known = np.isfinite(images.position).all(1) & np.isfinite(images.angles).all(1)
     messages = []
@@ -40,11 +40,14 @@ def read_views(
         )
     files = find_photographs(network.images.id, Path(folder))
     greys = [read_photograph(file) for file in files]
-    return frame_views(network, greys), network, tuple(messages)
+    colours = [partial(read_photograph, file, colour=True) for file in files]
+    return frame_views(network, greys, colours), network, tuple(messages)
 
 
 def find_photographs(names: Sequence[str], folder: Path) -> list[Path]:
-    """The files of photographs by their names, with or without suffix, in a folder or below it.
+    """The files of photographs by their names, with or without suffix, in a folder or below it;
+    images before other files (masks and depths beside them have names alike), the nearest folder
+    first.
 
     **Raises:** `InputError` that names those that are not there, or are there twice.
     """
@@ -58,9 +61,9 @@ def find_photographs(names: Sequence[str], folder: Path) -> list[Path]:
             found.append(exact)
             continue
         key = Path(name).name.lower()
-        same = [p for p in files if p.name.lower() == key] or [
-            p for p in files if p.stem.lower() == key
-        ]
+        same = _foremost([p for p in files if p.name.lower() == key]) or _foremost(
+            [p for p in files if p.stem.lower() == key]
+        )
         if len(same) > 1:
             raise InputError(f"--photos {folder}: {name}: there are {some(same, 3, str)}")
         found += same
@@ -73,7 +76,20 @@ def find_photographs(names: Sequence[str], folder: Path) -> list[Path]:
     return found
 
 
+def _foremost(files):
+    """Of files of one name the images, of these those in the nearest folder."""
+    files = [p for p in files if p.suffix.lower() in IMAGES] or files
+    near = min((len(p.parts) for p in files), default=0)
+    return [p for p in files if len(p.parts) == near]
+
+
 def tie_points(network: Network) -> np.ndarray:
     """Coordinates [n, 3] of the points of a network that have any."""
     X = network.points.position
     return X[np.isfinite(X).all(1)]
+
+
+def check_points(network: Network) -> np.ndarray:
+    """Coordinates [n, 3] of the check and control points of a network that are given."""
+    X = network.points.position
+    return X[np.isfinite(X).all(1) & network.points.has_role("check", "control", "fixed")]

@@ -6,10 +6,12 @@ Whole pixels, since the windows of least squares matching have a pixel in their 
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.choices import SURFACE_POINTS
 from jaxbundle.errors import InputError
 from jaxbundle.photographs.opencv import need_opencv
 
-KINDS = ("grid", "edges", "corners")
+TILE, SAMPLE = 2048, 1 << 20
+"""Side of the tiles of a large image; pixels of which the darkest and the brightest are found."""
 WEAKEST_CORNER = 1e-3
 """Least eigenvalue of a corner, as a part of that of the strongest."""
 
@@ -26,19 +28,37 @@ def interest_points(
         rows, columns = grey.shape
         v, u = np.mgrid[0:rows:step, 0:columns:step].reshape(2, -1)
         return np.stack([u, v], 1).astype(float)
-    if kind not in KINDS:
-        raise InputError(f"points {kind!r}: one of {', '.join(KINDS)} is expected")
+    if kind not in SURFACE_POINTS:
+        raise InputError(f"points {kind!r}: one of {', '.join(SURFACE_POINTS)} is expected")
+    every = max(1, grey.size // SAMPLE)
+    limits = np.percentile(grey.ravel()[::every], [1, 99])
+    find = _corners if kind == "corners" else _edges
+    rows, columns = grey.shape
+    found = [
+        find(_eight_bits(grey[v : v + TILE, u : u + TILE], limits), step) + [u, v]
+        for v in range(0, rows, TILE) for u in range(0, columns, TILE)
+    ]  # fmt: skip
+    return np.concatenate(found)
+
+
+def _corners(eight, step):
+    found = need_opencv().goodFeaturesToTrack(eight, 0, WEAKEST_CORNER, step)
+    places = np.zeros((0, 2)) if found is None else found.reshape(-1, 2)
+    return np.unique(np.rint(places).astype(float), axis=0)
+
+
+def _edges(eight, step):
+    """The first edge point of every cell."""
     cv2 = need_opencv()
-    low, high = np.percentile(grey, [1, 99])
-    eight = np.clip((grey - low) * (255 / max(high - low, 1e-9)), 0, 255).astype(np.uint8)
-    if kind == "corners":
-        found = cv2.goodFeaturesToTrack(eight, 0, WEAKEST_CORNER, step)
-        places = np.zeros((0, 2)) if found is None else found.reshape(-1, 2)
-        return np.unique(np.rint(places).astype(float), axis=0)
     smooth = cv2.GaussianBlur(eight, (0, 0), 1.0)
     slope = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
     strong = float(np.percentile(slope, 85)) + 1.0
     v, u = np.nonzero(cv2.Canny(smooth, 0.4 * strong, strong))
-    # the first edge point of every cell
     _, first = np.unique(np.stack([v // step, u // step], 1), axis=0, return_index=True)
     return np.stack([u[first], v[first]], 1).astype(float)
+
+
+def _eight_bits(grey, limits):
+    low, high = limits
+    stretched = (grey.astype(np.float32) - low) * (255 / max(high - low, 1e-9))
+    return np.clip(stretched, 0, 255).astype(np.uint8)

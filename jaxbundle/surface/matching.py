@@ -5,8 +5,10 @@
 
 The residuals across the epipolar lines are errors of the same matching that gives the heights: the
 median of vᵀC⁻¹v over its expectation is the variance factor by which all covariances are
-multiplied, unless it is below 1. It holds what the matching does not know of, small errors of the
-orientation included.
+multiplied. It holds what the matching does not know of, small errors of the orientation included.
+Below 1 it tells that what the windows are unlike by is finer than what shifts them; but errors
+along the epipolar lines may be larger, by the shape of the surface, so that it is taken only as far
+as the scatter of the surface agrees (`scatter.py`).
 """
 
 import dataclasses
@@ -22,9 +24,11 @@ from jaxbundle.surface.bending import corrected, sharpen
 from jaxbundle.surface.correlation import Pyramid
 from jaxbundle.surface.guide import Guide, search
 from jaxbundle.surface.intersection import Intersected, intersect
-from jaxbundle.surface.refinement import refine
+from jaxbundle.surface.orientation import orientation_covariance
+from jaxbundle.surface.refinement import has_texture, refine
+from jaxbundle.surface.scatter import scatter_factor
 from jaxbundle.surface.segments import positions, windows
-from jaxbundle.surface.views import OrientedImage, is_inside
+from jaxbundle.surface.views import OrientedImage, is_inside, line_of_sight
 
 SEARCH = 2.0
 """Pixels of the full image that are searched beyond the guide's range."""
@@ -37,6 +41,8 @@ CONSISTENT = 1.5
 """Pixels between a point and what the guide of the other image has there."""
 STRAYED = 2.5
 """Pixels from the position of the correlation to that of least squares matching, at most."""
+BLOCK_SIDE = 16
+"""Points a side of a block whose scatter is looked at."""
 SIGNIFICANCE = 1e-3
 """Of the test of a point's residuals."""
 
@@ -116,6 +122,7 @@ def match_points(
         with np.errstate(invalid="ignore"):
             good &= np.sqrt(np.trace(match.covariance, axis1=1, axis2=2)) < MOST_SIGMA
         good &= _agrees(base, other, guides[k], X)
+        good &= has_texture(base.grey, uv, match.sigma0, settings.fine)
         safe = np.where(good[:, None, None], match.A, np.eye(2))
         back = np.linalg.inv(safe)
         own[:, k] = np.where(
@@ -152,7 +159,9 @@ class _Rays:
 def _accepted(table, X, uv, rhos, settings, lost) -> Matches:
     """Intersect; rays that do not fit are left out, points that do not fit are rejected."""
     found = table.intersect(X)
-    factor = max(1.0, variance_factor(found.vtpv, found.redundancy))
+    factor = variance_factor(found.vtpv, found.redundancy)
+    if factor < 1:
+        factor = min(1.0, max(factor, _scatter(table.views[0], uv, found, settings)))
     bad = _misfits(found, factor)
     several = bad & (found.rays > max(settings.least_rays, 2))
     if several.any():
@@ -168,8 +177,10 @@ def _accepted(table, X, uv, rhos, settings, lost) -> Matches:
         rho = np.nanmin(np.where(table.used[good][:, 1:], rhos[good], np.nan), axis=1) if (
             good.any()
         ) else np.zeros(0)
+    covariance = factor * found.covariance[good]
+    covariance += orientation_covariance(table.views, found.X[good], table.used[good])
     return Matches(
-        uv[good], found.X[good], factor * found.covariance[good], found.rays[good],
+        uv[good], found.X[good], covariance, found.rays[good],
         found.angle[good], rho,
         np.where(table.used[good][:, 1:, None], table.uv[good][:, 1:], np.nan), factor,
         {reason: number for reason, number in lost.items() if number},
@@ -184,6 +195,24 @@ def variance_factor(
     if good.sum() < least:
         return 1.0
     return float(np.median(vtpv[good] / stats.chi2.median(redundancy[good])))
+
+
+def _scatter(base, uv, found, settings) -> float:
+    """The variance factor of points on a grid by their scatter, 1 where they are on none."""
+    good = np.isfinite(found.covariance).all((1, 2)) & np.isfinite(found.X).all(1)
+    if good.sum() < BLOCK_SIDE**2:
+        return 1.0
+    X, C, place = found.X[good], found.covariance[good], uv[good].astype(int)
+    step = int(np.gcd.reduce(np.diff(np.unique(place[:, 0])))) or 1
+    column, row = ((place - place.min(0)) // step).T
+    q = base.parameter(X)
+    d = line_of_sight(base.derivative(X))
+    scale = np.sqrt(np.einsum("ni,nij,nj->n", d, C, d))
+    rate = np.abs(base.parameter(X + scale[:, None] * d) - q)
+    values, sigma = np.full((2, row.max() + 1, column.max() + 1), np.nan)
+    values[row, column], sigma[row, column] = q, rate
+    apart = -(-(2 * settings.fine + 1) // step)
+    return max(scatter_factor(values, sigma, apart, BLOCK_SIDE, 0.5), default=1.0)
 
 
 def _misfits(found: Intersected, factor: float) -> Bool[np.ndarray, " n"]:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxbundle.choices import CLOUD_FILES
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import write_bytes, write_text
 from jaxbundle.io.writing.replacing import replaced_file
@@ -26,7 +27,6 @@ PLY_READ = {"double": "<f8", "float64": "<f8", "float": "<f4", "float32": "<f4",
             "uint8": "u1", "char": "i1", "int8": "i1", "int": "<i4", "int32": "<i4",
             "uint": "<u4", "uint32": "<u4", "short": "<i2", "int16": "<i2", "ushort": "<u2",
             "uint16": "<u2"}  # fmt: skip
-KINDS = (".csv", ".ply", ".las", ".laz", ".dxf")
 LEAST_SCALE = 1e-9
 MOST_DXF = 5_000_000
 
@@ -46,7 +46,9 @@ def write_cloud(cloud: Cloud, path: str | Path) -> None:
         case ".dxf":
             _write_dxf(cloud, path)
         case suffix:
-            raise InputError(f"{path}: suffix {suffix!r}; one of {', '.join(KINDS)} is expected")
+            raise InputError(
+                f"{path}: suffix {suffix!r}; one of {', '.join(CLOUD_FILES)} is expected"
+            )
 
 
 def read_cloud(path: str | Path) -> Cloud:

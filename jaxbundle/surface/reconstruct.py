@@ -15,9 +15,10 @@ from jaxbundle.surface.correlation import Pyramid, make_pyramid
 from jaxbundle.surface.dense_cloud import dense_cloud
 from jaxbundle.surface.dense_ground import dense_ground_cloud
 from jaxbundle.surface.ground import RpcView
-from jaxbundle.surface.guide import Guide, coarsest_level, make_guide
+from jaxbundle.surface.guide import MOST_NODES, Guide, coarsest_level, make_guide
 from jaxbundle.surface.interest import interest_points
 from jaxbundle.surface.matching import Matches, Settings, match_points
+from jaxbundle.surface.orientation import is_uncertain
 from jaxbundle.surface.pairs import choose_partners
 from jaxbundle.surface.segments import segments, visible_range
 from jaxbundle.surface.views import FrameView, OrientedImage
@@ -26,17 +27,25 @@ KEPT = 6
 """Pyramids kept at a time."""
 POINTS = 40_000
 """Points of a base image where no step is given."""
+DENSE_NODES = 25_000
+"""Of the guides of dense matching, which need no more than the range of depths."""
+MOST_POINTS = 16_000_000
+"""Of a dense cloud where no step is given; they take 2.5 GB."""
+SAMPLE = 1 << 20
+"""Pixels of which the darkest and the brightest are found."""
 
 Tell = Callable[[str, int, int], None]
 
 
 @dataclasses.dataclass(frozen=True)
 class Surface:
-    """A cloud, what became of the points of each base image, and messages."""
+    """A cloud, what became of the points of each base image, and messages; `orientation`: whether
+    the σ of the orientations are in those of the points."""
 
     cloud: Cloud
     bases: tuple[Mapping[str, Any], ...]
     messages: tuple[str, ...]
+    orientation: bool = False
 
 
 def find_bounds(
@@ -138,15 +147,19 @@ def reconstruct(
     tell = tell or (lambda *_: None)
     levels = max(_level(views, bounds[i], i, others) for i, others in partners.items())
     pyramids = _Pyramids(views, levels)
-    guides = _guides(views, bounds, partners, pyramids, tell)
+    guides = _guides(views, bounds, partners, pyramids, tell, dense)
     clouds, told, messages = [], [], []
+    every = step or _dense_step(views[i] for i in partners)
+    if dense and not step and every > 1:
+        messages.append(f"every {every}th pixel in both directions, not to run out of memory; "
+                        "--step 1 takes all")  # fmt: skip
     for done, (i, others) in enumerate(partners.items()):
         tell("matching", done, len(partners))
         row: dict[str, Any] = {"image": views[i].name, "with": [views[j].name for j in others]}
         if i not in guides:
             row |= {"points": 0, "matched": 0, "variance_factor": None, "rejected": {}}
         elif dense:
-            cloud, counts, left_out = _dense(views, i, others, guides[i], bounds[i], step or 1)
+            cloud, counts, left_out = _dense(views, i, others, guides[i], bounds[i], every)
             clouds.append(cloud)
             row |= counts
             messages += [f"{views[i].name} with {name}: cannot be rectified, left out"
@@ -168,7 +181,8 @@ def reconstruct(
             "no point was matched: the photographs have too little texture in common, or the "
             "orientation or the bounds of the heights are not theirs"
         )
-    return Surface(merge(clouds), tuple(told), tuple(messages))
+    uncertain = any(is_uncertain(views[j]) for i, others in partners.items() for j in (i, *others))
+    return Surface(merge(clouds), tuple(told), tuple(messages), uncertain)
 
 
 def _dense(views, i, others, guide, bounds, step):
@@ -189,19 +203,20 @@ def _dense(views, i, others, guide, bounds, step):
     }, left_out  # fmt: skip
 
 
-def _guides(views, bounds, partners, pyramids, tell) -> dict[int, Guide]:
-    """Of every base, and of every image that one is matched with."""
+def _guides(views, bounds, partners, pyramids, tell, dense) -> dict[int, Guide]:
+    """Of every base, and of every image that one is matched with; dense matching needs those of the
+    bases only, coarser ones."""
     with_whom = {i: list(others) for i, others in partners.items()}
     for i, others in partners.items():
         for j in others:
-            if j not in partners:
+            if j not in partners and not dense:
                 with_whom.setdefault(j, []).append(i)
     guides = {}
     for done, (i, others) in enumerate(with_whom.items()):
         tell("depths", done, len(with_whom))
         guide = make_guide(
             views[i], [views[j] for j in others], (pyramids[i], [pyramids[j] for j in others]),
-            bounds[i],
+            bounds[i], DENSE_NODES if dense else MOST_NODES,
         )
         if guide is not None:
             guides[i] = guide
@@ -223,6 +238,12 @@ def _level(views, bounds, i, others):
     return coarsest_level(views[i].size, float(np.max(seen)) if len(seen) else 0.0)
 
 
+def _dense_step(bases):
+    """Pixels between points, so that those of all base images can be held."""
+    pixels = sum(view.size[0] * view.size[1] for view in bases)
+    return max(1, int(np.ceil(np.sqrt(pixels / MOST_POINTS))))
+
+
 def _step(view):
     columns, rows = view.size
     return max(2, int(np.ceil(np.sqrt(columns * rows / POINTS))))
@@ -238,8 +259,11 @@ def _cloud(view, found: Matches) -> Cloud:
 
 def _colour(view, uv):
     place = np.rint(uv).astype(int)
+    if isinstance(view, FrameView) and view.colours is not None:
+        return view.colours()[place[:, 1], place[:, 0]]
     grey = np.asarray(view.grey[place[:, 1], place[:, 0]])
     if grey.dtype != np.uint8:
-        low, high = np.percentile(view.grey, [0.5, 99.5])
+        every = max(1, view.grey.size // SAMPLE)
+        low, high = np.percentile(view.grey.ravel()[::every], [0.5, 99.5])
         grey = np.clip((grey - low) * (255 / max(high - low, 1e-9)), 0, 255).astype(np.uint8)
     return np.repeat(grey[:, None], 3, axis=1)

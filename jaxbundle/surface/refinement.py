@@ -1,10 +1,15 @@
-"""Matches to a fraction of a pixel: least squares matching of many windows, from many starts."""
+"""Matches to a fraction of a pixel: least squares matching of many windows, from many starts.
+
+Both photographs are smoothed before: what is finer than the pixels allow, and noise, shift matches
+towards the middle between pixels, and make gradients of nothing (Schreier et al., 2000).
+"""
 
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 
 from jaxbundle.measure.least_squares_matching import (
     LeastSquaresMatch,
@@ -19,6 +24,10 @@ SPARE = 5
 """Pixels that the piece of the other image is larger than the window at the start, each side."""
 STRETCH = 1.4
 """By which a window may be longer in the other image."""
+OVER_NOISE, TOGETHER = 1.5, 4096
+"""Of the squares of gradients of half a window: three σ more than those of noise."""
+BLUR, BEYOND = 0.7, 3
+"""σ of the Gaussian, and pixels to which it reaches."""
 
 
 class Refined(NamedTuple):
@@ -47,7 +56,8 @@ def refine(
     affine transformation, from the base to the other image.
     """
     n, reach = len(uv), int(np.ceil(STRETCH * half)) + SPARE
-    usable = is_inside(base, uv, half) & is_inside(other, start, reach + 1)
+    usable = is_inside(base, uv, half)
+    usable &= is_inside(other, start, reach + 1)
     usable &= np.isfinite(A).all((1, 2))
     rows = np.flatnonzero(usable)
     out = Refined(
@@ -73,14 +83,55 @@ def refine(
     return out
 
 
+def has_texture(
+    grey: Shaped[np.ndarray, "rows columns"], uv: Float[np.ndarray, "n 2"],
+    sigma0: Float[np.ndarray, " n"], half: int,
+) -> Bool[np.ndarray, " n"]:
+    """Whether windows have texture on all sides of their points, by the squares of its gradients
+    against those of noise; else they tell of what is beside: of the ground at the edge of a roof.
+
+    Smoothed noise of variance σ² has σ²/4πs², twice of which are σ0²; central differences of it
+    have σ²/2 on each axis.
+    """
+    k = np.arange(-half - 1, half + 2)
+    rows, columns = grey.shape
+    noise = 2 * np.pi * BLUR**2 * sigma0**2
+    good = np.zeros(len(uv), bool)
+    for first in range(0, len(uv), TOGETHER):
+        part = slice(first, first + TOGETHER)
+        u, v = np.rint(uv[part]).astype(int).T
+        r = np.clip(v[:, None] + k, 0, rows - 1)
+        c = np.clip(u[:, None] + k, 0, columns - 1)
+        a = grey[r[:, :, None], c[:, None]].astype(np.float32)
+        gx, gy = a[:, 1:-1, 2:] - a[:, 1:-1, :-2], a[:, 2:, 1:-1] - a[:, :-2, 1:-1]
+        square = (gx * gx + gy * gy) / 4
+        near, far = slice(0, half + 2), slice(half - 1, None)
+        sides = square[:, near], square[:, far], square[:, :, near], square[:, :, far]
+        least = np.min([side.mean((1, 2)) for side in sides], axis=0)
+        with np.errstate(invalid="ignore"):
+            good[part] = least > OVER_NOISE * noise[part]
+    return good
+
+
 def _pieces(grey, corner, side):
-    """Pieces [n, side, side] from their upper-left pixels (u, v)."""
-    k = np.arange(side)
-    return grey[corner[:, 1, None, None] + k[:, None], corner[:, 0, None, None] + k].astype(
-        np.float32
+    """Pieces [n, side, side] from their upper-left pixels (u, v), and `BEYOND` on all sides."""
+    k = np.arange(-BEYOND, side + BEYOND)
+    rows, columns = (
+        np.clip(c[:, None] + k, 0, n - 1) for c, n in zip(corner.T[::-1], grey.shape)
     )
+    return grey[rows[:, :, None], columns[:, None]].astype(np.float32)
 
 
 @jax.jit
 def _match(template, piece, start):
-    return jax.vmap(match_least_squares)(template, piece, start)
+    match = lambda *arrays: match_least_squares(*arrays, blur=BLUR)
+    return jax.vmap(match)(_smooth(template), _smooth(piece), start)
+
+
+def _smooth(pieces):
+    """Pieces smoothed, without what is beyond them."""
+    side = pieces.shape[-1] - 2 * BEYOND
+    away = np.arange(side + 2 * BEYOND) - np.arange(side)[:, None] - BEYOND
+    weight = np.where(np.abs(away) <= BEYOND, np.exp(-(away**2) / (2 * BLUR**2)), 0.0)
+    S = jnp.asarray(weight / weight.sum(1, keepdims=True), pieces.dtype)
+    return jnp.einsum("ab,cd,nbd->nac", S, S, pieces)

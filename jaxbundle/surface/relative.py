@@ -43,7 +43,8 @@ def align(
     uv = interest_points(grey, "corners", spread)
     q = visible_range(base, other, uv, bounds(uv), margin=2 * HALF)
     seen = np.isfinite(q).all(1) & (q[:, 0] < q[:, 1])
-    uv, q = uv[seen][: 2 * POINTS], q[seen][: 2 * POINTS]
+    chosen = np.flatnonzero(seen)[:: max(1, -(-int(seen.sum()) // POINTS))]
+    uv, q = uv[chosen], q[chosen]
     if len(uv) < ENOUGH:
         return None
     shape = windows(base, other, base.points(uv, q.mean(1)))

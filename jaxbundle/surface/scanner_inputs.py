@@ -6,6 +6,7 @@ scanner file; the raster of the last two has their name and stands beside them, 
 --photos.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -29,6 +30,8 @@ BESIDE = ("_RPC.TXT", "_rpc.txt", "_RPC.txt", ".RPB", ".rpb", ".geom", ".xml", "
 ENDINGS = ("_rpc", "_RPC")
 BANDS = (0.3, 0.59, 0.11)
 """Weights of red, green and blue."""
+AT_ONCE, TOGETHER = 1 << 23, 1 << 18
+"""Pixels that are read, points that are brought to a map system together."""
 
 View = RpcView | ScannerView
 
@@ -79,18 +82,33 @@ def is_ground_image(path: Path) -> bool:
 
 
 def read_grey(path: Path) -> np.ndarray:
-    """The grey values of a raster, float32; of colours their luminance. No-data is 0.
+    """The grey values of a raster; of colours their luminance. No-data is 0.
+
+    One band of 8 or 16 bits is kept as it is, all else becomes float32; so large rasters, which are
+    read by blocks of lines, take no more memory than their pixels.
 
     **Raises:** `InputError` if it cannot be read.
     """
     package = rasterio()
     try:
         with open_plain(path) as source:
-            bands = source.read(range(1, min(source.count, 3) + 1), masked=True)
+            bands = list(range(1, min(source.count, 3) + 1))
+            plain = len(bands) < 3 and source.dtypes[0] in ("uint8", "uint16")
+            out = np.empty(source.shape, source.dtypes[0] if plain else np.float32)
+            rows = max(1, AT_ONCE // source.width)
+            for first in range(0, source.height, rows):
+                window = package.windows.Window(
+                    0, first, source.width, min(rows, source.height - first)
+                )
+                values = source.read(bands, window=window, masked=True).filled(0)
+                out[first : first + rows] = values[0] if plain else _luminance(values)
+            return out
     except package.errors.RasterioError as error:
         raise unreadable(path, error) from None
-    values = np.ma.filled(bands.astype(np.float32), 0.0)
-    values = np.nan_to_num(values)
+
+
+def _luminance(values):
+    values = np.nan_to_num(values.astype(np.float32))
     return values[0] if len(values) < 3 else np.tensordot(
         np.array(BANDS, np.float32), values, 1
     )
@@ -113,17 +131,23 @@ def to_map(
     """The cloud in a map system, its covariance turned and scaled with it.
 
     **Raises:** `InputError` for a system that pyproj does not know."""
-    x, y = map_coordinates(cloud.X, around, crs)
-    step = 1.0
+    X, covariance = np.empty_like(cloud.X), np.empty_like(cloud.covariance)
+    for first in range(0, len(cloud), TOGETHER):
+        part = slice(first, first + TOGETHER)
+        X[part], J = _with_derivative(cloud.X[part], around, crs)
+        covariance[part] = J @ cloud.covariance[part] @ np.swapaxes(J, 1, 2)
+    return dataclasses.replace(cloud, X=X, covariance=covariance, system=crs)
+
+
+def _with_derivative(X, around, crs):
+    """Points in a map system, and their derivatives by the coordinates of the neighbourhood."""
+    x, y = map_coordinates(X, around, crs)
     columns = []
     for axis in range(2):
-        moved = cloud.X + step * np.eye(3)[axis]
-        dx, dy = map_coordinates(moved, around, crs)
-        columns.append(np.stack([dx - x, dy - y, np.zeros_like(x)], 1) / step)
-    J = np.stack([*columns, np.broadcast_to([0.0, 0, 1], cloud.X.shape)], 2)
-    X = np.stack([x, y, cloud.X[:, 2]], 1)
-    covariance = J @ cloud.covariance @ np.swapaxes(J, 1, 2)
-    return Cloud(X, covariance, cloud.rays, cloud.image, cloud.uv, cloud.images, cloud.colour, crs)
+        dx, dy = map_coordinates(X + np.eye(3)[axis], around, crs)
+        columns.append(np.stack([dx - x, dy - y, np.zeros_like(x)], 1))
+    J = np.stack([*columns, np.broadcast_to([0.0, 0, 1], X.shape)], 2)
+    return np.stack([x, y, X[:, 2]], 1), J
 
 
 def map_coordinates(

@@ -25,7 +25,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, UInt8
 
 from jaxbundle.cameras import CameraModel, default_parameters, get_model, image_ray, project
 from jaxbundle.cameras.pixel_frame import pixel_frame
@@ -75,10 +75,15 @@ class OrientedImage(Protocol):
 
 
 class FrameView:
-    """A photograph: camera, projection centre, rotation M from object to camera."""
+    """A photograph: camera, projection centre, rotation M from object to camera; `sigma` of X0, Y0,
+    Z0, ω, φ, κ (object unit, radians), 0: fixed or not known; `colours()`: its red, green, blue."""
 
-    def __init__(self, name: str, grey, camera: Camera, X0, M):
-        self.name, self.grey = name, grey
+    def __init__(
+        self, name: str, grey, camera: Camera, X0, M, sigma=None,
+        colours: Callable[[], UInt8[np.ndarray, "rows columns 3"]] | None = None,
+    ):  # fmt: skip
+        self.name, self.grey, self.colours = name, grey, colours
+        self.sigma = np.nan_to_num(np.zeros(6) if sigma is None else np.asarray(sigma, float))
         self.size = (grey.shape[1], grey.shape[0])
         model = get_model(camera.model)
         if camera.image_size is not None and tuple(camera.image_size) != self.size:
@@ -94,7 +99,7 @@ class FrameView:
         given = {**default_parameters(model), **camera.parameters}
         self.camera, self.X0, self.M = camera, np.asarray(X0, float), np.asarray(M, float)
         p = np.array([float(given.get(n, 0.0)) for n in model.parameters])
-        self._frame = _Frame(model, *map(jnp.asarray, (p, self.X0, self.M, origin, step)))
+        self.frame = _Frame(model, *map(jnp.asarray, (p, self.X0, self.M, origin, step)))
         edge = self.edge()
         axis = self.points(edge, np.ones(len(edge))) - self.X0
         self._farthest = BEYOND * float(np.nanmax(np.arccos(np.clip(-axis @ self.M[2], -1, 1))))
@@ -105,7 +110,7 @@ class FrameView:
         return np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
 
     def points(self, uv, q):
-        return in_lanes(_points, self._frame, uv, q)
+        return in_lanes(_points, self.frame, uv, q)
 
     def parameter(self, X):
         return 1 / np.linalg.norm(X - self.X0, axis=1)
@@ -114,11 +119,11 @@ class FrameView:
         d = X - self.X0
         with np.errstate(invalid="ignore", divide="ignore"):
             angle = np.arccos(np.clip(-(d @ self.M[2]) / np.linalg.norm(d, axis=1), -1, 1))
-        uv = in_lanes(_project, self._frame, X)
+        uv = in_lanes(_project, self.frame, X)
         return np.where((angle <= self._farthest)[:, None], uv, np.nan)
 
     def derivative(self, X):
-        return in_lanes(_derivative, self._frame, X)
+        return in_lanes(_derivative, self.frame, X)
 
     def bounds(self, uv, low, high):
         d = self.points(uv, np.ones(len(uv))) - self.X0
@@ -139,14 +144,16 @@ class _Frame(eqx.Module):
 
 
 def frame_views(
-    network, greys: Sequence[np.ndarray]
+    network, greys: Sequence[np.ndarray], colours: Sequence[Callable | None] | None = None
 ) -> tuple[FrameView, ...]:
     """The oriented photographs of a network, a view for each of its images."""
-    M = jax.vmap(matrix_from_omega_phi_kappa)(jnp.asarray(network.images.angles))
+    images = network.images
+    M = np.asarray(jax.vmap(matrix_from_omega_phi_kappa)(jnp.asarray(images.angles)))
+    colours = colours or [None] * len(images)
     return tuple(
-        FrameView(name, grey, network.cameras[c], X0, m)
-        for name, grey, c, X0, m in zip(
-            network.images.id, greys, network.images.camera, network.images.position, np.asarray(M)
+        FrameView(name, grey, network.cameras[c], X0, m, sigma, read)
+        for name, grey, c, X0, m, sigma, read in zip(
+            images.id, greys, images.camera, images.position, M, images.sigma, colours
         )
     )
 
@@ -195,7 +202,8 @@ def _point(frame, uv, q):
     return frame.X0 + frame.M.T @ ray / q
 
 
-def _pixel(frame, X):
+def pixel_of(frame: _Frame, X: Float[Array, "3"]) -> Float[Array, "2"]:
+    """(u, v) of a point, by the frame of a photograph."""
     r, s, q = frame.M @ (X - frame.X0)
     xy = jnp.stack(project(frame.model, tuple(frame.p), r, s, q))
     return frame.origin + frame.step * xy
@@ -208,9 +216,9 @@ def _points(frame, uv, q):
 
 @eqx.filter_jit
 def _project(frame, X):
-    return jax.vmap(partial(_pixel, frame))(X)
+    return jax.vmap(partial(pixel_of, frame))(X)
 
 
 @eqx.filter_jit
 def _derivative(frame, X):
-    return jax.vmap(jax.jacfwd(partial(_pixel, frame)))(X)
+    return jax.vmap(jax.jacfwd(partial(pixel_of, frame)))(X)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import rasterio
-from surface_scenes import CAMERA, SIZE, photographs, two_shapes
+from surface_scenes import CAMERA, SIZE, hills, photographs, two_shapes
 
 from jaxbundle.io.scanner.rpc import write_rpc
 from jaxbundle.planning.render import Scene, Sensor, render_rays
@@ -36,16 +36,23 @@ def project(tmp_path_factory):
     (folder / "images.csv").write_text("\n".join([header, *rows]) + "\n")
     (folder / "photos").mkdir()
     for view in views:
-        cv2.imwrite(str(folder / "photos" / view.name), view.grey)
+        # as bright as before: 0.114·19 = 0.299·7
+        colour = np.stack([view.grey - 19.0, view.grey, view.grey + 7.0], 2)
+        colour = np.clip(colour, 0, 255).astype(np.uint8)
+        cv2.imwrite(str(folder / "photos" / view.name), colour)
     return folder, truth
 
 
 def test_a_project_becomes_a_cloud_and_a_dsm(project, tmp_path, command):
     folder, truth = project
-    out = tmp_path / "out"
+    out, check = tmp_path / "out", tmp_path / "check.csv"
+    x, y = (a.ravel() for a in np.meshgrid([-3, 1.5, 2.5], [-2, 1.5, 2]))
+    rows = np.column_stack([x, y, hills(x, y)])
+    np.savetxt(check, rows, delimiter=",", header="X,Y,Z", comments="")
     told = command(
         "surface", folder, "--photos", folder / "photos", "--out", out, "--zmin", -1.5, "--zmax", 3,
         "--pairs", "photo_0.png,photo_1.png", "--dense", "--step", 2, "--dsm", 0.25, "--json", "-",
+        "--orthophoto", "--check", check,
     )  # fmt: skip
     assert told.status == 0
     report = json.loads(told.out)
@@ -54,8 +61,14 @@ def test_a_project_becomes_a_cloud_and_a_dsm(project, tmp_path, command):
     v, u = cloud.uv.astype(int).T[::-1]
     e = cloud.X[:, 2] - truth[0][v, u][:, 2]
     assert np.median(np.abs(e)) < 0.02 and (np.abs(e) > 0.3).mean() < 0.01
-    with rasterio.open(out / "dsm.tif") as raster:
-        assert raster.res == (0.25, 0.25)
+    assert report["sigma_includes"] == ["matching"]
+    assert report["check_points"]["points"] == 9 and report["check_points"]["rms_Z"] < 0.05
+    with rasterio.open(out / "dsm.tif") as raster, rasterio.open(out / "orthophoto.tif") as photo:
+        assert raster.res == photo.res == (0.25, 0.25) and photo.dtypes == ("uint8",)
+        assert (photo.read(1)[raster.read(1) > -99] > 0).mean() > 0.9
+    colour = read_cloud(out / "cloud.ply").colour.astype(float)
+    inner = (colour > 30).all(1) & (colour < 225).all(1)
+    np.testing.assert_allclose(np.diff(colour[inner].mean(0)), [-7, -19], atol=0.1)
     thinned = tmp_path / "thin.ply"
     told = command("cloud", out / "cloud.csv", "--cube", 0.5, "--out", thinned, "--against",
                    out / "cloud.ply", "--json", "-")  # fmt: skip
@@ -71,6 +84,7 @@ def test_a_project_becomes_a_cloud_and_a_dsm(project, tmp_path, command):
         ({"--zmax": "-9"}, "the lower height first"),
         ({"--pairs": "photo_0.png,phot_1.png"}, "no image 'phot_1.png'"),
         ({"--points": "stars"}, "grid, edges, corners"),
+        ({"--orthophoto-of": "photo_0.png"}, "needs --dsm"),
     ],
 )
 def test_bad_input_ends_in_one_line(project, tmp_path, command, change, said):

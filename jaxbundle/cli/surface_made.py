@@ -1,0 +1,86 @@
+"""How `jaxbundle surface` makes one: of photographs, or of images of line scanners and RPC."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import typer
+
+from jaxbundle.errors import InputError
+from jaxbundle.network.columns import did_you_mean
+from jaxbundle.surface.inputs import check_points, read_views, tie_points
+from jaxbundle.surface.orthophoto import ToViews
+from jaxbundle.surface.pairs import given_partners
+from jaxbundle.surface.reconstruct import Surface, find_bounds, ground_bounds, reconstruct
+from jaxbundle.surface.relative import align_all
+from jaxbundle.surface.scanner_inputs import from_map, read_ground_views, system_of, to_map
+from jaxbundle.surface.views import OrientedImage
+
+
+class Found(NamedTuple):
+    """The surface, the images it is of, the way from the cloud's coordinates to theirs, and check
+    points."""
+
+    surface: Surface
+    views: Sequence[OrientedImage]
+    to_views: ToViews
+    check: np.ndarray
+
+
+def make_of_photographs(path, photos, heights, pairs, crs, options) -> Found:
+    if photos is None:
+        raise InputError("--photos is missing: the folder of the photographs")
+    views, network, messages = read_views(path, photos)
+    bounds, more = find_bounds(views, tie_points(network), heights)
+    found = reconstruct(views, bounds, _partners(pairs, views), **options)
+    cloud = dataclasses.replace(found.cloud, system=crs)
+    said = _with_messages(dataclasses.replace(found, cloud=cloud), (*messages, *more))
+    return Found(said, views, lambda X: X, check_points(network))
+
+
+def make_of_ground(files, photos, heights, pairs, crs, options) -> Found:
+    if len(files) < 2:
+        raise InputError(f"{files[0]}: one image; a surface needs two at least")
+    views, around = read_ground_views(files, photos)
+    bounds, messages = ground_bounds(views, heights)
+    moved = align_all(views, bounds)
+    found = reconstruct(views, bounds, _partners(pairs, views), **options)
+    to_views = lambda X: X
+    if around is not None:
+        system = system_of(around, crs)
+        to_views = lambda X: from_map(X[:, 0], X[:, 1], X[:, 2], around, system)
+        found = dataclasses.replace(found, cloud=to_map(found.cloud, around, system))
+    said = _with_messages(found, (*messages, *moved))
+    return Found(said, views, to_views, np.zeros((0, 3)))
+
+
+def choose(views, names):
+    """The images of these names, all if there are none."""
+    known = [view.name for view in views]
+    for name in names or ():
+        if name not in known:
+            raise InputError(f"--orthophoto-of {name!r}: no such image{did_you_mean(name, known)}")
+    return [view for view in views if not names or view.name in names]
+
+
+def _partners(pairs: Sequence[str] | None, views):
+    return given_partners(pairs, [v.name for v in views]) if pairs else None
+
+
+def _with_messages(found: Surface, messages: Sequence[str]) -> Surface:
+    everything = (*messages, *found.messages)
+    for message in everything:
+        typer.echo(f"jaxbundle: {message}", err=True)
+    return dataclasses.replace(found, messages=everything)
+
+
+def telling(bar) -> Callable[[str, int, int], None]:
+    tasks = {}
+
+    def tell(stage, done, total):
+        if stage not in tasks:
+            tasks[stage] = bar.add_task(stage, total=total)
+        bar.update(tasks[stage], completed=done, total=total)
+
+    return tell

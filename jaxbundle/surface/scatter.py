@@ -1,0 +1,50 @@
+"""What a smooth surface tells of the σ of its points.
+
+Third differences of values whose windows do not overlap,
+
+    d₀ − 3·d₁ + 3·d₂ − d₃,    σ² = σ₀² + 9·σ₁² + 9·σ₂² + σ₃²,
+
+are noise alone where the surface is smooth. The variance factor is a quantile of those of blocks.
+"""
+
+import numpy as np
+from jaxtyping import Float
+from scipy import stats
+
+ENOUGH = 100
+"""Values from which a factor is taken."""
+WEIGHTS = 1.0, -3.0, 3.0, -1.0
+
+
+def robust_factor(ratio: Float[np.ndarray, " n"], otherwise: float = 1.0) -> float:
+    """The variance factor of errors in units of their σ, by their median; of few `otherwise`."""
+    ratio = ratio[np.isfinite(ratio)]
+    if len(ratio) <= ENOUGH:
+        return otherwise
+    return float(np.median(ratio**2) / stats.chi2.median(1))
+
+
+def scatter_factor(
+    d: Float[np.ndarray, "rows columns"], sigma: Float[np.ndarray, "rows columns"],
+    step: int, side: int, quantile: float,
+) -> list[float]:
+    """The variance factor of values on a grid (NaN: none), along columns and rows, by differences
+    over `step`, of blocks of `side`; none where no block is full enough."""
+    found = []
+    for a, s in ((d, sigma), (d.T, sigma.T)):
+        n = a.shape[1] - 3 * step
+        if n < side:
+            continue
+        parts = [(w, slice(k * step, k * step + n)) for k, w in enumerate(WEIGHTS)]
+        difference = sum(w * a[:, part] for w, part in parts)
+        square = sum(w * w * s[:, part] ** 2 for w, part in parts)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratio = difference / np.sqrt(square)
+        blocks = [
+            ratio[r : r + side, c : c + side].ravel()
+            for r in range(0, ratio.shape[0], side) for c in range(0, n, side)
+        ]  # fmt: skip
+        full = [robust_factor(b) for b in blocks if np.isfinite(b).sum() > side**2 / 3]
+        if full:
+            found.append(float(np.quantile(full, quantile)))
+    return found
