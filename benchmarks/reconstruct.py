@@ -1,14 +1,15 @@
 """Rendered photographs from folder to adjusted network: seconds by stage, memory, accuracy.
 
-    python benchmarks/reconstruct.py [--photographs N] [--width PIXELS] [--json FILE]
-                                     [--folder FOLDER] [--colmap]
+    python benchmarks/reconstruct.py [--set NAME | all] [--photographs N] [--width PIXELS]
+                                     [--json FILE] [--folder FOLDER] [--colmap]
 
-Convergent photographs of hills with a roof are rendered into FOLDER (kept there for the next run),
-by a camera whose principal distance and distortion the reconstruction is not told. Errors of the
-projection centres are those after a similarity, in parts of the distance to the object; c in σ.
-With --colmap the incremental mapper of pycolmap runs on the same folder in the same process, where
-it is installed. The exit status is 1 where a photograph is left out, c or a centre is more than 4 σ
-off, or σ0 is not 1 to 2 %.
+Photographs of a set (`photograph_sets.py`) are rendered into FOLDER/NAME (kept there for the next
+run), by a camera whose principal distance and distortion the reconstruction is not told.
+`--photographs` is of the set `convergent`. Errors of the projection centres are those after a
+similarity, in parts of the distance from their middle; c in σ. With --colmap the incremental mapper
+of pycolmap runs on the same folder in the same process, where it is installed. The exit status is 1
+where a photograph is left out that belongs to a scene, or placed in one it does not belong to, c or
+a centre is more than 4 σ off, or σ0 is not 1 to 2 %.
 """
 
 import json
@@ -16,97 +17,83 @@ import os
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import cv2
 import machine
 import numpy as np
+from photograph_sets import SETS, WIDTH, Shot, convergent, write
 
 import jaxbundle
+from jaxbundle.errors import NotSolvedError
 from jaxbundle.orientation.alignment import similarity
-from jaxbundle.planning.render import Scene, Sensor, render
-from jaxbundle.planning.shapes import HeightField, Rectangle
-from jaxbundle.planning.stations import stations_looking_at
-from jaxbundle.planning.texture import Texture
-from jaxbundle.reconstruction.reconstruct import reconstruct
+from jaxbundle.reconstruction.reconstruct import Part, reconstruct
 
-DISTANCE, FOCAL, K1 = 6.0, 0.9, -0.08
-
-
-def hills(X, Y):
-    return 0.5 * np.sin(X / 1.5) * np.cos(Y / 2) + 0.2 * np.sin(2.1 * X + Y)
-
-
-def write_photographs(folder: Path, number: int, width: int) -> dict:
-    """Render what is not there yet; the truth."""
-    height, f = 3 * width // 4, FOCAL * width
-    rng = np.random.default_rng(0)
-    azimuth = np.linspace(-0.9, 0.9, number)
-    elevation = 0.75 + 0.25 * np.sin(5 * azimuth)
-    X0 = DISTANCE * np.stack(
-        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation),
-         np.sin(elevation)], 1,
-    )  # fmt: skip
-    roll = np.where(np.arange(number) % 4 == 3, np.pi / 2, 0.05 * rng.normal(size=number))
-    stations = stations_looking_at(X0, 0.3 * rng.normal(size=(number, 3)), roll=roll)
-    camera = jaxbundle.Camera(
-        "cam", "opencv",
-        {"fx": f, "fy": f, "cx": 0.503 * width, "cy": 0.498 * height, "k1": K1},
-        image_size=(width, height),
-    )  # fmt: skip
-    roof = Rectangle((-1.2, -1.0, 1.4), (2.0, 0, 0.4), (0, 2.0, 0))
-    texel = 0.5 * DISTANCE / f
-    scene = Scene((HeightField(hills, (-9, -9, 9, 9)), roof), (Texture(texel, seed=1, side=2048),))
-    from jaxbundle.orientation import many
-
-    M = many.matrices(stations.angles)
-    for k in range(number):
-        path = folder / f"photo_{k:03d}.jpg"
-        if not path.exists():
-            shot = render(scene, camera, X0[k], M[k], Sensor(noise=2.0, seed=k, fine=1))
-            cv2.imwrite(str(path), shot.grey, [cv2.IMWRITE_JPEG_QUALITY, 95])
-    return {"centres": {f"photo_{k:03d}.jpg": X0[k] for k in range(number)}, "c": f}
+LIMIT = 4.0
 
 
 def centre_errors(truth, ids, X0):
-    """Distances of the centres from the truth after a similarity, in parts of the distance."""
-    X = np.array([truth["centres"][id] for id in ids])
+    """Distances of the centres from the truth after a similarity, and its linear part."""
+    X = np.array([truth[id].X0 for id in ids])
     A, t = similarity(X0, X)
-    return A, (X0 @ A.T + t - X)
+    return A, X0 @ A.T + t - X
 
 
-def ours(folder: Path, truth) -> dict:
+def in_parts(truth, ids, e) -> float:
+    """The root of the mean square of errors in parts of the extent of the true centres."""
+    X = np.array([truth[id].X0 for id in ids])
+    extent = np.sqrt(((X - X.mean(0)) ** 2).sum(1).mean())
+    return float(np.sqrt((e**2).sum(1).mean()) / extent)
+
+
+def ours(folder: Path, truth: dict[str, Shot]) -> dict:
     stages, last = {}, ["", time.perf_counter()]
 
     def tell(stage, done, total):
         now = time.perf_counter()
         if last[0]:
-            stages[last[0]] = stages.get(last[0], 0.0) + now - last[1]
+            stages[last[0]] = round(stages.get(last[0], 0.0) + now - last[1], 2)
         last[:] = [stage, now]
 
-    start = time.perf_counter()
-    found = reconstruct([folder], tell=tell)
-    seconds = time.perf_counter() - start
-    result = found.parts[0].adjustment
-    ids = result.network.images.id
-    A, e = centre_errors(truth, ids, result.image_values[:, :3])
-    C = np.einsum("ij,njk,lk->nil", A, result.image_covariance[:, :3, :3], A)
-    sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
-    c = next(iter(result.cameras.values()))["parameters"]["fx"]
+    start, processor = time.perf_counter(), time.process_time()
+    try:
+        found = reconstruct([folder], tell=tell)
+    except NotSolvedError as error:
+        return {"failed": str(error), "parts": [], "left_out": dict.fromkeys(truth, "")}
     return {
-        "photographs": len(ids), "seconds": seconds, "stages": stages,
-        "peak_mb": machine.peak_mb(), "points": len(result.network.points),
-        "image_points": len(result.network.observations),
-        "centres_rms": float(np.sqrt((e**2).sum(1).mean()) / DISTANCE),
-        "centres_worst_sigma": float(np.abs(e / sigma).max()),
-        "c_error_sigma": float(abs(c["value"] - truth["c"]) / c["sigma"]),
-        "sigma0": result.sigma0, "removed": len(result.removed),
+        "seconds": time.perf_counter() - start, "processor": time.process_time() - processor,
+        "stages": stages, "peak_mb": machine.peak_mb(),
+        "parts": [of_part(part, truth) for part in found.parts],
+        "left_out": dict(found.left_out), "notes": list(found.notes),
     }  # fmt: skip
 
 
-def colmap(folder: Path, truth) -> dict | None:
+def of_part(part: Part, truth: dict[str, Shot]) -> dict:
+    """The accuracy of a part; of centres that belong elsewhere there is none."""
+    result = part.adjustment
+    network, ids = result.network, result.network.images.id
+    A, e = centre_errors(truth, ids, result.image_values[:, :3])
+    C = np.einsum("ij,njk,lk->nil", A, result.image_covariance[:, :3, :3], A)
+    sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
+    off = {}
+    for c, camera in enumerate(network.cameras):
+        first = next(id for k, id in enumerate(ids) if network.images.camera[k] == c)
+        fx = result.cameras[camera.id]["parameters"]["fx"]
+        if fx["sigma"]:
+            off[camera.id] = abs(fx["value"] - truth[first].camera.parameters["fx"]) / fx["sigma"]
+    return {
+        "photographs": len(ids), "of": sorted({truth[id].part for id in ids}),
+        "points": len(network.points), "image_points": len(network.observations),
+        "centres_rms": in_parts(truth, ids, e),
+        "centres_worst_sigma": float(np.abs(e / sigma).max()),
+        "c_error_sigma": off, "sigma0": result.sigma0, "removed": len(result.removed),
+        "factors": dict(part.factors),
+    }  # fmt: skip
+
+
+def colmap(folder: Path, truth: dict[str, Shot]) -> dict | None:
     if not machine.installed("pycolmap"):
         return None
     import pycolmap
@@ -114,47 +101,72 @@ def colmap(folder: Path, truth) -> dict | None:
     with tempfile.TemporaryDirectory() as work:
         database = Path(work) / "database.db"
         start = time.perf_counter()
-        pycolmap.extract_features(
-            database, folder, camera_mode=pycolmap.CameraMode.SINGLE
-        )
+        sizes = {shot.camera.image_size for shot in truth.values()}
+        one = len(sizes) == 1 and not any(shot.upright for shot in truth.values())
+        mode = pycolmap.CameraMode.SINGLE if one else pycolmap.CameraMode.AUTO
+        pycolmap.extract_features(database, folder, camera_mode=mode)
         pycolmap.match_exhaustive(database)
         models = pycolmap.incremental_mapping(database, folder, work)
         seconds = time.perf_counter() - start
-        best = max(models.values(), key=lambda m: m.num_reg_images())
-        images = [best.images[k] for k in best.reg_image_ids()]
-        X0 = np.array([image.projection_center() for image in images])
-        _, e = centre_errors(truth, [image.name for image in images], X0)
-    return {"photographs": len(images), "seconds": seconds,
-            "centres_rms": float(np.sqrt((e**2).sum(1).mean()) / DISTANCE)}  # fmt: skip
+        parts = []
+        for model in sorted(models.values(), key=lambda m: -m.num_reg_images()):
+            images = [model.images[k] for k in model.reg_image_ids()]
+            X0 = np.array([image.projection_center() for image in images])
+            ids = [image.name for image in images]
+            parts.append({"photographs": len(ids), "of": sorted({truth[id].part for id in ids}),
+                          "centres_rms": in_parts(truth, ids, centre_errors(truth, ids, X0)[1])})
+    return {"seconds": seconds, "parts": parts}
+
+
+def run(name: str, shots: Sequence[Shot], folder: Path, beside: bool) -> tuple[dict, list[str]]:
+    """The figures of a set, and what is wrong with them."""
+    write(shots, folder)
+    truth = {shot.name: shot for shot in shots}
+    figures = {"ours": ours(folder, truth)}
+    if beside:
+        figures["pycolmap"] = colmap(folder, truth)
+    found, parts = figures["ours"], figures["ours"]["parts"]
+    lost = [id for id in found["left_out"] if truth[id].part]
+    wrong = [
+        text for text, bad in (
+            (f"left out: {', '.join(lost)}", lost),
+            ("photographs in a part they do not belong to",
+             any(len(p["of"]) != 1 or p["of"] == [0] for p in parts)),
+            ("a scene is in pieces", len(parts) != len({s.part for s in shots} - {0})),
+            (f"c is more than {LIMIT:g} σ off",
+             any(not off < LIMIT for p in parts for off in p["c_error_sigma"].values())),
+            (f"a centre is more than {LIMIT:g} σ off",
+             any(not p["centres_worst_sigma"] < LIMIT for p in parts)),
+            ("σ0 is not 1", any(not abs(p["sigma0"] - 1) < 0.02 for p in parts)),
+        ) if bad
+    ]  # fmt: skip
+    return figures, [f"{name}: {text}" for text in wrong]
 
 
 def main():
     parser = machine.parser_of(__doc__)
+    parser.add_argument("--set", choices=[*SETS, "all"], default="convergent")
     parser.add_argument("--photographs", type=machine.positive, default=11)
-    parser.add_argument("--width", type=machine.positive, default=2800)
+    parser.add_argument("--width", type=machine.positive)
     parser.add_argument("--folder", type=Path)
     parser.add_argument("--colmap", action="store_true")
     parser.add_argument("--json", type=machine.target, metavar="FILE")
     given = parser.parse_args()
     jaxbundle.enable_x64()
+    figures: dict = {"machine": machine.machine()}
+    wrong = []
     with tempfile.TemporaryDirectory() as temporary:
-        folder = given.folder or Path(temporary)
-        folder.mkdir(parents=True, exist_ok=True)
-        truth = write_photographs(folder, given.photographs, given.width)
-        figures = {"machine": machine.machine(), "ours": ours(folder, truth)}
-        if given.colmap:
-            figures["pycolmap"] = colmap(folder, truth)
-    print(json.dumps(figures["ours"] | {"pycolmap": figures.get("pycolmap")}, indent=1))
+        for name in SETS if given.set == "all" else [given.set]:
+            if name == "convergent":
+                shots = convergent(given.width or 2800, given.photographs)
+                folder = f"{name}_{given.photographs}_{given.width or 2800}"
+            else:
+                shots, folder = SETS[name](given.width or WIDTH), f"{name}_{given.width or WIDTH}"
+            place = (given.folder or Path(temporary)) / folder
+            figures[name], bad = run(name, shots, place, given.colmap)
+            print(json.dumps({name: figures[name]}, indent=1, ensure_ascii=False), flush=True)
+            wrong += bad
     machine.write_json(figures, given.json)
-    f = figures["ours"]
-    wrong = [
-        text for text, bad in (
-            ("a photograph was left out", f["photographs"] < given.photographs),
-            ("c is more than 4 σ off", not f["c_error_sigma"] < 4),
-            ("a centre is more than 4 σ off", not f["centres_worst_sigma"] < 4),
-            ("σ0 is not 1", not abs(f["sigma0"] - 1) < 0.02),
-        ) if bad
-    ]  # fmt: skip
     return machine.verdict(wrong)
 
 

@@ -19,6 +19,8 @@ from jaxtyping import Float, Int
 
 from jaxbundle.bundle.adjust import adjust
 from jaxbundle.bundle.result import Adjustment
+from jaxbundle.errors import NotSolvedError
+from jaxbundle.network.sightings import keep_points
 from jaxbundle.network.tables import Network
 
 GROSS, DOUBTFUL = 4.0, 5.0
@@ -45,20 +47,36 @@ def adjust_weighted(
     significance: float,
     tell: Callable[[str], None],
 ) -> Weighted:
-    """Adjust with variance components of the kinds and data snooping.
+    """Adjust with variance components of the kinds and data snooping; where that has no solution,
+    without the points of two rays, whose gross errors nothing shows.
 
     **Arguments:** `kinds`: of every observation of the network.
 
     **Raises:** as `jaxbundle.adjust`.
     """
+    try:
+        found = _weighted(network, kinds, names, significance, tell)
+        if found.adjustment.converged:
+            return found
+    except NotSolvedError:
+        pass
+    rays = network.observations
+    number = np.bincount(rays.point, minlength=len(network.points))
+    known = (number > 2) | ~network.points.has_role("tie")
+    rows = np.flatnonzero(known[rays.point])
+    clear = keep_points(network, known)
+    return _weighted(clear, kinds[rows], names, significance, tell)
+
+
+def _weighted(network: Network, kinds, names, significance, tell) -> Weighted:
     tell("adjustment")
     result = adjust(network)
     total = np.ones(len(network.observations))
     given, doubtful = network.observations.sigma, []
     if result.converged:
-        w, r = _of_residuals(result)
-        total = _factors(w, r, kinds)
-        beyond = np.abs(w) / np.sqrt(np.maximum(r, 0.1)) > DOUBTFUL * total[:, None]
+        (w, r), rows = _of_residuals(result), _rows(result, network)
+        total[rows] = _factors(w, r, kinds[rows])
+        beyond = np.abs(w) / np.sqrt(np.maximum(r, 0.1)) > DOUBTFUL * total[rows, None]
         doubtful = _named(result, beyond.any(1))
     for _ in range(ROUNDS):
         tell("data snooping")
@@ -66,10 +84,11 @@ def adjust_weighted(
         result = adjust(network, snooping="pope", significance=significance, doubtful=doubtful)
         if not result.converged:
             break
-        factor = _factors(*_of_reliability(result), kinds, np.inf)
+        rows = _rows(result, network)
+        factor = _factors(*_of_reliability(result), kinds[rows], np.inf)
         if np.all(np.abs(factor - 1) < SETTLED):
             break
-        total *= factor
+        total[rows] *= factor
         used = np.asarray(result.problem.data.image_weight) > 0
         doubtful = _named(result, ~used.any(1))
     kept = {name: float(np.median(total[kinds == k])) for k, name in names.items()
@@ -77,11 +96,22 @@ def adjust_weighted(
     return Weighted(result, kept)
 
 
+def _rows(result: Adjustment, network: Network) -> Int[np.ndarray, " rays"]:
+    """For every image point of a result its row in the network, of which some were left out."""
+    rays = network.observations
+    index = {one: k for k, one in enumerate(_ids(network, rays.image, rays.point))}
+    return np.array([index[one] for one in _named(result, slice(None))], int)
+
+
+def _ids(network: Network, image, point):
+    images, points = network.images.id, network.points.id
+    return [(images[i], points[p]) for i, p in zip(image.tolist(), point.tolist())]
+
+
 def _named(result: Adjustment, rows) -> list[tuple[str, str]]:
     """Image and point, by id, of image points."""
-    network, problem = result.network, result.problem
-    return [(network.images.id[i], network.points.id[p]) for i, p in
-            zip(problem.image[rows].tolist(), problem.point[rows].tolist())]  # fmt: skip
+    problem = result.problem
+    return _ids(result.network, problem.image[rows], problem.point[rows])
 
 
 def _with_sigma(network: Network, sigma) -> Network:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxbundle.io.networks.control import with_control
-from jaxbundle.network.build import make_network
+from jaxbundle.network.build import make_further, make_network
 from jaxbundle.network.tables import Camera, Network, Points
 from jaxbundle.reconstruction.attitudes import Attitudes
 from jaxbundle.reconstruction.named import Named
@@ -21,8 +21,12 @@ UNTIED = 8
 """Photographs of a camera from which on its pixels need not be square."""
 FEWEST_CONTROL = 3
 """Control points that a part must show to be put into their frame."""
-BY_NUMBER = ((3, ("fx", "k1")), (4, ("cx", "cy")), (5, ("k2", "p1", "p2")))
-"""What is free from how many photographs of a camera on."""
+BY_NUMBER = ((3, ("fx", "k1")), (4, ("cx", "cy")), (5, ("k2",)))
+"""What is free from how many photographs by a lens on."""
+TANGENTIAL = 5
+"""Photographs of a camera from which on P1 and P2 are free."""
+OF_THE_LENS = ("fx", "k1", "k2")
+"""What cameras with one lens have in common."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +52,9 @@ def tie_network(
     rows = np.unique(measured.image).tolist()
     of = [cameras.of[k] for k in rows]
     used = sorted(set(of))
-    free = [_freed(cameras.cameras[c], of.count(c), cameras.given) for c in used]
+    lenses = [cameras.lens[c] for c in of]
+    free = [_freed(cameras.cameras[c], of.count(c), lenses.count(cameras.lens[c]), cameras.given)
+            for c in used]  # fmt: skip
     tracks = [track_name(t) for t in np.unique(measured.track).tolist()]
     named = extra.named.take(np.isin(extra.named.image, rows))
     points = [*tracks, *dict.fromkeys(named.name)]
@@ -72,6 +78,7 @@ def tie_network(
         datum="inner" if extra.positions is None else "control",
         object_unit="m" if distances or extra.positions is not None else "unit",
     )  # fmt: skip
+    network = _with_ties(network, [cameras.lens[c] for c in used])
     control = extra.control
     if control is None or len(there & set(control.id)) < FEWEST_CONTROL:
         return network
@@ -83,14 +90,30 @@ def track_name(track: int) -> str:
     return f"t{track}"
 
 
-def _freed(camera: Camera, number: int, given: bool) -> Camera:
+def _with_ties(network: Network, lens: Sequence[int]) -> Network:
+    """The network whose cameras with one lens have its parameters in common."""
+    first, columns = {}, {"camera": [], "other": [], "parameter": []}
+    for camera, number in zip(network.cameras, lens):
+        one = first.setdefault(number, camera)
+        for name in OF_THE_LENS if one is not camera else ():
+            if name in one.free and name in camera.free:
+                for column, value in zip(columns.values(), (one.id, camera.id, name)):
+                    column.append(value)
+    if not columns["camera"]:
+        return network
+    return network.replace(further=(*network.further, *make_further({"ties": columns}, 1.0)))
+
+
+def _freed(camera: Camera, own: int, of_lens: int, given: bool) -> Camera:
+    """A camera with what so many photographs, its own and those by its lens, determine."""
     if given:
         return camera
-    free = tuple(n for least, names in BY_NUMBER if number >= least for n in names)
+    free = tuple(n for least, names in BY_NUMBER if of_lens >= least for n in names)
+    free += ("p1", "p2") * (own >= TANGENTIAL)
     f, size = camera.parameters["fx"], max(camera.image_size or (1, 1))
     sigma = {"fx": PRIORS["fx"] * f, "cx": PRIORS["cx"] * size, "cy": PRIORS["cy"] * size,
              "k1": K1_PRIOR}  # fmt: skip
-    if number >= UNTIED:
+    if own >= UNTIED and own == of_lens:
         camera, free, sigma["fy"] = dataclasses.replace(camera, tie=()), ("fx", "fy", *free[1:]), (
             sigma["fx"]
         )

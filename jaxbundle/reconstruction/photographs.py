@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxbundle.errors import InputError
-from jaxbundle.network.columns import some
+from jaxbundle.network.columns import count, some
 from jaxbundle.network.tables import Camera
 from jaxbundle.photographs.exif import UPRIGHT, Exif, read_exif
 from jaxbundle.photographs.reading import SUFFIXES, photograph_size
@@ -94,13 +94,16 @@ def _names(paths: Sequence[Path]) -> list[str]:
 @dataclasses.dataclass(frozen=True)
 class Cameras:
     """`cameras`, the one of every photograph (`of`), whether its principal distance is `known` to
-    begin with, and whether it was `given` as calibrated; `notes` in words."""
+    begin with, and whether it was `given` as calibrated; `notes` in words; `lens` of every camera:
+    that of photographs stored upright is the lens of those stored lying, with the same principal
+    distance and radial distortion."""
 
     cameras: tuple[Camera, ...]
     of: tuple[int, ...]
     known: tuple[bool, ...]
     given: bool
     notes: tuple[str, ...]
+    lens: tuple[int, ...] = (0,)
 
 
 def assign_cameras(photographs: Sequence[Photograph], given: Camera | None = None) -> Cameras:
@@ -119,6 +122,8 @@ def assign_cameras(photographs: Sequence[Photograph], given: Camera | None = Non
         focal = round(exif.focal_length or 0.0, 1), round(exif.focal_length_35 or 0.0)
         groups.setdefault((exif.camera, *focal, exif.size), []).append(k)
     cameras, known, of = [], [], [0] * len(photographs)
+    lenses: dict[tuple, int] = {}
+    lens = [lenses.setdefault((*key[:-1], *sorted(key[-1])), len(lenses)) for key in groups]
     for number, rows in enumerate(groups.values()):
         exif = photographs[rows[0]].exif
         told = exif.principal_distance()
@@ -129,9 +134,12 @@ def assign_cameras(photographs: Sequence[Photograph], given: Camera | None = Non
         for k in rows:
             of[k] = number
         where = f"from {told[1]}" if told else "unknown: found from the photographs"
-        notes = (*notes, f"camera {id}: {len(rows)} photographs of {exif.size[0]} × "
-                 f"{exif.size[1]} pixels, principal distance {where}")  # fmt: skip
-    return Cameras(tuple(cameras), tuple(of), tuple(known), False, notes)
+        same = f", the lens of camera {cameras[lens.index(lens[number])].id}" * (
+            lens[number] in lens[:number]
+        )
+        notes = (*notes, f"camera {id}: {count(len(rows), 'photograph')} of {exif.size[0]} × "
+                 f"{exif.size[1]} pixels, principal distance {where}{same}")  # fmt: skip
+    return Cameras(tuple(cameras), tuple(of), tuple(known), False, notes, tuple(lens))
 
 
 def _new_camera(id, f, size):

@@ -61,12 +61,14 @@ class Part:
 @dataclasses.dataclass(frozen=True)
 class Reconstruction:
     """`parts`, the largest first; photographs that are in none of them, with the reason; notes;
-    `pairs` that were verified, by the names of their photographs."""
+    `pairs` that were verified, by the names of their photographs: matches found, those that agree,
+    kind; `photographs`: the files that were looked at, by name."""
 
     parts: tuple[Part, ...]
     left_out: Mapping[str, str]
     notes: tuple[str, ...]
     pairs: tuple[tuple[str, str, int, int, str], ...]
+    photographs: Mapping[str, Path] = dataclasses.field(default_factory=dict)
 
     def __str__(self) -> str:
         lines = [
@@ -141,7 +143,8 @@ class _Making:
         parts = self._parts(features, matches, pairs)
         said = tuple((self.names[p.images[0]], self.names[p.images[1]], p.found, len(p), p.kind)
                      for p in pairs)  # fmt: skip
-        return Reconstruction(tuple(parts), self.left_out, tuple(self.notes), said)
+        files = {p.name: p.path for p in self.photographs}
+        return Reconstruction(tuple(parts), self.left_out, tuple(self.notes), said, files)
 
     def _matches(self):
         features = self._features()
@@ -181,7 +184,8 @@ class _Making:
         if self.cameras.given:
             return
         cameras, notes = start_cameras(
-            self.cameras.cameras, self.cameras.of, self.cameras.known, features, matches
+            self.cameras.cameras, self.cameras.of, self.cameras.lens, self.cameras.known, features,
+            matches,
         )
         self.cameras = dataclasses.replace(self.cameras, cameras=tuple(cameras))
         self.notes += notes

@@ -3,8 +3,8 @@
 import dataclasses
 
 from jaxbundle.arguments import one_of, whole
+from jaxbundle.choices import MATCHED_PAIRS
 from jaxbundle.tiepoints.features import Detection
-from jaxbundle.tiepoints.pairs import WAYS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,5 +21,5 @@ class Settings:
     targets: str | None = None
 
     def __post_init__(self):
-        one_of("pairs", self.pairs, WAYS)
+        one_of("pairs", self.pairs, MATCHED_PAIRS)
         whole("points", self.points)

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxbundle.arguments import one_of, whole
+from jaxbundle.choices import FEATURES
 from jaxbundle.photographs.opencv import need_opencv
 
-KINDS = ("sift", "akaze", "orb")
 CELLS = 16
 """Cells of the grid along the longer side."""
 AMPLE = 1.6
@@ -34,7 +34,7 @@ class Detection:
     side: int = 1800
 
     def __post_init__(self):
-        one_of("features", self.kind, KINDS)
+        one_of("features", self.kind, FEATURES)
         whole("features: number", self.number)
 
 

@@ -25,6 +25,7 @@ from jaxbundle.network.tables import Camera
 from jaxbundle.orientation import many
 from jaxbundle.orientation.relative import retract, sampson_distance
 from jaxbundle.orientation.sights import ideal_points
+from jaxbundle.system.compilation import quick_jit
 
 FACTORS = tuple(0.55 * 1.2**k for k in range(10))
 """Principal distances tried, in parts of the longer side: 85° to 20° of view."""
@@ -114,7 +115,7 @@ def _fill(a):
     return np.resize(a, (SLOTS, *a.shape[1:]))
 
 
-@jax.jit
+@quick_jit
 @jax.vmap
 def _sampson(M, b, xy1, xy2):
     return (jax.vmap(sampson_distance, (None, None, 0, 0))(M, b, xy1, xy2),)
@@ -131,7 +132,7 @@ def _adjusted(camera, pairs, M, b, limit):
     return float(f), float(k1), np.asarray(e)[: len(pairs)]
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(quick_jit, static_argnums=0)
 def _self_calibrate(model, p, M, b, xy1, xy2, there, limit):
     names = model.parameters
     fx, fy, k1 = (names.index(name) for name in ("fx", "fy", "k1"))

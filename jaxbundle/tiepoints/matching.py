@@ -2,8 +2,9 @@
 
 Descriptors of SIFT count as the roots of their parts of the sum (Arandjelović and Zisserman, 2012):
 of unit length, so that their distance is √(2 − 2·a·b): one matrix product for all pairs.
-A match is kept if it is the best from both sides and its distance is below `ratio` times that of
-the second best (Lowe, 2004).
+A match is kept if it is the best from both sides, and if its distance is below `ratio` times that
+of the second best (Lowe, 2004), of either side, and of what looks most like either of the two in
+its own photograph: of identical windows the wrong one is as good as the right one.
 """
 
 import numpy as np
@@ -17,28 +18,39 @@ PORTION = 1024
 """Features whose distances to all others are computed at once."""
 OF_SIFT = 128
 """Numbers of a descriptor of SIFT."""
+SAME = 1e-3
+"""Descriptors whose distance is below this are the same."""
 FEW = 800
 """Largest features by which is decided whether two photographs may show the same."""
 
 
 def match_features(
-    one: Features, other: Features, ratio: float = RATIO
+    one: Features,
+    other: Features,
+    ratio: float = RATIO,
+    own: tuple[Float[np.ndarray, " a"], Float[np.ndarray, " b"]] | None = None,
 ) -> tuple[Int[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
     """Rows of features that match, the clearest first, and the ratio of their distances to those of
-    the second best."""
+    the second best.
+
+    **Arguments:** `own`: `distances_within` both photographs."""
     if min(len(one), len(other)) < 2 or one.descriptor.shape[1] != other.descriptor.shape[1]:
         return np.zeros((0, 2), int), np.zeros(0)
     sift = one.descriptor.shape[1] == OF_SIFT
     nearest = _nearest if sift else _nearest_bits
     a, b = (_root(f.descriptor) if sift else f.descriptor for f in (one, other))
-    best, found = nearest(a, b)
-    rows = np.flatnonzero(found < ratio)
+    best, distance, second = nearest(a, b)
+    if own is not None:
+        second = np.minimum(second, np.minimum(own[0], own[1][best]))
+    rows = np.flatnonzero(distance < ratio * second)
     if not len(rows):
         return np.zeros((0, 2), int), np.zeros(0)
-    back, _ = nearest(b[best[rows]], a)
-    rows = rows[back == rows]
-    rows = rows[np.argsort(found[rows], kind="stable")]
-    return np.stack([rows, best[rows]], 1), found[rows]
+    back, _, third = nearest(b[best[rows]], a)
+    clarity = distance[rows] / np.maximum(np.minimum(second[rows], third), SAME)
+    kept = np.flatnonzero((back == rows) & (clarity < ratio))
+    kept = kept[np.argsort(clarity[kept], kind="stable")]
+    rows = rows[kept]
+    return np.stack([rows, best[rows]], 1), clarity[kept]
 
 
 def number_alike(one: Features, other: Features) -> int:
@@ -52,25 +64,43 @@ def _root(descriptor):
     return np.sqrt(counts / np.maximum(counts.sum(1, keepdims=True), 1e-9))
 
 
+def distances_within(features: Features) -> Float[np.ndarray, " n"]:
+    """Of every feature the distance to what looks most like it elsewhere in its photograph; of bits
+    infinite."""
+    n = len(features)
+    found = np.full(n, np.inf)
+    if n < 2 or features.descriptor.shape[1] != OF_SIFT:
+        return found
+    a, xy = _root(features.descriptor), features.xy.astype(np.float32)
+    near = features.size.astype(np.float32) ** 2
+    for first in range(0, n, PORTION):
+        rows = slice(first, first + PORTION)
+        s = a[rows] @ a.T
+        away = (xy[rows, None, 0] - xy[:, 0]) ** 2 + (xy[rows, None, 1] - xy[:, 1]) ** 2
+        s[away <= near[rows, None]] = -1
+        found[rows] = _distance(s.max(1))
+    return found
+
+
 def _nearest(a, b):
-    """The nearest of b for each of a, and the ratio of its distance to that of the second."""
-    best, ratio = np.empty(len(a), int), np.empty(len(a))
+    """The nearest of b for each of a, its distance, and that of the second."""
+    best, distance, second = np.empty(len(a), int), np.empty(len(a)), np.empty(len(a))
     for first in range(0, len(a), PORTION):
         s = a[first : first + PORTION] @ b.T
-        every = np.arange(len(s))
+        rows, every = slice(first, first + len(s)), np.arange(len(s))
         k = s.argmax(1)
-        nearest = s[every, k]
+        best[rows], distance[rows] = k, _distance(s[every, k])
         s[every, k] = -1
-        second = s.max(1)
-        best[first : first + len(s)] = k
-        ratio[first : first + len(s)] = np.sqrt(
-            np.maximum(1 - nearest, 0) / np.maximum(1 - second, 1e-6)
-        )
-    return best, ratio
+        second[rows] = _distance(s.max(1))
+    return best, distance, second
+
+
+def _distance(product):
+    return np.sqrt(np.maximum(1 - product, 0))
 
 
 def _nearest_bits(a, b):
     cv2 = need_opencv()
     pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(a, b, k=2)
     best = np.array([p[0].trainIdx for p in pairs], int)
-    return best, np.array([p[0].distance / max(p[1].distance, 1) for p in pairs])
+    return best, *(np.array([float(p[k].distance) for p in pairs]) for k in (0, 1))

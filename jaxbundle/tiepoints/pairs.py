@@ -9,7 +9,6 @@ from jaxtyping import Float
 from jaxbundle.tiepoints.features import Features
 from jaxbundle.tiepoints.matching import number_alike
 
-WAYS = ("auto", "all", "sequence", "place", "alike")
 MANY = 60
 """Photographs beyond which not all pairs are matched."""
 NEXT = 5

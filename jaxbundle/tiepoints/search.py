@@ -1,18 +1,20 @@
 """From photographs to verified pairs: features, matches, principal distances, verification."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from jaxbundle.network.columns import count
 from jaxbundle.network.tables import Camera
 from jaxbundle.network.units import from_image_unit
 from jaxbundle.orientation.sights import ideal_points
 from jaxbundle.tiepoints import interior, refinement, verification
 from jaxbundle.tiepoints.features import Detection, Features, find_features
-from jaxbundle.tiepoints.interior import estimate_interior
-from jaxbundle.tiepoints.matching import match_features
+from jaxbundle.tiepoints.interior import Start, estimate_interior
+from jaxbundle.tiepoints.matching import distances_within, match_features
 from jaxbundle.tiepoints.pairs import candidate_pairs
 from jaxbundle.tiepoints.store import Store
 from jaxbundle.tiepoints.verification import Pair, verify_pairs
@@ -23,6 +25,12 @@ TOLERANCE = 0.0012
 WIDEST = 0.6
 """Pairs that determine the principal distance: those with at least this part of the most matches,
 and others with fewer, which lie wider apart."""
+OF_THE_LENS = ("fx", "fy", "k1")
+OTHERS, APART, MORE = (0.7, 0.9, 1.2, 1.6, 2.2), 1.15, 1.05
+"""Other principal distances that are tried, in parts of the longer side, unless they differ by less
+than this factor; and how many times as many matches they must explain."""
+TRIED = 40
+"""Pairs by which they are judged."""
 
 
 def prepare() -> None:
@@ -64,12 +72,18 @@ def match(
     with ThreadPoolExecutor(workers) as pool:
         pairs = candidate_pairs(features, way, place, pool.map)
 
+    of = lambda pair: (fingerprints[pair[0]], fingerprints[pair[1]])
+    kept = {pair: store.load_matches(*of(pair)) for pair in pairs}
+    needed = sorted({k for pair, found in kept.items() if found is None for k in pair})
+    with ThreadPoolExecutor(workers) as pool:
+        own = dict(zip(needed, pool.map(distances_within, (features[k] for k in needed))))
+
     def one(pair):
-        i, j = pair
-        found = store.load_matches(fingerprints[i], fingerprints[j])
+        found = kept[pair]
         if found is None:
-            found = match_features(features[i], features[j])
-            store.save_matches(fingerprints[i], fingerprints[j], *found)
+            i, j = pair
+            found = match_features(features[i], features[j], own=(own[i], own[j]))
+            store.save_matches(*of(pair), *found)
         return pair, *found
 
     return _each(one, pairs, workers, lambda n: tell("matching", n, len(pairs)))
@@ -87,39 +101,90 @@ def _each(function, items, workers, advance):
 def start_cameras(
     cameras: Sequence[Camera],
     of: Sequence[int],
+    lens: Sequence[int],
     known: Sequence[bool],
     features: Sequence[Features],
     matches,
 ) -> tuple[list[Camera], list[str]]:
-    """Cameras with the principal distance and K1 that pairs of their photographs agree on."""
-    better, notes = [], []
-    for c, camera in enumerate(cameras):
-        own = [(len(rows), pair, rows) for pair, rows, _ in matches
-               if of[pair[0]] == of[pair[1]] == c]  # fmt: skip
-        best = _various(own)
-        start = estimate_interior(
-            camera, [(features[i].xy[rows[:, 0]], features[j].xy[rows[:, 1]])
-                     for _, (i, j), rows in best], known[c],
-        )  # fmt: skip
-        better.append(start.camera)
+    """Cameras with the principal distance and K1 that pairs of photographs by their lens agree on.
+
+    Where nothing tells the principal distance, what few pairs agree on is held against other
+    distances: by how many matches of many pairs relative orientations explain.
+
+    **Arguments:** `lens` of every camera; `known`: whether its principal distance is one to begin
+    with.
+    """
+    better, notes = list(cameras), []
+    for number in dict.fromkeys(lens):
+        own = [c for c in range(len(cameras)) if lens[c] == number]
+        found = [m for m in matches if of[m[0][0]] in own and of[m[0][1]] in own]
+        first, name, told = cameras[own[0]], cameras[own[0]].id, known[own[0]]
+        xy = _centred(cameras, of, features, _various(found))
+        begin = dataclasses.replace(first, parameters={**first.parameters, "cx": 0.0, "cy": 0.0})
+        start = estimate_interior(begin, xy, told)
+        if not told and start.pairs:
+            clear = sorted(found, key=lambda m: -len(m[1]))[:TRIED]
+            explained = lambda camera, clear=clear, own=own: _explained(
+                _with_lens(cameras, own, camera), of, features, clear
+            )
+            start = _most_explained(start, begin, xy, explained)
+        p = start.camera.parameters
+        better = _with_lens(better, own, start.camera)
         if start.pairs:
-            p = start.camera.parameters
-            notes.append(f"camera {camera.id}: start values from {start.pairs} pairs: principal "
-                         f"distance {p['fx']:.0f} px, k1 {p['k1']:.3f}")  # fmt: skip
-        elif not known[c]:
-            notes.append(f"camera {camera.id}: the principal distance is a guess: no two of its "
+            notes.append(f"camera {name}: start values from {count(start.pairs, 'pair')}: principal"
+                         f" distance {p['fx']:.0f} px, k1 {p['k1']:.3f}")  # fmt: skip
+        elif not told:
+            notes.append(f"camera {name}: the principal distance is a guess: no two of its "
                          "photographs agree on one")  # fmt: skip
     return better, notes
 
 
+def _centred(cameras, of, features, matches):
+    """Matches of pairs, from the middles of their photographs."""
+    centred = lambda k: features[k].xy - _middle(cameras[of[k]])
+    return [(centred(i)[rows[:, 0]], centred(j)[rows[:, 1]]) for (i, j), rows, _ in matches]
+
+
+def _with_lens(cameras, own, camera: Camera) -> list[Camera]:
+    """The cameras; those in `own` with the principal distance and K1 of `camera`."""
+    same = {name: camera.parameters[name] for name in OF_THE_LENS if name in camera.parameters}
+    with_it = lambda c: dataclasses.replace(c, parameters={**c.parameters, **same})
+    return [with_it(c) if k in own else c for k, c in enumerate(cameras)]
+
+
+def _explained(cameras, of, features, matches) -> int:
+    """How many matches the relative orientations of their pairs explain."""
+    return sum(map(len, verify(cameras, of, features, matches, lambda *_: None)))
+
+
+def _most_explained(start: Start, begin: Camera, xy, explained) -> Start:
+    """The start, or that from another principal distance which explains clearly more matches."""
+    size = max(present_size(begin))
+    f = start.camera.parameters["fx"]
+    most, best = MORE * explained(start.camera), None
+    for other in (factor * size for factor in OTHERS):
+        if max(f / other, other / f) > APART:
+            camera = dataclasses.replace(
+                begin, parameters={**begin.parameters, "fx": other, "fy": other}
+            )
+            number = explained(camera)
+            if number > most:
+                most, best = number, camera
+    return start if best is None else estimate_interior(best, xy, True)
+
+
+def _middle(camera: Camera):
+    return (np.array(present_size(camera)) - 1) / 2
+
+
 def _various(own):
     """The pairs with the most matches, and as many others with enough, each photograph in turn."""
-    own = sorted(own, key=lambda found: -found[0])
+    own = sorted(own, key=lambda found: -len(found[1]))
     if not own:
         return []
-    most = own[0][0]
-    first = [found for found in own if found[0] >= WIDEST * most][:3]
-    enough = [found for found in own if 60 <= found[0] < WIDEST * most]
+    most = len(own[0][1])
+    first = [found for found in own if len(found[1]) >= WIDEST * most][:3]
+    enough = [found for found in own if 60 <= len(found[1]) < WIDEST * most]
     step = max(1, len(enough) // 5)
     return first + enough[: 5 * step : step]
 

@@ -11,9 +11,12 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from jaxbundle.system.temporaries import temporary
 from jaxbundle.tiepoints.features import Detection, Features
 
 LENGTH = 16
+RULES = "2"
+"""Of finding and matching: what was kept by others is not used."""
 
 
 class Store:
@@ -27,7 +30,7 @@ class Store:
 
     def name(self, *fingerprints: str) -> str:
         """The name of a file about these photographs."""
-        text = "\n".join((self.settings, *fingerprints))
+        text = "\n".join((RULES, self.settings, *fingerprints))
         found = hashlib.blake2b(text.encode(), digest_size=LENGTH // 2).hexdigest()
         self.used.add(found)
         return found
@@ -75,7 +78,7 @@ class Store:
     def _save(self, name, **arrays):
         if self.folder is None:
             return
-        part = self.folder / f"{name}.part{os.getpid()}"
-        with part.open("wb") as file:
-            np.savez(file, **arrays)
-        part.replace(self.folder / f"{name}.npz")
+        with temporary(self.folder / f"{name}.part{os.getpid()}") as part:
+            with part.open("wb") as file:
+                np.savez(file, **arrays)
+            part.replace(self.folder / f"{name}.npz")

@@ -25,6 +25,7 @@ from jaxbundle.orientation import (
 )
 from jaxbundle.orientation.absolute import rotation_between
 from jaxbundle.orientation.relative import retract, sampson_distance
+from jaxbundle.system.compilation import quick_jit
 
 LEAST, PART = 16, 0.2
 """Matches that must agree, and their least part of all."""
@@ -178,7 +179,7 @@ def _fill(a):
     return np.resize(a, (SLOTS, *a.shape[1:]))
 
 
-@jax.jit
+@quick_jit
 @jax.vmap
 def _refine(M, b, xy1, xy2, weights):
     def misclosures(pair, xy1, xy2, root):
@@ -209,7 +210,7 @@ def _kinds(found, xy1, xy2, tolerance):
     return kinds
 
 
-@jax.jit
+@quick_jit
 @jax.vmap
 def _simpler(M, b, xy1, xy2, weights):
     """Median angle of intersection; misclosures of a rotation and of a homography."""

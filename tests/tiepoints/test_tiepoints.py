@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 import jaxbundle
 from jaxbundle.tiepoints.features import Detection, Features
 from jaxbundle.tiepoints.interior import estimate_interior
-from jaxbundle.tiepoints.matching import match_features
+from jaxbundle.tiepoints.matching import distances_within, match_features
 from jaxbundle.tiepoints.pairs import candidate_pairs
 from jaxbundle.tiepoints.store import Store
 from jaxbundle.tiepoints.tracks import choose_tracks, make_tracks
@@ -153,3 +153,18 @@ def test_what_is_kept_is_found_again_for_the_same_content_only(tmp_path):
     assert again.load_features("one") is None
     Store(tmp_path / "kept", Detection()).drop_unused()
     assert not list((tmp_path / "kept").glob("*.npz"))
+
+
+def test_what_is_in_a_photograph_twice_matches_nothing():
+    rng = np.random.default_rng(2)
+    noisy = lambda a: np.clip(a + rng.integers(-6, 6, a.shape), 0, 255).astype(np.uint8)
+    once = features_at(rng.uniform(0, 900, (60, 2)))
+    window = once.descriptor[:20].astype(int)
+    both = np.concatenate([noisy(once.descriptor.astype(int)), noisy(window)])
+    xy = np.concatenate([once.xy, once.xy[:20] + [300.0, 0]])
+    twice = Features(xy, np.ones(80), np.zeros(80), both)
+    one = Features(once.xy, once.size, once.angle, noisy(once.descriptor.astype(int)))
+    own = distances_within(twice), distances_within(one)
+    assert np.all(own[0][np.r_[:20, 60:80]] < 0.3 * np.median(own[0][20:60]))
+    rows, _ = match_features(twice, one, own=own)
+    assert set(range(20, 60)) <= set(rows[:, 0].tolist()) and len(rows) <= 42

@@ -1,0 +1,91 @@
+"""What `jaxbundle reconstruct` writes: every part with its model and cloud, pairs, figures."""
+
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.cli.outputs import FILES as RESULTS
+from jaxbundle.cli.outputs import can_plot, fill_results, written
+from jaxbundle.errors import InputError
+from jaxbundle.io.networks.colmap import FILES as COLMAP
+from jaxbundle.io.networks.colmap import fill_colmap
+from jaxbundle.io.results.ply import write_ply
+from jaxbundle.io.results.result_json import result_text
+from jaxbundle.io.results.result_project import adjusted_network
+from jaxbundle.io.text.csv_tables import write_csv
+from jaxbundle.io.writing.folders import read_marker, replaced_folder
+from jaxbundle.photographs.reading import read_photograph
+from jaxbundle.plotting.files import PAIRS as PAIR_FIGURES
+from jaxbundle.plotting.files import TRACKS, draw_pairs, draw_tracks
+from jaxbundle.reconstruction.reconstruct import Part, Reconstruction
+
+BY, KEPT, MODEL, CLOUD, PAIRS = "reconstruct", "matches", "colmap", "points.ply", "pairs.csv"
+OF_A_PART = (*RESULTS, *(f"{MODEL}/{name}" for name in COLMAP), CLOUD, TRACKS)
+FILES = (*OF_A_PART, *(f"part_*/{name}" for name in OF_A_PART), PAIRS, *PAIR_FIGURES)
+SHOWN = 1200
+"""Pixels of the longer side of a photograph in a figure."""
+
+
+def make_store(out: Path, force: bool) -> Path:
+    """The folder in which features and matches are kept; --out is the command's own from now on."""
+    if read_marker(out) is None:
+        with replaced_folder(out, BY, (), force):
+            pass
+    return out / KEPT
+
+
+def write_reconstruction(
+    found: Reconstruction, json: str, out: Path, brief: bool, plots: bool, force: bool
+) -> None:
+    """Write the JSON, and into the folder each part, the pairs and figures of them."""
+    first, plots = found.parts[0], plots and can_plot()
+    also = {"reconstruction": _summary(found)}
+    text = result_text(first.adjustment, brief, also)
+    with written(json, text, out, BY, FILES, force) as new:
+        if new is None:
+            return
+        _write_part(found, first, new, plots, str(found) + "\n\n", also)
+        for number, part in enumerate(found.parts[1:], 2):
+            folder = new / f"part_{number}"
+            folder.mkdir()
+            _write_part(found, part, folder, plots, f"{part.name}\n\n", {})
+        if plots:
+            draw_pairs(list(found.photographs), found.pairs, list(found.left_out), new)
+        write_csv(new / PAIRS, ["image", "other", "matches", "verified", "kind"], found.pairs)
+
+
+def _write_part(
+    found: Reconstruction, part: Part, folder: Path, plots: bool, note: str, also
+) -> None:
+    fill_results(part.adjustment, folder, plots, note, also)
+    if plots:
+        draw_tracks(part.adjustment, lambda name: _thumbnail(found.photographs[name]), folder)
+    network = adjusted_network(part.adjustment)
+    write_ply(network, folder / CLOUD, part.colours)
+    try:
+        fill_colmap(network, folder / MODEL, False)
+    except InputError as error:
+        print(f"no COLMAP model: {error}")
+
+
+def _thumbnail(path: Path):
+    """The grey values of a photograph, made small; where it has gone, nothing but paper."""
+    try:
+        grey = read_photograph(path)
+    except InputError:
+        return np.full((2, 2), 255, np.uint8)
+    step = max(1, max(grey.shape) // SHOWN)
+    return grey[::step, ::step]
+
+
+def _summary(found: Reconstruction) -> dict:
+    return {
+        "parts": [
+            {"name": part.name, "images": list(part.adjustment.network.images.id),
+             "sigma0": part.adjustment.sigma0, "sigma_factors": dict(part.factors),
+             "removed": len(part.adjustment.removed),
+             "global_test_passed": part.adjustment.global_test()["passed"]}
+            for part in found.parts
+        ],
+        "left_out": dict(found.left_out), "notes": list(found.notes), "pairs": len(found.pairs),
+    }  # fmt: skip

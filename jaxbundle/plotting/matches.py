@@ -1,0 +1,123 @@
+"""What photographs have in common: the match graph, the overlap, tracks in a photograph."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import UInt8
+
+from jaxbundle.plotting.frame import image_index
+from jaxbundle.plotting.style import (
+    BLUE,
+    GREY,
+    INK,
+    LABELLED,
+    RUST,
+    axes,
+    image_axes,
+    legend,
+    plain,
+    quiet,
+    title,
+)
+
+KINDS = {"relative": (BLUE, "-"), "plane": (GREY, "--"), "rotation": (RUST, ":")}
+"""Colour and line of a pair that a relative orientation, a plane, a rotation explains."""
+WIDEST = 4.0
+"""Width of the line of the pair with the most matches, points."""
+
+Pairs = Sequence[tuple[str, str, int, int, str]]
+"""Two photographs, matches found, matches verified, kind."""
+
+
+def match_graph(names: Sequence[str], pairs: Pairs, alone: Sequence[str] = (), ax=None):
+    """Photographs on a circle, in their order, and a line for every verified pair: the wider, the
+    more matches; those that are in no part (`alone`) are coloured.
+
+    **Returns:** matplotlib `Axes`.
+    """
+    ax = axes(ax, (7, 7))
+    turn = np.pi / 2 - 2 * np.pi * np.arange(len(names)) / max(len(names), 1)
+    place = dict(zip(names, np.stack([np.cos(turn), np.sin(turn)], 1)))
+    most = max((verified for *_, verified, _ in pairs), default=1)
+    drawn = set()
+    for one, other, _, verified, kind in pairs:
+        colour, line = KINDS[kind]
+        share = verified / most
+        ax.plot(
+            *np.stack([place[one], place[other]], 1), line, color=colour, alpha=0.25 + 0.6 * share,
+            linewidth=WIDEST * max(share, 0.1), label="" if kind in drawn else kind, zorder=2,
+        )  # fmt: skip
+        drawn.add(kind)
+    at = np.array(list(place.values()))
+    lonely = np.isin(names, list(alone))
+    ax.scatter(*at.T, s=36, color=np.where(lonely, RUST, INK), zorder=3)
+    if len(names) <= LABELLED:
+        for name, angle in zip(names, turn):
+            c, s = 1.06 * np.cos(angle), 1.06 * np.sin(angle)
+            ax.text(c, s, plain(name), fontsize=7, color=INK, parse_math=False,
+                    ha="center" if abs(c) < 0.2 else "left" if c > 0 else "right", va="center")
+    ax.set_axis_off()
+    ax.set_aspect("equal")
+    ax.margins(0.25)
+    title(ax, "Match graph", f"{len(names)} photographs, {len(pairs)} verified pairs, "
+          f"{most if pairs else 0} matches at most")  # fmt: skip
+    if len(drawn) > 1:
+        legend(ax, loc="lower right")
+    return ax
+
+
+def overlap_matrix(names: Sequence[str], pairs: Pairs, ax=None):
+    """The number of verified matches of every two photographs, as a matrix.
+
+    **Returns:** matplotlib `Axes`.
+    """
+    ax = axes(ax, (7, 6))
+    index = {name: k for k, name in enumerate(names)}
+    number = np.full((len(names), len(names)), np.nan)
+    for one, other, _, verified, _ in pairs:
+        i, j = index[one], index[other]
+        number[i, j] = number[j, i] = verified
+    shown = ax.imshow(number, cmap="Blues", vmin=0)
+    ax.figure.colorbar(shown, ax=ax, shrink=0.8, label="verified matches")
+    if len(names) <= LABELLED:
+        ax.set_xticks(range(len(names)), map(plain, names), rotation=90, parse_math=False)
+        ax.set_yticks(range(len(names)), map(plain, names), parse_math=False)
+    if len(names) <= LABELLED // 3:
+        for i, j in np.argwhere(np.isfinite(number)):
+            dark = number[i, j] > 0.6 * np.nanmax(number)
+            ax.text(j, i, f"{number[i, j]:.0f}", ha="center", va="center", fontsize=7,
+                    color="white" if dark else INK)  # fmt: skip
+    quiet(ax, grid=False)
+    title(ax, "Overlap", "verified matches of every two photographs")
+    return ax
+
+
+def tracks_in_photograph(adjustment, image: str, picture: UInt8[np.ndarray, "r c"], ax=None):
+    """The measurements of a photograph in its picture, coloured by how many photographs show the
+    point; removed ones as crosses.
+
+    **Arguments:** `picture`: grey values, of any size: it is stretched over the photograph.
+
+    **Returns:** matplotlib `Axes`.
+    """
+    ax = axes(ax, (8, 6))
+    problem, i = adjustment.problem, image_index(adjustment, image)
+    used = (np.asarray(problem.data.image_weight) > 0).any(1)
+    rays = np.bincount(problem.point[used], minlength=len(problem.network.points))
+    rows = problem.image == i
+    xy = np.asarray(problem.data.image_xy)
+    columns, height = problem.network.cameras[problem.network.images.camera[i]].image_size
+    ax.imshow(picture, cmap="gray", vmin=0, vmax=255, alpha=0.75,
+              extent=(-0.5, columns - 0.5, height - 0.5, -0.5))  # fmt: skip
+    good = rows & used
+    shown = ax.scatter(*xy[good].T, s=7, c=rays[problem.point[good]], cmap="viridis", vmin=2,
+                       linewidths=0, zorder=3)  # fmt: skip
+    bad = rows & ~used
+    ax.scatter(*xy[bad].T, s=18, marker="x", color=RUST, linewidths=0.8, zorder=4)
+    ax.figure.colorbar(shown, ax=ax, shrink=0.8, label="photographs that show the point")
+    ax.set_xlim(-0.5, columns - 0.5)
+    ax.set_ylim(height - 0.5, -0.5)
+    quiet(ax, grid=False)
+    image_axes(ax, "px")
+    title(ax, f"Photograph {image}: tracks", f"{good.sum()} measurements, {bad.sum()} removed")
+    return ax
