@@ -36,6 +36,7 @@ DOMAINS = {
     "corrected": "corrected: the measurement freed of distortion against the ideal image",
     "measured": "measured: the distorted image of the point against the raw measurement",
 }
+NO_RESULT = "The adjustment did not converge. It has no result, and none is shown."
 ADVICE = {
     LIMIT: "Allow more iterations (--max-iterations), or give better start values.",
     SINGULAR: "Measure what determines them, give them a prior σ, or hold them.",
@@ -57,21 +58,21 @@ def title(adjustment, date: str | None) -> list[str]:
 
 def settings(adjustment) -> list[str]:
     """Method, datum, domain of the residuals, units."""
+    return ["", *facts(setting_facts(adjustment))]
+
+
+def setting_facts(adjustment) -> list[tuple[str, str]]:
+    """The settings by name, in words."""
     network = adjustment.network
     return [
-        "",
-        *facts(
-            [
-                ("Method", METHODS.get(adjustment.method) or adjustment.method),
-                ("Reduced system", reduced_system(adjustment)),
-                ("Datum", datum(adjustment)),
-                ("Residuals", f"v = computed − observed, {DOMAINS[network.residuals]}"),
-                (
-                    "Units",
-                    f"object {clean(network.object_unit)}, image {adjustment.image_unit}, "
-                    f"angles {network.angle_unit}",
-                ),
-            ]
+        ("Method", METHODS.get(adjustment.method) or adjustment.method),
+        ("Reduced system", reduced_system(adjustment)),
+        ("Datum", datum(adjustment)),
+        ("Residuals", f"v = computed − observed, {DOMAINS[network.residuals]}"),
+        (
+            "Units",
+            f"object {clean(network.object_unit)}, image {adjustment.image_unit}, "
+            f"angles {network.angle_unit}",
         ),
     ]
 
@@ -127,6 +128,11 @@ def datum(adjustment) -> str:
 
 def counts(adjustment) -> list[str]:
     """How many of what, and the redundancy they leave."""
+    return [*heading("Counts"), *table(("", "", ""), count_rows(adjustment), "lrl")[1:]]
+
+
+def count_rows(adjustment) -> list[tuple[str, str, str]]:
+    """What is counted, its number, and the parts of it."""
     network, n = adjustment.problem.network, adjustment.counts
     roles = [(role, int(network.points.has_role(role).sum())) for role in ROLES]
     kinds = [
@@ -153,8 +159,7 @@ def counts(adjustment) -> list[str]:
         ("Unknowns", n.unknowns, _listed(groups)),
         ("Redundancy", n.redundancy, "observations + pseudo-observations + conditions − unknowns"),
     ]
-    rows = [(name, str(n), detail) for name, n, detail in rows]
-    return [*heading("Counts"), *table(("", "", ""), rows, "lrl")[1:]]
+    return [(name, str(n), detail) for name, n, detail in rows]
 
 
 def _listed(groups) -> str:
@@ -164,16 +169,12 @@ def _listed(groups) -> str:
 
 def convergence(adjustment) -> list[str]:
     """One row an evaluation; a rejected step is one that would have increased vᵀPv."""
-    minimum = adjustment.minimum
-    tried = int(minimum.iterations)
-    cost, damping, accepted = (
-        np.asarray(column)[:tried]
-        for column in (minimum.history.cost, minimum.history.damping, minimum.history.accepted)
-    )
+    vtpv, damping, accepted = evaluations(adjustment)
+    tried = len(vtpv)
     rows = [
         (
             "start" if i == 0 else str(i),
-            f"{2 * cost[i]:.8e}" if np.isfinite(cost[i]) else "not finite",
+            f"{vtpv[i]:.8e}" if np.isfinite(vtpv[i]) else "not finite",
             "–" if i == 0 else f"{damping[i]:.1e}" if damping[i] else "0",
             "" if i == 0 else "accepted" if accepted[i] else "rejected",
         )
@@ -194,6 +195,14 @@ def convergence(adjustment) -> list[str]:
             "removed, or σ estimated, in between (see below)."
         )
     return lines
+
+
+def evaluations(adjustment) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """vᵀPv, damping, and whether the step was accepted, of the start and every step tried."""
+    tried, history = int(adjustment.minimum.iterations), adjustment.minimum.history
+    columns = (history.cost, history.damping, history.accepted)
+    cost, damping, accepted = (np.asarray(column)[:tried] for column in columns)
+    return 2 * cost, damping, accepted
 
 
 def image_sigmas(adjustment) -> np.ndarray:
@@ -255,13 +264,6 @@ def chi_squared(adjustment, level: float = 0.05) -> str:
 
 def variance_factor(adjustment) -> list[str]:
     """σ0, what it means in the image, and the global test."""
-    rows = [
-        ("vᵀPv", significant(adjustment.vtpv, 7)),
-        ("Redundancy", str(adjustment.redundancy)),
-        ("σ0", f"{significant(adjustment.sigma0, 6)}  √(vᵀPv/redundancy), without unit"),
-        ("Image coordinate", image_precision(adjustment)),
-        ("χ² test", chi_squared(adjustment)),
-    ]
     text = (
         "All standard deviations below are a posteriori, σ0 × those of the a priori weights, "
         "unless they are said to be a priori."
@@ -271,7 +273,18 @@ def variance_factor(adjustment) -> list[str]:
             " The a priori σ of the groups of observations are those estimated, not those given: "
             "see Variance components."
         )
-    return [*heading("Variance factor"), *facts(rows), "", *paragraph(text)]
+    return [*heading("Variance factor"), *facts(variance_facts(adjustment)), "", *paragraph(text)]
+
+
+def variance_facts(adjustment) -> list[tuple[str, str]]:
+    """vᵀPv, redundancy, σ0, the precision of an image coordinate, the global test."""
+    return [
+        ("vᵀPv", significant(adjustment.vtpv, 7)),
+        ("Redundancy", str(adjustment.redundancy)),
+        ("σ0", f"{significant(adjustment.sigma0, 6)}  √(vᵀPv/redundancy), without unit"),
+        ("Image coordinate", image_precision(adjustment)),
+        ("χ² test", chi_squared(adjustment)),
+    ]
 
 
 def warnings(adjustment) -> list[str]:
@@ -282,6 +295,13 @@ def warnings(adjustment) -> list[str]:
 
 def why_not_solved(adjustment) -> list[str]:
     """Why there is no result, what is not determined, what to do."""
+    return [
+        *heading("Not solved"), *paragraph(NO_RESULT), "", *facts(failure_facts(adjustment))
+    ]
+
+
+def failure_facts(adjustment) -> list[tuple[str, str]]:
+    """Why there is no result, what is not determined, what to do, by name."""
     names = adjustment.undetermined
     reason = SINGULAR if names else int(adjustment.minimum.termination)
     tried = int(adjustment.minimum.iterations)
@@ -299,12 +319,7 @@ def why_not_solved(adjustment) -> list[str]:
         advice.append("Most steps were rejected: hold parameters that the images hardly determine.")
     advice += [text for kind, text in ADVICE_FOR.items() if any(f" of {kind} " in n for n in names)]
     rows += [("What to do" if i == 0 else "", text) for i, text in enumerate(advice)]
-    return [
-        *heading("Not solved"),
-        *paragraph("The adjustment did not converge. It has no result, and none is shown."),
-        "",
-        *facts(rows),
-    ]
+    return rows
 
 
 def result_in_words(adjustment) -> str:

@@ -44,7 +44,7 @@ def residuals(adjustment, limit: float, test: str) -> list[str]:
     lines = heading(f"Residuals with |{symbol}| > {limit:g}")
     lines += paragraph(
         f"Test: {'Pope, τ = w/σ0, σ a posteriori' if test == 'pope' else 'Baarda, σ a priori'}; "
-        f"critical value {significant(_critical(adjustment, test), 3)} for one observation at "
+        f"critical value {significant(critical_value(adjustment, test), 3)} for one observation at "
         f"0.1 %. v and σ (a priori) of image coordinates in {adjustment.image_unit}, of control "
         "points and distances in the object unit; r redundancy number; MDB the smallest blunder "
         "that is found (α 0.1 %, power 80 %), σ a posteriori (σ0 times that of the tables); "
@@ -63,7 +63,8 @@ def residuals(adjustment, limit: float, test: str) -> list[str]:
     return lines + _histogram(found["tau"])
 
 
-def _critical(adjustment, test: str, level: float = 0.001) -> float:
+def critical_value(adjustment, test: str = "pope", level: float = 0.001) -> float:
+    """Of the test of one observation at a level."""
     if test == "baarda":
         return normal_quantile(1 - level / 2)
     return tau_quantile(1 - level / 2, adjustment.redundancy)
@@ -95,10 +96,7 @@ def _histogram(tau) -> list[str]:
     tau = tau[np.isfinite(tau)]
     if not len(tau):
         return []
-    edges = np.concatenate([[-np.inf], np.arange(-4, 4.25, 0.5), [np.inf]])
-    counted = np.histogram(tau, edges)[0]
-    normal = np.array([0.5 * (1 + math.erf(edge / math.sqrt(2))) for edge in edges])
-    expected = len(tau) * np.diff(normal)
+    edges, counted, expected = count_by_class(tau)
     largest = max(counted.max(), expected.max())
     rows = []
     for i, found in enumerate(counted):
@@ -114,6 +112,15 @@ def _histogram(tau) -> list[str]:
     ]
 
 
+def count_by_class(tau):
+    """Edges of classes of ½ from −4 to 4, open at both ends; how many τ are in each, and how many
+    a normal distribution would give."""
+    tau = tau[np.isfinite(tau)]
+    edges = np.concatenate([[-np.inf], np.arange(-4, 4.25, 0.5), [np.inf]])
+    normal = np.array([0.5 * (1 + math.erf(edge / math.sqrt(2))) for edge in edges])
+    return edges, np.histogram(tau, edges)[0], len(tau) * np.diff(normal)
+
+
 # --- reliability ----------------------------------------------------------------------------
 
 
@@ -122,8 +129,7 @@ def redundancy(adjustment) -> list[str]:
     found = adjustment.residuals
     r = found["r"]
     order = np.argsort(r, kind="stable")[:WEAKEST]
-    loose = int((r < 1e-8).sum())
-    weak = int((r < 0.1).sum())
+    weak, loose = count_weak(r)
     rows = [
         ("Sum", f"{r.sum():.3f} (redundancy {adjustment.redundancy})"),
         ("Mean, min, max", f"{r.mean():.3f}, {r.min():.3f}, {r.max():.3f}"),
@@ -138,6 +144,11 @@ def redundancy(adjustment) -> list[str]:
         "The least controlled observations:",
         *_rows(adjustment, order),
     ]
+
+
+def count_weak(r) -> tuple[int, int]:
+    """How many observations are weakly controlled, r < 0.1, and how many of them not at all."""
+    return int((r < 0.1).sum()), int((r < 1e-8).sum())
 
 
 def components(adjustment) -> list[str]:

@@ -1,0 +1,148 @@
+"""Charts as SVG, drawn here so that they print and need no script: line styles and hatching tell
+curves apart without colours."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxbundle.report.page.markup import text
+
+WIDE, HIGH = 640, 300
+LEFT, RIGHT, TOP, BOTTOM = 70, 15, 15, 45
+
+
+class Curve(NamedTuple):
+    """A line through x, y, with a band of y ± sigma around it; `kind` is its class of style."""
+
+    label: str
+    x: np.ndarray
+    y: np.ndarray
+    sigma: np.ndarray | None = None
+    kind: str = "first"
+
+
+class Scale(NamedTuple):
+    """From numbers to places in the drawing."""
+
+    low: float
+    high: float
+    start: float
+    end: float
+
+    def __call__(self, value):
+        return self.start + (np.asarray(value, float) - self.low) / (self.high - self.low) * (
+            self.end - self.start
+        )
+
+
+def draw_curves(
+    curves: Sequence[Curve], x_label: str, y_label: str, logarithmic: bool = False,
+    mark: tuple[float, str] | None = None,
+) -> str:  # fmt: skip
+    """Curves over a common x; `logarithmic`: y is log10 of what the axis says; `mark`: an x with a
+    vertical line, and its name."""
+    reach = [np.concatenate([c.y - band, c.y + band]) for c in curves
+             for band in [np.nan_to_num(0 if c.sigma is None else c.sigma)]]  # fmt: skip
+    xs, ys = np.concatenate([c.x for c in curves]), np.concatenate(reach)
+    x, y = _scale(xs, LEFT, WIDE - RIGHT), _scale(ys, HIGH - BOTTOM, TOP, 0.05)
+    parts = [_axes(x, y, x_label, y_label, logarithmic)]
+    if mark is not None:
+        at = float(x(mark[0]))
+        parts.append(f'<line class="mark" x1="{at:.1f}" x2="{at:.1f}" y1="{TOP}" '
+                     f'y2="{HIGH - BOTTOM}"/>\n')  # fmt: skip
+    for curve in curves:
+        if curve.sigma is not None:
+            ends = np.concatenate([curve.y - curve.sigma, (curve.y + curve.sigma)[::-1]])
+            outline = _places(x, y, np.concatenate([curve.x, curve.x[::-1]]), ends)
+            parts.append(f'<polygon class="band {curve.kind}" points="{outline}"/>\n')
+        line = _places(x, y, curve.x, curve.y)
+        parts.append(f'<polyline class="{curve.kind}" points="{line}"/>\n')
+    return _svg(parts) + _legend([(c.kind, c.label) for c in curves],
+                                 None if mark is None else mark[1])  # fmt: skip
+
+
+def draw_histogram(edges: np.ndarray, counted: np.ndarray, expected: np.ndarray) -> str:
+    """Counts by class as bars, beside the numbers expected as steps; the outer classes are open."""
+    step = edges[2] - edges[1]
+    ends = np.concatenate([[edges[1] - step], edges[1:-1], [edges[-2] + step]])
+    x = Scale(ends[0], ends[-1], LEFT, WIDE - RIGHT)
+    y = _scale(np.array([0, counted.max(initial=1), expected.max(initial=1)]), HIGH - BOTTOM, TOP)
+    base = float(y(0))
+    bars = [
+        f'<rect class="bar" x="{x(a):.1f}" y="{y(n):.1f}" width="{x(b) - x(a):.1f}" '
+        f'height="{base - y(n):.1f}"/>\n'
+        for a, b, n in zip(ends, ends[1:], counted)
+    ]
+    steps = _places(x, y, np.repeat(ends, 2)[1:-1], np.repeat(expected, 2))
+    line = f'<polyline class="second" points="{steps}"/>\n'
+    axes = _axes(x, y, "normalised residual τ = w/σ0", "observations")
+    names = [("bar", "observations"), ("second", "normal distribution")]
+    return _svg([axes, *bars, line]) + _legend(names)
+
+
+def _scale(values: np.ndarray, start: float, end: float, margin: float = 0.0) -> Scale:
+    values = values[np.isfinite(values)]
+    low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
+    spread = high - low or abs(high) or 1.0
+    low, high = low - margin * spread, high + margin * spread
+    return Scale(low, high if high > low else low + spread, start, end)
+
+
+def _ticks(scale: Scale, whole: bool = False) -> np.ndarray:
+    """About five round numbers within a scale; whole ones where it has at least two."""
+    rough = (scale.high - scale.low) / 5
+    if whole and np.floor(scale.high) > np.ceil(scale.low):
+        rough = max(rough, 1.0)
+    power = 10.0 ** np.floor(np.log10(rough))
+    step = next(s * power for s in (1, 2, 5, 10) if s * power >= rough * (1 - 1e-9))
+    first = np.ceil(scale.low / step - 1e-9)
+    return step * np.arange(first, np.floor(scale.high / step + 1e-9) + 1)
+
+
+def _axes(x: Scale, y: Scale, x_label: str, y_label: str, logarithmic: bool = False) -> str:
+    parts = []
+    for tick in _ticks(x):
+        at = float(x(tick))
+        parts.append(f'<line class="grid" x1="{at:.1f}" x2="{at:.1f}" y1="{TOP}" '
+                     f'y2="{HIGH - BOTTOM}"/>\n'
+                     f'<text x="{at:.1f}" y="{HIGH - BOTTOM + 16}" text-anchor="middle">'
+                     f"{tick + 0.0:.6g}</text>\n")  # fmt: skip
+    for tick in _ticks(y, logarithmic):
+        at = float(y(tick))
+        name = f"{10.0**tick:.3g}" if logarithmic else f"{tick + 0.0:.6g}"
+        parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDE - RIGHT}" y1="{at:.1f}" '
+                     f'y2="{at:.1f}"/>\n'
+                     f'<text x="{LEFT - 6}" y="{at + 4:.1f}" text-anchor="end">{name}</text>\n')
+    middle = (TOP + HIGH - BOTTOM) / 2
+    parts.append(f'<text x="{(LEFT + WIDE - RIGHT) / 2}" y="{HIGH - 8}" text-anchor="middle">'
+                 f"{text(x_label)}</text>\n"
+                 f'<text x="14" y="{middle}" text-anchor="middle" '
+                 f'transform="rotate(-90 14 {middle})">{text(y_label)}</text>\n')  # fmt: skip
+    return "".join(parts)
+
+
+def _places(x: Scale, y: Scale, xs, ys) -> str:
+    there = np.isfinite(xs) & np.isfinite(ys)
+    return " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x(xs[there]), y(ys[there])))
+
+
+def _svg(parts: Sequence[str]) -> str:
+    return f'<svg viewBox="0 0 {WIDE} {HIGH}" role="img">\n{"".join(parts)}</svg>\n'
+
+
+def _legend(names: Sequence[tuple[str, str]], mark: str | None = None) -> str:
+    """A sample of every line, and its name."""
+    rows = [*names, *([] if mark is None else [("mark", mark)])]
+    samples = "".join(
+        f'<span><svg class="sample" viewBox="0 0 30 10"><{_sample(kind)}/></svg>'
+        f"{text(name)}</span>\n"
+        for kind, name in rows
+    )
+    return f'<p class="legend">{samples}</p>\n'
+
+
+def _sample(kind: str) -> str:
+    if kind == "bar":
+        return 'rect class="bar" x="5" y="0" width="20" height="10"'
+    return f'line class="{kind}" x1="0" x2="30" y1="5" y2="5"'

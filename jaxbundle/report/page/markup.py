@@ -1,0 +1,55 @@
+"""Pieces of HTML; whatever comes from outside is escaped here."""
+
+from collections.abc import Iterable, Sequence
+from html import escape
+
+from jaxbundle.report.layout import clean
+
+
+def text(value: object) -> str:
+    """Text of one line, escaped."""
+    return escape(clean(value))
+
+
+def section(id: str, title: str, *content: str, breaks: bool = False) -> str:
+    """A section with its heading; `breaks`: on a new page when printed."""
+    kind = ' class="breaks"' if breaks else ""
+    return f'<section id="{id}"{kind}><h2>{text(title)}</h2>\n{"".join(content)}</section>\n'
+
+
+def paragraph(words: object, kind: str = "") -> str:
+    """A paragraph, of a class if one is given."""
+    return f"<p{_class(kind)}>{text(words)}</p>\n"
+
+
+def items(lines: Iterable[object]) -> str:
+    """A list."""
+    return "<ul>\n" + "".join(f"<li>{text(line)}</li>\n" for line in lines) + "</ul>\n"
+
+
+def facts(rows: Iterable[tuple[object, object]]) -> str:
+    """Names and what is to be said of them."""
+    cells = "".join(
+        f'<tr><th scope="row">{text(name)}</th><td>{text(value)}</td></tr>\n'
+        for name, value in rows
+    )
+    return f'<table class="facts">\n{cells}</table>\n'
+
+
+def grid(header: Sequence[object], rows: Iterable[Sequence[object]], kind: str = "") -> str:
+    """A table with a header; all but the first column are numbers."""
+    head = "".join(f'<th scope="col">{text(cell)}</th>' for cell in header)
+    body = "".join(
+        "<tr>" + "".join(f"<td>{text(cell)}</td>" for cell in row) + "</tr>\n" for row in rows
+    )
+    cells = f"<thead><tr>{head}</tr></thead>\n<tbody>\n{body}</tbody>"
+    return f"<table{_class(kind)}>\n{cells}</table>\n"
+
+
+def figure(drawing: str, caption: object) -> str:
+    """A drawing over its caption."""
+    return f"<figure>\n{drawing}<figcaption>{text(caption)}</figcaption></figure>\n"
+
+
+def _class(kind: str) -> str:
+    return f' class="{kind}"' if kind else ""

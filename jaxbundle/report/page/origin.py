@@ -1,0 +1,60 @@
+"""Where a result comes from: fingerprints of the files read, versions of the software."""
+
+import hashlib
+import os
+import platform
+from collections.abc import Iterable, Mapping
+from importlib.metadata import version
+from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
+
+from jaxbundle.system.file_content import is_plain
+
+PACKAGES = ("jax", "jaxlib", "equinox", "lineax", "numpy", "scipy")
+
+
+class InputFile(NamedTuple):
+    """A file that was read: its name, bytes, and SHA-256."""
+
+    name: str
+    size: int
+    sha256: str
+
+
+class Origin(NamedTuple):
+    """What a result was made of: the files read, and further settings by name as they are shown."""
+
+    inputs: tuple[InputFile, ...] = ()
+    settings: Mapping[str, object] = MappingProxyType({})
+
+
+UNKNOWN = Origin()
+
+
+def fingerprint_files(paths: Iterable[str | Path]) -> tuple[InputFile, ...]:
+    """The plain files among these, each once; what cannot be read is left out."""
+    found: dict[str, InputFile] = {}
+    for path in map(Path, paths):
+        real = os.path.realpath(path)
+        try:
+            if real in found or not path.is_file() or not is_plain(path):
+                continue
+            with path.open("rb") as file:
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+                found[real] = InputFile(str(path), os.fstat(file.fileno()).st_size, digest)
+        except OSError:
+            continue
+    return tuple(found.values())
+
+
+def software_versions() -> list[tuple[str, str]]:
+    """The versions of what computed: jaxbundle, its packages, Python, the system."""
+    from jaxbundle import __version__
+
+    return [
+        ("jaxbundle", __version__),
+        *((name, version(name)) for name in PACKAGES),
+        ("Python", platform.python_version()),
+        ("System", f"{platform.system()} {platform.machine()}"),
+    ]

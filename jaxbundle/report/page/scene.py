@@ -1,0 +1,43 @@
+"""What the page draws beside its tables: the stations of the network, and the frames of images."""
+
+import numpy as np
+
+from jaxbundle.cameras import get_model
+from jaxbundle.plotting.distortion import principal_point
+from jaxbundle.plotting.frame import image_frame
+from jaxbundle.plotting.style import extent, micrometres
+from jaxbundle.plotting.views import camera_pyramids, ellipse_factor, pyramid_size
+from jaxbundle.report.layout import clean
+from jaxbundle.report.page.columns import encode_values
+
+
+def describe_network(adjustment) -> dict:
+    """Centre, size and unit of the network, the factor of its error ellipsoids, and the pyramid of
+    every image (projection centre and four corners, relative to the centre)."""
+    centres = adjustment.image_values[:, :3]
+    near = adjustment.point_values[~adjustment.problem.at_any_distance]
+    centre, size = extent(np.concatenate([near, centres]))
+    pyramids = camera_pyramids(adjustment, pyramid_size(centres, size)) - centre
+    return {
+        "centre": centre.tolist(),
+        "size": size,
+        "unit": clean(adjustment.network.object_unit),
+        "factor": ellipse_factor(adjustment, size)[1],
+        "pyramids": encode_values(pyramids.ravel()),
+    }
+
+
+def describe_frames(adjustment) -> dict[str, dict]:
+    """By camera the frame of its images, its principal point, and the unit of residuals."""
+    found = {}
+    for camera in adjustment.problem.network.cameras:
+        model = get_model(camera.model)
+        low, high, known = image_frame(adjustment, camera.id)
+        scale, unit = micrometres(model.unit)
+        centre = principal_point(adjustment, camera.id)
+        found[camera.id] = {
+            "low": low.tolist(), "high": high.tolist(), "known": bool(known),
+            "down": model.axes == "down", "scale": scale, "unit": unit,
+            "centre": centre.tolist() if np.isfinite(centre).all() else None,
+        }  # fmt: skip
+    return found

@@ -1,0 +1,164 @@
+"""The tables of a result as the page embeds them: what can be sorted, searched and drawn."""
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from jaxbundle.network.tables import EXTERIOR
+from jaxbundle.report.layout import clean, column_decimals
+from jaxbundle.report.page.columns import Column, numbers
+
+MOST_ROWS = 500_000
+"""More observations than this are not embedded: a page with a million takes too long to open."""
+
+Columns = dict[str, Column]
+UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+"""The elements of a symmetric matrix that are embedded, in this order."""
+ANGLES = {"omega": "ω", "phi": "φ", "kappa": "κ"}
+
+
+def collect_tables(adjustment) -> dict[str, Columns]:
+    """All tables by name; empty ones are left out."""
+    made: dict[str, Callable[..., Columns]] = {
+        "cameras": cameras, "images": images, "points": points, "far_points": far_points,
+        "checks": checks, "observations": observations, "blunders": blunders,
+    }  # fmt: skip
+    tables = {name: make(adjustment) for name, make in made.items()}
+    return {
+        name: columns
+        for name, columns in tables.items()
+        if any(len(column.values) for column in columns.values())
+    }
+
+
+def cameras(adjustment) -> Columns:
+    """One row a parameter."""
+    found = adjustment.table("cameras")
+    return {
+        "camera": Column(found["camera"], "camera"),
+        "model": Column(found["model"], "model"),
+        "parameter": Column(found["parameter"], "parameter"),
+        "value": Column(numbers(found["value"]), "value", -9, True),
+        "sigma": Column(numbers(found["sigma"]), "σ"),
+        "free": Column(found["free"].astype(bool), "free"),
+        "t": Column(numbers(found["t"]), "t = |value|/σ"),
+        "total": Column(100 * numbers(found["total_correlation"]), "total correlation %", 1),
+    }
+
+
+def images(adjustment) -> Columns:
+    """Exterior orientation; the covariance of the projection centre, to be drawn."""
+    found, given = adjustment.images, adjustment.problem.network
+    unit, angle = clean(given.object_unit), given.angle_unit
+    units = dict(zip(EXTERIOR, [unit] * 3 + [angle] * 3))
+    label = lambda name: f"{ANGLES.get(name, name)} [{units[name]}]"
+    places = {name: column_decimals(found[f"s{name}"]) for name in EXTERIOR}
+    ids = np.array([camera.id for camera in given.cameras], dtype=object)
+    return (
+        {"id": Column(found["id"], "image"), "camera": Column(ids[given.images.camera], "camera")}
+        | {name: Column(found[name], label(name), places[name], True) for name in EXTERIOR}
+        | {f"s{name}": Column(found[f"s{name}"], f"σ {label(name)}") for name in EXTERIOR}
+        | {
+            "rays": Column(found["rays"], "rays"),
+            "rms": Column(found["rms"], f"RMS v [{adjustment.image_unit}]"),
+        }
+        | _covariance(adjustment.image_covariance[:, :3, :3])
+    )
+
+
+def points(adjustment) -> Columns:
+    """Coordinates with σ; the covariance, and whether a point is near enough to be drawn."""
+    found, unit = adjustment.points, clean(adjustment.network.object_unit)
+    places = {axis: column_decimals(found[f"s{axis}"]) for axis in "XYZ"}
+    return (
+        {"id": Column(found["id"], "point"), "role": Column(found["role"], "role")}
+        | {a: Column(found[a], f"{a} [{unit}]", places[a], True) for a in "XYZ"}
+        | {f"s{a}": Column(found[f"s{a}"], f"σ{a} [{unit}]") for a in "XYZ"}
+        | {
+            "rays": Column(found["rays"], "rays"),
+            "rms": Column(found["rms"], f"RMS v [{adjustment.image_unit}]"),
+            "near": Column((~adjustment.problem.at_any_distance).astype(int)),
+        }
+        | _covariance(adjustment.point_covariance)
+    )
+
+
+def _covariance(matrices) -> Columns:
+    return {f"c{i}{j}": Column(matrices[:, i, j]) for i, j in UPPER}
+
+
+def far_points(adjustment) -> Columns:
+    """Directions of the points at any distance."""
+    found = adjustment.table("far_points")
+    network = adjustment.network
+    labels = {
+        "id": "point", "uX": "uX", "uY": "uY", "uZ": "uZ", "su": f"σ [{network.angle_unit}]",
+        "distance": f"distance [{clean(network.object_unit)}]", "nearer": "from", "farther": "to",
+        "at_infinity": "at infinity",
+    }  # fmt: skip
+    directions = ("uX", "uY", "uZ")
+    return {
+        name: Column(column, labels[name], 6 if name in directions else -3)
+        for name, column in found.items()
+    }
+
+
+def checks(adjustment) -> Columns:
+    """Check points: intersected, minus given, σ."""
+    found, unit = adjustment.table("checks"), clean(adjustment.network.object_unit)
+    if not found:
+        return {}
+    places = {axis: column_decimals(found[f"s{axis}"]) for axis in "XYZ"}
+    return (
+        {"id": Column(found["id"], "point")}
+        | {a: Column(found[a], f"{a} [{unit}]", places[a], True) for a in "XYZ"}
+        | {f"d{a}": Column(found[f"d{a}"], f"d{a} [{unit}]") for a in "XYZ"}
+        | {f"s{a}": Column(found[f"s{a}"], f"σ{a} [{unit}]") for a in "XYZ"}
+        | {"rays": Column(found["rays"], "rays")}
+    )
+
+
+def observations(adjustment) -> Columns:
+    """All observations, of very many those with the largest |τ|; `measured` of image points."""
+    found = adjustment.residuals | {"measured": measured_coordinates(adjustment)}
+    chosen = choose_largest(found["tau"], MOST_ROWS)
+    labels = {
+        "kind": "kind", "image": "image", "point": "point", "axis": "axis", "measured": "measured",
+        "v": "v", "sigma": "σ a priori", "r": "r", "w": "w", "tau": "τ", "mdb": "MDB (σ a priori)",
+        "external": "ext.", "weight": "weight",
+    }  # fmt: skip
+    places = {"r": 3, "tau": 2, "w": 2, "measured": 4}
+    return {
+        name: Column(found[name][chosen], label, places.get(name, -3))
+        for name, label in labels.items()
+        if name in found
+    }
+
+
+def measured_coordinates(adjustment) -> np.ndarray:
+    """By row of the table of residuals, the measured image coordinate; NaN for other kinds."""
+    data, kind = adjustment.problem.data, adjustment.residuals["kind"]
+    measured = np.full(len(kind), np.nan)
+    used = np.asarray(data.image_weight) > 0
+    measured[kind == "image"] = np.asarray(data.image_xy)[used]
+    return measured
+
+
+def choose_largest(tau: np.ndarray, most: int) -> np.ndarray:
+    """The rows with the largest |τ|, at most so many, in their order."""
+    if len(tau) <= most:
+        return np.arange(len(tau))
+    return np.sort(np.argpartition(-np.abs(np.nan_to_num(tau)), most)[:most])
+
+
+def blunders(adjustment) -> Columns:
+    """What data snooping removed, in this order, and what a robust estimate suspects."""
+    rows = [("removed", r.kind, r.name, r.test, 0.0) for r in adjustment.removed]
+    rows += [("suspect", s.kind, s.name, s.test, s.weight) for s in adjustment.suspects]
+    if not rows:
+        return {}
+    state, kind, name, test, weight = zip(*rows)
+    words: Mapping[str, tuple] = {"state": state, "kind": kind, "observation": name}
+    return {
+        name: Column(np.array(values, dtype=object), name) for name, values in words.items()
+    } | {"test": Column(numbers(test), "test"), "weight": Column(numbers(weight), "weight")}
