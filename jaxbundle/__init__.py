@@ -43,6 +43,10 @@ if TYPE_CHECKING:
     from jaxbundle.network.arrays import Values as Values
     from jaxbundle.network.build import make_network as make_network
     from jaxbundle.network.check import check_network as check_network
+    from jaxbundle.network_design.aims import Aim as Aim
+    from jaxbundle.network_design.conditions import Conditions as Conditions
+    from jaxbundle.network_design.design import design as design
+    from jaxbundle.network_design.result import Design as Design
     from jaxbundle.orientation.network import Oriented as Oriented
     from jaxbundle.planning.simulate import simulate as simulate
     from jaxbundle.planning.simulate import simulate_with_truth as simulate_with_truth
@@ -75,6 +79,10 @@ _HOME = {
     "jaxbundle.network.arrays": ("Data", "Values"),
     "jaxbundle.network.build": ("make_network",),
     "jaxbundle.network.check": ("check_network",),
+    "jaxbundle.network_design.aims": ("Aim",),
+    "jaxbundle.network_design.conditions": ("Conditions",),
+    "jaxbundle.network_design.design": ("design",),
+    "jaxbundle.network_design.result": ("Design",),
     "jaxbundle.planning.simulate": ("simulate", "simulate_with_truth"),
     "jaxbundle.planning.simulate_further": ("simulate_further",),
     "jaxbundle.planning.stations": (
@@ -104,4 +112,4 @@ def __dir__() -> list[str]:
     return sorted(set(globals()) | set(__all__))
 
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

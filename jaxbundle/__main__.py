@@ -21,18 +21,21 @@ def main() -> None:
     handle_interrupts()
     gc.set_threshold(*SELDOM)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from jaxbundle.system.configuration import keep_programs
-
-    keep_programs()
-    _tell_once_of_damage()
     from jaxbundle.cli import main
 
     try:
-        main()
+        main(_keep_programs)
     except SystemExit as ended:
         set_status(ended.code if isinstance(ended.code, int) else int(bool(ended.code)))
         raise
     set_status(0)
+
+
+def _keep_programs() -> None:
+    from jaxbundle.system.configuration import keep_programs
+
+    keep_programs()
+    _tell_once_of_damage()
 
 
 def _tell_once_of_damage() -> None:

@@ -6,18 +6,9 @@ from typing import Annotated
 import typer
 
 import jaxbundle
-from jaxbundle import report
-from jaxbundle.adjustment.problem import REDUCTIONS
-from jaxbundle.bundle.result import Adjustment
-from jaxbundle.cli.app import Control, Force, Format, Input, Quiet, Settings, app
-from jaxbundle.cli.outputs import check_targets, write_targets
-from jaxbundle.cli.processes import check_sameness, join_processes
-from jaxbundle.cli.progress import iterating
+from jaxbundle.choices import ESTIMATORS, METHODS, REDUCTIONS, TESTS
+from jaxbundle.cli.app import Control, Force, Format, Input, Quiet, Settings, app, choice
 from jaxbundle.errors import InputError, NotSolvedError
-from jaxbundle.io import read_network
-from jaxbundle.io.writing.fingerprints import of_input
-from jaxbundle.leastsquares.snooping import check_test
-from jaxbundle.network.columns import some
 
 
 @app.command()
@@ -25,24 +16,18 @@ def adjust(
     input: Input,
     json: Annotated[str, typer.Option(help="write the result as JSON; - for stdout alone")] = "",
     out: Annotated[Path | None, typer.Option(help="folder for report, JSON, tables, plots")] = None,
+    html: Annotated[str, typer.Option(help="write the result as one page of HTML")] = "",
     force: Force = False,
     set: Settings = None,
     format: Format = None,
     control: Control = None,
     max_iterations: Annotated[int, typer.Option(min=1)] = 100,
-    method: Annotated[
-        str, typer.Option(help="levenberg-marquardt or gauss-newton")
-    ] = "levenberg-marquardt",
+    method: Annotated[str, choice(METHODS)] = "levenberg-marquardt",
     reduction: Annotated[
-        str | None,
-        typer.Option(help="of the reduced system: dense, banded or iterative; chosen if not given"),
+        str | None, choice(REDUCTIONS, "of the reduced system, chosen if not given")
     ] = None,
-    robust: Annotated[
-        str | None, typer.Option(help="robust estimation: huber, cauchy or tukey")
-    ] = None,
-    snooping: Annotated[
-        str | None, typer.Option(help="remove blunders by the test of pope or baarda")
-    ] = None,
+    robust: Annotated[str | None, choice(ESTIMATORS, "robust estimation")] = None,
+    snooping: Annotated[str | None, choice(TESTS, "remove blunders by a test")] = None,
     significance: Annotated[
         float, typer.Option(
             help="level of data snooping: of the largest (pope), of one (baarda); and of the "
@@ -73,6 +58,15 @@ def adjust(
     ] = False,
 ) -> None:
     """Adjust a network and report it."""
+    from jaxbundle import report
+    from jaxbundle.cli.outputs import check_targets, trace_origin, why_not, write_targets
+    from jaxbundle.cli.processes import check_sameness, join_processes
+    from jaxbundle.cli.progress import iterating
+    from jaxbundle.io import read_network
+    from jaxbundle.io.writing.fingerprints import of_input
+    from jaxbundle.leastsquares.snooping import check_test
+    from jaxbundle.report.page import UNKNOWN
+
     jaxbundle.use_cores(cores)
     if join or cluster:
         if join and cluster:
@@ -86,14 +80,17 @@ def adjust(
             reduction, robust, snooping, significance, eliminate, components,
         )  # fmt: skip
         if not first:
-            json, out, quiet = "", None, True
+            json, out, html, quiet = "", None, "", True
     network = read_network(input, format, tuple(set or ()), control)
-    if method not in ("levenberg-marquardt", "gauss-newton"):
-        raise InputError(f"--method {method!r}: levenberg-marquardt or gauss-newton")
-    if reduction not in (None, *REDUCTIONS):
-        raise InputError(f"--reduction {reduction!r}: {', '.join(REDUCTIONS)}")
     check_test(snooping, significance, "--")
-    check_targets(input, network, json, out, control, force)
+    check_targets(input, network, json, out, control, force, html)
+    origin = UNKNOWN
+    if html or out is not None:
+        origin = trace_origin(input, network, control, {
+            "--set": ", ".join(set or ()), "--max-iterations": max_iterations, "--robust": robust,
+            "--snooping": snooping, "--significance": significance, "--eliminate": eliminate,
+            "--components": components,
+        })  # fmt: skip
     try:
         with iterating(quiet or json == "-") as tell:
             result = jaxbundle.adjust(
@@ -109,27 +106,12 @@ def adjust(
                 progress=tell,
             )
     except NotSolvedError as error:
-        write_targets(error, json, out, brief, plots, force)
+        write_targets(error, json, out, brief, plots, force, html, origin)
         raise
-    write_targets(result, json, out, brief, plots, force)
+    write_targets(result, json, out, brief, plots, force, html, origin)
     if json != "-" and not quiet and result.converged:
         print(report.text(result))
         for doubt in result.doubts:
             print(f"warning: {doubt}")
     if not result.converged:
-        raise NotSolvedError(_why_not(result))
-
-
-def _why_not(result: Adjustment) -> str:
-    parts = [f"not solved: {result.termination}"]
-    if result.undetermined:
-        parts.append(f"not determined: {some(result.undetermined, 12, str)}")
-        parts.append("fix them, give them a prior σ, or measure what determines them")
-        parts += result.findings
-    elif result.findings or result.weakness.lines:
-        parts += [*result.findings, *result.weakness.lines]
-    elif "limit" in result.termination:
-        parts.append("raise --max-iterations or give better start values")
-    else:
-        parts.append("give better start values and look for gross errors")
-    return "; ".join(parts)
+        raise NotSolvedError(why_not(result))

@@ -3,10 +3,13 @@
 import os
 import sys
 import traceback
+from collections.abc import Callable, Iterable
+from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
+from typer.core import TyperCommand
 
 import jaxbundle
 from jaxbundle.errors import InputError, NotSolvedError
@@ -16,10 +19,47 @@ BAD_INPUT, NOT_SOLVED = 2, 3
 NO_READER = 128 + 13
 """As of a Unix tool whose reader has gone: ended by SIGPIPE, number 13."""
 
-app = typer.Typer(
+
+
+class Command(TyperCommand):
+    """A command that starts JAX when its arguments are understood: an error in them, and help, do
+    not wait for that."""
+
+    def invoke(self, ctx):
+        if ctx.obj is not None:
+            ctx.obj()
+        jaxbundle.enable_x64()
+        return super().invoke(ctx)
+
+    def get_short_help_str(self, limit: int = 0) -> str:
+        """The first sentence, whole, for the list of commands."""
+        return super().get_short_help_str(1000)
+
+
+class Application(typer.Typer):
+    """Commands of this kind; without one, their list. Help is plain text: rich would take as long
+    to import as all the rest."""
+
+    def __init__(self, help: str, **options: Any):
+        super().__init__(
+            help=help, short_help=help, rich_markup_mode=None, invoke_without_command=True,
+            callback=_list_commands, **options,
+        )  # fmt: skip
+
+    def command(self, name: str | None = None, **options: Any):
+        """As of typer."""
+        return super().command(name, cls=Command, **options)
+
+
+def _list_commands(context: typer.Context) -> None:
+    if context.invoked_subcommand is None:
+        print(context.get_help())
+        raise typer.Exit(BAD_INPUT)
+
+
+app = Application(
     name="jaxbundle",
     help="Least squares for photogrammetry: self-calibrating bundle adjustment.",
-    invoke_without_command=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
@@ -37,6 +77,21 @@ Force = Annotated[
 Quiet = Annotated[bool, typer.Option("--quiet", help="print nothing but errors")]
 
 
+def choice(words: Iterable[str], about: str = "") -> Any:
+    """An option that is one of some words; another is refused with the closest of them."""
+    words = tuple(words)
+    listed = ", ".join(words)
+
+    def check(option: typer.CallbackParam, value: str | None) -> str | None:
+        if value is not None and value not in words:
+            close = get_close_matches(value, words, 1)
+            mean = f"; did you mean {close[0]!r}?" if close else ""
+            raise InputError(f"{option.opts[0]} {value!r}: one of {listed} is expected{mean}")
+        return value
+
+    return typer.Option(help=f"{about}: {listed}" if about else listed, callback=check)
+
+
 def _version(asked: bool) -> None:
     if asked:
         print(f"jaxbundle {jaxbundle.__version__}")
@@ -51,16 +106,13 @@ def _main(
     ] = False,
 ) -> None:
     """Every command has its own help: jaxbundle adjust --help."""
-    if context.invoked_subcommand is None:
-        print(context.get_help())
-        raise typer.Exit(BAD_INPUT)
-    jaxbundle.enable_x64()
+    _list_commands(context)
 
 
-def run() -> None:
+def run(prepare: Callable[[], object] | None = None) -> None:
     """Run the application; errors of the input, the solution, the machine end in one line."""
     try:
-        status = app(standalone_mode=False)
+        status = app(standalone_mode=False, obj=prepare)
         sys.stdout.flush()
     except (InputError, NotSolvedError) as error:
         _end(error, BAD_INPUT if isinstance(error, InputError) else NOT_SOLVED)

@@ -5,12 +5,7 @@ from typing import Annotated
 import typer
 
 import jaxbundle
-from jaxbundle.arguments import one_of
-from jaxbundle.batch.run import run_batch
-from jaxbundle.batch.snooping import TESTS
-from jaxbundle.batch.stacks import is_camera_stack
-from jaxbundle.cli.app import Quiet, app
-from jaxbundle.cli.progress import counting
+from jaxbundle.cli.app import Quiet, app, choice
 from jaxbundle.system.interrupts import advise
 
 
@@ -21,9 +16,7 @@ def batch(
     model: Annotated[str, typer.Option(help="camera model of the .npz files")] = "opencv",
     free: Annotated[str, typer.Option(help="parameters to estimate: fx,fy,…")] = "",
     max_iterations: Annotated[int, typer.Option(min=1)] = 100,
-    snooping: Annotated[
-        str, typer.Option(help="removal of gross errors: pope, or none")
-    ] = "none",
+    snooping: Annotated[str, choice(("pope", "none"), "removal of gross errors")] = "none",
     significance: Annotated[float, typer.Option(help="level of the test")] = 0.001,
     portion: Annotated[int, typer.Option(min=1, help="cameras between two writes")] = 256,
     brief: Annotated[bool, typer.Option("--brief", help="no poses, no covariances")] = False,
@@ -41,7 +34,10 @@ def batch(
     Exit status: 0 every input has its line, whatever its status; 2 bad input,
     or another run is writing the file; 130, 143 interrupted.
     """
-    one_of("--snooping", snooping, ("none", *TESTS))
+    from jaxbundle.batch.run import run_batch
+    from jaxbundle.batch.stacks import is_camera_stack
+    from jaxbundle.cli.progress import counting
+
     if not all(map(is_camera_stack, inputs)):
         # Cameras fill the cores by threads of their own, and gain nothing.
         jaxbundle.use_cores()

@@ -6,27 +6,20 @@ from typing import Annotated
 
 import typer
 
-from jaxbundle.cli.app import app
-from jaxbundle.cli.outputs import check_json
+from jaxbundle.choices import CLOUD_FILES, CUBE_POINTS
+from jaxbundle.cli.app import app, choice
 from jaxbundle.errors import InputError
-from jaxbundle.io.results.result_json import without_nan
-from jaxbundle.io.text.csv_tables import write_text
-from jaxbundle.surface.accuracy import accuracy_of, to_plane
-from jaxbundle.surface.compare import compare
-from jaxbundle.surface.dsm import make_dsm, write_dsm
-from jaxbundle.surface.filtering import PLACES, drop_lonely, drop_weak, thin
-from jaxbundle.surface.point_files import KINDS, read_cloud, write_cloud
 
 
 @app.command()
 def cloud(
     file: Annotated[Path, typer.Argument(help="cloud: .csv with X,Y,Z, .ply, .las, .laz")],
     out: Annotated[
-        Path | None, typer.Option(help=f"file for the cloud: {', '.join(KINDS)}")
+        Path | None, typer.Option(help=f"file for the cloud: {', '.join(CLOUD_FILES)}")
     ] = None,
     cube: Annotated[float | None, typer.Option(help="side of cubes, a point of each")] = None,
     least: Annotated[int, typer.Option(min=1, help="points a cube must have")] = 1,
-    place: Annotated[str, typer.Option(help=f"the point of a cube: {', '.join(PLACES)}")] = "mean",
+    place: Annotated[str, choice(CUBE_POINTS, "the point of a cube")] = "mean",
     max_sigma: Annotated[float | None, typer.Option(help="greatest σ on any axis")] = None,
     min_rays: Annotated[int | None, typer.Option(min=1, help="rays a point must have")] = None,
     statistical: Annotated[
@@ -35,15 +28,27 @@ def cloud(
     dsm: Annotated[Path | None, typer.Option(help="GeoTIFF for a DSM; needs --size")] = None,
     size: Annotated[float | None, typer.Option(help="cells of the DSM")] = None,
     against: Annotated[Path | None, typer.Option(help="another cloud to compare with")] = None,
+    check: Annotated[
+        Path | None, typer.Option(help="points X,Y,Z (.csv) whose heights are compared")
+    ] = None,
     plane: Annotated[bool, typer.Option("--plane", help="RMS to the best plane")] = False,
     json: Annotated[str, typer.Option(help="figures as JSON; - for standard output")] = "",
 ) -> None:  # fmt: skip
     """Filter, thin and convert a cloud of points; compare two; accuracy and DSM."""
+    from jaxbundle.cli.outputs import check_json
+    from jaxbundle.io.results.result_json import without_nan
+    from jaxbundle.io.text.csv_tables import write_text
+    from jaxbundle.surface.accuracy import accuracy_of, at_check_points, to_plane
+    from jaxbundle.surface.compare import compare
+    from jaxbundle.surface.dsm import make_dsm, write_dsm
+    from jaxbundle.surface.filtering import drop_lonely, drop_weak, thin
+    from jaxbundle.surface.point_files import read_cloud, write_cloud
+
     check_json(json)
     if (dsm is None) != (size is None):
         raise InputError("--dsm and --size: give both")
-    if out is not None and out.suffix.lower() not in KINDS:
-        raise InputError(f"--out {out}: one of {', '.join(KINDS)} is expected")
+    if out is not None and out.suffix.lower() not in CLOUD_FILES:
+        raise InputError(f"--out {out}: one of {', '.join(CLOUD_FILES)} is expected")
     for option, path in (("--out", out), ("--dsm", dsm)):
         if path is not None and path.resolve() in (file.resolve(), against and against.resolve()):
             raise InputError(f"{option} {path} is part of the input and would be overwritten")
@@ -57,6 +62,8 @@ def cloud(
     report = {"points_read": len(given), "points": len(found), "accuracy": accuracy_of(found)}
     if plane:
         report["plane"] = to_plane(found.X)
+    if check is not None:
+        report["check_points"] = at_check_points(found, read_cloud(check).X)
     if other is not None:
         report["comparison"] = compare(found, other)
     if dsm is not None and size is not None:
@@ -70,6 +77,6 @@ def cloud(
     if json:
         write_text(Path(json), text)
     print(f"{len(given)} points read, {len(found)} kept")
-    for name in ("plane", "comparison"):
+    for name in ("plane", "check_points", "comparison"):
         for key, value in report.get(name, {}).items():
             print(f"{name} {key:20} {value}")

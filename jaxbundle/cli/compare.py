@@ -5,17 +5,10 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
-from jaxbundle.cameras import get_model
-from jaxbundle.cameras.compare import compare_cameras, difference_rings
 from jaxbundle.cli.app import app
-from jaxbundle.cli.cameras_given import calibration_given, pair, write_png
 from jaxbundle.errors import InputError
-from jaxbundle.io.networks.assemble import all_parameters
-from jaxbundle.io.text.csv_tables import write_csv
-from jaxbundle.statistics.difference import expected_difference
 
 RINGS = 10
 
@@ -35,6 +28,15 @@ def compare(
     plot: Annotated[Path | None, typer.Option(help="PNG file for the map")] = None,
 ) -> None:
     """Compare two calibrations: parameters, and how far images are apart over the image."""
+    import numpy as np
+
+    from jaxbundle.cameras import get_model
+    from jaxbundle.cameras.compare import compare_cameras, difference_rings
+    from jaxbundle.cli.cameras_given import calibration_given, pair, write_png
+    from jaxbundle.io.networks.assemble import all_parameters
+    from jaxbundle.io.text.csv_tables import write_csv
+    from jaxbundle.statistics.difference import expected_difference
+
     (first, C_first), (second, C_second) = calibration_given(a), calibration_given(b)
     sizes = [list(c.image_size) for c in (first, second) if c.image_size is not None]
     if len(sizes) == 2 and sizes[0] != sizes[1]:

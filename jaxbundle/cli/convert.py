@@ -7,9 +7,7 @@ from typing import Annotated
 import typer
 
 from jaxbundle.cli.app import Control, Format, Input, Quiet, Settings, app
-from jaxbundle.cli.cameras_given import pair
 from jaxbundle.errors import InputError
-from jaxbundle.io.exchange import convert as convert_file
 
 
 @app.command()
@@ -35,6 +33,9 @@ def convert(
     quiet: Quiet = False,
 ) -> None:
     """Write any input in another format: project, COLMAP, BAL, Bundler, OpenCV, PLY, DXF, CSV."""
+    from jaxbundle.cli.cameras_given import pair
+    from jaxbundle.io.exchange import convert as convert_file
+
     overrides = tuple(set or ())
     size = pair("--image-size", image_size)
     if size is not None and not all(number.is_integer() for number in size):

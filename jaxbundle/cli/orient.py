@@ -7,10 +7,6 @@ import typer
 
 import jaxbundle
 from jaxbundle.cli.app import Control, Force, Format, Input, Quiet, Settings, app
-from jaxbundle.cli.outputs import network_files
-from jaxbundle.io import read_network, write_project
-from jaxbundle.io.networks.project import FILES
-from jaxbundle.io.writing.folders import check_folder
 
 
 @app.command()
@@ -26,6 +22,11 @@ def orient(
     quiet: Quiet = False,
 ) -> None:
     """Find the start values of images and points; what cannot be placed is named, with why."""
+    from jaxbundle.cli.outputs import network_files
+    from jaxbundle.io import read_network, write_project
+    from jaxbundle.io.networks.project import FILES
+    from jaxbundle.io.writing.folders import check_folder
+
     network = read_network(input, format, tuple(set or ()), control)
     if out is not None:
         check_folder(out, "orient", FILES, network_files(input, network, control), force)

@@ -20,15 +20,18 @@ from jaxbundle.io.networks.project import FILES as NETWORK_FILES
 from jaxbundle.io.results.result_json import result_text, unsolved_text
 from jaxbundle.io.results.result_project import adjusted_network
 from jaxbundle.io.text.csv_tables import table_rows, write_csv, write_text
+from jaxbundle.io.writing.fingerprints import input_files
 from jaxbundle.io.writing.folders import check_folder, replaced_folder
+from jaxbundle.network.columns import some
 from jaxbundle.network.tables import Network
 from jaxbundle.plotting.files import FIGURES, draw_figures
 from jaxbundle.plotting.style import need_matplotlib
+from jaxbundle.report.page import UNKNOWN, Origin, compose, compose_failure, fingerprint_files
 
-REPORT, RESULT = "report.txt", "result.json"
+REPORT, PAGE, RESULT = "report.txt", "report.html", "result.json"
 TABLES = ("cameras", "images", "points", "residuals", "checks", "far_points")
 FILES = (
-    REPORT, RESULT, *(f"{name}.csv" for name in TABLES),
+    REPORT, PAGE, RESULT, *(f"{name}.csv" for name in TABLES),
     *(f"{ADJUSTED}/{name}" for name in NETWORK_FILES), *FIGURES,
 )  # fmt: skip
 """What is written into a folder, figures as patterns."""
@@ -37,6 +40,9 @@ NOTHING: Mapping = MappingProxyType({})
 
 JSON = re.compile(rb'\s*(\{\s*["}]|\[[\s\[]*([]{"\d-]|true|false|null))')
 """How JSON begins; a table of TOML, `[project]`, does not."""
+HTML = re.compile(rb"\s*<(!doctype\s+html|html)\b", re.IGNORECASE)
+"""How a page begins."""
+OR_FORCE = ", or --force to replace it"
 
 
 def network_files(
@@ -46,6 +52,15 @@ def network_files(
     tables = (network.images, network.points, network.observations, network.distances)
     files = (input, input / FILE_NAME, *(table.source.name for table in tables))
     return files if control is None else (*files, control)
+
+
+def trace_origin(
+    input: Path, network: Network, control: Path | None, settings: Mapping[str, object]
+) -> Origin:
+    """The fingerprints of the files a network was read from, and the settings that were chosen."""
+    files = (*input_files(input), *network_files(input, network, control))
+    chosen = {name: value for name, value in settings.items() if value not in (None, False, "")}
+    return Origin(fingerprint_files(files), chosen)
 
 
 def check_writable(
@@ -61,23 +76,28 @@ def check_writable(
     inputs = tuple(inputs)
     if out is not None:
         check_folder(out, by, names, inputs, force)
-    if json in ("", "-"):
+    _check_file("--json", json, out, inputs)
+    if not force:
+        check_json(json, OR_FORCE)
+
+
+def _check_file(option: str, file: str, out: Path | None, inputs: Iterable[str | Path]) -> None:
+    """Refuse the file of an option that cannot be written, or would replace one of the inputs."""
+    if file in ("", "-"):
         return
-    path = Path(json)
+    path = Path(file)
     real = Path(os.path.realpath(path))
     if path.is_dir():
-        raise InputError(f"--json {json}: is a folder; give the name of a file")
+        raise InputError(f"{option} {file}: is a folder; give the name of a file")
     if out is not None and Path(os.path.realpath(out)).is_relative_to(real):
-        raise InputError(f"--json {json}: is to be the folder of --out; give the name of a file")
-    if name_inside(json, out) is None:
+        raise InputError(f"{option} {file}: is to be the folder of --out; give the name of a file")
+    if name_inside(file, out) is None:
         if not os.path.isdir(path.parent):
-            raise InputError(f"--json {json}: there is no folder {path.parent}")
+            raise InputError(f"{option} {file}: there is no folder {path.parent}")
         if not os.access(path.parent, os.W_OK | os.X_OK):
-            raise InputError(f"--json {json}: cannot be written: no permission in {path.parent}")
-    if any(str(real) == os.path.realpath(file) for file in inputs):
+            raise InputError(f"{option} {file}: cannot be written: no permission in {path.parent}")
+    if any(str(real) == os.path.realpath(given) for given in inputs):
         raise InputError(f"{path} is part of the input and would be overwritten; give another")
-    if not force:
-        check_json(json, ", or --force to replace it")
 
 
 def check_json(json: str, way: str = "") -> None:
@@ -85,31 +105,44 @@ def check_json(json: str, way: str = "") -> None:
 
     `way`: what else than to give another name the command offers, for the message.
     """
-    path = Path(json)
-    if json in ("", "-") or not path.is_file():
+    _check_content("--json", json, JSON, "JSON", way)
+
+
+def _check_content(option: str, file: str, like: re.Pattern[bytes], noun: str, way: str) -> None:
+    """Refuse to replace a file that neither is empty nor begins as the new one will."""
+    path = Path(file)
+    if file in ("", "-") or not path.is_file():
         return
     try:
-        with path.open("rb") as file:
-            head = file.read(4096)
+        with path.open("rb") as stream:
+            head = stream.read(4096)
     except OSError as error:
-        raise InputError(f"--json {json}: cannot be read: {error.strerror}") from None
-    if head and not JSON.match(head):
-        raise InputError(f"--json {json}: exists and is not JSON; give another name{way}")
+        raise InputError(f"{option} {file}: cannot be read: {error.strerror}") from None
+    if head and not like.match(head):
+        raise InputError(f"{option} {file}: exists and is not {noun}; give another name{way}")
 
 
 def check_targets(
     input: Path, network: Network, json: str, out: Path | None, control: Path | None = None,
-    force: bool = False,
+    force: bool = False, html: str = "",
 ) -> None:  # fmt: skip
     """Check what `adjust` is to write, before it is computed (`check_writable`)."""
-    check_writable(json, out, "adjust", FILES, network_files(input, network, control), force)
+    inputs = network_files(input, network, control)
+    check_writable(json, out, "adjust", FILES, inputs, force)
+    if html == "-":
+        raise InputError("--html -: a page goes into a file; give the name of one")
+    if html and json and os.path.realpath(html) == os.path.realpath(json):
+        raise InputError(f"--html {html}: is the file of --json as well; give another name")
+    _check_file("--html", html, out, inputs)
+    if not force:
+        _check_content("--html", html, HTML, "HTML", OR_FORCE)
 
 
-def name_inside(json: str, out: Path | None) -> str | None:
-    """The name of a JSON file directly in the folder of --out, which it then belongs to."""
-    if json in ("", "-") or out is None:
+def name_inside(file: str, out: Path | None) -> str | None:
+    """The name of a file directly in the folder of --out, which it then belongs to."""
+    if file in ("", "-") or out is None:
         return None
-    path = Path(json)
+    path = Path(file)
     return path.name if os.path.realpath(path.parent) == os.path.realpath(out) else None
 
 
@@ -139,9 +172,9 @@ def written(
 
 def write_targets(
     result: Adjustment | NotSolvedError, json: str, out: Path | None, brief: bool, plots: bool,
-    force: bool = False,
+    force: bool = False, html: str = "", origin: Origin = UNKNOWN,
 ) -> None:  # fmt: skip
-    """Write JSON (`-`: on standard output) and folder of a result, or of why there is none."""
+    """Write JSON (`-`: on standard output), page and folder of a result, or why there is none."""
     solved = isinstance(result, Adjustment)
 
     def text(brief: bool) -> str | Iterable[str]:
@@ -149,15 +182,24 @@ def write_targets(
             return result_text(result, brief)
         return unsolved_text(result)
 
+    def page() -> Iterable[str]:
+        if isinstance(result, Adjustment):
+            return compose(result, origin)
+        return compose_failure(result, origin)
+
     plots = plots and out is not None and solved and result.converged and can_plot()
     with written(json, text(brief), out, "adjust", FILES, force) as new:
-        if new is None:
-            return
-        if isinstance(result, Adjustment):
-            fill_results(result, new, plots)
-        else:
-            write_text(new / REPORT, f"{result}\n")
-            write_text(new / RESULT, text(False))
+        if new is not None:
+            if isinstance(result, Adjustment):
+                fill_results(result, new, plots)
+            else:
+                write_text(new / REPORT, f"{result}\n")
+                write_text(new / RESULT, text(False))
+            write_text(new / PAGE, page())
+            if (name := name_inside(html, out)) not in (None, PAGE):
+                write_text(new / name, page())
+    if html and name_inside(html, out) is None:
+        write_text(Path(html), page())
 
 
 def fill_results(
@@ -173,6 +215,22 @@ def fill_results(
         fill_project(adjusted_network(result), folder / ADJUSTED)
     if plots:
         draw_figures(result, folder)
+
+
+def why_not(result: Adjustment) -> str:
+    """Why an adjustment has not converged, and what to do."""
+    parts = [f"not solved: {result.termination}"]
+    if result.undetermined:
+        parts.append(f"not determined: {some(result.undetermined, 12, str)}")
+        parts.append("fix them, give them a prior σ, or measure what determines them")
+        parts += result.findings
+    elif result.findings or result.weakness.lines:
+        parts += [*result.findings, *result.weakness.lines]
+    elif "limit" in result.termination:
+        parts.append("raise --max-iterations or give better start values")
+    else:
+        parts.append("give better start values and look for gross errors")
+    return "; ".join(parts)
 
 
 def can_plot() -> bool:

@@ -3,20 +3,10 @@
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
-from jaxbundle.cameras.field_of_view import angle_class, equivalent_35mm, field_of_view
 from jaxbundle.cli.app import Force, app
-from jaxbundle.cli.cameras_given import pair
 from jaxbundle.errors import InputError
-from jaxbundle.io import write_project
-from jaxbundle.io.networks.project import FILES
-from jaxbundle.io.writing.folders import check_folder
-from jaxbundle.network.tables import Camera
-from jaxbundle.planning.planned_block import planned_network
-from jaxbundle.planning.vertical_photographs import design_block, relief_displacement
-from jaxbundle.statistics.expected import expected_precision
 
 MOST_PHOTOGRAPHS = 2000
 
@@ -42,6 +32,17 @@ def plan(
     force: Force = False,
 ) -> None:
     """Design a block of vertical photographs: strips, photographs, and expected precision."""
+    import numpy as np
+
+    from jaxbundle.cameras.field_of_view import angle_class, equivalent_35mm, field_of_view
+    from jaxbundle.io import write_project
+    from jaxbundle.io.networks.project import FILES
+    from jaxbundle.io.writing.folders import check_folder
+    from jaxbundle.network.tables import Camera
+    from jaxbundle.planning.planned_block import planned_network
+    from jaxbundle.planning.vertical_photographs import design_block, relief_displacement
+    from jaxbundle.statistics.expected import expected_precision
+
     if out is not None:
         check_folder(out, "plan", FILES, force=force)
     image_format, extent = _needed("--image", image), _needed("--area", area)
@@ -89,6 +90,8 @@ def plan(
 
 
 def _needed(option: str, text: str) -> tuple[float, float]:
+    from jaxbundle.cli.cameras_given import pair
+
     found = pair(option, text)
     if found is None:
         raise InputError(f"{option}: two numbers A,B are expected")

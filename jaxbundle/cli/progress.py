@@ -1,5 +1,6 @@
 """What long work shows on a terminal; nothing in a pipe."""
 
+from jax import monitoring
 from rich.console import Console
 from rich.progress import (
     MofNCompleteColumn,
@@ -19,6 +20,12 @@ def counting(quiet: bool) -> Progress:
     )
 
 
+BEGUN = "/jax/compilation_cache/compile_requests_use_cache"
+MADE = "/jax/core/compile/backend_compile_duration"
+"""What JAX tells of a program: it begins to read a kept one, or to compile it, as it then finds; it
+has it."""
+
+
 class iterating:
     """A line with the iteration and vᵀPv; as a context gives what adjustment tells, or None."""
 
@@ -34,13 +41,27 @@ class iterating:
             console=self.console, transient=True,
         )  # fmt: skip
         self.bar.start()
-        task = self.bar.add_task("compiling")
-        return lambda step, cost, damping: self.bar.update(
-            task, description=f"iteration {int(step)}: vᵀPv {2 * float(cost):.6g}"
-        )
+        self.line = "starting"
+        self.task = self.bar.add_task(self.line)
+        monitoring.register_event_listener(self._hear)
+        monitoring.register_event_duration_secs_listener(self._hear)
+        return self.tell
+
+    def tell(self, step, cost, damping) -> None:
+        """Show the iteration."""
+        self.line = f"iteration {int(step)}: vᵀPv {2 * float(cost):.6g}"
+        self.bar.update(self.task, description=self.line)
+
+    def _hear(self, event: str, *_, **__) -> None:
+        if event == BEGUN:
+            self.bar.update(self.task, description="preparing programs, compiled once for a size")
+        elif event == MADE:
+            self.bar.update(self.task, description=self.line)
 
     def __exit__(self, *_):
         if not self.silent:
+            monitoring.unregister_event_listener(self._hear)
+            monitoring.unregister_event_duration_listener(self._hear)
             self.bar.stop()
 
 

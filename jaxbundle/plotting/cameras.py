@@ -39,12 +39,8 @@ def distortion_curve(adjustment, camera: str, ax=None):
     """
     ax = axes(ax, (6.5, 4.2))
     adjustment.camera_parameters(camera)  # refuses what is not there
-    low, high, known_frame = image_frame(adjustment, camera)
-    measured, reach = farthest_measurement(adjustment, camera), 0.0
-    if known_frame:
-        centre = principal_point(adjustment, camera)
-        reach = float(np.hypot(*np.maximum(high - centre, centre - low)))
-    found = distortion_profile(adjustment, camera, reach=max(measured, reach))
+    measured, reach = curve_reach(adjustment, camera)
+    found = distortion_profile(adjustment, camera, reach=reach)
     scale, unit = micrometres(found.unit)
     for value, sigma, colour, name in (
         (found.radial, found.radial_sigma, BLUE, "symmetric radial"),
@@ -72,6 +68,17 @@ def distortion_curve(adjustment, camera: str, ax=None):
     title(ax, f"Camera {camera}: distortion ({model})", band)
     legend(ax)
     return ax
+
+
+def curve_reach(adjustment, camera: str) -> tuple[float, float]:
+    """Radii of the farthest measurement of a camera and, where the size of the image is known, of
+    its farthest corner, if that is farther; in the unit of the model."""
+    low, high, known = image_frame(adjustment, camera)
+    measured = farthest_measurement(adjustment, camera)
+    if not known:
+        return measured, measured
+    centre = principal_point(adjustment, camera)
+    return measured, max(measured, float(np.hypot(*np.maximum(high - centre, centre - low))))
 
 
 def correlation_matrix(adjustment, camera: str | None = None, ax=None):

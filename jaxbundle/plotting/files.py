@@ -3,7 +3,7 @@
 import io
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from jaxbundle.io.text.csv_tables import write_bytes
 from jaxbundle.io.writing.folders import replaced_folder
 from jaxbundle.plotting.cameras import correlation_matrix, distortion_curve
 from jaxbundle.plotting.images import residual_histogram, residual_vectors
+from jaxbundle.plotting.matches import Pairs, match_graph, overlap_matrix, tracks_in_photograph
 from jaxbundle.plotting.style import need_matplotlib
 from jaxbundle.plotting.views import network_perspective, network_plan
 
@@ -24,7 +25,9 @@ PHOTOGRAPH = re.compile(r"\.(jpe?g|png|tiff?|bmp|webp|pgm|ppm|jp2)$", re.IGNOREC
 """The end of an id that is the name of a photograph; a figure has its own."""
 FIGURES = ("plan.png", "perspective.png", "histogram.png",
            "residuals_*.png", "distortion_*.png", "correlations_*.png")  # fmt: skip
-"""Patterns of the names of all files written here."""
+"""Patterns of the names of the figures of a result."""
+PAIRS, TRACKS = ("match_graph.png", "overlap.png"), "tracks_*.png"
+"""Those of the pairs of photographs, and of the tracks in them."""
 
 
 def save_figures(adjustment, folder: str | Path, force: bool = False) -> list[Path]:
@@ -56,7 +59,7 @@ def draw_figures(adjustment, folder: Path) -> list[Path]:
         "perspective": ((7.5, 6.5), "3d", network_perspective, ()),
         "histogram": ((6.5, 4.2), None, residual_histogram, ()),
     }
-    names = _Names(drawings)
+    names = FigureNames(drawings)
     for image in table["id"][np.sort(worst)]:
         drawings[names("residuals", image)] = ((7, 6), None, residual_vectors, (image,))
     for camera, entry in list(adjustment.cameras.items())[:MOST_CAMERAS]:
@@ -71,6 +74,33 @@ def draw_figures(adjustment, folder: Path) -> list[Path]:
         name: (size, projection, partial(draw, adjustment, *arguments))
         for name, (size, projection, draw, arguments) in drawings.items()
     })
+
+
+def draw_pairs(
+    names: Sequence[str], pairs: Pairs, alone: Sequence[str], folder: Path
+) -> list[Path]:
+    """Write the match graph and the overlap of photographs; arguments as of `match_graph`."""
+    graph, overlap = (Path(name).stem for name in PAIRS)
+    return write_figures(folder, {
+        graph: ((7, 7), None, partial(match_graph, names, pairs, alone)),
+        overlap: ((7, 6), None, partial(overlap_matrix, names, pairs)),
+    })  # fmt: skip
+
+
+def draw_tracks(adjustment, read: Callable[[str], np.ndarray], folder: Path) -> list[Path]:
+    """Write the tracks of at most 12 photographs, evenly chosen.
+
+    **Arguments:** `read(image)`: its grey values, of any size.
+    """
+    images = adjustment.network.images.id
+    chosen = np.unique(np.linspace(0, len(images) - 1, min(len(images), MOST_IMAGES)).astype(int))
+    names = FigureNames(())
+    return write_figures(folder, {
+        names("tracks", images[k]): (
+            (8, 6), None,
+            lambda ax, id=images[k]: tracks_in_photograph(adjustment, id, read(id), ax),
+        ) for k in chosen
+    })  # fmt: skip
 
 
 def write_figures(folder: str | Path, drawings: Mapping[str, tuple]) -> list[Path]:
@@ -111,7 +141,7 @@ def png(size, projection, draw) -> bytes:
     return data.getvalue()
 
 
-class _Names:
+class FigureNames:
     """File names from ids: letters, digits, dot, dash and underscore; each once, in any case."""
 
     def __init__(self, taken):

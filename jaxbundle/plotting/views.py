@@ -47,7 +47,7 @@ def network_plan(adjustment, ax=None):
 
     points, centres = _points(adjustment), adjustment.image_values[:, :3]
     _, size = extent(np.concatenate([points["xyz"], centres]))
-    pyramids = camera_pyramids(adjustment, _pyramid_size(centres, size))
+    pyramids = camera_pyramids(adjustment, pyramid_size(centres, size))
     lines = LineCollection(
         list(_pyramid_lines(pyramids)[:, :, :2]), colors=GREY, linewidths=0.6, zorder=2
     )
@@ -92,7 +92,7 @@ def network_perspective(adjustment, ax=None):
 
     points, centres = _points(adjustment), adjustment.image_values[:, :3]
     _, size = extent(np.concatenate([points["xyz"], centres]))
-    pyramids = camera_pyramids(adjustment, _pyramid_size(centres, size))
+    pyramids = camera_pyramids(adjustment, pyramid_size(centres, size))
     faces = Poly3DCollection(pyramids[:, 1:], facecolors=BLUE, alpha=0.12, edgecolors="none")
     ax.add_collection3d(faces)
     ax.add_collection3d(Line3DCollection(_pyramid_lines(pyramids), colors=GREY, linewidths=0.7))
@@ -168,7 +168,7 @@ def _pyramid_lines(pyramids):
     return pyramids[:, np.array(ends)].reshape(-1, 2, 3)
 
 
-def _pyramid_size(centres, size: float) -> float:
+def pyramid_size(centres, size: float) -> float:
     """Large enough to be seen, small enough to leave neighbours apart."""
     return float(np.clip(0.9 * _neighbour(centres), 0.045 * size, 0.15 * size))
 
@@ -217,18 +217,27 @@ def error_ellipses(adjustment, factor: float, corners: int = 49) -> np.ndarray:
     return adjustment.point_values[there, None, :2] + factor * (shape @ circle).transpose(0, 2, 1)
 
 
+def ellipse_factor(adjustment, size: float) -> tuple[int, float]:
+    """How many points have an error ellipse of X and Y, and the factor by which these are drawn in
+    a network of this size, to be seen and compared."""
+    covariance = adjustment.point_covariance[:, :2, :2]
+    there = ~adjustment.problem.at_any_distance
+    large = np.sqrt(np.trace(covariance, axis1=1, axis2=2))[there]
+    large = large[np.isfinite(large) & (large > 0)]
+    if not len(large):
+        return 0, 1.0
+    neighbour = _neighbour(adjustment.point_values[there, :2])
+    reach = np.clip(0.45 * neighbour, 0.012 * size, 0.03 * size)
+    return len(large), round_number(reach / np.median(large))
+
+
 def _draw_ellipses(adjustment, ax, size: float) -> np.ndarray:
     """Draw the error ellipses, in a size that can be seen and compared; what was drawn."""
     from matplotlib.collections import LineCollection
 
-    covariance = adjustment.point_covariance[:, :2, :2]
-    large = np.sqrt(np.trace(covariance, axis1=1, axis2=2))[~adjustment.problem.at_any_distance]
-    large = large[np.isfinite(large) & (large > 0)]
-    if not len(large) or len(large) > ELLIPSES:
+    number, factor = ellipse_factor(adjustment, size)
+    if not 0 < number <= ELLIPSES:
         return np.zeros((0, 1, 2))
-    neighbour = _neighbour(adjustment.point_values[~adjustment.problem.at_any_distance, :2])
-    reach = np.clip(0.45 * neighbour, 0.012 * size, 0.03 * size)
-    factor = round_number(reach / np.median(large))
     polygons = error_ellipses(adjustment, factor)
     ellipses = LineCollection(
         list(polygons), colors=BLUE, linewidths=0.8, alpha=0.8, zorder=3,

@@ -53,6 +53,17 @@ def is_plain(path: str | Path) -> bool:
     return os.path.isfile(path)
 
 
+def beginning(path: str | Path, length: int) -> bytes:
+    """The first bytes of a plain file; none of what is no such file, or cannot be read."""
+    if not is_plain(path):
+        return b""
+    try:
+        with open(path, "rb") as file:
+            return file.read(length)
+    except OSError:
+        return b""
+
+
 def read_content(path: str | Path, text: bool = True) -> bytes:
     """The bytes of a file; with `text` a zero byte ends the reading with an error.
 

@@ -1,5 +1,6 @@
 """The command line as a person meets it: exit status, one line of error, nothing half-written."""
 
+import hashlib
 import json
 import shutil
 import subprocess
@@ -11,7 +12,7 @@ import pytest
 
 import jaxbundle
 from jaxbundle.__main__ import _tell_once_of_damage as tell_once_of_damage
-from jaxbundle.cli import convert
+from jaxbundle.io import exchange
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "convergent4"
@@ -39,7 +40,8 @@ def edit(path: Path, old: str, new: str):
 @pytest.mark.slow
 def test_adjust_writes_everything(command, tmp_path):
     out, file = tmp_path / "out", tmp_path / "result.json"
-    done = command("adjust", EXAMPLE / "project.toml", "--json", file, "--out", out)
+    page = tmp_path / "page.html"
+    done = command("adjust", EXAMPLE / "project.toml", "--json", file, "--out", out, "--html", page)
     assert done.status == 0, done.err
     assert done.err == ""
     result = json.loads(file.read_text())
@@ -54,11 +56,14 @@ def test_adjust_writes_everything(command, tmp_path):
     assert len(result["residuals"]) == 80
     assert sum(row["r"] for row in result["residuals"]) == pytest.approx(23, abs=1e-6)
     written = {p.name for p in out.iterdir()}
-    expected = {"report.txt", "result.json", "cameras.csv", "images.csv", "points.csv",
-                "residuals.csv", "plan.png", "histogram.png"}  # fmt: skip
+    expected = {"report.txt", "report.html", "result.json", "cameras.csv", "images.csv",
+                "points.csv", "residuals.csv", "plan.png", "histogram.png"}  # fmt: skip
     assert expected <= written
     assert {name for name in written if name.startswith(".")} == {".jaxbundle"}
     assert (out / "report.txt").read_text().strip() in done.out
+    assert page.read_bytes() == (out / "report.html").read_bytes()
+    for given in ("project.toml", "images.csv", "points.csv", "observations.csv"):
+        assert hashlib.sha256((EXAMPLE / given).read_bytes()).hexdigest() in page.read_text()
 
 
 @pytest.mark.slow
@@ -152,7 +157,7 @@ def test_what_nobody_thought_of_ends_in_one_line(command, error, status, monkeyp
     def fail(*_):
         raise error
 
-    monkeypatch.setattr(convert, "convert_file", fail)
+    monkeypatch.setattr(exchange, "convert", fail)
     done = command("convert", EXAMPLE, "nowhere")
     lines = done.err.splitlines()
     assert done.status == status and len(lines) == 1 and lines[0].startswith("jaxbundle: ")
@@ -162,18 +167,18 @@ def test_compiled_programs_are_kept_and_damaged_ones_told_at_most_once(tmp_path,
     programs, file = tmp_path / "programs", tmp_path / "file"
     file.write_text("")
 
-    def told(folder, code="from jaxbundle.__main__ import main; main()"):
+    def told(folder, code="from jaxbundle.__main__ import _keep_programs; _keep_programs()"):
         monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(folder))
         code = (
-            f"import contextlib, jax, jaxbundle\nwith contextlib.suppress(SystemExit): {code}\n"
+            f"import jax, jaxbundle\n{code}; jaxbundle.enable_x64()\n"
             "jax.jit(lambda x: x + 1)(1.0); jax.jit(lambda x: x + 2)(1.0)"
         )
-        command = [sys.executable, "-W", "default", "-c", code, "convert", "--help"]
+        command = [sys.executable, "-W", "default", "-c", code]
         return subprocess.run(command, capture_output=True, text=True, check=True).stderr
 
     monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     kept = f"not jaxbundle.keep_programs({str(file)!r}) and jaxbundle.keep_programs()"
-    assert told(programs, f"jaxbundle.enable_x64(); assert {kept}") == ""
+    assert told(programs, f"assert {kept}") == ""
     damaged = list(programs.glob("*-cache"))
     for program in damaged:
         program.write_bytes(b"damaged")

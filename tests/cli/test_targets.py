@@ -8,7 +8,7 @@ import pytest
 
 import jaxbundle
 from jaxbundle.cli.outputs import check_targets, write_targets
-from jaxbundle.cli.pushbroom.app import keep_inputs
+from jaxbundle.cli.pushbroom.shared import keep_inputs
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.text.csv_tables import write_text
 from jaxbundle.io.writing.folders import MARKER
@@ -77,18 +77,18 @@ def test_folders_to_be_made_are_fine(network, tmp_path):
     check_targets(EXAMPLE, network, "-", out)
     assert names(tmp_path) == set()
     write_targets(REASON, str(out / "r.json"), out, brief=False, plots=False)
-    assert names(out) == {"report.txt", "result.json", "r.json"}
+    assert names(out) == {"report.txt", "report.html", "result.json", "r.json"}
 
 
 def test_no_file_of_an_earlier_result_stays(convergent4, tmp_path):
     out = tmp_path / "out"
     write_targets(convergent4, str(out / "r.json"), out, brief=False, plots=False)
     first = names(out)
-    assert {"report.txt", "result.json", "r.json", "points.csv", "network"} < first
+    assert {"report.txt", "report.html", "r.json", "points.csv", "network"} < first
     for mine in ("notes.txt", "network/residuals.txt"):
         (out / mine).write_text("mine")
     write_targets(REASON, "", out, brief=False, plots=False)
-    assert names(out) == {"report.txt", "result.json", "notes.txt", "network"}
+    assert names(out) == {"report.txt", "report.html", "result.json", "notes.txt", "network"}
     assert names(out / "network") == {"residuals.txt"}
     assert (out / "report.txt").read_text() == "not solved: too few images\n"
 

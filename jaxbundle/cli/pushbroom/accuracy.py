@@ -1,33 +1,14 @@
 """`jaxbundle pushbroom accuracy`: what errors of the ancillary data do on the ground."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
-import numpy as np
 import typer
 
-from jaxbundle.cli.pushbroom.accuracy_table import table_of, write_table
-from jaxbundle.cli.pushbroom.app import (
-    Csv,
-    Dem,
-    Geoid,
-    Json,
-    Level,
-    ScannerFile,
-    keep_inputs,
-    open_scanner,
-    pushbroom,
-    surface_of,
-    write_rows,
-)
-from jaxbundle.cli.pushbroom.locate import places
+from jaxbundle.choices import ATTITUDE_ERRORS, AttitudeError
+from jaxbundle.cli.app import choice
+from jaxbundle.cli.pushbroom.app import Csv, Dem, Geoid, Json, Level, ScannerFile, pushbroom
 from jaxbundle.errors import InputError
-from jaxbundle.io.rasters.error_maps import write_image_raster
-from jaxbundle.plotting import image_map
-from jaxbundle.plotting.files import write_figures
-from jaxbundle.pushbroom.accuracy import drawn, ground_errors, propagated
-from jaxbundle.pushbroom.noise import Noise
-from jaxbundle.pushbroom.terrain import Terrain
 
 Sigma = Annotated[float, typer.Option(min=0, help="standard deviation: degrees, metres, a second")]
 
@@ -48,8 +29,8 @@ def accuracy(
     seed: int = 0,
     grid: Annotated[str, typer.Option(help="LINESxPIXELS places over the image")] = "11x11",
     table: Annotated[
-        str, typer.Option(help="bias or white: the table of a flight file, given as SCANNER")
-    ] = "",
+        str | None, choice(ATTITUDE_ERRORS, "the table of a flight file, given as SCANNER")
+    ] = None,
     levels: Annotated[str, typer.Option(help="accuracies of that table, degrees")] = "0.01,0.1",
     map_: Annotated[
         Path | None,
@@ -62,6 +43,15 @@ def accuracy(
     json: Json = "",
 ) -> None:
     """RMS and CE90 on the ground of errors with given σ; or the errors against a known truth."""
+    import numpy as np
+
+    from jaxbundle.cli.pushbroom.accuracy_table import table_of, write_table
+    from jaxbundle.cli.pushbroom.places import places
+    from jaxbundle.cli.pushbroom.shared import keep_inputs, open_scanner, surface_of, write_rows
+    from jaxbundle.pushbroom.accuracy import drawn, ground_errors, propagated
+    from jaxbundle.pushbroom.noise import Noise
+    from jaxbundle.pushbroom.terrain import Terrain
+
     keep_inputs([scanner, truth, dem], csv=csv, json=json, map=map_)
     if 0 < draws < FEWEST_DRAWS:
         raise InputError(
@@ -73,7 +63,8 @@ def accuracy(
     if table:
         if dem is not None:
             raise InputError("--dem: with --table give --height; a terrain has no reverse mode")
-        write_table(table_of(scanner, table, levels, draws, seed, height), csv, json)
+        kind = cast(AttitudeError, table)
+        write_table(table_of(scanner, kind, levels, draws, seed, height), csv, json)
         return
     file = open_scanner(scanner)
     surface = surface_of(file.earth, height, dem, file.image, geoid)
@@ -111,7 +102,7 @@ def accuracy(
         typer.echo("; ".join(f"{k} {v:.6g}" for k, v in head.items()), err=True)
 
 
-def _check_map(path: Path, table: str) -> None:
+def _check_map(path: Path, table: str | None) -> None:
     if table:
         raise InputError("--map: a map is of one image; leave --table away")
     if path.suffix.lower() not in (".tif", ".tiff", ".png"):
@@ -120,8 +111,14 @@ def _check_map(path: Path, table: str) -> None:
         raise InputError(f"--map {path}: there is no folder {path.parent}")
 
 
-def _write_map(path: Path, columns: dict[str, np.ndarray], head: dict) -> None:
+def _write_map(path: Path, columns: dict, head: dict) -> None:
     """All columns as bands; or the RMS, or the error, as a figure."""
+    import numpy as np
+
+    from jaxbundle.io.rasters.error_maps import write_image_raster
+    from jaxbundle.plotting import image_map
+    from jaxbundle.plotting.files import write_figures
+
     lines, pixels = (np.unique(columns[name]) for name in ("line", "pixel"))
     bands = {
         f"{name} [m]": values.reshape(len(lines), len(pixels))

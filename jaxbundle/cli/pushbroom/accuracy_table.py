@@ -4,21 +4,19 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxbundle.cli.pushbroom.app import surface_of, write_rows
+from jaxbundle.choices import AttitudeError
+from jaxbundle.cli.pushbroom.shared import surface_of, write_rows
 from jaxbundle.errors import InputError
 from jaxbundle.io.scanner.flight import read_flight
 from jaxbundle.pushbroom.study import TRAJECTORIES, AccuracyTable, accuracy_table
 
-KINDS = ("bias", "white")
 WAYS = ("drawn", "propagated", "closed")
 
 
 def table_of(
-    path: Path, kind: str, levels: str, draws: int, seed: int, height: float | None
+    path: Path, kind: AttitudeError, levels: str, draws: int, seed: int, height: float | None
 ) -> AccuracyTable:
     """The table of a flight file, the levels as `0.01,0.1` in degrees."""
-    if kind not in KINDS:
-        raise InputError(f"--table {kind!r}: one of {', '.join(KINDS)} is expected")
     try:
         sigmas = [float(level) for level in levels.split(",")]
         if not min(sigmas) > 0:

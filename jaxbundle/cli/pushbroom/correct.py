@@ -1,30 +1,14 @@
 """`jaxbundle pushbroom correct`: the image as a map."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
 import typer
 
-from jaxbundle.cli.app import Quiet
-from jaxbundle.cli.progress import counting
-from jaxbundle.cli.pushbroom.app import (
-    Dem,
-    Geoid,
-    Level,
-    ScannerFile,
-    keep_inputs,
-    open_scanner,
-    pushbroom,
-    resampling_of,
-    surface_of,
-)
+from jaxbundle.choices import RESAMPLINGS, Resampling
+from jaxbundle.cli.app import Quiet, choice
+from jaxbundle.cli.pushbroom.app import Dem, Geoid, Level, ScannerFile, pushbroom
 from jaxbundle.errors import InputError
-from jaxbundle.io.rasters.correction import map_of, write_corrected
-from jaxbundle.io.rasters.error_maps import write_error_map
-from jaxbundle.io.rasters.maps import MapSystem
-from jaxbundle.io.scanner.scanner import Scanner
-from jaxbundle.pushbroom.image import PushbroomImage
-from jaxbundle.pushbroom.project import make_search
 
 
 @pushbroom.command()
@@ -39,7 +23,7 @@ def correct(
     height: Level = None,
     dem: Dem = None,
     geoid: Geoid = None,
-    resampling: Annotated[str, typer.Option(help="nearest, bilinear, cubic")] = "bilinear",
+    resampling: Annotated[str, choice(RESAMPLINGS)] = "bilinear",
     occlusion: Annotated[
         bool, typer.Option("--occlusion", help="leave out what other terrain of --dem hides")
     ] = False,
@@ -52,8 +36,15 @@ def correct(
     quiet: Quiet = False,
 ) -> None:
     """Correct an image to a map, in blocks."""
+    from jaxbundle.cli.progress import counting
+    from jaxbundle.cli.pushbroom.shared import keep_inputs, open_scanner, surface_of
+    from jaxbundle.io.rasters.correction import map_of, write_corrected
+    from jaxbundle.io.rasters.error_maps import write_error_map
+    from jaxbundle.io.rasters.maps import MapSystem
+    from jaxbundle.pushbroom.project import make_search
+
     keep_inputs([scanner, image, dem, truth], out=out, error_map=error_map)
-    kind = resampling_of(resampling)
+    kind = cast(Resampling, resampling)
     if spacing is not None and not spacing > 0:
         raise InputError(f"--spacing {spacing:g}: a positive number is expected")
     if (truth is None) != (error_map is None):
@@ -102,8 +93,10 @@ def _check_target(option: str, path: Path, image: Path) -> None:
         raise InputError(f"{option} {path} is the image itself; give another name")
 
 
-def _truth(path: Path, file: Scanner) -> PushbroomImage:
-    """The true image, which must be one of the same scene."""
+def _truth(path: Path, file):
+    """The true image, which must be one of the scene of a scanner file."""
+    from jaxbundle.cli.pushbroom.shared import open_scanner
+
     truth = open_scanner(path)
     if truth.earth != file.earth:
         raise InputError(f"--truth {path}: its earth is not that of the scanner file")

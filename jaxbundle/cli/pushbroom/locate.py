@@ -1,39 +1,14 @@
 """`jaxbundle pushbroom locate`: from the image to the ground."""
 
-import dataclasses
 from pathlib import Path
 from typing import Annotated
 
-import jax
-import numpy as np
 import typer
 
-from jaxbundle.cli.pushbroom.app import (
-    Csv,
-    Dem,
-    Geoid,
-    Json,
-    Level,
-    ScannerFile,
-    keep_inputs,
-    open_scanner,
-    pushbroom,
-    surface_of,
-    warn,
-    write_rows,
-)
+from jaxbundle.cli.pushbroom.app import Csv, Dem, Geoid, Json, Level, ScannerFile, pushbroom
 from jaxbundle.errors import InputError
-from jaxbundle.geometry.ellipsoid import geodetic
-from jaxbundle.io.text.csv_tables import read_csv
-from jaxbundle.network.tables import Source
-from jaxbundle.pushbroom.image import PushbroomImage
-from jaxbundle.pushbroom.locate import locate_points
-from jaxbundle.pushbroom.terrain import Terrain
 
-OFF = "off the image"
 OVER = "found beyond a place without height"
-TOLD = ("id", "X", "Y", "Z", "longitude", "latitude", "height", "count", "status")
-"""What `locate` and `project` write beside line and pixel: their tables are taken as they are."""
 
 
 @pushbroom.command()
@@ -50,11 +25,28 @@ def locate(
     json: Json = "",
 ) -> None:
     """Where on the ground places of the image are; (0, 0) is the centre of the first pixel."""
+    import dataclasses
+
+    import jax
+    import numpy as np
+
+    from jaxbundle.cli.pushbroom.places import OFF, off_image, places
+    from jaxbundle.cli.pushbroom.shared import (
+        keep_inputs,
+        open_scanner,
+        surface_of,
+        warn,
+        write_rows,
+    )
+    from jaxbundle.geometry.ellipsoid import geodetic
+    from jaxbundle.pushbroom.locate import locate_points
+    from jaxbundle.pushbroom.terrain import Terrain
+
     keep_inputs([scanner, points, dem, geoid], csv=csv, json=json)
     file = open_scanner(scanner)
     surface = surface_of(file.earth, height, dem, file.image, geoid)
     ids, line, pixel, source = places(file.image, points, grid)
-    off = _off(file.image, line, pixel, source)
+    off = off_image(file.image, line, pixel, source)
     find = jax.jit(locate_points)
     X = np.array(find(file.image, surface, line, pixel))
     X[:, off] = np.nan
@@ -85,43 +77,3 @@ def locate(
         columns |= {"height": h}
     columns["status"] = np.select([off, missed, over], [OFF, reason, OVER], "found").tolist()
     write_rows(columns, csv, json, {"scanner": file.name})
-
-
-def places(image: PushbroomImage, points: Path | None, grid: str):
-    """Ids, lines, pixels and their source: of a table, or a grid over the image."""
-    if points is None:
-        try:
-            rows, columns = (int(n) for n in grid.lower().split("x"))
-            if min(rows, columns) < 1:
-                raise ValueError
-        except ValueError:
-            raise InputError(f"--grid {grid!r}: two numbers are expected, such as 11x11") from None
-        lines = np.repeat(np.linspace(0, image.lines - 1, rows), columns)
-        pixels = np.tile(np.linspace(0, image.pixels - 1, columns), rows)
-        return (), lines, pixels, Source("grid", None, "place")
-    table = read_csv(points)
-    table.check_names(("line", "pixel"), TOLD)
-    line, pixel = (table.numbers(name, required=True) for name in ("line", "pixel"))
-    ids = table.ids("id") if "id" in table.values else ()
-    return ids, line, pixel, table.source
-
-
-def _off(image: PushbroomImage, line: np.ndarray, pixel: np.ndarray, source: Source) -> np.ndarray:
-    """Which places are off the image; told, and refused if all are."""
-    off = np.zeros(len(line), bool)
-    said = None
-    for name, values, size in (("line", line, image.lines), ("pixel", pixel, image.pixels)):
-        outside = ~((values >= -0.5) & (values <= size - 0.5))
-        if outside.any() and said is None:
-            row = int(outside.argmax())
-            said = (
-                f"{source(row)}: {name} {values[row]:g} is {OFF}, which has {size}; -0.5 to "
-                f"{size - 0.5:g} is expected"
-            )
-        off |= outside
-    if said is not None:
-        said += f" ({off.sum()} of {len(off)} points)"
-        if off.all():
-            raise InputError(said)
-        warn(said)
-    return off

@@ -3,32 +3,13 @@
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
-from jaxbundle.cli.pushbroom.app import (
-    Csv,
-    Json,
-    ScannerFile,
-    check_spheroid,
-    geographic,
-    keep_inputs,
-    open_scanner,
-    pushbroom,
-    warn,
-    write_rows,
-)
+from jaxbundle.cli.pushbroom.app import Csv, Json, ScannerFile, pushbroom
 from jaxbundle.errors import InputError
-from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed
-from jaxbundle.io.text.csv_tables import read_csv
-from jaxbundle.network.columns import Columns, did_you_mean
-from jaxbundle.pushbroom.project import Status, make_search, project_points
 
 MOST = 4
 """So many lines that see one point are told."""
-CARTESIAN, GEOGRAPHIC = ("X", "Y", "Z"), ("longitude", "latitude", "height")
-TOLD = ("id", "line", "pixel", "count", "status")
-"""What `locate` and `project` write beside the point: their tables are taken as they are."""
 
 
 @pushbroom.command()
@@ -41,10 +22,17 @@ def project(
     json: Json = "",
 ) -> None:
     """Where in the image points of the ground are: a row for every line that sees one."""
+    import numpy as np
+
+    from jaxbundle.cli.pushbroom.ground_points import points_of, with_points
+    from jaxbundle.cli.pushbroom.shared import keep_inputs, open_scanner, warn, write_rows
+    from jaxbundle.io.text.csv_tables import read_csv
+    from jaxbundle.pushbroom.project import Status, make_search, project_points
+
     keep_inputs([scanner, points], csv=csv, json=json)
     file = open_scanner(scanner)
-    table = _with_points(read_csv(points))
-    X = _points(table, file.earth)
+    table = with_points(read_csv(points))
+    X = points_of(table, file.earth)
     found = project_points(file.image, make_search(file.image, file.earth), X, most=MOST)
     line, pixel = np.asarray(found.line), np.asarray(found.pixel)
     status, count = np.asarray(found.status), np.asarray(found.count)
@@ -69,37 +57,3 @@ def project(
         "pixel": pixel[solution, point], "count": count[point],
         "status": [Status(int(status[p])).meaning for p in point],
     }, csv, json, {"scanner": file.name})  # fmt: skip
-
-
-def _with_points(table: Columns) -> Columns:
-    """The rows that have a point: `locate` leaves those without one empty, and says why."""
-    if "status" not in table.values:
-        return table
-    given = [name for name in (*CARTESIAN, *GEOGRAPHIC) if name in table.values]
-    empty = np.all([np.isnan(table.numbers(name)) for name in given], axis=0)
-    if not np.any(empty):
-        return table
-    warn(f"{table.source(int(empty.argmax()))}: no point ({empty.sum()} rows are left out)")
-    kept = np.flatnonzero(~empty).tolist()
-    values = {name: [column[row] for row in kept] for name, column in table.values.items()}
-    return Columns(values, table.source.take(kept))
-
-
-def _points(table: Columns, earth: Ellipsoid | None) -> np.ndarray:
-    """Points of a table, Earth-fixed or local; X, Y, Z where it has both."""
-    cartesian = "X" in table.values
-    if not cartesian and not any(name in table.values for name in GEOGRAPHIC[:2]):
-        expected = (*CARTESIAN, *GEOGRAPHIC)
-        odd = next((name for name in table.values if name not in TOLD), "")
-        raise InputError(
-            f"{table.source.name}: no columns {', '.join(CARTESIAN)} nor {', '.join(GEOGRAPHIC)}"
-            f"{did_you_mean(odd, expected, listing=False)}"
-        )
-    if cartesian:
-        table.check_names(CARTESIAN, (*GEOGRAPHIC, *TOLD))
-        return np.stack([table.numbers(n, required=True) for n in CARTESIAN])
-    if earth is None:
-        raise InputError(f"{table.source.name}: a local frame has no longitudes; give X, Y, Z")
-    check_spheroid(earth)
-    table.check_names(GEOGRAPHIC, TOLD)
-    return np.array(earth_fixed(earth, geographic(table)))

@@ -8,16 +8,7 @@ from typing import Annotated
 import typer
 
 from jaxbundle.cli.app import Force
-from jaxbundle.cli.outputs import REPORT, RESULT, check_writable, written
-from jaxbundle.cli.pushbroom.app import pushbroom, warn
-from jaxbundle.io.networks.project import FILES, fill_project
-from jaxbundle.io.results.result_json import without_nan
-from jaxbundle.io.scanner.refinement import read_refinement
-from jaxbundle.io.scanner.writing import names_of, write_scanner_image
-from jaxbundle.io.text.csv_tables import write_csv, write_text
-from jaxbundle.io.writing.fingerprints import files_read
-from jaxbundle.refinement import adjusted_photographs, point_rows, report, to_json
-from jaxbundle.refinement import refine as refine_images
+from jaxbundle.cli.pushbroom.app import pushbroom
 
 PHOTOGRAPHS = "photographs"
 
@@ -32,6 +23,17 @@ def refine(
     json: Annotated[str, typer.Option(help="write the result as JSON; - for stdout alone")] = "",
 ) -> None:
     """Refine attitude, position and optics of scanner images by points; report what they tell."""
+    from jaxbundle.cli.outputs import REPORT, RESULT, check_writable, written
+    from jaxbundle.cli.pushbroom.shared import warn
+    from jaxbundle.io.networks.project import FILES, fill_project
+    from jaxbundle.io.results.result_json import without_nan
+    from jaxbundle.io.scanner.refinement import read_refinement
+    from jaxbundle.io.scanner.writing import names_of, write_scanner_image
+    from jaxbundle.io.text.csv_tables import write_csv, write_text
+    from jaxbundle.io.writing.fingerprints import files_read
+    from jaxbundle.refinement import adjusted_photographs, point_rows, report, to_json
+    from jaxbundle.refinement import refine as refine_images
+
     file = read_refinement(input)
     names = [REPORT, RESULT, "points.csv", *(f"{PHOTOGRAPHS}/{name}" for name in FILES)]
     names += [name for one in file.images for name in names_of(one.id)]

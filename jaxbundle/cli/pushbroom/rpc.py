@@ -3,39 +3,18 @@
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
-from jaxbundle.cli.pushbroom.app import (
-    Csv,
-    Dem,
-    Geoid,
-    Json,
-    Level,
-    check_spheroid,
-    geographic,
-    keep_inputs,
-    open_scanner,
-    pushbroom,
-    surface_of,
-    warn,
-    write_rows,
-)
+from jaxbundle.choices import RPC_BIASES
+from jaxbundle.cli.app import Application, choice
+from jaxbundle.cli.pushbroom.app import Csv, Dem, Geoid, Json, Level, pushbroom
 from jaxbundle.errors import InputError, NotSolvedError
-from jaxbundle.geometry.ellipsoid import WGS84
-from jaxbundle.io.scanner.rpc import RASTERS, read_rpc, write_rpc
-from jaxbundle.io.text.csv_tables import read_csv
-from jaxbundle.network.columns import Columns
-from jaxbundle.pushbroom.rpc import RpcStatus, locate_points_on, project_points
-from jaxbundle.pushbroom.rpc_bias import compensated, fit_bias
-from jaxbundle.pushbroom.rpc_fit import RpcCheck, RpcTable, fit_image, fit_rpc
 
-rpc = typer.Typer(help="Rational polynomial coefficients (RPC00B).", no_args_is_help=True)
+rpc = Application(help="Rational polynomial coefficients (RPC00B).")
 pushbroom.add_typer(rpc, name="rpc")
 
 ENOUGH = 0.5
 """A fit that leaves more than this, in pixels, is not one to work with in silence."""
-COLUMNS = ("longitude", "latitude", "height", "line", "sample")
 GROUND_SIGMA = ("seast", "snorth", "sheight")
 TERMS = ("shift", "by_line", "by_sample")
 
@@ -64,10 +43,16 @@ def fit(
     json: Figures = "",
 ) -> None:
     """Fit coefficients to a scanner, or to a table; tell what they leave, in pixels."""
+    from jaxbundle.cli.pushbroom.rpc_tables import figures_of, heights_of, table_of, tell
+    from jaxbundle.cli.pushbroom.shared import check_spheroid, keep_inputs, open_scanner, warn
+    from jaxbundle.geometry.ellipsoid import WGS84
+    from jaxbundle.io.scanner.rpc import write_rpc
+    from jaxbundle.pushbroom.rpc_fit import fit_image, fit_rpc
+
     keep_inputs([source], out=out, json=json)
     head = {}
     if source.suffix.lower() == ".csv":
-        table, columns = _table(source)
+        table, columns = table_of(source)
         found = fit_rpc(table, ridge=ridge, source=columns.source)
     else:
         file = open_scanner(source)
@@ -76,8 +61,8 @@ def fit(
         check_spheroid(file.earth)
         if file.earth != WGS84:
             warn(f"{source}: the ellipsoid is not WGS84, which other programs will assume")
-        found, check = fit_image(file.image, file.earth, _heights(heights), ridge=ridge)
-        head = _told("check", check)
+        found, check = fit_image(file.image, file.earth, heights_of(heights), ridge=ridge)
+        head = figures_of("check", check)
     if not found.converged:
         raise NotSolvedError(
             f"{source}: the fit does not converge; give a larger --ridge than "
@@ -91,9 +76,9 @@ def fit(
             "jitters faster than a cubic over the image; cut it into shorter pieces, or use the "
             "rigorous model"
         )
-    head = {"points": len(found.check.residuals), **_told("fit", found.check), **head}
+    head = {"points": len(found.check.residuals), **figures_of("fit", found.check), **head}
     head |= {"ridge_line": found.ridge[0], "ridge_sample": found.ridge[1]}
-    _tell(head, json, found.check)
+    tell(head, json, found.check)
 
 
 @rpc.command()
@@ -110,6 +95,15 @@ def apply(
     json: Json = "",
 ) -> None:
     """Points of the ground to the image; places in the image to a surface."""
+    import numpy as np
+
+    from jaxbundle.cli.pushbroom.rpc_tables import COLUMNS
+    from jaxbundle.cli.pushbroom.shared import geographic, keep_inputs, surface_of, warn, write_rows
+    from jaxbundle.geometry.ellipsoid import WGS84
+    from jaxbundle.io.scanner.rpc import read_rpc
+    from jaxbundle.io.text.csv_tables import read_csv
+    from jaxbundle.pushbroom.rpc import RpcStatus, locate_points_on, project_points
+
     keep_inputs([coefficients, points, dem], csv=csv, json=json)
     given, table = read_rpc(coefficients), read_csv(points)
     ids = table.ids("id") if "id" in table.values else [str(k + 1) for k in range(len(table))]
@@ -147,17 +141,24 @@ def compensate(
         ),
     ],
     out: Out,
-    model: Annotated[str, typer.Option(help="shift or affine, in the image")] = "shift",
+    model: Annotated[str, choice(RPC_BIASES, "in the image")] = "shift",
     sigma: Annotated[float, typer.Option(help="σ of measured lines and samples, pixels")] = 1.0,
     csv: Csv = None,
     json: Figures = "",
 ) -> None:
     """Remove the bias that control points tell of; residuals, redundancy numbers and w of each."""
+    import numpy as np
+
+    from jaxbundle.cli.pushbroom.rpc_tables import figures_of, table_of
+    from jaxbundle.cli.pushbroom.shared import keep_inputs, write_rows
+    from jaxbundle.io.scanner.rpc import RASTERS, read_rpc, write_rpc
+    from jaxbundle.pushbroom.rpc_bias import compensated, fit_bias
+
     # the tags of a raster may be replaced in it
     keep_inputs([control], out=out, csv=csv, json=json)
     keep_inputs([coefficients], csv=csv, json=json, out=None if out.suffix in RASTERS else out)
     given = read_rpc(coefficients)
-    table, columns = _table(control, ("id", *GROUND_SIGMA))
+    table, columns = table_of(control, ("id", *GROUND_SIGMA))
     ground = None
     if any(name in columns.values for name in GROUND_SIGMA):
         ground = np.stack([columns.numbers(name, required=True) for name in GROUND_SIGMA], 1)
@@ -173,7 +174,7 @@ def compensate(
     sigmas = np.sqrt(np.diag(found.covariance)).tolist()
     head |= {f"s_{name}": s for name, s in zip(names, sigmas)}
     if left is not None:
-        head |= _told("refit", left)
+        head |= figures_of("refit", left)
     ids = columns.ids("id") if "id" in columns.values else [str(i + 1) for i in range(len(columns))]
     rows = {"id": ids}
     for i, axis in enumerate(("line", "sample")):
@@ -182,40 +183,3 @@ def compensate(
     write_rows(rows, csv, json, head)
     if json != "-":
         typer.echo("; ".join(f"{k} {v:.6g}" for k, v in head.items()), err=True)
-
-
-def _table(path: Path, optional: tuple[str, ...] = ()) -> tuple[RpcTable, Columns]:
-    columns = read_csv(path)
-    columns.check_names(COLUMNS, ("id", *optional))
-    measured = (columns.numbers(name, required=True) for name in COLUMNS[3:])
-    return RpcTable(*geographic(columns), *measured), columns
-
-
-def _heights(text: str) -> tuple[float, float]:
-    try:
-        low, high = (float(part) for part in text.split(":"))
-        if not low < high or not np.isfinite([low, high]).all():
-            raise ValueError
-    except ValueError:
-        raise InputError(
-            f"--heights {text!r}: two numbers, the lower first, are expected, such as 0:3000"
-        ) from None
-    return low, high
-
-
-def _told(name: str, check: RpcCheck) -> dict[str, float]:
-    axes = ("line", "sample")
-    told = {f"{name}_rms_{axis}": float(v) for axis, v in zip(axes, check.rms)}
-    return told | {f"{name}_largest_{axis}": float(v) for axis, v in zip(axes, check.largest)}
-
-
-def _tell(head: dict, json: str, check: RpcCheck) -> None:
-    """Figures as a table of name and value; as JSON with a row for every point fitted."""
-    head = {name: float(v) if isinstance(v, np.floating) else v for name, v in head.items()}
-    if json:
-        east, north, *rest = check.table
-        values = np.degrees(east), np.degrees(north), *rest, *check.residuals.T
-        write_rows(dict(zip((*COLUMNS, "v_line", "v_sample"), values)), None, json, head)
-    else:
-        for name, value in head.items():
-            print(f"{name:22} {value:.6g}")

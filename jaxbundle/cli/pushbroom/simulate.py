@@ -1,28 +1,13 @@
 """`jaxbundle pushbroom simulate`: a flight, its ancillary files, and the image it takes."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
-import jax.numpy as jnp
-import numpy as np
 import typer
 
-from jaxbundle.cli.app import Force, Quiet
-from jaxbundle.cli.progress import counting
-from jaxbundle.cli.pushbroom.app import (
-    Dem,
-    Geoid,
-    Level,
-    pushbroom,
-    resampling_of,
-    surface_of,
-)
-from jaxbundle.io.rasters.scenes import read_scene, write_taken
-from jaxbundle.io.scanner.flight import read_flight
-from jaxbundle.io.scanner.writing import names_of, write_scanner_image
-from jaxbundle.io.writing.fingerprints import files_read
-from jaxbundle.io.writing.folders import check_folder, replaced_folder
-from jaxbundle.pushbroom.simulate import measured_image, true_image
+from jaxbundle.choices import RESAMPLINGS, Resampling
+from jaxbundle.cli.app import Force, Quiet, choice
+from jaxbundle.cli.pushbroom.app import Dem, Geoid, Level, pushbroom
 
 COMMAND, NAME, IMAGE, TRUTH = "pushbroom simulate", "scanner", "image.tif", "truth"
 
@@ -36,11 +21,23 @@ def simulate(
     height: Level = None,
     dem: Dem = None,
     geoid: Geoid = None,
-    resampling: Annotated[str, typer.Option(help="nearest, bilinear, cubic")] = "cubic",
+    resampling: Annotated[str, choice(RESAMPLINGS)] = "cubic",
     quiet: Quiet = False,
 ) -> None:
     """Simulate a flight: what its instruments tell, the truth, and the image of a scene."""
-    kind = resampling_of(resampling)
+    import jax.numpy as jnp
+    import numpy as np
+
+    from jaxbundle.cli.progress import counting
+    from jaxbundle.cli.pushbroom.shared import surface_of
+    from jaxbundle.io.rasters.scenes import read_scene, write_taken
+    from jaxbundle.io.scanner.flight import read_flight
+    from jaxbundle.io.scanner.writing import names_of, write_scanner_image
+    from jaxbundle.io.writing.fingerprints import files_read
+    from jaxbundle.io.writing.folders import check_folder, replaced_folder
+    from jaxbundle.pushbroom.simulate import measured_image, true_image
+
+    kind = cast(Resampling, resampling)
     given = read_flight(flight)
     names = [IMAGE, *(f"{place}{n}" for place in ("", f"{TRUTH}/") for n in names_of(NAME, ""))]
     inputs = [path for path in (scene, dem, geoid) if path is not None]
