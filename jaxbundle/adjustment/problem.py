@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.arguments import one_of
+from jaxbundle.choices import REDUCTIONS
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.leastsquares import problem as engine
@@ -24,7 +25,6 @@ from jaxbundle.network.sightings import split_check_points
 from jaxbundle.network.tables import Network, require_network
 from jaxbundle.types import present
 
-REDUCTIONS = ("dense", "banded", "iterative")
 HELD = 1e-6
 """Of a datum's directions, the part of a motion that is none."""
 

@@ -2,9 +2,10 @@
 
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.arguments import one_of, shown
+from jaxbundle.choices import METHODS
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares import derivatives
-from jaxbundle.leastsquares.search import METHODS
+from jaxbundle.leastsquares.search import SEARCHES
 from jaxbundle.network.arrays import Data, Values
 
 
@@ -39,11 +40,11 @@ def solve(
     Gauss–Newton form.
     """
     check_given(problem, data)
-    one_of("method", method, tuple(METHODS))
+    one_of("method", method, METHODS)
     data = problem.data if data is None else data
     tables = derivatives.solve(
         problem.system, problem.layout.data(data), sensitivity=sensitivity,
-        max_iterations=max_iterations, atol=atol, search=METHODS[method],
+        max_iterations=max_iterations, atol=atol, search=SEARCHES[method],
     )  # fmt: skip
     return problem.layout.values(tables)
 

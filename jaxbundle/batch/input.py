@@ -219,6 +219,11 @@ def pixel_model(name: str | CameraModel) -> CameraModel:
         raise InputError(
             f"model {model.name!r} is in {model.unit}; a batch needs a camera in pixels"
         )
+    if model.prior:
+        raise InputError(
+            f"model {model.name!r} needs priors of its parameters, which a batch has not; "
+            "calibrate it by itself"
+        )
     return model
 
 

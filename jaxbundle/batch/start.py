@@ -31,6 +31,9 @@ THIN = 1e-7
 """An extent across below this fraction of that along is rounding: the points lie on the line."""
 ORDINARY = 1.2
 """Focal length, in lengths of the image, where the views determine none."""
+STEEPEST = -0.25
+"""−cos of the angle to the axis, 75°, beyond which the plane coordinates of a fisheye's points are
+so long that they alone would decide the pose."""
 FLIP = (1.0, -1.0, -1.0)
 
 
@@ -68,11 +71,11 @@ def start_values(model, flat, known, seen: Sightings, interior, size):
 
 def _ideal(model, known, seen: Sightings, interior):
     """Image points without distortion: directions if the camera is known, else pixels; and which
-    have a plane coordinate (those of a fisheye beyond 90° have none)."""
+    have a plane coordinate (those of a fisheye far to the side have none)."""
     u, v = seen.xy[..., 0], seen.xy[..., 1]
     if known:
         r, s, q = cameras.image_ray(model, tuple(interior), u, v)
-        front = q < -0.05
+        front = q < STEEPEST
         return *(jnp.where(front, c, 0.0) for c in (-r / q, s / q)), front
     x0, y0 = [interior[model.parameters.index(name)] for name in model.principal_point] or (0, 0)
     x, y = u - x0, v - y0

@@ -1,12 +1,14 @@
 """`adjust`: a network in, an `Adjustment` out."""
 
+import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
-from jaxbundle.adjustment.problem import REDUCTIONS, Problem, make_problem
+from jaxbundle.adjustment.problem import Problem, make_problem
 from jaxbundle.arguments import at_least_zero, one_of, shown, truth, whole
 from jaxbundle.bundle.far_points import minimise_at_any_distance, minimise_with_infinity
 from jaxbundle.bundle.minimum import (
@@ -20,10 +22,10 @@ from jaxbundle.bundle.minimum import (
 from jaxbundle.bundle.orient import orient, orient_again, screen
 from jaxbundle.bundle.repeated import eliminated_parameters, robustly, snooped, with_components
 from jaxbundle.bundle.result import Adjustment
+from jaxbundle.choices import ESTIMATORS, METHODS, REDUCTIONS
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.leastsquares.declarations import Observations, Table
-from jaxbundle.leastsquares.robust import ESTIMATORS
-from jaxbundle.leastsquares.search import METHODS
+from jaxbundle.leastsquares.search import SEARCHES
 from jaxbundle.leastsquares.snooping import check_test
 from jaxbundle.leastsquares.solver import Minimum
 from jaxbundle.leastsquares.stopping import converged
@@ -40,9 +42,12 @@ from jaxbundle.statistics.blunders import name_suspect
 from jaxbundle.statistics.check_points import intersect_check_points
 from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.statistics.misfit import doubt_of_robust
+from jaxbundle.types import present
 
 MISFIT = 5.0
 """A σ0 above this asks for its cause."""
+Begun = tuple[Problem, Minimum, tuple]
+"""A problem, where its iterations ended, check points and their image points."""
 UNNAMED = ("a combination of unknowns that spreads over many of them",)
 """What is not determined, where none stands out."""
 
@@ -103,75 +108,128 @@ def adjust(
         snooping=snooping, significance=significance, eliminate=eliminate, critical_t=critical_t,
         estimate_components=estimate_components, progress=progress,
     )  # fmt: skip
-    given, finding = require_network(network), ""
-    if lacks_start_values(given):
-        found = orient(given)
-        network, finding = _placed(found), found.finding
-    options = {"search": METHODS[method], "max_steps": max_iterations + 1, "progress": progress}
-    again = lambda problem, values: minimise_with_infinity(problem, values, **options)
+    given = require_network(network)
+    network, finding = _with_start_values(given)
+    options = {"search": SEARCHES[method], "max_steps": max_iterations + 1, "progress": progress}
+    first = _First(reduction, also, finding, options)
+    problem, minimum, check = first.find(given, network, outliers=bool(robust or snooping))
+    again = partial(minimise_with_infinity, **options)
+    found = _Found(problem.network, problem.with_factor(), minimum, method, problem.reduction)
+    if robust:
+        found.weight_robustly(again, robust, significance)
+    if found.inspection:
+        if snooping:
+            found.remove_blunders(again, snooping, significance, doubtful)
+        if estimate_components:
+            found.estimate_components(again)
+        if eliminate:
+            found.eliminate_parameters(again, critical_t)
+    return found.adjustment(check)
 
-    def begin(network, cameras: Mapping[str, Camera] = MappingProxyType({})):
-        network, points, rays = split_check_points(check_network(network))
-        make = partial(make_problem, network, reduction, also)
+
+@dataclasses.dataclass(frozen=True)
+class _First:
+    """How the first minimum is found; `finding`: what is said of start values that were found."""
+
+    reduction: str | None
+    also: Sequence[Table | Observations]
+    finding: str
+    options: Mapping[str, Any]
+
+    def find(self, given: Network, network: Network, outliers: bool) -> Begun:
+        """From start values of `network`, a part of `given`, in which there may be `outliers`."""
+        found = self._minimise(network)
+        while len(network.observations) < len(given.observations) and misjudged(*found[:2]):
+            # What the principal distance given made impossible may agree with the one found.
+            cameras, fewer = adjusted_cameras(found[0], found[1].values), network
+            network = orient_again(given, fewer, cameras)
+            if network is fewer:
+                break
+            found = self._minimise(network, cameras)
+        if outliers and not solved(found[0].with_factor(), found[1]):
+            screened = screen(network)
+            if len(screened.observations) < len(network.observations):
+                found = self._minimise(screened)
+        return found
+
+    def _minimise(
+        self, network: Network, cameras: Mapping[str, Camera] = MappingProxyType({})
+    ) -> Begun:
+        network, *check = split_check_points(check_network(network))
+        make = partial(make_problem, network, self.reduction, self.also)
         try:
             problem = make()
         except InputError as error:  # The datum, for want of the control points left out.
-            raise InputError(f"{error} {finding}".strip()) from None
+            raise InputError(f"{error} {self.finding}".strip()) from None
         start = start_with(problem, cameras)
-        return *minimise_at_any_distance(problem, start, make, **options), (points, rays)
+        return *minimise_at_any_distance(problem, start, make, **self.options), tuple(check)
 
-    problem, minimum, check = begin(network)
-    while len(network.observations) < len(given.observations) and misjudged(problem, minimum):
-        # What the principal distance given made impossible may agree with the one found.
-        cameras, fewer = adjusted_cameras(problem, minimum.values), network
-        network = orient_again(given, fewer, cameras)
-        if network is fewer:
-            break
-        problem, minimum, check = begin(network, cameras)
-    if (robust or snooping) and not solved(problem.with_factor(), minimum):
-        screened = screen(network)
-        if len(screened.observations) < len(network.observations):
-            problem, minimum, check = begin(screened)
-    network, used = problem.network, problem.reduction
-    problem = problem.with_factor()
 
-    removed, eliminated, factors, reweighted, suspects, doubt = [], [], {}, None, [], None
-    if robust:
-        reweighted, minimum = robustly(problem, minimum, again, robust)
-        suspects = [name_suspect(problem, s) for s in reweighted.suspects(significance)]
-        problem = problem.with_system(reweighted.found.problem)
-        doubt = doubt_of_robust(reweighted.scale, problem.counts.redundancy)
-    inspection = solved(problem, minimum)
-    if inspection and (snooping or estimate_components or eliminate):
-        if snooping:
-            problem, minimum, removed, doubt = snooped(
-                inspection, minimum, again, snooping, significance, doubtful
-            )
-        if estimate_components:
-            problem, minimum, factors = with_components(problem, minimum, again)
-        if eliminate:
-            problem, minimum, eliminated = eliminated_parameters(
-                problem, minimum, again, critical_t
-            )
+@dataclasses.dataclass
+class _Found:
+    """What an adjustment has found so far; each step changes it."""
 
-        inspection = solved(problem, minimum)
-    names = () if inspection else names_of_defects(problem, minimum)
-    if not inspection and converged(int(minimum.termination)):
-        names = names or UNNAMED
-    weak = None if inspection or names else weakness_without_solution(problem, minimum)
-    intersected = None
-    if len(check[0]):
+    network: Network
+    problem: Problem
+    minimum: Minimum
+    method: str
+    reduction: str
+    said: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Arguments of the `Adjustment`."""
+    inspected: tuple[Problem, Minimum, Inspection | None] | None = None
+
+    @property
+    def inspection(self) -> Inspection | None:
+        """The solution, if it is one; looked at once until a step changes it."""
+        seen = self.inspected
+        if seen is None or seen[0] is not self.problem or seen[1] is not self.minimum:
+            seen = self.problem, self.minimum, solved(self.problem, self.minimum)
+            self.inspected = seen
+        return seen[2]
+
+    def weight_robustly(self, again, robust: str, significance: float) -> None:
+        found, self.minimum = robustly(self.problem, self.minimum, again, robust)
+        suspects = (name_suspect(self.problem, s) for s in found.suspects(significance))
+        self.problem = self.problem.with_system(found.found.problem)
+        doubt = doubt_of_robust(found.scale, self.problem.counts.redundancy)
+        self.said |= {"robust": robust, "reweighted": found, "suspects": tuple(suspects)}
+        self.said["doubts"] = (doubt,) if doubt else ()
+
+    def remove_blunders(self, again, test: str, significance: float, doubtful) -> None:
+        self.problem, self.minimum, removed, doubt = snooped(
+            present(self.inspection), self.minimum, again, test, significance, doubtful
+        )
+        self.said |= {"removed": tuple(removed), "doubts": (doubt,) if doubt else ()}
+
+    def estimate_components(self, again) -> None:
+        self.problem, self.minimum, factors = with_components(self.problem, self.minimum, again)
+        self.said["sigma_factors"] = factors
+
+    def eliminate_parameters(self, again, critical_t: float) -> None:
+        self.problem, self.minimum, names = eliminated_parameters(
+            self.problem, self.minimum, again, critical_t
+        )
+        self.said["eliminated"] = tuple(names)
+
+    def adjustment(self, check) -> Adjustment:
+        """The result, and where there is none why."""
+        problem, minimum, inspection = self.problem, self.minimum, self.inspection
+        names = () if inspection else names_of_defects(problem, minimum)
+        if not inspection and converged(int(minimum.termination)):
+            names = names or UNNAMED
+        unnamed = not inspection and not names
         points, rays = check
+        factors = self.said.get("sigma_factors", {})
         intersected = lambda result: intersect_check_points(
             result.inspection, points, rays, factors
         )
-    return Adjustment(
-        network, problem, minimum, removed=tuple(removed), eliminated=tuple(eliminated),
-        undetermined=tuple(names), check=intersected, method=method, reduction=used,
-        sigma_factors=factors, inspection=inspection, robust=robust, weakness=weak,
-        findings=_likely_causes(problem, minimum, inspection), reweighted=reweighted,
-        suspects=tuple(suspects), doubts=(doubt,) if doubt else (),
-    )  # fmt: skip
+        return Adjustment(
+            self.network, problem, minimum, undetermined=tuple(names),
+            check=intersected if len(points) else None, method=self.method,
+            reduction=self.reduction, inspection=inspection,
+            weakness=weakness_without_solution(problem, minimum) if unnamed else None,
+            findings=_likely_causes(problem, minimum, inspection), **self.said,
+        )  # fmt: skip
 
 
 def check_options(
@@ -190,7 +248,7 @@ def check_options(
     """Refuse options of `adjust` that cannot be.
 
     **Raises:** `InputError`, naming the option and what is expected."""
-    one_of("method", method, tuple(METHODS))
+    one_of("method", method, METHODS)
     one_of("reduction", reduction, REDUCTIONS, none=True)
     whole("max_iterations", max_iterations)
     one_of("robust", robust, ESTIMATORS, none=True)
@@ -221,6 +279,14 @@ def _likely_causes(
         "" if inspection else name_one_place(network),
     )  # fmt: skip
     return tuple(filter(None, causes))
+
+
+def _with_start_values(network: Network) -> tuple[Network, str]:
+    """The network with start values, found where it lacks them, and what is said of it then."""
+    if not lacks_start_values(network):
+        return network, ""
+    found = orient(network)
+    return _placed(found), found.finding
 
 
 def _placed(found: Oriented) -> Network:

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from jaxbundle.arguments import one_of, truth, whole
+from jaxbundle.choices import ESTIMATORS, METHODS
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.leastsquares.components import Component, Group, estimate, variance_components
 from jaxbundle.leastsquares.declarations import Motions, Observations, Table
@@ -25,9 +26,9 @@ from jaxbundle.leastsquares.motions import likely_motions
 from jaxbundle.leastsquares.names import undetermined
 from jaxbundle.leastsquares.problem import Problem, make_problem, with_factor
 from jaxbundle.leastsquares.reliability import external_reliability, minimal_detectable
-from jaxbundle.leastsquares.robust import ESTIMATORS, Suspect, reweight
+from jaxbundle.leastsquares.robust import Suspect, reweight
 from jaxbundle.leastsquares.rows import Values
-from jaxbundle.leastsquares.search import METHODS
+from jaxbundle.leastsquares.search import SEARCHES
 from jaxbundle.leastsquares.snooping import Removed, check_test, snoop
 from jaxbundle.leastsquares.solution import Solution, find_minimum
 from jaxbundle.leastsquares.solver import Minimum
@@ -216,7 +217,7 @@ def adjust(
     **Raises:** `InputError` for declarations that do not fit together; `NotSolvedError` where what
     robust estimation, snooping or components leave determines no answer.
     """
-    one_of("method", method, tuple(METHODS))
+    one_of("method", method, METHODS)
     one_of("robust", robust, ESTIMATORS, none=True)
     truth("estimate_components", estimate_components)
     check_test(snooping, significance)
@@ -233,7 +234,7 @@ def adjust(
 
     def again(problem: Problem, start: Values) -> Solution:
         minima.append(find_minimum(
-            problem, start, search=METHODS[method], max_steps=steps, progress=progress,
+            problem, start, search=SEARCHES[method], max_steps=steps, progress=progress,
         ))  # fmt: skip
         found = Solution(problem, minima[-1].values)
         if len(minima) > 1 and not (converged(int(minima[-1].termination)) and found.determined):

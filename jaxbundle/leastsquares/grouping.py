@@ -14,6 +14,11 @@ from jaxbundle.leastsquares.indices import as_column, as_index
 from jaxbundle.leastsquares.plan import Group, Member
 from jaxbundle.types import present
 
+MASKED = 100_000
+"""Of so many eliminated rows it is compiled in whether all of them are free. Of fewer some may be
+held at any time, as data snooping does, by the same program: a mask costs little, compiling much.
+"""
+
 
 @dataclasses.dataclass
 class Choices:
@@ -147,7 +152,9 @@ class Grouping:
             index = None if rows is None else as_index(rows, ("group", name), ("table", table))
             members.append(Member(table, start, given.space.width, index))
         free = np.concatenate(free, 1)
-        all_free = self.choose("all free", name, found=bool(free.all()))
+        may_be_held = name == self.eliminate and len(free) < MASKED
+        all_free = bool(free.all()) and not may_be_held
+        all_free = self.choose("all free", name, found=all_free)
         return Group(tuple(members), as_column(free, ("group", name)), all_free)
 
     def touched_groups(self, share: Share, of):

@@ -6,6 +6,7 @@ from collections.abc import Hashable, Sequence
 import numpy as np
 from jaxtyping import Bool, Int
 
+from jaxbundle.choices import REDUCTIONS
 from jaxbundle.leastsquares.declarations import Observations, Table
 from jaxbundle.leastsquares.grouping import Choices, Grouping, Share
 from jaxbundle.leastsquares.indices import Sizes, as_column, as_index, count
@@ -18,7 +19,7 @@ from jaxbundle.leastsquares.layout import (
     pairs_between,
 )
 from jaxbundle.leastsquares.plan import Blocks, Couple, Incidences, Part, Plan, Touch
-from jaxbundle.leastsquares.reduction import FACTORS, MOST_PAIRS, REDUCTIONS, plan_reduction
+from jaxbundle.leastsquares.reduction import FACTORS, MOST_PAIRS, plan_reduction
 
 
 def make_plan(

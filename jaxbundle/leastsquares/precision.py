@@ -9,7 +9,7 @@ solved is that of its solution, `dataclasses.replace(data, start=solve(problem, 
 Source: Grafarend (1974), Bollettino di Geodesia 33: design of first order (J) and second order (P).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import equinox as eqx
 import jax
@@ -19,11 +19,14 @@ from jaxtyping import Array, Float
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.cofactors import blocks_of_tables, cofactors, propagate
 from jaxbundle.leastsquares.elimination import factorise
-from jaxbundle.leastsquares.normal import Normal, normal_equations, zero_tangent
+from jaxbundle.leastsquares.normal import Normal, Tangent, normal_equations, zero_tangent
+from jaxbundle.leastsquares.plan import Plan
 from jaxbundle.leastsquares.problem import Problem, given_data, with_factor, without_filling
 from jaxbundle.leastsquares.reduction import FACTORS
+from jaxbundle.leastsquares.reliability import reliability
 from jaxbundle.leastsquares.retraction import retract
-from jaxbundle.leastsquares.rows import Data, Values, fill_places, lay_out_data
+from jaxbundle.leastsquares.rows import Data, Declared, Values, fill_places, lay_out_data
+from jaxbundle.types import AnyArray
 
 
 class Precision(eqx.Module):
@@ -58,15 +61,31 @@ def precision(
         return jnp.zeros(0) if of is None else jnp.ravel(of(moved))
 
     rows = jax.jacrev(functions)(zero_tangent(plan))
-    own, covariance = _covariances(declared, plan, data, rows)
+    own, covariance = covariances(declared, plan, data, rows)
     found = Precision(without_filling(problem, own), covariance)
     return jax.tree.map(lambda C: sigma0**2 * C, found)
 
 
 @eqx.filter_jit
-def _covariances(declared, plan, data, rows):
+def covariances(
+    declared: Declared, plan: Plan, data: Data, rows: Tangent
+) -> tuple[dict[str, Float[Array, "rows width width"]], Float[Array, "functions functions"]]:
+    """Cofactors of all tables and of linear functions `rows` of the unknowns, of data that are
+    filled to the sizes of the plan (`problem.pad_data`): what designs of one shape share."""
     filled, laid = fill_places(plan, lay_out_data(plan, data))
     normal = normal_equations(declared, filled, data.start, laid)[-1]
     factor = factorise(Normal(plan, normal))
     own = blocks_of_tables(declared, plan, cofactors(declared, data.start, factor).own, data.start)
     return own, propagate(declared, data.start, factor, rows)
+
+
+@eqx.filter_jit
+def redundancy(
+    declared: Declared, plan: Plan, data: Data
+) -> Mapping[int, Float[AnyArray, "n r"]]:
+    """Redundancy numbers by set, of data that are filled to the sizes of the plan."""
+    filled, laid = fill_places(plan, lay_out_data(plan, data))
+    normal = normal_equations(declared, filled, data.start, laid)[-1]
+    factor = factorise(Normal(plan, normal))
+    Q = cofactors(declared, data.start, factor)
+    return reliability(declared, plan, data.start, data, Q).redundancy

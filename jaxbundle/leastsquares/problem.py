@@ -12,6 +12,7 @@ from jax.core import Tracer
 from jaxtyping import Bool, Float
 
 from jaxbundle.arguments import one_of
+from jaxbundle.choices import REDUCTIONS
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.leastsquares.declarations import Motions, Observations, Table
@@ -19,7 +20,7 @@ from jaxbundle.leastsquares.defect import find_open_motions, make_datum, survey_
 from jaxbundle.leastsquares.indices import common, finish, rounded
 from jaxbundle.leastsquares.plan import Plan
 from jaxbundle.leastsquares.planner import make_plan
-from jaxbundle.leastsquares.reduction import FACTORS, REDUCTIONS
+from jaxbundle.leastsquares.reduction import FACTORS
 from jaxbundle.leastsquares.retraction import retract
 from jaxbundle.leastsquares.rows import Data, Declared, Values, diagonal_of, evaluate, scalars
 from jaxbundle.leastsquares.solver import LeastSquares

@@ -19,7 +19,6 @@ from jaxtyping import Array, Int
 
 from jaxbundle.leastsquares.indices import as_column
 
-REDUCTIONS = ("dense", "banded", "iterative")
 FACTORS = ("dense", "banded")
 SMALL = 1000
 """Reduced systems with fewer unknowns are solved as they are."""

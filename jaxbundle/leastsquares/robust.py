@@ -33,7 +33,6 @@ from jaxbundle.leastsquares.rows import Values
 from jaxbundle.leastsquares.snooping import Adjust, readjust
 from jaxbundle.leastsquares.solution import Solution
 
-ESTIMATORS = ("huber", "cauchy", "tukey")
 LEAST_WEIGHT = 1e-6
 """Weights do not fall lower, so that the problem stays determined."""
 RESTING, NEARLY_RESTING = 1e-4, 1e-3

@@ -15,6 +15,7 @@ import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
+from jaxbundle.choices import METHODS
 from jaxbundle.leastsquares.damping import times
 from jaxbundle.leastsquares.elimination import EXACT, Factor, damp, factorise, solve
 from jaxbundle.leastsquares.normal import Normal, Tangent, dot
@@ -127,7 +128,9 @@ class FullStep(optx.AbstractSearch):
         return jnp.asarray(jnp.inf), jnp.asarray(True), optx.RESULTS.successful, None
 
 
-METHODS = {"levenberg-marquardt": NielsenTrustRegion(), "gauss-newton": FullStep()}
+SEARCHES: dict[str, NielsenTrustRegion | FullStep] = dict(
+    zip(METHODS, (NielsenTrustRegion(), FullStep()), strict=True)
+)
 
 
 def promise(info: Info, change: Tangent, cost: Float[Array, ""]):

@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbundle.arguments import number, one_of
+from jaxbundle.choices import TESTS
 from jaxbundle.leastsquares.distributions import critical_w, normal_quantile
 from jaxbundle.leastsquares.problem import Problem, hold, with_data
 from jaxbundle.leastsquares.rows import Values
@@ -54,9 +55,6 @@ class Removed:
     def rows(self) -> tuple[int, ...]:
         """All rows that were removed."""
         return (self.row, *self.others)
-
-
-TESTS = ("pope", "baarda")
 
 
 def check_test(test: str | None, significance: float, option: str = "") -> None:

@@ -24,10 +24,10 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.arguments import number, shown, whole
+from jaxbundle.choices import BOARDS
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import did_you_mean
 
-KINDS = ("chessboard", "circles", "asymmetric-circles", "charuco")
 LEAST = {"chessboard": 3, "circles": 2, "asymmetric-circles": 2, "charuco": 3}
 MARKER = 0.75
 """Side of a marker, in sides of a square, if it is not given."""
@@ -62,8 +62,8 @@ class Board:
     dictionary: str = "DICT_4X4_50"
 
     def __post_init__(self):
-        if not isinstance(self.kind, str) or self.kind not in KINDS:
-            raise InputError(f"kind of board {self.kind!r}{did_you_mean(self.kind, KINDS)}")
+        if not isinstance(self.kind, str) or self.kind not in BOARDS:
+            raise InputError(f"kind of board {self.kind!r}{did_you_mean(self.kind, BOARDS)}")
         least = LEAST[self.kind]
         for name in ("columns", "rows"):
             whole(f"board: {name}", getattr(self, name), least=0)

@@ -19,6 +19,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from jaxbundle.choices import CODED_TARGETS
 from jaxbundle.errors import InputError
 from jaxbundle.measure.boards import Board
 from jaxbundle.measure.corners import find_board
@@ -26,7 +27,6 @@ from jaxbundle.measure.targets import centre_by_ellipse
 from jaxbundle.network.columns import did_you_mean
 from jaxbundle.photographs.opencv import need_opencv
 
-KINDS = ("aruco", "apriltag", "aprilgrid", "charuco", "ring12", "ring14")
 CORNER = 0.1
 """σ of a corner, pixels."""
 WITHIN = 3
@@ -72,8 +72,10 @@ def check_kind(kind: str) -> None:
 
     **Raises:** `InputError`."""
     name = kind.partition(":")[0]
-    if name not in KINDS:
-        raise InputError(f"coded targets {kind!r}: {', '.join(KINDS)}{did_you_mean(name, KINDS)}")
+    if name not in CODED_TARGETS:
+        raise InputError(
+            f"coded targets {kind!r}: {', '.join(CODED_TARGETS)}{did_you_mean(name, CODED_TARGETS)}"
+        )
 
 
 def _dictionary(name, option):

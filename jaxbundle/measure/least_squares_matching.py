@@ -4,15 +4,32 @@
 
 with x, y counted from the centre of the window, A [2, 3] an affine transformation into the other
 image, whose last column is the place of the centre, h0 and h1 for brightness and contrast: eight
-unknowns. g2 between the pixels by cubic convolution (Keys, 1981, a = −½), which has a continuous
-derivative; the Jacobian is that of automatic differentiation. Damped steps (Marquardt).
+unknowns. g2 between the pixels by the cubic spline through them; the Jacobian is that of automatic
+differentiation. Damped steps (Marquardt).
 
-With σ0² = vᵀv/(n − 8) the cofactors give the covariance of the place. v has the noise of both
-windows, so that it is the covariance of the one place relative to the other: of two windows with
-like noise half of it belongs to either.
+Interpolated noise of variance σ² has the variance σ²·κ(u)·κ(v), periodic by pixels: 1 at a pixel,
+0.57 in the middle of four. With like noise in both windows
+
+    E vᵀv/(n − 8) = σ²·(1 + h1²·κ̄),    C = σ²·(1 + h1²)·N⁻¹,
+
+since the gradients are smooth and the interpolation does not take their noise away. C is the
+covariance of the one place relative to the other: half of it belongs to either window. And vᵀv is
+least where the noise is, midway between pixels; its expectation ½·σ²·h1²·Σκ(u)·κ(v) draws p by
+−N⁻¹·∂/∂p of it, which is taken off.
+
+Cubic convolution instead of the spline shifts places by up to 0.03 pixel on sharp photographs.
+
+Both images may have been smoothed by a Gaussian of s pixels before (`blur`). Then noise is not
+interpolated away, but correlated, by R = exp(−d²/4s²) at a distance of d pixels:
+
+    E vᵀv = σ²·(n² − tr(N⁻¹·JᵀRJ)),    C = σ²·N₀⁻¹·JᵀRJ·N₀⁻¹,
+
+with N₀ = N − E JₙᵀJₙ: the gradients of noise, of variance σ²/2s², are in N, but determine nothing.
 
 Sources: Gruen (1985), Adaptive least squares correlation, South African J. of Photogrammetry 14(3);
-Ackermann (1984), Digital image correlation, Photogrammetric Record 11(64).
+Ackermann (1984), Digital image correlation, Photogrammetric Record 11(64); Schreier, Braasch and
+Sutton (2000), Systematic errors in digital image correlation caused by intensity interpolation,
+Optical Engineering 39(11); Unser (1999), Splines, IEEE Signal Processing Magazine 16(6).
 """
 
 from enum import IntEnum
@@ -20,6 +37,7 @@ from enum import IntEnum
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Float, Int
 
@@ -35,9 +53,6 @@ FLAT = 1e-6
 """Standard deviation of grey values, in parts of the largest, below which there is no contrast."""
 DETERMINED = 1e-5
 """Least square of a pivot of N, scaled to a unit diagonal, below it nothing is determined."""
-LOST = 2 / (1 + 0.663)
-"""Interpolation takes a third of the variance of the noise of g2 out of v, not out of the place: of
-like noise in both windows 2 are left as 1.663, the mean of the squares of the weights."""
 TINY = 1e-20
 UNKNOWNS = 8
 
@@ -78,12 +93,14 @@ def match_least_squares(
     image: Float[AnyArray, "rows columns"],
     start: Float[AnyArray, "2 3"],
     steps: int = STEPS,
+    blur: float = 0.0,
 ) -> LeastSquaresMatch:
     """Match a window with another image, from a start within a few pixels; batch it by `jax.vmap`.
 
     **Arguments:** `template`: grey values of the window, n odd, its centre the point; `image`: the
     other image or a piece of it; `start`: A, from pixels about the centre of the window (x right, y
-    down) to pixels of `image`; `steps`: evaluations at most.
+    down) to pixels of `image`; `steps`: evaluations at most; `blur`: σ, pixels, of the Gaussian by
+    which the noise of both was smoothed, 0: white noise.
 
     **Returns:** `status` names what failed; the covariance is infinite where nothing is determined.
     """
@@ -93,7 +110,8 @@ def match_least_squares(
     contrast = jnp.std(template)
     textured = contrast > FLAT * jnp.max(jnp.abs(template))
     unit = jnp.where(textured, contrast, 1)
-    grey, other = ((template - mean) / unit).ravel(), (image.astype(dtype) - mean) / unit
+    grey = ((template - mean) / unit).ravel()
+    other = spline_coefficients((image.astype(dtype) - mean) / unit)
     x, y = _window(n, dtype)
     # unknowns of one size: what they do at the edge of the window
     size = jnp.asarray([n // 2, n // 2, 1, n // 2, n // 2, 1, 1, 1], dtype)
@@ -106,8 +124,20 @@ def match_least_squares(
 
     begin = size * _with_radiometry(start, other, grey, x, y)
     p, N, square, moving = _minimise(normal_equations, begin, steps)
-    spare = n * n - UNKNOWNS
     Q, determined = _inverse(N)
+    contrast2 = (p[7] / size[7]) ** 2
+    if blur > 0:
+        M = _correlated(jax.jacfwd(computed)(p), n, blur)
+        variance = square / (n * n - jnp.trace(Q @ M))
+        Q, real = _inverse(N - variance * _of_noise(contrast2, size, x, y, blur))
+        determined &= real
+        C = variance * Q @ M @ Q
+    else:
+        variance = square / (n * n - UNKNOWNS)
+        kept, pull = jax.value_and_grad(_interpolated_noise)(p, size, x, y)
+        noise = variance / (1 + contrast2 * kept / (n * n / 2))
+        p = p + contrast2 * noise * jnp.where(determined, Q @ pull, 0)
+        C = noise * (1 + contrast2) * Q
     p = p / size
     affine = p[:6].reshape(2, 3)
     known = textured & determined & (p[7] > 0)
@@ -115,8 +145,8 @@ def match_least_squares(
     return LeastSquaresMatch(
         affine,
         jnp.stack([mean + unit * p[6] - p[7] * mean, p[7]]),
-        jnp.where(known, LOST * square / spare * Q[2:6:3, 2:6:3], jnp.inf),
-        unit * jnp.sqrt(square / spare),
+        jnp.where(known, C[2:6:3, 2:6:3], jnp.inf),
+        unit * jnp.sqrt(variance),
         jnp.sqrt(jnp.maximum(1 - square / n**2, 0)),
         status,
     )
@@ -141,27 +171,72 @@ def _status(affine, start, shape, n, textured, known, moving):
     )  # fmt: skip
 
 
-def grey_value(image: Float[AnyArray, "rows columns"], u, v) -> Float[Array, ""]:
-    """The grey value of an image at (u, v), by cubic convolution; beyond its edge that of the edge.
+def spline_coefficients(image: Float[AnyArray, "rows columns"]) -> Float[Array, "rows columns"]:
+    """Of the cubic spline through the pixels of an image, linear beyond its edge."""
+    down, along = (jnp.asarray(_prefilter(n), image.dtype) for n in image.shape)
+    return down @ image @ along.T
 
-    Source: Keys (1981), IEEE Trans. Acoustics, Speech, Signal Processing 29(6), equation 15.
-    """
-    rows, columns = image.shape
+
+def grey_value(coefficients: Float[AnyArray, "rows columns"], u, v) -> Float[Array, ""]:
+    """The grey value of an image at (u, v), by its `spline_coefficients`."""
+    rows, columns = coefficients.shape
     i, j = (jnp.floor(jax.lax.stop_gradient(a)) for a in (v, u))
     row = [jnp.clip(i.astype(int) + k, 0, rows - 1) for k in (-1, 0, 1, 2)]
     column = [jnp.clip(j.astype(int) + k, 0, columns - 1) for k in (-1, 0, 1, 2)]
-    down, along = _cubic_weights(v - i), _cubic_weights(u - j)
+    down, along = _spline_weights(v - i), _spline_weights(u - j)
     # sums written out: one loop over the window, where small products are one call each
-    nil = jnp.zeros((), image.dtype)
-    line = lambda r: sum((b * image[r, c] for b, c in zip(along, column)), nil)
+    nil = jnp.zeros((), coefficients.dtype)
+    line = lambda r: sum((b * coefficients[r, c] for b, c in zip(along, column)), nil)
     return sum((a * line(r) for a, r in zip(down, row)), nil)
 
 
-def _cubic_weights(t):
+def _spline_weights(t):
     return (
-        ((2 - t) * t - 1) * t / 2, ((3 * t - 5) * t * t + 2) / 2,
-        ((4 - 3 * t) * t + 1) * t / 2, (t - 1) * t * t / 2,
+        (1 - t) ** 3 / 6, ((3 * t - 6) * t * t + 4) / 6,
+        (((3 - 3 * t) * t + 3) * t + 1) / 6, t**3 / 6,
     )  # fmt: skip
+
+
+def _prefilter(n):
+    """From n values to the coefficients of the spline through them."""
+    B = (np.eye(n, k=-1) + 4 * np.eye(n) + np.eye(n, k=1)) / 6
+    B[[0, -1]] = np.eye(n)[[0, -1]]
+    return np.linalg.inv(B)
+
+
+def _kept_noise(t):
+    """κ: variance of interpolated white noise of variance 1, t from a pixel, along one axis."""
+    k = np.arange(-24, 25)
+    response = np.sqrt(3.0) * (np.sqrt(3.0) - 2) ** np.abs(k)
+    own = np.correlate(response, response, "full")[2 * 24 :][:4]
+    w = _spline_weights(t)
+    return sum(own[abs(i - j)] * a * b for i, a in enumerate(w) for j, b in enumerate(w))
+
+
+def _correlated(J, n, blur):
+    """JᵀRJ of a window of n × n pixels."""
+    k = np.arange(n)
+    K = jnp.asarray(np.exp(-((k[:, None] - k) ** 2) / (4 * blur**2)), J.dtype)
+    smooth = jnp.einsum("ab,cd,bdp->acp", K, K, J.reshape(n, n, UNKNOWNS))
+    return J.T @ smooth.reshape(J.shape)
+
+
+def _of_noise(contrast2, size, x, y, blur):
+    """E JₙᵀJₙ for residuals of variance 1, of which the other image has its part."""
+    one, nil = jnp.ones_like(x), jnp.zeros_like(x)
+    slope = jnp.sqrt(contrast2 / (1 + contrast2) / (2 * blur**2))
+    u = jnp.stack([x, y, one, nil, nil, nil, nil, nil], 1) / size * slope
+    v = jnp.stack([nil, nil, nil, x, y, one, nil, nil], 1) / size * slope
+    contrast = jnp.zeros((UNKNOWNS, UNKNOWNS), x.dtype).at[7, 7].set(len(x) / (1 + contrast2))
+    return u.T @ u + v.T @ v + contrast
+
+
+def _interpolated_noise(p, size, x, y):
+    """½·Σκ(u)·κ(v) over a window."""
+    a = p / size
+    fraction = lambda u: u - jnp.floor(jax.lax.stop_gradient(u))
+    u, v = fraction(a[0] * x + a[1] * y + a[2]), fraction(a[3] * x + a[4] * y + a[5])
+    return jnp.sum(_kept_noise(u) * _kept_noise(v)) / 2
 
 
 def _computed(p, image, x, y):

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from jaxbundle.arguments import text
-from jaxbundle.cameras import MODEL_NAMES, CameraModel
+from jaxbundle.cameras import CameraModel, is_known
 from jaxbundle.errors import InputError
 from jaxbundle.network.columns import (
     NO_NUMBERS,
@@ -208,7 +208,7 @@ def _camera(row: Mapping[str, Any], number: int, where: str, models) -> Camera:
     model = next((own for own in models if own.name == model), model)
     where = f"{where}camera {id!r}: "
     parameters = {key: value for key, value in row.items() if key not in CAMERA_FIELDS}
-    if isinstance(model, CameraModel) or model in MODEL_NAMES:
+    if isinstance(model, CameraModel) or is_known(model):
         known = model_of(model, where).parameters
         for key in parameters:
             if key not in known:

@@ -183,49 +183,30 @@ def declare(network: Network, origin=None, also=(), lengths=None) -> Declared:
     observations of further kinds (`also.py`); `lengths`: of points at any distance (`Layout`)."""
     data, origin, priors = _data(network, origin)
     further, others = split(also)
-    images, points, observations = network.images, network.points, network.observations
+    images, points, start = network.images, network.points, data.start
     cameras = camera_tables(network.cameras)
-    table_of = {int(c): (t, row) for t in cameras for row, c in enumerate(t.cameras)}
-    start = data.start
     placed = start.point, Vector(3)
     if lengths is not None:
         placed = np.concatenate([start.point, lengths[:, None]], 1), AnyDistance()
     tables = [
-        ls.Table("image", PoseValue(start.position, start.rotation), Pose(), images.sigma != 0,
-                 images.id, EXTERIOR),
+        ls.Table(
+            "image",
+            PoseValue(start.position, start.rotation),
+            Pose(),
+            images.sigma != 0,
+            images.id,
+            EXTERIOR,
+        ),
         *(t.unknowns(network.cameras) for t in cameras),
-        ls.Table("point", *placed, free=~points.has_role("fixed"), labels=points.id,
-                 parameters=("X", "Y", "Z")),
+        ls.Table(
+            "point",
+            *placed,
+            free=~points.has_role("fixed"),
+            labels=points.id,
+            parameters=("X", "Y", "Z"),
+        ),
     ]
-    sets, given = [], []
-
-    def observe(kind, rows, *where):
-        if len(rows[0]):
-            s = Set(*where)
-            sets.append(s)
-            weight = s.cut(data.weight(s.field))
-            sigma = np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0), np.inf)
-            given.append(kind(rows, s.measured(data), sigma=sigma))
-
-    shutter = next((f for f in network.further if isinstance(f, RollingShutter)), None)
-    lines = None if shutter is None else shutter.lines(network)
-    row_of_camera = np.array([table_of[c][1] for c in range(len(network.cameras))], np.int64)
-    camera = images.camera[observations.image]
-    for t in cameras:
-        kind = kinds.image_points(t.model, network.residuals, t.name, moving=lines is not None)
-        rows = None if len(cameras) == 1 else np.flatnonzero(np.isin(camera, t.cameras))
-        take = lambda x, rows=rows: x if rows is None or x is None else x[rows]
-        motion = () if lines is None else (observations.image, camera)
-        touched = observations.image, *motion, row_of_camera[camera], observations.point
-        observe(kind, tuple(map(take, touched)), "image", rows, None, take(lines))
-    observe(kinds.CONTROL, (priors["control"],), "control")
-    observe(kinds.EXTERIOR, (priors["exterior"],), "exterior")
-    for t in cameras:
-        rows = np.flatnonzero(np.isin(priors["interior"], t.cameras))
-        kind = kinds.interior_orientation(t.name, t.parameters)
-        columns = len(t.parameters)
-        observe(kind, (row_of_camera[priors["interior"][rows]],), "interior", rows, columns)
-    observe(kinds.DISTANCES, tuple(network.distances.points.T), "distance")
+    sets, given = _observed(network, data, priors, cameras)
     taking_part = [f for f in network.further if isinstance(f, RollingShutter)]
     taking_part += [f for f in among(network) if not isinstance(f, RollingShutter)]
     declared = [f.among(network).declare(network, origin) for f in taking_part]
@@ -244,6 +225,44 @@ def declare(network: Network, origin=None, also=(), lengths=None) -> Declared:
     layout = Layout(cameras, tuple(sets), start.camera.shape[1], priors, lengths)
     motions = dataclasses.replace(similarity, actions=actions)
     return Declared(tuple(tables), tuple(given), layout, data, origin, motions)
+
+
+def _observed(network: Network, data: Data, priors, cameras: tuple[CameraTable, ...]):
+    """Image points, control, priors and distances: which rows of the network they are (`Set`), and
+    the observations."""
+    images, observations = network.images, network.observations
+    row_of_camera = np.zeros(len(network.cameras), np.int64)
+    for t in cameras:
+        row_of_camera[list(t.cameras)] = np.arange(len(t.cameras))
+    sets, given = [], []
+
+    def observe(kind, rows, *where):
+        if len(rows[0]):
+            s = Set(*where)
+            sets.append(s)
+            weight = s.cut(data.weight(s.field))
+            sigma = np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0), np.inf)
+            given.append(kind(rows, s.measured(data), sigma=sigma))
+
+    shutter = next((f for f in network.further if isinstance(f, RollingShutter)), None)
+    lines = None if shutter is None else shutter.lines(network)
+    camera = images.camera[observations.image]
+    for t in cameras:
+        kind = kinds.image_points(t.model, network.residuals, t.name, moving=lines is not None)
+        rows = None if len(cameras) == 1 else np.flatnonzero(np.isin(camera, t.cameras))
+        take = lambda x, rows=rows: x if rows is None or x is None else x[rows]
+        motion = () if lines is None else (observations.image, camera)
+        touched = observations.image, *motion, row_of_camera[camera], observations.point
+        observe(kind, tuple(map(take, touched)), "image", rows, None, take(lines))
+    observe(kinds.CONTROL, (priors["control"],), "control")
+    observe(kinds.EXTERIOR, (priors["exterior"],), "exterior")
+    for t in cameras:
+        rows = np.flatnonzero(np.isin(priors["interior"], t.cameras))
+        kind = kinds.interior_orientation(t.name, t.parameters)
+        columns = len(t.parameters)
+        observe(kind, (row_of_camera[priors["interior"][rows]],), "interior", rows, columns)
+    observe(kinds.DISTANCES, tuple(network.distances.points.T), "distance")
+    return sets, given
 
 
 def order_cameras(network: Network) -> Network:

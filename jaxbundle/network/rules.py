@@ -7,12 +7,14 @@ import numpy as np
 
 from jaxbundle.arguments import one_of
 from jaxbundle.cameras import (
+    FAMILIES,
     MODEL_NAMES,
     CameraModel,
     check_own,
     check_parameters,
     default_parameters,
     get_model,
+    is_known,
     is_own,
 )
 from jaxbundle.errors import InputError
@@ -52,8 +54,8 @@ def model_of(model: str | CameraModel, where: str = "") -> CameraModel:
     """The camera model of this name, or the own model that is given.
 
     **Raises:** `InputError`, for a name of none, or the name of another."""
-    if not isinstance(model, CameraModel) and model not in MODEL_NAMES:
-        known = did_you_mean(model, MODEL_NAMES)
+    if not isinstance(model, CameraModel) and not is_known(model):
+        known = did_you_mean(model, (*MODEL_NAMES, *FAMILIES))
         raise InputError(
             f"{where}unknown {'' if where else 'camera '}model {shown(model)}{known}"
             f"{'' if known.endswith('?') else ';'} one of your own is given as a CameraModel, to a "

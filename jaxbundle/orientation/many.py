@@ -25,6 +25,7 @@ from jaxbundle.orientation.pose import Pose
 from jaxbundle.orientation.resection import refine_resection
 from jaxbundle.orientation.robust import robust_relative_orientation, robust_resection
 from jaxbundle.orientation.status import Status
+from jaxbundle.system.compilation import quick_jit
 
 SLOTS = 64
 """Points of an image, of a pair, of two models."""
@@ -114,7 +115,7 @@ def spread(number: int, most: int = SLOTS) -> np.ndarray:
     return np.linspace(0, number - 1, most).astype(int)
 
 
-@jax.jit
+@quick_jit
 @jax.vmap
 def _resect(xy, X, weights, tolerance):
     key = jax.random.key(0)
@@ -124,7 +125,7 @@ def _resect(xy, X, weights, tolerance):
     return found.pose.X0, found.pose.M, jnp.where(sound, part, 0.0)
 
 
-@jax.jit
+@quick_jit
 @jax.vmap
 def _refine(X0, M, xy, X, weights):
     found = refine_resection(Pose(X0, M), xy, X, weights).pose
@@ -132,7 +133,7 @@ def _refine(X0, M, xy, X, weights):
     return jnp.where(good, found.X0, X0), jnp.where(good, found.M, M)
 
 
-@jax.jit
+@quick_jit
 @jax.vmap
 def _orient_pair(xy1, xy2, weights, tolerance):
     key = jax.random.key(0)
@@ -153,14 +154,14 @@ def _intersect(X0, rays, weights):
     return found.X, found.angle, found.status
 
 
-@jax.jit
+@quick_jit
 @jax.vmap
 def _similarity(source, target, weights):
     found = absolute_orientation(source, target, weights)
     return (*_as_matrix(found.tau), found.status)
 
 
-@jax.jit
+@quick_jit
 @jax.vmap
 def _similarity_by_rays(X, X0, rays, weights, A, t):
     scale = jnp.cbrt(jnp.linalg.det(A))

@@ -130,13 +130,11 @@ def robust_resection(
     found = consensus(key, solve, errors, (xy, X), 3, samples, threshold, p)
     pose, good = found.model, found.inliers
 
-    def again(_, state):
-        pose, good = state
-        pose = refine_resection(pose, xy, X, p * good).pose
-        return pose, _good(errors(pose, xy, X), p > 0, 3, threshold)
+    def again(pose, good):
+        found = refine_resection(pose, xy, X, p * good)
+        return found, _good(errors(found.pose, xy, X), p > 0, 3, threshold)
 
-    pose, good = jax.lax.fori_loop(0, ROUNDS, again, (pose, good))
-    return refine_resection(pose, xy, X, p * good), good
+    return _repeated(again, good, pose, lambda found: found.pose)
 
 
 def robust_relative_orientation(
@@ -176,10 +174,9 @@ def robust_relative_orientation(
 
     def again(_, good):
         result = relative_orientation(xy1, xy2, p * good)
-        return _good(errors((result.M, result.b), xy1, xy2), p > 0, 5, threshold)
+        return result, _good(errors((result.M, result.b), xy1, xy2), p > 0, 5, threshold)
 
-    good = jax.lax.fori_loop(0, ROUNDS, again, found.inliers)
-    return relative_orientation(xy1, xy2, p * good), good
+    return _repeated(again, found.inliers)
 
 
 def robust_homography(
@@ -280,10 +277,28 @@ def _robust_linear(key, solve, errors, data, weights, size, samples, threshold):
     good = consensus(key, of_sample, errors, data, size, samples, threshold, p).inliers
 
     def again(_, good):
-        return _good(errors(solve(*data, p * good), *data), p > 0, size, threshold)
+        found = solve(*data, p * good)
+        return found, _good(errors(found, *data), p > 0, size, threshold)
 
-    good = jax.lax.fori_loop(0, ROUNDS, again, good)
-    return solve(*data, p * good), good
+    return _repeated(again, good)
+
+
+def _repeated(again, good, model=None, model_of=lambda found: None):
+    """The solution by the good observations, `ROUNDS` times chosen anew, and which they are: one
+    program for all rounds and the last solution.
+
+    `again(model, good)`: the solution by the good ones, from a model, and which are good then.
+    """
+    shapes = eqx.filter_eval_shape(lambda: again(model, good)[0])
+    empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+    def once(_, state):
+        _, model, _, good = state
+        found, better = again(model, good)
+        return found, model_of(found), good, better
+
+    found, _, good, _ = jax.lax.fori_loop(0, ROUNDS + 1, once, (empty, model, good, good))
+    return found, good
 
 
 def _status(found):

@@ -75,9 +75,7 @@ def simulate(
 
     Arguments and errors are those of `simulate_with_truth`, which returns the truth as well.
     """
-    return simulate_with_truth(
-        stations, targets, camera, noise=noise, seed=seed, **options
-    ).network
+    return simulate_with_truth(stations, targets, camera, noise=noise, seed=seed, **options).network
 
 
 def simulate_with_truth(
@@ -165,63 +163,72 @@ def simulate_with_truth(
     role = _roles(len(targets), control, control_sigma, check)
     sigma_xy = _not_negative(noise, 2, "noise")
 
-    image, point, xy = _look(stations, targets, cameras, of_station, image_format)
     rng = np.random.default_rng(seed)
-    keep = np.ones(len(image), bool)
+    rays = _look(stations, targets, cameras, of_station, image_format)
+    kept = np.ones(len(rays[0]), bool)
     if max_incidence is not None:
-        keep = _facing(stations, targets, normals, image, point) >= np.cos(max_incidence)
+        kept = _facing(stations, targets, normals, *rays[:2]) >= np.cos(max_incidence)
     if max_rays is not None:
-        keep[keep] = _at_most(point[keep], max_rays, rng)
+        kept[kept] = _at_most(rays[1][kept], max_rays, rng)
     need = np.where(np.isin(role, ("tie", "check")), min_rays, 1)
-    used = np.bincount(point[keep], minlength=len(targets)) >= need
-    keep &= used[point]
-    if not keep.any():
+    (image, point, xy), used = _imaged(rays, kept, need)
+    row = np.cumsum(used) - 1
+    points = _points(targets, role, used, control_sigma)
+    ends = _ends(distances, len(targets), used, row)
+    observations = Observations(
+        image, row[point], xy, _sigma_of_images(sigma_xy, xy), Source("image points")
+    )
+    truth = Network(
+        cameras=cameras, images=_images(stations, of_station), points=points,
+        observations=observations, distances=_distances(points.position, ends, distance_sigma),
+        datum=datum, residuals=residuals, name=name, object_unit=object_unit,
+        image_unit=get_model(cameras[0].model).unit,
+    )  # fmt: skip
+    towards = stations.position[image] - points.position[observations.point]
+    disturbance = _disturbance(disturb, towards)
+    return Simulation(_measured(truth, begin, sigma_xy, disturbance, rng), truth)
+
+
+def _imaged(rays, kept, need):
+    """The rays that are kept of targets with as many as they need, and which targets these are.
+
+    **Raises:** `InputError` where there are none."""
+    used = np.bincount(rays[1][kept], minlength=len(need)) >= need
+    kept = kept & used[rays[1]]
+    if not kept.any():
         raise InputError(
             "no target is imaged often enough; check the format, the units, and where the "
             "stations look"
         )
-    image, point, xy = image[keep], point[keep], xy[keep]
+    return [x[kept] for x in rays], used
 
-    row = np.cumsum(used) - 1
-    point, true, role = row[point], targets[used], role[used]
-    sigma = np.full((len(true), 3), np.nan)
+
+def _images(stations: Stations, of_station) -> Images:
+    return Images(
+        id=tuple(str(i + 1) for i in range(len(stations))), camera=of_station,
+        position=stations.position, angles=stations.angles,
+        sigma=np.full((len(stations), 6), np.nan), source=Source("stations", None, "station"),
+    )  # fmt: skip
+
+
+def _points(targets, role, used, control_sigma) -> Points:
+    role, number = role[used], np.flatnonzero(used) + 1
+    sigma = np.full((len(role), 3), np.nan)
     if "control" in role:
         sigma[role == "control"] = np.broadcast_to(control_sigma, 3)
-    ends = _ends(distances, len(targets), used, row)
-    true_length = np.linalg.norm(true[ends[:, 0]] - true[ends[:, 1]], axis=1)
-    truth = Network(
-        cameras=cameras,
-        images=Images(
-            id=tuple(str(i + 1) for i in range(len(stations))),
-            camera=of_station,
-            position=stations.position,
-            angles=stations.angles,
-            sigma=np.full((len(stations), 6), np.nan),
-            source=Source("stations", None, "station"),
-        ),
-        points=Points(
-            tuple(str(k + 1) for k in np.flatnonzero(used)),
-            tuple(role.tolist()),
-            true,
-            sigma,
-            Source("targets", np.flatnonzero(used) + 1, "target"),
-        ),
-        observations=Observations(
-            image, point, xy,
-            np.broadcast_to(np.where(sigma_xy > 0, sigma_xy, 1.0), xy.shape).copy(),
-            Source("image points"),
-        ),
-        distances=Distances(
-            ends, true_length, np.full(len(ends), float(distance_sigma)), Source("distances")
-        ),
-        datum=datum,
-        residuals=residuals,
-        name=name,
-        object_unit=object_unit,
-        image_unit=get_model(cameras[0].model).unit,
-    )
-    disturbance = _disturbance(disturb, stations.position[image] - true[point])
-    return Simulation(_measured(truth, begin, sigma_xy, disturbance, rng), truth)
+    source = Source("targets", number, "target")
+    return Points(tuple(map(str, number.tolist())), tuple(role.tolist()), targets[used], sigma,
+                  source)  # fmt: skip
+
+
+def _distances(position, ends, sigma: float) -> Distances:
+    length = np.linalg.norm(position[ends[:, 0]] - position[ends[:, 1]], axis=1)
+    return Distances(ends, length, np.full(len(ends), float(sigma)), Source("distances"))
+
+
+def _sigma_of_images(sigma, xy):
+    """1 of exact coordinates."""
+    return np.broadcast_to(np.where(sigma > 0, sigma, 1.0), xy.shape).copy()
 
 
 def _measured(truth: Network, begin, noise, disturb, rng) -> Network:

@@ -5,15 +5,11 @@ numbers are the centres of pixels; up to half a pixel beyond the outer centres t
 farther out there is none: NaN. So is it where a pixel that takes part has none.
 """
 
-from typing import Literal, get_args
-
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxbundle.choices import RESAMPLINGS, Resampling
 from jaxbundle.types import AnyArray
-
-Resampling = Literal["nearest", "bilinear", "cubic"]
-RESAMPLINGS: tuple[Resampling, ...] = get_args(Resampling)
 
 
 def resample(

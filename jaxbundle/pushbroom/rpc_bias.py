@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.choices import RPC_BIASES
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.geometry.ellipsoid import WGS84, Ellipsoid, earth_fixed, geodetic
@@ -29,7 +30,7 @@ from jaxbundle.pushbroom.rpc import MARGIN, Rpc, Scalar, project, project_points
 from jaxbundle.pushbroom.rpc_fit import RpcCheck, RpcTable, check_rpc, fit_rpc
 from jaxbundle.types import AnyArray
 
-MODELS = {"shift": 1, "affine": 3}
+MODELS = dict(zip(RPC_BIASES, (1, 3), strict=True))
 """Unknowns of each axis."""
 CONTROL = Source("control points")
 DETERMINED = 1e-6

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.choices import Resampling
 from jaxbundle.errors import InputError
 from jaxbundle.pushbroom.ancillary import attitude_table, position_table
 from jaxbundle.pushbroom.earth_frames import circular_orbit
@@ -22,7 +23,7 @@ from jaxbundle.pushbroom.image import PushbroomImage, make_image
 from jaxbundle.pushbroom.locate import locate_lines
 from jaxbundle.pushbroom.noise import Noise, disturbed, draw, sigmas
 from jaxbundle.pushbroom.orbit import state_orbit
-from jaxbundle.pushbroom.resample import Resampling, resample
+from jaxbundle.pushbroom.resample import resample
 from jaxbundle.pushbroom.scanner import LineTimes, Optics
 from jaxbundle.pushbroom.signals import signal
 from jaxbundle.pushbroom.surfaces import Surface

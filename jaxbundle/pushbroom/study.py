@@ -11,11 +11,12 @@ and rate of the samples; here they are stated.
 
 import dataclasses
 import math
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
+from jaxbundle.choices import AttitudeError
 from jaxbundle.pushbroom.accuracy import (
     circular_error,
     closed_form,
@@ -35,7 +36,6 @@ TRAJECTORIES = {
     "roll": ("roll",), "pitch": ("pitch",), "yaw": ("yaw",), "3 axes": ("pitch", "roll", "yaw"),
 }  # fmt: skip
 FLOORS = ("linear", "spline")
-Kind = Literal["bias", "white"]
 SIGMAS = (math.radians(0.01), math.radians(0.1))
 """Accuracies of attitudes, radians, if none are given."""
 
@@ -67,7 +67,7 @@ class AccuracyTable(NamedTuple):
 
     altitude: float
     field_of_view: float
-    kind: Kind
+    kind: AttitudeError
     draws: int
     error_free: list[ErrorFree]
     erring: list[Erring]
@@ -77,7 +77,7 @@ def accuracy_table(
     flight: Flight,
     surface: Surface,
     sigmas: Numbers = SIGMAS,
-    kind: Kind = "bias",
+    kind: AttitudeError = "bias",
     draws: int = 1000,
     seed: int = 0,
     lines: int = 13,
