@@ -5,6 +5,8 @@ import re
 import tomllib
 from pathlib import Path
 
+from jaxbundle import __version__
+
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 APACHE = "cfc7749b96f63bd31c3c42b5c471bf756814053e847c10f3eb003417bc523d30"
@@ -20,6 +22,12 @@ def test_licence_authors_and_addresses_are_told():
     assert all(author["name"] for author in PROJECT["authors"])
     assert {"Source", "Issues"} <= {*PROJECT["urls"]}
     assert all(url.startswith("https://") for url in PROJECT["urls"].values())
+
+
+def test_the_version_stands_in_one_place_and_the_others_follow():
+    assert PROJECT["dynamic"] == ["version"] and "version" not in PROJECT
+    assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text()
+    assert f"\n## {__version__}\n" in (ROOT / "CHANGELOG.md").read_text()
 
 
 def test_type_checkers_are_told_of_the_annotations():
