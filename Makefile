@@ -65,7 +65,7 @@ bench-large: $(VENV)/compared
 	$(BIN)/python benchmarks/bal.py --street 1723 156502 --solver sparse_schur $(ONCE) $(PEERS)
 	$(BIN)/python benchmarks/bal.py --arc 356 226730 --solver iterative_schur $(ONCE) $(PEERS)
 
-bench-pushbroom bench-orientation bench-measuring bench-blunders: bench-%: $(VENV)/compared
+bench-pushbroom bench-orientation bench-measuring bench-blunders bench-design: bench-%: $(VENV)/compared
 	$(BIN)/python benchmarks/$*.py
 
 clean:

@@ -15,6 +15,7 @@ from jaxbundle.bundle import far_points
 from jaxbundle.bundle.adjust import adjust
 from jaxbundle.bundle.minimum import minimise
 from jaxbundle.cameras import get_model, residual
+from jaxbundle.choices import ESTIMATORS
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.io.results.result_json import result_dict
 from jaxbundle.leastsquares import robust, snooping
@@ -126,7 +127,7 @@ def test_predicted_test_of_an_observation(network):
     np.testing.assert_allclose(predicted, expected, rtol=1e-5)
 
 
-@pytest.mark.parametrize("estimator", robust.ESTIMATORS)
+@pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_robust_estimates_are_near_the_clean_one(network, clean, estimator):
     spoilt, bad, size = with_blunders(network, 3)
     found = adjust(spoilt, robust=estimator)

@@ -10,7 +10,7 @@ from jaxbundle import cli
 from jaxbundle.io import FORMATS, TARGETS, read_network
 from jaxbundle.io.cameras.camera_files import read_cameras
 from jaxbundle.io.exchange import CAMERA_KINDS
-from jaxbundle.io.networks.colmap_models import MODELS, OTHERS
+from jaxbundle.io.networks.colmap_models import MODELS
 from jaxbundle.io.networks.column_map import KEYS, ROTATIONS
 
 ROOT = Path(__file__).parents[1]
@@ -21,7 +21,7 @@ CAMERAS = ROOT / "examples" / "video_cameras" / "cameras.toml"
 def test_everything_is_named():
     for name in (*FORMATS, *TARGETS, *CAMERA_KINDS):
         assert f"| `{name}` |" in TEXT, name
-    for name in (*MODELS, *OTHERS.values(), *ROTATIONS):
+    for name in (*MODELS, *ROTATIONS):
         assert re.search(rf"\b{name}\b", TEXT), name
     for key in set(KEYS) - {"comment"}:
         assert f"{key} = " in TEXT, key

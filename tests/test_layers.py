@@ -9,6 +9,7 @@ import pytest
 
 LAYERS = (
     "errors",
+    "choices",
     "types",
     "arguments",
     "float64",
@@ -25,6 +26,7 @@ LAYERS = (
     "measure",
     "adjustment",
     "statistics",
+    "network_design",
     "refinement",
     "io",
     "surface",

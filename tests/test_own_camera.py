@@ -54,17 +54,17 @@ def test_the_truth_is_found(page):
 def test_the_report_and_json_name_the_model(page):
     result = page["result"]
     report = result.report()
-    assert "Model division  xi = x̄/(1 + L1·r² + L2·r⁴)" in report and "Fitzgibbon" in report
+    assert "Model division-mm  xi = x̄/(1 + L1·r² + L2·r⁴)" in report and "Fitzgibbon" in report
     assert "one-to-one over the image, as far as r = 21.63 mm" in report
     document = json.loads(json.dumps(result_dict(result)))
-    assert document["cameras"]["cam"]["model"] == "division"
+    assert document["cameras"]["cam"]["model"] == "division-mm"
     assert document["units"]["residuals"] == {"cam": "mm"}
-    assert set(result.table("cameras")["model"]) == {"division"}
+    assert set(result.table("cameras")["model"]) == {"division-mm"}
 
 
 def test_the_plots_draw_it(page):
     title = plotting.distortion_curve(page["result"], "cam").get_title(loc="left")
-    assert "distortion (division)" in title
+    assert "distortion (division-mm)" in title
     plotting.correlation_matrix(page["result"])
     plt.close("all")
 
@@ -75,13 +75,13 @@ def test_a_file_names_it_and_the_reader_is_given_it(page, tmp_path):
     assert camera.model is DIVISION and camera == network.cameras[0]
     assert page["network"].observations.xy.tolist() == network.observations.xy.tolist()
     path = jaxbundle.write_project(network, tmp_path / "p")
-    assert "# 'division' is a model of the user's own" in path.read_text()
-    with pytest.raises(InputError, match="camera 'cam': unknown model 'division'.*models=") as said:
+    assert "# 'division-mm' is a model of the user's own" in path.read_text()
+    with pytest.raises(InputError, match="'cam': unknown model 'division-mm'.*models=") as said:
         jaxbundle.read_network(path)
     assert "\n" not in str(said.value)
     with pytest.raises(InputError, match="models must be a list of CameraModels, but is"):
-        jaxbundle.read_network(path, models=["division"])
-    with pytest.raises(InputError, match="model 'division' stands already"):
+        jaxbundle.read_network(path, models=["division-mm"])
+    with pytest.raises(InputError, match="model 'division-mm' stands already"):
         jaxbundle.read_network(path, models=[DIVISION, DIVISION])
     with pytest.raises(InputError, match="camera 'cam': .*unknown key 'L3'"):
         path.write_text(path.read_text().replace("L1 =", "L3 ="))
@@ -93,7 +93,7 @@ def test_a_file_names_it_and_the_reader_is_given_it(page, tmp_path):
 def test_conversion_to_and_from_it(page, tmp_path):
     network, DIVISION = page["simulation"].network, page["DIVISION"]
     own, path = {"models": [DIVISION]}, jaxbundle.write_project(network, tmp_path / "own")
-    with pytest.raises(InputError, match="colmap has no model 'division', and opencv is not"):
+    with pytest.raises(InputError, match="colmap has no model 'division-mm', and opencv is not"):
         jaxbundle.convert(path, tmp_path / "colmap", **own)
     made = jaxbundle.convert(path, tmp_path / "pixels", model="opencv", **own)
     assert made.conversions["cam"].largest < 1 and "opencv: fitted" in str(made)

@@ -167,7 +167,7 @@ def test_ids_of_a_plan_stay_inside_and_apart(convergent4):
 
 
 def test_names_of_figures_have_one_suffix():
-    names = files._Names(())
+    names = files.FigureNames(())
     assert [names("residuals", id) for id in ("photo_01.jpg", "photo_01.TIF", "12.5", ".png")] == [
         "residuals_photo_01", "residuals_photo_01_2", "residuals_12.5", "residuals_png",
     ]  # fmt: skip

@@ -12,7 +12,7 @@ import pytest
 
 from jaxbundle import report
 from jaxbundle.bundle.result import Adjustment
-from jaxbundle.cameras import MODEL_NAMES, get_model
+from jaxbundle.cameras import FAMILIES, MODEL_NAMES, get_model
 from jaxbundle.cli.outputs import write_targets
 from jaxbundle.io.results.result_json import result_dict
 from jaxbundle.leastsquares.names import Name
@@ -20,7 +20,7 @@ from jaxbundle.leastsquares.stopping import LIMIT, NOT_FINITE, STUCK
 from jaxbundle.network.columns import count
 from jaxbundle.network.tables import EXTERIOR, Camera
 from jaxbundle.report import head, layout, observations, unknowns
-from jaxbundle.report.equations import EQUATIONS
+from jaxbundle.report.equations import EQUATIONS, equations
 from jaxbundle.statistics.blunders import Removed
 from jaxbundle.statistics.check_points import CheckPoints
 
@@ -357,7 +357,9 @@ def test_warnings_are_printed(convergent4):
 
 
 def test_equations_of_every_model():
-    assert set(EQUATIONS) == set(MODEL_NAMES)
+    families = {name.partition("-N")[0] for name in FAMILIES}
+    assert set(EQUATIONS) == {*MODEL_NAMES, *families}
+    assert equations(get_model("spline-6x5-90")) == EQUATIONS["spline"]
     for name, lines in EQUATIONS.items():
         assert len(layout.facts([(f"Model {name}", line) for line in lines])) == len(lines)
 

@@ -11,7 +11,7 @@ import pytest
 import jaxbundle
 from jaxbundle import Camera, grid_of_targets, ring_of_stations, simulate, stations_looking_at
 from jaxbundle.adjustment.problem import make_problem
-from jaxbundle.cli.adjust import _why_not
+from jaxbundle.cli.outputs import why_not
 from jaxbundle.network.repetitions import warn_of_repetitions
 from jaxbundle.orientation.one_place import name_one_place
 from jaxbundle.planning.stations import Stations
@@ -163,7 +163,7 @@ def test_c_in_pixels_is_named_where_the_adjustment_fails(size):
     with pytest.raises(jaxbundle.NotSolvedError, match="is c in pixels"):
         assert result.cameras
     assert "one place" not in said(result)
-    told = _why_not(result)  # names of what is not determined do not hide the cause
+    told = why_not(result)  # names of what is not determined do not hide the cause
     assert result.undetermined and "is c in pixels" in told
 
 

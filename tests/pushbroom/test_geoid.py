@@ -13,7 +13,7 @@ from rpc_scenes import made_up
 from scanner_files import write_scanner
 
 from jaxbundle import cli
-from jaxbundle.cli.pushbroom.app import surface_of
+from jaxbundle.cli.pushbroom.shared import surface_of
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.ellipsoid import WGS84
 from jaxbundle.io.rasters.geoid import add_geoid, undulations
