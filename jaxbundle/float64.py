@@ -17,24 +17,26 @@ from importlib.metadata import version
 
 QUICK_LOOPS = "--xla_cpu_use_fusion_emitters=false"
 """XLA writes loops in the older of its two ways: compiled in half the time and memory, as fast."""
-THREADS = 8
-"""Of XLA's pool at least. jaxlib waits inside the pool for the parts of a batched factorisation or
-triangular solve: two of them at once, as under `vmap`, block a pool of two threads for ever."""
+ONE_AFTER_THE_OTHER = "--xla_cpu_enable_concurrency_optimized_scheduler=false"
+"""The operations of a program do not wait for each other inside XLA's pool of threads. jaxlib does
+so for the parts of a batched factorisation or triangular solve: as many of them at once as there
+are threads, as under `vmap`, wait for ever. Programs are as fast, and smaller."""
 
 
 def enable_x64() -> None:
     """Switch JAX to the 64-bit floats adjustment needs; call it before the first JAX computation.
 
     The compiler is set up for the processor, too, where it still has the choice (jaxlib 0.10):
-    `QUICK_LOOPS` is put into the environment variable XLA_FLAGS, unless that speaks of it; NPROC,
-    the number of XLA's threads, is set to `THREADS` on machines with fewer cores, unless it is set.
+    `QUICK_LOOPS` and `ONE_AFTER_THE_OTHER` are put into the environment variable XLA_FLAGS, each
+    unless that speaks of it.
     """
     import jax
 
-    os.environ.setdefault("NPROC", str(max(THREADS, os.cpu_count() or 1)))
-    flags = os.environ.get("XLA_FLAGS", "")
-    if version("jaxlib").startswith("0.10.") and "fusion_emitters" not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} {QUICK_LOOPS}".strip()
+    if version("jaxlib").startswith("0.10."):
+        flags = os.environ.get("XLA_FLAGS", "").split()
+        said = {flag.partition("=")[0] for flag in flags}
+        ours = [f for f in (QUICK_LOOPS, ONE_AFTER_THE_OTHER) if f.partition("=")[0] not in said]
+        os.environ["XLA_FLAGS"] = " ".join(flags + ours)
     jax.config.update("jax_enable_x64", True)
 
 

@@ -31,20 +31,20 @@ def _of_group(declared, group, values, blocks):
         rows = values[member.table]
         rows = rows if member.rows is None else jax.tree.map(lambda x, m=member: x[m.rows], rows)
         charts.append(jax.vmap(declared.spaces[member.table].chart)(rows))
-    if all(T is None for T in charts):
+    if all(chart is None for chart in charts):
         return _positive(jnp.diagonal(blocks, axis1=1, axis2=2))
-    T = jnp.zeros(blocks.shape)
+    T = inverse = jnp.broadcast_to(jnp.eye(blocks.shape[1]), blocks.shape)
     for member, chart in zip(group.members, charts):
         at = slice(member.start, member.start + member.width)
-        T = T.at[:, at, at].set(jnp.eye(member.width) if chart is None else chart)
+        if chart is not None:
+            T, inverse = T.at[:, at, at].set(chart[0]), inverse.at[:, at, at].set(chart[1])
 
-    def one(T, N, free):
-        inverse = jnp.linalg.inv(T)
+    def one(T, inverse, N, free):
         D = T.T @ (jnp.diagonal(inverse.T @ N @ inverse)[:, None] * T)
         D = D * free * free[:, None]  # What is held takes no part in what is not.
         return D + jnp.diag(jnp.where(jnp.diagonal(D) > 0, 0.0, 1.0))
 
-    return jax.vmap(one)(T, blocks, group.free)
+    return jax.vmap(one)(T, inverse, blocks, group.free)
 
 
 def _positive(diagonal):

@@ -19,7 +19,6 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import optimistix as optx
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
 from jaxbundle.leastsquares.normal import Normal, Tangent, agreed, gather, scatter, times_kept
@@ -93,6 +92,22 @@ class ConjugateGradients(eqx.Module):
 
 def precondition(normal: Normal, Z, S: Reduced, scale: Tangent, tolerance) -> ConjugateGradients:
     """S for conjugate gradients, `S.own` its diagonal blocks scaled."""
-    inverse = lambda L: solve_triangular(L, jnp.eye(L.shape[1]), lower=True)
-    lower_inverse = {g: jax.vmap(inverse)(jnp.linalg.cholesky(B)) for g, B in S.own.items()}
+    lower_inverse = {g: inverse_of_lower(B) for g, B in S.own.items()}
     return ConjugateGradients(normal, Z, scale, lower_inverse, tolerance)
+
+
+def inverse_of_lower(B: Float[Array, "rows w w"]) -> Float[Array, "rows w w"]:
+    """L⁻¹ of B = L·Lᵀ: elimination takes (B, 1) to (Lᵀ, L⁻¹); NaN where B is not positive definite.
+
+    A loop over the w columns: LAPACK's loop over the rows waits inside the pool of threads, in
+    which the programs of several devices would wait for each other.
+    """
+    w = B.shape[1]
+
+    def eliminate(k, both):
+        row = both[:, k] / jnp.sqrt(both[:, k, k])[:, None]
+        below = jnp.where(jnp.arange(w) > k, row[:, :w], 0.0)
+        return (both - below[:, :, None] * row[:, None]).at[:, k].set(row)
+
+    both = jnp.concatenate([B, jnp.broadcast_to(jnp.eye(w), B.shape)], -1)
+    return jax.lax.fori_loop(0, w, eliminate, both)[:, :, w:]

@@ -5,7 +5,7 @@ sees of it (`prepare`, a block of scalars), how a small change δ moves that blo
 second order at δ = 0, the only place where derivatives are taken), where a finite change leads
 (`retract`), and which change leads from one value to another (`difference`). `hold` is a value
 with what is held taken from another; `chart` gives the unknowns in which damping is measured,
-T = ∂(those)/∂δ.
+T = ∂(those)/∂δ and T⁻¹.
 
 Blocks consist of scalars, not of small arrays: under `vmap` every scalar becomes one long array,
 and XLA turns the observation equations into straight loops over the observations (a third of the
@@ -27,6 +27,7 @@ from jaxbundle.geometry import (
 from jaxbundle.types import AnyArray, Scalar
 
 Change = tuple[Scalar, ...]
+Matrix = Float[Array, "width width"]
 
 
 @runtime_checkable
@@ -46,7 +47,7 @@ class Space(Protocol):
 
     def hold(self, value: Any, given: Any, free: Float[Array, " width"]) -> Any: ...
 
-    def chart(self, value: Any) -> Float[Array, "width width"] | None: ...
+    def chart(self, value: Any) -> tuple[Matrix, Matrix] | None: ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -224,13 +225,12 @@ class Pose:
 
     def chart(self, value):
         M = matrix_from_quaternion(value.rotation)
-
-        def shift(change):
-            # exp([δθ]×) ≈ 1 + [δθ]×: the derivative is taken at 0 only.
-            t = -M @ (value.position + change[:3])
-            return t + jnp.cross(change[3:], t)
-
-        return jnp.eye(6).at[:3].set(jax.jacfwd(shift)(jnp.zeros(6)))
+        t = -M @ value.position
+        # exp([δθ]×) ≈ 1 + [δθ]×: the derivatives are taken at 0 only.
+        to_shift = lambda change: jnp.cross(change[3:], t) - M @ change[:3]
+        from_shift = lambda those: M.T @ (jnp.cross(those[3:], t) - those[:3])
+        matrix = lambda f: jnp.eye(6).at[:3].set(jax.jacfwd(f)(jnp.zeros(6)))
+        return matrix(to_shift), matrix(from_shift)
 
 
 @dataclasses.dataclass(frozen=True)
