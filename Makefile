@@ -1,6 +1,6 @@
-# `make demo`, `make test` and `make bench` (or a part of it, below). All make .venv first (uv where
-# installed, else venv and pip) and install the package with what the tests need; `bench` also what
-# it compares with. More problems: make bench-bal BAL="problem-16-22106-pre.txt.bz2 …" PEERS="--ceres …"
+# `make demo`, `make test`, `make docs` and `make bench` (or a part of it, below). All make .venv first
+# (uv where installed, else venv and pip) and install the package with what the tests need; `docs` also
+# Sphinx, `bench` also what it compares with. More problems: make bench-bal BAL="problem-16-22106-pre.txt.bz2 …" PEERS="--ceres …"
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -15,7 +15,7 @@ MORE_BENCHES = large pushbroom orientation measuring blunders
 BAL ?=
 PEERS ?=
 
-.PHONY: demo test lint bench install clean $(BENCHES:%=bench-%) $(MORE_BENCHES:%=bench-%)
+.PHONY: demo test lint bench docs install clean $(BENCHES:%=bench-%) $(MORE_BENCHES:%=bench-%)
 
 install: $(VENV)/installed
 
@@ -32,9 +32,22 @@ demo: install
 	$(BIN)/jaxbundle adjust examples/convergent4/project.toml --out out/convergent4
 
 test: install
-	$(BIN)/python -m ruff check jaxbundle tests benchmarks
+	$(BIN)/python -m ruff check jaxbundle tests benchmarks docs
 	$(BIN)/basedpyright --pythonpath $(BIN)/python
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+
+$(VENV)/documented: $(VENV)/installed
+	@if command -v uv >/dev/null 2>&1; then \
+	  uv pip install --quiet --python $(BIN)/python -e '.[docs]'; \
+	else \
+	  $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'; \
+	fi
+	@touch $@
+
+# The site, in out/docs; a warning, such as of a link that leads nowhere, is an error.
+docs: $(VENV)/documented
+	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going -c docs . out/docs
+	@echo "out/docs/index.html"
 
 $(VENV)/compared: $(VENV)/installed
 	@if command -v uv >/dev/null 2>&1; then \
