@@ -101,6 +101,9 @@ def is_described(value, name):
 
 def test_the_reference_of_commands_has_every_one(generated):
     page = generated.list_commands([])
+    for line in re.findall(r"For example:\n\n```text\njaxbundle (.*)", page):
+        command, context, words = generated.find_command(shlex.split(line))
+        command.make_context(context.info_name, words, parent=context.parent)
     for command in cli.COMMANDS:
         assert f"## jaxbundle {command}\n" in page
     assert "### jaxbundle pushbroom locate\n" in page and "`--json" in page

@@ -145,7 +145,7 @@ def walk(command, context, level: int) -> Iterator[str]:
     for parameter in command.get_params(context):
         if (record := parameter.get_help_record(context)) and parameter.name != "help":
             yield f"| `{record[0]}` | {escape(record[1])} |"
-    yield ""
+    yield f"\nFor example:\n\n```text\n{context.command_path} {command.example}\n```\n"
 
 
 def paragraphs(text: str | None) -> Iterator[str]:

@@ -11,7 +11,7 @@ from jaxbundle.cli.app import Control, Force, Format, Input, Quiet, Settings, ap
 from jaxbundle.errors import InputError, NotSolvedError
 
 
-@app.command()
+@app.command(example="examples/convergent4/project.toml --out out/convergent4")
 def adjust(
     input: Input,
     json: Annotated[str, typer.Option(help="write the result as JSON; - for stdout alone")] = "",

@@ -19,7 +19,10 @@ BAD_INPUT, NOT_SOLVED = 2, 3
 NO_READER = 128 + 13
 """As of a Unix tool whose reader has gone: ended by SIGPIPE, number 13."""
 
-
+EXIT_STATUS = (
+    "0 done; 2 bad input: one line, nothing written; 3 not solved: says why; 130, 143 interrupted; "
+    "141 nobody reads the output."
+)
 
 class Command(TyperCommand):
     """A command that starts JAX when its arguments are understood: an error in them, and help, do
@@ -31,9 +34,19 @@ class Command(TyperCommand):
         jaxbundle.enable_x64()
         return super().invoke(ctx)
 
+    example: str = ""
+    """A line that calls it."""
+
     def get_short_help_str(self, limit: int = 0) -> str:
         """The first sentence, whole, for the list of commands."""
         return super().get_short_help_str(1000)
+
+    def format_epilog(self, ctx, formatter) -> None:
+        """What every help ends with: an example, and what the exit status says."""
+        with formatter.section("Example"):
+            formatter.write(f"  {ctx.command_path} {self.example}\n")
+        with formatter.section("Exit status"):
+            formatter.write_text(EXIT_STATUS)
 
 
 class Application(typer.Typer):
@@ -46,9 +59,10 @@ class Application(typer.Typer):
             callback=_list_commands, **options,
         )  # fmt: skip
 
-    def command(self, name: str | None = None, **options: Any):
-        """As of typer."""
-        return super().command(name, cls=Command, **options)
+    def command(self, name: str | None = None, *, example: str, **options: Any):
+        """As of typer. `example`: the arguments of a line that calls it, for its help."""
+        kind = type("Command", (Command,), {"example": example})
+        return super().command(name, cls=kind, **options)
 
 
 def _list_commands(context: typer.Context) -> None:

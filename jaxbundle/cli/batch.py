@@ -9,7 +9,7 @@ from jaxbundle.cli.app import Quiet, app, choice
 from jaxbundle.system.interrupts import advise
 
 
-@app.command()
+@app.command(example="cameras.npz PROJECT.toml --json-lines results.jsonl")
 def batch(
     inputs: Annotated[list[str], typer.Argument(help=".npz of many cameras; projects")],
     json_lines: Annotated[str, typer.Option(help="file of results, one a line; is continued")],
@@ -31,8 +31,8 @@ def batch(
     Lines that are in the file already are not computed again. Those of other
     settings or other data are refused, or computed again with --renew.
 
-    Exit status: 0 every input has its line, whatever its status; 2 bad input,
-    or another run is writing the file; 130, 143 interrupted.
+    It is done when every input has its line, whatever the status in it; another
+    run that is writing the file is refused.
     """
     from jaxbundle.batch.run import run_batch
     from jaxbundle.batch.stacks import is_camera_stack

@@ -11,7 +11,7 @@ from jaxbundle.cli.app import Force, Quiet, app, choice
 from jaxbundle.errors import InputError, NotSolvedError
 
 
-@app.command()
+@app.command(example="examples/board --board 9x6 --square 0.03 --out out/board")
 def calibrate(
     photos: Annotated[
         list[str] | None, typer.Argument(help="photographs, patterns or folders of one camera")

@@ -13,7 +13,7 @@ STEPS, CURVE = 12, 200
 MOST_ROWS = 100_000
 
 
-@app.command()
+@app.command(example="examples/video_cameras/cameras.toml#1-indoor --step 1")
 def camera(
     files: Annotated[list[str], typer.Argument(help="files of cameras or networks, or FILE#ID")],
     step: Annotated[float | None, typer.Option(help="of the radius, in the unit of the model")] = (

@@ -11,7 +11,7 @@ from jaxbundle.cli.app import app, choice
 from jaxbundle.errors import InputError
 
 
-@app.command()
+@app.command(example="out/surface/cloud.csv --cube 0.05 --out out/thinned.las")
 def cloud(
     file: Annotated[Path, typer.Argument(help="cloud: .csv with X,Y,Z, .ply, .las, .laz")],
     out: Annotated[

@@ -13,7 +13,9 @@ from jaxbundle.errors import InputError
 RINGS = 10
 
 
-@app.command()
+@app.command(
+    example="cameras.toml#1-indoor cameras.toml#1-outdoor --plot out/difference.png"
+)
 def compare(
     a: Annotated[str, typer.Argument(help="camera: a file of cameras or a network, or FILE#ID")],
     b: Annotated[str, typer.Argument(help="the other one")],

@@ -10,7 +10,7 @@ from jaxbundle.cli.app import Control, Format, Input, Quiet, Settings, app
 from jaxbundle.errors import InputError
 
 
-@app.command()
+@app.command(example="examples/four_photographs/project.toml out/colmap")
 def convert(
     input: Input,
     output: Annotated[Path, typer.Argument(help="file or folder to write")],

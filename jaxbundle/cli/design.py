@@ -12,7 +12,7 @@ from jaxbundle.cli.app import Force, Quiet, app, choice
 SIX = "Xmin,Ymin,Zmin,Xmax,Ymax,Zmax"
 
 
-@app.command()
+@app.command(example="PROJECT.toml --distance 1,6 --out out/designed")
 def design(
     project: Annotated[Path, typer.Argument(help="cameras, targets, stations to start from")],
     aim: Annotated[str, choice(AIMS, "what is to be small")] = "mean",

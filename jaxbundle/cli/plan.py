@@ -11,7 +11,9 @@ from jaxbundle.errors import InputError
 MOST_PHOTOGRAPHS = 2000
 
 
-@app.command()
+@app.command(
+    example="--c 100 --image 68,104 --area 1000,600 --sigma-image 0.003 --height 1000"
+)
 def plan(
     c: Annotated[float, typer.Option(help="principal distance, mm")],
     image: Annotated[str, typer.Option(help="format along,across the flight, mm")],

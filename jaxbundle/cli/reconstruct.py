@@ -11,7 +11,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.system.interrupts import advise
 
 
-@app.command(name="reconstruct")
+@app.command(name="reconstruct", example="PHOTOS --control gcp_list.txt --out out/block")
 def reconstruct_command(
     photos: Annotated[list[Path], typer.Argument(help="photographs, or folders of them")],
     out: Annotated[Path, typer.Option(help="folder for report, JSON, tables, COLMAP model, PLY")],

@@ -14,7 +14,9 @@ FILES = ("cloud.csv", "cloud.ply", "surface.json", "report.txt", "dsm.tif", "dsm
          "orthophoto.tif")  # fmt: skip
 
 
-@app.command()
+@app.command(
+    example="PROJECT.toml --photos PHOTOS --dsm 0.05 --out out/surface"
+)
 def surface(
     input: Annotated[
         list[Path],

@@ -80,6 +80,9 @@ def test_every_command_has_help(first_touch):
     for (status, out, err), arguments in zip(first_touch[0], HELPS):
         assert (status, err) == (0, ""), arguments
         assert "--help" in out or arguments == ["--version"], arguments
+        if arguments[0] in COMMANDS and arguments not in (["pushbroom", "--help"],):
+            program = " ".join(["jaxbundle", *arguments[:-1]])
+            assert f"Example:\n  {program} " in out and "Exit status:\n  0 done; 2 bad" in out
     listed = first_touch[0][0][1]
     assert all(command in listed for command in COMMANDS) and "..." not in listed.split("\n", 1)[1]
 

@@ -15,7 +15,7 @@ Sigma = Annotated[float, typer.Option(min=0, help="standard deviation: degrees, 
 FEWEST_DRAWS = 20
 
 
-@pushbroom.command()
+@pushbroom.command(example="out/flight/scanner.toml --attitude-white 0.01")
 def accuracy(
     scanner: ScannerFile,
     truth: Annotated[Path | None, typer.Option(help="scanner file of the truth")] = None,

@@ -11,7 +11,7 @@ from jaxbundle.cli.pushbroom.app import Dem, Geoid, Level, ScannerFile, pushbroo
 from jaxbundle.errors import InputError
 
 
-@pushbroom.command()
+@pushbroom.command(example="out/flight/scanner.toml out/flight/image.tif --out out/map.tif")
 def correct(
     scanner: ScannerFile,
     image: Annotated[Path, typer.Argument(help="the image: a raster of all lines and pixels")],

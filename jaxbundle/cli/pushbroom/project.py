@@ -12,7 +12,7 @@ MOST = 4
 """So many lines that see one point are told."""
 
 
-@pushbroom.command()
+@pushbroom.command(example="out/flight/scanner.toml --points points.csv")
 def project(
     scanner: ScannerFile,
     points: Annotated[

@@ -13,7 +13,7 @@ from jaxbundle.cli.pushbroom.app import pushbroom
 PHOTOGRAPHS = "photographs"
 
 
-@pushbroom.command()
+@pushbroom.command(example="refine.toml --out out/refined")
 def refine(
     input: Annotated[Path, typer.Argument(help="refine file, .toml (docs/pushbroom.md)")],
     out: Annotated[

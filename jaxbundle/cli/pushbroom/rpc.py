@@ -30,7 +30,7 @@ Figures = Annotated[
 Out = Annotated[Path, typer.Option(help="file for the coefficients: .txt, .rpb, an existing .tif")]
 
 
-@rpc.command()
+@rpc.command(example="out/flight/scanner.toml --out out/image_RPC.TXT")
 def fit(
     source: Annotated[
         Path, typer.Argument(help="scanner file, or table longitude,latitude,height,line,sample")
@@ -81,7 +81,7 @@ def fit(
     tell(head, json, found.check)
 
 
-@rpc.command()
+@rpc.command(example="image_RPC.TXT --points points.csv")
 def apply(
     coefficients: RpcFile,
     points: Annotated[
@@ -131,7 +131,7 @@ def apply(
     write_rows({"id": ids, **columns, "status": meaning}, csv, json)
 
 
-@rpc.command()
+@rpc.command(example="image_RPC.TXT --control control.csv --out out/image_RPC.TXT")
 def compensate(
     coefficients: RpcFile,
     control: Annotated[

@@ -12,7 +12,7 @@ from jaxbundle.cli.pushbroom.app import Dem, Geoid, Level, pushbroom
 COMMAND, NAME, IMAGE, TRUTH = "pushbroom simulate", "scanner", "image.tif", "truth"
 
 
-@pushbroom.command()
+@pushbroom.command(example="examples/line_scanner/flight.toml --out out/flight")
 def simulate(
     flight: Annotated[Path, typer.Argument(help="flight file, .toml (docs/pushbroom.md)")],
     out: Annotated[Path, typer.Option(help="folder for scanner.toml, tables, truth/, image.tif")],
