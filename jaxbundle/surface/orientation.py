@@ -4,9 +4,9 @@ A point is moved by its images' exterior orientations θₖ = (X0, Y0, Z0, ω, �
 
     dX = −N⁻¹·Σ Jₖᵀ·Bₖ·dθₖ,    N = Σ JₖᵀJₖ,    Jₖ = ∂(u, v)ₖ/∂X,    Bₖ = ∂(u, v)ₖ/∂θₖ,
 
-so that C = Σ Sₖ·diag(σ²)·Sₖᵀ with Sₖ = N⁻¹·Jₖᵀ·Bₖ. The σ are those of images.csv, which are taken
-as independent: a network knows the orientations relative to each other better. σ of 0, or none,
-adds nothing.
+so that C = Σ Sₖ·diag(σ²)·Sₖᵀ with Sₖ = N⁻¹·Jₖᵀ·Bₖ. The σ are those of images.csv, taken as
+uncorrelated, which after an adjustment they are not: the true part may be smaller or larger. σ of
+0, or none, adds nothing.
 """
 
 from collections.abc import Sequence
