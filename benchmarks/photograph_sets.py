@@ -13,6 +13,7 @@
 | `portrait` | a facade, three of the photographs stored upright |
 | `cameras` | two cameras of other sizes and principal distances, told by EXIF |
 | `parts` | hills and a facade that have nothing in common |
+| `scenes` | hills and the square of `depth`, which have nothing in common |
 | `foreign` | hills, and three photographs of other places |
 
 Unless it is said, nothing tells the principal distance.
@@ -205,8 +206,15 @@ def cameras(width: int) -> list[Shot]:
 
 
 def parts(width: int) -> list[Shot]:
-    rename = lambda s: dataclasses.replace(s, name=f"other_{s.name}", part=2)
-    return [*map(rename, facade(width)[3:9]), *convergent(width, 8)]
+    return [*map(_other, facade(width)[3:9]), *convergent(width, 8)]
+
+
+def scenes(width: int) -> list[Shot]:
+    return [*map(_other, depth(width)[2:8]), *convergent(width, 8)]
+
+
+def _other(shot: Shot) -> Shot:
+    return dataclasses.replace(shot, name=f"other_{shot.name}", part=2)
 
 
 def foreign(width: int) -> list[Shot]:
@@ -227,7 +235,9 @@ def convergent(width: int, number: int = 11) -> list[Shot]:
 
 SETS: dict[str, Callable[[int], list[Shot]]] = {
     f.__name__: f
-    for f in (convergent, facade, chain, loop, wide, depth, portrait, cameras, parts, foreign)
+    for f in (
+        convergent, facade, chain, loop, wide, depth, portrait, cameras, parts, scenes, foreign,
+    )  # fmt: skip
 }
 
 
