@@ -1,6 +1,7 @@
-# `make demo`, `make test`, `make docs` and `make bench` (or a part of it, below). All make .venv first
-# (uv where installed, else venv and pip) and install the package with what the tests need; `docs` also
-# Sphinx, `bench` also what it compares with. More problems: make bench-bal BAL="problem-16-22106-pre.txt.bz2 …" PEERS="--ceres …"
+# `make demo`, `make test` (`make test-all`: with the further cases of its dear tests), `make docs` and
+# `make bench` (or a part of it, below). All make .venv first (uv where installed, else venv and pip)
+# and install the package with what the tests need; `docs` also Sphinx, `bench` also what it compares
+# with. More problems: make bench-bal BAL="problem-16-22106-pre.txt.bz2 …" PEERS="--ceres …"
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -15,7 +16,7 @@ MORE_BENCHES = large pushbroom orientation measuring blunders
 BAL ?=
 PEERS ?=
 
-.PHONY: demo test lint bench docs install clean $(BENCHES:%=bench-%) $(MORE_BENCHES:%=bench-%)
+.PHONY: demo test test-all bench docs install clean $(BENCHES:%=bench-%) $(MORE_BENCHES:%=bench-%)
 
 install: $(VENV)/installed
 
@@ -31,10 +32,11 @@ $(VENV)/installed: pyproject.toml
 demo: install
 	$(BIN)/jaxbundle adjust examples/convergent4/project.toml --out out/convergent4
 
-test: install
+test: CASES = -m 'not further'
+test test-all: install
 	$(BIN)/python -m ruff check jaxbundle tests benchmarks docs
 	$(BIN)/basedpyright --pythonpath $(BIN)/python
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(CASES)
 
 $(VENV)/documented: $(VENV)/installed
 	@if command -v uv >/dev/null 2>&1; then \

@@ -118,7 +118,7 @@ def _write_foreign(network: Network, folder: Path, name: str) -> list[str]:
             return [f"not written for OpenCV and COLMAP: {error}"]
         remark = [f"{name}.yaml and {COLMAP}: {conversion}" for conversion in cost.values()]
     write_opencv(network.cameras[0], folder / f"{name}.yaml")
-    fill_colmap(network, folder / COLMAP, text=True)
+    fill_colmap(network, folder / COLMAP)
     return remark
 
 

@@ -84,9 +84,12 @@ def write_colmap(
         return fill_colmap(network, new, text)
 
 
-def fill_colmap(network: Network, folder: Path, text: bool) -> tuple[str, ...]:
-    """Write a sparse model beside what is in a folder, or a new one; as `write_colmap`."""
+def fill_colmap(network: Network, folder: Path, text: bool | None = None) -> tuple[str, ...]:
+    """Write a sparse model beside what is in a folder, or a new one; as `write_colmap`. `text`, if
+    not given: where it can be, which is not with blanks in the names of images."""
     model, lost = from_network(network)
+    if text is None:
+        text = not any(character.isspace() for image in model.images for character in image.name)
     files = text_files(model) if text else binary_files(model)
     folder.mkdir(exist_ok=True)
     for name, content in files.items():
