@@ -20,10 +20,10 @@ SETTINGS = Settings(Detection(number=1500), points=250)
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """Truth, and what was made of eight photographs, one of another scene, one cut short, one that
+    """Truth, and what was made of six photographs, one of another scene, one cut short, one that
     is there twice and one without texture; and the folder of matches."""
     folder = tmp_path_factory.mktemp("photographs")
-    truth = write_photographs(folder, "a", 8, 1)
+    truth = write_photographs(folder, "a", 6, 1)
     write_photographs(folder / "other", "c", 1, 11)
     (folder / "c0.png").write_bytes((folder / "other" / "c0.png").read_bytes())
     (folder / "cut.png").write_bytes((folder / "a1.png").read_bytes()[:20_000])
@@ -77,7 +77,7 @@ def test_stages_end_and_what_was_found_is_kept(made):
     _, _, stages, store = made
     assert {"features", "matching", "verification", "start values"} <= set(stages)
     assert all(done == total for stage, (done, total) in stages.items() if "data" not in stage)
-    assert len(list(store.glob("*.npz"))) > 20 and not list(store.glob("*.part*"))
+    assert len(list(store.glob("*.npz"))) > 12 and not list(store.glob("*.part*"))
 
 
 def test_groups_of_connected_photographs():

@@ -80,6 +80,7 @@ def seen_by(image, scene, seed):
     return render_rays(scene, top.reshape(shape), d.reshape(shape), Sensor(noise=2, seed=seed)).grey
 
 
+@pytest.mark.further
 def test_scanner_files_become_a_cloud_a_dsm_and_an_orthophoto(tmp_path, command):
     texture = Texture(0.25, seed=2, side=512)
     scene = Scene((HeightField(ground, (-120, -120, 120, 220)),), (texture,))
