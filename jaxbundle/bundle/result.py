@@ -293,13 +293,18 @@ class Adjustment:
         wide = (np.resize(x, (rows, x.shape[1])) for x in (self.values.rotation, given))
         return [np.asarray(x)[: len(given)] for x in _all_angles(*wide)]
 
+    @property
+    def angle_jacobian(self) -> Float[np.ndarray, "images 3 3"]:
+        """∂(ω, φ, κ)/∂δθ of every image."""
+        return self._angles[1]
+
     @functools.cached_property
     def image_covariance(self) -> Float[np.ndarray, "images 6 6"]:
         """Covariance of X0, Y0, Z0, ω, φ, κ, angles by their exact Jacobian; radians."""
         Q = self.cofactors.image_cofactors
         A = np.zeros((len(Q), 6, 6))
         A[:, :3, :3] = np.eye(3)
-        A[:, 3:, 3:] = self._angles[1]
+        A[:, 3:, 3:] = self.angle_jacobian
         free = self.problem.system.table("image").free
         Q = Q * free[:, :, None] * free[:, None, :]
         return self.sigma0**2 * A @ Q @ A.transpose(0, 2, 1)

@@ -13,8 +13,11 @@ from pathlib import Path
 from types import MappingProxyType
 
 from jaxbundle import report
+from jaxbundle.bundle.orientations import orientation_covariance
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.io.networks.orientation_covariance import FILE as PRECISION
+from jaxbundle.io.networks.orientation_covariance import write_orientation_covariance
 from jaxbundle.io.networks.project import ADJUSTED, FILE_NAME, fill_project
 from jaxbundle.io.networks.project import FILES as NETWORK_FILES
 from jaxbundle.io.results.result_json import result_text, unsolved_text
@@ -24,6 +27,7 @@ from jaxbundle.io.writing.fingerprints import input_files
 from jaxbundle.io.writing.folders import check_folder, replaced_folder
 from jaxbundle.network.columns import some
 from jaxbundle.network.tables import Network
+from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.plotting.files import FIGURES, draw_figures
 from jaxbundle.plotting.style import need_matplotlib
 from jaxbundle.report.page import UNKNOWN, Origin, compose, compose_failure, fingerprint_files
@@ -32,7 +36,7 @@ REPORT, PAGE, RESULT = "report.txt", "report.html", "result.json"
 TABLES = ("cameras", "images", "points", "residuals", "checks", "far_points")
 FILES = (
     REPORT, PAGE, RESULT, *(f"{name}.csv" for name in TABLES),
-    *(f"{ADJUSTED}/{name}" for name in NETWORK_FILES), *FIGURES,
+    *(f"{ADJUSTED}/{name}" for name in NETWORK_FILES), f"{ADJUSTED}/{PRECISION}", *FIGURES,
 )  # fmt: skip
 """What is written into a folder, figures as patterns."""
 
@@ -213,6 +217,9 @@ def fill_results(
     if result.converged:
         _write_tables(result, folder)
         fill_project(adjusted_network(result), folder / ADJUSTED)
+        if (found := orientation_covariance(result)) is not None:
+            unit = ANGLE_UNITS[result.network.angle_unit]
+            write_orientation_covariance(found, folder / ADJUSTED / PRECISION, unit)
     if plots:
         draw_figures(result, folder)
 

@@ -149,7 +149,8 @@ class _Making:
     def _matches(self):
         features = self._features()
         prints = [p.fingerprint for p in self.photographs]
-        matches = match(features, prints, self.settings.pairs, None, self.store, self.workers,
+        place = self.extra.positions and self.extra.positions[0]
+        matches = match(features, prints, self.settings.pairs, place, self.store, self.workers,
                         self.tell)  # fmt: skip
         self.store.drop_unused()
         return features, matches

@@ -9,8 +9,15 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.formats import read_oriented
+from jaxbundle.io.networks.orientation_covariance import (
+    FILE,
+    OrientationCovariance,
+    read_orientation_covariance,
+)
+from jaxbundle.io.networks.project import ADJUSTED, FILE_NAME
 from jaxbundle.network.columns import some
 from jaxbundle.network.tables import Network
+from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.photographs.reading import SUFFIXES, read_photograph
 from jaxbundle.surface.views import FrameView, frame_views
 
@@ -41,7 +48,23 @@ def read_views(
     files = find_photographs(network.images.id, Path(folder))
     greys = [read_photograph(file) for file in files]
     colours = [partial(read_photograph, file, colour=True) for file in files]
-    return frame_views(network, greys, colours), network, tuple(messages)
+    views = frame_views(network, greys, colours, _joint(Path(path), network))
+    return views, network, tuple(messages)
+
+
+def _joint(path: Path, network: Network) -> OrientationCovariance | None:
+    """The covariance of the orientations beside a project, where an adjustment has written one."""
+    folder = path if path.is_dir() else path.parent
+    # a folder of results holds its project in another
+    file = next((f / FILE for f in (folder, folder / ADJUSTED) if (f / FILE_NAME).is_file()), None)
+    if file is None or not file.is_file():
+        return None
+    found = read_orientation_covariance(file, ANGLE_UNITS[network.angle_unit])
+    known = {("image", id) for id in network.images.id}
+    known |= {("camera", camera.id) for camera in network.cameras}
+    if not known & {(kind, id) for kind, id, _ in found.unknowns}:
+        raise InputError(f"{file}: not of this project: it has none of its images; remove it")
+    return found
 
 
 def find_photographs(names: Sequence[str], folder: Path) -> list[Path]:

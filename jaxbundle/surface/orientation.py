@@ -1,12 +1,12 @@
 """What the orientation of photographs adds to the covariance of points.
 
-A point is moved by its images' exterior orientations θₖ = (X0, Y0, Z0, ω, φ, κ) by
+A point is moved by its images' orientations θₖ = (X0, Y0, Z0, ω, φ, κ, parameters of the camera) by
 
     dX = −N⁻¹·Σ Jₖᵀ·Bₖ·dθₖ,    N = Σ JₖᵀJₖ,    Jₖ = ∂(u, v)ₖ/∂X,    Bₖ = ∂(u, v)ₖ/∂θₖ,
 
-so that C = Σ Sₖ·diag(σ²)·Sₖᵀ with Sₖ = N⁻¹·Jₖᵀ·Bₖ. The σ are those of images.csv, taken as
-uncorrelated, which after an adjustment they are not: the true part may be smaller or larger. σ of
-0, or none, adds nothing.
+so that C = ΣΣ Sₖ·Cₖₗ·Sₗᵀ with Sₖ = N⁻¹·Jₖᵀ·Bₖ. Cₖₗ is what an adjustment says (`precision.csv`), or
+diag(σ²) for k = l by the σ of images.csv, taken as uncorrelated, which after an adjustment they are
+not: the true part may be smaller or larger. σ of 0, or none, adds nothing.
 """
 
 from collections.abc import Sequence
@@ -20,10 +20,13 @@ from jaxtyping import Bool, Float
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, omega_phi_kappa_from_matrix
 from jaxbundle.surface.views import FrameView, OrientedImage, in_lanes, pixel_of
 
+PORTION = 1 << 16
+"""Points that are computed at once."""
+
 
 def is_uncertain(view: OrientedImage) -> bool:
     """Whether an image has a σ of its orientation."""
-    return isinstance(view, FrameView) and bool((view.sigma > 0).any())
+    return isinstance(view, FrameView) and bool(_covariance(view, view).any())
 
 
 def orientation_covariance(
@@ -33,21 +36,50 @@ def orientation_covariance(
 ) -> Float[np.ndarray, "n 3 3"]:
     """The covariance of points by that of the orientations of the images that see them."""
     C = np.zeros((len(X), 3, 3))
-    if not any(map(is_uncertain, views)):
-        return C
+    if any(map(is_uncertain, views)):
+        for first in range(0, len(X), PORTION):
+            rows = slice(first, first + PORTION)
+            C[rows] = _of_portion(views, X[rows], used[rows])
+    return C
+
+
+def _of_portion(views, X, used):
     J = np.stack([view.derivative(X) for view in views], 1) * used[:, :, None, None]
     N = np.einsum("nkij,nkil->njl", J, J)
     scale = np.trace(N, axis1=1, axis2=2)[:, None, None]
     Q = np.linalg.pinv(N / scale) / scale
-    for k, view in enumerate(views):
-        if isinstance(view, FrameView) and is_uncertain(view):
-            S = Q @ np.swapaxes(J[:, k], 1, 2) @ by_orientation(view, X)
-            C += (S * view.sigma**2) @ np.swapaxes(S, 1, 2)
+    S = {
+        k: Q @ np.swapaxes(J[:, k], 1, 2) @ by_orientation(view, X)
+        for k, view in enumerate(views) if isinstance(view, FrameView) and is_uncertain(view)
+    }  # fmt: skip
+    C = np.zeros((len(X), 3, 3))
+    for k, one in S.items():
+        for l, other in S.items():
+            between = _covariance(views[k], views[l])
+            if between.any():
+                C += one @ between @ np.swapaxes(other, 1, 2)
     return C
 
 
-def by_orientation(view: FrameView, X: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 6"]:
-    """∂(u, v)/∂(X0, Y0, Z0, ω, φ, κ) of points, pixels per object unit and radian."""
+def _covariance(one: FrameView, other: FrameView) -> Float[np.ndarray, "k l"]:
+    """Between the orientations of two photographs, cameras included."""
+    if one.joint is not None and one.joint is other.joint:
+        rows, columns = (
+            one.joint.rows(view.name, view.camera.id, view.frame.model.parameters)
+            for view in (one, other)
+        )
+        C = one.joint.matrix[np.ix_(rows, columns)]
+        return C * (rows >= 0)[:, None] * (columns >= 0)
+    shape = (6 + len(one.frame.p), 6 + len(other.frame.p))
+    C = np.zeros(shape)
+    if one is other and one.joint is None:
+        C[:6, :6] = np.diag(one.sigma**2)
+    return C
+
+
+def by_orientation(view: FrameView, X: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 k"]:
+    """∂(u, v)/∂(X0, Y0, Z0, ω, φ, κ, parameters) of points, pixels per object unit, radian, unit of
+    the parameter."""
     return in_lanes(_derivative, view.frame, X)
 
 
@@ -56,9 +88,9 @@ def _derivative(frame, X):
     angles = omega_phi_kappa_from_matrix(frame.M)
 
     def pixel(theta, X):
-        M = matrix_from_omega_phi_kappa(theta[3:])
-        moved = eqx.tree_at(lambda f: (f.X0, f.M), frame, (theta[:3], M))
+        M = matrix_from_omega_phi_kappa(theta[3:6])
+        moved = eqx.tree_at(lambda f: (f.X0, f.M, f.p), frame, (theta[:3], M, theta[6:]))
         return pixel_of(moved, X)
 
-    theta = jnp.concatenate([frame.X0, angles])
+    theta = jnp.concatenate([frame.X0, angles, frame.p])
     return jax.vmap(jax.jacfwd(pixel), (None, 0))(theta, X)

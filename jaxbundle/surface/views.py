@@ -31,6 +31,7 @@ from jaxbundle.cameras import CameraModel, default_parameters, get_model, image_
 from jaxbundle.cameras.pixel_frame import pixel_frame
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
+from jaxbundle.io.networks.orientation_covariance import OrientationCovariance
 from jaxbundle.network.tables import Camera
 
 LANES = 1 << 13
@@ -76,13 +77,16 @@ class OrientedImage(Protocol):
 
 class FrameView:
     """A photograph: camera, projection centre, rotation M from object to camera; `sigma` of X0, Y0,
-    Z0, ω, φ, κ (object unit, radians), 0: fixed or not known; `colours()`: its red, green, blue."""
+    Z0, ω, φ, κ (object unit, radians), 0: fixed or not known; `joint`: covariance of these and the
+    parameters of the camera with those of the other photographs, used instead of `sigma`;
+    `colours()`: its red, green, blue."""
 
     def __init__(
         self, name: str, grey, camera: Camera, X0, M, sigma=None,
         colours: Callable[[], UInt8[np.ndarray, "rows columns 3"]] | None = None,
+        joint: OrientationCovariance | None = None,
     ):  # fmt: skip
-        self.name, self.grey, self.colours = name, grey, colours
+        self.name, self.grey, self.colours, self.joint = name, grey, colours, joint
         self.sigma = np.nan_to_num(np.zeros(6) if sigma is None else np.asarray(sigma, float))
         self.size = (grey.shape[1], grey.shape[0])
         model = get_model(camera.model)
@@ -144,14 +148,15 @@ class _Frame(eqx.Module):
 
 
 def frame_views(
-    network, greys: Sequence[np.ndarray], colours: Sequence[Callable | None] | None = None
+    network, greys: Sequence[np.ndarray], colours: Sequence[Callable | None] | None = None,
+    joint: OrientationCovariance | None = None,
 ) -> tuple[FrameView, ...]:
     """The oriented photographs of a network, a view for each of its images."""
     images = network.images
     M = np.asarray(jax.vmap(matrix_from_omega_phi_kappa)(jnp.asarray(images.angles)))
     colours = colours or [None] * len(images)
     return tuple(
-        FrameView(name, grey, network.cameras[c], X0, m, sigma, read)
+        FrameView(name, grey, network.cameras[c], X0, m, sigma, read, joint)
         for name, grey, c, X0, m, sigma, read in zip(
             images.id, greys, images.camera, images.position, M, images.sigma, colours
         )

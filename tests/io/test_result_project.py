@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import jaxbundle
 from jaxbundle.cli.outputs import NETWORK_FILES, check_targets, write_targets
 from jaxbundle.io import adjusted_network, read_network, write_project
+from jaxbundle.io.networks.orientation_covariance import read_orientation_covariance
 
 
 def test_it_is_a_fixed_point(convergent4, tmp_path):
@@ -43,8 +44,18 @@ def test_it_is_written_with_the_result_and_read_from_its_folder(convergent4, tmp
     write_targets(convergent4, "", tmp_path, brief=True, plots=False)
     folder = tmp_path / "network"
     needed = {"project.toml", "images.csv", "points.csv", "observations.csv"}
-    assert {p.name for p in folder.iterdir()} == needed < set(NETWORK_FILES)
+    assert {p.name for p in folder.iterdir()} == needed | {"precision.csv"}
+    assert needed < set(NETWORK_FILES)
     network = read_network(tmp_path)
+    precision = read_orientation_covariance(folder / "precision.csv", 1.0)
+    for k, id in enumerate(network.images.id):
+        rows = precision.rows(id, "cam", ["c", "K1"])
+        C = precision.matrix[np.ix_(rows, rows)]
+        of_image, of_camera = convergent4.image_covariance[k], convergent4.cameras["cam"]
+        unit = np.sqrt(np.outer(of_image.diagonal(), of_image.diagonal()))
+        assert_allclose(C[:6, :6] / unit, of_image / unit, atol=1e-9)
+        sigma = [of_camera["parameters"][name]["sigma"] for name in ("c", "K1")]
+        assert_allclose(np.sqrt(C.diagonal()[6:]), sigma, rtol=1e-9)
     assert_allclose(network.images.position, convergent4.image_values[:, :3], rtol=1e-15)
     with pytest.raises(jaxbundle.InputError, match="part of the input and would be overwritten"):
         check_targets(tmp_path / "network" / "project.toml", network, "", tmp_path)

@@ -1,6 +1,8 @@
 """Photographs and rasters as surfaces are given them: folders with masks beside, COLMAP models, the
 σ of orientations, colours, large rasters by blocks."""
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
@@ -9,6 +11,12 @@ from surface_scenes import CAMERA, SIZE, F
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
+from jaxbundle.io.networks.orientation_covariance import (
+    OrientationCovariance,
+    read_orientation_covariance,
+    write_orientation_covariance,
+)
+from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.surface import scanner_inputs
 from jaxbundle.surface.correlation import make_pyramid
 from jaxbundle.surface.inputs import find_photographs, read_views
@@ -21,10 +29,11 @@ CENTRES = np.array([[-1.0, 0, 10], [1.0, 0.2, 10], [0.1, 1.5, 9.5]])
 SIGMA = np.array([0.02, 0.01, 0.03, 1e-3, 2e-3, 5e-4])
 
 
-def views(sigma, angles=ANGLES, centres=CENTRES):
+def views(sigma, angles=ANGLES, centres=CENTRES, camera=CAMERA, joint=None):
     blank = np.zeros(SIZE[::-1], np.uint8)
     return [
-        FrameView(str(k), blank, CAMERA, X0, np.asarray(matrix_from_omega_phi_kappa(a)), s)
+        FrameView(str(k), blank, camera, X0, np.asarray(matrix_from_omega_phi_kappa(a)), s,
+                  joint=joint)
         for k, (X0, a, s) in enumerate(zip(centres, angles, sigma))
     ]  # fmt: skip
 
@@ -49,6 +58,43 @@ def test_uncertain_orientations_move_points_as_their_covariance_says():
     found = orientation_covariance(given, X, used)
     np.testing.assert_allclose(found, expected, rtol=0.02, atol=1e-9)
     assert not orientation_covariance(views([None] * 3), X, used).any()
+
+
+def test_a_joint_covariance_of_orientations_and_camera_moves_points_as_it_says(tmp_path):
+    """Every unknown moved on its own, and their covariance over these directions: D·C·Dᵀ; from the
+    file as it was written, in degrees."""
+    unknowns = tuple(("image", id, name) for id in ("0", "2") for name in EXTERIOR)
+    unknowns += (("camera", CAMERA.id, "fx"),)
+    rng, sigma = np.random.default_rng(1), np.concatenate([SIGMA, 2 * SIGMA, [1.5]])
+    L = rng.normal(size=(13, 13))
+    R = L @ L.T
+    matrix = R / np.sqrt(np.outer(R.diagonal(), R.diagonal())) * np.outer(sigma, sigma)
+    file = tmp_path / "precision.csv"
+    write_orientation_covariance(OrientationCovariance(unknowns, matrix), file, np.pi / 180)
+    joint = read_orientation_covariance(file, np.pi / 180)
+    np.testing.assert_allclose(joint.matrix, matrix, rtol=1e-13)
+    X = np.array([[0.3, 0.2, 0.1], [-0.5, 0.6, 1.0]])
+    given = views([None] * 3, joint=joint)
+    assert [is_uncertain(v) for v in given] == [True, True, True]  # the camera is that of all
+    uv = np.stack([v.project(X) for v in given], 1)
+    used, unit = np.ones((2, 3), bool), np.broadcast_to(np.eye(2), (2, 3, 2, 2))
+    D = np.zeros((2, 3, 13))
+    for j, (kind, id, name) in enumerate(unknowns):
+        angles, centres, camera, step = ANGLES.copy(), CENTRES.copy(), CAMERA, 0.01 * sigma[j]
+        if kind == "camera":
+            moved = {**CAMERA.parameters, name: CAMERA.parameters[name] + step}
+            camera = dataclasses.replace(CAMERA, parameters=moved)
+        else:
+            i = EXTERIOR.index(name)
+            (centres if i < 3 else angles)[int(id), i % 3] += step
+        at = intersect(views([None] * 3, angles, centres, camera), uv, unit, used, X).X
+        D[:, :, j] = (at - X) / step
+    found = orientation_covariance(given, X, used)
+    np.testing.assert_allclose(found, D @ matrix @ np.swapaxes(D, 1, 2), rtol=0.03, atol=1e-7)
+    text = file.read_text().replace("image,2,X0", "image,2,X0,", 1)
+    file.write_text(text)
+    with pytest.raises(InputError, match="cells where the header has"):
+        read_orientation_covariance(file, 1.0)
 
 
 def test_the_derivative_by_the_orientation_is_that_of_the_projection():

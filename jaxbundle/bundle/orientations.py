@@ -1,0 +1,46 @@
+"""The joint covariance of all orientations and cameras of a result."""
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from jaxbundle.bundle.result import Adjustment
+from jaxbundle.io.networks.orientation_covariance import OrientationCovariance, Unknown
+from jaxbundle.network.tables import EXTERIOR
+
+LARGEST = 20_000_000
+"""Orientations times coordinates of points up to which it is computed."""
+
+
+def orientation_covariance(result: Adjustment) -> OrientationCovariance | None:
+    """Of X0 … kappa (radians) of all images, and of the parameters of cameras that were free, tied
+    ones included; None where nothing was free, or where it is too large to be computed."""
+    problem, network = result.problem, result.network
+    free = np.asarray(problem.system.table("image").free, bool)
+    unknowns: list[Unknown] = [("image", id, n) for id in network.images.id for n in EXTERIOR]
+    places = [("image", k, j) for k in range(len(network.images)) for j in range(6)]
+    repeated = list(range(len(places)))
+    for table in problem.layout.cameras:
+        for row, c in enumerate(table.cameras):
+            names, columns = problem.interior(c)
+            for j in columns:
+                same = [g[1:] for g in network.cameras[c].tie if g[0] == names[j]]
+                for name in (names[j], *(tied for group in same for tied in group)):
+                    unknowns.append(("camera", network.cameras[c].id, name))
+                    repeated.append(len(places))
+                places.append((table.name, row, j))
+    if len(places) == free.size and not free.any():
+        return None
+    if len(places) * 3 * len(network.points) > LARGEST:
+        return None
+    rows = {t.name: np.zeros((len(places), t.rows, t.space.width)) for t in problem.system.tables}
+    for n, (name, row, column) in enumerate(places):
+        rows[name][n, row, column] = 1.0
+    C = result.sigma0**2 * result.cofactors.solution.propagate_rows(rows)
+    used = np.concatenate([free.ravel(), np.ones(len(places) - free.size)])
+    turns = (block_diag(np.eye(3), A) for A in result.angle_jacobian)
+    A = block_diag(*turns, np.eye(len(places) - free.size)) * used
+    C = (A @ C @ A.T)[np.ix_(repeated, repeated)]
+    there = np.diagonal(C) > 0
+    return OrientationCovariance(
+        tuple(one for one, use in zip(unknowns, there) if use), C[np.ix_(there, there)]
+    )

@@ -1,0 +1,93 @@
+"""`precision.csv` beside a project: how well its orientations and cameras are known, jointly.
+
+| column | |
+|---|---|
+| `kind`, `id`, `parameter` | `image`, its id, `X0` … `kappa`; `camera`, its id, a parameter |
+| `sigma` | object unit, angle unit of the project, unit of the parameter |
+| `1`, `2`, … | correlations with the rows above, and with itself |
+
+It is no table of the project: nothing of it becomes an observation. What is not in it is held.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.text.csv_tables import read_csv, write_csv
+from jaxbundle.network.tables import EXTERIOR
+
+FILE = "precision.csv"
+HEAD = ("kind", "id", "parameter", "sigma")
+ANGLES = EXTERIOR[3:]
+
+Unknown = tuple[str, str, str]
+"""Kind (`image`, `camera`), id, parameter."""
+
+
+@dataclasses.dataclass(frozen=True)
+class OrientationCovariance:
+    """Unknowns of images and cameras, and their covariance (angles in radians)."""
+
+    unknowns: tuple[Unknown, ...]
+    matrix: Float[np.ndarray, "n n"]
+
+    def rows(self, image: str, camera: str, parameters: Sequence[str]) -> Int[np.ndarray, " k"]:
+        """The rows of X0 … kappa of an image and of parameters of its camera; −1: held."""
+        index = {unknown: k for k, unknown in enumerate(self.unknowns)}
+        wanted = [("image", image, name) for name in EXTERIOR]
+        wanted += [("camera", camera, name) for name in parameters]
+        return np.array([index.get(name, -1) for name in wanted])
+
+
+def write_orientation_covariance(
+    found: OrientationCovariance, path: str | Path, radians: float
+) -> None:
+    """Write the file; `radians`: the unit of angles."""
+    sigma = np.sqrt(np.diagonal(found.matrix))
+    R = found.matrix / np.outer(sigma, sigma)
+    unit = np.array([radians if name in ANGLES and kind == "image" else 1.0
+                     for kind, _, name in found.unknowns])  # fmt: skip
+    n = len(sigma)
+    rows = (
+        (*unknown, s, *R[k, : k + 1].tolist(), *[""] * (n - k - 1))
+        for k, (unknown, s) in enumerate(zip(found.unknowns, (sigma / unit).tolist()))
+    )
+    write_csv(Path(path), (*HEAD, *(str(k + 1) for k in range(n))), rows)
+
+
+def read_orientation_covariance(path: str | Path, radians: float) -> OrientationCovariance:
+    """Read it back; `radians`: the unit of angles.
+
+    **Raises:** `InputError` naming the file, and the line."""
+    table = read_csv(Path(path))
+    n = len(table)
+    columns = tuple(str(k + 1) for k in range(n))
+    table.check_names((*HEAD, *columns))
+    numbers = np.full((n, n + 1), np.nan)
+    for j, name in enumerate(("sigma", *columns)):
+        for k, text in enumerate(table.values[name]):
+            if j == 0 or k >= j - 1:
+                numbers[k, j] = _number(table.source(k), name, text)
+    kinds, ids, names = (table.values[name] for name in HEAD[:3])
+    unit = np.array([radians if name in ANGLES and kind == "image" else 1.0
+                     for kind, name in zip(kinds, names)])  # fmt: skip
+    sigma, lower = numbers[:, 0] * unit, np.tril(np.nan_to_num(numbers[:, 1:]), -1)
+    R = lower + lower.T + np.eye(n)
+    unknowns = tuple((str(a).strip(), str(b).strip(), str(c).strip())
+                     for a, b, c in zip(kinds, ids, names))  # fmt: skip
+    return OrientationCovariance(unknowns, np.outer(sigma, sigma) * R)
+
+
+def _number(where, name, text) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value) or (value <= 0 if name == "sigma" else abs(value) > 1 + 1e-9):
+        what = "a σ above 0" if name == "sigma" else "a correlation"
+        raise InputError(f"{where}: {name} is {text!r}; {what} is expected")
+    return value
