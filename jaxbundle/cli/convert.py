@@ -10,7 +10,7 @@ from jaxbundle.cli.app import Control, Format, Input, Quiet, Settings, app
 from jaxbundle.errors import InputError
 
 
-@app.command(example="examples/four_photographs/project.toml out/colmap")
+@app.command(example="examples/convergent4/project.toml out/network.ply")
 def convert(
     input: Input,
     output: Annotated[Path, typer.Argument(help="file or folder to write")],
