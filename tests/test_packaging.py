@@ -5,7 +5,11 @@ import re
 import tomllib
 from pathlib import Path
 
+import pytest
+
 from jaxbundle import __version__
+from jaxbundle.errors import InputError
+from jaxbundle.system.examples import EXAMPLES, write_example
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -42,3 +46,36 @@ def test_packages_of_extras_are_imported():
         for requirement in PROJECT["optional-dependencies"][extra]:
             package = re.match(r"[\w-]+", requirement)[0]
             assert MODULES.get(package, package) in used, f"{package} is imported nowhere"
+
+
+# --- examples -------------------------------------------------------------------------------
+
+
+def test_the_wheel_takes_the_examples_from_where_they_are():
+    build = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]
+    taken = build["targets"]["wheel"]["force-include"]
+    assert taken == {f"examples/{name}": f"jaxbundle/examples/{name}" for name in EXAMPLES}
+    assert not (ROOT / "jaxbundle" / "examples").exists()
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_an_example_is_written_whole(command, tmp_path, name):
+    told = command("example", name, tmp_path / name)
+    assert told.status == 0 and f"jaxbundle {EXAMPLES[name].command.split()[1]}" in told.out
+    files = lambda folder: {p.name: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    assert files(tmp_path / name) == files(ROOT / "examples" / name)
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+
+
+def test_examples_are_listed_and_only_new_folders_written(command, tmp_path):
+    assert all(name in command("example").out for name in EXAMPLES)
+    assert command("example", "convergent4").status == 2
+    (tmp_path / "empty").mkdir()
+    write_example("line_scanner", tmp_path / "empty")
+    for folder, why in (("empty", "is not empty"), ("empty/flight.toml", "is no folder"),
+                        ("none/new", "there is no folder")):  # fmt: skip
+        with pytest.raises(InputError, match=why):
+            write_example("convergent4", tmp_path / folder)
+    with pytest.raises(InputError, match="no example 'four'.*convergent4"):
+        write_example("four", tmp_path / "four")
+    assert not (tmp_path / "four").exists()

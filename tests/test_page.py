@@ -8,12 +8,12 @@ import re
 import shutil
 import subprocess
 import tomllib
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from page_reader import Page, column, decode
 
 import jaxbundle
 from jaxbundle.bundle.result import Adjustment
@@ -27,61 +27,7 @@ from jaxbundle.report.page.verdict import BAD, DOUBTFUL, GOOD, Finding, in_words
 
 ROOT = Path(__file__).parent.parent
 EXAMPLE = ROOT / "examples" / "convergent4" / "project.toml"
-VOID = {"meta", "input", "img", "br"}
 HOSTILE = "</script><script>alert('1')</script><!--<img src=x onerror=\"alert(2)\">&amp;"
-
-
-class Page(HTMLParser):
-    """The elements of a page; refuses one that is not closed where it should be."""
-
-    def __init__(self, text: str):
-        super().__init__()
-        self.open: list[str] = []
-        self.tags: list[tuple[str, dict]] = []
-        self.texts: dict[str, list[str]] = {}
-        self.feed(text)
-        self.close()
-        assert self.open == []
-
-    def handle_starttag(self, tag, attrs):
-        names = [name for name, _ in attrs]
-        assert len(names) == len(set(names))
-        self.tags.append((tag, dict(attrs)))
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        if self.open:
-            self.texts.setdefault(self.open[-1], []).append(data)
-
-    def attributes(self, name: str) -> list[str]:
-        return [given[name] for _, given in self.tags if name in given]
-
-
-def data_of(text: str, id: str):
-    found = re.search(rf'<script type="application/json" id="{id}">(.*?)</script>', text)
-    return None if found is None else json.loads(found[1])
-
-
-def decode(packed, length: int):
-    """The values of a column: numbers, or names."""
-    if "same" in packed:
-        numbers = np.full(length, packed["same"])
-    else:
-        numbers = np.frombuffer(base64.b64decode(packed["data"]), "<" + packed["type"])
-    assert len(numbers) == length
-    return np.array(packed["names"], dtype=object)[numbers] if "names" in packed else numbers
-
-
-def column(text: str, table: str, name: str):
-    found = data_of(text, f"data-{table}")
-    return decode(found["columns"][name], found["length"])
 
 
 @pytest.fixture(scope="module")
@@ -255,7 +201,7 @@ def test_a_fit_that_the_test_refuses_is_not_met(convergent4):
 def test_the_distribution_carries_scripts_and_style():
     """The wheel takes what lies in the package and git does not ignore; nothing is excluded."""
     wheel = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]
-    assert wheel == {"targets": {"wheel": {"packages": ["jaxbundle"]}}}
+    assert wheel["targets"]["wheel"]["packages"] == ["jaxbundle"] and "exclude" not in wheel
     folder = ROOT / "jaxbundle" / "report" / "page"
     assert {p.name for p in folder.iterdir() if p.suffix in (".js", ".css")} == {*SCRIPTS, STYLE}
     assert not any(line.startswith("*.") and line.rstrip()[2:] in ("js", "css")

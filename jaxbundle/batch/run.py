@@ -10,7 +10,7 @@ and the fingerprint of its `data`; where those are others, nothing is taken for 
 import dataclasses
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import jax
@@ -113,6 +113,15 @@ def run_batch(
                     jax.clear_caches()
     heads = (lines.heads[key] for work in works.values() for key in work.keys)
     return Counter(str(head.get("status", "unknown")) for head in heads) + counts
+
+
+def result_rows(inputs: Sequence[str | Path], file: str | Path) -> Iterator[dict]:
+    """The lines of these inputs in a file of results, in its order, as `run_batch` wrote them."""
+    names = {key_of(path, file) for path in inputs}
+    ours = lambda key: key in names or any(key.startswith(f"{name}#") for name in names)
+    with locked(file):
+        lines = JsonLines(file)
+        yield from lines.rows(filter(ours, lines.heads))
 
 
 def key_of(path: str | Path, file: str | Path) -> str:

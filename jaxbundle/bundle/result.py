@@ -28,7 +28,6 @@ from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.adjust import TableResult, table_result
 from jaxbundle.leastsquares.any_distance import is_at_infinity
 from jaxbundle.leastsquares.components import Component, variance_components
-from jaxbundle.leastsquares.distributions import chi2_quantile
 from jaxbundle.leastsquares.indices import rounded
 from jaxbundle.leastsquares.names import Name
 from jaxbundle.leastsquares.reduction import FACTORS
@@ -47,6 +46,7 @@ from jaxbundle.statistics.blunders import Removed, Suspect
 from jaxbundle.statistics.check_points import CheckPoints
 from jaxbundle.statistics.components import groups
 from jaxbundle.statistics.far_points import FarPoints, find_far_points
+from jaxbundle.statistics.global_test import chi_squared_test
 from jaxbundle.statistics.inspection import Inspection, OfNetwork
 from jaxbundle.statistics.misfit import doubt_of_fit
 from jaxbundle.statistics.validity import Reach, distortion_reach
@@ -232,10 +232,8 @@ class Adjustment:
 
         `passed` is None where variance components were estimated, which makes σ0 = 1.
         """
-        f = self.redundancy
-        low, high = chi2_quantile(significance / 2, f), chi2_quantile(1 - significance / 2, f)
-        passed = None if self.sigma_factors else low <= self.vtpv <= high
-        return {"vtpv": self.vtpv, "low": low, "high": high, "passed": passed}
+        found = chi_squared_test(self.vtpv, self.redundancy, significance)
+        return found | {"passed": None} if self.sigma_factors else found
 
     # --- cofactors --------------------------------------------------------------------------
 

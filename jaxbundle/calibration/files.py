@@ -2,7 +2,7 @@
 
 | file | |
 |---|---|
-| report.txt, result.json | the whole protocol; its numbers |
+| report.txt, report.html, result.json | the whole protocol; the same as a page; its numbers |
 | CAMERA.toml | the camera, to stand in a project; σ as comments |
 | CAMERA.yaml, colmap/ | the camera for OpenCV; camera, poses and board for COLMAP |
 | network/ | the adjusted network: `jaxbundle adjust FOLDER/network` goes on from it |
@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxbundle.calibration.page import compose_calibration, compose_calibrations
 from jaxbundle.calibration.report import rig_dict
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
@@ -37,9 +38,10 @@ from jaxbundle.network.tables import Camera, Network
 from jaxbundle.plotting import write_figures
 from jaxbundle.plotting.files import FIGURES, draw_figures
 from jaxbundle.plotting.style import need_matplotlib
+from jaxbundle.report.page import UNKNOWN, Origin
 
 COMMAND = "calibrate"
-REPORT, RESULT = "report.txt", "result.json"
+REPORT, PAGE, RESULT = "report.txt", "report.html", "result.json"
 COLMAP = "colmap"
 OWN_FIGURES = ("coverage.png", "uncertainty*.png", "halves.png")
 COMPARED = ["models.txt", "models.json", "difference_*.png"]
@@ -62,11 +64,11 @@ def file_name(name: str) -> str:
 
 def files_of(names: Sequence[str]) -> list[str]:
     """What a calibration of these cameras may write into its folder, figures as patterns."""
-    found = [REPORT, RESULT]
+    found = [REPORT, PAGE, RESULT]
     for name in map(file_name, names):
         place = "" if len(names) == 1 else f"{name}/"
         found += [f"{place}{file}" for file in (
-            REPORT, RESULT, f"{name}.toml", f"{name}.yaml", *OWN_FIGURES, *FIGURES,
+            REPORT, PAGE, RESULT, f"{name}.toml", f"{name}.yaml", *OWN_FIGURES, *FIGURES,
             *(f"{ADJUSTED}/{file}" for file in NETWORK_FILES),
             *(f"{COLMAP}/{file}" for file in COLMAP_FILES),
         )]  # fmt: skip
@@ -87,13 +89,14 @@ def write_calibration(
     if plots:
         need_matplotlib()
     with replaced_folder(folder, COMMAND, files_of([calibration.name]), force) as new:
-        _fill(calibration, new, plots)
+        _fill(calibration, new, plots, UNKNOWN)
 
 
-def _fill(calibration, folder: Path, plots: bool) -> None:
+def _fill(calibration, folder: Path, plots: bool, origin: Origin, choice=None) -> None:
     name = file_name(calibration.name)
     folder.mkdir(exist_ok=True)
     write_text(folder / REPORT, calibration.report())
+    write_text(folder / PAGE, compose_calibration(calibration, origin, choice))
     write_text(folder / RESULT, json_text(calibration.to_dict()))
     if not calibration.converged:
         return
@@ -127,8 +130,10 @@ def write_calibrations(
 ) -> None:
     """Write one calibration into a folder, several into folders of their own, and the rig beside.
 
-    A rig adds report.txt and result.json of the whole, its cameras as rig_CAMERA.toml, and figures
-    of their coverage and uncertainty in it. Arguments and errors as of `write_calibration`.
+    Several have report.txt, report.html and result.json of the whole beside them; a rig adds its
+    cameras as rig_CAMERA.toml, and figures of their coverage and uncertainty in it.
+
+    Arguments and errors as of `write_calibration`.
     """
     if plots:
         need_matplotlib()
@@ -136,13 +141,16 @@ def write_calibrations(
         fill_calibrations(found, new, plots)
 
 
-def fill_calibrations(found, folder: Path, plots: bool) -> None:
-    """Write the same beside what is in a folder."""
+def fill_calibrations(
+    found, folder: Path, plots: bool, origin: Origin = UNKNOWN, choice=None
+) -> None:
+    """Write the same beside what is in a folder; `origin` and `choice` are for the page."""
     if len(found.cameras) == 1:
-        return _fill(next(iter(found.cameras.values())), folder, plots)
+        return _fill(next(iter(found.cameras.values())), folder, plots, origin, choice)
     for name, one in found.cameras.items():
-        _fill(one, folder / file_name(name), plots)
+        _fill(one, folder / file_name(name), plots, origin)
     write_text(folder / REPORT, found.report())
+    write_text(folder / PAGE, compose_calibrations(found, origin))
     write_text(folder / RESULT, json_text(calibrations_dict(found)))
     if found.rig is not None:
         for name in found.rig.names:

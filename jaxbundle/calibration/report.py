@@ -18,6 +18,7 @@ from jaxbundle.report.layout import (
 )
 
 MOST_FAILED = 50
+MAPS_HEADER = ("point held in", "middle", "corners")
 LIMIT = 3.0
 """Residuals of a rig with a larger |τ| are listed."""
 
@@ -33,19 +34,23 @@ def text(calibration) -> str:
 
 def _photographs(calibration):
     views = calibration.views
-    size = " × ".join(map(str, views.image_size))
     lines = [f"Calibration of {clean(calibration.name)}", "=" * 100]
-    found = int(views.visible.sum())
-    lines += facts([
-        ("Board", str(views.board)),
-        ("Photographs", f"{len(views)} used, {len(views.failed)} not; {size} pixels"),
-        ("Points", f"{found} of {views.visible.size} image points found"),
-    ])  # fmt: skip
+    lines += facts(photograph_facts(views))
     if views.failed:
         lines += heading("Photographs not used")
         rows = facts((clean(name), clean(why)) for name, why in views.failed)
         lines += shortened(rows, MOST_FAILED, "…")
     return lines
+
+
+def photograph_facts(views) -> list[tuple[str, str]]:
+    """The board, how many photographs, how many points of it were found."""
+    size = " × ".join(map(str, views.image_size))
+    return [
+        ("Board", str(views.board)),
+        ("Photographs", f"{len(views)} used, {len(views.failed)} not; {size} pixels"),
+        ("Points", f"{int(views.visible.sum())} of {views.visible.size} image points found"),
+    ]
 
 
 def _camera(calibration):
@@ -64,33 +69,46 @@ def _camera(calibration):
 
 def _quality(calibration):
     lines = heading("Quality")
-    covered = calibration.coverage
-    away, unit = calibration.distances, calibration.adjustment.network.object_unit
+    away, unit = calibration.distances, clean(calibration.adjustment.network.object_unit)
     lines += facts([
-        ("Coverage", f"points in {100 * covered.part:.0f} % of the image's cells, out to "
-         f"{100 * covered.reach:.0f} % of the half diagonal"),
-        ("Distances", f"{away.min():.4g} to {away.max():.4g} {clean(unit)}"),
+        ("Coverage", coverage_in_words(calibration.coverage)),
+        ("Distances", f"{away.min():.4g} to {away.max():.4g} {unit}"),
     ])  # fmt: skip
     lines += ["", "Uncertainty of a projected point (σ, pixels)"]
-    rows = [
-        (_held_in(m, clean(unit)), fixed(m.middle, 3), fixed(m.corners, 3))
-        for m in calibration.reported_maps
-    ]
-    lines += table(("point held in", "middle", "corners"), rows, "lrr")
+    lines += table(MAPS_HEADER, map_rows(calibration.reported_maps, unit), "lrr")
+    first, *further = cross_validation_in_words(calibration)
+    lines += ["", *paragraph(f"Cross-validation: {first}")]
+    return [*lines, *(line for words in further for line in paragraph(words))]
+
+
+def coverage_in_words(covered) -> str:
+    """How much of the image holds measured points."""
+    return (
+        f"points in {100 * covered.part:.0f} % of the image's cells, out to "
+        f"{100 * covered.reach:.0f} % of the half diagonal"
+    )
+
+
+def map_rows(maps, unit: str) -> list[tuple[str, str, str]]:
+    """What a point is held in, its σ in the middle and in the corners, pixels (`MAPS_HEADER`)."""
+    return [(_held_in(m, unit), fixed(m.middle, 3), fixed(m.corners, 3)) for m in maps]
+
+
+def cross_validation_in_words(calibration) -> list[str]:
+    """What either half of the photographs says of the other, in sentences."""
     checked = calibration.cross_validation
     if checked is None:
-        why = "too few photographs for two halves" if calibration.validated else "not made"
-        return [*lines, "", f"Cross-validation: {why}"]
+        return ["too few photographs for two halves" if calibration.validated else "not made"]
     largest = max(checked.difference, key=lambda n: abs(checked.difference[n]))
-    lines += ["", *paragraph(
-        f"Cross-validation: the camera of either half leaves an RMS of {checked.rms_other:.4f} px "
-        f"in the other half, where its own leaves {checked.rms_own:.4f} px. The two differ by "
+    sentences = [
+        f"the camera of either half leaves an RMS of {checked.rms_other:.4f} px in the other half, "
+        f"where its own leaves {checked.rms_own:.4f} px. The two differ by "
         f"{abs(checked.difference[largest]):.1f} σ in {largest}, the most; test of all parameters "
         f"together {checked.test:.2f} (1 expected)."
-    )]  # fmt: skip
+    ]
     if checked.comparison is not None:
-        lines += paragraph(f"Their images, over the whole image: {checked.comparison}.")
-    return lines
+        sentences.append(f"Their images, over the whole image: {checked.comparison}.")
+    return sentences
 
 
 def _held_in(m, unit: str) -> str:
@@ -152,6 +170,19 @@ def choice_text(found) -> str:
         ("Photographs", f"{len(found.views)}, in {found.folds} folds; "
          f"{len(found.gross)} points that no model explains are left out"),
     ])  # fmt: skip
+    lines += ["", *table(MODELS_HEADER, model_rows(found), "lrrrrrrrrr"), ""]
+    lines += paragraph(models_legend(found))
+    lines += [f"not compared: {clean(name)}: {clean(why)}" for name, why in found.failed.items()]
+    return "\n".join(line.rstrip() for line in [*lines, "", *paragraph(found.sentence)])
+
+
+MODELS_HEADER = (
+    "model", "free", "σ0", "RMS", "left out", "ΔAIC", "ΔBIC", "Δ rms", "largest", "/σ"
+)  # fmt: skip
+
+
+def model_rows(found) -> list[tuple[str, ...]]:
+    """A row a model (`MODELS_HEADER`)."""
     low = {name: min(getattr(one, name) for one in found.candidates) for name in ("aic", "bic")}
     rows = []
     for one in found.candidates:
@@ -163,15 +194,16 @@ def choice_text(found) -> str:
             fixed(one.left_out, 4), fixed(one.aic - low["aic"], 1),
             fixed(one.bic - low["bic"], 1), *map_of,
         ))  # fmt: skip
-    head = ("model", "free", "σ0", "RMS", "left out", "ΔAIC", "ΔBIC", "Δ rms", "largest", "/σ")
-    lines += ["", *table(head, rows, "lrrrrrrrrr"), ""]
-    lines += paragraph(
+    return rows
+
+
+def models_legend(found) -> str:
+    """What the columns of `model_rows` are."""
+    return (
         f"RMS: residuals of all photographs; left out: of those not used for the camera; Δ: images "
         f"apart from those of {found.best.model}, over the whole image, rotation removed, and RMS "
         "over their σ. Pixels."
     )
-    lines += [f"not compared: {clean(name)}: {clean(why)}" for name, why in found.failed.items()]
-    return "\n".join(line.rstrip() for line in [*lines, "", *paragraph(found.sentence)])
 
 
 def choice_dict(found) -> dict:
@@ -218,42 +250,56 @@ def rig_text(rig) -> str:
     """The mountings of a rig and its cameras in the common adjustment."""
     unit = clean(next(iter(rig.cameras.values())).adjustment.network.object_unit)
     lines = [f"Rig of {len(rig.cameras)} cameras, reference {clean(rig.names[0])}", "=" * 100]
-    lines += facts([
+    lines += facts(rig_facts(rig, unit))
+    for name, m in rig.mountings.items():
+        lines += heading(mounting_title(rig, name))
+        lines += table(("", "value", "σ", "unit"), mounting_rows(m, unit), "lrrl")
+    for name in rig.names:
+        lines += heading(f"Camera {clean(name)} in the rig")
+        lines += table(("parameter", "value", "σ"), rig_parameter_rows(rig, name), "lrr")
+        said = coverage_in_words(rig.coverage(name))
+        lines += ["", *paragraph(
+            f"{said.capitalize()}. Uncertainty of a projected point (σ, pixels):"
+        )]  # fmt: skip
+        lines += table(MAPS_HEADER, map_rows(rig.reported_maps(name), unit), "lrr")
+    lines += observations.residuals(rig, LIMIT, "pope")
+    lines += [*observations.redundancy(rig), *observations.removals(rig)]
+    return "\n".join(line.rstrip() for line in lines) + "\n"
+
+
+def rig_facts(rig, unit: str) -> list[tuple[str, str]]:
+    """Epochs, σ0, RMS, the board, and the epochs that are out or contradict."""
+    odd = (*rig.left_out, *rig.contradicting)
+    return [
         ("Epochs", f"{len(rig.epochs)} used, {len(rig.left_out)} left out"),
         ("σ0", f"{rig.sigma0:.4f}, redundancy {rig.redundancy}"),
         ("RMS", ", ".join(f"{clean(name)} {rms:.4f} px" for name, rms in rig.rms.items())),
         ("Board", "its points estimated, inner constraints" if rig.rig.points_free else "exact"
          if rig.rig.point_sigma is None else f"known with σ {rig.rig.point_sigma:g} {unit}"),
-    ])  # fmt: skip
-    odd = (*rig.left_out, *rig.contradicting)
-    lines += facts((clean(epoch), clean(why)) for epoch, why in odd)
-    for name, m in rig.mountings.items():
-        lines += heading(f"Mounting of {clean(name)} in the frame of {clean(rig.names[0])}")
-        values = [*m.base, *m.angles]
-        rows = [
-            (label, *estimate(value, sigma), what)
-            for label, value, sigma, what in zip(
-                ("bx", "by", "bz", "ω", "φ", "κ"), values, m.sigma, [unit] * 3 + ["deg"] * 3
-            )
-        ]
-        rows.append(("length", *estimate(m.length, m.length_sigma), unit))
-        lines += table(("", "value", "σ", "unit"), rows, "lrrl")
-    for name in rig.names:
-        lines += heading(f"Camera {clean(name)} in the rig")
-        rows = [(n, *estimate(rig.parameters[name][n], s)) for n, s in rig.sigma[name].items()]
-        lines += table(("parameter", "value", "σ"), rows, "lrr")
-        covered = rig.coverage(name)
-        lines += ["", *paragraph(
-            f"Points in {100 * covered.part:.0f} % of the image's cells, out to "
-            f"{100 * covered.reach:.0f} % of the half diagonal. Uncertainty of a projected point "
-            "(σ, pixels):"
-        )]  # fmt: skip
-        rows = [(_held_in(m, unit), fixed(m.middle, 3), fixed(m.corners, 3))
-                for m in rig.reported_maps(name)]  # fmt: skip
-        lines += table(("point held in", "middle", "corners"), rows, "lrr")
-    lines += observations.residuals(rig, LIMIT, "pope")
-    lines += [*observations.redundancy(rig), *observations.removals(rig)]
-    return "\n".join(line.rstrip() for line in lines) + "\n"
+        *((clean(epoch), clean(why)) for epoch, why in odd),
+    ]  # fmt: skip
+
+
+def mounting_title(rig, name: str) -> str:
+    """Whose mounting, in whose frame."""
+    return f"Mounting of {clean(name)} in the frame of {clean(rig.names[0])}"
+
+
+def mounting_rows(m, unit: str) -> list[tuple[str, str, str, str]]:
+    """Base and angles of a mounting: name, value, σ, unit."""
+    units = [unit] * 3 + ["deg"] * 3
+    rows = [
+        (label, *estimate(value, sigma), what)
+        for label, value, sigma, what in zip(
+            ("bx", "by", "bz", "ω", "φ", "κ"), [*m.base, *m.angles], m.sigma, units
+        )
+    ]
+    return [*rows, ("length", *estimate(m.length, m.length_sigma), unit)]
+
+
+def rig_parameter_rows(rig, name: str) -> list[tuple[str, str, str]]:
+    """The free parameters of a camera in the rig: name, value, σ."""
+    return [(n, *estimate(rig.parameters[name][n], s)) for n, s in rig.sigma[name].items()]
 
 
 def rig_dict(rig, brief: bool = False) -> dict:

@@ -146,6 +146,16 @@ class Calibration:
         """σ of a projected point in the middle and in the corners, pixels, [n] each."""
         return quality.over_distance(self._scene_maps, distances)
 
+    def uncertainty_curves(self):
+        """Distances from a quarter of the nearest of the board to a hundred times the farthest; σ
+        of a projected point at them in the middle and in the corners (pixels); and these three of
+        the maps of the report, as rows."""
+        reported = np.array([(m.distance, m.middle, m.corners) for m in self._scene_maps]).T
+        near = reported[0, np.isfinite(reported[0])]
+        ends = self.distances.min() / 4, 100 * self.distances.max()
+        distances = np.union1d(np.geomspace(*ends, DISTANCES), near)
+        return distances, *self.uncertainty_over_distance(distances), reported
+
     @property
     def _scene_maps(self) -> list[UncertaintyMap]:
         return [m for m in self.reported_maps if m.frame == "scene"]
@@ -166,16 +176,12 @@ class Calibration:
         return plotting.uncertainty_image(found, self.views.image_size, self._unit, self.name, ax)
 
     def plot_uncertainty_over_distance(self, ax=None):
-        """σ of a projected point in the middle and in the corners, from a quarter of the nearest
-        distance of the board to a hundred times the farthest, with the figures of the report
-        marked; matplotlib axes."""
+        """The curves of `uncertainty_curves`, with the figures of the report marked; matplotlib
+        axes."""
         span = float(self.distances.min()), float(self.distances.max())
-        reported = np.array([(m.distance, m.middle, m.corners) for m in self._scene_maps]).T
-        near = reported[0, np.isfinite(reported[0])]
-        distances = np.union1d(np.geomspace(span[0] / 4, 100 * span[1], DISTANCES), near)
-        curves = self.uncertainty_over_distance(distances)
+        distances, middle, corners, reported = self.uncertainty_curves()
         return plotting.uncertainty_curve(
-            distances, *curves, span, self._unit, self.name, ax, reported=reported
+            distances, middle, corners, span, self._unit, self.name, ax, reported=reported
         )
 
     def plot_halves(self, ax=None):

@@ -7,7 +7,7 @@ import typer
 
 import jaxbundle
 from jaxbundle.choices import ESTIMATORS, METHODS, REDUCTIONS, TESTS
-from jaxbundle.cli.app import Control, Force, Format, Input, Quiet, Settings, app, choice
+from jaxbundle.cli.app import Control, Force, Format, Html, Input, Quiet, Settings, app, choice
 from jaxbundle.errors import InputError, NotSolvedError
 
 
@@ -15,8 +15,10 @@ from jaxbundle.errors import InputError, NotSolvedError
 def adjust(
     input: Input,
     json: Annotated[str, typer.Option(help="write the result as JSON; - for stdout alone")] = "",
-    out: Annotated[Path | None, typer.Option(help="folder for report, JSON, tables, plots")] = None,
-    html: Annotated[str, typer.Option(help="write the result as one page of HTML")] = "",
+    out: Annotated[
+        Path | None, typer.Option(help="folder for report, page, JSON, tables, plots")
+    ] = None,
+    html: Html = "",
     force: Force = False,
     set: Settings = None,
     format: Format = None,

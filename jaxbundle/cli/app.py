@@ -88,6 +88,7 @@ Control = Annotated[
 Force = Annotated[
     bool, typer.Option("--force", help="replace files in the folder of --out of other origin")
 ]
+Html = Annotated[str, typer.Option(help="write the result as one page of HTML")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="print nothing but errors")]
 
 

@@ -1,12 +1,19 @@
 """`jaxbundle batch`: many cameras, many networks."""
 
+import os
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 import jaxbundle
-from jaxbundle.cli.app import Quiet, app, choice
+from jaxbundle.cli.app import Html, Quiet, app, choice
+from jaxbundle.errors import InputError
 from jaxbundle.system.interrupts import advise
+
+WITH_REASON = ("bad input", "not solved", "failed")
+"""Statuses of networks whose lines have an `error`."""
+MOST_REASONS = 5
 
 
 @app.command(example="cameras.npz PROJECT.toml --json-lines results.jsonl")
@@ -24,6 +31,10 @@ def batch(
     renew: Annotated[
         bool, typer.Option("--renew", help="again what is from other settings or other data")
     ] = False,
+    html: Html = "",
+    force: Annotated[
+        bool, typer.Option("--force", help="let --html replace a file that is no page")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Calibrate many cameras and adjust many networks; interrupted, it takes up where it was.
@@ -34,10 +45,17 @@ def batch(
     It is done when every input has its line, whatever the status in it; another
     run that is writing the file is refused.
     """
-    from jaxbundle.batch.run import run_batch
+    from jaxbundle.batch.page import compose_batch
+    from jaxbundle.batch.run import result_rows, run_batch
     from jaxbundle.batch.stacks import is_camera_stack
+    from jaxbundle.cli.outputs import check_page, trace_files
     from jaxbundle.cli.progress import counting
+    from jaxbundle.io.text.csv_tables import write_text
 
+    check_page(html, None, [*inputs, json_lines], force)
+    if html and os.path.exists(json_lines) and not os.path.isfile(json_lines):
+        raise InputError(f"--html: the page is made of the lines in --json-lines, and {json_lines} "
+                         "is no file")  # fmt: skip
     if not all(map(is_camera_stack, inputs)):
         # Cameras fill the cores by threads of their own, and gain nothing.
         jaxbundle.use_cores()
@@ -53,7 +71,19 @@ def batch(
             renew=renew,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )  # fmt: skip
+    if html:
+        origin = trace_files(inputs, {
+            "--model": model, "--free": free, "--max-iterations": max_iterations,
+            "--snooping": snooping, "--significance": significance,
+        })  # fmt: skip
+        write_text(Path(html), compose_batch(result_rows(inputs, json_lines), origin))
     if not quiet:
         skipped = counts.pop("skipped", 0)
         said = ", ".join(f"{number} {status}" for status, number in counts.most_common() if number)
         print(f"{json_lines}: {said}" + f" ({skipped} skipped, they were there)" * bool(skipped))
+        if os.path.isfile(json_lines) and any(counts[status] for status in WITH_REASON):
+            reasons = [f"{row['key']}: {row['error']}" for row in result_rows(inputs, json_lines)
+                       if row.get("error")]  # fmt: skip
+            print(*reasons[:MOST_REASONS], sep="\n")
+            if len(reasons) > MOST_REASONS:
+                print(f"and {len(reasons) - MOST_REASONS} more: see \"error\" in {json_lines}")

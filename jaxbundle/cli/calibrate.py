@@ -1,13 +1,14 @@
 """`jaxbundle calibrate`: photographs of a board in, calibrated cameras out."""
 
 import re
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from jaxbundle.choices import BOARDS, ESTIMATORS, TESTS
-from jaxbundle.cli.app import Force, Quiet, app, choice
+from jaxbundle.cli.app import Force, Html, Quiet, app, choice
 from jaxbundle.errors import InputError, NotSolvedError
 
 
@@ -65,8 +66,9 @@ def calibrate(
     unit: Annotated[str, typer.Option(help="name of the unit of the board")] = "m",
     json: Annotated[str, typer.Option(help="write the result as JSON; - for stdout alone")] = "",
     out: Annotated[
-        Path | None, typer.Option(help="folder for report, JSON, cameras, network, plots")
+        Path | None, typer.Option(help="folder for report, page, JSON, cameras, network, plots")
     ] = None,
+    html: Html = "",
     force: Force = False,
     brief: Annotated[bool, typer.Option("--brief", help="no points and residuals in JSON")] = False,
     quiet: Quiet = False,
@@ -83,23 +85,44 @@ def calibrate(
         fill_comparison,
         json_text,
     )
-    from jaxbundle.cli.outputs import can_plot, check_writable, name_inside, written
+    from jaxbundle.calibration.page import KIND, compose_calibrations
+    from jaxbundle.cli.outputs import (
+        can_plot,
+        check_writable,
+        name_inside,
+        trace_files,
+        written,
+    )
     from jaxbundle.cli.progress import counting
     from jaxbundle.io.results.result_json import unsolved_text
     from jaxbundle.leastsquares.snooping import check_test
     from jaxbundle.measure.views import photographs
+    from jaxbundle.photographs.opencv import need_opencv
+    from jaxbundle.report.page import UNKNOWN, compose_failure
 
     test = None if snooping == "none" else snooping
     check_test(test, significance, "--")
     known = _board(board, square, kind, diameter, marker, dictionary)
     cameras = _cameras(photos, camera)
+    need_opencv()
     files = [path for paths in cameras.values() for path in photographs(paths)]
+    for path in files:
+        if not path.exists():
+            raise InputError(f"{path}: no such file or folder")
     _check_names(cameras)
     compared = _words(models)
     if compared:
         _check_compared(compared, cameras, free, rig)
     names = files_of([*cameras]) + (COMPARED if compared else [])
-    check_writable(json, out, COMMAND, names, files, force)
+    check_writable(json, out, COMMAND, names, files, force, html)
+    origin = UNKNOWN
+    if html or out is not None:
+        origin = trace_files(files, {
+            "--board": board, "--square": square, "--kind": kind, "--model": models or model,
+            "--free": free, "--given": ", ".join(given or ()), "--board-sigma": board_sigma,
+            "--board-free": board_free, "--sigma-image": sigma_image, "--snooping": snooping,
+            "--significance": significance, "--robust": robust,
+        })  # fmt: skip
     with counting(quiet or json == "-") as bar:
         task = bar.add_task("searching the board", total=len(files))
 
@@ -129,8 +152,9 @@ def calibrate(
                     **options,
                 )  # fmt: skip
         except NotSolvedError as error:
-            place = out if name_inside(json, out) else None
-            with written(json, unsolved_text(error), place, COMMAND, names, force):
+            place = out if name_inside(json, out) or name_inside(html, out) else None
+            page = partial(compose_failure, error, origin, KIND)
+            with written(json, unsolved_text(error), place, COMMAND, names, force, html, page):
                 pass
             raise
         bar.update(task, description="how good it is")
@@ -140,9 +164,10 @@ def calibrate(
         text = json_text(document) if json else ""
         report = "" if quiet or json == "-" else (choice or found).report()
         bar.update(task, description="writing")
-        with written(json, text, out, COMMAND, names, force) as new:
+        page = partial(compose_calibrations, found, origin, choice)
+        with written(json, text, out, COMMAND, names, force, html, page) as new:
             if new is not None:
-                fill_calibrations(found, new, plots and can_plot())
+                fill_calibrations(found, new, plots and can_plot(), origin, choice)
                 if choice is not None:
                     fill_comparison(choice, new, plots and can_plot())
     if report:
@@ -157,7 +182,10 @@ def calibrate(
         )
 
 
-def _board(board: str, square: float | None, *more):
+def _board(
+    board: str, square: float | None, kind: str, diameter: float | None, marker: float | None,
+    dictionary: str,
+):  # fmt: skip
     """The board, or the target, that the options name."""
     from jaxbundle.calibration import Board
     from jaxbundle.io.boards.targets import read_target
@@ -166,10 +194,18 @@ def _board(board: str, square: float | None, *more):
         if square is not None:
             raise InputError(f"--square: {board} says how large the board is; leave it out")
         return read_target(board)
+    if not board:
+        raise InputError("--board is missing: COLUMNSxROWS, inner corners of a chessboard, as 9x6")
     columns, rows = _size(board)
     if square is None:
         raise InputError("--square is missing: the side of a square, or the distance of circles")
-    return Board(columns, rows, square, *more)
+    circles = ("circles", "asymmetric-circles")
+    for value, option, kinds in (
+        (diameter, "--diameter", circles), (marker, "--marker", ("charuco",)),
+    ):  # fmt: skip
+        if value is not None and kind not in kinds:
+            raise InputError(f"{option} is not for --kind {kind}, but for {' and '.join(kinds)}")
+    return Board(columns, rows, square, kind, diameter, marker, dictionary)
 
 
 def _check_compared(models, cameras, free, rig) -> None:

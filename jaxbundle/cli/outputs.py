@@ -7,7 +7,7 @@ adjusted network as a project.
 import os
 import re
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
@@ -22,7 +22,7 @@ from jaxbundle.io.networks.project import ADJUSTED, FILE_NAME, fill_project
 from jaxbundle.io.networks.project import FILES as NETWORK_FILES
 from jaxbundle.io.results.result_json import result_text, unsolved_text
 from jaxbundle.io.results.result_project import adjusted_network
-from jaxbundle.io.text.csv_tables import table_rows, write_csv, write_text
+from jaxbundle.io.text.csv_tables import table_rows, write_bytes, write_csv, write_text
 from jaxbundle.io.writing.fingerprints import input_files
 from jaxbundle.io.writing.folders import check_folder, replaced_folder
 from jaxbundle.network.columns import some
@@ -62,7 +62,11 @@ def trace_origin(
     input: Path, network: Network, control: Path | None, settings: Mapping[str, object]
 ) -> Origin:
     """The fingerprints of the files a network was read from, and the settings that were chosen."""
-    files = (*input_files(input), *network_files(input, network, control))
+    return trace_files((*input_files(input), *network_files(input, network, control)), settings)
+
+
+def trace_files(files: Iterable[str | Path], settings: Mapping[str, object]) -> Origin:
+    """The fingerprints of files, and the settings that were chosen."""
     chosen = {name: value for name, value in settings.items() if value not in (None, False, "")}
     return Origin(fingerprint_files(files), chosen)
 
@@ -74,15 +78,31 @@ def check_writable(
     names: Iterable[str],
     inputs: Iterable[str | Path],
     force: bool = False,
+    html: str = "",
 ) -> None:
-    """Refuse a JSON file, or a folder for files of these names, that the command `by` cannot or may
-    not write (`io.writing.folders`, `check_json`), or that would replace one of the inputs."""
+    """Refuse a JSON file, a page, or a folder for files of these names, that the command `by`
+    cannot or may not write (`io.writing.folders`, `check_json`), or that would replace one of the
+    inputs."""
     inputs = tuple(inputs)
     if out is not None:
         check_folder(out, by, names, inputs, force)
     _check_file("--json", json, out, inputs)
     if not force:
         check_json(json, OR_FORCE)
+    if html and json and os.path.realpath(html) == os.path.realpath(json):
+        raise InputError(f"--html {html}: is the file of --json as well; give another name")
+    check_page(html, out, inputs, force)
+
+
+def check_page(
+    html: str, out: Path | None, inputs: Iterable[str | Path], force: bool = False
+) -> None:
+    """Refuse a page that cannot be written, or would replace an input or what is no page."""
+    if html == "-":
+        raise InputError("--html -: a page goes into a file; give the name of one")
+    _check_file("--html", html, out, inputs)
+    if not force:
+        _check_content("--html", html, HTML, "HTML", OR_FORCE)
 
 
 def _check_file(option: str, file: str, out: Path | None, inputs: Iterable[str | Path]) -> None:
@@ -132,14 +152,7 @@ def check_targets(
 ) -> None:  # fmt: skip
     """Check what `adjust` is to write, before it is computed (`check_writable`)."""
     inputs = network_files(input, network, control)
-    check_writable(json, out, "adjust", FILES, inputs, force)
-    if html == "-":
-        raise InputError("--html -: a page goes into a file; give the name of one")
-    if html and json and os.path.realpath(html) == os.path.realpath(json):
-        raise InputError(f"--html {html}: is the file of --json as well; give another name")
-    _check_file("--html", html, out, inputs)
-    if not force:
-        _check_content("--html", html, HTML, "HTML", OR_FORCE)
+    check_writable(json, out, "adjust", FILES, inputs, force, html)
 
 
 def name_inside(file: str, out: Path | None) -> str | None:
@@ -153,12 +166,13 @@ def name_inside(file: str, out: Path | None) -> str | None:
 @contextmanager
 def written(
     json: str, text: str | Iterable[str], out: Path | None, by: str, names: Iterable[str],
-    force: bool,
+    force: bool, html: str = "", page: Callable[[], Iterable[str]] | None = None,
 ) -> Iterator[Path | None]:  # fmt: skip
-    """Write the JSON of a result (`-`: on standard output), and give the folder to fill that
-    becomes --out, None if there is none.
+    """Write the JSON of a result (`-`: on standard output) and its `page`, and give the folder to
+    fill that becomes --out, None if there is none. The folder has the page in any case.
 
-    A JSON file is written when the folder is in place; one in the folder belongs to it.
+    A file of --json or --html is written when the folder is in place; one in the folder belongs to
+    it.
     """
     if json == "-":
         sys.stdout.writelines((text,) if isinstance(text, str) else text)
@@ -170,8 +184,18 @@ def written(
             if (name := name_inside(json, out)) is not None:
                 write_text(new / name, text)
                 json = ""
+            if page is not None:
+                if not (new / PAGE).exists():
+                    write_text(new / PAGE, page())
+                if (name := name_inside(html, out)) not in (None, PAGE):
+                    write_bytes(new / name, (new / PAGE).read_bytes())
     if json not in ("", "-"):
         write_text(Path(json), text)
+    if page is not None and html and name_inside(html, out) is None:
+        if out is None:
+            write_text(Path(html), page())
+        else:
+            write_bytes(Path(html), (out / PAGE).read_bytes())
 
 
 def write_targets(
@@ -192,18 +216,13 @@ def write_targets(
         return compose_failure(result, origin)
 
     plots = plots and out is not None and solved and result.converged and can_plot()
-    with written(json, text(brief), out, "adjust", FILES, force) as new:
+    with written(json, text(brief), out, "adjust", FILES, force, html, page) as new:
         if new is not None:
             if isinstance(result, Adjustment):
                 fill_results(result, new, plots)
             else:
                 write_text(new / REPORT, f"{result}\n")
                 write_text(new / RESULT, text(False))
-            write_text(new / PAGE, page())
-            if (name := name_inside(html, out)) not in (None, PAGE):
-                write_text(new / name, page())
-    if html and name_inside(html, out) is None:
-        write_text(Path(html), page())
 
 
 def fill_results(

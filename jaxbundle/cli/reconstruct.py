@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from jaxbundle.choices import CODED_TARGETS, FEATURES, MATCHED_PAIRS
-from jaxbundle.cli.app import Force, Quiet, app, choice
+from jaxbundle.cli.app import Force, Html, Quiet, app, choice
 from jaxbundle.errors import InputError
 from jaxbundle.system.interrupts import advise
 
@@ -14,7 +14,7 @@ from jaxbundle.system.interrupts import advise
 @app.command(name="reconstruct", example="PHOTOS --control gcp_list.txt --out out/block")
 def reconstruct_command(
     photos: Annotated[list[Path], typer.Argument(help="photographs, or folders of them")],
-    out: Annotated[Path, typer.Option(help="folder for report, JSON, tables, COLMAP model, PLY")],
+    out: Annotated[Path, typer.Option(help="folder for report, page, JSON, tables, COLMAP model")],
     camera: Annotated[
         str | None, typer.Option(help="calibrated camera of all: FILE or FILE#ID; held as it is")
     ] = None,
@@ -33,6 +33,7 @@ def reconstruct_command(
     pairs: Annotated[str, choice(MATCHED_PAIRS, "matched")] = "auto",
     points: Annotated[int, typer.Option(min=20, help="tie points wanted a photograph")] = 1500,
     json: Annotated[str, typer.Option(help="write the result as JSON; - for stdout alone")] = "",
+    html: Html = "",
     brief: Annotated[bool, typer.Option("--brief", help="no points and residuals in JSON")] = False,
     surface: Annotated[
         bool, typer.Option("--surface", help="match the oriented photographs for a surface")
@@ -43,7 +44,7 @@ def reconstruct_command(
 ) -> None:
     """Orient photographs by what they show: tie points, self-calibration, adjustment."""
     from jaxbundle.cli.cameras_given import camera_given
-    from jaxbundle.cli.outputs import check_writable
+    from jaxbundle.cli.outputs import check_writable, trace_files
     from jaxbundle.cli.progress import staging
     from jaxbundle.cli.reconstruct_files import BY, FILES, make_store, write_reconstruction
     from jaxbundle.measure.coded_targets import check_kind
@@ -65,12 +66,16 @@ def reconstruct_command(
     files = [p for p in (*photos, control, distances) if p is not None and p.is_file()]
     check_writable(json, out, BY, FILES, files, force)
     found, _ = find_photographs(photos)
-    check_writable(json, out, BY, FILES, [p.path for p in found], force)
+    check_writable(json, out, BY, FILES, [*files, *(p.path for p in found)], force, html)
     store = make_store(out, force)
     advise(f"run the same command again to go on: what was found is kept in {store}")
     with staging(quiet or json == "-") as tell:
         result = reconstruct(photos, given, settings, store, tell, known, bars)
-    write_reconstruction(result, json, out, brief, plots, force)
+    origin = trace_files([*files, *(p.path for p in found)], {
+        "--camera": camera, "--targets": targets, "--features": features, "--pairs": pairs,
+        "--points": points,
+    })  # fmt: skip
+    write_reconstruction(result, json, out, brief, plots, force, html, origin)
     if not quiet and json != "-":
         print(result)
         print(out)

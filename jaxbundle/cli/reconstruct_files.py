@@ -1,23 +1,26 @@
 """What `jaxbundle reconstruct` writes: every part with its model and cloud, pairs, figures."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from jaxbundle.cli.outputs import FILES as RESULTS
-from jaxbundle.cli.outputs import can_plot, fill_results, written
+from jaxbundle.cli.outputs import PAGE, can_plot, fill_results, written
 from jaxbundle.errors import InputError
 from jaxbundle.io.networks.colmap import FILES as COLMAP
 from jaxbundle.io.networks.colmap import fill_colmap
 from jaxbundle.io.results.ply import write_ply
 from jaxbundle.io.results.result_json import result_text
 from jaxbundle.io.results.result_project import adjusted_network
-from jaxbundle.io.text.csv_tables import write_csv
+from jaxbundle.io.text.csv_tables import write_csv, write_text
 from jaxbundle.io.writing.folders import read_marker, replaced_folder
 from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.plotting.files import PAIRS as PAIR_FIGURES
 from jaxbundle.plotting.files import TRACKS, draw_pairs, draw_tracks
+from jaxbundle.reconstruction.page import compose_part
 from jaxbundle.reconstruction.reconstruct import Part, Reconstruction
+from jaxbundle.report.page import UNKNOWN, Origin
 
 BY, KEPT, MODEL, CLOUD, PAIRS = "reconstruct", "matches", "colmap", "points.ply", "pairs.csv"
 OF_A_PART = (*RESULTS, *(f"{MODEL}/{name}" for name in COLMAP), CLOUD, TRACKS)
@@ -35,13 +38,15 @@ def make_store(out: Path, force: bool) -> Path:
 
 
 def write_reconstruction(
-    found: Reconstruction, json: str, out: Path, brief: bool, plots: bool, force: bool
-) -> None:
-    """Write the JSON, and into the folder each part, the pairs and figures of them."""
+    found: Reconstruction, json: str, out: Path, brief: bool, plots: bool, force: bool,
+    html: str = "", origin: Origin = UNKNOWN,
+) -> None:  # fmt: skip
+    """Write JSON and page, and into the folder each part, the pairs and figures of them."""
     first, plots = found.parts[0], plots and can_plot()
     also = {"reconstruction": _summary(found)}
     text = result_text(first.adjustment, brief, also)
-    with written(json, text, out, BY, FILES, force) as new:
+    page = partial(compose_part, found, first, origin)
+    with written(json, text, out, BY, FILES, force, html, page) as new:
         if new is None:
             return
         _write_part(found, first, new, plots, str(found) + "\n\n", also)
@@ -49,6 +54,7 @@ def write_reconstruction(
             folder = new / f"part_{number}"
             folder.mkdir()
             _write_part(found, part, folder, plots, f"{part.name}\n\n", {})
+            write_text(folder / PAGE, compose_part(found, part, origin))
         if plots:
             draw_pairs(list(found.photographs), found.pairs, list(found.left_out), new)
         write_csv(new / PAIRS, ["image", "other", "matches", "verified", "kind"], found.pairs)

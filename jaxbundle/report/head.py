@@ -246,19 +246,27 @@ def chi_squared(adjustment, level: float = 0.05) -> str:
     if adjustment.sigma_factors:
         return "not made: the σ of the groups were estimated from these residuals, so that σ0 is 1"
     found = adjustment.global_test(level)
-    numbers = (
+    if unit_weights(adjustment):
+        return f"says nothing: unit weights (σ a priori 1 mm); {_interval(found, level)}"
+    return test_in_words(found, level) + (
+        ", see Warnings" if adjustment.doubts and found["vtpv"] > found["high"] else ""
+    )
+
+
+def test_in_words(found, level: float = 0.05) -> str:
+    """What a χ² test of vᵀPv says (`statistics.global_test`)."""
+    said = f"{'' if found['passed'] else 'not '}passed: {_interval(found, level)}; "
+    if found["passed"]:
+        return f"{said}the a priori σ are confirmed"
+    if found["vtpv"] < found["low"]:
+        return f"{said}the observations are better than their a priori σ"
+    return f"{said}the a priori σ are too small, blunders are left, or the cameras lack parameters"
+
+
+def _interval(found, level: float) -> str:
+    return (
         f"vᵀPv {significant(found['vtpv'], 5)}, {100 * (1 - level):g} % interval "
         f"{significant(found['low'], 5)} to {significant(found['high'], 5)}"
-    )
-    if unit_weights(adjustment):
-        return f"says nothing: unit weights (σ a priori 1 mm); {numbers}"
-    if found["passed"]:
-        return f"passed: {numbers}; the a priori σ are confirmed"
-    if found["vtpv"] < found["low"]:
-        return f"not passed: {numbers}; the observations are better than their a priori σ"
-    return (
-        f"not passed: {numbers}; the a priori σ are too small, blunders are left, or the cameras "
-        f"lack parameters{', see Warnings' if adjustment.doubts else ''}"
     )
 
 

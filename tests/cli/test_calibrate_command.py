@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from page_reader import Page, column
 
 import jaxbundle.calibration.files
 import jaxbundle.calibration.quality
@@ -34,8 +35,9 @@ def test_photographs_to_camera(calibrate, folder, tmp_path, monkeypatch):
     monkeypatch.setattr(jaxbundle.calibration.files, "save_plots", lambda *a: drawn.append(a))
     out, file = tmp_path / "out", tmp_path / "result.json"
     code, told, error = calibrate(
-        folder, "--board", "9x6", "--square", 0.03, "--out", out, "--json", file
-    )
+        folder, "--board", "9x6", "--square", 0.03, "--out", out, "--json", file,
+        "--html", tmp_path / "page.html",
+    )  # fmt: skip
     assert (code, error) == (0, "")
     assert "photo_13.jpg  no chessboard" in told and "text.jpg      not an image" in told
     assert "Cross-validation" in told
@@ -45,18 +47,27 @@ def test_photographs_to_camera(calibrate, folder, tmp_path, monkeypatch):
     assert abs(fx["value"] - 620) < 3 * fx["sigma"]
     written = {path.name for path in out.iterdir()} - {".jaxbundle"}
     cameras = {"cam.toml", "cam.yaml", "colmap", "network"}
-    assert written == {"report.txt", "result.json"} | cameras and len(drawn) == 1
+    assert written == {"report.txt", "report.html", "result.json"} | cameras and len(drawn) == 1
+    page = (out / "report.html").read_text()
+    assert page == (tmp_path / "page.html").read_text()
+    said = Page(page).texts["td"]
+    assert "no chessboard" in " ".join(said) and "--sigma-image" in Page(page).texts["th"]
+    sizes = {str(path.stat().st_size) for path in folder.glob("*.jpg")}
+    assert sizes <= set(said)  # the photographs with their fingerprints
     assert (out / "report.txt").read_text().strip() in told
 
 
-def test_two_cameras_and_brief_json_alone(calibrate, folder, monkeypatch):
+def test_two_cameras_and_brief_json_alone(calibrate, folder, tmp_path, monkeypatch):
     monkeypatch.delattr(jaxbundle.calibration.quality, "cross_validation")
     code, told, error = calibrate(
         "--camera", f"a={folder}/photo_*.jpg", "--camera", f"b={folder}/photo_*.jpg",
         "--board", "9x6", "--square", 0.03, "--json", "-", "--brief",
-        "--no-cross-validation",
+        "--no-cross-validation", "--html", tmp_path / "both.html",
     )  # fmt: skip
     assert (code, error) == (0, "")
+    page = (tmp_path / "both.html").read_text()
+    assert {"Camera a", "Camera b"} <= set(Page(page).texts["td"])
+    assert set(column(page, "cameras", "camera")) == {"a", "b"}
     result = json.loads(told)
     assert result["converged"] and set(result["calibrations"]) == {"a", "b"}
     assert "residuals" not in result["calibrations"]["a"] and "rig" not in result
@@ -65,6 +76,12 @@ def test_two_cameras_and_brief_json_alone(calibrate, folder, monkeypatch):
 
 @pytest.mark.parametrize("arguments, said", [
     (["--board", "9x6", "--square", "0.03"], "no photographs: give files"),
+    (["FOLDER", "--square", "1"], "--board is missing: COLUMNSxROWS"),
+    (["no_such.jpg", "--board", "9x6", "--square", "1"], "no_such.jpg: no such file or folder"),
+    (["FOLDER", "--board", "9x6", "--square", "1", "--marker", "0.5"],
+     "--marker is not for --kind chessboard, but for charuco"),
+    (["FOLDER", "--board", "9x6", "--square", "1", "--html", "FOLDER/photo_01.jpg"],
+     "is part of the input"),
     (["FOLDER", "--board", "9by6", "--square", "1"], "--board '9by6': COLUMNSxROWS is expected"),
     (["FOLDER", "--board", "9x6"], "--square is missing"),
     (["FOLDER", "--board", "9x6", "--square", "1", "--kind", "dots"], "--kind 'dots': one of"),

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from page_reader import Page, column
 from refinement_scenes import (
     COUNT,
     FREEDOM,
@@ -91,6 +92,16 @@ def test_the_command_writes_what_locate_reads(folder):
     assert len(result["image_points"]) == COUNT
     points = read_csv(folder / "out" / "points.csv")
     assert len(points) == COUNT and set(points.values["role"]) == {"control"}
+    text = (folder / "out" / "report.html").read_text()
+    assert Page(text).texts["h2"][0] == "Verdict"
+    v = np.array([row["v"] for row in result["image_points"]])
+    np.testing.assert_allclose(column(text, "observations", "v").reshape(-1, 2), v, rtol=1e-6)
+    assert set(column(text, "observations", "axis")) == {"line", "pixel"}
+    given = read_csv(folder / "observations.csv").values["pixel"]
+    across = column(text, "observations", "measured").reshape(-1, 2)[:, 1]
+    np.testing.assert_allclose(across, np.array(given, float), rtol=1e-6)
+    covered = column(text, "points", "sX")
+    np.testing.assert_allclose(covered, [float(s) for s in points.values["sX"]], rtol=1e-5)
     image, given = (read_scanner(folder / p / "A.toml").image for p in ("out", ""))
     pitch = {row["name"]: row["change"] for row in result["unknowns"]}["pitch bias"]
     assert abs(pitch - np.degrees(1e-4) * 3600) < 10

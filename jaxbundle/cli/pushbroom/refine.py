@@ -2,12 +2,13 @@
 
 import dataclasses
 import json as json_
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from jaxbundle.cli.app import Force
+from jaxbundle.cli.app import Force, Html
 from jaxbundle.cli.pushbroom.app import pushbroom
 
 PHOTOGRAPHS = "photographs"
@@ -17,13 +18,14 @@ PHOTOGRAPHS = "photographs"
 def refine(
     input: Annotated[Path, typer.Argument(help="refine file, .toml (docs/pushbroom.md)")],
     out: Annotated[
-        Path | None, typer.Option(help="folder for report, JSON, refined files")
+        Path | None, typer.Option(help="folder for report, page, JSON, refined files")
     ] = None,
+    html: Html = "",
     force: Force = False,
     json: Annotated[str, typer.Option(help="write the result as JSON; - for stdout alone")] = "",
 ) -> None:
     """Refine attitude, position and optics of scanner images by points; report what they tell."""
-    from jaxbundle.cli.outputs import REPORT, RESULT, check_writable, written
+    from jaxbundle.cli.outputs import PAGE, REPORT, RESULT, check_writable, trace_files, written
     from jaxbundle.cli.pushbroom.shared import warn
     from jaxbundle.io.networks.project import FILES, fill_project
     from jaxbundle.io.results.result_json import without_nan
@@ -33,11 +35,19 @@ def refine(
     from jaxbundle.io.writing.fingerprints import files_read
     from jaxbundle.refinement import adjusted_photographs, point_rows, report, to_json
     from jaxbundle.refinement import refine as refine_images
+    from jaxbundle.report.page import UNKNOWN
+    from jaxbundle.report.page.refinement import compose_refinement
 
     file = read_refinement(input)
-    names = [REPORT, RESULT, "points.csv", *(f"{PHOTOGRAPHS}/{name}" for name in FILES)]
+    names = [REPORT, PAGE, RESULT, "points.csv", *(f"{PHOTOGRAPHS}/{name}" for name in FILES)]
     names += [name for one in file.images for name in names_of(one.id)]
-    check_writable(json, out, "pushbroom refine", names, files_read(input), force)
+    files = files_read(input)
+    check_writable(json, out, "pushbroom refine", names, files, force, html)
+    origin = UNKNOWN
+    if html or out is not None:
+        origin = trace_files(files, {
+            "snooping": file.snooping, "significance": file.significance,
+        })  # fmt: skip
     result = refine_images(
         file.images, file.points, file.observations, file.frames,
         snooping=file.snooping, significance=file.significance,
@@ -45,7 +55,8 @@ def refine(
     result = dataclasses.replace(result, warnings=(*file.warnings, *result.warnings))
     text, document = report(result), without_nan(to_json(result))
     as_json = json_.dumps(document, ensure_ascii=False) + "\n"
-    with written(json, as_json, out, "pushbroom refine", names, force) as new:
+    page = partial(compose_refinement, result, origin)
+    with written(json, as_json, out, "pushbroom refine", names, force, html, page) as new:
         if new is not None:
             for one in file.images:
                 write_scanner_image(new, one.id, result.image(one.id), one.earth)

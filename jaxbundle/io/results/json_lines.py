@@ -63,6 +63,11 @@ class JsonLines:
         self._write(lambda file: file.write(text))
         self.heads.update((row["key"], _head(row)) for row in rows)
 
+    def rows(self, keys: Iterable[str]) -> Iterator[dict]:
+        """The rows of some keys, in the order of the file."""
+        wanted = set(keys)
+        return (row for row in map(_row, self._lines()) if row is not None and row["key"] in wanted)
+
     def drop(self, keys: Iterable[str]) -> None:
         """Remove the lines of some keys."""
         gone = set(keys)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxbundle.report.layout import significant
 from jaxbundle.report.page.markup import text
 
 WIDE, HIGH = 640, 300
@@ -37,11 +38,11 @@ class Scale(NamedTuple):
 
 
 def draw_curves(
-    curves: Sequence[Curve], x_label: str, y_label: str, logarithmic: bool = False,
+    curves: Sequence[Curve], x_label: str, y_label: str, logarithmic: str = "",
     mark: tuple[float, str] | None = None,
 ) -> str:  # fmt: skip
-    """Curves over a common x; `logarithmic`: y is log10 of what the axis says; `mark`: an x with a
-    vertical line, and its name."""
+    """Curves over a common x; `logarithmic`: the axes, of x and y, whose values are log10 of what
+    they say; `mark`: an x with a vertical line, and its name."""
     reach = [np.concatenate([c.y - band, c.y + band]) for c in curves
              for band in [np.nan_to_num(0 if c.sigma is None else c.sigma)]]  # fmt: skip
     xs, ys = np.concatenate([c.x for c in curves]), np.concatenate(reach)
@@ -62,23 +63,57 @@ def draw_curves(
                                  None if mark is None else mark[1])  # fmt: skip
 
 
-def draw_histogram(edges: np.ndarray, counted: np.ndarray, expected: np.ndarray) -> str:
-    """Counts by class as bars, beside the numbers expected as steps; the outer classes are open."""
-    step = edges[2] - edges[1]
-    ends = np.concatenate([[edges[1] - step], edges[1:-1], [edges[-2] + step]])
+def draw_histogram(
+    edges: np.ndarray, counted: np.ndarray, x_label: str, things: str,
+    expected: np.ndarray | None = None,
+) -> str:  # fmt: skip
+    """Counts by class as bars, beside the numbers expected of a normal distribution as steps; an
+    outer class whose edge is infinite is open, and drawn as wide as its neighbour."""
+    ends = np.array(edges, float)
+    if np.isinf(ends[0]):
+        ends[0] = 2 * ends[1] - ends[2]
+    if np.isinf(ends[-1]):
+        ends[-1] = 2 * ends[-2] - ends[-3]
     x = Scale(ends[0], ends[-1], LEFT, WIDE - RIGHT)
-    y = _scale(np.array([0, counted.max(initial=1), expected.max(initial=1)]), HIGH - BOTTOM, TOP)
+    tallest = max(counted.max(initial=1), 0 if expected is None else expected.max(initial=1))
+    y = _scale(np.array([0.0, tallest]), HIGH - BOTTOM, TOP)
     base = float(y(0))
-    bars = [
+    parts = [_axes(x, y, x_label, things)]
+    parts += [
         f'<rect class="bar" x="{x(a):.1f}" y="{y(n):.1f}" width="{x(b) - x(a):.1f}" '
         f'height="{base - y(n):.1f}"/>\n'
         for a, b, n in zip(ends, ends[1:], counted)
     ]
-    steps = _places(x, y, np.repeat(ends, 2)[1:-1], np.repeat(expected, 2))
-    line = f'<polyline class="second" points="{steps}"/>\n'
-    axes = _axes(x, y, "normalised residual τ = w/σ0", "observations")
-    names = [("bar", "observations"), ("second", "normal distribution")]
-    return _svg([axes, *bars, line]) + _legend(names)
+    names = [("bar", things)]
+    if expected is not None:
+        steps = _places(x, y, np.repeat(ends, 2)[1:-1], np.repeat(expected, 2))
+        parts.append(f'<polyline class="second" points="{steps}"/>\n')
+        names.append(("second", "normal distribution"))
+    return _svg(parts) + _legend(names)
+
+
+def draw_field(values: np.ndarray, digits: int = 2) -> str:
+    """Numbers in the cells of an image, row by row from its top, the larger the darker; a cell
+    without a number is empty. `digits`: significant ones; 0: whole numbers."""
+    rows, columns = values.shape
+    wide, high = WIDE / columns, HIGH / rows
+    there = np.isfinite(values)
+    low, top = (values[there].min(), values[there].max()) if there.any() else (0.0, 1.0)
+    shade = 0.6 * (values - low) / (top - low or 1.0)
+    parts = []
+    for i, j in np.argwhere(there):
+        x, y = j * wide, i * high
+        parts.append(
+            f'<rect class="cell" x="{x:.1f}" y="{y:.1f}" width="{wide:.1f}" height="{high:.1f}" '
+            f'fill-opacity="{shade[i, j]:.2f}"/>\n<text x="{x + wide / 2:.1f}" '
+            f'y="{y + high / 2 + 4:.1f}" text-anchor="middle">'
+            f"{_cell(float(values[i, j]), digits)}</text>\n"
+        )
+    return _svg([*parts, f'<rect class="frame" width="{WIDE}" height="{HIGH}"/>\n'])
+
+
+def _cell(value: float, digits: int) -> str:
+    return f"{value:.0f}" if digits == 0 else significant(value, digits)
 
 
 def _scale(values: np.ndarray, start: float, end: float, margin: float = 0.0) -> Scale:
@@ -100,17 +135,16 @@ def _ticks(scale: Scale, whole: bool = False) -> np.ndarray:
     return step * np.arange(first, np.floor(scale.high / step + 1e-9) + 1)
 
 
-def _axes(x: Scale, y: Scale, x_label: str, y_label: str, logarithmic: bool = False) -> str:
+def _axes(x: Scale, y: Scale, x_label: str, y_label: str, logarithmic: str = "") -> str:
     parts = []
-    for tick in _ticks(x):
+    for tick in _ticks(x, "x" in logarithmic):
         at = float(x(tick))
         parts.append(f'<line class="grid" x1="{at:.1f}" x2="{at:.1f}" y1="{TOP}" '
                      f'y2="{HIGH - BOTTOM}"/>\n'
                      f'<text x="{at:.1f}" y="{HIGH - BOTTOM + 16}" text-anchor="middle">'
-                     f"{tick + 0.0:.6g}</text>\n")  # fmt: skip
-    for tick in _ticks(y, logarithmic):
-        at = float(y(tick))
-        name = f"{10.0**tick:.3g}" if logarithmic else f"{tick + 0.0:.6g}"
+                     f"{_name(tick, 'x' in logarithmic)}</text>\n")  # fmt: skip
+    for tick in _ticks(y, "y" in logarithmic):
+        at, name = float(y(tick)), _name(tick, "y" in logarithmic)
         parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDE - RIGHT}" y1="{at:.1f}" '
                      f'y2="{at:.1f}"/>\n'
                      f'<text x="{LEFT - 6}" y="{at + 4:.1f}" text-anchor="end">{name}</text>\n')
@@ -120,6 +154,10 @@ def _axes(x: Scale, y: Scale, x_label: str, y_label: str, logarithmic: bool = Fa
                  f'<text x="14" y="{middle}" text-anchor="middle" '
                  f'transform="rotate(-90 14 {middle})">{text(y_label)}</text>\n')  # fmt: skip
     return "".join(parts)
+
+
+def _name(tick: float, logarithmic: bool) -> str:
+    return f"{10.0**tick:.3g}" if logarithmic else f"{tick + 0.0:.6g}"
 
 
 def _places(x: Scale, y: Scale, xs, ys) -> str:

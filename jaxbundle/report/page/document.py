@@ -1,4 +1,6 @@
-"""One page of HTML that holds a whole result: words, charts, tables, the network to be turned.
+"""One page of HTML that holds a whole result: words, charts, tables, drawings to be turned.
+
+A command declares its page: the sections, the verdict first, the tables, and what scripts draw.
 
 The page needs nothing from outside: its script and its style stand in it once, and its policy
 allows neither another script nor any request. What a browser without scripts cannot show, the
@@ -7,60 +9,101 @@ tables, is said to be in the CSV files.
 
 import base64
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from importlib.resources import files
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
-from jaxbundle.errors import NotSolvedError
-from jaxbundle.report import head
-from jaxbundle.report.layout import clean
-from jaxbundle.report.page import markup, sections
-from jaxbundle.report.page.columns import encode_table, script_text
-from jaxbundle.report.page.origin import UNKNOWN, Origin
-from jaxbundle.report.page.scene import describe_frames, describe_network
-from jaxbundle.report.page.tables import collect_tables
+from jaxbundle.report.page import markup
+from jaxbundle.report.page.columns import Column, encode_table, script_text
 
 SCRIPTS = (
     "data.js", "table.js", "canvas.js", "pointer.js", "network.js", "photograph.js", "start.js",
 )  # fmt: skip
 STYLE = "page.css"
+NO_SCRIPT = "<noscript><p>The tables need JavaScript; --out has them as CSV files.</p></noscript>\n"
+NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
-def compose(
-    adjustment, origin: Origin = UNKNOWN, *, date: str | None = None
-) -> Iterator[str]:
-    """The page of an adjustment as HTML, in pieces; of one that was not solved, why it was not.
+class Section(NamedTuple):
+    """A section: its `id`, heading and HTML; `link`: its name in the contents, empty: not listed;
+    `breaks`: on a new page when printed."""
 
-    **Arguments:**
-
-    - `origin`: the files that were read, with their fingerprints (`fingerprint_files`), and
-      settings that are to be shown.
-    - `date`: printed in the head as it is given; nothing is printed without it, so that the same
-      adjustment always gives the same page.
-    """
-    yield _beginning(clean(adjustment.network.name) or "network", date)
-    if adjustment.converged:
-        yield from sections.result(adjustment)
-    else:
-        yield sections.failure(head.failure_facts(adjustment), adjustment.warnings)
-    yield sections.describe_origin(head.setting_facts(adjustment), origin)
-    if adjustment.converged:
-        for id, columns in collect_tables(adjustment).items():
-            yield _data(f"data-{id}", encode_table(columns))
-        yield _data("network-data", describe_network(adjustment))
-        yield _data("frames", describe_frames(adjustment))
-    yield _end()
+    id: str
+    title: str
+    content: str
+    link: str = ""
+    breaks: bool = False
 
 
-def compose_failure(error: NotSolvedError, origin: Origin = UNKNOWN) -> Iterator[str]:
-    """The page of an adjustment that ended before there was a result."""
-    rows = [("Why", str(error)), *(("Not determined", name) for name in error.undetermined)]
-    yield _beginning("no result")
-    yield sections.failure(rows, ())
-    yield sections.describe_origin((), origin)
-    yield _end()
+class Listing(NamedTuple):
+    """A table that sorts and searches: its heading, its columns by name, the file that has all of
+    its rows, and a note above it."""
+
+    title: str
+    columns: Mapping[str, Column]
+    file: str = ""
+    note: str = ""
 
 
-def _beginning(name: str, date: str | None = None) -> str:
+class Page(NamedTuple):
+    """A page: its title; its sections, the verdict first; its tables by name, the empty ones are
+    left out; what the scripts draw, by id; the section on where it comes from."""
+
+    title: str
+    sections: Iterable[Section]
+    origin: Section
+    tables: Mapping[str, Listing] = NOTHING
+    drawings: Mapping[str, Any] = NOTHING
+
+
+def write(page: Page, date: str | None = None) -> Iterator[str]:
+    """The page as HTML, in pieces; `date` is printed in its head as it is given."""
+    tables = {
+        id: table
+        for id, table in page.tables.items()
+        if any(len(column.values) for column in table.columns.values())
+    }
+    first, *sections = page.sections
+    listed = [_listing(id, table) for id, table in tables.items()]
+    if listed:
+        listed[0] = listed[0]._replace(link="Tables")
+    yield _beginning(page.title, date)
+    yield _section(first)
+    yield _contents([*sections, *listed, page.origin])
+    yield from map(_section, sections)
+    if listed:
+        yield markup.paragraph(
+            "Click a header to sort, again to turn the order; type to search.", "hint"
+        )
+        yield NO_SCRIPT
+        yield from map(_section, listed)
+    yield _section(page.origin)
+    for id, table in tables.items():
+        yield _data(f"data-{id}", encode_table(table.columns))
+    for id, value in page.drawings.items():
+        yield _data(id, value)
+    yield f"</main>\n<script>{_script()}</script>\n</body>\n</html>\n"
+
+
+def _listing(id: str, table: Listing) -> Section:
+    """The place of a table, which the script fills."""
+    place = f'<div class="table" data-table="{id}" data-file="{markup.text(table.file)}"></div>\n'
+    note = markup.paragraph(table.note) if table.note else ""
+    return Section(f"table-{id}", table.title, note + place)
+
+
+def _contents(sections: Iterable[Section]) -> str:
+    """Links to the sections."""
+    links = "".join(f'<a href="#{s.id}">{markup.text(s.link)}</a>\n' for s in sections if s.link)
+    return f"<nav>{links}</nav>\n"
+
+
+def _section(section: Section) -> str:
+    return markup.section(section.id, section.title, section.content, breaks=section.breaks)
+
+
+def _beginning(title: str, date: str | None) -> str:
     from jaxbundle import __version__
 
     style, script = _read(STYLE), _script()
@@ -68,7 +111,7 @@ def _beginning(name: str, date: str | None = None) -> str:
         f"default-src 'none'; img-src data:; style-src '{_digest(style)}'; "
         f"script-src '{_digest(script)}'; base-uri 'none'; form-action 'none'"
     )
-    title = markup.text(f"{name}: bundle adjustment")
+    title = markup.text(title)
     made = f"jaxbundle {__version__}" + (f", {date}" if date else "")
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
@@ -77,10 +120,6 @@ def _beginning(name: str, date: str | None = None) -> str:
         f"<title>{title}</title>\n<style>{style}</style>\n</head>\n<body>\n"
         f"<header><h1>{title}</h1>{markup.paragraph(made)}</header>\n<main>\n"
     )
-
-
-def _end() -> str:
-    return f"</main>\n<script>{_script()}</script>\n</body>\n</html>\n"
 
 
 def _data(id: str, value) -> str:

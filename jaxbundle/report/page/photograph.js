@@ -1,6 +1,6 @@
 // One photograph: residuals as vectors, redundancy numbers as the area of marks.
 
-const LARGE = 3, WEAK = 0.1;
+const LARGE = 3, WEAK = 0.1, ACROSS = ["x", "pixel"];
 
 class PhotographView {
   constructor(frames, { images, observations }) {
@@ -37,14 +37,14 @@ class PhotographView {
     this.draw();
   }
 
-  // Image points of an image: x and y follow each other in the table.
+  // Image points of an image: two coordinates of a point, in either order.
   collectPoints(image) {
     const table = this.observations, axis = table.numbers("axis"), names = table.names("axis");
     const [point, at, v, r, tau] = ["point", "measured", "v", "r", "tau"]
       .map(name => table.numbers(name));
     const found = new Map();
     for (const row of this.rows[image]) {
-      const k = names[axis[row]] === "x" ? 0 : 1;
+      const k = ACROSS.includes(names[axis[row]]) ? 0 : 1;
       const one = found.get(point[row]) ?? { at: [NaN, NaN], v: [0, 0], r: [], tau: 0 };
       one.at[k] = at[row];
       one.v[k] = v[row] || 0;
@@ -74,7 +74,7 @@ class PhotographView {
     const large = points.filter(one => one.tau > LARGE).length;
     const rms = this.images.cell("rms", image);
     this.said.textContent = `Image ${this.images.cell("id", image)}: ${points.length} image points, `
-      + `RMS v ${rms}, vectors drawn ${factor} times as large, ${large} with |τ| > ${LARGE}.`;
+      + `RMS v ${rms}, vectors drawn ${factor} times as large, ${large} with |${this.observations.columns.tau.label}| > ${LARGE}.`;
   }
 
   drawFrame(context, frame, place) {

@@ -25,15 +25,10 @@ function start() {
   const places = [...document.querySelectorAll("[data-table]")];
   const names = places.map(({ dataset }) => dataset.table);
   const tables = Object.fromEntries(names.map(name => [name, readTable(name)]));
-  for (const place of places) {
-    if (tables[place.dataset.table] === null) place.parentElement.remove();
-  }
-  const scene = readData("network-data");
-  if (scene === null) return;
-  const photograph = new PhotographView(readData("frames"), tables);
-  const network = new NetworkView(scene, tables, id => photograph.choose(id));
-  network.draw();
-  photograph.draw();
+  const frames = readData("frames"), scene = readData("network-data");
+  const photograph = frames && new PhotographView(frames, tables);
+  if (scene !== null) new NetworkView(scene, tables, id => photograph.choose(id)).draw();
+  photograph?.draw();
   fillTables(tables);
 }
 

@@ -83,7 +83,8 @@ class Listing {
       rows.unshift(this.gap(first));
       rows.push(this.gap(total - end));
     } else if (end < this.order.length) {
-      const more = `… and ${this.order.length - end} more: all are in ${this.file}.`;
+      const place = this.file === "" ? "" : `: all are in ${this.file}`;
+      const more = `… and ${this.order.length - end} more${place}.`;
       rows.push(make("tr", {}, make("td", { colSpan: this.table.shown.length, className: "name",
                                             textContent: more })));
     }

@@ -1,12 +1,13 @@
 """The tables of a result as the page embeds them: what can be sorted, searched and drawn."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.report.layout import clean, column_decimals
 from jaxbundle.report.page.columns import Column, numbers
+from jaxbundle.report.page.document import Listing
 
 MOST_ROWS = 500_000
 """More observations than this are not embedded: a page with a million takes too long to open."""
@@ -17,17 +18,21 @@ UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 ANGLES = {"omega": "ω", "phi": "φ", "kappa": "κ"}
 
 
-def collect_tables(adjustment) -> dict[str, Columns]:
-    """All tables by name; empty ones are left out."""
-    made: dict[str, Callable[..., Columns]] = {
-        "cameras": cameras, "images": images, "points": points, "far_points": far_points,
-        "checks": checks, "observations": observations, "blunders": blunders,
-    }  # fmt: skip
-    tables = {name: make(adjustment) for name, make in made.items()}
+def collect_tables(adjustment) -> dict[str, Listing]:
+    """All tables by name."""
+    total = len(adjustment.residuals["tau"])
+    most = "" if total <= MOST_ROWS else (
+        f"The {MOST_ROWS} with the largest |τ| of {total}, here and in the photographs; all are in "
+        "residuals.csv."
+    )  # fmt: skip
     return {
-        name: columns
-        for name, columns in tables.items()
-        if any(len(column.values) for column in columns.values())
+        "cameras": Listing("Cameras", cameras(adjustment), "cameras.csv"),
+        "images": Listing("Images", images(adjustment), "images.csv"),
+        "points": Listing("Points", points(adjustment), "points.csv"),
+        "far_points": Listing("Points at any distance", far_points(adjustment), "far_points.csv"),
+        "checks": Listing("Check points", checks(adjustment), "checks.csv"),
+        "observations": Listing("Observations", observations(adjustment), "residuals.csv", most),
+        "blunders": Listing("Blunders", blunders(adjustment), "result.json"),
     }
 
 
@@ -120,7 +125,13 @@ def checks(adjustment) -> Columns:
 
 def observations(adjustment) -> Columns:
     """All observations, of very many those with the largest |τ|; `measured` of image points."""
-    found = adjustment.residuals | {"measured": measured_coordinates(adjustment)}
+    return table_of_residuals(
+        adjustment.residuals | {"measured": measured_coordinates(adjustment)}
+    )
+
+
+def table_of_residuals(found: Mapping[str, np.ndarray]) -> Columns:
+    """The columns there are of a table of residuals."""
     chosen = choose_largest(found["tau"], MOST_ROWS)
     labels = {
         "kind": "kind", "image": "image", "point": "point", "axis": "axis", "measured": "measured",

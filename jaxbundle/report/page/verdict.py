@@ -44,8 +44,12 @@ def _fit(adjustment) -> Finding:
     words = chi_squared(adjustment)
     if adjustment.redundancy < 1 or unit_weights(adjustment) or adjustment.sigma_factors:
         return Finding("χ² test", DOUBTFUL, words)
-    found = adjustment.global_test()
-    # Better than the a priori σ is a matter of these σ, and harms no result.
+    return judge_fit(adjustment.global_test(), words)
+
+
+def judge_fit(found, words: str) -> Finding:
+    """The finding of a χ² test: better than the a priori σ is a matter of these σ, and harms no
+    result."""
     state = GOOD if found["passed"] else DOUBTFUL if found["vtpv"] < found["low"] else BAD
     return Finding("χ² test", state, words)
 

@@ -1,0 +1,205 @@
+"""The pages of a calibration: of one camera, of several, of a rig."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from jaxbundle.calibration.advice import CONTRADICTION, PART, REACH
+from jaxbundle.calibration.report import (
+    MAPS_HEADER,
+    MODELS_HEADER,
+    coverage_in_words,
+    cross_validation_in_words,
+    map_rows,
+    model_rows,
+    models_legend,
+    mounting_rows,
+    mounting_title,
+    photograph_facts,
+    rig_facts,
+    rig_parameter_rows,
+)
+from jaxbundle.report.layout import clean
+from jaxbundle.report.page import (
+    UNKNOWN,
+    Addition,
+    Finding,
+    Listing,
+    Origin,
+    Page,
+    Section,
+    compose,
+    describe_origin,
+    find,
+    give_verdict,
+    write,
+)
+from jaxbundle.report.page.charts import Curve, draw_curves, draw_field
+from jaxbundle.report.page.columns import Column, numbers
+from jaxbundle.report.page.markup import facts, figure, grid, paragraph, text
+from jaxbundle.report.page.sections import show_residuals
+from jaxbundle.report.page.tables import table_of_residuals
+from jaxbundle.report.page.verdict import BAD, DOUBTFUL, GOOD, in_words
+
+KIND = "calibration of cameras"
+BOARD = ("Control",)
+"""What the page of an adjustment judges and a board does not have."""
+
+
+def compose_calibrations(found, origin: Origin = UNKNOWN, choice=None) -> Iterator[str]:
+    """The page of one calibration, of several the one of the whole, with the rig.
+
+    **Arguments:** `found`: `Calibrations`; `choice`: the comparison of models they come from.
+    """
+    if len(found.cameras) == 1:
+        return compose_calibration(next(iter(found.cameras.values())), origin, choice)
+    return write(_describe_several(found, origin))
+
+
+def compose_calibration(calibration, origin: Origin = UNKNOWN, choice=None) -> Iterator[str]:
+    """The page of one camera: that of its adjustment, and how good it is."""
+    return compose(calibration.adjustment, origin, also=_describe_one(calibration, choice))
+
+
+def _describe_one(calibration, choice=None) -> Addition:
+    views, sections = calibration.views, []
+    overview = f"<h3>Photographs</h3>\n{facts(photograph_facts(views))}"
+    if choice is not None:
+        sections.append(_models(choice))
+    if not calibration.converged:
+        return Addition("", overview=overview, sections=(*sections, *_failed(views)))
+    sections += [
+        _quality(calibration.coverage, calibration.reported_maps, _unit(calibration)),
+        _validation(calibration), *_failed(views),
+    ]  # fmt: skip
+    findings = (_coverage(calibration.coverage), *_halves(calibration))
+    rows = [("RMS of an image point", f"{calibration.rms:.4f} px")]
+    return Addition(
+        "", findings, BOARD, tuple(calibration.advice), overview + facts(rows), tuple(sections)
+    )
+
+
+def _unit(calibration) -> str:
+    return clean(calibration.adjustment.network.object_unit)
+
+
+def _coverage(covered) -> Finding:
+    good = covered.part >= PART and covered.reach >= REACH
+    return Finding("Coverage", GOOD if good else DOUBTFUL, coverage_in_words(covered))
+
+
+def _halves(calibration) -> list[Finding]:
+    checked = calibration.cross_validation
+    if checked is None:
+        return []
+    state = DOUBTFUL if checked.test > CONTRADICTION else GOOD
+    return [Finding("Cross-validation", state, " ".join(cross_validation_in_words(calibration)))]
+
+
+def _quality(covered, maps, unit: str, name: str = "", number: int = 0) -> Section:
+    """Where points were measured, and how well a projected point is known over the image."""
+    counts = np.where(covered.counts > 0, covered.counts, np.nan)
+    caption = f"Measured points by cell: {coverage_in_words(covered)}"
+    parts = [figure(draw_field(counts, 0), caption)]
+    parts += ["<h3>Uncertainty of a projected point (σ, pixels)</h3>\n",
+              grid(MAPS_HEADER, map_rows(maps, unit))]  # fmt: skip
+    for one, (held, *_) in zip(maps, map_rows(maps, unit)):
+        caption = f"σ over the image from corner to corner, pixels; point held in {held}"
+        parts.append(figure(draw_field(one.sigma), caption))
+    title = f"Quality of camera {name}" if name else "Quality"
+    link = "Quality" if number == 0 else ""
+    return Section(f"quality-{number}" if number else "quality", title, "".join(parts), link, True)
+
+
+def _validation(calibration) -> Section:
+    """σ over the distance, and the two halves of the photographs."""
+    distances, middle, corners, reported = calibration.uncertainty_curves()
+    x = np.log10(distances)
+    curves = [Curve("middle of the image", x, np.log10(middle)),
+              Curve("worst corner", x, np.log10(corners), kind="second")]  # fmt: skip
+    unit = _unit(calibration)
+    drawing = draw_curves(curves, f"distance [{unit}]", "σ of a projected point [px]", "xy",
+                          (float(np.log10(reported[0, 0])), "median distance of the board"))
+    parts = [figure(drawing, "Uncertainty over the distance of the point, in the scene"),
+             "<h3>Cross-validation</h3>\n"]  # fmt: skip
+    parts += [paragraph(words[:1].upper() + words[1:])
+              for words in cross_validation_in_words(calibration)]  # fmt: skip
+    return Section("validation", "Distance and cross-validation", "".join(parts), "Validation")
+
+
+def _failed(views) -> list[Section]:
+    if not views.failed:
+        return []
+    rows = grid(("photograph", "reason"), views.failed, "words")
+    return [Section("failed", "Photographs not used", rows, "Not used")]
+
+
+def _models(choice) -> Section:
+    parts = [paragraph(choice.sentence), grid(MODELS_HEADER, model_rows(choice)),
+             paragraph(models_legend(choice))]  # fmt: skip
+    if choice.failed:
+        parts += ["<h3>Not compared</h3>\n",
+                  grid(("model", "reason"), choice.failed.items(), "words")]  # fmt: skip
+    return Section("models", "Camera models compared", "".join(parts), "Models")
+
+
+def _describe_several(found, origin: Origin) -> Page:
+    """The whole: a finding a camera, the rig, the parameters of all."""
+    findings, sections, tables = [], [], {"cameras": _table_of_cameras(found)}
+    for name, one in found.cameras.items():
+        if not one.converged:
+            said = BAD, f"not solved: {one.adjustment.termination}"
+        else:
+            also = _describe_one(one)
+            warnings = (*also.warnings, *one.adjustment.warnings)
+            said = in_words(find(one.adjustment, also), len(warnings))
+        findings.append(Finding(f"Camera {name}", *said))
+    rig = found.rig
+    if rig is not None:
+        unit = _unit(next(iter(rig.cameras.values())))
+        state = DOUBTFUL if rig.left_out or rig.contradicting or not rig.converged else GOOD
+        words = f"{len(rig.epochs)} epochs, {len(rig.left_out)} left out, σ0 {rig.sigma0:.4f}"
+        findings.append(Finding("Rig", state, words))
+        sections += [_rig(rig, unit)]
+        for number, name in enumerate(rig.names):
+            maps = rig.reported_maps(name)
+            sections.append(_quality(rig.coverage(name), maps, unit, f"{name} in the rig", number))
+        sections.append(show_residuals(rig.residuals["tau"]))
+        listed = table_of_residuals(rig.residuals)
+        tables["observations"] = Listing("Observations of the rig", listed, "result.json")
+    else:
+        for number, (name, one) in enumerate(found.cameras.items()):
+            if one.converged:
+                maps = one.reported_maps
+                sections.append(_quality(one.coverage, maps, _unit(one), name, number))
+    more = paragraph("Every camera by itself has a page of its own in its folder of --out.")
+    title = f"{KIND.capitalize()} {', '.join(map(clean, found.cameras))}"
+    first = give_verdict(findings, (), more)
+    return Page(title, [first, *sections], describe_origin((), origin), tables)
+
+
+def _rig(rig, unit: str) -> Section:
+    parts = [facts(rig_facts(rig, unit))]
+    for name, m in rig.mountings.items():
+        parts += [f"<h3>{text(mounting_title(rig, name))}</h3>\n",
+                  grid(("", "value", "σ", "unit"), mounting_rows(m, unit))]  # fmt: skip
+    for name in rig.names:
+        parts += [f"<h3>{text(f'Camera {name} in the rig')}</h3>\n",
+                  grid(("parameter", "value", "σ"), rig_parameter_rows(rig, name))]  # fmt: skip
+    return Section("rig", f"Rig, reference {rig.names[0]}", "".join(parts), "Rig", True)
+
+
+def _table_of_cameras(found) -> Listing:
+    """A row a parameter of every camera by itself."""
+    rows = [
+        (name, one.camera.model, parameter, value, one.sigma.get(parameter))
+        for name, one in found.cameras.items() if one.converged
+        for parameter, value in one.parameters.items()
+    ]  # fmt: skip
+    camera, model, parameter, value, sigma = zip(*rows) if rows else ((),) * 5
+    words = lambda values: np.array(values, dtype=object)
+    return Listing("Cameras, each by itself", {
+        "camera": Column(words(camera), "camera"), "model": Column(words(model), "model"),
+        "parameter": Column(words(parameter), "parameter"),
+        "value": Column(numbers(value), "value", -9, True), "sigma": Column(numbers(sigma), "σ"),
+    }, "result.json")  # fmt: skip

@@ -1,0 +1,32 @@
+"""`jaxbundle example`: examples to begin with."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from jaxbundle.cli.app import Quiet, app
+from jaxbundle.errors import InputError
+from jaxbundle.system.examples import EXAMPLES, write_example
+
+
+@app.command()
+def example(
+    name: Annotated[str, typer.Argument(help=", ".join(EXAMPLES))] = "",
+    folder: Annotated[Path | None, typer.Argument(help="new or empty folder")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Write an example into a folder; without a name, list the examples.
+
+    Example: jaxbundle example convergent4 first
+    """
+    if not name:
+        for one, (about, _) in EXAMPLES.items():
+            print(f"{one:14} {about}")
+        return
+    if folder is None:
+        raise InputError(f"FOLDER is missing: jaxbundle example {name} {name}")
+    write_example(name, folder)
+    if not quiet:
+        print(f"{folder}: {EXAMPLES[name].about}")
+        print(f"next: {EXAMPLES[name].command.replace('FOLDER', str(folder))}")

@@ -1,0 +1,81 @@
+"""The page of a reconstruction: that of an adjusted part, and what became of the photographs."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from jaxbundle.network.columns import count
+from jaxbundle.report.layout import clean, significant
+from jaxbundle.report.page import (
+    UNKNOWN,
+    Addition,
+    Finding,
+    Listing,
+    Origin,
+    Section,
+    compose,
+)
+from jaxbundle.report.page.columns import Column
+from jaxbundle.report.page.markup import facts, grid, items
+from jaxbundle.report.page.verdict import DOUBTFUL, GOOD
+
+
+def compose_part(found, part, origin: Origin = UNKNOWN) -> Iterator[str]:
+    """The page of a part of a `Reconstruction`: HTML, in pieces."""
+    return compose(part.adjustment, origin, also=_describe(found, part))
+
+
+def _describe(found, part) -> Addition:
+    sections = [_factors(part)] if part.factors else []
+    if found.left_out:
+        rows = grid(("photograph", "reason"), found.left_out.items(), "words")
+        sections.append(Section("left-out", "Photographs left out", rows, "Left out"))
+    overview = f"<h3>Reconstruction</h3>\n{facts(_counts(found, part))}"
+    if found.notes:
+        overview += items(found.notes)
+    return Addition(
+        "reconstruction", (_photographs(found, part),), overview=overview,
+        sections=tuple(sections), tables={"pairs": _pairs(found)},
+    )  # fmt: skip
+
+
+def _photographs(found, part) -> Finding:
+    used, total = len(part.adjustment.network.images), len(found.photographs)
+    words = f"{used} of {count(total, 'photograph')} in this part"
+    if len(found.parts) > 1:
+        words += f", {len(found.parts)} parts that do not hang together"
+    if found.left_out:
+        words += f", {len(found.left_out)} left out"
+    whole = len(found.parts) == 1 and not found.left_out
+    return Finding("Photographs", GOOD if whole else DOUBTFUL, words)
+
+
+def _counts(found, part) -> list[tuple[str, str]]:
+    """The parts, this one marked, and the pairs."""
+    rows = []
+    for one in found.parts:
+        network = one.adjustment.network
+        rows.append((
+            clean(one.name) + (" (this page)" if one is part and len(found.parts) > 1 else ""),
+            f"{count(len(network.images), 'photograph')}, {count(len(network.points), 'point')}, "
+            f"σ0 {significant(one.adjustment.sigma0, 4)}",
+        ))  # fmt: skip
+    return [*rows, ("Verified pairs", str(len(found.pairs)))]
+
+
+def _factors(part) -> Section:
+    """How the σ of the kinds of measurements were weighted."""
+    rows = [(kind, significant(factor, 4)) for kind, factor in part.factors.items()]
+    note = ("kind of measurement", "factor of its a priori σ")
+    return Section("factors", "Variance factors", grid(note, rows), "Variance factors")
+
+
+def _pairs(found) -> Listing:
+    one, other, matches, verified, kind = zip(*found.pairs) if found.pairs else ((),) * 5
+    words = lambda values: np.array(values, dtype=object)
+    return Listing("Pairs of photographs", {
+        "image": Column(words(one), "image"), "other": Column(words(other), "other"),
+        "matches": Column(np.array(matches, int), "matches"),
+        "verified": Column(np.array(verified, int), "verified"),
+        "kind": Column(words(kind), "kind"),
+    }, "pairs.csv")  # fmt: skip

@@ -1,0 +1,99 @@
+"""The page of an adjustment, and of what another command has found with one."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+from jaxbundle.errors import NotSolvedError
+from jaxbundle.report import head
+from jaxbundle.report.layout import clean
+from jaxbundle.report.page import sections
+from jaxbundle.report.page.document import NOTHING, Listing, Page, Section, write
+from jaxbundle.report.page.markup import facts, grid, paragraph
+from jaxbundle.report.page.origin import UNKNOWN, Origin
+from jaxbundle.report.page.overview import describe_origin, explain_failure, give_verdict
+from jaxbundle.report.page.scene import describe_frames, describe_network
+from jaxbundle.report.page.tables import collect_tables
+from jaxbundle.report.page.verdict import Finding, judge
+from jaxbundle.report.summary import summary
+
+A_POSTERIORI = (
+    "Standard deviations are a posteriori, σ0 times those of the a priori weights, unless they are "
+    "said to be a priori."
+)
+
+
+class Addition(NamedTuple):
+    """What a command that adjusts says beside its adjustment.
+
+    **Fields:** `kind`, for the title, empty where the name of the network says it; `findings`
+    before those of the adjustment, of which `without` names some that say nothing here; `warnings`
+    before its own; `overview`: HTML below the tests; `sections` after the verdict; `tables` before
+    the others.
+    """
+
+    kind: str = "bundle adjustment"
+    findings: tuple[Finding, ...] = ()
+    without: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    overview: str = ""
+    sections: tuple[Section, ...] = ()
+    tables: Mapping[str, Listing] = NOTHING
+
+
+ALONE = Addition()
+
+
+def compose(
+    adjustment, origin: Origin = UNKNOWN, *, date: str | None = None, also: Addition = ALONE
+) -> Iterator[str]:
+    """The page of an adjustment as HTML, in pieces; of one that was not solved, why it was not.
+
+    **Arguments:**
+
+    - `origin`: the files that were read, with their fingerprints (`fingerprint_files`), and
+      settings that are to be shown.
+    - `date`: printed in the head as it is given; nothing is printed without it, so that the same
+      adjustment always gives the same page.
+    - `also`: what is to be said beside the adjustment.
+    """
+    yield from write(describe(adjustment, origin, also), date)
+
+
+def compose_failure(
+    error: NotSolvedError, origin: Origin = UNKNOWN, kind: str = ALONE.kind
+) -> Iterator[str]:
+    """The page of an adjustment that ended before there was a result."""
+    rows = [("Why", str(error)), *(("Not determined", name) for name in error.undetermined)]
+    first = explain_failure(rows, ())
+    yield from write(Page(f"no result: {kind}", [first], describe_origin((), origin)))
+
+
+def describe(adjustment, origin: Origin = UNKNOWN, also: Addition = ALONE) -> Page:
+    """The page of an adjustment, to be written."""
+    title = ": ".join(filter(None, (clean(adjustment.network.name) or "network", also.kind)))
+    last = describe_origin(head.setting_facts(adjustment), origin)
+    warnings = (*also.warnings, *adjustment.warnings)
+    if not adjustment.converged:
+        first = explain_failure(head.failure_facts(adjustment), warnings, also.overview)
+        return Page(title, [first, *also.sections], last, also.tables)
+    first = give_verdict(find(adjustment, also), warnings, also.overview, *_whole(adjustment))
+    drawings: dict[str, Any] = {
+        "network-data": describe_network(adjustment), "frames": describe_frames(adjustment)
+    }  # fmt: skip
+    shown = [first, *also.sections, *sections.collect(adjustment)]
+    return Page(title, shown, last, {**also.tables, **collect_tables(adjustment)}, drawings)
+
+
+def find(adjustment, also: Addition = ALONE) -> list[Finding]:
+    """The findings of a solved adjustment, those of an addition first."""
+    return [*also.findings, *(f for f in judge(adjustment) if f.about not in also.without)]
+
+
+def _whole(adjustment) -> list[str]:
+    """The numbers of the whole."""
+    return [
+        "<h3>Result</h3>\n", facts(row for row in summary(adjustment) if row[0] != "Note"),
+        "<h3>Variance factor</h3>\n", facts(head.variance_facts(adjustment)),
+        "<h3>Counts</h3>\n", grid(("", "", ""), head.count_rows(adjustment), "words"),
+        paragraph(A_POSTERIORI),
+    ]  # fmt: skip

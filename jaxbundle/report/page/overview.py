@@ -1,0 +1,43 @@
+"""The first and the last section of every page: the verdict, and where the result comes from."""
+
+from collections.abc import Iterable, Sequence
+
+from jaxbundle.report import head
+from jaxbundle.report.page.document import Section
+from jaxbundle.report.page.markup import facts, grid, items, paragraph
+from jaxbundle.report.page.origin import Origin, software_versions
+from jaxbundle.report.page.verdict import Finding, in_words
+
+
+def give_verdict(findings: Sequence[Finding], warnings: Sequence[str], *parts: str) -> Section:
+    """The verdict, the warnings, the findings, and then what else the whole has to say."""
+    state, words = in_words(list(findings), len(warnings))
+    rows = [(f.about, f.state, f.words) for f in findings]
+    content = [
+        paragraph(words, f"verdict {state.replace(' ', '-')}"), _warnings(warnings),
+        "<h3>Tests</h3>\n", grid(("test", "", "what was found"), rows, "words"), *parts,
+    ]  # fmt: skip
+    return Section("overview", "Verdict", "".join(content))
+
+
+def explain_failure(
+    rows: Iterable[tuple[str, str]], warnings: Sequence[str], *parts: str
+) -> Section:
+    """The verdict where there is no result, and what to do."""
+    content = [paragraph(head.NO_RESULT, "verdict not-met"), _warnings(warnings), facts(rows)]
+    return Section("overview", "Verdict", "".join([*content, *parts]))
+
+
+def describe_origin(chosen: Iterable[tuple[str, object]], origin: Origin) -> Section:
+    """Settings, fingerprints of the files read, versions of the software."""
+    parts = [facts([*chosen, *origin.settings.items()])]
+    if origin.inputs:
+        rows = [(file.name, file.size, file.sha256) for file in origin.inputs]
+        parts += ["<h3>Input files</h3>\n", grid(("file", "bytes", "SHA-256"), rows, "words")]
+    parts += ["<h3>Software</h3>\n", facts(software_versions())]
+    title = "Settings and origin"
+    return Section("origin", title, "".join(parts), title, True)
+
+
+def _warnings(lines: Sequence[str]) -> str:
+    return f"<h3>Warnings</h3>\n{items(lines)}" if lines else ""

@@ -1,0 +1,201 @@
+"""The page of a refinement of scanner images (`jaxbundle.refinement`)."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from jaxbundle.cameras import get_model
+from jaxbundle.network.columns import count
+from jaxbundle.refinement import point_rows
+from jaxbundle.report.head import test_in_words
+from jaxbundle.report.layout import estimate, significant
+from jaxbundle.report.observations import count_weak
+from jaxbundle.report.page.columns import Column, numbers
+from jaxbundle.report.page.document import Listing, Page, Section, write
+from jaxbundle.report.page.markup import facts, grid
+from jaxbundle.report.page.origin import UNKNOWN, Origin
+from jaxbundle.report.page.overview import describe_origin, give_verdict
+from jaxbundle.report.page.sections import photographs, show_correlations, show_residuals
+from jaxbundle.report.page.tables import Columns
+from jaxbundle.report.page.verdict import DOUBTFUL, GOOD, Finding, judge_fit
+from jaxbundle.statistics.global_test import chi_squared_test
+
+KIND = "refinement of scanner images"
+LARGE = 3.29
+"""Critical value of |w| at 0.1 %."""
+MOST_CORRELATED = 40
+"""Of more unknowns the matrix is not shown, but is in result.json."""
+SCANNER_AXES = ("line", "pixel")
+
+
+def compose_refinement(result, origin: Origin = UNKNOWN) -> Iterator[str]:
+    """The page of a `Refinement`: HTML, in pieces."""
+    return write(_describe(result, origin))
+
+
+def _describe(result, origin: Origin) -> Page:
+    found = _image_points(result)
+    used = [row for row in found if not row["removed"]]
+    w = np.concatenate([row["w"] for row in used])
+    first = give_verdict(_judge(result, used, w), result.warnings, _whole(result, used))
+    sections = [first, photographs("w"), _unknowns(result), show_residuals(w, "w")]
+    tables = {
+        "images": Listing("Images", _images(result, used), "result.json"),
+        "points": Listing("Points", _points(result), "points.csv"),
+        "checks": Listing("Check points, computed − given", _checks(result), "result.json"),
+        "observations": Listing("Image points", _observations(used), "result.json"),
+        "removed": Listing("Removed as blunders", {
+            "observation": Column(_words(b.name for b in result.removed), "observation"),
+            "test": Column(numbers(b.test for b in result.removed), "|w|"),
+        }, "result.json"),
+    }  # fmt: skip
+    title = f"{', '.join(one.id for one in result.images)}: {KIND}"
+    frames = {"frames": _frames(result)}
+    return Page(title, sections, describe_origin((), origin), tables, frames)
+
+
+def _words(values) -> np.ndarray:
+    return np.array(list(values), dtype=object)
+
+
+def _image_points(result) -> list[dict]:
+    """The rows of `Refinement.image_points`, with what was measured and the names of the axes."""
+    declared, given = result.inspection.declared, result.inspection.declared.given
+    xy = lambda of_scanner: np.asarray(
+        given.observations.xy if of_scanner else given.frames.observations.xy
+    )
+    measured = declared.image_by_image(xy(p.of_scanner)[p.rows] for p in declared.parts)
+    scanners = {one.id for one in result.images}
+    return [
+        row | {"measured": at, "axes": SCANNER_AXES if row["image"] in scanners else ("x", "y")}
+        for row, at in zip(result.image_points(), measured)
+    ]
+
+
+def _judge(result, used, w) -> list[Finding]:
+    r = np.concatenate([row["r"] for row in used])
+    weak, loose = count_weak(r)
+    large, expected = int((np.abs(w) > LARGE).sum()), 0.001 * len(w)
+    over = large > expected + 3 * np.sqrt(expected) + 1
+    findings = [
+        _fit(result),
+        Finding("Reliability", DOUBTFUL if weak > 0.05 * len(r) else GOOD,
+                f"mean redundancy number {r.mean():.3f}; {weak} of {count(len(r), 'coordinate')} "
+                f"weakly controlled (r < 0.1), {loose} not at all"),
+        Finding("Blunders", DOUBTFUL if over else GOOD,
+                f"{large} of {count(len(w), 'coordinate')} with |w| over {LARGE} (by chance about "
+                f"{expected:.2g}); {len(result.removed)} removed by data snooping"),
+    ]  # fmt: skip
+    check = result.check
+    if check is not None:
+        ratio = np.abs(check.difference[check.sigma > 0]) / check.sigma[check.sigma > 0]
+        largest = np.nan_to_num(ratio).max(initial=0.0)
+        rms = ", ".join(significant(value) for value in check.rms)
+        words = (f"{count(len(check.id), 'point')}; RMS of computed − given {rms} m; largest "
+                 f"difference {significant(largest)} times its σ")  # fmt: skip
+        findings.append(Finding("Check points", GOOD if largest <= LARGE else DOUBTFUL, words))
+    return findings
+
+
+def _fit(result) -> Finding:
+    if result.redundancy < 1:
+        words = "no redundancy: σ0 and standard deviations cannot be estimated"
+        return Finding("χ² test", DOUBTFUL, words)
+    found = chi_squared_test(result.redundancy * result.sigma0**2, result.redundancy)
+    return judge_fit(found, test_in_words(found))
+
+
+def _whole(result, used) -> str:
+    roles = [result.points.role[k] for k in result.inspection.declared.rays.points]
+    frames = 0 if result.frames is None else len(result.frames.images)
+    rows = [
+        ("Scanner images", len(result.images)), ("Photographs", frames),
+        ("Points", ", ".join(f"{roles.count(role)} {role}" for role in ("control", "tie"))),
+        ("Image points", len(used)),
+        ("σ0", f"{result.sigma0:.4f}, redundancy {result.redundancy}, "
+         f"{count(result.inspection.steps, 'step')}"),
+    ]  # fmt: skip
+    return f"<h3>Result</h3>\n{facts(rows)}"
+
+
+def _unknowns(result) -> Section:
+    """The changes of the unknowns with σ and prior, and their correlations."""
+    rows = []
+    for name, value, s, p in zip(
+        result.names, result.estimate, result.inspection.sigma, result.prior_sigma
+    ):
+        prior = "free" if np.isinf(p) else f"{p * name.factor:.4g}"
+        rows.append((str(name), *estimate(value * name.factor, s * name.factor), prior, name.unit))
+    parts = [grid(("unknown", "change", "σ", "σ of prior", "unit"), rows)]
+    if 1 < len(rows) <= MOST_CORRELATED:
+        numbered = [f"{i}: {name}" for i, name in enumerate(result.names, 1)]
+        parts += ["<h3>Correlations in %</h3>\n",
+                  show_correlations(numbered, result.correlation, range(1, len(rows) + 1))]
+    return Section("unknowns", "Unknowns of the images", "".join(parts), "Unknowns", True)
+
+
+def _images(result, used) -> Columns:
+    camera, rms = [], []
+    for id in result.inspection.declared.given.ids:
+        v = np.array([row["v"] for row in used if row["image"] == id]).reshape(-1, 2)
+        rms.append(np.sqrt((v**2).sum(1).mean()) if len(v) else np.nan)
+    scanners = [one.id for one in result.images]
+    if result.frames is not None:
+        camera = [result.frames.cameras[c].id for c in result.frames.images.camera]
+    return {
+        "id": Column(_words(result.inspection.declared.given.ids), "image"),
+        "camera": Column(_words([*(f"scanner {id}" for id in scanners), *camera]), "camera"),
+        "rms": Column(np.array(rms), "RMS |v|"),
+    }
+
+
+def _points(result) -> Columns:
+    rows = point_rows(result)
+    found = {"id": Column(_words(row["id"] for row in rows), "point"),
+             "role": Column(_words(row["role"] for row in rows), "role")}  # fmt: skip
+    found |= {a: Column(numbers(row[a] for row in rows), f"{a} [m]", 3, True) for a in "XYZ"}
+    return found | {f"s{a}": Column(numbers(row[f"s{a}"] for row in rows), f"σ{a} [m]")
+                    for a in "XYZ"}  # fmt: skip
+
+
+def _checks(result) -> Columns:
+    check = result.check
+    if check is None:
+        return {}
+    axes = ("X", "Y", "Z") if result.images[0].earth is None else ("east", "north", "up")
+    found = {"id": Column(_words(check.id), "point")}
+    for k, axis in enumerate(axes):
+        found[f"d{k}"] = Column(check.difference[:, k], f"d {axis} [m]")
+        found[f"s{k}"] = Column(check.sigma[:, k], f"σ {axis} [m]")
+    return found | {"rays": Column(np.asarray(check.rays), "rays")}
+
+
+def _observations(used) -> Columns:
+    """A row a coordinate, as of an adjustment; `tau`, the test that is drawn, is w."""
+    both = lambda name: np.concatenate([row[name] for row in used])
+    twice = lambda name: _words(row[name] for row in used for _ in range(2))
+    return {
+        "kind": Column(np.full(2 * len(used), "image", dtype=object)),
+        "image": Column(twice("image"), "image"), "point": Column(twice("point"), "point"),
+        "axis": Column(_words(axis for row in used for axis in row["axes"]), "axis"),
+        "measured": Column(both("measured"), "measured", 3), "v": Column(both("v"), "v"),
+        "r": Column(both("r"), "r", 3), "tau": Column(both("w"), "w", 2),
+    }  # fmt: skip
+
+
+def _frames(result) -> dict[str, dict]:
+    """By camera, and scanner image, what is drawn: pixels to the right, lines down."""
+    frame = lambda low, high, known, down, unit: {
+        "low": low, "high": high, "known": known, "down": down, "scale": 1.0, "unit": unit,
+        "centre": None,
+    }  # fmt: skip
+    found = {
+        f"scanner {one.id}": frame(
+            [0.0, 0.0], [one.image.pixels - 1.0, one.image.lines - 1.0], True, True, "px"
+        )
+        for one in result.images
+    }
+    for camera in () if result.frames is None else result.frames.cameras:
+        model = get_model(camera.model)
+        found[camera.id] = frame([0.0, 0.0], [0.0, 0.0], False, model.axes == "down", model.unit)
+    return found

@@ -1,0 +1,67 @@
+"""The examples that come with the package, to be written into a folder of one's own.
+
+Their files are those of `examples/` in the repository: the wheel has copies of them in
+`jaxbundle/examples` (pyproject.toml), the source tree itself has them beside the package.
+"""
+
+import os
+import shutil
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import NamedTuple
+
+from jaxbundle.errors import InputError
+from jaxbundle.system.temporaries import temporary
+
+
+class Example(NamedTuple):
+    """What an example is of, and a command to begin with, with FOLDER for where it was written."""
+
+    about: str
+    command: str
+
+
+EXAMPLES = {
+    "convergent4": Example(
+        "four convergent photographs; exterior orientation, points and ten camera parameters",
+        "jaxbundle adjust FOLDER/project.toml --out FOLDER-result",
+    ),
+    "board": Example(
+        "thirteen photographs of a chessboard, to calibrate their camera (extra: images)",
+        "jaxbundle calibrate FOLDER --board 9x6 --square 0.03 --out FOLDER-result",
+    ),
+    "line_scanner": Example(
+        "a satellite's line scanner that rolls, to simulate, correct and measure",
+        "jaxbundle pushbroom simulate FOLDER/flight.toml --out FOLDER-result",
+    ),
+}
+"""By name; pyproject.toml lists the same folders."""
+
+
+def write_example(name: str, folder: str | Path) -> None:
+    """Copy the files of an example into a folder that is new or empty.
+
+    **Raises:** `InputError` for another name, or a folder that cannot or may not be written.
+    """
+    if name not in EXAMPLES:
+        raise InputError(f"no example {name!r}: one of {', '.join(EXAMPLES)} is expected")
+    target = Path(os.path.abspath(folder))
+    if os.path.lexists(target) and not (target.is_dir() and not any(target.iterdir())):
+        why = "is not empty" if target.is_dir() else "is no folder"
+        raise InputError(f"{folder}: {why}; give a new folder")
+    if not target.parent.is_dir():
+        raise InputError(f"{folder}: there is no folder {target.parent}")
+    try:
+        with as_file(_source(name)) as source, temporary(f"{target}.{os.getpid()}.new") as new:
+            shutil.copytree(source, new)
+            os.replace(new, target)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
+
+
+def _source(name: str):
+    """The files of an example: in the package, or beside it in the source tree."""
+    for place in (files("jaxbundle") / "examples", Path(__file__).parents[2] / "examples"):
+        if (place / name).is_dir():
+            return place / name
+    raise InputError(f"the files of example {name!r} are missing from this installation")
