@@ -126,7 +126,7 @@ def _judge(found: _Population) -> list[Finding]:
     total, solved, fit = len(found), int(found.solved.sum()), int(found.fit.sum())
     state = BAD if not solved else GOOD if solved == total else DOUBTFUL
     findings = [Finding("Results", state, f"{solved} of {count(total, 'input')} have values")]
-    words = f"{solved - fit} of them are weak or do not fit (misfit)"
+    words = f"weak or misfit: {solved - fit} of these {solved}"
     findings.append(Finding("Fit", GOOD if fit == solved else DOUBTFUL, words))
     far = int((np.nan_to_num(found.farthest) > APART).sum())
     if np.isfinite(found.farthest).any():
