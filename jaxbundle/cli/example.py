@@ -10,16 +10,13 @@ from jaxbundle.errors import InputError
 from jaxbundle.system.examples import EXAMPLES, write_example
 
 
-@app.command()
+@app.command(example="convergent4 first")
 def example(
     name: Annotated[str, typer.Argument(help=", ".join(EXAMPLES))] = "",
     folder: Annotated[Path | None, typer.Argument(help="new or empty folder")] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Write an example into a folder; without a name, list the examples.
-
-    Example: jaxbundle example convergent4 first
-    """
+    """Write an example into a folder; without a name, list the examples."""
     if not name:
         for one, (about, _) in EXAMPLES.items():
             print(f"{one:14} {about}")
