@@ -76,9 +76,29 @@ def _quality(calibration):
     ])  # fmt: skip
     lines += ["", "Uncertainty of a projected point (σ, pixels)"]
     lines += table(MAPS_HEADER, map_rows(calibration.reported_maps, unit), "lrr")
+    lines += ["", *paragraph(mapping_error_in_words(calibration.mapping_error))]
+    if calibration.bias is not None:
+        lines += paragraph(bias_in_words(calibration.bias))
     first, *further = cross_validation_in_words(calibration)
     lines += ["", *paragraph(f"Cross-validation: {first}")]
     return [*lines, *(line for words in further for line in paragraph(words))]
+
+
+def mapping_error_in_words(error) -> str:
+    """The expected mapping error."""
+    return (
+        f"Expected mapping error over the whole image, rotation removed: {error.rms:.3f} px (RMS), "
+        f"below {error.quantile():.3f} px with 95 %."
+    )
+
+
+def bias_in_words(bias) -> str:
+    """σ of a corner beside that of the residuals, and what the tests say."""
+    tests = "; ".join(f"{name} {test}" for name, test in bias.tests.items())
+    return (
+        f"Bias: σ of a corner {bias.corner_sigma:.4f} px from {bias.cells} cells of four, of "
+        f"the residuals {bias.residual_sigma:.4f} px. {tests}: {bias.sentence}."
+    )
 
 
 def coverage_in_words(covered) -> str:
@@ -144,12 +164,23 @@ def as_dict(calibration, brief: bool = False) -> dict:
 
 
 def _quality_dict(calibration) -> dict:
-    covered, checked = calibration.coverage, calibration.cross_validation
+    covered, checked, bias = calibration.coverage, calibration.cross_validation, calibration.bias
     return {
         "rms": calibration.rms,
         "distances": calibration.distances.tolist(),
         "coverage": _coverage_dict(covered),
         "uncertainty": _maps_dict(calibration.reported_maps),
+        "mapping_error": {
+            "expected": calibration.mapping_error.expected, "rms": calibration.mapping_error.rms,
+            "quantile_95": calibration.mapping_error.quantile(),
+        },
+        "bias": None if bias is None else {
+            "cells": bias.cells, "corner_sigma": bias.corner_sigma,
+            "residual_sigma": bias.residual_sigma, "ratio": bias.ratio, "found": list(bias.found),
+            "tests": {name: {"F": test.F, "degrees": list(test.degrees),
+                             "probability": test.probability}
+                      for name, test in bias.tests.items()},
+        },
         "cross_validation": None if checked is None else {
             "rms_own": checked.rms_own, "rms_other": checked.rms_other, "test": checked.test,
             "difference": checked.difference, "halves": list(checked.halves),

@@ -11,7 +11,9 @@ from jaxbundle import plotting
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.calibration import quality
 from jaxbundle.calibration.advice import advice
+from jaxbundle.calibration.bias import Bias, find_bias
 from jaxbundle.calibration.left_out import left_out
+from jaxbundle.calibration.mapping_error import MappingError, mapping_error
 from jaxbundle.calibration.quality import Coverage, CrossValidation, UncertaintyMap
 from jaxbundle.cameras import get_model
 from jaxbundle.geometry import matrix_from_quaternion
@@ -32,8 +34,8 @@ class Calibration:
     - `camera`: the camera with its adjusted parameters, held; `parameters` and `sigma` by name
       (in the unit of the model, a posteriori);
     - `rms`: √(Σ(vx² + vy²)/points) in pixels, as OpenCV defines it;
-    - `coverage`, `advice`, `cross_validation`: how good it is, and what to photograph next;
-      `validated`: whether the last is wanted.
+    - `bias`, `mapping_error`, `coverage`, `advice`, `cross_validation`: how good it is, and what
+      to photograph next; `validated`: whether the last is wanted.
     """
 
     def __init__(self, views: BoardViews, adjustment: Adjustment, validated: bool = True):
@@ -110,6 +112,17 @@ class Calibration:
         return quality.cross_validation(self.adjustment) if self.validated else None
 
     @functools.cached_property
+    def bias(self) -> Bias | None:
+        """Whether the residuals hold more than noise: of camera model or board; None where too few
+        cells of four corners were seen."""
+        return find_bias(self.adjustment, self.views.board.grid)
+
+    @functools.cached_property
+    def mapping_error(self) -> MappingError:
+        """How far images are off over the whole image, whatever the camera model."""
+        return mapping_error(self.adjustment, self.name)
+
+    @functools.cached_property
     def advice(self) -> list[str]:
         """Warnings in words, and what to photograph next (cross-validation not asked)."""
         t = {name: abs(self.parameters[name]) / s for name, s in self.sigma.items() if s > 0}
@@ -119,7 +132,11 @@ class Calibration:
             self.__dict__.get("cross_validation"),
         )  # fmt: skip
         missed = left_out(self.adjustment)
-        return [*found, str(missed)] if missed is not None and missed.missed else found
+        if missed is not None and missed.missed:
+            found = [*found, str(missed)]
+        if self.bias is not None and self.bias.found:
+            found = [*found, self.bias.sentence]
+        return found
 
     def uncertainty(
         self, distance: float = np.inf, frame: str = "scene", grid=quality.GRID

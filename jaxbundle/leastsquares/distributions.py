@@ -1,4 +1,4 @@
-"""Quantiles of the normal, χ², t and τ distributions, and the critical values of the tests."""
+"""Quantiles of the normal, χ², t and τ distributions, tails of χ² and F, critical values."""
 
 import functools
 import importlib
@@ -24,6 +24,16 @@ def chi2_quantile(probability: float, degrees: float) -> float:
 def t_quantile(probability: float, degrees: float) -> float:
     """t with P(T ≤ t) = probability, Student's distribution."""
     return float(_special().stdtrit(degrees, probability))
+
+
+def chi2_tail(x: float, degrees: float) -> float:
+    """P(χ² > x)."""
+    return float(_special().chdtrc(degrees, x))
+
+
+def f_tail(x: float, numerator: float, denominator: float) -> float:
+    """P(F > x), Fisher's distribution."""
+    return float(_special().fdtrc(numerator, denominator, x))
 
 
 def tau_quantile(probability: float, redundancy: float) -> float:

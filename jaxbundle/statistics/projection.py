@@ -45,19 +45,18 @@ def _slopes(model, p, xy):
     return jax.vmap(one)(xy)
 
 
-def interior_covariance_of_images(
+def slopes_of_images(
     model: CameraModel,
     p: Float[np.ndarray, " parameters"],
     free: tuple[int, ...],
-    covariance: Float[np.ndarray, "k k"],
     xy: Float[np.ndarray, "n 2"],
     frame: str = "rotation",
-) -> Float[np.ndarray, "n 2 2"]:
-    """Covariance of image points whose rays are held in the frame "camera" or "rotation".
+) -> Float[np.ndarray, "n 2 k"]:
+    """A, or A' of the frame "rotation": the change of images whose rays are held in that frame, by
+    the parameters in the columns `free`. NaN, where a point has no ray, takes no part.
 
-    **Arguments:** `free`: columns of the parameters the covariance is of; `xy`: image points, in
-    the unit of the model; for "rotation" they stand for the image, in which the rotation is sought.
-    NaN, where a point has no ray, takes no part.
+    **Arguments:** `xy`: image points, in the unit of the model; for "rotation" they stand for the
+    image, in which the rotation is sought.
     """
     if frame not in ("camera", "rotation"):
         raise ValueError(f"frame must be \"camera\" or \"rotation\", not {frame!r}")
@@ -69,6 +68,20 @@ def interior_covariance_of_images(
             B[good].reshape(-1, 3), A[good].reshape(-1, A.shape[2]), rcond=None
         )[0]
         A = A - B @ turn
+    return A
+
+
+def interior_covariance_of_images(
+    model: CameraModel,
+    p: Float[np.ndarray, " parameters"],
+    free: tuple[int, ...],
+    covariance: Float[np.ndarray, "k k"],
+    xy: Float[np.ndarray, "n 2"],
+    frame: str = "rotation",
+) -> Float[np.ndarray, "n 2 2"]:
+    """Covariance of image points whose rays are held in the frame "camera" or "rotation"
+    (`slopes_of_images`); `covariance`: of the parameters in the columns `free`."""
+    A = slopes_of_images(model, p, free, xy, frame)
     return A @ covariance @ A.swapaxes(1, 2)
 
 

@@ -107,6 +107,25 @@ def test_uncertainty_in_the_scene_is_that_of_a_sample(sample, distance):
     assert stated.corners == stated.sigma[[0, 0, 2, 2], [0, 2, 0, 2]].max()
 
 
+def test_the_expected_mapping_error_is_that_of_a_sample(sample):
+    """K of calibrations against the truth, each with its best rotation; mean and quantile."""
+    calibration, batch = sample
+    truth = dict(zip(get_model("opencv").parameters, render.LENS.parameters))
+    K = []
+    for values in batch.interior[:100]:
+        other = dict(zip(truth, values.tolist()))
+        model = get_model("opencv")
+        found = compare_cameras((model, truth), (model, other), image_size=(480, 360))
+        K.append(found.rms**2)
+    stated = calibration.mapping_error
+    assert stated.expected == pytest.approx(np.mean(K), rel=0.3)
+    assert stated.rms < stated.quantile() and stated.weights.shape == (9,)
+    assert np.mean(np.array(K) < stated.quantile() ** 2) == pytest.approx(0.95, abs=0.05)
+    of_map = calibration.uncertainty(frame="rotation", grid=(33, 25)).covariance
+    trace = np.trace(of_map, axis1=2, axis2=3).mean()
+    assert stated.expected == pytest.approx(trace, rel=1e-6)
+
+
 def test_maps_that_cannot_be(sample):
     adjustment = sample[0].adjustment
     with pytest.raises(InputError, match="frame 'board': camera, rotation, scene"):

@@ -1,0 +1,241 @@
+r"""Is a calibration biased? Its residuals beside the noise of the corners, found without them.
+
+The residuals contain the noise of the measured corners, and whatever camera model
+or board do not describe: a missing coefficient, a bent board, a rolling shutter.
+
+**Cells.** Four neighbouring corners are a board of their own. Its pose is estimated anew, with the
+camera as calibrated: what is systematic hardly changes over so small a board, and the pose takes it
+up; noise remains. In linear form, with J the derivatives of four corners by the pose, and N an
+orthonormal basis of what is left of 8 − 6 = 2 dimensions,
+
+    NᵀJ = 0,        t = Nᵀ·v/σ
+
+The robust estimate of the corners' σ is that of the median of |t|. The bias ratio, the part of the
+residual variance that is systematic, compares it with that of the calibration, σ0:
+
+    BR = 1 − σ²_corner/σ0²
+
+To decide, the two are nested linear models: the calibration, Ω = vᵀPv with r degrees of freedom,
+and the one in which every cell has a pose of its own (camera, board and priors are estimated from
+all t), Ω' with r'. Without a bias
+
+    F = ((Ω − Ω')/(r − r')) / (Ω'/r')   ~   F(r − r', r')
+
+**Smooth biases.** That test sees everything, and so nothing well. Two more add a smooth field with
+q free coefficients b to the calibration (`linearised.lagrange_multipliers`, no second adjustment),
+
+    F = (bᵀSb/q) / ((Ω − bᵀSb)/(r − q))   ~   F(q, r − q)
+
+"camera": polynomials of the fifth degree in the image, the same in all photographs; "board":
+polynomials of the fourth degree on the board for its heights, of the second in its plane. What the
+unknowns can do to 99 % already is left out and does not count in q. Each of the three is tested at
+a third of the level.
+
+Source: Hagemann, Knorr, Janssen, Stiller (2022), Inferring bias and uncertainty in camera
+calibration, International Journal of Computer Vision 130 (cells, robust noise, bias ratio); F tests
+of nested models: Koch (1999), Parameter Estimation and Hypothesis Testing in Linear Models,
+section 4.2.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxbundle.calibration.linearised import lagrange_multipliers, linearise_image_points
+from jaxbundle.calibration.pixels import unit_size
+from jaxbundle.cameras import get_model
+from jaxbundle.leastsquares.distributions import f_tail
+
+SIGNIFICANCE = 0.01
+"""Level of the test."""
+NORMAL_MEDIAN = 0.6744897501960817
+"""The median of |x| of a standard normal x."""
+FEWEST = 10
+"""Cells below which nothing is said."""
+
+
+DEGREES = {"camera": 5, "heights": 4, "plane": 2}
+"""Of the polynomials of a smooth bias."""
+ABSORBED = 0.01
+"""Of the square of a field, what the unknowns leave of it; below it they can do the same."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FTest:
+    """F, its degrees of freedom, and the probability of so large a value by chance."""
+
+    F: float
+    degrees: tuple[int, int]
+    probability: float
+
+    def __str__(self) -> str:
+        q, r = self.degrees
+        return f"F = {self.F:.2f} ({q}, {r}), p = {self.probability:.2g}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Bias:
+    """The noise of the corners beside the residuals of a calibration.
+
+    **Fields:** `cells` of four corners; `corner_sigma`: σ of a coordinate from them, robust;
+    `residual_sigma`: σ0 of the calibration as σ of a coordinate, both pixels; `tests`: by "cells",
+    "camera", "board" (not where its points are free).
+    """
+
+    cells: int
+    corner_sigma: float
+    residual_sigma: float
+    tests: dict[str, FTest]
+
+    @property
+    def ratio(self) -> float:
+        """The bias ratio; without a bias around 0, negative as well."""
+        return 1 - (self.corner_sigma / self.residual_sigma) ** 2
+
+    @property
+    def found(self) -> tuple[str, ...]:
+        """The tests that find a bias, the most certain first; together at a level of 1 %."""
+        tests = sorted(self.tests.items(), key=lambda item: (item[1].probability, -item[1].F))
+        level = SIGNIFICANCE / len(tests)
+        return tuple(name for name, test in tests if test.probability < level)
+
+    @property
+    def sentence(self) -> str:
+        """What it means, in words."""
+        if not self.found:
+            return "no bias is found at a level of 1 %"
+        smooth = [name for name in self.found if name != "cells"]
+        remedy = {"camera": "another camera model (--models)", "board": "estimate the points of "
+                  "the board (--board-free)"}  # fmt: skip
+        what = f"as of the {smooth[0]}: {remedy[smooth[0]]}" if smooth else "of no smooth kind"
+        part = f", {100 * self.ratio:.0f} % of the residual variance" if self.ratio > 0 else ""
+        return f"the residuals hold a bias{part}, {what}"
+
+
+def find_bias(adjustment, grid: tuple[int, int]) -> Bias | None:
+    """Test the calibration of one camera from photographs of a board.
+
+    **Arguments:** the adjustment; `grid`: rows and columns of the board, whose points follow each
+    other row by row.
+
+    **Returns:** None where there are too few whole cells, or no redundancy.
+    """
+    problem = adjustment.problem
+    cells = cells_of_four(problem, grid)
+    if len(cells) < FEWEST or not adjustment.sigma0 > 0:
+        return None
+    found = linearise_image_points(problem, adjustment.values)
+    t, A = _equations(adjustment, found, cells)
+    U, size, _ = np.linalg.svd(A / np.maximum(np.linalg.norm(A, axis=0), 1e-300), False)
+    U = U[:, size > len(A) * np.finfo(float).eps * size[0]]
+    left, own = t - U @ (U.T @ t), len(t) - U.shape[1]
+    more = adjustment.redundancy - own
+    if own < FEWEST or more < 1:
+        return None
+    omega, of_cells = float(left @ left), slice(0, 2 * len(cells))
+    kept = np.sqrt(np.clip(1 - np.sum(U**2, 1), 1e-3, None))
+    noise = float(np.median(np.abs(left / kept)[of_cells])) / NORMAL_MEDIAN
+    tests = {"cells": _f_test(adjustment.vtpv - omega, more, omega, own)}
+    for name, B in (("camera", _image_fields(problem)), ("board", _board_fields(problem, found))):
+        gain, q = _gain(adjustment, found, B)
+        r = adjustment.redundancy - q
+        if q and r > 0:
+            tests[name] = _f_test(gain, q, adjustment.vtpv - gain, r)
+    camera = problem.network.cameras[0]
+    pixel = np.array(unit_size(get_model(camera.model), camera.pixel_size))
+    weight = np.asarray(problem.data.image_weight)[np.ravel(cells)]
+    sigma = float(np.sqrt(np.mean(1 / (weight * pixel) ** 2)))
+    return Bias(len(cells), sigma * noise, sigma * adjustment.sigma0, tests)
+
+
+def _f_test(gain: float, q: int, rest: float, r: int) -> FTest:
+    F = (gain / q) / (rest / r)
+    return FTest(float(F), (q, r), f_tail(max(float(F), 0.0), q, r))
+
+
+def _gain(adjustment, found, B) -> tuple[float, int]:
+    """How far vᵀPv falls with the parameters of B, and how many of them are new."""
+    B = B / np.maximum(np.sqrt((B**2).sum((0, 1))), 1e-300)
+    score, S = lagrange_multipliers(adjustment, found, B)
+    size, V = np.linalg.eigh(S)
+    new = size > ABSORBED
+    return float(((V[:, new].T @ score) ** 2 / size[new]).sum()), int(new.sum())
+
+
+def _powers(xy, least: int, most: int) -> Float[np.ndarray, "n terms"]:
+    """Products of Legendre polynomials of x and y [n, 2], both scaled to −1 … 1."""
+    scaled = [2 * (a - a.min()) / max(np.ptp(a), 1e-300) - 1 for a in xy.T]
+    P, R = (np.polynomial.legendre.legvander(a, most) for a in scaled)
+    pairs = [(i, j) for i in range(most + 1) for j in range(most + 1) if least <= i + j <= most]
+    return np.stack([P[:, i] * R[:, j] for i, j in pairs], 1)
+
+
+def _image_fields(problem) -> Float[np.ndarray, "n 2 k"]:
+    """Over σ: displacements in x and in y that are smooth over the image."""
+    field = _powers(np.asarray(problem.data.image_xy), 0, DEGREES["camera"])
+    each = np.asarray(problem.data.image_weight)[:, :, None] * field[:, None]
+    none = np.zeros_like(each[:, 0])
+    return np.stack([np.hstack([each[:, 0], none]), np.hstack([none, each[:, 1]])], 1)
+
+
+def _board_fields(problem, found) -> Float[np.ndarray, "n 2 k"]:
+    """Over σ: by displacements of the points that are smooth over the board."""
+    XY = problem.network.points.position[problem.point, :2]
+    plane, height = _powers(XY, 0, DEGREES["plane"]), _powers(XY, 2, DEGREES["heights"])
+    of = found.slopes["point"]
+    return np.concatenate([
+        of[:, :, :1] * plane[:, None], of[:, :, 1:2] * plane[:, None],
+        of[:, :, 2:] * height[:, None],
+    ], 2)  # fmt: skip
+
+
+def cells_of_four(problem, grid) -> Int[np.ndarray, "cells 4"]:
+    """The image points of every whole cell of 2 × 2 points, in all photographs."""
+    rows, columns = grid
+    used = np.flatnonzero((np.asarray(problem.data.image_weight) > 0).all(1))
+    place = np.full((len(problem.network.images), rows * columns), -1)
+    place[problem.image[used], problem.point[used]] = used
+    place = place.reshape(-1, rows, columns)[:, : rows // 2 * 2, : columns // 2 * 2]
+    corners = [place[:, i::2, j::2].ravel() for i in (0, 1) for j in (0, 1)]
+    place = np.stack(corners, 1)
+    return place[(place >= 0).all(1)]
+
+
+def _equations(
+    adjustment, found, cells
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m u"]]:
+    """t of all cells, after it the pseudo-observations, and their derivatives by what is free of
+    camera and board."""
+    problem = adjustment.problem
+    (name,) = (table.name for table in problem.layout.cameras)
+    cut = lambda x: x[cells].reshape(len(cells), 8, -1)
+    N = np.linalg.svd(cut(found.slopes["image"]))[0][:, :, 6:]
+    t = np.einsum("cek,cep->ckp", N, cut(found.v)).ravel()
+    of_camera = np.einsum("cek,cep->ckp", N, cut(found.slopes[name]))
+    free = problem.system.table("point").free.astype(bool)
+    of_points = np.zeros((len(cells), 2, *free.shape))
+    if free.any():
+        slope = found.slopes["point"][cells]
+        each = np.einsum("cqrk,cqrw->qckw", N.reshape(-1, 4, 2, 2), slope)
+        for corner, part in enumerate(each):
+            of_points[np.arange(len(cells)), :, problem.point[cells[:, corner]]] = part
+    flat = lambda x: x.reshape(len(t), -1)
+    A = np.concatenate([flat(of_camera), flat(of_points)[:, free.ravel()]], 1)
+    # Pseudo-observations: of a known board, and of the camera.
+    v, data, width = adjustment.inspection.residuals, problem.data, of_camera.shape[2]
+    place = np.full(free.shape, -1)
+    place[free] = width + np.arange(free.sum())
+    of_table = np.full(v.interior.shape, -1)
+    moving = list(problem.system.table(name).space.moving)
+    of_table[:, moving] = np.arange(width)
+    for x, weight, column in (
+        (v.control, data.control_weight, place[problem.layout.given["control"]]),
+        (v.interior, data.interior_weight, of_table),
+    ):
+        weight = np.asarray(weight)
+        used = weight > 0
+        rows = np.zeros((int(used.sum()), A.shape[1]))
+        rows[np.arange(len(rows)), column[used]] = weight[used]
+        t, A = np.append(t, x[used]), np.concatenate([A, rows])
+    return t, A

@@ -1,0 +1,89 @@
+"""The observation equations of the image points of one camera at its adjusted values, dense.
+
+For tests that add parameters to a calibration, or divide it, without adjusting it again.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxbundle.network.kinds import ImagePoint
+
+
+class Linearised(NamedTuple):
+    """Residuals over their σ, and their derivatives.
+
+    `v` [n, 2]; `slopes`: by table, the derivatives by the changes of the row that is touched;
+    `touched`: by table, which row that is; `by_columns`: by parameters of the camera that are held.
+    """
+
+    v: Float[np.ndarray, "n 2"]
+    slopes: dict[str, Float[np.ndarray, "n 2 width"]]
+    touched: dict[str, Int[np.ndarray, " n"]]
+    by_columns: Float[np.ndarray, "n 2 columns"]
+
+
+def linearise_image_points(problem, values, columns: tuple[int, ...] = ()) -> Linearised:
+    """All image points of a network of one camera; 0 where one has no weight.
+
+    **Arguments:** `columns`: parameters of the camera, held or not, whose derivatives are wanted.
+    """
+    camera = problem.network.cameras[0].model
+    of, declared = ImagePoint(camera, problem.network.residuals), problem.system.declared
+    (name,) = (table.name for table in problem.layout.cameras)
+    tables = problem.layout.tables(values)
+    at = {"image": problem.image, name: problem.camera, "point": problem.point}
+    touched = tuple(jax.tree.map(lambda x, i=i: np.asarray(x)[i], tables[t]) for t, i in at.items())
+    spaces = tuple(declared.spaces[t] for t in at)
+    data = problem.data
+    v, J = _linearise(of, spaces, columns, touched, data.image_xy, data.image_weight)
+    *parts, B = np.split(np.asarray(J), np.cumsum([s.width for s in spaces]), 2)
+    return Linearised(np.asarray(v), dict(zip(at, parts)), at, B)
+
+
+def lagrange_multipliers(
+    adjustment, found: Linearised, B: Float[np.ndarray, "n 2 k"]
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
+    """Bᵀv and S of parameters b that were left out, B = ∂v/∂b:
+
+        S·b = −Bᵀ·v,      S = BᵀB − (JᵀB)ᵀ·Q·(JᵀB),      vᵀv falls by bᵀ·S·b
+
+    with J = ∂v/∂unknowns, Q their cofactors. S is singular along what the unknowns can do already.
+
+    Source: Rao (1948), Proceedings of the Cambridge Philosophical Society 44, 50-57.
+    """
+    tables, k = adjustment.problem.system.tables, B.shape[2]
+    rows = {t.name: np.zeros((k, t.rows, t.space.width)) for t in tables}
+    for t, i in found.touched.items():
+        part = np.einsum("nrw,nrk->nkw", found.slopes[t], B)
+        np.add.at(rows[t].swapaxes(0, 1), i, part)
+    flat = B.reshape(-1, k)
+    S = flat.T @ flat - adjustment.inspection.solution.propagate_rows(rows)
+    return flat.T @ found.v.ravel(), S
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _linearise(of, spaces, columns, touched, xy, weight):
+    """v/σ [n, 2] of all image points and their derivatives [n, 2, directions]: by the changes of
+    pose, camera and point, and by b."""
+    ends = np.cumsum([s.width for s in spaces])
+
+    def of_one(touched, xy, weight):
+        def v(change):
+            *changes, b = jnp.split(change, ends)
+            pose, interior, ray = (
+                s.moved(s.prepare(x), tuple(d)) for s, x, d in zip(spaces, touched, changes)
+            )
+            p = dict(enumerate(interior)) | {c: interior[c] + b[k] for k, c in enumerate(columns)}
+            residual = jnp.stack(of(pose, tuple(p.values()), tuple(ray), tuple(xy)))
+            residual = jnp.where(weight > 0, weight * residual, 0.0)
+            return residual, residual
+
+        J, found = jax.jacfwd(v, has_aux=True)(jnp.zeros(ends[-1] + len(columns)))
+        return found, J
+
+    return jax.vmap(of_one)(touched, xy, weight)

@@ -1,0 +1,215 @@
+r"""How stable is a camera? Calibrations of it at n epochs or temperatures, and what differs by more
+than their σ.
+
+With interior orientations pᵢ and covariances Cᵢ, independent of each other:
+
+**Homogeneity.** p̄ = (ΣCᵢ⁻¹)⁻¹·ΣCᵢ⁻¹pᵢ, and if nothing has changed
+
+    Σ (pᵢ − p̄)ᵀ·Cᵢ⁻¹·(pᵢ − p̄)   ~   χ²((n − 1)·k)
+
+A second test leaves out what every exterior orientation takes up. With A the slopes of images by
+the parameters, A' those after the best rotation, G and H the means of AᵀA and A'ᵀA' over the image,
+
+    H·s = μ·G·s,        0 ≤ μ ≤ 1
+
+says which part μ of the image motion by a change s no rotation removes. Changes with μ below a
+tenth (a shift of the principal point is nearly a rotation) are taken out: χ² of the others.
+
+**Between epochs.** For each parameter τ², a variance on top of its σᵢ², by Paule and Mandel:
+Σ (pᵢ − m)²/(σᵢ² + τ²) = n − 1, m the mean with these weights. In the image, rotation removed, the
+variance between epochs is that of the differences less what is expected by chance,
+
+    Σ (pᵢ − p̄ₐ)ᵀ·H·(pᵢ − p̄ₐ)/(n − 1) − mean of tr(H·Cᵢ),        p̄ₐ the arithmetic mean
+
+Source: Rao (1973), Linear Statistical Inference, 4f (homogeneity); Paule and Mandel (1982), Journal
+of Research of the NBS 87, 377-385.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.calibration.mapping_error import mapping_form
+from jaxbundle.cameras import default_parameters, get_model
+from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.distributions import chi2_tail
+from jaxbundle.network.tables import Camera
+from jaxbundle.statistics.difference import Covariance
+
+ROTATION = 0.1
+"""μ below this: nearly a rotation."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Homogeneity:
+    """χ² that all epochs have the same values, its degrees of freedom, and its probability."""
+
+    chi2: float
+    degrees: int
+
+    @property
+    def probability(self) -> float:
+        return chi2_tail(self.chi2, self.degrees)
+
+    def __str__(self) -> str:
+        return f"χ² = {self.chi2:.1f} ({self.degrees}), p = {self.probability:.2g}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Stability:
+    """**Fields:** `names` of the free parameters; `values`, `sigma` [epochs, k]; `mean`,
+    `mean_sigma`, `between` (τ), `probability` (of its χ² alone) [k]; `all_parameters`,
+    `rotation_removed`: tests of homogeneity; `image_found`, `image_expected`, `image_between`: RMS
+    over the image of an epoch against the mean, pixels; `at`, `slope`, `slope_sigma`: with what
+    the epochs were at (temperatures), else None."""
+
+    names: tuple[str, ...]
+    values: Float[np.ndarray, "epochs k"]
+    sigma: Float[np.ndarray, "epochs k"]
+    mean: Float[np.ndarray, " k"]
+    mean_sigma: Float[np.ndarray, " k"]
+    between: Float[np.ndarray, " k"]
+    probability: Float[np.ndarray, " k"]
+    all_parameters: Homogeneity
+    rotation_removed: Homogeneity
+    image_found: float
+    image_expected: float
+    image_between: float
+    at: Float[np.ndarray, " epochs"] | None = None
+    slope: Float[np.ndarray, " k"] | None = None
+    slope_sigma: Float[np.ndarray, " k"] | None = None
+
+    def to_dict(self) -> dict:
+        """As in JSON."""
+        test = lambda one: {"chi2": one.chi2, "degrees": one.degrees,
+                            "probability": one.probability}  # fmt: skip
+        rows = {}
+        for k, name in enumerate(self.names):
+            rows[name] = {
+                "mean": float(self.mean[k]), "sigma": float(self.mean_sigma[k]),
+                "between": float(self.between[k]), "probability": float(self.probability[k]),
+                "epochs": self.values[:, k].tolist(), "sigma_epochs": self.sigma[:, k].tolist(),
+            }
+            if self.slope is not None and self.slope_sigma is not None:
+                rows[name] |= {"slope": float(self.slope[k]),
+                               "sigma_slope": float(self.slope_sigma[k])}  # fmt: skip
+        return {
+            "parameters": rows, "all_parameters": test(self.all_parameters),
+            "rotation_removed": test(self.rotation_removed),
+            "image": {"found": self.image_found, "expected": self.image_expected,
+                      "between": self.image_between},
+            "at": None if self.at is None else self.at.tolist(),
+        }  # fmt: skip
+
+
+def stability(
+    calibrations: Sequence[tuple[Camera, Covariance]], at: Sequence[float] | None = None
+) -> Stability:
+    """Compare two calibrations of a camera or more.
+
+    **Arguments:** camera, and names and covariance of its free parameters, of every epoch
+    (`Calibration.camera`, `Calibration.adjustment.camera_covariance`; of files
+    `read_calibrated`); `at`: a number for each epoch, such as its temperature, for the slopes.
+
+    **Raises:** `InputError` where they are not of one camera.
+    """
+    cameras = [camera for camera, _ in calibrations]
+    names = _check(calibrations, at)
+    p = np.array([[camera.parameters[name] for name in names] for camera in cameras])
+    C = np.array([_ordered(covariance, names) for _, covariance in calibrations])
+    sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
+    columns = [_between(p[:, k], sigma[:, k]) for k in range(len(names))]
+    mean, mean_sigma, tau, probability = np.array(columns).T
+    model = get_model(cameras[0].model)
+    whole = {**default_parameters(model), **cameras[0].parameters, **dict(zip(names, mean))}
+    given = np.array([whole[name] for name in model.parameters])
+    G, H = (mapping_form(cameras[0], given, names, frame=f) for f in ("camera", "rotation"))
+    F = _without_rotation(G, H, sigma.mean(0))
+    d = p - p.mean(0)
+    found = float(np.einsum("nk,kl,nl->", d, H, d)) / (len(p) - 1)
+    expected = float(np.einsum("kl,nlk->", H, C)) / len(p)
+    slope = slope_sigma = x = None
+    if at is not None:
+        x = np.array(at, float)
+        slope, slope_sigma = _slopes(x, p, sigma**2 + tau**2)
+    return Stability(
+        names, p, sigma, mean, mean_sigma, tau, probability, _homogeneity(p, C),
+        _homogeneity(p @ F.T, F @ C @ F.T), np.sqrt(found), np.sqrt(expected),
+        float(np.sqrt(max(found - expected, 0.0))), x, slope, slope_sigma,
+    )  # fmt: skip
+
+
+def _check(calibrations, at) -> tuple[str, ...]:
+    """The names of the free parameters."""
+    if len(calibrations) < 2:
+        raise InputError("stability: give two calibrations of a camera or more")
+    if at is not None and (len(at) != len(calibrations) or len({*at}) < 3):
+        raise InputError(
+            f"stability: {len(at)} numbers for {len(calibrations)} calibrations; one for each is "
+            "expected, and three different ones at least"
+        )
+    first, (names, _) = calibrations[0]
+    if first.image_size is None:
+        raise InputError(f"camera {first.id!r}: its image_size in pixels is needed")
+    for number, (camera, (free, _)) in enumerate(calibrations, 1):
+        held = {n: v for n, v in camera.parameters.items() if n not in names}
+        same = {n: v for n, v in first.parameters.items() if n not in names}
+        if (camera.model, camera.image_size) != (first.model, first.image_size):
+            raise InputError(f"calibration {number} is of another camera model or image size")
+        if {*free} != {*names} or any(held.get(n, 0.0) != same.get(n, 0.0) for n in held | same):
+            raise InputError(f"calibration {number} has other free parameters, or held values")
+    return tuple(names)
+
+
+def _ordered(covariance: Covariance, names):
+    order = [list(covariance[0]).index(name) for name in names]
+    return np.asarray(covariance[1])[np.ix_(order, order)]
+
+
+def _homogeneity(p, C) -> Homogeneity:
+    """Scaled by the σ of the first epoch, so that no parameter is tiny."""
+    scale = np.sqrt(np.diagonal(C[0]))
+    p, W = p / scale, np.linalg.inv(C / np.outer(scale, scale))
+    mean = np.linalg.solve(W.sum(0), np.einsum("nkl,nl->k", W, p))
+    d = p - mean
+    return Homogeneity(float(np.einsum("nk,nkl,nl->", d, W, d)), (len(p) - 1) * p.shape[1])
+
+
+def _without_rotation(G, H, scale) -> Float[np.ndarray, "m k"]:
+    """Functions F·p of the parameters that a change like a rotation leaves as they are."""
+    unit = np.outer(scale, scale)
+    size, U = np.linalg.eigh(G * unit)
+    root = U / np.sqrt(size)
+    mu, V = np.linalg.eigh(root.T @ (H * unit) @ root)
+    vectors = (root @ V)[:, mu > ROTATION]
+    return vectors.T @ (G * unit) / scale
+
+
+def _between(x, sigma) -> tuple[float, float, float, float]:
+    """Mean, its σ, τ, and the probability of χ² without τ."""
+
+    def at(variance):
+        w = 1 / (sigma**2 + variance)
+        mean = w @ x / w.sum()
+        return mean, 1 / np.sqrt(w.sum()), float(w @ (x - mean) ** 2)
+
+    n, low, high = len(x), 0.0, float(np.var(x, ddof=1) * len(x))
+    chi2 = at(0.0)[2]
+    if chi2 <= n - 1:
+        high = 0.0
+    for _ in range(200 if high else 0):
+        middle = (low + high) / 2
+        low, high = (middle, high) if at(middle)[2] > n - 1 else (low, middle)
+    mean, of_mean, _ = at(high)
+    return float(mean), float(of_mean), float(np.sqrt(high)), chi2_tail(chi2, n - 1)
+
+
+def _slopes(x, p, variance):
+    """Of every parameter against x, and their σ."""
+    w = 1 / variance
+    middle = (w * x[:, None]).sum(0) / w.sum(0)
+    away = x[:, None] - middle
+    square = (w * away**2).sum(0)
+    return (w * away * p).sum(0) / square, 1 / np.sqrt(square)

@@ -1,0 +1,64 @@
+"""`jaxbundle stability`: calibrations of one camera at several epochs."""
+
+from typing import Annotated
+
+import typer
+
+from jaxbundle.cli.app import app
+from jaxbundle.errors import InputError
+
+
+@app.command(example="winter/result.json summer/result.json --at 5,25")
+def stability(
+    files: Annotated[
+        list[str], typer.Argument(help="results (JSON) of calibrate or adjust, FILE or FILE#ID")
+    ],
+    at: Annotated[
+        str, typer.Option(help="a,b,c: a number for each, such as its temperature, for slopes")
+    ] = "",
+    json: Annotated[str, typer.Option(help="write the result as JSON; - for stdout alone")] = "",
+) -> None:
+    """Test whether calibrations of one camera differ by more than their standard deviations."""
+    import sys
+    from json import dumps
+    from pathlib import Path
+
+    from jaxbundle.calibration.stability import stability as compare_epochs
+    from jaxbundle.cli.cameras_given import calibration_given
+    from jaxbundle.io.text.csv_tables import write_bytes
+    from jaxbundle.report.layout import table
+
+    calibrations = []
+    for file in files:
+        camera, covariance = calibration_given(file)
+        if covariance is None:
+            raise InputError(
+                f"{file}: has no covariance; give the result.json of calibrate or adjust"
+            )
+        calibrations.append((camera, covariance))
+    try:
+        numbers = [float(word) for word in at.split(",")] if at else None
+    except ValueError:
+        raise InputError(f"--at {at}: numbers are expected, such as 10,20,30") from None
+    found = compare_epochs(calibrations, numbers)
+    if json:
+        text = dumps(found.to_dict(), indent=1) + "\n"
+        if json == "-":
+            sys.stdout.write(text)
+            return
+        write_bytes(Path(json), text.encode())
+    rows = []
+    for k, name in enumerate(found.names):
+        row = [name, *(f"{x:.6g}" for x in (found.mean[k], found.mean_sigma[k], found.between[k])),
+               f"{found.probability[k]:.2g}"]  # fmt: skip
+        if found.slope is not None and found.slope_sigma is not None:
+            row += [f"{found.slope[k]:.4g}", f"{found.slope_sigma[k]:.2g}"]
+        rows.append(row)
+    head = ["parameter", "mean", "σ", "between", "p", "slope", "σ slope"][: len(rows[0])]
+    print("\n".join(table(head, rows, "l" + "r" * (len(head) - 1))))
+    print(f"\nall epochs the same, all parameters: {found.all_parameters}")
+    print(f"the same, rotation removed:          {found.rotation_removed}")
+    print(
+        f"images against the mean (RMS, rotation removed): {found.image_found:.4g} px, expected by "
+        f"the σ {found.image_expected:.4g} px; between epochs {found.image_between:.4g} px"
+    )
