@@ -8,7 +8,7 @@ from jaxbundle.cli.app import app
 from jaxbundle.errors import InputError
 
 
-@app.command(example="winter/result.json summer/result.json --at 5,25")
+@app.command(example="spring.json summer.json autumn.json --at 8,24,13")
 def stability(
     files: Annotated[
         list[str], typer.Argument(help="results (JSON) of calibrate or adjust, FILE or FILE#ID")
