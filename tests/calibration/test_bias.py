@@ -63,10 +63,9 @@ def test_cells_are_the_dense_model_with_a_pose_each(clean):
     assert clean.bias.tests["cells"].F == pytest.approx(F, rel=1e-6)
 
 
-@pytest.mark.slow
 def test_a_missing_k2_is_of_the_camera():
     """Another camera to compile than that of the other tests."""
-    for seed in range(4):
+    for seed in range(2):
         found = bias_of(lens(k2=-0.4), free=FEW, seed=seed)
         assert found.bias.found[0] == "camera" and "another camera model" in found.bias.sentence
         assert found.advice[-1] == found.bias.sentence
@@ -79,7 +78,7 @@ def test_a_bent_board_is_of_the_board():
     assert "estimate the points of the board" in found.sentence
 
 
-@pytest.mark.slow
+@pytest.mark.further
 def test_a_board_that_is_known_to_its_sigma_is_control():
     """Pseudo-observations of the board take part in Ω'."""
     found = bias_of(board_sigma=1e-4, sigma_image=0.05).bias

@@ -30,7 +30,7 @@ def epochs(changes, seed=0):
 
 
 def test_a_stable_camera_is_homogeneous():
-    """χ² of both tests over 60 series has the mean of its degrees of freedom."""
+    """χ² of both tests over 40 series has the mean of its degrees of freedom."""
     found = [stability(epochs(np.zeros((6, 6)), seed)) for seed in range(40)]
     for of, degrees in (("all_parameters", 30), ("rotation_removed", None)):
         tests = [getattr(one, of) for one in found]
