@@ -62,8 +62,13 @@ def mapping_error(adjustment, camera: str, grid: tuple[int, int] = GRID) -> Mapp
     names, C = adjustment.camera_covariance(camera)
     p = np.array(list(adjustment.camera_parameters(camera).values()))
     H = mapping_form(given, p, names, grid)
-    root = np.linalg.cholesky(C)
-    return MappingError(np.clip(np.linalg.eigvalsh(root.T @ H @ root), 0, None))
+    # By a root of H, in units of σ: C may be singular to rounding, as where two parameters are one.
+    sigma = np.sqrt(np.diagonal(C))
+    unit = np.where(sigma > 0, sigma, 1.0)
+    size, V = np.linalg.eigh(H * np.outer(unit, unit))
+    root = V * np.sqrt(np.clip(size, 0, None))
+    weights = np.linalg.eigvalsh(root.T @ (C / np.outer(unit, unit)) @ root)
+    return MappingError(np.clip(weights, 0, None))
 
 
 def mapping_form(

@@ -40,6 +40,8 @@ from jaxbundle.statistics.difference import Covariance
 
 ROTATION = 0.1
 """μ below this: nearly a rotation."""
+SEEN = 1e-12
+"""Of the largest: changes of the parameters that move no image are left out below it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -181,7 +183,8 @@ def _without_rotation(G, H, scale) -> Float[np.ndarray, "m k"]:
     """Functions F·p of the parameters that a change like a rotation leaves as they are."""
     unit = np.outer(scale, scale)
     size, U = np.linalg.eigh(G * unit)
-    root = U / np.sqrt(size)
+    seen = size > SEEN * size[-1]
+    root = U[:, seen] / np.sqrt(size[seen])
     mu, V = np.linalg.eigh(root.T @ (H * unit) @ root)
     vectors = (root @ V)[:, mu > ROTATION]
     return vectors.T @ (G * unit) / scale

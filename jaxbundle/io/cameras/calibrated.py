@@ -49,7 +49,8 @@ def read_calibrated(path: str | Path) -> list[Calibrated]:
     except ValueError as error:
         raise InputError(f"{path}: not a result in JSON: {str(error)[:100]}") from None
     except (KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: not the result of adjust or calibrate: {error!r:.100}") from None
+        what = f"has no {error}" if isinstance(error, KeyError) else f"{error!r:.100}"
+        raise InputError(f"{path}: not the result of adjust or calibrate: {what}") from None
 
 
 def _calibrated(path, id, entry, about) -> Calibrated:
