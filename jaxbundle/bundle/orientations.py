@@ -1,7 +1,6 @@
 """The joint covariance of all orientations and cameras of a result."""
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.io.networks.orientation_covariance import OrientationCovariance, Unknown
@@ -37,6 +36,8 @@ def orientation_covariance(result: Adjustment) -> OrientationCovariance | None:
         rows[name][n, row, column] = 1.0
     C = result.sigma0**2 * result.cofactors.solution.propagate_rows(rows)
     used = np.concatenate([free.ravel(), np.ones(len(places) - free.size)])
+    from scipy.linalg import block_diag  # not at the top: it takes a while, and few ask for it
+
     turns = (block_diag(np.eye(3), A) for A in result.angle_jacobian)
     A = block_diag(*turns, np.eye(len(places) - free.size)) * used
     C = (A @ C @ A.T)[np.ix_(repeated, repeated)]

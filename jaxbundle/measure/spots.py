@@ -9,7 +9,7 @@ linear in the image (Immerkær, 1996).
 import dataclasses
 
 import numpy as np
-from scipy import ndimage
+import scipy  # whose parts are loaded when they are used
 
 from jaxbundle.errors import InputError
 
@@ -76,15 +76,15 @@ def _nearest_spot(window, near):
     if contrast < max(CONTRAST * noise_of(window), LEAST_CONTRAST):
         return None, threshold
     rim = np.concatenate([bright[0], bright[-1], bright[1:-1, 0], bright[1:-1, -1]])
-    labels, number = ndimage.label(bright if rim.mean() < 0.5 else ~bright)
-    sizes = ndimage.sum_labels(np.ones_like(window), labels, np.arange(1, number + 1))
+    labels, number = scipy.ndimage.label(bright if rim.mean() < 0.5 else ~bright)
+    sizes = scipy.ndimage.sum_labels(np.ones_like(window), labels, np.arange(1, number + 1))
     large = np.flatnonzero(sizes >= LEAST_PIXELS) + 1
     rows, columns = np.nonzero(np.isin(labels, large))
     if not len(rows):
         return None, threshold
     nearest = np.argmin((columns - near[0]) ** 2 + (rows - near[1]) ** 2)
     inside = labels == labels[rows[nearest], columns[nearest]]
-    return ndimage.binary_fill_holes(inside), threshold
+    return scipy.ndimage.binary_fill_holes(inside), threshold
 
 
 def _ends_inside(inside) -> bool:
@@ -104,12 +104,12 @@ def _levels(grey, low, window, inside, threshold) -> Spot:
     cut = (slice(first[1], last[1]), slice(first[0], last[0]))
     window, inside = window[cut], inside[cut]
     bright = window[inside].mean() > window[~inside].mean()
-    core = inside & ~ndimage.binary_dilation(~inside, iterations=2)
+    core = inside & ~scipy.ndimage.binary_dilation(~inside, iterations=2)
     level = np.median(window[core]) if core.sum() >= LEAST_PIXELS else np.quantile(
         window[inside], 0.9 if bright else 0.1
     )
-    around = ndimage.binary_dilation(inside, iterations=MARGIN + 2)
-    around &= ~ndimage.binary_dilation(inside, iterations=MARGIN)
+    around = scipy.ndimage.binary_dilation(inside, iterations=MARGIN + 2)
+    around &= ~scipy.ndimage.binary_dilation(inside, iterations=MARGIN)
     own = window > threshold if bright else window < threshold
     around &= ~own
     background = np.median(window[around]) if around.any() else np.median(window[~inside])
@@ -138,5 +138,5 @@ def noise_of(grey) -> float:
     if min(grey.shape) < 3:
         return 12**-0.5
     mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]])
-    response = ndimage.convolve(grey, mask)[1:-1, 1:-1]
+    response = scipy.ndimage.convolve(grey, mask)[1:-1, 1:-1]
     return max(float(np.median(np.abs(response)) / (6 * 0.6745)), 12**-0.5)

@@ -18,8 +18,8 @@ import dataclasses
 
 import jax
 import numpy as np
+import scipy  # whose parts are loaded when they are used
 from jaxtyping import Float
-from scipy import ndimage
 
 from jaxbundle.errors import InputError
 from jaxbundle.measure.ellipses import fit_ellipse
@@ -101,7 +101,7 @@ def _place(spot, xy):
 
 
 def _region(spot):
-    return ndimage.binary_dilation(spot.inside, np.ones((3, 3)), iterations=MARGIN)
+    return scipy.ndimage.binary_dilation(spot.inside, np.ones((3, 3)), iterations=MARGIN)
 
 
 def _places(spot):
@@ -137,7 +137,7 @@ def _edge_points(spot, xy, axes, angle):
     reach = min(MARGIN, 0.8 * axes[1])
     s = np.arange(-reach, MARGIN + STEP / 2, STEP)
     x, y = (start[:, None] + s[:, None] * normal[:, None]).transpose(2, 0, 1)
-    profile = ndimage.map_coordinates(spot.grey, [y, x], order=3, mode="nearest")
+    profile = scipy.ndimage.map_coordinates(spot.grey, [y, x], order=3, mode="nearest")
     profile = (profile - spot.background) / spot.contrast
     inner, outer = profile[:, :3].mean(1), profile[:, -3:].mean(1)
     middle = (inner + outer) / 2

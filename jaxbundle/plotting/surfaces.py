@@ -1,10 +1,16 @@
 """Pictures of surfaces: a cloud in perspective coloured by σ, a DSM as relief."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from jaxbundle.plotting.style import axes, axes_3d
-from jaxbundle.surface.cloud import Cloud
-from jaxbundle.surface.dsm import Dsm
+
+if TYPE_CHECKING:  # with them come scanners and matching, which an adjustment does without
+    from jaxbundle.surface.cloud import Cloud
+    from jaxbundle.surface.dsm import Dsm
 
 MOST_POINTS = 40_000
 SUN = np.radians(315.0), np.radians(45.0)

@@ -15,10 +15,10 @@ from the folder above. Angles (CodageAngulaire) and other conventions are refuse
 Source: MicMac's documentation, "Orientation"; its conventions eConvApero_DistM2C, eConvOriLib.
 """
 
+import html
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from pathlib import Path
-from xml.sax.saxutils import escape
 
 import numpy as np
 
@@ -150,7 +150,8 @@ def _orientation(file: str, C2W: np.ndarray, X0: np.ndarray) -> list[str]:
         "<OrientationConique>", "<OrIntImaM2C>",
         *(f"<{name}>{text(values)}</{name}>" for name, values in IDENTITY.items()),
         "</OrIntImaM2C>", "<TypeProj>eProjStenope</TypeProj>",
-        f"<FileInterne>{escape(file)}</FileInterne>", "<RelativeNameFI>true</RelativeNameFI>",
+        f"<FileInterne>{html.escape(file, quote=False)}</FileInterne>",
+        "<RelativeNameFI>true</RelativeNameFI>",
         "<Externe>", f"<KnownConv>{M2C[0]}</KnownConv>", f"<Centre>{text(X0)}</Centre>",
         "<ParamRotation>", "<CodageMatr>", *rows, "</CodageMatr>", "</ParamRotation>", "</Externe>",
         "<ConvOri>", f"<KnownConv>{M2C[0]}</KnownConv>", "</ConvOri>", "</OrientationConique>",
