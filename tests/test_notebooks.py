@@ -84,8 +84,15 @@ def shell(only_shell):
     only_shell.reset()
 
 
+FURTHER = ("lapan_a3", "next_photograph", "two_video_cameras")
+"""Whose functions another notebook calls."""
+
+
 @pytest.mark.slow
-@each_notebook
+@pytest.mark.parametrize("path", [
+    pytest.param(path, id=path.stem, marks=pytest.mark.further if path.stem in FURTHER else ())
+    for path in NOTEBOOKS
+])  # fmt: skip
 def test_runs(path, shell, monkeypatch):
     monkeypatch.chdir(path.parent)
     figures = 0

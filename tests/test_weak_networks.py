@@ -61,6 +61,7 @@ def exchanged(given, *ids):
     return given.replace(points=dataclasses.replace(given.points, position=X))
 
 
+@pytest.mark.further
 def test_exchanged_control_points_among_others_are_a_warning():
     six = CONTROL | {"control": (0, 4, 10, 12, 20, 24)}
     found = jaxbundle.orient(without_start_values(exchanged(network(RING, **six), "1", "5")))

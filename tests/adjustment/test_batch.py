@@ -291,6 +291,7 @@ def test_object_points_may_be_repeated_for_every_view(three):
     np.testing.assert_array_equal(once(X[:, None].repeat(views, 1), xy), X)
 
 
+@pytest.mark.further
 def test_few_views_are_not_filled_up_to_many(three, solved, monkeypatch):
     """The first camera keeps every other view, the last all: each by itself or together."""
     monkeypatch.setattr(batch_input, "ON_CPU", 2)

@@ -80,6 +80,7 @@ def directions(data, random):
     yield "start camera", eqx.tree_at(lambda d: d.start.camera, zero, change)
 
 
+@pytest.mark.further
 def test_derivatives_by_everything_that_was_given():
     """First ones; of the second, by the same rule: the engine's own tests, and below."""
     problem, of = program()

@@ -66,11 +66,12 @@ TRUTH = {
 }  # fmt: skip
 
 
-SIMPLE = ("fov", "eucm", "division", "stereographic", "equidistant", "equisolid")
+FURTHER = ("fov", "eucm", "division", "stereographic", "equidistant", "equisolid", "orthographic",
+           "kannala-brandt-tangential")  # fmt: skip
 
 
 @pytest.mark.parametrize("name", [
-    pytest.param(name, marks=pytest.mark.further) if name in SIMPLE else name for name in TRUTH
+    pytest.param(name, marks=pytest.mark.further) if name in FURTHER else name for name in TRUTH
 ])  # fmt: skip
 def test_a_calibration_finds_the_truth(name):
     """Within 3 σ, and σ0 is that of the noise. Of `double-sphere` and `mei` f and ξ are one number
@@ -91,6 +92,7 @@ def fisheye():
     return views_of(render.Lens.of(SIZE, "equidistant", **CORE), 10)
 
 
+@pytest.mark.further
 def test_which_model_suffices(fisheye):
     """Of a camera that is equidistant: neither the stereographic one, nor more parameters."""
     found = compare_models(
@@ -187,6 +189,7 @@ def over_sigma(found, truth):
     return np.sqrt(np.nanmean(ratio**2)), apart.largest
 
 
+@pytest.mark.further
 def test_the_spline_follows_a_lens_that_no_parametric_model_fits(bumpy_views):
     options = dict(snooping=None, sigma_image=NOISE, cross_validation=False)
     stiff = calibrate(bumpy_views, model="kannala-brandt-tangential", **options)

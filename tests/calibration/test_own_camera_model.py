@@ -22,6 +22,7 @@ AGAIN = CameraModel(
 )
 
 
+@pytest.mark.further
 def test_opencv_said_again_has_the_figures_of_opencv():
     """By `calibrate_batch`; and `calibrate`, whose start is of another model, finds the same."""
     views = simulated()

@@ -286,6 +286,7 @@ def test_conjugate_gradients_give_the_same_as_a_factor():
     np.testing.assert_allclose(*own, atol=1e-14)
 
 
+@pytest.mark.further
 def test_gradient_of_a_gradient_in_a_batch():
     """Reverse over reverse, forward over reverse, both under vmap; one member has no solution."""
     problem = made("inner constraints")

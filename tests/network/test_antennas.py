@@ -189,6 +189,7 @@ def test_a_lever_arm_that_never_turns_is_named(flight, result):
     assert "lever arm" in names or "GNSS strip" in names
 
 
+@pytest.mark.further
 def test_antennas_give_the_frame(flight):
     """No control, no start values: the places of the antennas are the datum."""
     network, images = flight.network, flight.network.images

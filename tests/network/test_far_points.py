@@ -283,6 +283,7 @@ def test_start_values_of_a_horizon_are_found(horizon):
     np.testing.assert_allclose(found.vtpv, result.vtpv, rtol=1e-6)
 
 
+@pytest.mark.further
 def test_images_from_one_place_are_not_solved_by_points_at_infinity():
     """A panorama determines no distance at all: that is said."""
     network, _ = simulated(np.full(FAR, 50.0))

@@ -95,6 +95,7 @@ def test_sigma_is_that_of_a_sample(simulated, result):
     assert (np.abs(ratio - 1) < 4 / np.sqrt(2 * len(found))).all(), ratio
 
 
+@pytest.mark.further
 def test_a_mounting_that_works_loose(simulated):
     """With a σ the epochs may differ: their residuals have it."""
     section = {"sigma_position": 1e-3, "sigma_angle": 1e-3}

@@ -167,6 +167,7 @@ def with_neighbours(network, xy):
     )
 
 
+@pytest.mark.further
 def test_neighbours_tell_velocities(flown, result):
     made, _ = flown
     truth = made.truth.images

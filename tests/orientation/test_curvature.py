@@ -40,7 +40,12 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+FURTHER = ("relative orientation", "homography")
+
+
+@pytest.mark.parametrize("name", [
+    pytest.param(name, marks=pytest.mark.further) if name in FURTHER else name for name in CASES
+])  # fmt: skip
 def test_second_derivatives(name):
     function, x = CASES[name]
     x, u = jnp.asarray(x), jnp.asarray(RNG.normal(size=x.shape))

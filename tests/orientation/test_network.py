@@ -104,6 +104,7 @@ def minimum(network):
 # --- start values alone: these tests share their programs
 
 
+@pytest.mark.further
 def test_control_seen_once_throughout(with_control):
     """Eight control points, each measured in a single image."""
     rays = with_control.network.observations

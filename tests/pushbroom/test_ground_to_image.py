@@ -93,7 +93,8 @@ def placed(image, X, earth=el.WGS84, most=1):
 
 
 @pytest.mark.parametrize("name, points", [
-    *((name, at_heights) for name in CASES), (LINEAR, on_other_surfaces)
+    pytest.param(name, points, marks=pytest.mark.further) if name == LINEAR else (name, points)
+    for name, points in [*((name, at_heights) for name in CASES), (LINEAR, on_other_surfaces)]
 ])  # fmt: skip
 def test_project_undoes_locate(name, points):
     """To 1e-6 pixel over the whole image, on every surface."""
@@ -125,6 +126,7 @@ def rocking(size, period, angles=(0.0, 0.0, 0.0)):
     )
 
 
+@pytest.mark.further
 def test_in_a_local_frame():
     image = rocking(0.0, 1.0, (0.01, 0.1, 0.2))
     X = np.array(locate(image, Plane(30.0), SOME_LINES, SOME_PIXELS)).reshape(3, -1)

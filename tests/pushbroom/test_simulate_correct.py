@@ -182,6 +182,7 @@ def test_a_satellite_image_in_utm(tmp_path):
         MapSystem(Ground().earth, "EPSG:999999")
 
 
+@pytest.mark.further
 def test_a_coarse_map_is_made_in_parts(tmp_path, monkeypatch):
     """No part of the image is larger than allowed; the map is the same as made at once."""
     image, rng = measured_image(AIRCRAFT), np.random.default_rng(8)
@@ -205,6 +206,7 @@ def test_a_coarse_map_is_made_in_parts(tmp_path, monkeypatch):
     np.testing.assert_array_equal(*maps)
 
 
+@pytest.mark.further
 def test_a_rough_trajectory_leaves_no_holes():
     """Every pixel of the map that the search finds in the image is placed, and where it is found.
 

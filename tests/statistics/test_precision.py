@@ -97,6 +97,7 @@ def test_a_design_that_determines_nothing_is_nan(problem, program):
     assert np.isnan(found.cameras[0, 0])
 
 
+@pytest.mark.further
 def test_a_station_moves_the_precision_of_the_principal_distance_in_a_batch(problem):
     """∂σ²/∂X0, forward, under vmap and jit."""
     X0 = problem.data.start.position[1, 0]
