@@ -67,7 +67,7 @@ TRUTH = {
 
 
 FURTHER = ("fov", "eucm", "division", "stereographic", "equidistant", "equisolid", "orthographic",
-           "kannala-brandt-tangential")  # fmt: skip
+           "kannala-brandt-tangential", "scaramuzza")  # fmt: skip
 
 
 @pytest.mark.parametrize("name", [

@@ -69,6 +69,7 @@ def test_in_two_processes():
     assert_same(found[0][name], name)
 
 
+@pytest.mark.further
 def test_a_lost_process_ends_the_others():
     port = free_port()
     running = [start(1, "traverse, banded", 2, k, port, k * signal.SIGKILL) for k in range(2)]
