@@ -27,6 +27,8 @@ def named(problem: Problem, names: Sequence[tuple[str, str, str]]) -> list[Name]
 
     **Raises:** `InputError` where nothing is named, or a name has other than three parts;
     `KeyError` for a name that is not there."""
+    if not isinstance(names, list | tuple):
+        raise InputError(f"covariance: a list of names is expected, but it is {shown(names)}")
     given: Sequence[Any] = names or (None,)
     for name in given:
         if name is None or isinstance(name, str) or np.shape(name) != (3,):

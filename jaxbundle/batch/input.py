@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -231,7 +231,7 @@ def free_parameters(model: CameraModel, free) -> tuple[str, ...]:
     """The parameters to estimate, checked."""
     if free is None:
         free = model.free
-    if isinstance(free, str | bytes) or not isinstance(free, Iterable):
+    if not isinstance(free, list | tuple):
         raise InputError(f"free must be a list of names, such as ['fx', 'fy'], but is {free!r}")
     free = list(free)
     for name in free:

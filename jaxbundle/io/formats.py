@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from jaxbundle.arguments import path as given_path
-from jaxbundle.arguments import shown
+from jaxbundle.arguments import shown, text
 from jaxbundle.cameras import CameraModel
 from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.camera_files import is_camera_file, write_cameras
@@ -306,12 +306,12 @@ def read_network(
     """
     path = Path(given_path("path", path))
     if isinstance(overrides, str) or not (
-        isinstance(overrides, Sequence) and all(isinstance(text, str) for text in overrides)
+        isinstance(overrides, Sequence) and all(isinstance(one, str) for one in overrides)
     ):
         raise InputError(
             f"overrides must be a list of texts, such as ['datum=inner'], but is {shown(overrides)}"
         )
-    if format is not None and format not in FORMATS:
+    if format is not None and text("format", format) not in FORMATS:
         if format in TARGETS or format == "opencv":
             what = "holds a camera alone" if format == "opencv" else "is written only"
             raise InputError(
@@ -333,7 +333,7 @@ def read_network(
     own = (check_own_models(models),) if FORMATS[format].names_models else ()
     network = FORMATS[format].read(path, overrides, *own)
     if given is not None:
-        datum = any(text.partition("=")[0].strip() == "datum" for text in overrides)
+        datum = any(one.partition("=")[0].strip() == "datum" for one in overrides)
         return with_control(network, given, datum=not datum)
     return network.warn(*_of_adjusted_control(network)) if FORMATS[format].adjusted else network
 

@@ -182,7 +182,7 @@ def make_cameras(
         table = as_columns(cameras, "cameras")
         rows = ({k: v[row] for k, v in table.values.items()} for row in range(len(table)))
         cameras = [{k: v for k, v in row.items() if not is_missing(v)} for row in rows]
-    if isinstance(cameras, str) or not isinstance(cameras, Iterable):
+    if isinstance(cameras, str | np.ndarray) or not isinstance(cameras, Iterable):
         raise InputError(
             f"{where}cameras: expected Camera objects, dict rows or a data frame of pandas, not "
             f"{shown(cameras)}"
@@ -193,9 +193,9 @@ def make_cameras(
     )
     if not made:
         raise InputError(f"{where}no camera is given; give at least one")
-    check_unique([camera.id for camera in made], Source(f"{where}cameras"), "camera")
     for camera in made:
         check_camera(camera, where)
+    check_unique([camera.id for camera in made], Source(f"{where}cameras"), "camera")
     check_models(made, where)
     return made
 

@@ -128,9 +128,9 @@ def _sighting(network: Network, row: SupportsIndex) -> str:
 
 
 def _check_cameras(network: Network) -> Network:
-    check_unique([camera.id for camera in network.cameras], Source("cameras"), "camera")
     for camera in network.cameras:
         check_camera(camera)
+    check_unique([camera.id for camera in network.cameras], Source("cameras"), "camera")
     check_models(network.cameras)
     used, index = np.unique(network.images.camera, return_inverse=True)
     if len(used) == len(network.cameras):

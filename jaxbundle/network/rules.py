@@ -1,11 +1,11 @@
 """Rules that one value, one id or one camera must obey; readers use them before `check_network`."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from jaxbundle.arguments import one_of
+from jaxbundle.arguments import one_of, text
 from jaxbundle.cameras import (
     FAMILIES,
     MODEL_NAMES,
@@ -84,7 +84,9 @@ def check_camera(camera: Camera, where: str = "") -> None:
 
     `where` begins the message: "project.toml, ".
     """
+    text(f"{where}id of a camera", camera.id)
     where = f"{where}camera {camera.id!r}: "
+    _check_fields(camera, where)
     model = model_of(camera.model, where)
     values = {**default_parameters(model), **camera.parameters}
     try:
@@ -116,6 +118,27 @@ def check_camera(camera: Camera, where: str = "") -> None:
     _check_pair(where, "pixel_size", camera.pixel_size, "[width, height] in mm")
 
 
+def _check_fields(camera: Camera, where: str) -> None:
+    """Refuse fields that are no numbers by name, names, or groups of names."""
+    if not isinstance(camera.model, str | CameraModel):
+        raise InputError(f"{where}model is {shown(camera.model)}; expected a name or a CameraModel")
+    for field in ("parameters", "sigma"):
+        given = getattr(camera, field)
+        if not isinstance(given, Mapping):
+            raise InputError(f"{where}{field} is {shown(given)}; expected numbers by name, such as "
+                             "{'c': 20.0}")  # fmt: skip
+    if not _are_names(camera.free):
+        raise InputError(f"{where}free is {shown(camera.free)}; expected names of parameters, such "
+                         "as ('c', 'x0')")  # fmt: skip
+    if not isinstance(camera.tie, list | tuple) or not all(map(_are_names, camera.tie)):
+        raise InputError(f"{where}tie is {shown(camera.tie)}; expected groups of names, such as "
+                         "[('fx', 'fy')]")  # fmt: skip
+
+
+def _are_names(given) -> bool:
+    return isinstance(given, list | tuple) and all(isinstance(name, str) for name in given)
+
+
 def _check_ties(camera: Camera, values, where: str) -> None:
     """Refuse ties of unknown parameters, of one in two groups, of different start values."""
     names = [name for group in camera.tie for name in group]
@@ -134,8 +157,9 @@ def _check_ties(camera: Camera, values, where: str) -> None:
 
 
 def _check_pair(where, name, pair, meaning):
-    if pair is not None and not (len(pair) == 2 and all(map(_positive, pair))):
-        raise InputError(f"{where}{name} is {list(pair)}; expected {meaning}, both positive")
+    numbers = np.shape(pair) == (2,) and not isinstance(pair, str | np.ma.MaskedArray)
+    if pair is not None and not (numbers and all(map(_positive, pair))):
+        raise InputError(f"{where}{name} is {shown(pair)}; expected {meaning}, both positive")
 
 
 def check_sigma_image(sigma: float, where: str = "") -> None:
@@ -149,5 +173,5 @@ def check_sigma_image(sigma: float, where: str = "") -> None:
 def _positive(value) -> bool:
     try:
         return math.isfinite(value) and value > 0
-    except OverflowError:
+    except (OverflowError, TypeError):
         return False

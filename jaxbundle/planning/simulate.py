@@ -298,7 +298,8 @@ def _indices(name: str, values):
 def _not_negative(value, size: int, name: str):
     value = numeric_array(name, value, f"0 or positive, one number or {size}").astype(float)
     if value.shape not in ((), (size,)) or not (np.isfinite(value) & (value >= 0)).all():
-        raise InputError(f"{name} is {value}; it must be 0 or positive, one number or {size}")
+        raise InputError(f"{name} is {shown(value.tolist())}; it must be 0 or positive, one number "
+                         f"or {size}")  # fmt: skip
     return np.broadcast_to(value, size)
 
 

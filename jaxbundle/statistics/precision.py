@@ -74,7 +74,7 @@ def precision(
     that is not there.
     """
     check_given(problem, data)
-    problem, wanted = problem.with_factor(), named(problem, names) if names else []
+    problem, wanted = problem.with_factor(), [] if names == () else named(problem, names)
     if problem.reduction not in FACTORS:
         raise InputError("precision: the network is too large for its covariance; take part of it")
     data = problem.data if data is None else data

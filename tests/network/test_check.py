@@ -1,6 +1,7 @@
 """Every fault of a network is refused in one line that names the place, the thing, the remedy."""
 
 import dataclasses
+import re
 import time
 
 import jax
@@ -12,6 +13,7 @@ from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.network import Camera, Network
 from jaxbundle.network.build import make_network
 from jaxbundle.network.check import check_network, split_check_points
+from jaxbundle.network.rules import check_camera
 from jaxbundle.network.sightings import connected_parts
 from jaxbundle.planning.simulate import simulate
 from jaxbundle.planning.stations import aerial_block, cloud_of_targets
@@ -377,3 +379,18 @@ def test_a_single_strip_with_gnss_alone_does_not_fix_its_roll(off, said):
         left = z - np.polyval(np.polyfit(x, z, 1), x)
         roll = np.degrees(0.05 / np.sqrt(left @ left))
         assert float(told[0].split("some ")[1].split("°")[0]) == pytest.approx(roll, rel=0.02)
+
+
+@pytest.mark.parametrize("field, value, message", [
+    ("id", None, "id of a camera must be a text, but is None"),
+    ("model", 5, "camera 'cam': model is 5; expected a name or a CameraModel"),
+    ("parameters", [20.0], "camera 'cam': parameters is [20.0]; expected numbers by name"),
+    ("sigma", 0.1, "camera 'cam': sigma is 0.1; expected numbers by name"),
+    ("free", "c", "camera 'cam': free is 'c'; expected names of parameters"),
+    ("tie", ["c", "x0"], "camera 'cam': tie is ['c', 'x0']; expected groups of names"),
+    ("pixel_size", 0.005, "camera 'cam': pixel_size is 0.005; expected [width, height] in mm"),
+])  # fmt: skip
+def test_fields_of_a_camera_of_another_kind(field, value, message):
+    fields = {"id": "cam", "model": "brown", "parameters": {"c": 20.0}} | {field: value}
+    with pytest.raises(InputError, match=re.escape(message)):
+        check_camera(Camera(**fields))
