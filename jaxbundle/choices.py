@@ -44,3 +44,6 @@ ATTITUDE_ERRORS: tuple[AttitudeError, ...] = get_args(AttitudeError)
 """One error an image, or one in every row of the table of attitudes."""
 RPC_BIASES = ("shift", "affine")
 """Biases of coefficients, in the image."""
+
+EXPLORED = ("network", "camera", "scanner")
+"""What can be explored."""

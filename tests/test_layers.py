@@ -37,6 +37,7 @@ LAYERS = (
     "tiepoints",
     "reconstruction",
     "calibration",
+    "explore",
     "cli",
     "__main__",
 )

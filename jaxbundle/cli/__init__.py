@@ -16,7 +16,7 @@ from jaxbundle.cli.app import run
 
 COMMANDS = (
     "reconstruct", "orient", "adjust", "calibrate", "batch", "design", "plan", "camera",
-    "compare", "stability", "convert", "surface", "cloud", "pushbroom", "example",
+    "compare", "stability", "explore", "convert", "surface", "cloud", "pushbroom", "example",
 )  # fmt: skip
 
 

@@ -92,8 +92,9 @@ Html = Annotated[str, typer.Option(help="write the result as one page of HTML")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="print nothing but errors")]
 
 
-def choice(words: Iterable[str], about: str = "") -> Any:
-    """An option that is one of some words; another is refused with the closest of them."""
+def choice(words: Iterable[str], about: str = "", *names: str) -> Any:
+    """An option that is one of some words; another is refused with the closest of them. `names`:
+    of the option, if not that of the argument."""
     words = tuple(words)
     listed = ", ".join(words)
 
@@ -104,7 +105,7 @@ def choice(words: Iterable[str], about: str = "") -> Any:
             raise InputError(f"{option.opts[0]} {value!r}: one of {listed} is expected{mean}")
         return value
 
-    return typer.Option(help=f"{about}: {listed}" if about else listed, callback=check)
+    return typer.Option(*names, help=f"{about}: {listed}" if about else listed, callback=check)
 
 
 def _version(asked: bool) -> None:

@@ -63,6 +63,26 @@ def draw_curves(
                                  None if mark is None else mark[1])  # fmt: skip
 
 
+def draw_plan(
+    lines: Sequence[Curve], x_label: str, y_label: str, down: bool = False
+) -> str:  # fmt: skip
+    """Lines in a plane, both axes at one scale; `down`: y grows downwards. Lines of the same label
+    have one sample."""
+    xs, ys = (np.concatenate([getattr(line, name) for line in lines]) for name in ("x", "y"))
+    ends = [_scale(v, 0, 1, 0.03) for v in (xs, ys)]
+    room = WIDE - RIGHT - LEFT, HIGH - BOTTOM - TOP
+    unit = max((end.high - end.low) / size for end, size in zip(ends, room))
+    # What is left of the room is shared by both sides.
+    low = [(end.low + end.high - unit * size) / 2 for end, size in zip(ends, room)]
+    top, bottom = (HIGH - BOTTOM, TOP) if not down else (TOP, HIGH - BOTTOM)
+    x = Scale(low[0], low[0] + unit * room[0], LEFT, WIDE - RIGHT)
+    y = Scale(low[1], low[1] + unit * room[1], top, bottom)
+    parts = [_axes(x, y, x_label, y_label)]
+    parts += [f'<polyline class="{line.kind}" points="{_places(x, y, line.x, line.y)}"/>\n'
+              for line in lines]  # fmt: skip
+    return _svg(parts) + _legend([*dict.fromkeys((line.kind, line.label) for line in lines)])
+
+
 def draw_histogram(
     edges: np.ndarray, counted: np.ndarray, x_label: str, things: str,
     expected: np.ndarray | None = None,

@@ -9,7 +9,7 @@ tables, is said to be in the CSV files.
 
 import base64
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.resources import files
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -48,13 +48,18 @@ class Listing(NamedTuple):
 
 class Page(NamedTuple):
     """A page: its title; its sections, the verdict first; its tables by name, the empty ones are
-    left out; what the scripts draw, by id; the section on where it comes from."""
+    left out; what the scripts draw, by id; the section on where it comes from. `scripts` run after
+    those of every page, `style` adds to its style; `asks`: the scripts may send requests to the
+    server that the page came from."""
 
     title: str
     sections: Iterable[Section]
     origin: Section
     tables: Mapping[str, Listing] = NOTHING
     drawings: Mapping[str, Any] = NOTHING
+    scripts: Sequence[str] = ()
+    style: str = ""
+    asks: bool = False
 
 
 def write(page: Page, date: str | None = None) -> Iterator[str]:
@@ -68,7 +73,7 @@ def write(page: Page, date: str | None = None) -> Iterator[str]:
     listed = [_listing(id, table) for id, table in tables.items()]
     if listed:
         listed[0] = listed[0]._replace(link="Tables")
-    yield _beginning(page.title, date)
+    yield _beginning(page, date)
     yield _section(first)
     yield _contents([*sections, *listed, page.origin])
     yield from map(_section, sections)
@@ -83,7 +88,7 @@ def write(page: Page, date: str | None = None) -> Iterator[str]:
         yield _data(f"data-{id}", encode_table(table.columns))
     for id, value in page.drawings.items():
         yield _data(id, value)
-    yield f"</main>\n<script>{_script()}</script>\n</body>\n</html>\n"
+    yield f"</main>\n<script>{_script(page)}</script>\n</body>\n</html>\n"
 
 
 def _listing(id: str, table: Listing) -> Section:
@@ -103,21 +108,24 @@ def _section(section: Section) -> str:
     return markup.section(section.id, section.title, section.content, breaks=section.breaks)
 
 
-def _beginning(title: str, date: str | None) -> str:
+def _beginning(page: Page, date: str | None) -> str:
     from jaxbundle import __version__
 
-    style, script = _read(STYLE), _script()
+    style, script = _read(STYLE) + page.style, _script(page)
     policy = (
         f"default-src 'none'; img-src data:; style-src '{_digest(style)}'; "
         f"script-src '{_digest(script)}'; base-uri 'none'; form-action 'none'"
     )
-    title = markup.text(title)
+    # A server is asked for an icon, unless the page says that it has none.
+    icon = '<link rel="icon" href="data:,">\n' if page.asks else ""
+    policy += "; connect-src 'self'" if page.asks else ""
+    title = markup.text(page.title)
     made = f"jaxbundle {__version__}" + (f", {date}" if date else "")
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{title}</title>\n<style>{style}</style>\n</head>\n<body>\n"
+        f"{icon}<title>{title}</title>\n<style>{style}</style>\n</head>\n<body>\n"
         f"<header><h1>{title}</h1>{markup.paragraph(made)}</header>\n<main>\n"
     )
 
@@ -126,9 +134,9 @@ def _data(id: str, value) -> str:
     return f'<script type="application/json" id="{id}">{script_text(value)}</script>\n'
 
 
-def _script() -> str:
+def _script(page: Page) -> str:
     """All scripts in one function, so that they share their names and leave none behind."""
-    body = "\n".join(_read(name) for name in SCRIPTS)
+    body = "\n".join([*(_read(name) for name in SCRIPTS), *page.scripts])
     return f'"use strict";\n(() => {{\n{body}}})();\n'
 
 

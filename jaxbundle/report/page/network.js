@@ -10,7 +10,8 @@ const MOST_ELLIPSOIDS = 3000, MOST_RAYS = 3000, NEAR = 10, MANY = 3000;
 const STATION = ["X0", "Y0", "Z0"], POINT = ["X", "Y", "Z"];
 
 class NetworkView {
-  // `tell` gets the id of a station that is clicked.
+  // `tell` gets the id of a station that is clicked; `chosen(table, row, at, station)` whatever is
+  // at the place of a click, and the station whose rays were drawn before it.
   constructor(scene, { images, points, checks, observations }, tell) {
     Object.assign(this, scene, { images, points, observations, tell });
     this.canvas = document.getElementById("network-canvas");
@@ -19,6 +20,7 @@ class NetworkView {
     this.show = { ellipsoids: true, rays: observations.length / 2 < MOST_RAYS };
     this.corners = unpack(scene.pyramids, images.length * 15);
     this.station = null;
+    this.chosen = () => {};
     this.reset(VIEWS.oblique);
     this.addTools(document.getElementById("network-tools"));
     followPointer(this.canvas, {
@@ -200,11 +202,12 @@ class NetworkView {
         if (distance < best.distance) best = { distance, table, row };
       }
     }
-    const { table, row } = best;
+    const { table, row } = best, before = this.station;
     this.station = table === this.images ? row : null;
     this.said.textContent = table === undefined ? "" : table.shown
       .map(name => `${table.columns[name].label} ${table.cell(name, row)}`).join(", ");
     if (this.station !== null) this.tell(table.cell("id", row));
+    this.chosen(table, row, at, before);
     this.draw();
   }
 

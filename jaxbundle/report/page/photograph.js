@@ -18,6 +18,8 @@ class PhotographView {
     addButton(place, "previous", () => this.step(-1));
     addButton(place, "next", () => this.step(1));
     this.select.addEventListener("change", () => this.draw());
+    this.chosen = () => {};
+    this.canvas.addEventListener("click", event => this.choosePoint(event));
     window.addEventListener("resize", () => this.draw());
   }
 
@@ -45,7 +47,8 @@ class PhotographView {
     const found = new Map();
     for (const row of this.rows[image]) {
       const k = ACROSS.includes(names[axis[row]]) ? 0 : 1;
-      const one = found.get(point[row]) ?? { at: [NaN, NaN], v: [0, 0], r: [], tau: 0 };
+      const one = found.get(point[row])
+        ?? { id: table.cell("point", row), at: [NaN, NaN], v: [0, 0], r: [], tau: 0 };
       one.at[k] = at[row];
       one.v[k] = v[row] || 0;
       one.r.push(r[row]);
@@ -70,11 +73,26 @@ class PhotographView {
     const longest = points.reduce((most, { v }) => Math.max(most, Math.hypot(...v)), 0);
     const factor = longest > 0 ? roundNumber((0.1 * Math.hypot(width, height)) / longest) : 1;
     for (const one of points) this.drawPoint(context, one, place, factor);
+    Object.assign(this, { place, placed: points });
     drawBar(context, 20, high - 20, (scale * factor) / frame.scale, `${frame.unit} (residuals)`);
     const large = points.filter(one => one.tau > LARGE).length;
     const rms = this.images.cell("rms", image);
     this.said.textContent = `Image ${this.images.cell("id", image)}: ${points.length} image points, `
       + `RMS v ${rms}, vectors drawn ${factor} times as large, ${large} with |${this.observations.columns.tau.label}| > ${LARGE}.`;
+  }
+
+  // `chosen(image, point)` gets the ids of the image point that is clicked.
+  choosePoint(event) {
+    const box = this.canvas.getBoundingClientRect();
+    const [x, y] = [event.clientX - box.left, event.clientY - box.top];
+    const away = this.placed.map(({ at }) => {
+      const [u, v] = this.place(...at);
+      return Math.hypot(u - x, v - y);
+    });
+    const nearest = away.indexOf(Math.min(...away));
+    if (away[nearest] < NEAR) {
+      this.chosen(this.images.cell("id", Number(this.select.value)), this.placed[nearest].id);
+    }
   }
 
   drawFrame(context, frame, place) {

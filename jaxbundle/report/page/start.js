@@ -27,9 +27,11 @@ function start() {
   const tables = Object.fromEntries(names.map(name => [name, readTable(name)]));
   const frames = readData("frames"), scene = readData("network-data");
   const photograph = frames && new PhotographView(frames, tables);
-  if (scene !== null) new NetworkView(scene, tables, id => photograph.choose(id)).draw();
+  const network = scene && new NetworkView(scene, tables, id => photograph.choose(id));
+  network?.draw();
   photograph?.draw();
   fillTables(tables);
+  return { tables, network, photograph };
 }
 
-start();
+const shown = start();

@@ -1,0 +1,286 @@
+"""A camera to explore: what its parameters do to the image, by its own projection function.
+
+The grid: rays that the camera as given would image at even distances if it had no distortion (grey,
+straight lines), and where the parameters on the sliders image the same rays. The curve: radial
+distortion, measured − ideal, beside that of the camera as given. A photograph is freed of the
+distortion by looking up, for every pixel of a perspective image of the same principal distance,
+where its ray is imaged.
+"""
+
+import base64
+import dataclasses
+from collections.abc import Mapping
+from functools import cached_property, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from jaxbundle.cameras import check_parameters, default_parameters, get_model, project
+from jaxbundle.cameras.convert import image_area
+from jaxbundle.cameras.convert_fit import images_of
+from jaxbundle.cameras.field_of_view import field_of_view_of_rays
+from jaxbundle.cameras.pixel_frame import pixel_frame
+from jaxbundle.errors import InputError
+from jaxbundle.explore.page import Number, draw_controls, draw_tools, make_page, place
+from jaxbundle.explore.view import File, Given, check_keys, number
+from jaxbundle.io.networks.project import cameras_text
+from jaxbundle.network.tables import Camera
+from jaxbundle.photographs.opencv import need_opencv
+from jaxbundle.plotting.distortion import distortion_at
+from jaxbundle.plotting.style import micrometres
+from jaxbundle.report.equations import equations
+from jaxbundle.report.layout import clean, significant
+from jaxbundle.report.page import UNKNOWN, Origin, Page, Section, describe_origin
+from jaxbundle.report.page.charts import Curve, draw_curves, draw_plan
+from jaxbundle.report.page.markup import figure, grid, items, paragraph
+
+LINES = 13, 9
+"""Of the grid, across and down."""
+RADII = 61
+STEPS = 6
+"""Rows of the table of distortion."""
+SLIDER = 0.04
+"""A slider moves the image point near a corner by this part of the half diagonal at most."""
+WIDEST = 1000
+"""Pixels across of a photograph on the page."""
+JPEG_QUALITY = 85
+
+
+class CameraView:
+    """A camera with the size of its image.
+
+    **Arguments:** `sigma`: of its free parameters, where it comes from a calibration; `photograph`:
+    red, green, blue, of the camera's image size.
+
+    **Raises:** `InputError` without the size of the image, of a model in mm that of a pixel.
+    """
+
+    def __init__(
+        self, camera: Camera, sigma: Mapping[str, float] | None = None,
+        photograph: UInt8[np.ndarray, "rows columns 3"] | None = None, origin: Origin = UNKNOWN,
+    ):  # fmt: skip
+        self.camera, self.sigma, self.origin = camera, dict(sigma or {}), origin
+        self.model, self.photograph = get_model(camera.model), photograph
+        self.values = {
+            **dict.fromkeys(self.model.parameters, 0.0), **default_parameters(self.model),
+            **{name: float(value) for name, value in camera.parameters.items()},
+        }  # fmt: skip
+        if camera.image_size is None:
+            raise InputError(f"camera {camera.id!r} has no image_size; see --image-size")
+        self.size = camera.image_size
+        if photograph is not None and photograph.shape[1::-1] != tuple(self.size):
+            columns, rows = photograph.shape[1::-1]
+            raise InputError(f"the photograph has {columns} × {rows} pixels, camera {camera.id!r} "
+                             f"{self.size[0]} × {self.size[1]}")  # fmt: skip
+        try:
+            self.low, self.high = image_area(self.model, camera.image_size, camera.pixel_size)
+            self.origin_of_pixels, self.step = pixel_frame(
+                self.model, camera.image_size, camera.pixel_size
+            )
+        except ValueError as error:
+            raise InputError(f"camera {camera.id!r}: {error}; see --pixel-size") from None
+
+    # --- values -----------------------------------------------------------------------------
+
+    def parameters(self, given: Given) -> dict[str, float]:
+        """All parameters by name, those of the camera where the page sends none.
+
+        **Raises:** `InputError`."""
+        check_keys(given, self.values)
+        found = {name: number(given, name, value) for name, value in self.values.items()}
+        try:
+            check_parameters(self.model, found)
+        except ValueError as error:
+            raise InputError(str(error)) from None
+        return found
+
+    @property
+    def reach(self) -> float:
+        """Half the diagonal of the image, in the unit of the model."""
+        return float(np.hypot(*(self.high - self.low)) / 2)
+
+    @cached_property
+    def _controls(self) -> list[Number]:
+        """A slider for every parameter, as long as it takes to move a corner visibly."""
+        at = (self.low + self.high) / 2 + np.array([0.7, 0.6]) * (self.high - self.low) / 2
+        slopes = np.hypot(*np.asarray(_slopes(self.model, jnp.array([*self.values.values()]), at)))
+        controls = []
+        for name, slope in zip(self.values, slopes):
+            value, ranges = self.values[name], dict(self.model.ranges)
+            length = SLIDER * self.reach / slope if slope > 0 and np.isfinite(slope) else 1.0
+            low, high = value - length, value + length
+            if name in self.model.principal_distance:
+                low = max(low, 0.1 * value)
+            if name in ranges:
+                low, high = max(low, ranges[name][0]), min(high, ranges[name][1])
+            note = f"σ {significant(self.sigma[name])}" if name in self.sigma else ""
+            controls.append(Number(name, name, value, note, float(low), float(high)))
+        return controls
+
+    # --- what the server asks ---------------------------------------------------------------
+
+    def answer(self, given: Given) -> dict[str, Any]:
+        """`parts`; `radius`, `radial`, `decentring`: the curves; `grid` [lines, points, 2], and how
+        far the image moves: `rms`, `largest`."""
+        values = self.parameters(given)
+        radius, now, before = self._curves(values)
+        straight, lattice = self._grids(values)
+        moved = lattice - self._grids(self.values)[1]
+        length = np.hypot(moved[..., 0], moved[..., 1])
+        there = np.isfinite(length)
+        rms = float(np.sqrt(np.mean(length[there] ** 2))) if there.any() else float("nan")
+        largest = float(length[there].max()) if there.any() else float("nan")
+        parts = {
+            "curve": self._draw_curve(radius, now, before),
+            "grid": self._draw_grid(straight, lattice, rms, largest),
+            "numbers": self._list(values, radius, now, before),
+        }
+        if self.photograph is not None:
+            parts["photo"] = self._draw_photograph(self.photograph, values)
+        return {
+            "parts": parts, "radius": radius.tolist(), "radial": now[0].tolist(),
+            "decentring": now[1].tolist(), "grid": lattice.tolist(), "rms": rms,
+            "largest": largest,
+        }  # fmt: skip
+
+    def export(self, name: str, given: Given) -> File:
+        """`camera.toml`: the camera with these parameters.
+
+        **Raises:** `InputError`."""
+        if name != "camera.toml":
+            raise InputError(f"there is no file {name!r}; camera.toml is one")
+        camera = dataclasses.replace(self.camera, parameters=self.parameters(given))
+        return File(name, "application/toml", cameras_text([camera]).encode())
+
+    def page(self, given: Given, live: bool) -> Page:
+        """Sliders, curve, grid and photograph."""
+        values = self.parameters(given)
+        controls = [c._replace(value=values[c.key]) for c in self._controls]
+        sections = [
+            Section("parameters", "Parameters", "".join([
+                paragraph(f"Camera {clean(self.camera.id)}, model {self.model.name}, "
+                          f"{self.size[0]} × {self.size[1]} pixels."),
+                items(equations(self.model)), draw_controls(controls, live),
+                draw_tools(live, {"Camera file": "camera.toml"}), place("numbers"),
+            ])),
+            Section("distortion", "Distortion", place("curve"), "Distortion"),
+            Section("grid-section", "Grid", place("grid"), "Grid"),
+        ]  # fmt: skip
+        if self.photograph is not None:
+            sections.append(Section("photo-section", "Undistorted photograph", place("photo"),
+                                    "Photograph"))  # fmt: skip
+        title = f"camera {clean(self.camera.id)}: explorer"
+        chosen = describe_origin([("model", self.model.name)], self.origin)
+        return make_page(title, sections, chosen, live, "camera", self.answer(given),
+                         given=values)  # fmt: skip
+
+    # --- drawings ---------------------------------------------------------------------------
+
+    def _curves(self, values):
+        """Radius, and radial distortion and decentring [2, radii] of these values and as given."""
+        radius = np.linspace(0, self.reach, RADII)
+        of = lambda p: distortion_at(self.model, np.array([*p.values()]), radius)[0]
+        return radius, of(values), of(self.values)
+
+    def _grids(self, values) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
+        """Where a camera as given without distortion images even rays, and where these values do;
+        [rows, columns, 2], NaN where there is no image."""
+        axes = [np.linspace(a, b, n) for a, b, n in zip(self.low, self.high, LINES)]
+        xy = np.stack(np.meshgrid(*axes), -1)
+        rays = _plain_rays(self.model, self.values, xy)
+        found = images_of(self.model, values, rays.reshape(-1, 3))
+        return xy, found.reshape(xy.shape)
+
+    def _draw_curve(self, radius, now, before) -> str:
+        scale, unit = micrometres(self.model.unit)
+        curves = [Curve("as given", radius, scale * before[0], None, "second"),
+                  Curve("symmetric radial", radius, scale * now[0])]  # fmt: skip
+        return figure(
+            draw_curves(curves, f"distance from the principal point [{self.model.unit}]",
+                        f"measured − ideal [{unit}]"),
+            "Symmetric radial distortion, to the half diagonal of the image",
+        )  # fmt: skip
+
+    def _draw_grid(self, straight, lattice, rms: float, largest: float) -> str:
+        scale, unit = micrometres(self.model.unit)
+        lines = []
+        for places, label, kind in ((straight, "without distortion, as given", "given"),
+                                    (lattice, "with these parameters", "first")):  # fmt: skip
+            for part in (places, places.swapaxes(0, 1)):
+                lines += [Curve(label, line[:, 0], line[:, 1], None, kind) for line in part]
+        unit_of_axes = self.model.unit
+        drawing = draw_plan(lines, f"x [{unit_of_axes}]", f"y [{unit_of_axes}]",
+                            down=self.model.axes == "down")  # fmt: skip
+        return figure(
+            drawing, f"Against the camera as given the image moves by RMS "
+            f"{significant(scale * rms)} {unit}, at most {significant(scale * largest)} {unit}",
+        )  # fmt: skip
+
+    def _list(self, values, radius, now, before) -> str:
+        rows = []
+        for name, value in values.items():
+            given, sigma = self.values[name], self.sigma.get(name, 0)
+            change = value - given
+            by_sigma = significant(change / sigma) if sigma > 0 else ""
+            rows.append((name, f"{given:.8g}", f"{value:.8g}", significant(change), by_sigma))
+        table = grid(("parameter", "as given", "now", "difference", "difference/σ"), rows)
+        view = field_of_view_of_rays(self.model, values, self.size, self.camera.pixel_size)
+        degrees = ", ".join(f"{np.degrees(angle):.3f}°" for angle in view)
+        scale, unit = micrometres(self.model.unit)
+        chosen = np.linspace(0, len(radius) - 1, STEPS + 1).astype(int)[1:]
+        rows = [
+            (f"{radius[k]:.4g}", *(significant(scale * x[k]) for x in (before[0], now[0], now[1])))
+            for k in chosen
+        ]
+        header = (f"radius [{self.model.unit}]", f"radial as given [{unit}]", f"radial [{unit}]",
+                  f"decentring [{unit}]")  # fmt: skip
+        return "".join([
+            table, paragraph(f"Field of view {degrees} (horizontal, vertical, diagonal)."),
+            grid(header, rows),
+        ])
+
+    def _draw_photograph(self, photograph: UInt8[np.ndarray, "r c 3"], values) -> str:
+        cv2 = need_opencv()
+        u, v = (x.astype(np.float32) for x in self._lookup(photograph.shape[:2], values))
+        picture = cv2.remap(photograph, u, v, cv2.INTER_LINEAR,
+                            borderMode=cv2.BORDER_CONSTANT, borderValue=(255, 255, 255))
+        options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+        _, coded = cv2.imencode(".jpg", picture[..., ::-1], options)
+        data = base64.b64encode(coded.tobytes()).decode("ascii")
+        return (f'<img alt="undistorted photograph" src="data:image/jpeg;base64,{data}">\n'
+                + paragraph("In perspective, with the principal distance and point on the "
+                            "sliders; white where the photograph does not reach.", "hint"))
+
+    def _lookup(self, shape: tuple[int, int], values):
+        """Columns and rows in a photograph of the pixels of its undistorted picture."""
+        rows, columns = shape
+        every = max(1.0, columns / WIDEST)
+        u, v = (np.arange(0, n - 1 + 1e-9, every) for n in (columns, rows))
+        pixels = np.stack(np.meshgrid(u, v), -1)
+        xy = (pixels - self.origin_of_pixels) / self.step
+        rays = _plain_rays(self.model, values, xy)
+        found = images_of(self.model, values, rays.reshape(-1, 3)).reshape(xy.shape)
+        found = self.origin_of_pixels + self.step * found
+        return tuple(np.nan_to_num(np.moveaxis(found, -1, 0), nan=-1e6))
+
+
+def _plain_rays(model, values: Mapping[str, float], xy) -> np.ndarray:
+    """Rays of a perspective camera of this principal distance and point, without distortion."""
+    c = [values[name] for name in model.principal_distance] or [1.0]
+    middle = [values[name] for name in model.principal_point] or [0.0, 0.0]
+    slope = (np.asarray(xy) - middle) / c
+    if model.axes == "down":
+        slope = slope * [1, -1]
+    return np.concatenate([slope, np.full((*slope.shape[:-1], 1), -1.0)], -1)
+
+
+@partial(jax.jit, static_argnums=0)
+def _slopes(model, p, xy):
+    """∂(x, y)/∂p of the ray that is imaged at xy."""
+    from jaxbundle.cameras import image_ray
+
+    ray = image_ray(model, tuple(p), *xy)
+    return jax.jacfwd(lambda p: jnp.stack(project(model, tuple(p), *ray)))(p)

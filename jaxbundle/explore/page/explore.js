@@ -1,0 +1,88 @@
+// Controls whose values go to the server, and what comes back, into its places.
+
+const explored = readData("explore");
+// `collect()` gives the values, `show` what else is done with an answer.
+const explorer = { collect: readControls, show: [], busy: false, waiting: false };
+
+function readControls() {
+  const fields = document.querySelectorAll("[data-key]");
+  return Object.fromEntries([...fields].map(field => [field.dataset.key, valueOf(field)]));
+}
+
+function valueOf(field) {
+  if (field.type === "checkbox") return field.checked;
+  if (field.type !== "number") return field.value;
+  return field.value === "" ? null : Number(field.value);
+}
+
+function say(words) {
+  const place = document.getElementById("explore-said");
+  if (place !== null) place.textContent = words;
+}
+
+function putAnswer(answer) {
+  for (const [id, html] of Object.entries(answer.parts ?? {})) {
+    document.getElementById(id).innerHTML = html;
+  }
+  for (const show of explorer.show) show(answer);
+}
+
+async function send(action, given) {
+  const response = await fetch(action, {
+    method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(given),
+  });
+  if (response.ok) return response;
+  const { error } = await response.json().catch(() => ({ error: response.statusText }));
+  throw new Error(error);
+}
+
+// One request at a time; of values that change meanwhile the last ones are asked for.
+async function ask() {
+  if (explorer.busy) {
+    explorer.waiting = true;
+    return;
+  }
+  explorer.busy = true;
+  say("computing …");
+  try {
+    putAnswer(await (await send("answer", explorer.collect())).json());
+    say("");
+  } catch (error) {
+    say(error.message === "Failed to fetch" ? "the program has ended" : error.message);
+  }
+  explorer.busy = false;
+  if (explorer.waiting) {
+    explorer.waiting = false;
+    ask();
+  }
+}
+
+async function takeAway(action, name) {
+  try {
+    const url = URL.createObjectURL(await (await send(action, explorer.collect())).blob());
+    make("a", { href: url, download: name }).click();
+    setTimeout(() => URL.revokeObjectURL(url), 10000);
+  } catch (error) {
+    say(error.message);
+  }
+}
+
+function connectControls() {
+  for (const field of document.querySelectorAll("[data-key]")) {
+    const slider = document.querySelector(`[data-slides="${CSS.escape(field.dataset.key)}"]`);
+    field.addEventListener("input", () => {
+      if (slider !== null) slider.value = field.value;
+      ask();
+    });
+    slider?.addEventListener("input", () => {
+      field.value = slider.value;
+      ask();
+    });
+  }
+  for (const button of document.querySelectorAll("[data-export]")) {
+    const name = button.dataset.export;
+    button.addEventListener("click", () => takeAway(`export/${name}`, name));
+  }
+  document.getElementById("explore-save")?.addEventListener("click", () =>
+    takeAway("save", `${explored.kind}.html`));
+}

@@ -1,0 +1,434 @@
+"""A line scanner to explore: interpolation, errors of attitude, corrections, and the ground.
+
+Two kinds of files. Of a *scanner file* the image as it was read is what changes are measured
+against, or a known truth. A *flight file* is simulated: what its instruments tell, sampled, noisy
+and interpolated by the chosen methods, is measured against the true trajectory; its rates and σ are
+controls too.
+
+Attitude errors are given as roll, pitch, yaw of the camera (R·exp([ε]×)) and put into the rows of
+the table, so that the exported flight file has them. Ground places are those of `locate`, the error
+map is `ground_errors`, σ → RMS and CE90 are `propagated` and, for a level camera, `closed_form`.
+"""
+
+import dataclasses
+import io
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.errors import InputError
+from jaxbundle.explore.page import (
+    Choice,
+    Control,
+    Number,
+    Switch,
+    draw_controls,
+    draw_tools,
+    make_page,
+    place,
+)
+from jaxbundle.explore.view import File, Given, check_keys, number, switch, word
+from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed, geodetic
+from jaxbundle.io.scanner.writing import write_scanner_image
+from jaxbundle.plotting import image_map
+from jaxbundle.plotting.files import png
+from jaxbundle.pushbroom.accuracy import (
+    circular_error,
+    closed_form,
+    east_north,
+    ground_errors,
+    propagated,
+)
+from jaxbundle.pushbroom.ancillary import attitude_table, position_table
+from jaxbundle.pushbroom.corrections import Corrections
+from jaxbundle.pushbroom.image import PushbroomImage, make_image, pose_at
+from jaxbundle.pushbroom.interpolation import METHODS, Table
+from jaxbundle.pushbroom.locate import locate_points
+from jaxbundle.pushbroom.noise import Noise, no_errors
+from jaxbundle.pushbroom.simulate import Flight, measured_image, true_image, with_errors_in_rows
+from jaxbundle.pushbroom.study import altitude_and_view
+from jaxbundle.pushbroom.surfaces import Ground, Height, Plane, Surface
+from jaxbundle.pushbroom.trajectory import Attitude, Trajectory
+from jaxbundle.report.layout import clean, significant
+from jaxbundle.report.page import UNKNOWN, Origin, Page, Section, describe_origin
+from jaxbundle.report.page.charts import Curve, draw_field, draw_plan
+from jaxbundle.report.page.markup import figure, grid, paragraph
+
+ANGLES = {"roll": 1, "pitch": 0, "yaw": 2}
+"""Where an angle stands in an attitude error: about right (pitch), forward (roll), up (yaw)."""
+PLACES = 7, 6
+"""Lines and pixels of the error map."""
+EDGE = 9
+"""Places along a side of the footprint."""
+LEVELS = (0.01, 0.1)
+"""σ of the attitude in the accuracy table, degrees."""
+FLIGHT_FILE, TABLE_FILE, PICTURE_FILE = "flight.zip", "accuracy.csv", "error_map.png"
+
+
+class Chosen(NamedTuple):
+    """An image with what was chosen, and the surface it is located on."""
+
+    image: PushbroomImage
+    surface: Surface
+
+
+class ScannerView:
+    """The image of a scanner file, or what a flight file simulates.
+
+    **Arguments:** `given` the image, or the flight; `earth`: the ellipsoid, None in a local frame;
+    `truth`: an image that is true, the given one if none is given.
+    """
+
+    def __init__(
+        self, name: str, given: PushbroomImage | Flight, earth: Ellipsoid | None,
+        truth: PushbroomImage | None = None, origin: Origin = UNKNOWN,
+    ):  # fmt: skip
+        self.name, self.earth, self.origin = name, earth, origin
+        self.flight = given if isinstance(given, Flight) else None
+        self.image = measured_image(given) if isinstance(given, Flight) else given
+        self.truth = truth if truth is not None else (
+            self.image if self.flight is None else true_image(self.flight)
+        )
+        self.known = truth is not None or self.flight is not None
+
+    # --- values -----------------------------------------------------------------------------
+
+    @cached_property
+    def controls(self) -> list[Control]:
+        """What can be chosen, as the file has it."""
+        position, attitude = self.image.trajectory.position, self.image.trajectory.attitude
+        quaternions = attitude.table.values.shape[1] == 4
+        ways = [m for m in METHODS if m != "hermite" or position.rates is not None]
+        turns = [m for m in METHODS if m != "hermite"] + ["slerp"] * quaternions
+        found: list[Control] = [
+            Choice("position_interpolation", "interpolation of the orbit", position.method, ways),
+            Choice("attitude_interpolation", "interpolation of the attitude",
+                   "slerp" if attitude.slerp else attitude.table.method, turns),
+        ]  # fmt: skip
+        found += [
+            Number(name, f"error of {name}", 0.0, "°", -0.2, 0.2) for name in ANGLES
+        ]
+        if self.flight is not None:
+            found += [
+                Number("position_rate", "samples of the orbit", self.flight.position_rate, "Hz"),
+                Number("attitude_rate", "samples of the attitude", self.flight.attitude_rate, "Hz"),
+                Number("attitude_white", "σ of every attitude row",
+                       _degrees(self.flight.noise.attitude_white), "°"),
+                Number("position_white", "σ of every position row",
+                       _one(self.flight.noise.position_white), "m"),
+            ]  # fmt: skip
+        if self.earth is not None:
+            found += [
+                Switch(name, name.replace("_", " "), on)
+                for name, on in zip(Corrections._fields, self.image.corrections)
+            ]
+        return [*found, Number("height", "height of the ground", 0.0, "m")]
+
+    def values(self, given: Given) -> dict[str, Any]:
+        """All values by key, those of the file where the page sends none.
+
+        **Raises:** `InputError`."""
+        check_keys(given, [control.key for control in self.controls])
+        found: dict[str, Any] = {}
+        for one in self.controls:
+            if isinstance(one, Number):
+                lowest = 0.0 if one.key.endswith("white") else -np.inf
+                found[one.key] = number(given, one.key, one.value, lowest)
+                if one.key.endswith("rate") and not 0 < found[one.key] <= 1000:
+                    raise InputError(f"{one.key} is {found[one.key]:g}; above 0, to 1000 Hz")
+            elif isinstance(one, Switch):
+                found[one.key] = switch({one.key: given.get(one.key, one.value)}, one.key)
+            else:
+                found[one.key] = word(given, one.key, one.value, one.words)
+        return found
+
+    def choose(self, values: Mapping[str, Any]) -> Chosen:
+        """The image with these values.
+
+        **Raises:** `InputError`."""
+        image = self.image
+        if self.flight is not None:
+            image = measured_image(self._flight_with(values))
+        trajectory = Trajectory(
+            _table_with(image.trajectory.position, values["position_interpolation"]),
+            _attitude_with(image.trajectory.attitude, values["attitude_interpolation"]),
+        )
+        corrections = Corrections(*(values.get(name, False) for name in Corrections._fields))
+        image = make_image(
+            trajectory, image.times, image.optics, image.lines, image.pixels, image.mounting,
+            corrections,
+        )  # fmt: skip
+        error = np.zeros(3)
+        for name, k in ANGLES.items():
+            error[k] = np.radians(values[name])
+        if error.any():
+            errors = no_errors(image)._replace(attitude_bias=jnp.asarray(error))
+            image = with_errors_in_rows(image, errors)
+        return Chosen(image, self._surface(values["height"]))
+
+    def _flight_with(self, values) -> Flight:
+        assert self.flight is not None
+        noise = self.flight.noise
+        for name, unit in (("attitude_white", np.pi / 180), ("position_white", 1.0)):
+            # A σ for every axis stays as the file has it until it is changed.
+            if values[name] != _control(self.controls, name).value:
+                noise = noise._replace(**{name: unit * values[name]})
+        names = ("position_interpolation", "attitude_interpolation", "position_rate",
+                 "attitude_rate")  # fmt: skip
+        return dataclasses.replace(self.flight, noise=noise, **{n: values[n] for n in names})
+
+    def _surface(self, height: float) -> Surface:
+        if self.earth is None:
+            return Plane(level=height)
+        if height == 0 or self.earth.a != self.earth.b:
+            return Ground(self.earth)
+        return Height(level=height, earth=self.earth)
+
+    # --- what the server asks ---------------------------------------------------------------
+
+    def answer(self, given: Given) -> dict[str, Any]:
+        """`parts`; `rms`, `ce90`, `largest` of the errors on the ground, metres; `errors` by place
+        [lines, pixels], `expected`: rows of the accuracy table."""
+        values = self.values(given)
+        chosen = self.choose(values)
+        errors = self._errors(chosen)
+        length = np.hypot(*errors.T)
+        if not np.isfinite(length).all():
+            raise InputError("not every place of the image has a point on the ground: look at "
+                             "attitude, mounting and height")  # fmt: skip
+        expected = self._expected(chosen)
+        rms, ce90 = np.sqrt(np.mean(length**2)), np.quantile(length, 0.9)
+        told = {"rms": float(rms), "ce90": float(ce90), "largest": float(length.max())}
+        field = length.reshape(PLACES)
+        return {
+            "parts": {
+                "ground": self._draw_ground(chosen),
+                "errors": self._draw_errors(field, told),
+                "accuracy": self._list(told, errors, expected),
+            },
+            **told, "errors": field.tolist(), "expected": expected,
+        }  # fmt: skip
+
+    def export(self, name: str, given: Given) -> File:
+        """The flight file with its tables (zip), the accuracy table (CSV), the error map (PNG).
+
+        **Raises:** `InputError`."""
+        values = self.values(given)
+        chosen = self.choose(values)
+        if name == FLIGHT_FILE:
+            return File(name, "application/zip", self._zip(chosen.image))
+        if name == TABLE_FILE:
+            return File(name, "text/csv", self._csv(chosen).encode())
+        if name == PICTURE_FILE:
+            return File(name, "image/png", self._picture(chosen))
+        raise InputError(f"there is no file {name!r}; {FLIGHT_FILE}, {TABLE_FILE} and "
+                         f"{PICTURE_FILE} are")  # fmt: skip
+
+    def page(self, given: Given, live: bool) -> Page:
+        """Controls, the ground, the error map, the table."""
+        values = self.values(given)
+        controls = [_with_value(control, values[control.key]) for control in self.controls]
+        image = self.image
+        if self.flight is not None:
+            against = "the true trajectory of the flight file"
+        else:
+            against = "the given truth" if self.known else "the image as its file has it"
+        exports = {"Flight file (zip)": FLIGHT_FILE, "Table (CSV)": TABLE_FILE,
+                   "Picture (PNG)": PICTURE_FILE}  # fmt: skip
+        sections = [
+            Section("choices", "Trajectory and attitude", "".join([
+                paragraph(f"{image.lines} lines of {image.pixels} pixels; errors are against "
+                          f"{against}."),
+                draw_controls(controls, live), draw_tools(live, exports),
+            ])),
+            Section("accuracy-section", "Accuracy", place("accuracy"), "Accuracy"),
+            Section("errors-section", "Error map", place("errors"), "Error map"),
+            Section("ground-section", "Ground track and footprint", place("ground"), "Ground"),
+        ]  # fmt: skip
+        title = f"{clean(self.name)}: explorer"
+        rows = [(key.replace("_", " "), value) for key, value in values.items()]
+        return make_page(title, sections, describe_origin(rows, self.origin), live, "scanner",
+                         self.answer(given), given=values)  # fmt: skip
+
+    # --- numbers ----------------------------------------------------------------------------
+
+    def _places(self) -> tuple[np.ndarray, np.ndarray]:
+        size = self.image.lines, self.image.pixels
+        lines, pixels = (np.linspace(0, n - 1, k) for n, k in zip(size, PLACES))
+        return np.repeat(lines, PLACES[1]), np.tile(pixels, PLACES[0])
+
+    def _errors(self, chosen: Chosen) -> Float[np.ndarray, "n 2"]:
+        return ground_errors(chosen.image, self.truth, chosen.surface, *self._places())
+
+    def _expected(self, chosen: Chosen) -> list[dict[str, float]]:
+        """RMS and CE90 of attitudes with given σ about every axis, one error an image."""
+        image, surface = chosen
+        altitude, view = altitude_and_view(image, surface)
+        rows = []
+        for level in LEVELS:
+            sigma = np.radians(level)
+            exact = propagated(image, surface, *self._places(), Noise(attitude_bias=sigma))
+            rms = closed_form(altitude, view, sigma, sigma, sigma)
+            rows.append({
+                "sigma": level, "rms": exact.overall, "ce90": exact.overall_ce90,
+                "closed_rms": rms, "closed_ce90": circular_error(np.eye(2) * rms**2 / 2),
+            })  # fmt: skip
+        return rows
+
+    def _map(self, X) -> np.ndarray:
+        """East and north [km] of points [3, n] from the middle of the image on the ground."""
+        surface = self._surface(0.0)
+        middle = np.array([(self.image.lines - 1) / 2]), np.array([(self.image.pixels - 1) / 2])
+        O = np.asarray(_locate(self.image, surface, *middle))[:, 0]
+        axes = np.asarray(east_north(surface, tuple(O)))
+        return 1e-3 * axes @ (np.asarray(X) - O[:, None])
+
+    def _draw_ground(self, chosen: Chosen) -> str:
+        image, surface = chosen
+        curves = []
+        for one, label, kind in ((self.truth, "footprint, reference", "second"),
+                                 (image, "footprint", "first")):  # fmt: skip
+            X = np.asarray(_locate(one, surface, *_outline(one)))
+            east, north = self._map(X)
+            curves.append(Curve(label, east, north, None, kind))
+        lines = np.linspace(0, image.lines - 1, 4 * EDGE)
+        P = np.asarray(_positions(image, jnp.asarray(lines))).T
+        if self.earth is not None and self.earth.a == self.earth.b:
+            longitude, latitude, _ = _geodetic(self.earth, tuple(P))
+            below = _earth_fixed(self.earth, (longitude, latitude, 0 * longitude))
+            east, north = self._map(np.stack(below))
+            curves.append(Curve("ground track, below the platform", east, north, None, "given"))
+        elif self.earth is None:
+            P = np.array(P)
+            P[2] = 0.0
+            east, north = self._map(P)
+            curves.append(Curve("track, from above", east, north, None, "given"))
+        return figure(draw_plan(curves, "east [km]", "north [km]"),
+                      "From the middle of the image; both axes at one scale")  # fmt: skip
+
+    def _draw_errors(self, field, told) -> str:
+        return figure(
+            draw_field(field, 3),
+            f"Error on the ground in metres over the image, line 0 at the top: RMS "
+            f"{significant(told['rms'])} m, CE90 {significant(told['ce90'])} m",
+        )
+
+    def _list(self, told, errors, expected) -> str:
+        east, north = np.sqrt(np.mean(errors**2, 0))
+        rows = [
+            ("RMS", told["rms"]), ("RMS east", east), ("RMS north", north),
+            ("CE90", told["ce90"]), ("largest", told["largest"]),
+        ]  # fmt: skip
+        first = grid(("error on the ground", "m"), [(n, significant(v, 4)) for n, v in rows])
+        header = ("σ of the attitude, each axis", "RMS [m]", "CE90 [m]", "RMS, level camera",
+                  "CE90, level camera")  # fmt: skip
+        names = ("rms", "ce90", "closed_rms", "closed_ce90")
+        table = [
+            (f"{row['sigma']:g}°", *(significant(row[name], 4) for name in names))
+            for row in expected
+        ]
+        return first + "<h3>Accuracy to expect of an error for the whole image</h3>\n" + grid(
+            header, table
+        )
+
+    # --- files ------------------------------------------------------------------------------
+
+    def _zip(self, image: PushbroomImage) -> bytes:
+        """`scanner.toml` with its tables."""
+        data = io.BytesIO()
+        with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(data, "w") as archive:
+            write_scanner_image(folder, "scanner", image, self.earth, prefix="", angle_unit="deg")
+            for path in sorted(Path(folder).iterdir()):
+                archive.write(path, path.name, zipfile.ZIP_DEFLATED)
+        return data.getvalue()
+
+    def _csv(self, chosen: Chosen) -> str:
+        lines, pixels = self._places()
+        errors = self._errors(chosen)
+        rows = ["line,pixel,east,north,error"]
+        rows += [
+            f"{line!r},{pixel!r},{e!r},{n!r},{float(np.hypot(e, n))!r}"
+            for line, pixel, (e, n) in zip(lines.tolist(), pixels.tolist(), errors.tolist())
+        ]
+        rows += ["", "sigma_degrees,rms,ce90,closed_rms,closed_ce90"]
+        rows += [",".join(repr(float(v)) for v in row.values()) for row in self._expected(chosen)]
+        return "\n".join(rows) + "\n"
+
+    def _picture(self, chosen: Chosen) -> bytes:
+        lines, pixels = (np.unique(v) for v in self._places())
+        length = np.hypot(*self._errors(chosen).T).reshape(PLACES)
+        told = f"RMS {np.sqrt(np.mean(length**2)):.3g} m"
+        try:
+            return png((7.5, 6), None, lambda ax: image_map(
+                lines, pixels, length, "Error on the ground", "m", told, ax
+            ))  # fmt: skip
+        except ImportError as error:
+            raise InputError(str(error)) from None
+
+
+def _table_with(table: Table, method: str) -> Table:
+    """Positions with another interpolation."""
+    if method == table.method:
+        return table
+    return position_table(
+        np.asarray(table.times), np.asarray(table.values),
+        None if table.rates is None else np.asarray(table.rates), method=method, order=table.order,
+        gap=table.gap if np.isfinite(table.gap) else None, extrapolate=table.extrapolate,
+    )  # fmt: skip
+
+
+def _attitude_with(attitude: Attitude, method: str) -> Attitude:
+    """Attitudes with another interpolation."""
+    table = attitude.table
+    if method == ("slerp" if attitude.slerp else table.method):
+        return attitude
+    return attitude_table(
+        np.asarray(table.times), np.asarray(table.values), method=method, order=table.order,
+        gap=table.gap if np.isfinite(table.gap) else None, extrapolate=table.extrapolate,
+        reference=attitude.reference,
+    )  # fmt: skip
+
+
+def _outline(image: PushbroomImage) -> tuple[np.ndarray, np.ndarray]:
+    """Lines and pixels around the image, closed."""
+    s, zero, one = np.linspace(0, 1, EDGE), np.zeros(EDGE), np.ones(EDGE)
+    down = np.concatenate([zero, s, one, s[::-1]])
+    across = np.concatenate([s, one, s[::-1], zero])
+    return down * (image.lines - 1), across * (image.pixels - 1)
+
+
+def _with_value(control: Control, value) -> Control:
+    if isinstance(control, Number) and control.low is not None and control.high is not None:
+        low, high = min(control.low, value), max(control.high, value)
+        return control._replace(value=value, low=low, high=high)
+    return control._replace(value=value)
+
+
+def _control(controls: list[Control], key: str) -> Control:
+    return next(one for one in controls if one.key == key)
+
+
+def _one(sigma) -> float:
+    """A σ of three axes as one number, the largest."""
+    return float(np.max(sigma))
+
+
+def _degrees(sigma) -> float:
+    """As people write it: 0.01, not 0.010000000000000002."""
+    return float(f"{np.degrees(_one(sigma)):.12g}")
+
+
+_locate = jax.jit(locate_points)
+_geodetic = jax.jit(geodetic)
+_earth_fixed = jax.jit(earth_fixed)
+_positions = jax.jit(
+    lambda image, lines: jax.vmap(lambda line: pose_at(image, image.times.time(line)).P)(lines)
+)

@@ -1,0 +1,188 @@
+"""One page for one browser, from the loopback address.
+
+The address has a random token, without which nothing is answered: another user of the machine, or a
+page of another site that guesses the port, gets status 403. Bodies are JSON of limited size. What
+the view refuses comes back as `{"error": …}`, one line, with status 400; a fault of the program
+with status 500, and its line on the terminal.
+
+| request | answer |
+|---|---|
+| `GET /TOKEN/` | the page |
+| `POST /TOKEN/answer` | what follows from the values of the controls, JSON |
+| `POST /TOKEN/save` | the page with these values, as a copy to keep |
+| `POST /TOKEN/export/NAME` | a file of the view |
+"""
+
+import json
+import secrets
+import threading
+from collections.abc import Callable
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.explore.view import File, Given, View
+from jaxbundle.io.results.result_json import without_nan
+from jaxbundle.report.page import write
+
+HOST = "127.0.0.1"
+MOST_BYTES = 256 * 1024
+"""Of the body of a request."""
+MOST_READ = 16 * MOST_BYTES
+PATIENCE = 30.0
+"""Seconds a browser has to send what it has announced."""
+HTML, JSON = "text/html; charset=utf-8", "application/json"
+
+
+class Refused(Exception):
+    """A request that is not answered: its status, and why."""
+
+    def __init__(self, status: HTTPStatus, why: str):
+        super().__init__(why)
+        self.status = status
+
+
+class Server(ThreadingHTTPServer):
+    """Serves a view at `address`, until `shutdown`; one request is computed at a time.
+
+    **Arguments:** `port`: 0 for any that is free; `tell`: gets lines for the terminal.
+
+    **Raises:** `InputError` where the port is taken.
+    """
+
+    daemon_threads = True
+
+    def __init__(self, view: View, port: int = 0, tell: Callable[[str], object] = lambda _: None):
+        self.view, self.tell = view, tell
+        self.token = secrets.token_urlsafe(24)
+        self.computing = threading.Lock()
+        try:
+            super().__init__((HOST, port), Handler)
+        except (OSError, OverflowError) as error:
+            why = getattr(error, "strerror", None) or error
+            raise InputError(f"port {port} of {HOST} cannot be used: {why}") from None
+
+    @property
+    def address(self) -> str:
+        """Where the page is."""
+        return f"http://{HOST}:{self.server_port}/{self.token}/"
+
+    def handle_error(self, request, client_address) -> None:
+        """A browser that has gone is no matter for the terminal."""
+
+
+class Handler(BaseHTTPRequestHandler):
+    """One request."""
+
+    server: Server
+    server_version, sys_version = "jaxbundle", ""
+    timeout = PATIENCE
+
+    def do_GET(self) -> None:
+        """The page."""
+        self._respond(self._get, b"")
+
+    def do_POST(self) -> None:
+        """What follows from values, or a file made of them."""
+        length = self.headers.get("Content-Length", "")
+        known = length.isascii() and length.isdigit() and len(length) < 10
+        # Read before it is answered, or the browser would lose the answer; of too much enough to
+        # see that it is.
+        body = self.rfile.read(min(int(length), MOST_READ)) if known else None
+        self._respond(self._post, body)
+
+    def log_message(self, *_: Any) -> None:
+        """Requests are not listed on the terminal."""
+
+    def _respond(self, act: Callable[[str, bytes], File], body: bytes | None) -> None:
+        try:
+            action = self._action()
+            if body is None:
+                raise Refused(HTTPStatus.LENGTH_REQUIRED, "a body with its length is expected")
+            if len(body) > MOST_BYTES:
+                raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+                              f"a body of at most {MOST_BYTES} bytes is expected")  # fmt: skip
+            with self.server.computing:
+                file = act(action, body)
+            status = HTTPStatus.OK
+        except Refused as refused:
+            status, file = refused.status, _error(refused)
+        except (InputError, NotSolvedError) as error:
+            status, file = HTTPStatus.BAD_REQUEST, _error(error)
+        except Exception as error:
+            self.server.tell(f"a fault of the program: {type(error).__name__}: {_line(error)}")
+            status, file = HTTPStatus.INTERNAL_SERVER_ERROR, _error(error)
+        self.send_response(status)
+        self.send_header("Content-Type", file.type)
+        self.send_header("Content-Length", str(len(file.content)))
+        for name, value in (
+            ("Cache-Control", "no-store"), ("X-Content-Type-Options", "nosniff"),
+            ("Referrer-Policy", "no-referrer"),
+        ):  # fmt: skip
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(file.content)
+
+    def _action(self) -> str:
+        """What the address names after the token.
+
+        **Raises:** `Refused` without the token, and for another name of this machine: a site whose
+        name leads here must not speak with it."""
+        port = self.server.server_port
+        if self.headers.get("Host") not in (f"{HOST}:{port}", f"localhost:{port}"):
+            raise Refused(HTTPStatus.FORBIDDEN, f"this page is at {HOST} alone")
+        _, token, *rest = [*self.path.partition("?")[0].split("/"), ""]
+        if not secrets.compare_digest(token.encode(), self.server.token.encode()):
+            raise Refused(HTTPStatus.FORBIDDEN, "the address is not complete: take it from the "
+                          "terminal, with all its letters")  # fmt: skip
+        return "/".join(rest).rstrip("/")
+
+    def _get(self, action: str, _: bytes) -> File:
+        if action or not self.path.endswith("/"):
+            raise Refused(HTTPStatus.NOT_FOUND, "there is one page, at /TOKEN/")
+        return _page(self.server.view, {}, live=True)
+
+    def _post(self, action: str, body: bytes) -> File:
+        view, given = self.server.view, _parse(body)
+        if action == "answer":
+            return _json(view.answer(given))
+        if action == "save":
+            return _page(view, given, live=False)
+        room, _, name = action.partition("/")
+        if room == "export" and name:
+            return view.export(name, given)
+        raise Refused(HTTPStatus.NOT_FOUND, f"there is no {action:.100}")
+
+
+def _parse(body: bytes) -> Given:
+    """The values of a body, a JSON object."""
+    try:
+        given = json.loads(body, parse_constant=_no_number)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"the body is not JSON: {_line(error)}") from None
+    if not isinstance(given, dict):
+        raise InputError("the body must be an object of values by name")
+    return given
+
+
+def _page(view: View, given: Given, live: bool) -> File:
+    content = "".join(write(view.page(given, live)))
+    return File("page.html", HTML, content.encode("utf-8", "replace"))
+
+
+def _json(value: dict) -> File:
+    text = json.dumps(without_nan(value), allow_nan=False)
+    return File("answer.json", JSON, text.encode())
+
+
+def _error(error: Exception) -> File:
+    return _json({"error": _line(error)})
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())[:1000] or type(error).__name__
+
+
+def _no_number(word: str):
+    raise ValueError(f"{word} is no number of JSON")

@@ -1,0 +1,85 @@
+"""What the server asks of a thing that can be explored, and how its answers are checked."""
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple, Protocol
+
+from jaxbundle.errors import InputError
+from jaxbundle.network.columns import did_you_mean, shown
+from jaxbundle.report.page import Page
+
+Given = Mapping[str, Any]
+"""Values of the controls, by their keys."""
+
+
+class File(NamedTuple):
+    """A file to take away: its name, its media type, its content."""
+
+    name: str
+    type: str
+    content: bytes
+
+
+class View(Protocol):
+    """A thing that can be explored.
+
+    `given` are the values of the controls as the page sends them; every method refuses what it
+    cannot compute by `InputError` or `NotSolvedError`.
+    """
+
+    def page(self, given: Given, live: bool) -> Page:
+        """The page with these values; `live`: its controls ask the server, otherwise it is a copy
+        to keep."""
+        ...
+
+    def answer(self, given: Given) -> dict[str, Any]:
+        """What follows from these values: `parts`, HTML by the id of its place, and whatever else
+        the scripts of the view take."""
+        ...
+
+    def export(self, name: str, given: Given) -> File:
+        """The file of this name with these values."""
+        ...
+
+
+def number(given: Given, key: str, default: float, low: float = -math.inf) -> float:
+    """The number of a control; `default` where the page does not send it.
+
+    **Raises:** `InputError` for what is no finite number, or below `low`.
+    """
+    value = given.get(key, default)
+    fits = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    if not fits or value < low:
+        least = "" if low == -math.inf else f" of at least {low:g}"
+        raise InputError(f"{key} must be a finite number{least}, but is {shown(value)}")
+    return float(value)
+
+
+def switch(given: Given, key: str) -> bool:
+    """Whether a box is ticked.
+
+    **Raises:** `InputError`."""
+    value = given.get(key, False)
+    if not isinstance(value, bool):
+        raise InputError(f"{key} must be true or false, but is {shown(value)}")
+    return value
+
+
+def word(given: Given, key: str, default: str, words: Iterable[str]) -> str:
+    """One of some words.
+
+    **Raises:** `InputError`."""
+    value, words = given.get(key, default), tuple(words)
+    if value not in words:
+        raise InputError(f"{key} is {shown(value)}{did_you_mean(str(value), words)}")
+    return value
+
+
+def check_keys(given: Given, known: Iterable[str]) -> None:
+    """Refuse a value that no control has.
+
+    **Raises:** `InputError`."""
+    known = tuple(known)
+    for key in given:
+        if key not in known:
+            raise InputError(f"there is no value {shown(key)}{did_you_mean(str(key), known)}")

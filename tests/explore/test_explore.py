@@ -1,0 +1,521 @@
+"""The explorer: who may ask, and that what it answers is what the library computes."""
+
+import base64
+import dataclasses
+import http.client
+import io
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import zipfile
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from browser import CHROMIUM, Browser
+from numpy.testing import assert_allclose
+from page_reader import decode
+
+import jaxbundle
+from jaxbundle.cameras import get_model, project
+from jaxbundle.errors import InputError
+from jaxbundle.explore.camera import CameraView
+from jaxbundle.explore.network import NetworkView
+from jaxbundle.explore.page import Number, draw_controls, draw_tools, make_page, place
+from jaxbundle.explore.scanner import FLIGHT_FILE, PICTURE_FILE, TABLE_FILE, ScannerView
+from jaxbundle.explore.server import MOST_BYTES, Server
+from jaxbundle.explore.view import File, check_keys, number
+from jaxbundle.io.scanner.flight import read_flight
+from jaxbundle.io.scanner.read import read_scanner
+from jaxbundle.network.tables import Camera
+from jaxbundle.pushbroom.accuracy import ground_errors
+from jaxbundle.pushbroom.simulate import measured_image, true_image
+from jaxbundle.report.page import Section
+from jaxbundle.report.page.scene import describe_network
+from jaxbundle.statistics.expected import expected_precision
+
+ROOT = Path(__file__).parents[2]
+FLIGHT = """
+[scanner]
+name = "aircraft"
+lines = 60
+pixels = 40
+earth = "local"
+
+[times]
+period = 0.02
+
+[optics]
+c = 60.0
+pitch = 0.1
+
+[track]
+start = [300.0, 200.0, 800.0]
+velocity = [5.0, 60.0, 0.0]
+
+[angles]
+roll = [{ kind = "sine", amplitude = 1.0, period = 3.0 }, 0.5]
+
+[instruments]
+attitude_rate = 4.0
+attitude_interpolation = "linear"
+"""
+
+
+class Doubling:
+    """The least view: it doubles a number."""
+
+    def page(self, given, live):
+        x = number(given, "x", 1.0)
+        content = draw_controls([Number("x", "x", x, "", -5.0, 5.0)], live) + draw_tools(live)
+        sections = [Section("one", "Doubling", content + place("twice"))]
+        origin = Section("origin", "Origin", "", "Origin")
+        return make_page("doubling", sections, origin, live, "doubling", self.answer(given))
+
+    def answer(self, given):
+        check_keys(given, ["x"])
+        x = number(given, "x", 1.0)
+        if x == 13:
+            raise ZeroDivisionError("a\nfault")
+        return {"parts": {"twice": f"<p>{2 * x:g}</p>"}, "twice": 2 * x, "none": float("nan")}
+
+    def export(self, name, given):
+        if name != "x.txt":
+            raise InputError(f"there is no file {name!r}")
+        return File(name, "text/plain", str(given["x"]).encode())
+
+
+def serve(view, lines):
+    server = Server(view, tell=lines.append)
+    threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+    return server
+
+
+@pytest.fixture(scope="module")
+def doubling():
+    lines = []
+    server = serve(Doubling(), lines)
+    server.lines = lines
+    yield server
+    server.shutdown()
+    server.server_close()
+
+
+def ask(server, path, body=None, method=None, **headers):
+    """Status, body and headers of a request; `path` after the token if it does not begin by /."""
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=60)
+    path = path if path.startswith("/") else f"/{server.token}/{path}"
+    method = method or ("GET" if body is None else "POST")
+    if isinstance(body, dict):
+        body = json.dumps(body)
+    connection.request(method, path, body, headers)
+    found = connection.getresponse()
+    content = found.read()
+    connection.close()
+    return found.status, content.decode(errors="replace"), found.headers
+
+
+# --- the server -----------------------------------------------------------------------------
+
+
+def test_the_page_is_served_to_who_has_the_token(doubling):
+    assert doubling.server_address[0] == "127.0.0.1" and len(doubling.token) >= 32
+    status, page, headers = ask(doubling, "")
+    assert status == 200 and headers["Content-Type"].startswith("text/html")
+    assert "connect-src 'self'" in page and "default-src 'none'" in page
+    assert headers["Cache-Control"] == "no-store"
+    status, answer, _ = ask(doubling, "answer", {"x": 4})
+    assert status == 200
+    assert json.loads(answer) == {"parts": {"twice": "<p>8</p>"}, "twice": 8.0, "none": None}
+    assert ask(doubling, "export/x.txt", {"x": 4})[1] == "4"
+
+
+@pytest.mark.parametrize("path", ["/", "/answer", "/x/", "/TOKEN/", "/%C3%A9/"])
+def test_without_the_token_nothing_is_answered(doubling, path):
+    for body in (None, {"x": 1}):
+        status, said, _ = ask(doubling, path, body)
+        assert status == 403 and "doubling" not in said and doubling.token not in said
+    token = doubling.token
+    for wrong in (token[:-1], token.lower() if token != token.lower() else token.upper()):
+        assert ask(doubling, f"/{wrong}/")[0] == 403
+    # A site whose name leads to this machine is not spoken with.
+    assert ask(doubling, "", Host=f"evil.example:{doubling.server_port}")[0] == 403
+
+
+@pytest.mark.parametrize("path, body, status, words", [
+    ("other", None, 404, "one page"), ("other", {}, 404, "there is no other"),
+    ("export/", {}, 404, "there is no export"), ("export/y", {}, 400, "no file 'y'"),
+    ("answer", "{", 400, "not JSON"), ("answer", "[1]", 400, "object of values"),
+    ("answer", '{"x": NaN}', 400, "NaN is no number"), ("answer", "[" * 5000, 400, "not JSON"),
+    ("answer", b"\xff\xfe", 400, "not JSON"),
+    ("answer", {"x": "1"}, 400, "x must be a finite number"),
+    ("answer", {"x": True}, 400, "x must be a finite number"),
+    ("answer", {"z": 1}, 400, "no value 'z'"), ("answer", {"x": 13}, 500, "a fault"),
+    ("answer", " " * (MOST_BYTES + 1), 413, "at most"),
+])  # fmt: skip
+def test_what_cannot_be_answered_is_one_line_of_json(doubling, path, body, status, words):
+    found, said, headers = ask(doubling, path, body)
+    assert found == status and headers["Content-Type"] == "application/json"
+    (line,) = json.loads(said).values()
+    assert words in line and "\n" not in line and "Traceback" not in line
+
+
+def test_a_fault_is_told_on_the_terminal(doubling):
+    doubling.lines.clear()
+    ask(doubling, "answer", {"x": 13})
+    assert doubling.lines == ["a fault of the program: ZeroDivisionError: a fault"]
+    assert ask(doubling, "answer", {"x": 1})[0] == 200
+
+
+def test_a_saved_page_asks_nobody(doubling):
+    status, page, _ = ask(doubling, "save", {"x": 3})
+    assert status == 200 and "connect-src" not in page and doubling.token not in page
+    fields = re.findall(r"<(?:input|select)[^>]*>", page.partition("<script>")[0])
+    assert fields and all("disabled" in field for field in fields)
+    assert 'value="3.0"' in page and '"twice":6.0' in page
+
+
+def test_a_port_that_is_taken_is_refused(doubling):
+    with pytest.raises(InputError, match=f"port {doubling.server_port} of 127.0.0.1"):
+        Server(Doubling(), doubling.server_port)
+
+
+# --- networks -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def network(convergent4):
+    return NetworkView(convergent4)
+
+
+def moved_start(adjustment, id, centre):
+    row = adjustment.problem.network.images.id.index(id)
+    position = np.array(adjustment.values.position)
+    position[row] = centre - adjustment.problem.origin
+    return row, eqx.tree_at(lambda v: v.position, adjustment.values, jnp.asarray(position))
+
+
+def test_a_moved_station_has_the_sigma_of_the_design(network, convergent4):
+    """By `jaxbundle.precision`, and as an adjustment of measurements from there would have it."""
+    id = convergent4.problem.network.images.id[1]
+    pose = np.array([convergent4.images[name][1] for name in
+                     ("X0", "Y0", "Z0", "omega", "phi", "kappa")])  # fmt: skip
+    pose[:3] += [0.3, -0.2, 0.4]
+    found = network.answer({"moves": {id: pose.tolist()}, "aim": False})
+    assert_allclose(found["stations"][id]["values"], pose, rtol=1e-10)
+    _, start = moved_start(convergent4, id, pose[:3])
+    problem = convergent4.problem
+    data = dataclasses.replace(problem.data, start=start)
+    direct = jaxbundle.precision(problem, data, sigma0=convergent4.sigma0)
+    assert_allclose(found["sigma"]["after"]["points"], direct.points, rtol=1e-9)
+    assert_allclose(found["sigma"]["after"]["cameras"], direct.cameras, rtol=1e-9)
+    # Measurements without error of the moved network, adjusted: their a priori σ times σ0.
+    simulated = predicted_network(convergent4, start)
+    expected = expected_precision(simulated).points * convergent4.sigma0
+    assert_allclose(found["sigma"]["after"]["points"], expected, rtol=1e-6)
+    assert "as adjusted" in found["parts"]["moved"] and "%" in found["parts"]["moved"]
+
+
+def predicted_network(adjustment, values):
+    """The network at these values, with the image coordinates that follow from them."""
+    problem = adjustment.problem
+    network = problem.network
+    camera = network.cameras[0]
+    model, p = get_model(camera.model), tuple(np.asarray(values.camera)[0])
+
+    def of_ray(i, j):
+        M = jaxbundle.geometry.matrix_from_quaternion(values.rotation[i])
+        return jnp.stack(project(model, p, *(M @ (values.point[j] - values.position[i]))))
+
+    xy = np.asarray(jax.vmap(of_ray)(problem.image, problem.point))
+    angles = np.asarray(adjustment.image_values)[:, 3:]
+    parameters = dict(zip(model.parameters, map(float, p)))
+    return network.replace(
+        cameras=(dataclasses.replace(camera, parameters=parameters),),
+        images=dataclasses.replace(
+            network.images, position=np.asarray(values.position) + problem.origin, angles=angles
+        ),
+        points=dataclasses.replace(
+            network.points, position=np.asarray(values.point) + problem.origin
+        ),
+        observations=dataclasses.replace(network.observations, xy=xy),
+    )
+
+
+def test_before_a_move_sigma_are_those_of_the_adjustment(network, convergent4):
+    sigma = np.stack([convergent4.points[f"s{axis}"] for axis in "XYZ"], 1)
+    assert_allclose(network.before.points, sigma, rtol=2e-3)
+    assert network.answer({})["stations"] == {}
+
+
+def test_a_station_turns_to_its_points(network, convergent4):
+    """The middle of its points is imaged in the direction it was; not moved, nothing changes."""
+    id = convergent4.problem.network.images.id[0]
+    pose = [float(convergent4.images[name][0]) for name in
+            ("X0", "Y0", "Z0", "omega", "phi", "kappa")]  # fmt: skip
+    same = network.answer({"moves": {id: pose}, "aim": True})["stations"][id]
+    assert_allclose(same["values"], pose, atol=1e-9)
+    scene = describe_network(convergent4)
+    drawn = decode(scene["pyramids"], 15 * len(convergent4.images["id"]))[:15]
+    assert_allclose(same["pyramid"], drawn, rtol=1e-5, atol=1e-5)
+    pose[0] += 1.0
+    (move,) = network.moves({"moves": {id: pose}, "aim": True})
+    seen = convergent4.problem.point[convergent4.problem.image == 0]
+    middle = convergent4.point_values[seen].mean(0)
+    unit = lambda v: v / np.linalg.norm(v)
+    M = np.asarray(jaxbundle.geometry.matrix_from_quaternion(convergent4.values.rotation[0]))
+    before = unit(M @ (middle - convergent4.image_values[0, :3]))
+    assert_allclose(unit(move.M @ (middle - move.centre)), before, atol=1e-12)
+
+
+@pytest.mark.parametrize("given, words", [
+    ({"moves": [1]}, "values by station"), ({"moves": {"nowhere": [0] * 6}}, "no image 'nowhere'"),
+    ({"moves": {"ID": [0] * 5}}, "six numbers"), ({"moves": {"ID": [None] * 6}}, "six numbers"),
+    ({"moves": {}, "aim": 1}, "true or false"), ({"move": {}}, "no value 'move'"),
+])  # fmt: skip
+def test_moves_that_mean_nothing_are_refused(network, given, words):
+    text = json.dumps(given).replace("ID", network.ids[0])
+    with pytest.raises(InputError, match=words):
+        network.answer(json.loads(text))
+
+
+# --- cameras --------------------------------------------------------------------------------
+
+SIZE = (400, 300)
+CAMERA = Camera(
+    "cam", "opencv", {"fx": 380.0, "fy": 380.0, "cx": 201.0, "cy": 148.0, "k1": -0.2, "k2": 0.05},
+    free=("fx", "k1"), image_size=SIZE,
+)  # fmt: skip
+
+
+def test_the_grid_is_the_image_of_its_rays_by_the_model():
+    view = CameraView(CAMERA, {"k1": 0.001})
+    found = view.answer({"k1": -0.1, "cx": 205.0})
+    model = get_model("opencv")
+    values = view.values | {"k1": -0.1, "cx": 205.0}
+    x, y = np.meshgrid(np.linspace(-0.5, 399.5, 13), np.linspace(-0.5, 299.5, 9))
+    ray = (x - 201.0) / 380, -(y - 148.0) / 380, -np.ones_like(x)
+    # By hand: the radial distortion of OpenCV.
+    a, b = ray[0], -ray[1]
+    factor = 1 - 0.1 * (a**2 + b**2) + 0.05 * (a**2 + b**2) ** 2
+    by_hand = np.stack([205.0 + 380 * a * factor, 148.0 + 380 * b * factor], -1)
+    assert_allclose(found["grid"], by_hand, atol=1e-9)
+    by_model = np.stack(project(model, tuple(values.values()), *map(jnp.asarray, ray)), -1)
+    assert_allclose(found["grid"], by_model, atol=1e-9)
+    given = view.answer({})
+    assert given["rms"] == 0 and found["largest"] > found["rms"] > 1
+    assert "difference/σ" in found["parts"]["numbers"] and ">100<" in found["parts"]["numbers"]
+
+
+def test_the_camera_file_has_the_values_of_the_sliders(tmp_path):
+    file = CameraView(CAMERA).export("camera.toml", {"k1": -0.1})
+    (tmp_path / file.name).write_bytes(file.content)
+    from jaxbundle.io.cameras.camera_files import read_cameras
+
+    (camera,) = read_cameras(tmp_path / file.name)
+    assert camera.parameters["k1"] == -0.1 and camera.parameters["fx"] == 380
+
+
+def test_a_photograph_is_freed_of_its_distortion():
+    """A ramp that is even over the ideal image, as the camera sees it, is even again."""
+    cv2 = pytest.importorskip("cv2")
+    model, view = get_model("opencv"), CameraView(CAMERA)
+    u, v = (jnp.asarray(x, float) for x in np.meshgrid(np.arange(400), np.arange(300)))
+    p = tuple(view.values.values())
+    a = np.asarray(jax.jit(model.to_ideal)(p, u, v)[0])
+    grey = np.clip(128 + 0.5 * a, 0, 255).astype(np.uint8)
+    view = CameraView(CAMERA, photograph=np.repeat(grey[..., None], 3, 2))
+    image = view.answer({})["parts"]["photo"]
+    data = re.search(r"base64,([^\"]+)", image)[1]
+    shown = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_GRAYSCALE)
+    expected = 128 + 0.5 * (np.arange(400) - 201)
+    inner = np.abs(shown[20:-20, 20:-20].astype(float) - expected[20:-20])
+    assert inner.mean() < 1 and inner.max() < 6
+    assert np.abs(grey[20:-20, 20:-20] - expected[20:-20]).max() > 6
+
+
+@pytest.mark.parametrize("given, words", [
+    ({"k9": 1.0}, "no value 'k9'"), ({"fx": -1.0}, "fx"), ({"k1": None}, "finite number"),
+])  # fmt: skip
+def test_parameters_that_are_none_are_refused(given, words):
+    with pytest.raises(InputError, match=words):
+        CameraView(CAMERA).answer(given)
+
+
+def test_a_camera_needs_the_size_of_its_image():
+    with pytest.raises(InputError, match="--image-size"):
+        CameraView(dataclasses.replace(CAMERA, image_size=None))
+    with pytest.raises(InputError, match="10 × 10 pixels"):
+        CameraView(CAMERA, photograph=np.zeros((10, 10, 3), np.uint8))
+
+
+# --- line scanners --------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    path = tmp_path_factory.mktemp("flight") / "flight.toml"
+    path.write_text(FLIGHT)
+    return read_flight(path)
+
+
+@pytest.fixture(scope="module")
+def scanner(flight):
+    return ScannerView("aircraft", flight.flight, flight.earth)
+
+
+def test_errors_on_the_ground_are_those_of_the_library(scanner, flight):
+    """Those of linear interpolation, which the spline does not leave; and of an error of roll, as
+    an offset of the attitude."""
+    truth, ground = scanner.truth, scanner._surface(0.0)
+    places = scanner._places()
+    found = scanner.answer({})
+    image = measured_image(flight.flight)
+    direct = ground_errors(image, true_image(flight.flight), ground, *places)
+    assert_allclose(np.ravel(found["errors"]), np.hypot(*direct.T), atol=1e-9)
+    splined = scanner.answer({"attitude_interpolation": "spline"})
+    assert splined["rms"] < 0.1 * found["rms"]
+    rolled = scanner.answer({"attitude_interpolation": "spline", "roll": 0.1})
+    offset = eqx.tree_at(lambda i: i.offsets.attitude, scanner.truth,
+                         jnp.array([0.0, np.radians(0.1), 0.0]))  # fmt: skip
+    direct = ground_errors(offset, truth, ground, *places)
+    assert_allclose(np.ravel(rolled["errors"]), np.hypot(*direct.T), atol=3e-3)
+    # 800 m high: an error of roll moves the ground across by h·ε at least
+    assert rolled["rms"] > 800 * np.radians(0.1)
+    assert "CE90" in found["parts"]["accuracy"] and "<svg" in found["parts"]["ground"]
+
+
+def test_the_flight_file_holds_what_was_chosen(scanner, tmp_path):
+    given = {"attitude_interpolation": "spline", "roll": 0.05, "yaw": -0.02}
+    file = scanner.export(FLIGHT_FILE, given)
+    zipfile.ZipFile(io.BytesIO(file.content)).extractall(tmp_path)
+    read = read_scanner(tmp_path / "scanner.toml")
+    chosen = scanner.choose(scanner.values(given))
+    errors = ground_errors(read.image, chosen.image, chosen.surface, *scanner._places())
+    assert np.abs(errors).max() < 1e-6
+    assert read.image.trajectory.attitude.table.method == "spline"
+    table = scanner.export(TABLE_FILE, given).content.decode()
+    errors = [float(line.split(",")[4]) for line in table.splitlines()[1:43]]
+    assert_allclose(errors, np.ravel(scanner.answer(given)["errors"]), rtol=1e-12)
+    if pytest.importorskip("matplotlib"):
+        assert scanner.export(PICTURE_FILE, given).content.startswith(b"\x89PNG")
+
+
+def test_an_image_that_was_read_is_its_own_reference(flight):
+    view = ScannerView("aircraft", measured_image(flight.flight), None)
+    assert view.answer({})["rms"] == 0
+    keys = {control.key for control in view.controls}
+    assert "attitude_rate" not in keys and "aberration" not in keys  # no Earth
+    assert view.answer({"pitch": 0.1})["rms"] > 800 * np.radians(0.1)
+
+
+@pytest.mark.parametrize("given, words", [
+    ({"attitude_interpolation": "splin"}, "did you mean 'spline'"),
+    ({"roll": "x"}, "roll must be a finite number"), ({"attitude_rate": 0}, "above 0"),
+    ({"attitude_white": -1}, "at least 0"), ({"aberration": True}, "no value 'aberration'"),
+    ({"roll": 89.9}, "ground"), ({"position_interpolation": "slerp"}, "position_interpolation"),
+])  # fmt: skip
+def test_a_choice_that_means_nothing_is_refused(scanner, given, words):
+    with pytest.raises(InputError, match=words):
+        scanner.answer(given)
+
+
+# --- the command ----------------------------------------------------------------------------
+
+
+def test_inputs_are_recognised(tmp_path):
+    from jaxbundle.cli.explore_given import recognise
+
+    examples = ROOT / "examples"
+    assert recognise(str(examples / "convergent4" / "project.toml")) == "network"
+    assert recognise(str(examples / "convergent4")) == "network"
+    assert recognise(f"{examples}/video_cameras/cameras.toml#1-indoor") == "camera"
+    assert recognise(str(examples / "line_scanner" / "flight.toml")) == "scanner"
+    for name, text, kind in (("isd.json", '{"name_model": "X"}', "scanner"),
+                             ("result.json", '{"cameras": {}}', "camera")):  # fmt: skip
+        (tmp_path / name).write_text(text)
+        assert recognise(str(tmp_path / name)) == kind
+    assert recognise(str(tmp_path)) == "camera"
+    # A folder of calibrate has a network beside its camera, as one of adjust.
+    (tmp_path / "project.toml").write_text((examples / "convergent4/project.toml").read_text())
+    for word, kind in (("calibrate", "camera"), ("adjust", "network")):
+        (tmp_path / ".jaxbundle").write_text(f'{{"command": "{word}"}}')
+        assert recognise(str(tmp_path)) == kind
+
+
+@pytest.mark.parametrize("arguments, words", [
+    (["nowhere"], "no such file"),
+    (["examples/convergent4/project.toml", "--truth", "x"], "--truth: is for a scanner"),
+    (["examples/line_scanner/flight.toml", "--set", "a=1"], "--set: is for a network"),
+    (["examples/convergent4/project.toml#cam"], "--image-size"),
+    (["examples/convergent4/project.toml", "--as", "scaner"], "did you mean 'scanner'"),
+])  # fmt: skip
+def test_mistakes_end_in_one_line(command, monkeypatch, arguments, words):
+    monkeypatch.chdir(ROOT)
+    told = command("explore", *arguments, "--no-browser")
+    assert told.status == 2 and words in told.err and told.err.count("\n") == 1
+
+
+def test_ctrl_c_ends_the_command():
+    program = subprocess.Popen(
+        [sys.executable, "-m", "jaxbundle", "explore", "--no-browser",
+         "examples/video_cameras/cameras.toml#1-indoor"],
+        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    address = program.stdout.readline().strip()
+    found = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/([\w-]+)/", address)
+    assert found, address
+    connection = http.client.HTTPConnection("127.0.0.1", int(found[1]), timeout=60)
+    connection.request("GET", f"/{found[2]}/")
+    assert b"1-indoor" in connection.getresponse().read()
+    connection.close()
+    program.send_signal(signal.SIGINT)
+    _, said = program.communicate(timeout=60)
+    assert program.returncode == 130 and "jaxbundle: interrupted" in said
+
+
+# --- in a browser ---------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium is missing")
+@pytest.mark.parametrize("kind", ["camera", "network", "scanner"])
+def test_in_a_browser_a_control_changes_the_numbers(kind, network, scanner, tmp_path):
+    view = {"camera": CameraView(CAMERA), "network": network, "scanner": scanner}[kind]
+    key, part, value = {
+        "camera": ("k1", "numbers", "-0.1"), "scanner": ("roll", "accuracy", "0.1"),
+        "network": (None, "moved", None),
+    }[kind]  # fmt: skip
+    server = serve(view, [])
+    try:
+        with Browser(tmp_path) as browser:
+            browser.open(server.address)
+            before = browser.value(f"document.getElementById('{part}').innerText")
+            assert before
+            if kind == "network":
+                browser.value("""(() => { const field = document.getElementById("move-Z0");
+                    field.value = Number(field.value) + 0.3;
+                    field.dispatchEvent(new Event("change")); })()""")
+            else:
+                browser.value(f"""(() => {{
+                    const slider = document.querySelector('[data-slides="{key}"]');
+                    slider.value = {value}; slider.dispatchEvent(new Event("input")); }})()""")
+            browser.until(f"document.getElementById('{part}').innerText !== {json.dumps(before)}")
+            browser.until("document.getElementById('explore-said').textContent === ''")
+            assert browser.value(f"document.getElementById('{part}').innerText") != before
+            assert browser.console == []
+            assert browser.requests and all(
+                url.startswith((server.address, "data:")) for url in browser.requests
+            )
+            if folder := os.environ.get("PICTURES"):
+                browser.take_picture(Path(folder) / f"{kind}.png")
+    finally:
+        server.shutdown()
+        server.server_close()
