@@ -12,6 +12,8 @@ import typer
 from typer.core import TyperCommand
 
 import jaxbundle
+from jaxbundle.cli.habits import Quiet as Quiet
+from jaxbundle.cli.habits import add_habits
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.system.configuration import leave
 
@@ -60,9 +62,16 @@ class Application(typer.Typer):
         )  # fmt: skip
 
     def command(self, name: str | None = None, *, example: str, **options: Any):
-        """As of typer. `example`: the arguments of a line that calls it, for its help."""
+        """As of typer, with --quiet and --verbose. `example`: the arguments of a line that calls
+        it, for its help."""
         kind = type("Command", (Command,), {"example": example})
-        return super().command(name, cls=kind, **options)
+        register = super().command(name, cls=kind, **options)
+
+        def add(function):
+            register(add_habits(function))
+            return function
+
+        return add
 
 
 def _list_commands(context: typer.Context) -> None:
@@ -89,7 +98,6 @@ Force = Annotated[
     bool, typer.Option("--force", help="replace files in the folder of --out of other origin")
 ]
 Html = Annotated[str, typer.Option(help="write the result as one page of HTML")]
-Quiet = Annotated[bool, typer.Option("--quiet", help="print nothing but errors")]
 
 
 def choice(words: Iterable[str], about: str = "", *names: str) -> Any:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from jaxbundle.cli.app import Quiet, app
+from jaxbundle.cli.app import app
 from jaxbundle.errors import InputError
 from jaxbundle.system.examples import EXAMPLES, write_example
 
@@ -14,7 +14,6 @@ from jaxbundle.system.examples import EXAMPLES, write_example
 def example(
     name: Annotated[str, typer.Argument(help=", ".join(EXAMPLES))] = "",
     folder: Annotated[Path | None, typer.Argument(help="new or empty folder")] = None,
-    quiet: Quiet = False,
 ) -> None:
     """Write an example into a folder; without a name, list the examples."""
     if not name:
@@ -24,6 +23,5 @@ def example(
     if folder is None:
         raise InputError(f"FOLDER is missing: jaxbundle example {name} {name}")
     write_example(name, folder)
-    if not quiet:
-        print(f"{folder}: {EXAMPLES[name].about}")
-        print(f"next: {EXAMPLES[name].command.replace('FOLDER', str(folder))}")
+    print(f"{folder}: {EXAMPLES[name].about}")
+    print(f"next: {EXAMPLES[name].command.replace('FOLDER', str(folder))}")

@@ -1,4 +1,6 @@
-"""What long work shows on a terminal; nothing in a pipe."""
+"""What long work shows on a terminal, nothing in a pipe; with --verbose lines on standard error."""
+
+import time
 
 from jax import monitoring
 from rich.console import Console
@@ -10,14 +12,43 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 
+from jaxbundle.cli.habits import verbose
+from jaxbundle.cli.verbose import Stages, say
+
+
+class _Staged(Progress):
+    """Bars, of which each is a stage, as is each new description; with --verbose their times are
+    said."""
+
+    stages: Stages | None = None
+
+    def add_task(self, description: str, *arguments, **options):
+        self._begin(description)
+        return super().add_task(description, *arguments, **options)
+
+    def update(self, task_id, *, description: str | None = None, **options) -> None:
+        self._begin(description)
+        super().update(task_id, description=description, **options)
+
+    def stop(self) -> None:
+        super().stop()
+        if self.stages is not None:
+            self.stages.end()
+
+    def _begin(self, description: str | None) -> None:
+        if self.stages is not None and description is not None:
+            self.stages.begin(description)
+
 
 def counting(quiet: bool) -> Progress:
     """A bar with the number done of the number there is."""
     console = Console(stderr=True)
     columns = (*Progress.get_default_columns(), MofNCompleteColumn())
-    return Progress(
+    bar = _Staged(
         *columns, console=console, transient=True, disable=quiet or not console.is_terminal
     )
+    bar.stages = Stages() if verbose.get() else None
+    return bar
 
 
 BEGUN = "/jax/compilation_cache/compile_requests_use_cache"
@@ -27,13 +58,17 @@ has it."""
 
 
 class iterating:
-    """A line with the iteration and vᵀPv; as a context gives what adjustment tells, or None."""
+    """A line with the iteration and vᵀPv; as a context gives what adjustment tells, or None. With
+    --verbose a line for each iteration."""
 
     def __init__(self, silent: bool):
         self.console = Console(stderr=True)
-        self.silent = silent or not self.console.is_terminal
+        self.silent = silent or verbose.get() or not self.console.is_terminal
 
     def __enter__(self):
+        if verbose.get():
+            self.begun = time.perf_counter()
+            return self.tell_line
         if self.silent:
             return None
         self.bar = Progress(
@@ -51,6 +86,11 @@ class iterating:
         """Show the iteration."""
         self.line = f"iteration {int(step)}: vᵀPv {2 * float(cost):.6g}"
         self.bar.update(self.task, description=self.line)
+
+    def tell_line(self, step, cost, damping) -> None:
+        """Say the iteration, and how long it is since the beginning."""
+        say(f"iteration {int(step)}: vᵀPv {2 * float(cost):.8g}, λ {float(damping):.2g}, "
+            f"{time.perf_counter() - self.begun:.2f} s")
 
     def _hear(self, event: str, *_, **__) -> None:
         if event == BEGUN:

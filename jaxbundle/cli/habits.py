@@ -1,0 +1,70 @@
+"""What every command has: --quiet and --verbose, added to its function where it is registered."""
+
+import contextlib
+import functools
+import inspect
+import os
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
+from typing import Annotated
+
+import typer
+
+from jaxbundle.errors import InputError
+
+Quiet = Annotated[bool, typer.Option("--quiet", help="print nothing but errors")]
+Verbose = Annotated[
+    bool, typer.Option("--verbose", help="say versions, iterations, and how long stages take")
+]
+verbose: ContextVar[bool] = ContextVar("verbose", default=False)
+"""Whether the command that runs was called with --verbose."""
+
+
+def add_habits(function: Callable) -> Callable:
+    """The function of a command with the options `quiet` and `verbose`. A function that has no
+    `quiet` of its own is silenced as a whole; what goes to standard output by name (`--json -`)
+    goes there all the same."""
+    given = inspect.signature(function)
+    own = "quiet" in given.parameters
+    added = {"verbose": Verbose} if own else {"quiet": Quiet, "verbose": Verbose}
+
+    @functools.wraps(function)
+    def command(**values):
+        talk, quiet = values.pop("verbose"), values["quiet"] if own else values.pop("quiet")
+        if talk and quiet:
+            raise InputError("--quiet and --verbose: give one of them")
+        with _silent(values) if quiet and not own else _talking() if talk else _nothing():
+            return function(**values)
+
+    command.__annotations__ = {**function.__annotations__, **added}
+    parameters = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=kind)
+        for name, kind in added.items()
+    ]
+    whole = given.replace(parameters=[*given.parameters.values(), *parameters])
+    command.__dict__["__signature__"] = whole
+    return command
+
+
+_nothing = contextlib.nullcontext
+
+
+@contextlib.contextmanager
+def _silent(values: dict) -> Iterator[None]:
+    """Nothing is printed; errors come after it."""
+    named = any(str(values.get(name)) == "-" for name in ("json", "csv"))
+    with open(os.devnull, "w") as nowhere, contextlib.redirect_stderr(nowhere):
+        with _nothing() if named else contextlib.redirect_stdout(nowhere):
+            yield
+
+
+@contextlib.contextmanager
+def _talking() -> Iterator[None]:
+    from jaxbundle.cli.verbose import telling
+
+    token = verbose.set(True)
+    try:
+        with telling():
+            yield
+    finally:
+        verbose.reset(token)

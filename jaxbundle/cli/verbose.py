@@ -1,0 +1,69 @@
+"""What --verbose says on standard error: versions first, then stages and iterations with their
+times (`progress`), at the end the time of the whole and what was compiled."""
+
+import contextlib
+import sys
+import time
+from collections.abc import Iterator
+
+import jax
+from jax import monitoring
+
+from jaxbundle.report.page.origin import software_versions
+
+MADE = "/jax/core/compile/backend_compile_duration"
+FOUND = "/jax/compilation_cache/cache_hits"
+
+
+def say(words: str) -> None:
+    """A line."""
+    print(words, file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def telling() -> Iterator[None]:
+    """Versions, and at the end how long it took."""
+    say(", ".join(f"{name} {version}" for name, version in software_versions()))
+    made: list[float] = []
+    found: list[str] = []
+
+    def hear_time(event: str, duration_secs: float, **_: str | int) -> None:
+        if event == MADE:
+            made.append(duration_secs)
+
+    def hear(event: str, **_: str | int) -> None:
+        if event == FOUND:
+            found.append(event)
+
+    monitoring.register_event_duration_secs_listener(hear_time)
+    monitoring.register_event_listener(hear)
+    begun = time.perf_counter()
+    try:
+        yield
+    finally:
+        monitoring.unregister_event_duration_listener(hear_time)
+        monitoring.unregister_event_listener(hear)
+        devices = jax.devices()  # not before: it is the command that says how many there are
+        say(f"{time.perf_counter() - begun:.2f} s in all, on {len(devices)} devices of JAX "
+            f"({devices[0].platform}); {len(made)} programs made ready in {sum(made):.2f} s, "
+            f"{len(found)} of them kept from before")
+
+
+class Stages:
+    """Says how long each stage took; a stage ends when the next one begins."""
+
+    def __init__(self):
+        self.name, self.begun = "", 0.0
+
+    def begin(self, name: str) -> None:
+        """A stage begins, unless it is the one that goes on."""
+        if name == self.name:
+            return
+        self.end()
+        self.name, self.begun = name, time.perf_counter()
+
+    def end(self) -> None:
+        """The stage ends."""
+        if self.name:
+            say(f"{self.name}: {time.perf_counter() - self.begun:.2f} s")
+        self.name = ""
