@@ -133,7 +133,7 @@ def as_columns(table: Any, name: str) -> Columns:
             raise InputError(f"{name}: the columns differ in length: {lengths}")
         return Columns(columns, source)
     one = isinstance(table, np.ndarray) and not table.ndim
-    rows = list(table) if isinstance(table, Iterable) and not one else [table]
+    rows: list[Any] = list(table) if isinstance(table, Iterable) and not one else [table]
     if not all(isinstance(row, Mapping) for row in rows):
         raise InputError(
             f"{name}: expected a data frame of pandas, a dict of columns, or a list of dict rows, "
