@@ -23,8 +23,12 @@ if TYPE_CHECKING:
     from jaxbundle.batch.calibrate import BatchCalibration as BatchCalibration
     from jaxbundle.batch.calibrate import calibrate_batch as calibrate_batch
     from jaxbundle.bundle.adjust import adjust as adjust
+    from jaxbundle.bundle.influence import Influence as Influence
+    from jaxbundle.bundle.influence import influence as influence
     from jaxbundle.bundle.orient import orient as orient
     from jaxbundle.bundle.result import Adjustment as Adjustment
+    from jaxbundle.bundle.sensitivity import Budget as Budget
+    from jaxbundle.bundle.sensitivity import sensitivity as sensitivity
     from jaxbundle.calibration import Board as Board
     from jaxbundle.calibration import BoardViews as BoardViews
     from jaxbundle.calibration import Calibration as Calibration
@@ -92,6 +96,8 @@ _HOME = {
     "jaxbundle.orientation.network": ("Oriented",),
     "jaxbundle.bundle.orient": ("orient",),
     "jaxbundle.bundle.result": ("Adjustment",),
+    "jaxbundle.bundle.sensitivity": ("Budget", "sensitivity"),
+    "jaxbundle.bundle.influence": ("Influence", "influence"),
     "jaxbundle.statistics.precision": ("Precision", "precision"),
 }
 _MODULE = {name: module for module, names in _HOME.items() for name in names}

@@ -3,12 +3,15 @@
 σ are a posteriori, angles in the network's unit; the tables of one kind of thing are one function.
 """
 
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
+from jaxbundle.adjustment.problem import Problem
 from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.leastsquares.reliability import external_reliability, minimal_detectable
+from jaxbundle.network.declare import Rows
 from jaxbundle.network.further import OF_ANGLES
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.statistics.correlation import correlation_matrix, total_correlation
@@ -117,39 +120,40 @@ def residuals(adjustment) -> dict[str, np.ndarray]:
     """One row an observation: kind, image, point, axis, v, sigma (a priori), r, w (Baarda),
     tau (Pope), mdb, external, and weight (the factor) after robust estimation; image observations
     first, in the order they were given."""
-    problem, data, found = adjustment.problem, adjustment.problem.data, adjustment.reliability
-    network = problem.network
+    found = adjustment.reliability
+    parts = observations(adjustment.problem, found.residual, found.redundancy, found.w)
+    return concatenate([
+        residual_rows(adjustment, *of, v, weight, r, w) for *of, weight, v, r, w in parts
+    ])  # fmt: skip
+
+
+def observations(problem: Problem, *found: Rows) -> Iterator[tuple[Any, ...]]:
+    """Of every kind of observations: kind, ids of images and of points, axes, the weights [things,
+    axes], and of each of `found` its part of that shape."""
+    data, network, given = problem.data, problem.network, problem.layout.given
     images = np.array(network.images.id, dtype=object)
     points = np.array(network.points.id, dtype=object)
     cameras = np.array([c.id for c in network.cameras], dtype=object)
     blank = lambda rows: np.full(rows, "", dtype=object)
-    parts: list[tuple[Any, ...]] = [
-        ("image", images[problem.image], points[problem.point], ("x", "y"),
-         found.residual.image, data.image_weight, found.redundancy.image, found.w.image),
-    ]  # fmt: skip
-    control = points[problem.layout.given["control"]]
-    parts.append(("control", blank(len(control)), control, tuple("XYZ"),
-                  found.residual.control, data.control_weight, found.redundancy.control,
-                  found.w.control))  # fmt: skip
-    exterior = images[problem.layout.given["exterior"]]
-    parts.append(("prior", exterior, blank(len(exterior)), EXTERIOR,
-                  found.residual.exterior, data.exterior_weight, found.redundancy.exterior,
-                  found.w.exterior))  # fmt: skip
-    for row, c in enumerate(problem.layout.given["interior"]):
+    every = np.s_[:]
+
+    def of(field, at=every):
+        return data.weight(field)[at], *(getattr(rows, field)[at] for rows in found)
+
+    yield "image", images[problem.image], points[problem.point], ("x", "y"), *of("image")
+    control, exterior = points[given["control"]], images[given["exterior"]]
+    yield "control", blank(len(control)), control, tuple("XYZ"), *of("control")
+    yield "prior", exterior, blank(len(exterior)), EXTERIOR, *of("exterior")
+    for row, c in enumerate(given["interior"]):
         axes = get_model(network.cameras[c].model).parameters
         one = np.s_[row : row + 1, : len(axes)]
-        parts.append(("prior", cameras[[c]], blank(1), axes,
-                      found.residual.interior[one], data.interior_weight[one],
-                      found.redundancy.interior[one], found.w.interior[one]))  # fmt: skip
-    parts += _further(problem, found)
+        yield "prior", cameras[[c]], blank(1), axes, *of("interior", one)
+    yield from _further(problem, found)
     a, b = (points[network.distances.points[:, i]] for i in range(2))
-    parts.append(("distance", a, b, ("d",), found.residual.distance[:, None],
-                  data.distance_weight[:, None], found.redundancy.distance[:, None],
-                  found.w.distance[:, None]))  # fmt: skip
-    return concatenate([residual_rows(adjustment, *part) for part in parts])
+    yield "distance", a, b, ("d",), *of("distance", np.s_[:, None])
 
 
-def _further(problem, found):
+def _further(problem: Problem, found: Sequence[Rows]):
     """Observations of further kinds: what they touch stands where the point does."""
     first = len(problem.layout.sets)
     for k, given in enumerate(problem.system.observations[first:]):
@@ -159,8 +163,8 @@ def _further(problem, found):
         axes = given.kind.axes or tuple(str(i + 1) for i in range(weight.shape[1]))
         blank = np.full(given.number, "", dtype=object)
         yield (
-            given.kind.name, blank, np.array(touched, dtype=object), axes,
-            found.residual.other[k], weight, found.redundancy.other[k], found.w.other[k],
+            given.kind.name, blank, np.array(touched, dtype=object), axes, weight,
+            *(one.other[k] for one in found),
         )  # fmt: skip
 
 

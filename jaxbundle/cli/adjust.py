@@ -42,6 +42,14 @@ def adjust(
     components: Annotated[
         bool, typer.Option("--components", help="estimate variance components of the groups")
     ] = False,
+    budget: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=SIGMA",
+            help="what an error of this σ in something held, such as camera:cam:K3 or point:*:Z, "
+            "does to the results; may be repeated",
+        ),
+    ] = None,
     brief: Annotated[bool, typer.Option("--brief", help="no points and residuals in JSON")] = False,
     quiet: Quiet = False,
     plots: Annotated[bool, typer.Option(help="plots in the folder of --out")] = True,
@@ -61,6 +69,8 @@ def adjust(
 ) -> None:
     """Adjust a network and report it."""
     from jaxbundle import report
+    from jaxbundle.bundle.sensitivity import sensitivity
+    from jaxbundle.cli.budget_given import held_of
     from jaxbundle.cli.outputs import check_targets, trace_origin, why_not, write_targets
     from jaxbundle.cli.processes import check_sameness, join_processes
     from jaxbundle.cli.progress import iterating
@@ -79,19 +89,20 @@ def adjust(
         first = join_processes(join, quiet)
         check_sameness(
             of_input(input), control and of_input(control), set, format, max_iterations, method,
-            reduction, robust, snooping, significance, eliminate, components,
+            reduction, robust, snooping, significance, eliminate, components, budget,
         )  # fmt: skip
         if not first:
             json, out, html, quiet = "", None, "", True
     network = read_network(input, format, tuple(set or ()), control)
     check_test(snooping, significance, "--")
+    held = held_of(budget, network)
     check_targets(input, network, json, out, control, force, html)
     origin = UNKNOWN
     if html or out is not None:
         origin = trace_origin(input, network, control, {
             "--set": ", ".join(set or ()), "--max-iterations": max_iterations, "--robust": robust,
             "--snooping": snooping, "--significance": significance, "--eliminate": eliminate,
-            "--components": components,
+            "--components": components, "--budget": ", ".join(budget or ()),
         })  # fmt: skip
     try:
         with iterating(quiet or json == "-") as tell:
@@ -110,9 +121,10 @@ def adjust(
     except NotSolvedError as error:
         write_targets(error, json, out, brief, plots, force, html, origin)
         raise
-    write_targets(result, json, out, brief, plots, force, html, origin)
+    found = sensitivity(result, held) if held and result.converged else None
+    write_targets(result, json, out, brief, plots, force, html, origin, found)
     if json != "-" and not quiet and result.converged:
-        print(report.text(result))
+        print(report.text(result, budget=found))
         for doubt in result.doubts:
             print(f"warning: {doubt}")
     if not result.converged:

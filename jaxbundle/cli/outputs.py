@@ -15,11 +15,13 @@ from types import MappingProxyType
 from jaxbundle import report
 from jaxbundle.bundle.orientations import orientation_covariance
 from jaxbundle.bundle.result import Adjustment
+from jaxbundle.bundle.sensitivity import Budget
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io.networks.orientation_covariance import FILE as PRECISION
 from jaxbundle.io.networks.orientation_covariance import write_orientation_covariance
 from jaxbundle.io.networks.project import ADJUSTED, FILE_NAME, fill_project
 from jaxbundle.io.networks.project import FILES as NETWORK_FILES
+from jaxbundle.io.results.budget_json import budget_dict
 from jaxbundle.io.results.result_json import result_text, unsolved_text
 from jaxbundle.io.results.result_project import adjusted_network
 from jaxbundle.io.text.csv_tables import table_rows, write_bytes, write_csv, write_text
@@ -31,11 +33,14 @@ from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.plotting.files import FIGURES, draw_figures
 from jaxbundle.plotting.style import need_matplotlib
 from jaxbundle.report.page import UNKNOWN, Origin, compose, compose_failure, fingerprint_files
+from jaxbundle.report.page.budget import describe_budget
 
 REPORT, PAGE, RESULT = "report.txt", "report.html", "result.json"
 TABLES = ("cameras", "images", "points", "residuals", "checks", "far_points")
+BUDGET = "budget"
+"""The table of an error budget, and its entry in the JSON."""
 FILES = (
-    REPORT, PAGE, RESULT, *(f"{name}.csv" for name in TABLES),
+    REPORT, PAGE, RESULT, *(f"{name}.csv" for name in (*TABLES, BUDGET)),
     *(f"{ADJUSTED}/{name}" for name in NETWORK_FILES), f"{ADJUSTED}/{PRECISION}", *FIGURES,
 )  # fmt: skip
 """What is written into a folder, figures as patterns."""
@@ -86,7 +91,7 @@ def check_writable(
     inputs = tuple(inputs)
     if out is not None:
         check_folder(out, by, names, inputs, force)
-    _check_file("--json", json, out, inputs)
+    check_file("--json", json, out, inputs)
     if not force:
         check_json(json, OR_FORCE)
     if html and json and os.path.realpath(html) == os.path.realpath(json):
@@ -100,12 +105,12 @@ def check_page(
     """Refuse a page that cannot be written, or would replace an input or what is no page."""
     if html == "-":
         raise InputError("--html -: a page goes into a file; give the name of one")
-    _check_file("--html", html, out, inputs)
+    check_file("--html", html, out, inputs)
     if not force:
         _check_content("--html", html, HTML, "HTML", OR_FORCE)
 
 
-def _check_file(option: str, file: str, out: Path | None, inputs: Iterable[str | Path]) -> None:
+def check_file(option: str, file: str, out: Path | None, inputs: Iterable[str | Path]) -> None:
     """Refuse the file of an option that cannot be written, or would replace one of the inputs."""
     if file in ("", "-"):
         return
@@ -124,12 +129,12 @@ def _check_file(option: str, file: str, out: Path | None, inputs: Iterable[str |
         raise InputError(f"{path} is part of the input and would be overwritten; give another")
 
 
-def check_json(json: str, way: str = "") -> None:
+def check_json(json: str, way: str = "", option: str = "--json") -> None:
     """Refuse to replace by JSON a file that is not JSON, for it was not meant, unless it is empty.
 
     `way`: what else than to give another name the command offers, for the message.
     """
-    _check_content("--json", json, JSON, "JSON", way)
+    _check_content(option, json, JSON, "JSON", way)
 
 
 def _check_content(option: str, file: str, like: re.Pattern[bytes], noun: str, way: str) -> None:
@@ -200,41 +205,47 @@ def written(
 
 def write_targets(
     result: Adjustment | NotSolvedError, json: str, out: Path | None, brief: bool, plots: bool,
-    force: bool = False, html: str = "", origin: Origin = UNKNOWN,
+    force: bool = False, html: str = "", origin: Origin = UNKNOWN, budget: Budget | None = None,
 ) -> None:  # fmt: skip
-    """Write JSON (`-`: on standard output), page and folder of a result, or why there is none."""
+    """Write JSON (`-`: on standard output), page and folder of a result with its error `budget`, or
+    why there is none."""
     solved = isinstance(result, Adjustment)
+    also = NOTHING if budget is None else {BUDGET: budget_dict(budget)}
 
     def text(brief: bool) -> str | Iterable[str]:
         if isinstance(result, Adjustment):
-            return result_text(result, brief)
+            return result_text(result, brief, also)
         return unsolved_text(result)
 
     def page() -> Iterable[str]:
         if isinstance(result, Adjustment):
-            return compose(result, origin)
+            return compose(result, origin, also=describe_budget(budget))
         return compose_failure(result, origin)
 
     plots = plots and out is not None and solved and result.converged and can_plot()
     with written(json, text(brief), out, "adjust", FILES, force, html, page) as new:
         if new is not None:
             if isinstance(result, Adjustment):
-                fill_results(result, new, plots)
+                fill_results(result, new, plots, also=also, budget=budget)
             else:
                 write_text(new / REPORT, f"{result}\n")
                 write_text(new / RESULT, text(False))
 
 
 def fill_results(
-    result: Adjustment, folder: Path, plots: bool, note: str = "", also: Mapping = NOTHING
-) -> None:
+    result: Adjustment, folder: Path, plots: bool, note: str = "", also: Mapping = NOTHING,
+    budget: Budget | None = None,
+) -> None:  # fmt: skip
     """Write report, JSON, tables, the adjusted network and plots of a result into a folder.
 
-    `note`: text before the report; `also`: further entries of the JSON."""
-    write_text(folder / REPORT, note + report.text(result))
+    `note`: text before the report; `also`: further entries of the JSON; `budget`: of errors."""
+    write_text(folder / REPORT, note + report.text(result, budget=budget))
     write_text(folder / RESULT, result_text(result, False, also))
     if result.converged:
         _write_tables(result, folder)
+        if budget is not None:
+            columns = budget.table()
+            write_csv(folder / f"{BUDGET}.csv", list(columns), table_rows(columns))
         fill_project(adjusted_network(result), folder / ADJUSTED)
         if (found := orientation_covariance(result)) is not None:
             unit = ANGLE_UNITS[result.network.angle_unit]

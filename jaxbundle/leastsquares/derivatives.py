@@ -127,13 +127,13 @@ def attach_derivatives(
     values, _ = datum.move_to_datum(declared, plan, values, fixed.start)
     at = linearise(declared, plan, values, fixed, sensitivity == "exact")
     # Along what is open the gradient is rounding.
-    gradient = _gradient(zero_tangent(plan), at, fixed)
+    gradient = gradient_after(zero_tangent(plan), at, fixed)
     gradient = datum.s_transform_transposed(declared, plan, values, gradient)
     step = jax.tree.map(jnp.negative, elimination.solve(at.factor, gradient))
     if sensitivity == "gauss-newton":
         change = datum.s_transform(declared, plan, values, step)
         return at.moved(_propagated(change, at, data), data)
-    change = implicit_root(_gradient, _solve_structured, step, at, data)
+    change = implicit_root(gradient_after, _solve_structured, step, at, data)
     return datum.attach_motion(declared, plan, at.moved(change, data), data.start)
 
 
@@ -151,7 +151,7 @@ def linearise(
     return Linearised(declared, plan, values, data, elimination.factorise(normal), pins)
 
 
-def _gradient(change: Tangent, at: Linearised, data: Data) -> Tangent:
+def gradient_after(change: Tangent, at: Linearised, data: Data) -> Tangent:
     """g: that of ½vᵀPv, and of the penalty on the pins, after a change of the unknowns."""
 
     def penalised(change):

@@ -223,8 +223,13 @@ class Solution:
     def propagate(self, function: Callable[[Values], Array]) -> Float[np.ndarray, "n n"]:
         """The cofactors of any differentiable function (`Values` → [n]) of the unknowns; it is
         compiled, once for the same function."""
+        return self.propagate_rows(self.slopes(function))
+
+    def slopes(self, function: Callable[[Values], Array]) -> dict[str, Array]:
+        """The derivatives of a function of the unknowns by the changes of tables, [n, rows, width]
+        each."""
         still = {t.name: np.zeros((t.rows, t.space.width)) for t in self.problem.tables}
-        return self.propagate_rows(_rows_of(function, self.problem.declared, self.values, still))
+        return _rows_of(function, self.problem.declared, self.values, still)
 
     def propagate_rows(self, rows) -> Float[np.ndarray, "n n"]:
         """F·Q·Fᵀ of linear functions F of the changes of tables, [n, rows, width] each."""

@@ -9,6 +9,7 @@ report that says why and what to do, without any number of a solution.
 """
 
 from jaxbundle.report import head, observations, unknowns
+from jaxbundle.report.budget import budget_lines
 from jaxbundle.report.head import unit_weights as unit_weights
 from jaxbundle.report.summary import html as html
 from jaxbundle.report.summary import one_line as one_line
@@ -23,6 +24,7 @@ def text(
     test: str = "pope",
     max_rows: int = 200,
     accuracy_unit: float | None = None,
+    budget=None,
 ) -> str:
     """The whole protocol of an adjustment.
 
@@ -35,6 +37,7 @@ def text(
     - `max_rows`: at most so many images, points, check points and distances are listed.
     - `accuracy_unit`: points are counted by σ in classes of 0.1, 0.5, 1, 2 and 4 times this length
       (object unit); None: times the RMS of all σ of the points.
+    - `budget`: the error budget of the adjustment (`jaxbundle.sensitivity`), a section at the end.
 
     **Returns:** text that ends with a line feed.
     """
@@ -59,6 +62,7 @@ def text(
     lines += observations.components(adjustment)
     lines += observations.downweighted(adjustment, max_rows)
     lines += observations.removals(adjustment)
+    lines += [] if budget is None else budget_lines(budget)
     return _joined(lines)
 
 

@@ -89,7 +89,11 @@ class Inspection:
     def propagate(self, function: Callable[[Values], Array]) -> Float[np.ndarray, "n n"]:
         """The cofactors of any differentiable function (`Values` → [n]) of the unknowns; it is
         compiled, once for the same function (an `equinox.Partial`: of whatever arrays)."""
-        return self.solution.propagate(_OfTables(function, self.problem.layout.values))
+        return self.solution.propagate(self.of_tables(function))
+
+    def of_tables(self, function: Callable[[Values], Array]) -> Callable[[Tables], Array]:
+        """A function of a network's values as one of the engine's tables."""
+        return _OfTables(function, self.problem.layout.values)
 
     def _rows(self, by_set) -> Rows:
         return self.problem.layout.rows(by_set, self.problem.data)

@@ -84,7 +84,7 @@ def precision(
         return jnp.stack([value_of(problem, name, values) for name in wanted])
 
     found = engine_precision(
-        problem.system, problem.layout.data(_predicted(problem, data)), of if wanted else None
+        problem.system, problem.layout.data(predicted(problem, data)), of if wanted else None
     )
     of_points = problem.layout.coordinate_cofactors(data.start.point, found.own["point"])
     return Precision(
@@ -95,7 +95,7 @@ def precision(
     )
 
 
-def _predicted(problem: Problem, data: Data) -> Data:
+def predicted(problem: Problem, data: Data) -> Data:
     """The data with the image coordinates that the given values have."""
     space, values, xy = Pose(), data.start, data.image_xy
     poses = PoseValue(values.position, values.rotation)

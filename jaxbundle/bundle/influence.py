@@ -1,0 +1,129 @@
+"""The influence of every measurement on a result.
+
+One σ of a measurement l changes the result f by σ·∂f/∂l = −σ·λᵀ·∂g/∂l, H·λ = ∂f/∂y, exactly to
+first order (`leastsquares/response.py`): one solution for each result, whatever the number of
+measurements. To the order of the residuals these are the rows of N⁻¹JᵀP, and the squares of the
+influences, in the σ of the result, add up to 1: each is the share of a measurement.
+"""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.adjustment.problem import Problem
+from jaxbundle.bundle.result import Adjustment
+from jaxbundle.bundle.sensitivity import looked_at
+from jaxbundle.bundle.tables import observations
+from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.response import pull_back
+from jaxbundle.report.layout import significant, table
+from jaxbundle.statistics.results import CAMERAS, Asked, ask
+
+MOST_ROWS = 20
+"""Measurements that are printed, of every result."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Influence:
+    """How results follow the measurements.
+
+    **Fields:** `results`, with their names and words; `sigma` of them (a posteriori; of a design a
+    priori; angles in radians); `columns`: kind, image, point, axis of every measurement, as in the
+    table of residuals; `effects`: of one σ of every measurement, in the σ of each result;
+    `derivatives`: ∂(result)/∂(measurement).
+    """
+
+    results: tuple[Asked, ...]
+    sigma: Float[np.ndarray, " results"]
+    columns: dict[str, np.ndarray]
+    effects: Float[np.ndarray, "measurements results"]
+    derivatives: Float[np.ndarray, "measurements results"]
+
+    def table(self, result: str | None = None) -> dict[str, np.ndarray]:
+        """The measurements with their influence on one result, the first if none is named, the
+        largest first: kind, image, point, axis, effect, derivative.
+
+        **Raises:** `KeyError` for a result that was not asked for."""
+        names = [one.name for one in self.results]
+        if result is not None and result not in names:
+            raise KeyError(f"there is no result {result!r}; known: {', '.join(names)}")
+        r = 0 if result is None else names.index(result)
+        order = np.argsort(-np.abs(self.effects[:, r]), kind="stable")
+        values = {"effect": self.effects[:, r], "derivative": self.derivatives[:, r]}
+        return {name: column[order] for name, column in (self.columns | values).items()}
+
+    def __str__(self) -> str:
+        blocks = []
+        for result in self.results:
+            rows = list(zip(*(c[:MOST_ROWS] for c in self.table(result.name).values())))
+            text = [(*map(str, row[:4]), f"{row[4]:.4f}", significant(row[5])) for row in rows]
+            lines = table(("kind", "image", "point", "axis", "effect in σ", "derivative"), text,
+                          "llllrr")  # fmt: skip
+            blocks.append("\n".join([f"Influence on {result.words}", *lines]))
+        return "\n\n".join(blocks)
+
+    def to_pandas(self, result: str | None = None):
+        """`table` as a pandas data frame (extra `tables`)."""
+        try:
+            import pandas
+        except ImportError as error:
+            raise ImportError("data frames need pandas: pip install 'jaxbundle[tables]'") from error
+        return pandas.DataFrame(self.table(result))
+
+
+def influence(given: Adjustment | Problem, of: Any = CAMERAS) -> Influence:
+    """The influence of every measurement on each result.
+
+    **Arguments:**
+
+    - `given`: an `Adjustment`; or a `Problem`, a design.
+    - `of`: results by name, as of `jaxbundle.sensitivity`, `"cameras"`, or a function of `Values`.
+      One solution each: thousands of measurements cost no more than one.
+
+    **Returns:** an `Influence`.
+
+    **Raises:** `InputError` for a name that is not there, and for results that are a mean over
+    images or points; `NotSolvedError` without a solution.
+    """
+    inspection, sigma0, _ = looked_at(given)
+    results = ask(inspection, of)
+    if any(not _is_single(one) for one in results.asked):
+        raise InputError("influence: name single results, such as point:7:Z; a mean over all has "
+                         "no derivative")  # fmt: skip
+    found, problem = inspection.solution, inspection.problem
+    by_set = pull_back(found, found.slopes(inspection.of_tables(results.function)))
+    of_result = [
+        problem.layout.rows({o: x[r] for o, x in enumerate(by_set)}, problem.data)
+        for r in range(len(results.asked))
+    ]
+    parts = list(observations(problem, *of_result))
+    weight = np.concatenate([np.ravel(weight) for *_, weight in (part[:5] for part in parts)])
+    effects = np.stack([
+        np.concatenate([np.ravel(part[5 + r]) for part in parts])
+        for r in range(len(results.asked))
+    ], 1)  # fmt: skip
+    used = weight > 0
+    columns = {
+        name: np.concatenate([column(*part[:4]) for part in parts])[used]
+        for name, column in COLUMNS.items()
+    }
+    size = np.maximum(results.sigma, 1e-300)
+    return Influence(
+        results.asked, sigma0 * results.sigma, columns, (effects / size)[used],
+        (effects * weight[:, None])[used],
+    )  # fmt: skip
+
+
+def _is_single(one: Asked) -> bool:
+    return len(range(one.numbers.stop)[one.numbers]) == 1
+
+
+COLUMNS = {
+    "kind": lambda kind, image, point, axes: np.full(len(image) * len(axes), kind, object),
+    "image": lambda kind, image, point, axes: np.repeat(image, len(axes)),
+    "point": lambda kind, image, point, axes: np.repeat(point, len(axes)),
+    "axis": lambda kind, image, point, axes: np.tile(np.array(axes, object), len(image)),
+}
+"""What names a measurement."""

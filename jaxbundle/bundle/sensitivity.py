@@ -1,0 +1,167 @@
+"""A budget of errors: what is held fixed, and not known exactly, does to the results.
+
+An error of one σ in something held (a K3 fixed at 0, a lever arm, the flatness of a board, a fixed
+control point) moves the solution by dx = −H⁻¹·(∂g/∂θ)·σ, exactly to first order
+(`leastsquares/response.py`). Independent errors add in squares, to each other and to the σ of the
+result, which knows the measurements only:
+
+    total² = σ² + Σ effect²
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.adjustment.problem import Problem
+from jaxbundle.arguments import shown
+from jaxbundle.bundle.result import Adjustment
+from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.reduction import FACTORS
+from jaxbundle.leastsquares.response import follow
+from jaxbundle.network.units import ANGLE_UNITS
+from jaxbundle.report.budget import HEADER
+from jaxbundle.report.layout import significant, table
+from jaxbundle.statistics.held import Cause, find_causes
+from jaxbundle.statistics.inspection import Inspection
+from jaxbundle.statistics.precision import predicted
+from jaxbundle.statistics.results import WORDS, Asked, ask, effects_on
+
+MEASUREMENTS, TOTAL = "measurements", "total"
+
+
+@dataclasses.dataclass(frozen=True)
+class Budget:
+    """What errors of things held do to results.
+
+    **Fields:** `results` and `causes`, with their names and words; `sigma` of every result, from
+    the measurements (a posteriori; of a design a priori); `effects`: of an error of one σ of each
+    cause on each result, with its sign where cause and result are one number each; else the root of
+    the sum of squares over independent errors, the root mean square over images or points. Angles
+    in radians; `angle_scale`: to the unit of tables.
+    """
+
+    results: tuple[Asked, ...]
+    causes: tuple[Cause, ...]
+    sigma: Float[np.ndarray, " results"]
+    effects: Float[np.ndarray, "causes results"]
+    angle_scale: float = 1.0
+
+    @property
+    def total(self) -> Float[np.ndarray, " results"]:
+        """σ of every result with all causes."""
+        return np.sqrt(self.sigma**2 + (self.effects**2).sum(0))
+
+    @property
+    def shares(self) -> Float[np.ndarray, "causes+1 results"]:
+        """Of the measurements (first) and each cause, the part of the square of the total."""
+        squares = np.concatenate([self.sigma[None], self.effects]) ** 2
+        return squares / np.maximum(squares.sum(0), 1e-300)
+
+    def table(self) -> dict[str, np.ndarray]:
+        """A row for every result and cause, the measurements and the total among them: result,
+        cause, sigma (of the cause), effect, share (of the square of the total)."""
+        rows, shares, total = [], self.shares, self.total
+        for r, result in enumerate(self.results):
+            unit = self.angle_scale if result.angle else 1.0
+            rows.append((result.name, MEASUREMENTS, np.nan, self.sigma[r] * unit, shares[0, r]))
+            for c, cause in enumerate(self.causes):
+                own = np.nan if cause.sigma is None else cause.sigma
+                own *= self.angle_scale if cause.angle else 1.0
+                rows.append((result.name, cause.name, own, self.effects[c, r] * unit,
+                             shares[c + 1, r]))  # fmt: skip
+            rows.append((result.name, TOTAL, np.nan, total[r] * unit, 1.0))
+        names = ("result", "cause", "sigma", "effect", "share")
+        columns = dict(zip(names, zip(*rows)))
+        text = {"result", "cause"}
+        return {n: np.array(c, object if n in text else float) for n, c in columns.items()}
+
+    def rows(self) -> list[tuple[str, str, str, str, str]]:
+        """`table` as text to be read, under `report.budget.HEADER`."""
+        found, columns = [], self.table()
+        words = {MEASUREMENTS: "the measurements", TOTAL: "all together"}
+        words |= {cause.name: cause.words for cause in self.causes}
+        called, before = {result.name: result.words for result in self.results}, ""
+        for name, cause, sigma, effect, share in zip(*columns.values()):
+            first = called[name] if name != before else ""
+            before = name
+            part = "" if cause == TOTAL else f"{100 * share:.1f}"
+            given = "" if np.isnan(sigma) else f"{sigma:.4g}"
+            found.append((first, words[cause], given, significant(effect), part))
+        return found
+
+    def __str__(self) -> str:
+        return "\n".join(table(HEADER, self.rows(), "llrrr"))
+
+    def to_pandas(self):
+        """`table` as a pandas data frame (extra `tables`)."""
+        try:
+            import pandas
+        except ImportError as error:
+            raise ImportError("data frames need pandas: pip install 'jaxbundle[tables]'") from error
+        return pandas.DataFrame(self.table())
+
+
+def sensitivity(given: Adjustment | Problem, held: Mapping[Any, Any], of: Any = WORDS) -> Budget:
+    """What an error of stated σ in each thing that is held does to each result.
+
+    **Arguments:**
+
+    - `given`: an `Adjustment`; or a `Problem`, a design: its start values are taken as adjusted, σ
+      are a priori, and its image coordinates do not count.
+    - `held`: by name the σ of its error. A name is KIND:ID:NAME, such as `"camera:cam:K3"`,
+      `"image:12:X0"`, `"point:7:Z"`, `"lever arm:cam:az"`, or a tuple of the three; `*` for the id
+      or the name stands for all that are held, with independent errors. Or, by any name, names and
+      amounts of one error that they have in common: `{"bent board": {"point:1:Z": 0.2, …}}`.
+      Angles in radians.
+    - `of`: results, by name as in `held` or in words: `"cameras"` (all free parameters), `"images"`
+      and `"points"` (the root mean square over all that are not held); or a function of `Values`
+      with one number or several. All words if not given.
+
+    **Returns:** a `Budget`.
+
+    **Raises:** `InputError` for a name that is not there, for one of `held` that is estimated, and
+    a σ that is no positive number; `NotSolvedError` without a solution.
+    """
+    inspection, sigma0, unit = looked_at(given)
+    problem = inspection.problem
+    found = inspection.solution
+    causes = find_causes(problem, found.values, held)
+    results = ask(inspection, of)
+    errors = [change for cause in causes for change in cause.errors]
+    parts = [
+        effects_on(problem, results, found.values, tangents) for tangents in follow(found, errors)
+    ]
+    effects = np.concatenate(parts)
+    ends = np.cumsum([0, *(len(cause.errors) for cause in causes)])
+    by_cause = np.array([
+        [_together(asked.of(effects[a:b])) for asked in results.asked]
+        for a, b in zip(ends, ends[1:])
+    ])  # fmt: skip
+    return Budget(results.asked, tuple(causes), sigma0 * results.sigma, by_cause, unit)
+
+
+def _together(effects: Float[np.ndarray, " k"]) -> float:
+    """Of independent errors; one keeps its sign."""
+    return float(effects[0]) if len(effects) == 1 else float(np.sqrt((effects**2).sum()))
+
+
+def looked_at(given: Any) -> tuple[Inspection, float, float]:
+    """The inspection of an adjustment or a design, its σ0, and the factor from radians to its unit
+    of angles.
+
+    **Raises:** `InputError` for anything else; where no factor fits into memory."""
+    if isinstance(given, Problem):
+        given = given.with_factor()
+        if given.reduction not in FACTORS:
+            raise InputError("the network is too large for its covariance; take part of it")
+        given = given.with_data(predicted(given, given.data))
+        return Inspection(given, given.data.start), 1.0, 1 / ANGLE_UNITS[given.network.angle_unit]
+    if not isinstance(given, Adjustment):
+        raise InputError(
+            f"what jaxbundle.adjust or jaxbundle.make_problem gives is expected, not {shown(given)}"
+        )
+    return given.cofactors, given.sigma0, given.angle_scale
+

@@ -1,0 +1,34 @@
+"""What `jaxbundle adjust --budget` says."""
+
+from jaxbundle.arguments import positive
+from jaxbundle.errors import InputError
+from jaxbundle.network.further.base import ANGLES
+from jaxbundle.network.tables import Network
+from jaxbundle.network.units import ANGLE_UNITS
+from jaxbundle.statistics.held import split_name
+
+
+def held_of(given: list[str] | None, network: Network) -> dict[str, float]:
+    """σ by name, angles in radians.
+
+    **Raises:** `InputError`."""
+    found = {}
+    for text in given or ():
+        name, mark, sigma = text.rpartition("=")
+        if not mark:
+            raise InputError(
+                f"--budget {text!r}: NAME=SIGMA is expected, such as camera:cam:K3=1e-6"
+            )
+        try:
+            parameter = split_name(name)[2]
+        except InputError as error:
+            raise InputError(f"--budget {error}") from None
+        if name in found:
+            raise InputError(f"--budget {name}: is given twice")
+        try:
+            number = float(sigma)
+        except ValueError:
+            raise InputError(f"--budget {name}: {sigma!r} is no number") from None
+        unit = ANGLE_UNITS[network.angle_unit] if parameter in ANGLES else 1.0
+        found[name] = positive(f"--budget {name}", number) * unit
+    return found

@@ -1,0 +1,175 @@
+"""Results that are asked about, by name or as a whole: how they follow, and their σ."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.adjustment.problem import Problem
+from jaxbundle.adjustment.unknowns import angles_near, value_of
+from jaxbundle.arguments import shown
+from jaxbundle.cameras import get_model
+from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.names import Name
+from jaxbundle.network.arrays import Values
+from jaxbundle.network.tables import EXTERIOR
+from jaxbundle.statistics.held import split_name
+from jaxbundle.statistics.inspection import Inspection
+
+CAMERAS, IMAGES, POINTS = WORDS = ("cameras", "images", "points")
+"""All free parameters of cameras; the root mean square of X0, Y0, Z0, ω, φ, κ of all images, and of
+X, Y, Z of all points, that are not held."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Asked:
+    """A result: its `name`, in `words`; radians of an `angle`; the numbers of `function` whose root
+    mean square it is (a slice of one: that number itself)."""
+
+    name: str
+    words: str
+    angle: bool
+    numbers: slice
+
+    def of(self, effects: Float[np.ndarray, "k numbers"]) -> Float[np.ndarray, " k"]:
+        """The effect on it, of those on all numbers."""
+        own = effects[:, self.numbers]
+        return own[:, 0] if own.shape[1] == 1 else np.sqrt(np.mean(own**2, 1))
+
+
+@dataclasses.dataclass(frozen=True)
+class Results:
+    """What is asked, `function(values) -> [numbers]`, and the σ of each result for σ0 = 1."""
+
+    asked: tuple[Asked, ...]
+    function: Callable[[Values], jax.Array]
+    sigma: Float[np.ndarray, " results"]
+
+
+def ask(inspection: Inspection, of: Any = WORDS) -> Results:
+    """The results named: words, KIND:ID:NAME (a text or a tuple), or a function of `Values`.
+
+    **Raises:** `InputError` for a name that is not there, and where nothing is left."""
+    if callable(of):
+        return _of_function(inspection, of)
+    given = (of,) if isinstance(of, str) or _is_name(of) else of
+    if not isinstance(given, Sequence):
+        raise InputError(f"of: names of results are expected, not {shown(of)}")
+    parts, asked, sigmas, first = [], [], [], 0
+    words = given == WORDS
+    for one in given:
+        found = _part(inspection, one)
+        if found is None:
+            if words:
+                continue
+            raise InputError(f"of: {one} are all held")
+        function, names, size, sigma = found
+        for k, (name, text, angle) in enumerate(names):
+            at = slice(first + k, first + size, len(names))
+            asked.append(Asked(name, text, angle, at))
+        parts.append(function)
+        sigmas.append(sigma)
+        first += size
+    if not parts:
+        raise InputError("of: no result is asked for, or the network has no unknowns")
+    function = lambda values: jnp.concatenate([part(values) for part in parts])
+    return Results(tuple(asked), function, np.concatenate(sigmas))
+
+
+def _is_name(of) -> bool:
+    return isinstance(of, tuple) and len(of) == 3 and of[0] in ("camera", "image", "point")
+
+
+def _part(inspection: Inspection, one):
+    """A function of the values, the names of its results, how many numbers it has, σ for σ0 = 1."""
+    problem = inspection.problem
+    if one == CAMERAS:
+        return _of_cameras(inspection)
+    if one == IMAGES:
+        return _of_images(inspection)
+    if one == POINTS:
+        return _of_points(inspection)
+    name = Name(*split_name(one))
+    try:
+        value_of(problem, name, inspection.adjusted)
+    except KeyError as error:
+        raise InputError(f"of: {error.args[0]}") from None
+    function = lambda values: jnp.atleast_1d(value_of(problem, name, values))
+    sigma = np.sqrt(np.clip(np.diagonal(inspection.propagate(function)), 0, None))
+    angle = name.kind == "image" and name.parameter in EXTERIOR[3:]
+    return function, [(":".join(split_name(one)), str(name), angle)], 1, sigma
+
+
+def _of_cameras(inspection: Inspection):
+    problem, places, names, sigmas = inspection.problem, [], [], []
+    for c, camera in enumerate(problem.network.cameras):
+        parameters, free = problem.interior(c)
+        every = get_model(camera.model).parameters
+        Q = inspection.camera_cofactors[c]
+        for k in free:
+            places.append((c, every.index(parameters[k])))
+            name = Name("camera", camera.id, parameters[k])
+            names.append((f"camera:{camera.id}:{parameters[k]}", str(name), False))
+            sigmas.append(np.sqrt(max(Q[k, k], 0.0)))
+    if not places:
+        return None
+    rows, columns = np.array(places).T
+    # One number each: slices of one.
+    return lambda values: values.camera[rows, columns], names, len(names), np.array(sigmas)
+
+
+def _of_images(inspection: Inspection):
+    problem = inspection.problem
+    rows = np.flatnonzero((problem.system.table("image").free > 0).any(1))
+    if not len(rows):
+        return None
+    given = jnp.asarray(problem.network.images.angles[rows])
+
+    def poses(values: Values):
+        angles = jax.vmap(angles_near, (0, None, 0))(values.rotation[rows], jnp.zeros(3), given)
+        return jnp.concatenate([values.position[rows], angles], 1).ravel()
+
+    turn = jax.jit(jax.vmap(jax.jacfwd(angles_near, 1), (0, None, 0)))
+    A = np.zeros((len(rows), 6, 6))
+    A[:, :3, :3] = np.eye(3)
+    A[:, 3:, 3:] = turn(jnp.asarray(inspection.adjusted.rotation)[rows], jnp.zeros(3), given)
+    variance = np.einsum("nij,njk,nik->ni", A, inspection.image_cofactors[rows], A)
+    names = [(f"images:{p}", f"{p} of images, RMS", p in EXTERIOR[3:]) for p in EXTERIOR]
+    return poses, names, 6 * len(rows), np.sqrt(np.clip(variance.mean(0), 0, None))
+
+
+def _of_points(inspection: Inspection):
+    problem = inspection.problem
+    rows = np.flatnonzero((problem.system.table("point").free > 0).any(1))
+    if not len(rows):
+        return None
+    variance = np.diagonal(inspection.point_cofactors[rows], axis1=1, axis2=2)
+    names = [(f"points:{axis}", f"{axis} of points, RMS", False) for axis in "XYZ"]
+    sigma = np.sqrt(np.clip(variance.mean(0), 0, None))
+    return lambda values: values.point[rows].ravel(), names, 3 * len(rows), sigma
+
+
+def _of_function(inspection: Inspection, of: Callable[[Values], jax.Array]) -> Results:
+    function = lambda values: jnp.ravel(of(values))
+    sigma = np.sqrt(np.clip(np.diagonal(inspection.propagate(function)), 0, None))
+    number = range(len(sigma))
+    asked = tuple(Asked(str(k + 1), f"result {k + 1}", False, slice(k, k + 1)) for k in number)
+    return Results(asked, function, sigma)
+
+
+def effects_on(
+    problem: Problem, results: Results, values: Values, tangents
+) -> Float[np.ndarray, "k numbers"]:
+    """The change of every number asked for, along tangents of the engine's tables [k, rows, …]."""
+    return np.asarray(_along(results.function, problem.layout.values, values, tangents))
+
+
+@eqx.filter_jit
+def _along(function, as_values, tables, tangents):
+    of_tables = lambda tables: function(as_values(tables))
+    return jax.vmap(lambda d: jax.jvp(of_tables, (tables,), (d,))[1])(tangents)
