@@ -4,12 +4,14 @@
 
 Twelve views of a chessboard of 9 × 6 corners, 480 × 360 pixels, σ = 0.05 pixels, OpenCV's model.
 Clean data; a lens with k2 = −0.4 calibrated without k2 and k3; a board bent by 0.1 mm over its
-240 mm. Exit status 1 where clean data are called biased in more than 3 % of the draws, or a bias is
-missed or laid to the wrong cause in more than 5 %.
+240 mm. The first draw of a case is calibrated from its corners alone, every other one is adjusted
+again from there. Exit status 1 where clean data are called biased in more than 3 % of the draws, or
+a bias is missed or laid to the wrong cause in more than 5 %.
 """
 
 import dataclasses
 import sys
+import time
 from pathlib import Path
 
 import machine
@@ -29,6 +31,9 @@ def main() -> int:
     parser.add_argument("--json", type=machine.target, help="file for the figures; - for stdout")
     options = parser.parse_args()
     import jaxbundle
+    from jaxbundle.bundle.minimum import minimise
+    from jaxbundle.bundle.result import Adjustment
+    from jaxbundle.calibration.bias import find_bias
 
     jaxbundle.enable_x64()
     tests = Path(__file__).parent.parent / "tests"
@@ -43,14 +48,18 @@ def main() -> int:
     p = render.LENS.parameters
     strong = dataclasses.replace(render.LENS, parameters=(*p[:5], K2, *p[6:]))
     figures, wrong = {"machine": machine.machine(), "draws": options.draws}, []
+    begin = time.perf_counter()
     for name, (given, bend) in CASES.items():
         lens = strong if name == "k2 missing" else render.LENS
         points = X + np.outer(bend * away**2, [0, 0, 1])
-        found = []
-        for seed in range(options.draws):
-            views = simulated(lens, points=points, seed=seed)
-            one = jaxbundle.calibrate(views, snooping=None, cross_validation=False, **given)
-            found.append(one.bias)
+        views = simulated(lens, points=points, seed=0)
+        first = jaxbundle.calibrate(views, snooping=None, cross_validation=False, **given)
+        problem, found = first.adjustment.problem, [first.bias]
+        for seed in range(1, options.draws):
+            xy = simulated(lens, points=points, seed=seed).xy.reshape(problem.data.image_xy.shape)
+            again = problem.with_data(dataclasses.replace(problem.data, image_xy=xy))
+            one = Adjustment(problem.network, again, minimise(again, first.adjustment.values))
+            found.append(find_bias(one, taken.BOARD.grid))
         rate = lambda of, found=found: float(np.mean([bool(of(bias)) for bias in found]))
         figures[name] = {
             "speaks": rate(lambda bias: bias.found),
@@ -64,6 +73,7 @@ def main() -> int:
             wrong.append("clean data are called biased")
         if name in CAUSE and figures[name]["right cause"] < 0.95:
             wrong.append(f"{name}: not found")
+    figures["s"] = round(time.perf_counter() - begin, 1)
     if options.json != "-":
         print(machine.in_words(figures["machine"]))
         for name in CASES:
