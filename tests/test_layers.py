@@ -45,7 +45,7 @@ PACKAGE = Path(__file__).parent.parent / "jaxbundle"
 FILES = sorted(p for p in PACKAGE.rglob("*.py") if p != PACKAGE / "__init__.py")
 OPTIONAL = {
     "matplotlib", "pandas", "cv2", "pyproj", "rasterio", "erfa", "sgp4", "ezdxf", "laspy", "plotly",
-    "PIL",
+    "PIL", "pyarrow",
 }  # fmt: skip
 LIGHT = {"geometry", "cameras"}
 

@@ -14,13 +14,14 @@ import os
 import zipfile
 import zlib
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from jaxbundle.arguments import numeric_array
 from jaxbundle.batch.input import check_shapes, once
 from jaxbundle.errors import InputError
+from jaxbundle.io.text.stored_rows import StoredRows, find_stored_rows
 from jaxbundle.io.text.unpacking import most_unpacked
 from jaxbundle.io.writing.fingerprints import of_arrays
 
@@ -32,23 +33,25 @@ UNREADABLE = (
 
 NEEDED = ("object_points", "image_points", "image_size")
 KNOWN = (*NEEDED, "visible", "ids")
+BY_CAMERA = {"object_points": 3, "image_points": 4, "visible": 3}
+"""Axes of arrays with a row a camera."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CameraStack:
-    """The cameras of a file."""
+    """The cameras of a file; big arrays stay there."""
 
     ids: tuple[str, ...]
-    object_points: np.ndarray
-    image_points: np.ndarray
+    object_points: np.ndarray | StoredRows
+    image_points: np.ndarray | StoredRows
     image_size: tuple[float, ...]
-    visible: np.ndarray | None
+    visible: np.ndarray | StoredRows | None
 
     def arguments(self, chosen: np.ndarray) -> dict:
         """Arguments of `calibrate_batch` for some of the cameras."""
-        single = self.object_points.ndim == 2
+        X = self.object_points
         return dict(
-            object_points=self.object_points if single else self.object_points[chosen],
+            object_points=X[chosen] if isinstance(X, StoredRows) or X.ndim == 3 else X,
             image_points=self.image_points[chosen],
             image_size=self.image_size,
             visible=None if self.visible is None else self.visible[chosen],
@@ -57,7 +60,8 @@ class CameraStack:
     def fingerprint(self, camera: int) -> str:
         """Of what was measured of a camera; what is not visible does not count, nor how much room
         there is for it."""
-        X = self.object_points if self.object_points.ndim == 2 else self.object_points[camera]
+        X = self.object_points
+        X = X[camera] if isinstance(X, StoredRows) or X.ndim == 3 else X
         xy = self.image_points[camera]
         seen = ~np.isnan(xy).any(-1) & ~np.isnan(X).any(-1)
         seen = seen if self.visible is None else seen & (self.visible[camera] != 0)
@@ -84,7 +88,7 @@ def read_camera_stack(path: str | Path) -> CameraStack:
                 raise zipfile.BadZipFile("it is no archive")
             _check_size(stream)
             with np.load(stream, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in KNOWN if name in file}
+                arrays = {name: _rows(path, name, file) for name in KNOWN if name in file}
     except UNREADABLE as error:
         why = " ".join(str(error).split())[:200]
         raise InputError(f"{path}: not a readable .npz file of plain arrays ({why})") from None
@@ -97,11 +101,16 @@ def read_camera_stack(path: str | Path) -> CameraStack:
     X, xy, size = (arrays[name] for name in NEEDED)
     visible = arrays.get("visible")
     try:
-        for name in {*arrays} - {"ids"}:
+        for name in [n for n, array in arrays.items() if isinstance(array, np.ndarray)]:
+            if name == "ids":
+                continue
             mask = name == "visible"
             numeric_array(name, arrays[name], "true or false" if mask else "numbers", truths=mask)
+        if isinstance(X, StoredRows) and X.shape[:2] != xy.shape[:3:2]:
+            X = X[np.arange(len(X))]  # the points of a view each
         X = once(X, xy)
-        check_shapes(X, xy, size, np.ones(xy.shape[:3]) if visible is None else visible)
+        every = np.broadcast_to(np.True_, xy.shape[:3])
+        check_shapes(X, xy, size, every if visible is None else visible)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     ids = arrays.get("ids", np.arange(len(xy)))
@@ -115,6 +124,16 @@ def read_camera_stack(path: str | Path) -> CameraStack:
     if len({*names}) < len(xy):
         raise InputError(f"{path}: ids must differ, but some occur twice")
     return CameraStack(names, X, xy, tuple(size.tolist()), visible)
+
+
+def _rows(path: str | Path, name: str, file) -> Any:
+    """An array, or the rows of one that is big, has a row a camera, and lies there as it is."""
+    found = find_stored_rows(path, name) if name in BY_CAMERA else None
+    cameras = found is not None and found.ndim == BY_CAMERA[name]
+    truths = name == "visible"
+    if found is None or not cameras or (found.dtype.kind == "b") != truths:
+        return file[name]
+    return found
 
 
 def _check_size(stream: BinaryIO) -> None:

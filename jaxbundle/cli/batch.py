@@ -31,9 +31,24 @@ def batch(
     renew: Annotated[
         bool, typer.Option("--renew", help="again what is from other settings or other data")
     ] = False,
+    table: Annotated[
+        Path | None,
+        typer.Option(help="a row an input, CSV, or Parquet if the name ends with .parquet"),
+    ] = None,
+    summary: Annotated[
+        Path | None,
+        typer.Option(help="JSON: distributions, outlying cameras, what parameters go with"),
+    ] = None,
+    against: Annotated[
+        Path | None,
+        typer.Option(help="CSV of id and what parameters may go with: serial number, date"),
+    ] = None,
     html: Html = "",
     force: Annotated[
-        bool, typer.Option("--force", help="let --html replace a file that is no page")
+        bool,
+        typer.Option(
+            "--force", help="let --html and --summary replace files that are no page, no JSON"
+        ),
     ] = False,
     quiet: Quiet = False,
 ) -> None:
@@ -46,16 +61,27 @@ def batch(
     run that is writing the file is refused.
     """
     from jaxbundle.batch.page import compose_batch
+    from jaxbundle.batch.population import Population, read_against
     from jaxbundle.batch.run import result_rows, run_batch
     from jaxbundle.batch.stacks import is_camera_stack
+    from jaxbundle.cli.batch_outputs import check_outputs, write_outputs
     from jaxbundle.cli.outputs import check_page, trace_files
     from jaxbundle.cli.progress import counting
-    from jaxbundle.io.text.csv_tables import write_text
+    from jaxbundle.io.text.csv_tables import read_csv, write_text
 
     check_page(html, None, [*inputs, json_lines], force)
-    if html and os.path.exists(json_lines) and not os.path.isfile(json_lines):
-        raise InputError(f"--html: the page is made of the lines in --json-lines, and {json_lines} "
+    given = [*inputs, json_lines, *filter(None, (html, against and str(against)))]
+    check_outputs(table, summary, given, force)
+    asked = {"--html": html, "--table": table, "--summary": summary}
+    asked = [name for name, value in asked.items() if value]
+    if asked and os.path.exists(json_lines) and not os.path.isfile(json_lines):
+        raise InputError(f"{asked[0]}: is made of the lines in --json-lines, and {json_lines} "
                          "is no file")  # fmt: skip
+    columns = None if against is None else read_csv(against)
+    if columns is not None:
+        if not asked:
+            raise InputError("--against: goes with --html, --table or --summary")
+        read_against(columns, columns.ids("id") if "id" in columns.values else (), str(against))
     if not all(map(is_camera_stack, inputs)):
         # Cameras fill the cores by threads of their own, and gain nothing.
         jaxbundle.use_cores()
@@ -71,12 +97,17 @@ def batch(
             renew=renew,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )  # fmt: skip
+    if asked:
+        found = Population(result_rows(inputs, json_lines))
+        beside = {} if columns is None else read_against(columns, found.keys, str(against))
+        write_outputs(found, beside, table, summary)
     if html:
         origin = trace_files(inputs, {
             "--model": model, "--free": free, "--max-iterations": max_iterations,
             "--snooping": snooping, "--significance": significance,
+            "--against": "" if against is None else str(against),
         })  # fmt: skip
-        write_text(Path(html), compose_batch(result_rows(inputs, json_lines), origin))
+        write_text(Path(html), compose_batch(found, origin, beside))
     if not quiet:
         skipped = counts.pop("skipped", 0)
         said = ", ".join(f"{number} {status}" for status, number in counts.most_common() if number)

@@ -55,3 +55,34 @@ def test_what_is_not_visible_does_not_count(tmp_path):
         stack = read_camera_stack(tmp_path / "a.npz")
         found.append([stack.fingerprint(i) for i in range(len(stack.ids))])
     assert found[0][0] == found[1][0] == found[2][0] != found[1][1]
+
+
+def test_big_arrays_are_read_where_they_lie(tmp_path):
+    """The same cameras and fingerprints as of a compressed archive, without all of it in memory."""
+    rng = np.random.default_rng(2)
+    xy = rng.uniform(0, 400, (900, 20, 50, 2)).round(1)
+    given = arrays(900, xy) | {"object_points": rng.normal(size=(900, 50, 3)).round(3)}
+    np.savez(tmp_path / "a.npz", **given)
+    np.savez_compressed(tmp_path / "b.npz", **given)
+    tracemalloc.start()
+    stored = read_camera_stack(tmp_path / "a.npz")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 0.4 * xy.nbytes
+    packed = read_camera_stack(tmp_path / "b.npz")
+    for chosen in ([0, 1, 2], [899, 3, 4, 7]):
+        found, known = (stack.arguments(np.array(chosen)) for stack in (stored, packed))
+        for name in ("object_points", "image_points", "visible"):
+            np.testing.assert_array_equal(found[name], known[name])
+        np.testing.assert_array_equal(found["image_points"], xy[chosen])
+    assert stored.fingerprint(899) == packed.fingerprint(899)
+
+
+def test_a_byte_that_was_changed_is_found(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, **arrays(200, np.zeros((200, 20, 50, 2))))
+    garbled = bytearray(path.read_bytes())
+    garbled[len(garbled) // 2] ^= 1
+    path.write_bytes(garbled)
+    with pytest.raises(InputError, match="not a readable .npz"):
+        read_camera_stack(path)

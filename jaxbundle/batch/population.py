@@ -1,0 +1,268 @@
+"""The population of a batch: how its cameras are distributed, which are outlying, what their
+parameters go with.
+
+A parameter of a camera is outlying where it is more than `APART` robust standard deviations
+(1.4826 times the median absolute deviation) from the median of the converged cameras; so is an RMS
+above theirs. What parameters go with, a serial number or a date, is the rank correlation of
+Spearman (1904), with the probability of as large a one by chance from
+
+    t = r·√((n − 2)/(1 − r²))   ~   Student's t with n − 2 degrees of freedom.
+"""
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.batch.camera import CONVERGED, STATUS
+from jaxbundle.batch.result import SOLVED
+from jaxbundle.errors import InputError
+from jaxbundle.leastsquares.distributions import f_tail
+from jaxbundle.network.columns import Columns, as_columns
+from jaxbundle.report.layout import significant
+from jaxbundle.report.page.columns import numbers
+
+FEWEST = 8
+"""Cameras that make a population."""
+APART = 5.0
+"""So many robust standard deviations from the median is outlying."""
+NORMAL = 1.4826
+"""The standard deviation of a normal distribution over its median absolute deviation."""
+LEVEL = 0.01
+"""Of all correlations of a batch together."""
+CLASSES, WIDE = 24, 4.0
+"""Classes of a histogram, and how many robust standard deviations it reaches to each side."""
+NUMBERS = ("rms", "sigma0", "redundancy", "iterations", "views", "removed")
+ID = "id"
+
+
+@dataclasses.dataclass(frozen=True)
+class Correlation:
+    """Rank correlation of a parameter with a column over `cameras`; the `probability` of as large a
+    one by chance; `change`: the median of the upper half of the column less that of the lower."""
+
+    column: str
+    parameter: str
+    cameras: int
+    rank_correlation: float
+    probability: float
+    change: float
+
+
+class Population:
+    """Columns over all rows of a batch (`batch.run.result_rows`): `keys`, `status`, `remark`,
+    `numbers` by name; the parameters of cameras, `values`, with their `sigma`, and how far each is
+    `apart` from the median, in robust standard deviations; `rms_apart`, with its sign."""
+
+    def __init__(self, rows: Iterable[Mapping]):
+        kept = [_row(row) for row in rows]
+        words = lambda name: np.array([str(row.get(name, "")) for row in kept], dtype=object)
+        self.keys, self.status, self.remark = (words(n) for n in ("key", "status", "remark"))
+        self.numbers = {name: numbers(row.get(name) for row in kept) for name in NUMBERS}
+        names = dict.fromkeys(name for row in kept for name in row["parameters"])
+        of = lambda name, what: numbers(row["parameters"].get(name, {}).get(what) for row in kept)
+        self.values = {name: of(name, "value") for name in names}
+        self.sigma = {name: of(name, "sigma") for name in names}
+        self.apart = {name: np.abs(self._apart(values)) for name, values in self.values.items()}
+        self.rms_apart = self._apart(self.numbers["rms"])
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    @property
+    def solved(self) -> np.ndarray:
+        """Which have values."""
+        return np.isin(self.status.astype(str), SOLVED)
+
+    @property
+    def fit(self) -> np.ndarray:
+        """Which have values that fit and are determined: the population."""
+        return self.status == STATUS[CONVERGED]
+
+    def spread(self, values: np.ndarray) -> tuple[float, float]:
+        """Median and robust standard deviation over the population."""
+        found = values[self.fit & np.isfinite(values)]
+        if not len(found):
+            return np.nan, np.nan
+        middle = float(np.median(found))
+        return middle, NORMAL * float(np.median(np.abs(found - middle)))
+
+    def _apart(self, values: np.ndarray) -> np.ndarray:
+        middle, deviation = self.spread(values)
+        known = np.isfinite(values).sum() >= FEWEST and deviation > 0
+        return (values - middle) / deviation if known else np.full(len(values), np.nan)
+
+    @property
+    def farthest(self) -> np.ndarray:
+        """Of every row the largest deviation of a parameter from the median; NaN without any."""
+        if not self.apart:
+            return np.full(len(self), np.nan)
+        found = np.array(list(self.apart.values()))
+        largest = np.nan_to_num(found, nan=-1.0).max(0)
+        return np.where(largest < 0, np.nan, largest)
+
+    def why_outlying(self, i: int) -> str:
+        """Status, remark and what is far from the median, in words; empty: not outlying."""
+        said = [] if self.fit[i] else [self.status[i]]
+        said += [self.remark[i]] if self.remark[i] else []
+        said += [f"{name} {significant(far[i], 2)} robust σ from the median"
+                 for name, far in self.apart.items() if far[i] > APART]  # fmt: skip
+        if self.fit[i] and self.rms_apart[i] > APART:
+            said.append(f"RMS {significant(self.rms_apart[i], 2)} robust σ above the median")
+        return "; ".join(said)
+
+    def outlying(self) -> list[tuple[int, str]]:
+        """Rows that need attention and why: no result first, then misfit, then the farthest."""
+        said = [(i, self.why_outlying(i)) for i in range(len(self))]
+        far, rms = np.nan_to_num(self.farthest), np.nan_to_num(self.numbers["rms"])
+        said = [(i, words) for i, words in said if words]
+        return sorted(said, key=lambda item: (bool(self.solved[item[0]]), bool(self.fit[item[0]]),
+                                              -far[item[0]], -rms[item[0]]))  # fmt: skip
+
+    def histogram(self, values: np.ndarray) -> tuple[Float[np.ndarray, " edges"], np.ndarray]:
+        """Edges and numbers of classes over the population, the outer ones open where values lie
+        beyond."""
+        found = values[self.fit & np.isfinite(values)]
+        if not len(found):
+            return np.zeros(0), np.zeros(0, int)
+        middle, deviation = self.spread(values)
+        least, greatest = float(found.min()), float(found.max())
+        if deviation > 0:
+            least = max(least, middle - WIDE * deviation)
+            greatest = min(greatest, middle + WIDE * deviation)
+        if not greatest > least:
+            least, greatest = least - 0.5, greatest + 0.5
+        edges = np.linspace(least, greatest, CLASSES + 1)
+        edges[0] = -np.inf if found.min() < least else edges[0]
+        edges[-1] = np.inf if found.max() > greatest else edges[-1]
+        return edges, np.histogram(found, edges)[0]
+
+    def correlations(self, against: Mapping[str, np.ndarray]) -> list[Correlation]:
+        """Of every parameter and the RMS with every column of `against` (a number for each row, NaN
+        where there is none), the most certain first."""
+        found = []
+        for column, with_it in against.items():
+            for name, values in {**self.values, "rms": self.numbers["rms"]}.items():
+                used = self.fit & np.isfinite(values) & np.isfinite(with_it)
+                if used.sum() >= FEWEST and np.ptp(with_it[used]) > 0 and np.ptp(values[used]) > 0:
+                    found.append(_correlation(column, name, with_it[used], values[used]))
+        return sorted(found, key=lambda one: (one.probability, -abs(one.rank_correlation)))
+
+    def summary(self, against: Mapping[str, np.ndarray] | None = None) -> dict[str, Any]:
+        """All of it as plain dicts and numbers."""
+        names, counts = np.unique(self.status.astype(str), return_counts=True)
+        of = {**self.values, "rms": self.numbers["rms"]}
+        parameters = {}
+        for name, values in of.items():
+            there = values[self.fit & np.isfinite(values)]
+            if not len(there):
+                continue
+            middle, deviation = self.spread(values)
+            edges, counted = self.histogram(values)
+            parameters[name] = {
+                "cameras": len(there), "median": middle, "robust_sigma": deviation,
+                "least": float(there.min()), "greatest": float(there.max()),
+                "histogram": {"edges": edges.tolist(), "numbers": counted.tolist()},
+            }  # fmt: skip
+            if name in self.sigma:
+                parameters[name]["median_sigma"] = self.spread(self.sigma[name])[0]
+        found = self.correlations(against or {})
+        return {
+            "inputs": len(self), "status": dict(zip(names.tolist(), counts.tolist())),
+            "rms": parameters.pop("rms", None), "parameters": parameters,
+            "outlying": [{"key": self.keys[i], "why": why} for i, why in self.outlying()],
+            "correlations": [
+                vars(one) | {"significant": one.probability < LEVEL / len(found)} for one in found
+            ],
+        }  # fmt: skip
+
+    def table(self, against: Mapping[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
+        """A row an input: key, status, remark, the numbers, every parameter with its σ, the largest
+        deviation from a median, and the columns of `against`."""
+        columns = {"key": self.keys, "status": self.status, "remark": self.remark}
+        columns |= {n: values for n, values in self.numbers.items() if np.isfinite(values).any()}
+        for name, values in self.values.items():
+            columns |= {name: values, f"sigma_{name}": self.sigma[name]}
+        columns["farthest"] = self.farthest
+        return columns | {name: x for name, x in (against or {}).items() if name not in columns}
+
+
+def _row(row: Mapping) -> dict:
+    """What the population has of a line, without poses and covariances."""
+    names = ("key", "status", "remark", "rms", "sigma0", "redundancy", "iterations", "views")
+    found = {name: row[name] for name in names if name in row}
+    removed = row.get("removed")
+    found["removed"] = len(removed) if isinstance(removed, list) else removed
+    found["remark"] = row.get("remark") or row.get("error", "")
+    return found | {"parameters": row.get("parameters", {})}
+
+
+def _correlation(column: str, name: str, with_it, values) -> Correlation:
+    n = len(values)
+    r = float(np.corrcoef(_ranks(with_it), _ranks(values))[0, 1])
+    square = r * r * (n - 2) / max(1 - r * r, 1e-300)
+    upper = with_it > np.median(with_it)
+    change = np.median(values[upper]) - np.median(values[~upper]) if upper.any() else np.nan
+    return Correlation(column, name, n, r, f_tail(square, 1, n - 2), float(change))
+
+
+def _ranks(values: np.ndarray) -> np.ndarray:
+    """Ranks, those of equal values their mean."""
+    _, of, numbers = np.unique(values, return_inverse=True, return_counts=True)
+    return (np.cumsum(numbers) - (numbers - 1) / 2)[of]
+
+
+def read_against(table: Any, keys: Iterable[str], name: str) -> dict[str, np.ndarray]:
+    """The columns of a table (numbers, or dates as 2026-05-01: days) for these keys, by its column
+    `id`: the key of an input, or of a camera what stands after # in it.
+
+    **Raises:** `InputError` for a table without `id`, or without another column, for an id twice,
+    for what is neither number nor date, and where no key is in it."""
+    given: Columns = as_columns(table, name)
+    others = [column for column in given.values if column != ID]
+    if ID not in given.values or not others:
+        raise InputError(f"{name}: a column id and others are expected, but there are "
+                         f"{', '.join(given.values) or 'none'}")  # fmt: skip
+    rows: dict[str, int] = {}
+    for row, id in enumerate(given.ids(ID)):
+        if id in rows:
+            raise InputError(f"{given.source(row)}: id {id!r} is there twice")
+        rows[id] = row
+    keys = list(keys)
+    place = [rows.get(key, rows.get(key.rpartition("#")[2])) for key in keys]
+    if all(at is None for at in place):
+        raise InputError(f"{name}: none of its ids is that of a camera or input")
+    at = np.array([-1 if row is None else row for row in place], int)
+    found = {}
+    for column in others:
+        values = np.append(_numbers(given, column), np.nan)
+        found[column] = values[at]
+    return found
+
+
+def _numbers(given: Columns, column: str) -> np.ndarray:
+    """Numbers, or dates as days since 1970; NaN where a cell is empty."""
+    cells = [str(cell).strip() if cell is not None else "" for cell in given.values[column]]
+    found = np.full(len(cells), np.nan)
+    for row, cell in enumerate(cells):
+        if cell in ("", "nan", "None", "NaT"):
+            continue
+        try:
+            found[row] = float(cell)
+        except ValueError:
+            found[row] = _days(cell, f"{given.source(row)}: {column}")
+    return found
+
+
+def _days(cell: str, where: str) -> float:
+    try:
+        date = datetime.fromisoformat(cell)
+    except ValueError:
+        raise InputError(
+            f"{where} is {cell!r}; a number or a date such as 2026-05-01 is expected"
+        ) from None
+    date = date if date.tzinfo else date.replace(tzinfo=UTC)
+    return date.timestamp() / 86400

@@ -1,0 +1,56 @@
+"""The files `jaxbundle batch` writes besides its lines: a table, a summary of the population."""
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.batch.population import Population
+from jaxbundle.cli.outputs import OR_FORCE, check_file, check_json
+from jaxbundle.errors import InputError
+from jaxbundle.io.results.parquet import is_parquet, need_pyarrow, write_parquet
+from jaxbundle.io.results.result_json import without_nan
+from jaxbundle.io.text.csv_tables import table_rows, write_csv, write_text
+
+
+def check_outputs(
+    table: Path | None, summary: Path | None, inputs: Iterable[str], force: bool
+) -> None:
+    """Refuse a table or a summary that cannot be written or would replace an input."""
+    inputs = tuple(inputs)
+    for option, path in (("--table", table), ("--summary", summary)):
+        if path is not None:
+            check_file(option, str(path), None, inputs)
+    if table is not None:
+        if table.suffix.lower() not in (".csv", ".parquet"):
+            raise InputError(f"--table {table}: a name that ends with .csv or .parquet is expected")
+        if summary is not None and table.resolve() == summary.resolve():
+            raise InputError(f"--summary {summary}: is the file of --table as well")
+        if is_parquet(table):
+            try:
+                need_pyarrow()
+            except ImportError as error:
+                raise InputError(f"--table {table}: {error}") from None
+    if summary is not None and not force:
+        check_json(str(summary), OR_FORCE, "--summary")
+
+
+def write_outputs(
+    found: Population, against: Mapping[str, np.ndarray], table: Path | None, summary: Path | None
+) -> None:
+    """Write what is asked for."""
+    if table is not None:
+        columns = found.table(against)
+        if is_parquet(table):
+            write_parquet(table, columns)
+        else:
+            write_csv(table, list(columns), map(_plain, table_rows(columns)))
+    if summary is not None:
+        text = json.dumps(without_nan(found.summary(against)), ensure_ascii=False, indent=1)
+        write_text(summary, text + "\n")
+
+
+def _plain(row: tuple) -> tuple:
+    """What does not exist is empty."""
+    return tuple("" if isinstance(x, float) and np.isnan(x) else x for x in row)

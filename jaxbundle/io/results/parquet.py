@@ -1,0 +1,39 @@
+"""Tables as Parquet files, by pyarrow."""
+
+import importlib
+import io
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.io.text.csv_tables import write_bytes
+
+
+def is_parquet(path: Path) -> bool:
+    """Whether the name is that of a Parquet file."""
+    return path.suffix.lower() == ".parquet"
+
+
+def need_pyarrow() -> None:
+    """**Raises:** `ImportError`, with what to install."""
+    try:
+        importlib.import_module("pyarrow.parquet")
+    except ImportError as error:
+        raise ImportError(
+            "Parquet files need pyarrow: pip install 'jaxbundle[parquet]'; a .csv needs nothing"
+        ) from error
+
+
+def write_parquet(path: Path, columns: Mapping[str, np.ndarray]) -> None:
+    """Write columns of numbers and words; what is NaN is null."""
+    need_pyarrow()
+    arrow, parquet = map(importlib.import_module, ("pyarrow", "pyarrow.parquet"))
+    arrays = {
+        name: arrow.array([str(x) for x in values] if values.dtype.kind in "OU" else values,
+                          from_pandas=True)
+        for name, values in columns.items()
+    }  # fmt: skip
+    written = io.BytesIO()
+    parquet.write_table(arrow.table(arrays), written)
+    write_bytes(path, written.getvalue())

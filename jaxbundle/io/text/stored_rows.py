@@ -1,0 +1,89 @@
+"""Rows of an array in an `.npz`, read when they are asked for: memory does not grow with the file.
+
+An archive of NumPy stores its members as they are (`numpy.savez`) or compressed
+(`numpy.savez_compressed`). Of the first the rows can be read where they lie; the second must be
+unpacked as a whole.
+"""
+
+import dataclasses
+import struct
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+
+WORTH = 2**20
+"""Smaller arrays are read at once, bytes."""
+LOCAL_HEADER = struct.Struct("<4s22xHH")
+"""Signature, length of the name, of what follows it."""
+READERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+AT_ONCE = 2**20
+
+
+@dataclasses.dataclass(frozen=True)
+class StoredRows:
+    """Rows of an array of numbers in a file, from `offset` on."""
+
+    path: Path
+    offset: int
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+    @property
+    def ndim(self) -> int:
+        return len(self.shape)
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, rows) -> np.ndarray:
+        """A row, or the rows of a list of numbers."""
+        wanted = np.atleast_1d(np.asarray(rows, int))
+        found = np.empty((len(wanted), *self.shape[1:]), self.dtype)
+        size = int(np.prod(self.shape[1:]))
+        ends = [0, *(np.flatnonzero(np.diff(wanted) != 1) + 1), len(wanted)]
+        with self.path.open("rb") as stream:
+            for first, last in zip(ends, ends[1:]):
+                stream.seek(self.offset + int(wanted[first]) * size * self.dtype.itemsize)
+                read = np.fromfile(stream, self.dtype, (last - first) * size)
+                if read.size < (last - first) * size:
+                    raise InputError(f"{self.path}: has become shorter while it was read")
+                found[first:last] = read.reshape(-1, *self.shape[1:])
+        return found[0] if np.ndim(rows) == 0 else found
+
+
+def find_stored_rows(path: str | Path, name: str) -> StoredRows | None:
+    """The rows of an array of an `.npz`, where they can be read one by one and that is worth it;
+    its checksum is tested once.
+
+    **Raises:** what `zipfile` and NumPy raise for an archive that is damaged."""
+    with zipfile.ZipFile(path) as archive:
+        try:
+            member = archive.getinfo(f"{name}.npy")
+        except KeyError:
+            return None
+        if member.compress_type != zipfile.ZIP_STORED or member.file_size < WORTH:
+            return None
+        with archive.open(member) as stream:
+            version = np.lib.format.read_magic(stream)
+            if version not in READERS:
+                return None
+            shape, by_columns, dtype = READERS[version](stream)
+            head = stream.tell()
+            while stream.read(AT_ONCE):
+                pass
+    whole = head + int(np.prod(shape)) * dtype.itemsize
+    if by_columns or dtype.kind not in "biuf" or not shape or member.file_size != whole:
+        return None
+    with open(path, "rb") as stream:
+        stream.seek(member.header_offset)
+        signature, *lengths = LOCAL_HEADER.unpack(stream.read(LOCAL_HEADER.size))
+    if signature != b"PK\3\4":
+        return None
+    offset = member.header_offset + LOCAL_HEADER.size + sum(lengths) + head
+    return StoredRows(Path(path), offset, tuple(shape), dtype)
