@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -62,8 +63,8 @@ def once(X: np.ndarray, xy: np.ndarray) -> np.ndarray:
     return X
 
 
-def check_shapes(X: np.ndarray, xy: np.ndarray, size: np.ndarray, visible: np.ndarray) -> None:
-    """Refuse the arrays of a batch whose shapes do not fit each other.
+def check_shapes(X: Any, xy: Any, size: np.ndarray, visible: Any) -> None:
+    """Refuse the arrays of a batch, or what has their shapes, where these do not fit each other.
 
     **Raises:** `InputError`."""
     if xy.ndim != 4 or xy.shape[3] != 2:

@@ -108,7 +108,7 @@ def read_camera_stack(path: str | Path) -> CameraStack:
             numeric_array(name, arrays[name], "true or false" if mask else "numbers", truths=mask)
         if isinstance(X, StoredRows) and X.shape[:2] != xy.shape[:3:2]:
             X = X[np.arange(len(X))]  # the points of a view each
-        X = once(X, xy)
+        X = X if isinstance(X, StoredRows) else once(X, xy)
         every = np.broadcast_to(np.True_, xy.shape[:3])
         check_shapes(X, xy, size, every if visible is None else visible)
     except InputError as error:

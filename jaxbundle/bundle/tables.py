@@ -123,7 +123,8 @@ def residuals(adjustment) -> dict[str, np.ndarray]:
     found = adjustment.reliability
     parts = observations(adjustment.problem, found.residual, found.redundancy, found.w)
     return concatenate([
-        residual_rows(adjustment, *of, v, weight, r, w) for *of, weight, v, r, w in parts
+        residual_rows(adjustment, kind, image, point, axes, v, weight, r, w)
+        for kind, image, point, axes, weight, v, r, w in parts
     ])  # fmt: skip
 
 
@@ -135,9 +136,8 @@ def observations(problem: Problem, *found: Rows) -> Iterator[tuple[Any, ...]]:
     points = np.array(network.points.id, dtype=object)
     cameras = np.array([c.id for c in network.cameras], dtype=object)
     blank = lambda rows: np.full(rows, "", dtype=object)
-    every = np.s_[:]
 
-    def of(field, at=every):
+    def of(field: str, at: Any = np.s_[:]):
         return data.weight(field)[at], *(getattr(rows, field)[at] for rows in found)
 
     yield "image", images[problem.image], points[problem.point], ("x", "y"), *of("image")

@@ -31,6 +31,7 @@ from jaxbundle.leastsquares.plan import Plan
 from jaxbundle.leastsquares.rows import Data, Declared, Values, in_given_order
 from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.leastsquares.solver import half_square
+from jaxbundle.types import AnyArray
 
 AT_ONCE = 16
 """Changes that one call of the program follows."""
@@ -69,7 +70,7 @@ def _add(x, k, row, amount):
 
 
 def pull_back(
-    found: Solution, functions: Mapping[str, Float[np.ndarray, "f rows width"]]
+    found: Solution, functions: Mapping[str, Float[AnyArray, "f rows width"]]
 ) -> list[Float[np.ndarray, "f n r"]]:
     """The change of linear functions of the changes of tables by one σ (a priori) of every
     observation, by set.

@@ -17,6 +17,7 @@ from jaxbundle.cameras import get_model
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.names import Name
 from jaxbundle.network.arrays import Values
+from jaxbundle.network.declare import Tables
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.statistics.held import split_name
 from jaxbundle.statistics.inspection import Inspection
@@ -154,7 +155,7 @@ def _of_points(inspection: Inspection):
     return lambda values: values.point[rows].ravel(), names, 3 * len(rows), sigma
 
 
-def _of_function(inspection: Inspection, of: Callable[[Values], jax.Array]) -> Results:
+def _of_function(inspection: Inspection, of: Callable[..., Any]) -> Results:
     function = lambda values: jnp.ravel(of(values))
     sigma = np.sqrt(np.clip(np.diagonal(inspection.propagate(function)), 0, None))
     number = range(len(sigma))
@@ -163,7 +164,7 @@ def _of_function(inspection: Inspection, of: Callable[[Values], jax.Array]) -> R
 
 
 def effects_on(
-    problem: Problem, results: Results, values: Values, tangents
+    problem: Problem, results: Results, values: Tables, tangents: Tables
 ) -> Float[np.ndarray, "k numbers"]:
     """The change of every number asked for, along tangents of the engine's tables [k, rows, …]."""
     return np.asarray(_along(results.function, problem.layout.values, values, tangents))
