@@ -3,7 +3,6 @@
 import dataclasses
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 import numpy as np
 
@@ -63,7 +62,7 @@ def once(X: np.ndarray, xy: np.ndarray) -> np.ndarray:
     return X
 
 
-def check_shapes(X: Any, xy: Any, size: np.ndarray, visible: Any) -> None:
+def check_shapes(X, xy, size: np.ndarray, visible) -> None:
     """Refuse the arrays of a batch, or what has their shapes, where these do not fit each other.
 
     **Raises:** `InputError`."""

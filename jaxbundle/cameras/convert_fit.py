@@ -36,6 +36,8 @@ MORE_FITTED = {"brown": ("b1", "b2"), "brown-projected": ("b1", "b2"), "usgs": (
 
 GRID = (33, 25)
 MOST_EVALUATIONS = 200
+INSIDE = 1e-3
+"""A fit stays inside the range of a parameter by this part of it."""
 
 
 def fitted(model: CameraModel) -> tuple[str, ...]:
@@ -70,6 +72,8 @@ def fit_parameters(
 ) -> dict[str, float]:
     """The parameters of a model that bring rays nearest to their images.
 
+    Parameters that mean something only between two values (`CameraModel.ranges`) stay there.
+
     **Arguments:** `xy` in the model's unit and axes; `starts` complete sets of start values, the
     best of them is taken; `free` what is fitted (`fitted` of the model if empty).
 
@@ -89,16 +93,28 @@ def fit_parameters(
             p[chosen] = q
             return p
 
+        low, high = _bounds(model, chosen)
+        start[chosen] = np.clip(start[chosen], low, high)
         residuals = lambda q: np.asarray(_images(model, complete(q), rays) - xy).ravel()
         slopes = lambda q: np.asarray(_jacobian(model, complete(q), rays))[..., chosen]
         try:
             found = least_squares(
                 residuals, start[chosen], lambda q: slopes(q).reshape(-1, len(chosen)),
                 x_scale="jac", ftol=1e-15, xtol=1e-15, gtol=1e-15, max_nfev=MOST_EVALUATIONS,
+                bounds=(low, high),
             )  # fmt: skip
         except np.linalg.LinAlgError as error:
             raise ValueError(f"the fit failed: {error}") from None
     return dict(zip(model.parameters, complete(found.x).tolist()))
+
+
+def _bounds(model: CameraModel, chosen: Sequence[int]):
+    """Between which values parameters mean something, a little inside where that is an interval."""
+    ends = [dict(model.ranges).get(model.parameters[j], (-np.inf, np.inf)) for j in chosen]
+    low, high = np.array(ends, float).reshape(-1, 2).T
+    width = high - low
+    margin = INSIDE * np.where(np.isfinite(width), width, 0.0)
+    return low + margin, high - margin
 
 
 def start_values(

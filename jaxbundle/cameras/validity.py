@@ -75,11 +75,16 @@ def validity_message(
     radius = turning_radius(model, parameters, half_diagonal)
     if radius is None:
         return None
+    what, remedy = "distortion", "Free fewer distortion parameters"
+    turns = "turns back"
+    if "spline" in model.name:
+        what, turns = "field", "ends, or its distortion turns back,"
+        remedy = "Choose a model with a wider field or more knots across"
     return (
-        f"Camera {camera!r}: the distortion of model {model.name!r} turns back at a radius of "
+        f"Camera {camera!r}: the {what} of model {model.name!r} {turns} at a radius of "
         f"{radius:.4g} {model.unit} from the principal point, inside the image, whose half "
         f"diagonal is {half_diagonal:.4g} {model.unit}: points farther out have no valid image. "
-        f"Free fewer distortion parameters, or measure points out to the corners."
+        f"{remedy}, or measure points out to the corners."
     )
 
 

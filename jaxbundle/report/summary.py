@@ -20,7 +20,7 @@ from jaxbundle.report.layout import (
     significant,
 )
 
-MOST_CAMERAS = 3
+MOST_CAMERAS, MOST_PARAMETERS = 3, 20
 
 
 def one_line(adjustment) -> str:
@@ -82,6 +82,9 @@ def _cameras(adjustment):
             if found["free"]
             for value, sigma in [estimate(found["value"], found["sigma"])]
         ]
+        if len(parts) > MOST_PARAMETERS:
+            more = len(parts) - MOST_PARAMETERS // 2
+            parts[MOST_PARAMETERS // 2 :] = [f"and {more} more parameters, see report()"]
         text = ", ".join(parts) if parts else "held"
         yield f"Camera {clean(camera)}", f"{entry['model']}: {text}"
     if len(tables) > MOST_CAMERAS:

@@ -178,3 +178,13 @@ def test_why_a_conversion_is_not_exact():
     }  # fmt: skip
     assert "one principal distance" in reasons["brown-projected"]
     assert "image centre" in reasons["snavely"]
+
+
+def test_a_fit_stays_where_its_parameters_mean_something():
+    """A narrow lens with a barrel distortion: of `eucm` without bounds α = 5.7 comes out."""
+    lens = dict(fx=620.0, fy=621.0, cx=242.0, cy=178.0, k1=-0.12, k2=0.05)
+    target = get_model("eucm")
+    found = convert_camera(get_model("opencv"), lens, target, image_size=(480, 360))
+    for name, (low, high) in dict(target.ranges).items():
+        assert low <= found.parameters[name] < high
+    assert found.rms < 0.2

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 
+from jaxbundle.cameras import get_model
 from jaxbundle.network.sightings import keep_points
 from jaxbundle.network.tables import Images, Network, Observations, Points
 
@@ -14,7 +15,8 @@ def adjusted_network(adjustment) -> Network:
     Cameras, orientations and points have their adjusted values; observations that data snooping has
     removed are gone. Control points with σ are tie points here; priors and observations of further
     kinds are dropped: what they said has been used, and around the adjusted values they would say
-    it twice. So the datum is inner; adjusted again, the network stays as it is. σ of image
+    it twice. Only the priors that a camera model needs, as a grid of splines, stay: without them it
+    has no solution. So the datum is inner; adjusted again, the network stays as it is. σ of image
     coordinates are those given, also where variance components were estimated. Check points are
     not in it, nor are points at infinity, which have no coordinates.
     """
@@ -25,7 +27,8 @@ def adjusted_network(adjustment) -> Network:
     gone = {(name.id, name.parameter) for name in adjustment.eliminated}
     cameras = tuple(
         dataclasses.replace(
-            camera, parameters=adjustment.camera_parameters(camera.id), sigma={},
+            camera, parameters=adjustment.camera_parameters(camera.id),
+            sigma=camera.sigma if get_model(camera.model).prior else {},
             free=tuple(name for name in camera.unknowns if (camera.id, name) not in gone),
         )
         for camera in network.cameras
