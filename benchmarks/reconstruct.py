@@ -27,6 +27,7 @@ import numpy as np
 from photograph_sets import SETS, WIDTH, Shot, convergent, write
 
 import jaxbundle
+from jaxbundle.bundle.orientations import orientation_covariance
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.orientation.alignment import similarity
 from jaxbundle.reconstruction.reconstruct import Part, reconstruct
@@ -39,6 +40,24 @@ def centre_errors(truth, ids, X0):
     X = np.array([truth[id].X0 for id in ids])
     A, t = similarity(X0, X)
     return A, X0 @ A.T + t - X
+
+
+def error_over_sigma(result, truth, ids, A, e) -> float:
+    """√(eᵀC⁻¹e/(3n − 7)) of the centres after the similarity, which takes seven of their 3n
+    components; C is the joint covariance of the others. 1 is expected."""
+    joint = orientation_covariance(result)
+    if joint is None or len(ids) < 3:
+        return np.nan
+    rows = [joint.unknowns.index(("image", id, name)) for id in ids for name in ("X0", "Y0", "Z0")]
+    turn = np.kron(np.eye(len(ids)), A)
+    X = np.array([truth[id].X0 for id in ids])
+    X = X - X.mean(0)
+    spin = [np.cross(axis, X).ravel() for axis in np.eye(3)]
+    G = np.column_stack([np.tile(np.eye(3), (len(ids), 1)), *spin, X.ravel()])
+    left = np.linalg.qr(G, "complete")[0][:, 7:]
+    C = left.T @ turn @ joint.matrix[np.ix_(rows, rows)] @ turn.T @ left
+    d = left.T @ e.ravel()
+    return float(np.sqrt(d @ np.linalg.solve(C, d) / len(d)))
 
 
 def in_parts(truth, ids, e) -> float:
@@ -88,6 +107,7 @@ def of_part(part: Part, truth: dict[str, Shot]) -> dict:
         "points": len(network.points), "image_points": len(network.observations),
         "centres_rms": in_parts(truth, ids, e),
         "centres_worst_sigma": float(np.abs(e / sigma).max()),
+        "centres_over_sigma": error_over_sigma(result, truth, ids, A, e),
         "c_error_sigma": off, "sigma0": result.sigma0, "removed": len(result.removed),
         "factors": dict(part.factors),
     }  # fmt: skip

@@ -15,18 +15,21 @@ from jaxbundle.network.tables import Camera, Distances, Network
 from jaxbundle.orientation import many
 from jaxbundle.orientation.growth import Model, misclosures
 from jaxbundle.orientation.network import Oriented, find_start_values
-from jaxbundle.orientation.sights import Sights
+from jaxbundle.orientation.sights import TOLERANCE, Sights
 
 STEPS = 12
 """Iterations of an adjustment on the way: drift is what it takes away, and that goes first."""
 
 
-def orient(network: Network) -> Oriented:
+def orient(network: Network, tolerance: float = TOLERANCE) -> Oriented:
     """Find the start values a network lacks; those it has stay.
 
     The principal distance of a camera should be right to some per cent; its distortion may be
     unknown, and some measurements wrong. Large networks are adjusted on the way, whenever they have
     become two and a half times as large.
+
+    **Arguments:** `tolerance`: how far image points may miss, in parts of the extent of a picture;
+    as far as the distortion of a lens goes that is not known at all, if it is not given.
 
     **Returns:** the network with start values; images and points that could not be placed, and
     image points that contradict everything else, are left out of it and named with the reason.
@@ -34,7 +37,7 @@ def orient(network: Network) -> Oriented:
     **Raises:** `InputError` for bad tables; `NotSolvedError` where no image could be placed.
     """
     require_x64()
-    return find_start_values(network, _adjusted)
+    return find_start_values(network, _adjusted, tolerance)
 
 
 def orient_again(given: Network, placed: Network, better: Mapping[str, Camera]) -> Network:

@@ -21,8 +21,9 @@ from jaxbundle.orientation.status import Status
 
 LEAST = 4
 """Known points an image needs: three, and one to choose among their solutions."""
-ENOUGH = 12
-"""An image with so many known points need not wait for better ones."""
+ENOUGH, WAITING = 12, 0.4
+"""An image waits while it has fewer known points, or less than this part of the most that another
+one has."""
 DRIFTS, LARGER = 30, 2.5
 """Images of a model that is improved first, and how much larger it becomes before the next time."""
 PARALLEL, FAR_AWAY = 2e-3, 2e3
@@ -107,7 +108,8 @@ def grow(
         waiting = among & ~model.placed & (known >= LEAST) & (known > tried)
         if not waiting.any():
             break
-        enough = min(ENOUGH, known[waiting].max())
+        most = known[waiting].max()
+        enough = min(max(ENOUGH, WAITING * most), most)
         chosen = np.flatnonzero(waiting & (known >= enough))
         tried[chosen] = known[chosen]
         if place_images(sights, model, chosen):

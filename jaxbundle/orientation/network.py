@@ -40,7 +40,7 @@ from jaxbundle.orientation.growth import (
     misclosures,
     place_far_points,
 )
-from jaxbundle.orientation.sights import Sights, sights
+from jaxbundle.orientation.sights import TOLERANCE, Sights, sights
 from jaxbundle.types import Index
 
 IN_COMMON = 6
@@ -101,7 +101,9 @@ def lacks_start_values(network: Network) -> bool:
     )
 
 
-def find_start_values(network: Network, improve: Callable | None = None) -> Oriented:
+def find_start_values(
+    network: Network, improve: Callable | None = None, tolerance: float = TOLERANCE
+) -> Oriented:
     """The start values a network lacks; those it has stay.
 
     `improve(network, sights, model)`: adjusts a part of a large network on the way, in place.
@@ -110,7 +112,7 @@ def find_start_values(network: Network, improve: Callable | None = None) -> Orie
     network = check_tables(network)
     for one in network.further:
         network = one.begin(network)
-    seen = sights(network)
+    seen = sights(network, tolerance)
     model, frame = _model(network, seen, improve and partial(improve, network))
     if not model.placed.any():
         why = _mirrored(network, seen) or _why_nothing(network, seen)

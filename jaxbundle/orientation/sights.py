@@ -51,8 +51,10 @@ TOLERANCE = 0.03
 """Lens distortion that is not known yet may be as large, in parts of the picture."""
 
 
-def sights(network: Network) -> Sights:
-    """The image points of a network with the interior orientation it gives."""
+def sights(network: Network, tolerance: float = TOLERANCE) -> Sights:
+    """The image points of a network with the interior orientation it gives.
+
+    **Arguments:** `tolerance`: of start values, in parts of the extent of a picture."""
     rays, images = network.observations, network.images
     xy = np.full((len(rays), 2), np.nan)
     extent = np.ones(len(images))
@@ -66,10 +68,8 @@ def sights(network: Network) -> Sights:
         extent[images.camera == c] = np.nanquantile(radius, 0.95) if len(radius) else 1.0
     rows = np.flatnonzero(np.isfinite(xy).all(1))
     rows = rows[np.argsort(rays.image[rows], kind="stable")]
-    tolerance = TOLERANCE * np.where(np.isfinite(extent), extent, 1.0)
-    return Sights(
-        rays.image[rows], rays.point[rows], xy[rows], rows, tolerance, len(network.points)
-    )
+    limit = tolerance * np.where(np.isfinite(extent), extent, 1.0)
+    return Sights(rays.image[rows], rays.point[rows], xy[rows], rows, limit, len(network.points))
 
 
 def ideal_points(camera: Camera, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:

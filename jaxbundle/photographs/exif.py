@@ -17,6 +17,7 @@ DETAILS, GPS, PACKET = 0x8769, 0x8825, 0x02BC
 PNG_PACKET = "XML:com.adobe.xmp"
 FOCAL_LENGTH, FOCAL_LENGTH_35, DATE_TAKEN, FRACTION = 0x920A, 0xA405, 0x9003, 0x9291
 PLANE_X, PLANE_UNIT = 0xA20E, 0xA210
+TAKEN_X, TAKEN_Y = 0xA002, 0xA003
 FILM_DIAGONAL = math.hypot(36, 24)
 """mm: what focal lengths equivalent to those of 35 mm film refer to."""
 MM = {2: 25.4, 3: 10.0, 4: 1.0}
@@ -89,6 +90,10 @@ def read_exif(path: str | Path) -> Exif:
             return Exif(size)
     resolution = _positive(details.get(PLANE_X))
     unit = MM.get(details.get(PLANE_UNIT, 2))
+    taken = max(_positive(details.get(TAKEN_X)) or 0, _positive(details.get(TAKEN_Y)) or 0)
+    if resolution and taken:
+        # of the photograph as it was taken: what made it smaller usually leaves this as it was
+        resolution *= max(size) / taken
     xmp = parse_xmp(packet) if isinstance(packet, bytes | str) else Xmp()
     return Exif(
         size=size,

@@ -6,7 +6,7 @@ more than 8 bits is stretched over them.
 """
 
 import os
-import warnings
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ MOST_PIXELS = 2**30
 """OpenCV decodes no more."""
 BRIGHT = 99.8
 """Percentile of the grey values of more than 8 bits that becomes white."""
+LIMIT = threading.Lock()
 START, SCAN, END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
 """Marks of JPEG: start of the file, of a scan, end of the image."""
 
@@ -63,29 +64,19 @@ def photograph_size(path: str | Path) -> tuple[int, int]:
     **Raises:** `InputError` if it is no image, or has more than 2³⁰ pixels.
     """
     with open_image(path) as image:
-        columns, rows = image.size
-    if columns * rows > MOST_PIXELS:
-        raise InputError(
-            f"{path}: {columns} × {rows} pixels; at most {MOST_PIXELS} can be read: make it smaller"
-        )
-    return columns, rows
+        return image.size
 
 
 def open_image(path: str | Path):
     """The file opened by Pillow, its head read; the pixels are not decoded. Close it, by `with`.
 
-    **Raises:** `InputError` if it cannot be read, or is no image.
+    **Raises:** `InputError` if it cannot be read, is no image, or has more than 2³⁰ pixels.
     """
-    Image = need_pillow()
     check_plain(path)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of sizes that might be an attack; ours are checked
-            return Image.open(path)
+        image = _open_any_size(path)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
-    except Image.DecompressionBombError as error:
-        raise InputError(f"{path}: {error}") from None
     except OSError as error:
         if os.path.isfile(path) and not os.path.getsize(path):
             raise InputError(f"{path}: the file is empty") from None
@@ -93,6 +84,25 @@ def open_image(path: str | Path):
             f"{path}: not an image that can be read (JPEG, PNG, TIFF are)"
             + (f": {error.strerror}" if error.strerror else "")
         ) from None
+    columns, rows = image.size
+    if columns * rows > MOST_PIXELS:
+        image.close()
+        raise InputError(
+            f"{path}: {columns} × {rows} pixels; at most {MOST_PIXELS} can be read: make it smaller"
+        )
+    return image
+
+
+def _open_any_size(path):
+    """The file opened without the limit that Pillow sets for fear of files that unpack to much more
+    than they are: 179 million pixels, which a photograph may have."""
+    Image = need_pillow()
+    with LIMIT:
+        given, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+        try:
+            return Image.open(path)
+        finally:
+            Image.MAX_IMAGE_PIXELS = given
 
 
 def _looks_cut(content: bytes) -> bool:

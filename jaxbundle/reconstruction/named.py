@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.csv_tables import read_csv
-from jaxbundle.measure.coded_targets import find_coded_targets
+from jaxbundle.measure.coded_targets import NamedPoints, find_coded_targets
 from jaxbundle.network.columns import some
 from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.reconstruction.control import Control
@@ -53,9 +53,10 @@ def find_named(
     """
     image, name, xy, sigma, notes = [], [], [], [], []
     if targets:
-        found = list(run(lambda p: find_coded_targets(read_photograph(p.path), targets),
-                         photographs))  # fmt: skip
+        found = list(run(lambda p: _targets_of(p, targets), photographs))
         for k, one in enumerate(found):
+            if one is None:
+                continue
             image += [k] * len(one)
             name += one.names
             xy += list(one.xy)
@@ -80,6 +81,16 @@ def find_named(
     if not name:
         return no_named_points(), notes
     return Named(np.array(image), tuple(name), np.array(xy, float), np.array(sigma, float)), notes
+
+
+def _targets_of(photograph: Photograph, kind: str) -> NamedPoints | None:
+    """The coded targets of a photograph; None where it cannot be read: it is left out later, with
+    the reason."""
+    try:
+        grey = read_photograph(photograph.path)
+    except InputError:
+        return None
+    return find_coded_targets(grey, kind)
 
 
 def read_distances(path: str | Path) -> list[dict]:

@@ -33,7 +33,7 @@ def why_alone(k: int, names: Sequence[str], matches, pairs: Sequence[Pair]) -> s
     if mine:
         with_it = sorted({names[j] for pair in mine for j in pair.images if j != k})
         return f"it shows the same as {', '.join(with_it[:3])} alone, no other photograph does"
-    found = [(len(rows), pair) for pair, rows, _ in matches if k in pair]
+    found = [(len(m.rows), m.images) for m in matches if k in m.images]
     most, best = max(found, default=(0, None))
     if best is None or not most:
         return "nothing in it is found in any other photograph"

@@ -11,15 +11,15 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxbundle.bundle.orient import orient
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.float64 import require_x64
 from jaxbundle.network.columns import count, some
 from jaxbundle.network.tables import Camera, Network
+from jaxbundle.orientation.network import Oriented
 from jaxbundle.photographs.places import map_positions
 from jaxbundle.photographs.reading import read_photograph
-from jaxbundle.reconstruction.adjusting import adjust_weighted
+from jaxbundle.reconstruction.adjusting import Weighted, adjust_weighted
 from jaxbundle.reconstruction.attitudes import map_attitudes, with_attitudes
 from jaxbundle.reconstruction.control import Control
 from jaxbundle.reconstruction.named import find_named
@@ -32,10 +32,19 @@ from jaxbundle.reconstruction.photographs import (
     find_photographs,
 )
 from jaxbundle.reconstruction.settings import Settings
+from jaxbundle.reconstruction.starting import believable, start_again, start_values
 from jaxbundle.system.configuration import available_cores
 from jaxbundle.tiepoints.features import Features
 from jaxbundle.tiepoints.refinement import Measurements, measure_tracks
-from jaxbundle.tiepoints.search import Tell, detect, match, prepare, start_cameras, verify
+from jaxbundle.tiepoints.search import (
+    Tell,
+    detect,
+    match,
+    prepare,
+    start_cameras,
+    verify,
+    without_contradicted,
+)
 from jaxbundle.tiepoints.store import Store
 from jaxbundle.tiepoints.tracks import choose_tracks, make_tracks
 from jaxbundle.tiepoints.verification import Pair
@@ -139,7 +148,7 @@ class _Making:
             features, matches = self._matches()
             prepared.result()
         self._calibrate(features, matches)
-        pairs = verify(self.cameras.cameras, self.cameras.of, features, matches, self.tell)
+        pairs = self._verify(features, matches)
         parts = self._parts(features, matches, pairs)
         said = tuple((self.names[p.images[0]], self.names[p.images[1]], p.found, len(p), p.kind)
                      for p in pairs)  # fmt: skip
@@ -190,6 +199,15 @@ class _Making:
         )
         self.cameras = dataclasses.replace(self.cameras, cameras=tuple(cameras))
         self.notes += notes
+
+    def _verify(self, features, matches) -> list[Pair]:
+        cameras = self.cameras.cameras, self.cameras.of, features
+        pairs, wrong = without_contradicted(*cameras, verify(*cameras, matches, self.tell))
+        if wrong:
+            named = (" and ".join(self.names[k] for k in p.images) for p in wrong)
+            self.notes.append(f"{count(len(wrong), 'pair')} of photographs not used, which others "
+                              f"contradict around three: {some(named, 3, str)}")  # fmt: skip
+        return pairs
 
     def _parts(self, features, matches, pairs: Sequence[Pair]) -> list[Part]:
         least = min(SMALLEST, len(self.photographs))
@@ -260,20 +278,55 @@ class _Making:
         )  # fmt: skip
         network = tie_network(self.photographs, self.cameras, measured, self.extra, name)
         self._begin("start values")
-        oriented = orient(network)
-        placed, note = with_attitudes(oriented.network, self.names, self.extra.attitudes)
-        self.notes += [note] if note else []
-        kinds, named = _kinds(placed, measured, self.names)
-        weighted = adjust_weighted(
-            placed, kinds, named, self.settings.significance,
-            self._begin,
-        )  # fmt: skip
+        oriented, weighted, note = self._adjusted(network, measured)
         self._begin("")
-        result = weighted.adjustment
-        if not result.converged:
-            raise NotSolvedError(f"not solved: {result.termination}", list(result.undetermined))
-        colours = _colours(measured)
-        return Part(name, result, colours, weighted.factors), dict(oriented.images)
+        self.notes += [note] if note else []
+        part = Part(name, weighted.adjustment, _colours(measured), weighted.factors)
+        return part, dict(oriented.images)
+
+    def _adjusted(self, network: Network, measured) -> tuple[Oriented, Weighted, str]:
+        """The first start values that lead to an adjustment, this, and a note of attitudes."""
+        guessed = [camera.id for camera, known in zip(self.cameras.cameras, self.cameras.known)
+                   if not known]  # fmt: skip
+        failed: NotSolvedError | None = None
+        for oriented in start_values(network, guessed):
+            try:
+                weighted, note = self._adjust(oriented, measured)
+            except NotSolvedError as error:
+                failed = failed or error
+                continue
+            result = weighted.adjustment
+            if not believable(result):
+                failed = failed or _not_solved(result)
+                continue
+            again = start_again(network, oriented, result)
+            if again is not None:
+                try:
+                    better, other_note = self._adjust(again, measured)
+                except NotSolvedError:
+                    return oriented, weighted, note
+                if believable(better.adjustment):
+                    return again, better, other_note
+            return oriented, weighted, note
+        assert failed is not None, "start values are there, or an error says why not"
+        raise failed
+
+    def _adjust(self, oriented: Oriented, measured) -> tuple[Weighted, str]:
+        placed, note = with_attitudes(oriented.network, self.names, self.extra.attitudes)
+        kinds, named = _kinds(placed, measured, self.names)
+        significance = self.settings.significance
+        return adjust_weighted(placed, kinds, named, significance, self._begin), note
+
+
+def _not_solved(result: Adjustment) -> NotSolvedError:
+    if not result.converged:
+        return NotSolvedError(f"not solved: {result.termination}", list(result.undetermined))
+    distances = ", ".join(f"{camera['parameters']['fx']['value']:.0f} px in {id}"
+                          for id, camera in result.cameras.items())  # fmt: skip
+    return NotSolvedError(
+        f"not solved: principal distance {distances}, which no camera has; take photographs from "
+        "places that lie farther apart, or give --camera"
+    )
 
 
 def _kinds(network: Network, measured: Measurements, names: Sequence[str]):

@@ -29,17 +29,21 @@ from jaxbundle.system.compilation import quick_jit
 
 FACTORS = tuple(0.55 * 1.2**k for k in range(10))
 """Principal distances tried, in parts of the longer side: 85° to 20° of view."""
-PAIRS, SLOTS, PIXELS = 8, 64, 4.0
-"""Pairs and matches used; the misclosure at which a match counts half, for a photograph of 3000
-pixels: lens distortion is not known yet."""
+CANDIDATES, PAIRS, SLOTS, PIXELS = 16, 8, 64, 4.0
+"""Pairs that are looked at, those that are used (most matches agree, wide angles), and the matches
+of each; the misclosure at which a match counts half, for a photograph of 3000 pixels: lens
+distortion is not known yet."""
 ROUNDS, STEPS = 4, 8
-USUAL, DOUBT = 1.0, 0.03
+USUAL, DOUBT = 1.0, 0.06
 """The usual principal distance, in parts of the longer side, and by which part a sum must be less
-to believe one that differs by a factor of e."""
+to believe one that differs by a factor of e; for x = |ln| of another factor x·(1 + x)/2 times as
+much."""
+WIDE = 0.35
+"""Angle of intersection, radians, beyond which wider is no better."""
 FARTHEST = 0.35
 """|k1| beyond this is not believed."""
 KNOWN = 1.35
-"""A principal distance from the file may be wrong by this factor."""
+"""A principal distance that is tried, or is from the file, may be wrong by this factor."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,7 +65,7 @@ def estimate_interior(
     **Arguments:** matches of each pair in pixels, the clearest first, the best pairs first;
     `known`: whether the principal distance of the camera is one to begin with.
     """
-    pairs = [(one, other) for one, other in pairs if len(one) >= 24][:PAIRS]
+    pairs = [(one, other) for one, other in pairs if len(one) >= 24][:CANDIDATES]
     if not pairs or camera.image_size is None:
         return Start(camera, 0, np.nan)
     size = max(camera.image_size)
@@ -69,8 +73,15 @@ def estimate_interior(
     clear = [many.spread(max(int(0.6 * len(a)), 24), SLOTS) for a, _ in pairs]
     xy1, xy2 = ([pair[i][r] for pair, r in zip(pairs, clear)] for i in (0, 1))
     tried = [camera.parameters["fx"]] if known else [size * factor for factor in FACTORS]
-    M, b, part, costs = _oriented([_with(camera, f) for f in tried], xy1, xy2, limit)
-    usual = 1 + DOUBT * np.abs(np.log(np.array(tried) / (USUAL * size)))
+    if len(pairs) > PAIRS:
+        first = tried if known else tried[1::3]
+        _, _, part, _, angle = _oriented([_with(camera, f) for f in first], xy1, xy2, limit)
+        worth = (part * np.sqrt(np.minimum(angle, WIDE))).max(0)
+        chosen = np.sort(np.argsort(-worth, kind="stable")[:PAIRS])
+        xy1, xy2 = ([side[k] for k in chosen] for side in (xy1, xy2))
+    M, b, part, costs, _ = _oriented([_with(camera, f) for f in tried], xy1, xy2, limit)
+    unusual = np.abs(np.log(np.array(tried) / (USUAL * size)))
+    usual = 1 + DOUBT * unusual * (1 + unusual) / 2
     best = int(np.argmin(costs.sum(1) * (1 if known else usual)))
     f, M, b, part = tried[best], M[best], b[best], part[best]
     use = np.flatnonzero(part > 0.3)
@@ -78,7 +89,7 @@ def estimate_interior(
         return Start(_with(camera, f), 0, np.nan)
     f, k1, e = _adjusted(_with(camera, f), [(xy1[k], xy2[k]) for k in use], M[use], b[use], limit)
     sane = np.isfinite(f) and 0.3 * size < f < 12 * size and abs(k1) < FARTHEST
-    sane &= not known or 1 / KNOWN < f / tried[0] < KNOWN
+    sane &= 1 / KNOWN < f / tried[best] < KNOWN
     better = _with(camera, f, k1) if sane else _with(camera, tried[best])
     return Start(better, len(use), float(np.median(np.abs(e))))
 
@@ -99,16 +110,17 @@ def _with(camera, f, k1=0.0):
 
 
 def _oriented(cameras, xy1, xy2, limit):
-    """Relative orientations of all pairs with each camera, the parts that agree, robust sums."""
+    """Relative orientations of all pairs with each camera, the parts that agree, robust sums, and
+    angles of intersection."""
     f = np.repeat([camera.parameters["fx"] for camera in cameras], len(xy1))
     one, two = ([ideal_points(c, xy) for c in cameras for xy in side] for side in (xy1, xy2))
-    M, b, part, _ = many.orient_pairs(one, two, limit / f)
+    M, b, part, angle = many.orient_pairs(one, two, limit / f)
     filled = (np.stack([_fill(a) for a in side]) for side in (one, two))
     e = np.asarray(many.in_lanes(_sampson, many.LANES, M, b, *filled)[0])
     e = np.nan_to_num(f[:, None] * e, nan=1e3)
     costs = np.where(part > 0, np.log1p((e / limit) ** 2).mean(1), np.log1p(100.0))
     by_camera = lambda a: a.reshape(len(cameras), len(xy1), *a.shape[1:])
-    return tuple(by_camera(a) for a in (M, b, part, costs))
+    return tuple(by_camera(a) for a in (M, b, part, costs, angle))
 
 
 def _fill(a):

@@ -5,10 +5,17 @@ of unit length, so that their distance is √(2 − 2·a·b): one matrix product
 A match is kept if it is the best from both sides, and if its distance is below `ratio` times that
 of the second best (Lowe, 2004), of either side, and of what looks most like either of the two in
 its own photograph: of identical windows the wrong one is as good as the right one.
+
+Windows seen at other angles are not quite identical, and one may look more like another window of
+the second photograph, seen at the same angle, than like itself. So a match says as well whether it
+is `single`: whether nothing in either photograph looks like it as much as two photographs of one
+place usually do.
 """
 
+from typing import NamedTuple
+
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.photographs.opencv import need_opencv
 from jaxbundle.tiepoints.features import Features
@@ -20,8 +27,27 @@ OF_SIFT = 128
 """Numbers of a descriptor of SIFT."""
 SAME = 1e-3
 """Descriptors whose distance is below this are the same."""
+REPEATED = 0.22
+"""Distance below which two features of a photograph may be of one kind of thing: that of most true
+matches of SIFT."""
 FEW = 800
 """Largest features by which is decided whether two photographs may show the same."""
+
+
+class Matches(NamedTuple):
+    """Rows of the features of two photographs that match, the clearest first; their clarity; which
+    of them are of something that is in the photographs once."""
+
+    images: tuple[int, int]
+    rows: Int[np.ndarray, "n 2"]
+    clarity: Float[np.ndarray, " n"]
+    single: Bool[np.ndarray, " n"]
+
+    def take(self, chosen) -> "Matches":
+        """The chosen matches."""
+        return Matches(
+            self.images, self.rows[chosen], self.clarity[chosen], self.single[chosen]
+        )
 
 
 def match_features(
@@ -51,6 +77,14 @@ def match_features(
     kept = kept[np.argsort(clarity[kept], kind="stable")]
     rows = rows[kept]
     return np.stack([rows, best[rows]], 1), clarity[kept]
+
+
+def single_matches(
+    rows: Int[np.ndarray, "n 2"],
+    own: tuple[Float[np.ndarray, " a"], Float[np.ndarray, " b"]],
+) -> Bool[np.ndarray, " n"]:
+    """Which matches are of something that nothing else in either photograph looks like."""
+    return np.minimum(own[0][rows[:, 0]], own[1][rows[:, 1]]) >= REPEATED
 
 
 def number_alike(one: Features, other: Features) -> int:

@@ -13,11 +13,12 @@ from jaxbundle.network.units import from_image_unit
 from jaxbundle.orientation.sights import ideal_points
 from jaxbundle.tiepoints import interior, refinement, verification
 from jaxbundle.tiepoints.features import Detection, Features, find_features
-from jaxbundle.tiepoints.interior import Start, estimate_interior
-from jaxbundle.tiepoints.matching import distances_within, match_features
+from jaxbundle.tiepoints.interior import CANDIDATES, Start, estimate_interior
+from jaxbundle.tiepoints.loops import split_contradicted
+from jaxbundle.tiepoints.matching import Matches, distances_within, match_features, single_matches
 from jaxbundle.tiepoints.pairs import candidate_pairs
 from jaxbundle.tiepoints.store import Store
-from jaxbundle.tiepoints.verification import Pair, verify_pairs
+from jaxbundle.tiepoints.verification import ENOUGH, Pair, verify_pairs
 
 Tell = Callable[[str, int, int], None]
 TOLERANCE = 0.0012
@@ -25,10 +26,15 @@ TOLERANCE = 0.0012
 WIDEST = 0.6
 """Pairs that determine the principal distance: those with at least this part of the most matches,
 and others with fewer, which lie wider apart."""
+MOST_ALIKE = 5
+"""Of the former."""
 OF_THE_LENS = ("fx", "fy", "k1")
 OTHERS, APART, MORE = (0.7, 0.9, 1.2, 1.6, 2.2), 1.15, 1.05
 """Other principal distances that are tried, in parts of the longer side, unless they differ by less
 than this factor; and how many times as many matches they must explain."""
+BELIEVED = 0.4
+"""Part of the matches that must be explained where a file tells the principal distance: it may be
+wrong, of photographs that were cut or made smaller."""
 TRIED = 40
 """Pairs by which they are judged."""
 
@@ -67,8 +73,8 @@ def match(
     store: Store,
     workers: int,
     tell: Tell,
-) -> list[tuple[tuple[int, int], np.ndarray, np.ndarray]]:
-    """Pairs with the rows of their features that match, and the clarity of each match."""
+) -> list[Matches]:
+    """The matches of candidate pairs."""
     with ThreadPoolExecutor(workers) as pool:
         pairs = candidate_pairs(features, way, place, pool.map)
 
@@ -81,10 +87,11 @@ def match(
     def one(pair):
         found = kept[pair]
         if found is None:
-            i, j = pair
-            found = match_features(features[i], features[j], own=(own[i], own[j]))
+            both = own[pair[0]], own[pair[1]]
+            rows, clarity = match_features(features[pair[0]], features[pair[1]], own=both)
+            found = rows, clarity, single_matches(rows, both)
             store.save_matches(*of(pair), *found)
-        return pair, *found
+        return Matches(pair, *found)
 
     return _each(one, pairs, workers, lambda n: tell("matching", n, len(pairs)))
 
@@ -104,7 +111,7 @@ def start_cameras(
     lens: Sequence[int],
     known: Sequence[bool],
     features: Sequence[Features],
-    matches,
+    matches: Sequence[Matches],
 ) -> tuple[list[Camera], list[str]]:
     """Cameras with the principal distance and K1 that pairs of photographs by their lens agree on.
 
@@ -117,17 +124,20 @@ def start_cameras(
     better, notes = list(cameras), []
     for number in dict.fromkeys(lens):
         own = [c for c in range(len(cameras)) if lens[c] == number]
-        found = [m for m in matches if of[m[0][0]] in own and of[m[0][1]] in own]
+        found = [_once(m) for m in matches if {of[k] for k in m.images} <= set(own)]
         first, name, told = cameras[own[0]], cameras[own[0]].id, known[own[0]]
         xy = _centred(cameras, of, features, _various(found))
         begin = dataclasses.replace(first, parameters={**first.parameters, "cx": 0.0, "cy": 0.0})
         start = estimate_interior(begin, xy, told)
-        if not told and start.pairs:
-            clear = sorted(found, key=lambda m: -len(m[1]))[:TRIED]
+        if start.pairs:
+            clear = sorted(found, key=lambda m: -len(m.rows))[:TRIED]
             explained = lambda camera, clear=clear, own=own: _explained(
                 _with_lens(cameras, own, camera), of, features, clear
             )
-            start = _most_explained(start, begin, xy, explained)
+            now = explained(start.camera)
+            few = now < BELIEVED * sum(len(m.rows) for m in clear)
+            if not told or few:
+                start = _most_explained(start, begin, xy, explained, now)
         p = start.camera.parameters
         better = _with_lens(better, own, start.camera)
         if start.pairs:
@@ -139,10 +149,16 @@ def start_cameras(
     return better, notes
 
 
+def _once(matches: Matches) -> Matches:
+    """Those of what is there once, where they are enough."""
+    use = matches.single
+    return matches.take(use) if use.sum() >= ENOUGH else matches
+
+
 def _centred(cameras, of, features, matches):
     """Matches of pairs, from the middles of their photographs."""
     centred = lambda k: features[k].xy - _middle(cameras[of[k]])
-    return [(centred(i)[rows[:, 0]], centred(j)[rows[:, 1]]) for (i, j), rows, _ in matches]
+    return [tuple(centred(k)[rows] for k, rows in zip(m.images, m.rows.T)) for m in matches]
 
 
 def _with_lens(cameras, own, camera: Camera) -> list[Camera]:
@@ -157,11 +173,11 @@ def _explained(cameras, of, features, matches) -> int:
     return sum(map(len, verify(cameras, of, features, matches, lambda *_: None)))
 
 
-def _most_explained(start: Start, begin: Camera, xy, explained) -> Start:
+def _most_explained(start: Start, begin: Camera, xy, explained, now: int) -> Start:
     """The start, or that from another principal distance which explains clearly more matches."""
     size = max(present_size(begin))
     f = start.camera.parameters["fx"]
-    most, best = MORE * explained(start.camera), None
+    most, best = MORE * now, None
     for other in (factor * size for factor in OTHERS):
         if max(f / other, other / f) > APART:
             camera = dataclasses.replace(
@@ -179,43 +195,50 @@ def _middle(camera: Camera):
 
 def _various(own):
     """The pairs with the most matches, and as many others with enough, each photograph in turn."""
-    own = sorted(own, key=lambda found: -len(found[1]))
+    own = sorted(own, key=lambda found: -len(found.rows))
     if not own:
         return []
-    most = len(own[0][1])
-    first = [found for found in own if len(found[1]) >= WIDEST * most][:3]
-    enough = [found for found in own if 60 <= len(found[1]) < WIDEST * most]
-    step = max(1, len(enough) // 5)
-    return first + enough[: 5 * step : step]
+    most = len(own[0].rows)
+    first = [found for found in own if len(found.rows) >= WIDEST * most][:MOST_ALIKE]
+    enough = [found for found in own if ENOUGH <= len(found.rows) < WIDEST * most]
+    others = CANDIDATES - MOST_ALIKE
+    step = max(1, len(enough) // others)
+    return first + enough[: others * step : step]
 
 
 def verify(
     cameras: Sequence[Camera],
     of: Sequence[int],
     features: Sequence[Features],
-    matches,
+    matches: Sequence[Matches],
     tell: Tell,
 ) -> list[Pair]:
     """The pairs that one object can explain, with the matches that agree."""
     ideal = [ideal_features(cameras[c], f.xy) for c, f in zip(of, features)]
-    size = [max(present_size(cameras[c])) / _scale(cameras[c]) for c in of]
-    matches = [m for m in matches if len(m[1])]
+    size = np.array([max(present_size(cameras[c])) / _scale(cameras[c]) for c in of])
+    matches = [m for m in matches if len(m.rows)]
     kept, portion = [], 64
     for first in range(0, len(matches), portion):
-        some = [_inside(ideal, *m) for m in matches[first : first + portion]]
-        tolerance = np.array([TOLERANCE * (size[i] + size[j]) / 2 for (i, j), *_ in some])
-        found = verify_pairs(
-            [ideal[i][rows[:, 0]] for (i, _), rows, _ in some],
-            [ideal[j][rows[:, 1]] for (_, j), rows, _ in some], tolerance,
-        )  # fmt: skip
-        for ((i, j), rows, clarity), one in zip(some, found):
-            if one is not None:
-                good, M, b, angle, kind = one
-                kept.append(
-                    Pair((i, j), rows[good], clarity[good], M, b, angle, kind, len(rows))
-                )
+        some = [_inside(ideal, m) for m in matches[first : first + portion]]
+        tolerance = np.array([TOLERANCE * size[list(m.images)].mean() for m in some])
+        one, other = ([ideal[m.images[k]][m.rows[:, k]] for m in some] for k in (0, 1))
+        found = verify_pairs(one, other, tolerance, [m.single for m in some])
+        for m, pair in zip(some, found):
+            if pair is not None:
+                good, M, b, angle, kind, sure = pair
+                kept.append(Pair(m.images, m.rows[good], m.clarity[good], M, b, angle, kind,
+                                 len(m.rows), sure))  # fmt: skip
         tell("verification", min(first + portion, len(matches)), len(matches))
     return kept
+
+
+def without_contradicted(
+    cameras: Sequence[Camera], of: Sequence[int], features: Sequence[Features],
+    pairs: Sequence[Pair],
+) -> tuple[list[Pair], list[Pair]]:  # fmt: skip
+    """The pairs that agree with one another in loops of three, and the others."""
+    ideal = [ideal_features(cameras[c], f.xy) for c, f in zip(of, features)]
+    return split_contradicted(pairs, ideal)
 
 
 def ideal_features(camera: Camera, uv):
@@ -237,9 +260,8 @@ def _scale(camera):
     return 1 / np.linalg.norm(np.diff(ideal_features(camera, middle), axis=0))
 
 
-def _inside(ideal, pair, rows, clarity):
-    there = np.isfinite(ideal[pair[0]][rows[:, 0]]).all(1)
-    there &= np.isfinite(ideal[pair[1]][rows[:, 1]]).all(1)
-    return pair, rows[there], clarity[there]
+def _inside(ideal, matches: Matches) -> Matches:
+    there = [np.isfinite(ideal[k][rows]).all(1) for k, rows in zip(matches.images, matches.rows.T)]
+    return matches.take(there[0] & there[1])
 
 

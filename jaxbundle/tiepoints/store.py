@@ -6,6 +6,8 @@ that has changed nothing is found. Files are written under a temporary name and 
 
 import hashlib
 import os
+import time
+from contextlib import suppress
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -15,7 +17,9 @@ from jaxbundle.system.temporaries import temporary
 from jaxbundle.tiepoints.features import Detection, Features
 
 LENGTH = 16
-RULES = "2"
+ABANDONED = 600.0
+"""Seconds after which nobody writes a file any more."""
+RULES = "4"
 """Of finding and matching: what was kept by others is not used."""
 
 
@@ -49,14 +53,17 @@ class Store:
             descriptor=features.descriptor,
         )  # fmt: skip
 
-    def load_matches(self, one: str, other: str) -> tuple[np.ndarray, np.ndarray] | None:
-        """The matches of two photographs, if they are kept."""
+    def load_matches(self, one: str, other: str) -> tuple[np.ndarray, ...] | None:
+        """The rows of features that match of two photographs, their clarity, and which are single,
+        if they are kept."""
         found = self._load(self.name(one, other))
-        return None if found is None else (found["matches"], found["clarity"])
+        if found is None or set(found) != {"rows", "clarity", "single"}:
+            return None
+        return found["rows"], found["clarity"], found["single"]
 
-    def save_matches(self, one: str, other: str, matches, clarity) -> None:
+    def save_matches(self, one: str, other: str, rows, clarity, single) -> None:
         """Keep the matches of two photographs."""
-        self._save(self.name(one, other), matches=matches, clarity=clarity)
+        self._save(self.name(one, other), rows=rows, clarity=clarity, single=single)
 
     def drop_unused(self) -> None:
         """Remove the files of photographs that are no longer there."""
@@ -64,6 +71,11 @@ class Store:
             for path in self.folder.glob("*.npz"):
                 if path.stem not in self.used:
                     path.unlink(missing_ok=True)
+            for path in self.folder.glob("*.part*"):
+                # of a run that was killed, unless it is so new that another one may be writing it
+                with suppress(OSError):
+                    if time.time() - path.stat().st_mtime > ABANDONED:
+                        path.unlink()
 
     def _load(self, name):
         if self.folder is None:

@@ -5,15 +5,24 @@ at a time, `orientation.robust`); refined with the matches that agree; then all 
 against it: the distance of coplanarity (Sampson), and both rays in front. A rotation alone, or a
 homography, that explains nearly all of them as well is named: two photographs from one place, or of
 a plane, from which no model begins.
+
+Matches of what is there once go first (`Matches.single`): of a row of windows, those of one to its
+neighbour agree on an orientation of their own, with a camera that is moved by their distance. Only
+where too few single ones agree are all taken; such a pair is not `sure`. Of a sure pair with
+`ENOUGH` single matches the others are left out: along an epipolar line windows follow one another.
+
+Matches that agree must be spread over both photographs, and not lie in one corner: a sign that two
+places have in common is no reason to believe that they are one.
 """
 
 import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxbundle.geometry import matrix_from_quaternion
 from jaxbundle.leastsquares.small import minimise
@@ -31,6 +40,11 @@ LEAST, PART = 16, 0.2
 """Matches that must agree, and their least part of all."""
 CLEAR = 0.6
 """Part of the matches, the clearest ones, from which the orientation is sought."""
+ENOUGH = 60
+"""Single matches that suffice."""
+EXTENT = 0.05
+"""Least standard deviation of the places of agreeing matches across their longest direction, in
+parts of that of a photograph's features: they are no speck, and on no line."""
 SLOTS, LANES = 192, 8
 ROUNDS, STEPS = 2, 8
 TURNS = 40
@@ -47,7 +61,7 @@ class Pair:
     """Two photographs that show the same: rows of features that match; M from the first camera to
     the second and base b; angle of intersection (median, radians); `kind`: `"relative"`, or what
     explains the pair as well: `"plane"`, `"rotation"` (b is then zero or without meaning); `found`:
-    matches before verification."""
+    matches before verification; `sure`: it was oriented by matches of what is there once."""
 
     images: tuple[int, int]
     matches: Int[np.ndarray, "n 2"]
@@ -57,49 +71,90 @@ class Pair:
     angle: float
     kind: str
     found: int
+    sure: bool = True
 
     def __len__(self) -> int:
         return len(self.matches)
+
+
+class Verified(NamedTuple):
+    """What one object can explain of a pair: which matches; M, b, angle and kind as of `Pair`."""
+
+    good: Bool[np.ndarray, " n"]
+    M: Float[np.ndarray, "3 3"]
+    b: Float[np.ndarray, "3"]
+    angle: float
+    kind: str
+    sure: bool
 
 
 def verify_pairs(
     xy1: Sequence[Float[np.ndarray, "_ 2"]],
     xy2: Sequence[Float[np.ndarray, "_ 2"]],
     tolerance: Float[np.ndarray, " pairs"],
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, float, str] | None]:
-    """For each pair the matches that agree (a mask), M, b, angle and kind; None where too few do.
+    single: Sequence[Bool[np.ndarray, " _"]] | None = None,
+) -> list[Verified | None]:
+    """For each pair what one object can explain; None where too few matches agree.
 
     **Arguments:** matches, the clearest first, as ideal image coordinates, c = 1; `tolerance`: of
-    Sampson's distance, c = 1.
+    Sampson's distance, c = 1; `single`: which matches are of what is there once; all, if not given.
     """
+    single = [np.ones(len(xy), bool) for xy in xy1] if single is None else single
     usable = [k for k, xy in enumerate(xy1) if len(xy) >= LEAST]
     found: list = [None] * len(xy1)
     if not usable:
         return found
-    clear = [_clear_rows(len(xy1[k])) for k in usable]
-    M, b, part, _ = many.orient_pairs(
-        [xy1[k][r] for k, r in zip(usable, clear)], [xy2[k][r] for k, r in zip(usable, clear)],
-        LOOSE * tolerance[usable],
-    )  # fmt: skip
-    poses = {k: (M[i], b[i]) for i, k in enumerate(usable) if part[i] > 0}
-    for limit in (LOOSE, 1.0):
-        poses = _improved(poses, xy1, xy2, tolerance, limit)
-    for k, (M, b) in poses.items():
-        good = _agree(M, b, xy1[k], xy2[k], tolerance[k])
-        if good.sum() >= max(LEAST, PART * len(good)):
-            found[k] = good, M, b
+    sure = _agreed({k: np.flatnonzero(single[k]) for k in usable}, xy1, xy2, tolerance)
+    others = {k: np.arange(len(xy1[k])) for k in usable
+              if k not in sure and (~single[k]).sum() >= LEAST}  # fmt: skip
+    agreed = {**_agreed(others, xy1, xy2, tolerance), **sure}
+    for k in sure:
+        good, M, b = agreed[k]
+        if (good & single[k]).sum() >= ENOUGH:
+            agreed[k] = good & single[k], M, b
     turned = {
-        k: turn for k in usable if found[k] is None
+        k: turn for k in usable if k not in agreed
         and (turn := _by_rotation(xy1[k], xy2[k], tolerance[k])) is not None
     }  # fmt: skip
-    left = [k for k in range(len(found)) if found[k] is not None]
-    kinds = _kinds([found[k] for k in left], [xy1[k] for k in left], [xy2[k] for k in left],
+    left = sorted(agreed)
+    kinds = _kinds([agreed[k] for k in left], [xy1[k] for k in left], [xy2[k] for k in left],
                    tolerance[left])  # fmt: skip
     for k, (good, angle, kind) in zip(left, kinds):
-        found[k] = (good, *found[k][1:], angle, kind)
+        _, M, b = agreed[k]
+        found[k] = Verified(good, M, b, angle, kind, k in sure)
     for k, (good, M) in turned.items():
-        found[k] = good, M, np.zeros(3), 0.0, "rotation"
+        found[k] = Verified(good, M, np.zeros(3), 0.0, "rotation", True)
     return found
+
+
+def _agreed(rows: dict[int, np.ndarray], xy1, xy2, tolerance):
+    """Of pairs the matches that agree with the orientation by some of them (`rows`), M and b, where
+    enough of these agree."""
+    rows = {k: r for k, r in rows.items() if len(r) >= LEAST}
+    if not rows:
+        return {}
+    keys = np.array(list(rows))
+    clear = [rows[k][_clear_rows(len(rows[k]))] for k in rows]
+    M, b, part, _ = many.orient_pairs(
+        [xy1[k][r] for k, r in zip(rows, clear)], [xy2[k][r] for k, r in zip(rows, clear)],
+        LOOSE * tolerance[keys],
+    )  # fmt: skip
+    poses = {k: (M[i], b[i]) for i, k in enumerate(rows) if part[i] > 0}
+    for limit in (LOOSE, 1.0):
+        poses = _improved(poses, rows, xy1, xy2, tolerance, limit)
+    found = {}
+    for k, (M, b) in poses.items():
+        good = _agree(M, b, xy1[k], xy2[k], tolerance[k])
+        use = rows[k][good[rows[k]]]
+        enough = len(use) >= max(LEAST, PART * len(rows[k]))
+        if enough and all(_extended(xy[k][use], xy[k]) for xy in (xy1, xy2)):
+            found[k] = good, M, b
+    return found
+
+
+def _extended(some, every) -> bool:
+    """Whether some places extend over more than a speck or a line among all."""
+    return np.linalg.eigvalsh(np.cov(some.T))[0] > (EXTENT * every.std()) ** 2
 
 
 def prepare() -> None:
@@ -158,11 +213,12 @@ def _distances(M, b, xy1, xy2):
     return e, front
 
 
-def _improved(poses, xy1, xy2, tolerance, limit):
-    """The relative orientations refined by the matches that agree to `limit` tolerances."""
+def _improved(poses, of, xy1, xy2, tolerance, limit):
+    """The relative orientations refined by the matches (`of` these rows) that agree to `limit`
+    tolerances."""
     keys, rows = [], []
     for k, (M, b) in poses.items():
-        good = np.flatnonzero(_agree(M, b, xy1[k], xy2[k], limit * tolerance[k]))
+        good = of[k][_agree(M, b, xy1[k][of[k]], xy2[k][of[k]], limit * tolerance[k])]
         if len(good) >= LEAST:
             keys.append(k)
             rows.append(good[many.spread(len(good), SLOTS)])

@@ -1,5 +1,8 @@
 """Photographs of every kind: pixels, and what their heads say."""
 
+import struct
+import zlib
+
 import cv2
 import numpy as np
 import pytest
@@ -38,6 +41,21 @@ def test_pixels_of_a_turned_photograph_are_those_of_the_sensor(tmp_path):
     assert photograph_size(tmp_path / "turned.png") == (90, 60)
 
 
+def test_photographs_of_any_size_but_what_cannot_be_decoded(tmp_path):
+    """Heads alone: the pixels are not there."""
+    def head(columns, rows):
+        found = struct.pack(">IIBBBBB", columns, rows, 8, 0, 0, 0, 0)
+        chunk = lambda kind, data: (struct.pack(">I", len(data)) + kind + data
+                                    + struct.pack(">I", zlib.crc32(kind + data)))  # fmt: skip
+        path = tmp_path / f"{columns}.png"
+        path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", found) + chunk(b"IDAT", b""))
+        return path
+
+    assert photograph_size(head(20_000, 10_000)) == (20_000, 10_000)
+    with pytest.raises(InputError, match="40000 × 40000 pixels; at most .* make it smaller"):
+        photograph_size(head(40_000, 40_000))
+
+
 def test_files_cut_short(tmp_path):
     Image.fromarray(GREY).save(tmp_path / "whole.jpg")
     content = (tmp_path / "whole.jpg").read_bytes()
@@ -64,6 +82,17 @@ def test_exif(tmp_path):
     assert found.camera == "NIKON D800" and found.time.minute == 11
     assert found.principal_distance() == (pytest.approx(24 / 35.9 * 90), "focal length and sensor")
     assert found.place == Place(pytest.approx(-33.51), pytest.approx(-70.75), 512.5)
+
+
+def test_resolution_in_the_focal_plane_is_that_of_the_photograph_as_it_was_taken(tmp_path):
+    head = Image.Exif()
+    head[0x010F], head[0x0110] = "Maker", "of a camera in no table"
+    details = head.get_ifd(0x8769)
+    details[0x920A], details[0xA20E], details[0xA210] = 8.0, 254.0, 3  # pixels for a centimetre
+    details[0xA002], details[0xA003] = 180, 120
+    Image.fromarray(GREY).save(tmp_path / "half.jpg", exif=head)
+    told = pytest.approx(8.0 * 25.4 / 2), "focal length and resolution"
+    assert read_exif(tmp_path / "half.jpg").principal_distance() == told
 
 
 def test_sensors_are_not_mistaken():

@@ -1,4 +1,9 @@
-"""Rendered convergent photographs as files: hills with a roof, by a camera with distortion."""
+"""Rendered convergent photographs as files: hills with a roof, by a camera with distortion.
+
+On request a plate with four ArUco markers lies on the hills.
+"""
+
+import dataclasses
 
 import cv2
 import numpy as np
@@ -20,10 +25,43 @@ def hills(X, Y):
     return 0.5 * np.sin(X / 1.5) * np.cos(Y / 2) + 0.2 * np.sin(2.1 * X + Y)
 
 
-def scene(seed):
+SIDE, PITCH = 0.8, 1.1
+"""Of a marker, and from one to the next."""
+PLATE = (0.9, -2.9, 0.9)
+
+
+@dataclasses.dataclass(frozen=True)
+class Markers(Texture):
+    """White, with markers 0 and 1 of DICT_4X4_50, and beyond them in t 2 and 3."""
+
+    def __call__(self, s, t, width):
+        words = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+        bits = np.stack([words.generateImageMarker(k, 6) for k in range(4)]) / 255
+        number = (s // PITCH).astype(int) + 2 * (t // PITCH).astype(int)
+        column, row = (
+            np.floor((a % PITCH - (PITCH - SIDE) / 2) / SIDE * 6).astype(int) for a in (s, -t)
+        )
+        inside = (np.minimum(row, column) >= 0) & (np.maximum(row, column) < 6) & (number < 4)
+        black = bits[np.clip(number, 0, 3), np.clip(row, 0, 5), np.clip(column, 0, 5)] < 0.5
+        return np.where(inside & black, 0.1, 0.9)
+
+
+def corner(number, k):
+    """Where corner k (1 to 4, clockwise from the upper left one) of a marker lies."""
+    begin = np.array([number % 2, number // 2]) * PITCH + (PITCH - SIDE) / 2
+    at = [(0, 1), (1, 1), (1, 0), (0, 0)][k - 1]
+    return np.array(PLATE) + [*(begin + SIDE * np.array(at)), 0]
+
+
+def scene(seed, markers=False):
     roof = Rectangle((-1.2, -1.0, 1.4), (2.0, 0, 0.4), (0, 2.0, 0))
-    shapes = HeightField(hills, (-9, -9, 9, 9)), roof
-    return Scene(shapes, (Texture(0.012, seed=seed, side=512),))
+    shapes, textures = [HeightField(hills, (-9, -9, 9, 9)), roof], [
+        Texture(0.012, seed=seed, side=512)
+    ] * 2
+    if markers:
+        shapes.append(Rectangle(PLATE, (2 * PITCH, 0, 0), (0, 2 * PITCH, 0)))
+        textures.append(Markers(0.012))
+    return Scene(tuple(shapes), tuple(textures))
 
 
 def stations(number, seed, spread=1.3):
@@ -44,10 +82,10 @@ def _looking(X0, at, roll):
     return Rotation.from_rotvec([0, 0, -roll]).as_matrix() @ M
 
 
-def write_photographs(folder, prefix, number, seed, camera=CAMERA):
+def write_photographs(folder, prefix, number, seed, camera=CAMERA, markers=False):
     """Photographs as PNG files; returns their true projection centres by file name."""
     folder.mkdir(parents=True, exist_ok=True)
-    world, truth = scene(seed), {}
+    world, truth = scene(seed, markers), {}
     for k, (X0, M) in enumerate(zip(*stations(number, seed))):
         shot = render(world, camera, X0, M, Sensor(noise=1.5, seed=k + 100 * seed, fine=2))
         name = f"{prefix}{k}.png"

@@ -1,9 +1,13 @@
 """Rendered photographs of a scene and some that do not belong to it, reconstructed."""
 
+import dataclasses
+
 import cv2
 import numpy as np
+import pyproj
 import pytest
-from rendered_photographs import SIZE, F, write_photographs
+from PIL import Image
+from rendered_photographs import SIZE, F, corner, write_photographs
 
 import jaxbundle
 from jaxbundle.errors import InputError
@@ -15,24 +19,32 @@ from jaxbundle.reconstruction.settings import Settings
 from jaxbundle.tiepoints.features import Detection
 from jaxbundle.tiepoints.verification import Pair
 
+BAR = 0.001
+"""σ of scale bars."""
 SETTINGS = Settings(Detection(number=1500), points=250)
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """Truth, and what was made of six photographs, one of another scene, one cut short, one that
-    is there twice and one without texture; and the folder of matches."""
+    """Truth, and what was made of six photographs with scale bars between coded targets, one of
+    another scene, one cut short, one that is there twice and one without texture; and the folder of
+    matches."""
     folder = tmp_path_factory.mktemp("photographs")
-    truth = write_photographs(folder, "a", 6, 1)
+    truth = write_photographs(folder, "a", 6, 1, markers=True)
     write_photographs(folder / "other", "c", 1, 11)
     (folder / "c0.png").write_bytes((folder / "other" / "c0.png").read_bytes())
     (folder / "cut.png").write_bytes((folder / "a1.png").read_bytes()[:20_000])
     (folder / "again.png").write_bytes((folder / "a2.png").read_bytes())
     cv2.imwrite(str(folder / "dull.png"), np.full(SIZE[::-1], 120, np.uint8))
     stages, store = {}, folder / "kept"
+    bars = [((0, 1), (3, 3)), ((1, 2), (2, 4))]
+    length = lambda a, b: np.linalg.norm(corner(*a) - corner(*b))
+    name = lambda of: f"{of[0]}-{of[1]}"
+    distances = [{"from": name(a), "to": name(b), "value": length(a, b), "sigma": BAR}
+                 for a, b in bars]  # fmt: skip
     found = reconstruct(
-        [folder], settings=SETTINGS, store=store,
-        tell=lambda stage, done, total: stages.update({stage: (done, total)}),
+        [folder], settings=dataclasses.replace(SETTINGS, targets="aruco"), store=store,
+        tell=lambda stage, done, total: stages.update({stage: (done, total)}), distances=distances,
     )  # fmt: skip
     return truth, found, stages, store
 
@@ -66,6 +78,18 @@ def test_centres_and_principal_distance_are_within_their_sigma(made):
     assert abs(c["value"] - F) < 3 * c["sigma"] < 1.0
 
 
+def test_scale_bars_between_coded_targets_give_the_scale(made):
+    truth, found, _, _ = made
+    result = found.parts[0].adjustment
+    rows = [k for k, id in enumerate(result.network.images.id) if id in truth]
+    X = np.array([truth[result.network.images.id[k]] for k in rows])
+    A, _ = similarity(result.image_values[rows, :3], X)
+    # bars of 2.3 m, corners to a tenth of a pixel, which is 1.6 mm
+    assert abs(np.cbrt(np.linalg.det(A)) - 1) < 3 * np.hypot(BAR, 0.0016) / 2.3
+    assert len(result.network.distances) == 2
+    assert any("coded targets (aruco)" in note for note in found.notes)
+
+
 def test_weights_are_those_of_the_residuals(made):
     part = made[1].parts[0]
     assert part.adjustment.global_test()["passed"] or abs(part.adjustment.sigma0 - 1) < 0.02
@@ -78,6 +102,34 @@ def test_stages_end_and_what_was_found_is_kept(made):
     assert {"features", "matching", "verification", "start values"} <= set(stages)
     assert all(done == total for stage, (done, total) in stages.items() if "data" not in stage)
     assert len(list(store.glob("*.npz"))) > 12 and not list(store.glob("*.part*"))
+
+
+def test_two_scenes_by_the_positions_in_their_files(tmp_path):
+    """Twenty metres for a unit of the rendered scenes, which lie a kilometre apart."""
+    truth = {}
+    for number, (prefix, photographs) in enumerate((("a", 4), ("b", 3))):
+        of = write_photographs(tmp_path, prefix, photographs, 1 + 6 * number)
+        truth |= {k: 20 * X + [600_000 + 1000 * number, 5_300_000, 200] for k, X in of.items()}
+    to_degrees = pyproj.Transformer.from_crs("EPSG:32633", "EPSG:4326", always_xy=True)
+    for name, (x, y, height) in truth.items():
+        longitude, latitude = to_degrees.transform(x, y)
+        head = Image.Exif()
+        head[0x010F] = "Rendered"
+        gps = head.get_ifd(0x8825)
+        parts = lambda a: (float(int(a)), float(int(a % 1 * 60)), a * 60 % 1 * 60)
+        gps[1], gps[2], gps[3], gps[4] = "N", parts(latitude), "E", parts(longitude)
+        gps[5], gps[6] = b"\0", height
+        with Image.open(tmp_path / name) as image:
+            image.copy().save(tmp_path / name, exif=head)
+    settings = dataclasses.replace(SETTINGS, pairs="place", points=120)
+    found = reconstruct([tmp_path], settings=settings)
+    assert any("EPSG:32633" in note for note in found.notes) and not found.left_out
+    assert [part.name for part in found.parts] == ["part 1", "part 2"]
+    for part, prefix in zip(found.parts, "ab"):
+        ids = part.adjustment.network.images.id
+        assert set(ids) == {name for name in truth if name[0] == prefix}
+        e = part.adjustment.image_values[:, :3] - [truth[id] for id in ids]
+        assert np.abs(e).max() < 0.6
 
 
 def test_groups_of_connected_photographs():

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 import jaxbundle
 from jaxbundle.tiepoints.features import Detection, Features
 from jaxbundle.tiepoints.interior import estimate_interior
+from jaxbundle.tiepoints.loops import split_contradicted
 from jaxbundle.tiepoints.matching import distances_within, match_features
 from jaxbundle.tiepoints.pairs import candidate_pairs
 from jaxbundle.tiepoints.store import Store
@@ -77,12 +78,64 @@ def test_verification_keeps_true_matches_and_names_what_is_degenerate(cloud):
     first = [a, noise(seen(X, X0, M)), noise(seen(flat, *views[0])), foreign[0]]
     second = [b, turned, noise(seen(flat, *views[2])), foreign[1]]
     found = verify_pairs(first, second, np.full(4, 2e-3))
-    good, M, base, angle, kind = found[0]
+    good, M, base, angle, kind, _ = found[0]
     assert good[~wrong].mean() > 0.97 and good[wrong].mean() < 0.2
     true = views[3][1] @ views[0][1].T
     assert np.linalg.norm(Rotation.from_matrix(M @ true.T).as_rotvec()) < 0.01
     assert 0.5 < angle < 1.3
     assert [one and one[4] for one in found] == ["relative", "rotation", "plane", None]
+
+
+@pytest.fixture(scope="module")
+def windows():
+    """Four identical windows with their distance, and places of the wall in no plane."""
+    rng = np.random.default_rng(6)
+    T = np.array([1.1, 0, 0])
+    window = rng.uniform(-0.4, 0.4, (40, 3)) - [1.6, 0, 0]
+    X = np.concatenate([window + k * T for k in range(4)])
+    return rng, X, T, rng.uniform(-2.2, 2.2, (80, 3))
+
+
+def test_what_is_there_once_orients_a_pair_of_repeated_windows(cloud, windows):
+    views = cloud[2]
+    rng, X, T, wall = windows
+    noise = lambda xy: xy + 3e-4 * rng.normal(size=xy.shape)
+    one = np.concatenate([X[:-40], wall])
+    other = np.concatenate([X[40:], wall])  # every window is taken for the next one
+    a, b = noise(seen(one, *views[0])), noise(seen(other, *views[3]))
+    single = np.arange(len(one)) >= 120
+    order = rng.permutation(len(one))
+    everything, by_single = (
+        verify_pairs([a[order]], [b[order]], np.full(1, 2e-3), given)[0]
+        for given in (None, [single[order]])
+    )
+    true = views[3][1] @ views[0][1].T
+    base = views[0][1] @ (views[3][0] - views[0][0])
+    assert by_single.sure and by_single.b @ base / np.linalg.norm(base) > 0.9998
+    assert np.linalg.norm(Rotation.from_matrix(by_single.M @ true.T).as_rotvec()) < 0.01
+    assert by_single.good[single[order]].mean() > 0.95 and not by_single.good[~single[order]].any()
+    shifted = base - views[0][1] @ T
+    assert everything.b @ shifted / np.linalg.norm(shifted) > 0.999
+
+
+def test_a_pair_that_does_not_close_around_three_photographs_is_found(cloud, windows):
+    views, X, T = cloud[2], windows[1], windows[2]
+    ideal = [seen(X, *view) for view in views]
+    every = np.arange(len(X))
+
+    def pair(i, j, moved):
+        (X0, M), (other, N) = views[i], views[j]
+        b = M @ (other - moved * T - X0)
+        step = 40 * moved
+        rows = np.stack([every[: len(X) - step], every[step:]], 1)
+        return Pair((i, j), rows, np.zeros(len(rows)), N @ M.T, b / np.linalg.norm(b), 0.5,
+                    "relative", len(rows))  # fmt: skip
+
+    shifted = (1, 2)
+    pairs = [pair(i, j, int((i, j) == shifted)) for i in range(5) for j in range(i + 1, 5)]
+    kept, wrong = split_contradicted(pairs, ideal)
+    assert [p.images for p in wrong] == [shifted] and len(kept) == 9
+    assert split_contradicted(pairs[3:4], ideal) == ([pairs[3]], [])
 
 
 def features_at(xy):

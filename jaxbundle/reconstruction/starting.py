@@ -1,0 +1,128 @@
+"""Start values of a part, in several ways, until one of them leads to an adjustment.
+
+1. With the cameras that pairs of photographs agree on: what misses by more than `CLOSE` of the
+   picture contradicts. Where that leaves photographs out, as far as an unknown lens may bend it.
+2. With other principal distances, unless the file tells one, those first that explain the most.
+
+Whichever it is, photographs that are left out then get another chance with the cameras adjusted.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from jaxbundle.bundle.orient import orient
+from jaxbundle.bundle.result import Adjustment
+from jaxbundle.errors import NotSolvedError
+from jaxbundle.network.sightings import keep_images, keep_points
+from jaxbundle.network.tables import Camera, Network
+from jaxbundle.orientation.network import Oriented
+from jaxbundle.orientation.sights import TOLERANCE
+from jaxbundle.tiepoints.search import APART, OTHERS, present_size
+
+CLOSE = 0.01
+"""Tolerance of start values by cameras that pairs agree on, in parts of the extent of a picture."""
+SHORTEST, LONGEST = 0.35, 12.0
+"""Principal distances between which an adjusted one is believed, in parts of the longer side."""
+FEWEST_RAYS = 12
+"""Image points a photograph needs; of fewer gross errors may be most."""
+LEAST_OF_IMAGES = 0.5
+"""Part of the photographs that start values by another principal distance must place."""
+
+
+def start_values(network: Network, guessed: Sequence[str]) -> Iterator[Oriented]:
+    """The network with start values, in one way after another.
+
+    **Arguments:** `guessed`: ids of cameras whose principal distance no file tells.
+
+    **Raises:** `NotSolvedError` if there are none.
+    """
+    found, failed = [], None
+    for tolerance in (CLOSE, TOLERANCE):
+        try:
+            found.append(_oriented(network, tolerance))
+        except NotSolvedError as error:
+            failed = error
+        else:
+            if not found[-1].images:
+                break
+    yield from sorted(found, key=lambda one: len(one.images))
+    others = []
+    for changed in _with_other_distances(network, guessed):
+        try:
+            others.append(_oriented(changed, CLOSE))
+        except NotSolvedError:
+            continue
+    enough = [one for one in others
+              if len(one.network.images) >= LEAST_OF_IMAGES * len(network.images)]  # fmt: skip
+    yield from sorted(enough, key=lambda one: -len(one.network.observations))
+    if failed is not None and not found and not enough:
+        raise failed
+
+
+def _oriented(network: Network, tolerance: float) -> Oriented:
+    """Start values, without photographs that are hardly tied to the others."""
+    found = orient(network, tolerance)
+    network, images = found.network, dict(found.images)
+    while True:
+        rays = np.bincount(network.observations.point, minlength=len(network.points))
+        tied = (rays > 1)[network.observations.point]
+        number = np.bincount(network.observations.image, tied, len(network.images))
+        few = number < FEWEST_RAYS
+        if not few.any() or few.all():
+            return dataclasses.replace(found, network=network, images=images)
+        for k in np.flatnonzero(few):
+            why = f"only {int(number[k])} places in it agree with the others"
+            images[network.images.id[k]] = why
+        network = keep_images(network, ~few)
+        rays = np.bincount(network.observations.point, minlength=len(network.points))
+        network = keep_points(network, (rays > 1) | ~network.points.has_role("tie"))
+
+
+def _with_other_distances(network: Network, guessed: Sequence[str]) -> Iterator[Network]:
+    of = {c.id: c for c in network.cameras if c.id in guessed and c.image_size is not None}
+    for factor in OTHERS if of else ():
+        distances = {id: factor * max(present_size(c)) for id, c in of.items()}
+        ratios = [of[id].parameters["fx"] / f for id, f in distances.items()]
+        if any(max(r, 1 / r) > APART for r in ratios):
+            yield network.replace(cameras=tuple(
+                _with_distance(c, distances[c.id]) if c.id in of else c for c in network.cameras
+            ))
+
+
+def _with_distance(camera: Camera, f: float) -> Camera:
+    scale = f / camera.parameters["fx"]
+    parameters = {**camera.parameters, "fx": f, "fy": f, "k1": 0.0}
+    sigma = {n: s * scale if n in ("fx", "fy") else s for n, s in camera.sigma.items()}
+    return dataclasses.replace(camera, parameters=parameters, sigma=sigma)
+
+
+def believable(result: Adjustment) -> bool:
+    """Whether an adjustment converged to principal distances that a camera may have."""
+    return bool(result.converged) and all(
+        SHORTEST < found["fx"] / max(camera.image_size) < LONGEST
+        for camera in result.network.cameras
+        if camera.image_size and "fx" in (found := _parameters(result, camera))
+    )
+
+
+def start_again(network: Network, oriented: Oriented, result: Adjustment) -> Oriented | None:
+    """Start values with the adjusted cameras, if these place more photographs."""
+    if not oriented.images:
+        return None
+    better: Mapping[str, Camera] = {
+        c.id: dataclasses.replace(c, parameters={**c.parameters, **_parameters(result, c)})
+        for c in result.network.cameras
+    }
+    cameras = tuple(better.get(c.id, c) for c in network.cameras)
+    try:
+        found = _oriented(network.replace(cameras=cameras), CLOSE)
+    except NotSolvedError:
+        return None
+    return found if len(found.images) < len(oriented.images) else None
+
+
+def _parameters(result: Adjustment, camera: Camera) -> dict[str, float]:
+    values = result.cameras[camera.id]["parameters"]
+    return {name: float(one["value"]) for name, one in values.items()}

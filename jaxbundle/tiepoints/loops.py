@@ -1,0 +1,127 @@
+"""Pairs that contradict other pairs: around three photographs, orientations must close.
+
+Of photographs i, j, k, of which each two are a pair with M and a base b of length 1,
+
+    M_jk·M_ij = M_ik,        β_ij·b_ij + β_jk·M_ijᵀ·b_jk = β_ik·b_ik
+
+with the lengths β of the bases, whose ratios the depths tell of features that two pairs have
+in common (a depth s of a pair is s·β). A row of windows that is matched one window further keeps
+the rotation, and moves the camera: only the bases do not close.
+
+Pairs are taken one after another, sure ones first, and of these the ones with many matches and
+loops that close. One that contradicts pairs already taken, in more loops than it agrees with, is
+left out. Where it would have been alone to connect photographs there is no loop: it stays.
+
+Zach, Klopschitz and Pollefeys (2010), Disambiguating visual relations using loop constraints.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbundle.tiepoints.verification import Pair
+
+TURN, GAP = np.radians(5.0), 0.15
+"""Rotation that remains around a loop, and gap of the bases in parts of the longest, at most."""
+COMMON = 8
+"""Features that two pairs must have in common for the ratio of their bases."""
+MOST = 12
+"""Loops of a pair that are looked at, those with the most matches."""
+
+
+def split_contradicted(
+    pairs: Sequence[Pair], ideal: Sequence[Float[np.ndarray, "_ 2"]]
+) -> tuple[list[Pair], list[Pair]]:
+    """The pairs that agree with one another, and those that contradict them, in the given order.
+
+    **Arguments:** `ideal`: coordinates of the features of every photograph, c = 1.
+    """
+    loops = _Loops(pairs, ideal)
+    votes = {of: [loops.closes(of, k) for k in loops.thirds(of)] for of in loops.pairs}
+
+    def strength(pair: Pair):
+        of = votes.get(pair.images, [])
+        good, bad = of.count(True), of.count(False)
+        return pair.sure, len(pair) * (1 + good) / (1 + good + bad)
+
+    taken: set[tuple[int, int]] = set()
+    for pair in sorted(pairs, key=strength, reverse=True):
+        i, j = pair.images
+        found = [loops.closes((i, j), k) for k in loops.thirds((i, j))
+                 if {_pair(i, k), _pair(j, k)} <= taken]  # fmt: skip
+        if found.count(False) <= found.count(True):
+            taken.add((i, j))
+    return ([p for p in pairs if p.images in taken], [p for p in pairs if p.images not in taken])
+
+
+def _pair(i: int, j: int) -> tuple[int, int]:
+    return min(i, j), max(i, j)
+
+
+class _Loops:
+    """Loops of pairs that have a base."""
+
+    def __init__(self, pairs: Sequence[Pair], ideal):
+        self.pairs = {p.images: p for p in pairs if p.kind != "rotation"}
+        self.depth = {p.images: _depths(p, ideal) for p in self.pairs.values()}
+        self.next: dict[int, set[int]] = {}
+        for i, j in self.pairs:
+            self.next.setdefault(i, set()).add(j)
+            self.next.setdefault(j, set()).add(i)
+        self.known: dict[tuple[int, ...], bool | None] = {}
+
+    def thirds(self, of: tuple[int, int]) -> list[int]:
+        """Photographs that are a pair with both, those with the most matches first."""
+        if of not in self.pairs:
+            return []
+        i, j = of
+        fewest = lambda k: min(len(self.pairs[_pair(i, k)]), len(self.pairs[_pair(j, k)]))
+        return sorted(self.next[i] & self.next[j], key=lambda k: (-fewest(k), k))[:MOST]
+
+    def closes(self, of: tuple[int, int], k: int) -> bool | None:
+        """Whether a loop closes; None where nothing tells the bases."""
+        loop = tuple(sorted((*of, k)))
+        if loop not in self.known:
+            self.known[loop] = self._closes(*loop)
+        return self.known[loop]
+
+    def _closes(self, i, j, k):
+        ij, jk, ik = (self.pairs[of] for of in ((i, j), (j, k), (i, k)))
+        turn = jk.M @ ij.M @ ik.M.T
+        if np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)) > TURN:
+            return False
+        # ln β of jk and ik, β of ij is 1
+        at_j, at_i = self._ratio((i, j), (j, k), 1, 0), self._ratio((i, j), (i, k), 0, 0)
+        at_k = self._ratio((j, k), (i, k), 1, 1)
+        if np.isnan([at_j, at_i, at_k]).sum() > 1:
+            return None
+        of_jk = at_i - at_k if np.isnan(at_j) else at_j
+        of_ik = at_j + at_k if np.isnan(at_i) else at_i
+        second, third = np.exp(of_jk) * ij.M.T @ jk.b, np.exp(of_ik) * ik.b
+        gap = np.linalg.norm(ij.b + second - third)
+        return bool(gap < GAP * max(1.0, np.exp(of_jk), np.exp(of_ik)))
+
+    def _ratio(self, one, other, of_one, of_other) -> float:
+        """ln of the ratio of the base of `other` to that of `one`, by the depths in the photograph
+        that they have in common: the first or second (0, 1) of each; NaN: not known."""
+        a, depth = self.pairs[one].matches[:, of_one], self.depth[one][of_one]
+        b, far = self.pairs[other].matches[:, of_other], self.depth[other][of_other]
+        _, rows, columns = np.intersect1d(a, b, return_indices=True)
+        ratio = depth[rows] / far[columns]
+        ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
+        return float(np.log(np.median(ratio))) if len(ratio) >= COMMON else np.nan
+
+
+def _depths(pair: Pair, ideal):
+    """Depths of the matches in both photographs, the base being 1."""
+    a, c = (np.pad(ideal[k][rows], ((0, 0), (0, 1)), constant_values=-1.0)
+            for k, rows in zip(pair.images, pair.matches.T))  # fmt: skip
+    c = c @ pair.M
+    aa, cc, dot = (a**2).sum(1), (c**2).sum(1), (a * c).sum(1)
+    determinant = aa * cc - dot * dot
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return (
+            (cc * (a @ pair.b) - dot * (c @ pair.b)) / determinant,
+            (dot * (a @ pair.b) - aa * (c @ pair.b)) / determinant,
+        )
