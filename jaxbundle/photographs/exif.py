@@ -6,6 +6,7 @@ Every value may be missing, and those of some cameras are wrong: they are start 
 import dataclasses
 import datetime
 import math
+import warnings
 from pathlib import Path
 
 from jaxbundle.photographs.reading import open_image
@@ -80,7 +81,8 @@ def read_exif(path: str | Path) -> Exif:
 
     **Raises:** `InputError` if it is no image.
     """
-    with open_image(path) as image:
+    with open_image(path) as image, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of damaged heads
         size = image.size
         try:
             head = image.getexif()

@@ -7,6 +7,7 @@ more than 8 bits is stretched over them.
 
 import os
 import threading
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -100,7 +101,9 @@ def _open_any_size(path):
     with LIMIT:
         given, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
         try:
-            return Image.open(path)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of damaged heads: what is missing is not known
+                return Image.open(path)
         finally:
             Image.MAX_IMAGE_PIXELS = given
 

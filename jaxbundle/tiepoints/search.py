@@ -29,13 +29,15 @@ and others with fewer, which lie wider apart."""
 MOST_ALIKE = 5
 """Of the former."""
 OF_THE_LENS = ("fx", "fy", "k1")
-OTHERS, APART, MORE = (0.7, 0.9, 1.2, 1.6, 2.2), 1.15, 1.05
+OTHERS, APART = (0.7, 0.9, 1.2, 1.6, 2.2), 1.15
 """Other principal distances that are tried, in parts of the longer side, unless they differ by less
-than this factor; and how many times as many matches they must explain."""
-BELIEVED = 0.4
-"""Part of the matches that must be explained where a file tells the principal distance: it may be
-wrong, of photographs that were cut or made smaller."""
-TRIED = 40
+than this factor."""
+MORE, MORE_THAN_TOLD = 1.05, 1.25
+"""How many times as many matches they must explain; also as that from a file, which may be wrong of
+photographs that were cut or made smaller."""
+PLENTY = 0.85
+"""Part of the matches that must be explained for others not to be tried."""
+TRIED = 24
 """Pairs by which they are judged."""
 
 
@@ -135,9 +137,9 @@ def start_cameras(
                 _with_lens(cameras, own, camera), of, features, clear
             )
             now = explained(start.camera)
-            few = now < BELIEVED * sum(len(m.rows) for m in clear)
-            if not told or few:
-                start = _most_explained(start, begin, xy, explained, now)
+            if now < PLENTY * sum(len(m.rows) for m in clear):
+                least = (MORE_THAN_TOLD if told else MORE) * now
+                start = _most_explained(start, begin, xy, explained, least)
         p = start.camera.parameters
         better = _with_lens(better, own, start.camera)
         if start.pairs:
@@ -169,15 +171,17 @@ def _with_lens(cameras, own, camera: Camera) -> list[Camera]:
 
 
 def _explained(cameras, of, features, matches) -> int:
-    """How many matches the relative orientations of their pairs explain."""
-    return sum(map(len, verify(cameras, of, features, matches, lambda *_: None)))
+    """How many matches the relative orientations of their pairs explain, of pairs that close around
+    three photographs, as hardly any do by a wrong principal distance."""
+    pairs = verify(cameras, of, features, matches, lambda *_: None)
+    return sum(map(len, without_contradicted(cameras, of, features, pairs)[0]))
 
 
-def _most_explained(start: Start, begin: Camera, xy, explained, now: int) -> Start:
+def _most_explained(start: Start, begin: Camera, xy, explained, least: float) -> Start:
     """The start, or that from another principal distance which explains clearly more matches."""
     size = max(present_size(begin))
     f = start.camera.parameters["fx"]
-    most, best = MORE * now, None
+    most, best = least, None
     for other in (factor * size for factor in OTHERS):
         if max(f / other, other / f) > APART:
             camera = dataclasses.replace(
