@@ -83,6 +83,35 @@ def find_named(
     return Named(np.array(image), tuple(name), np.array(xy, float), np.array(sigma, float)), notes
 
 
+def name_unused(
+    named: Named, control: Control | None, distances: Sequence[dict], fewest: int
+) -> list[str]:
+    """Notes of scale bars and control points that are in no photographs.
+
+    **Raises:** `InputError` where no scale bar, or fewer than `fewest` control points, are left.
+    """
+    photographs = {name: len(set(named.image[np.array(named.name) == name].tolist()))
+                   for name in set(named.name)}  # fmt: skip
+    ends = lambda d: min(photographs.get(d["from"], 0), photographs.get(d["to"], 0))
+    lost = [f"{d['from']} to {d['to']}" for d in distances if ends(d) < 2]
+    if distances and len(lost) == len(distances):
+        raise InputError(
+            f"no scale bar has both ends in two photographs ({some(lost, 3, str)}): look at the "
+            "names of the targets"
+        )
+    notes = [f"scale bars that are not in two photographs: {some(lost, 3, str)}"] * bool(lost)
+    if control is not None:
+        lost = [id for id in control.points.id if id not in photographs]
+        if len(control.points) - len(lost) < fewest:
+            raise InputError(
+                f"{control.points.source.name}: {len(control.points) - len(lost)} control points "
+                f"are measured in the photographs, {fewest} are needed; not found: "
+                f"{some(lost, 5, str)}"
+            )
+        notes += [f"control points in no photograph: {some(lost, 5, str)}"] * bool(lost)
+    return notes
+
+
 def _targets_of(photograph: Photograph, kind: str) -> NamedPoints | None:
     """The coded targets of a photograph; None where it cannot be read: it is left out later, with
     the reason."""

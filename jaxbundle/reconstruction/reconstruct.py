@@ -22,8 +22,8 @@ from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.reconstruction.adjusting import Weighted, adjust_weighted
 from jaxbundle.reconstruction.attitudes import map_attitudes, with_attitudes
 from jaxbundle.reconstruction.control import Control
-from jaxbundle.reconstruction.named import find_named
-from jaxbundle.reconstruction.network import Extra, tie_network, track_name
+from jaxbundle.reconstruction.named import find_named, name_unused
+from jaxbundle.reconstruction.network import FEWEST_CONTROL, Extra, tie_network, track_name
 from jaxbundle.reconstruction.parts import SMALLEST, connected, why_alone
 from jaxbundle.reconstruction.photographs import (
     Cameras,
@@ -52,6 +52,8 @@ from jaxbundle.tiepoints.verification import Pair
 DEFAULT = Settings()
 NAMED = 99
 """Kind of the measurements of named points."""
+REPEATS = 0.3
+"""Part of the pairs that contradict others from which on the whole is doubtful."""
 TEXTURE = 16
 """Features a photograph needs."""
 
@@ -113,6 +115,7 @@ def reconstruct(
     cameras = assign_cameras(photographs, camera)
     with ThreadPoolExecutor(settings.workers or available_cores()) as pool:
         named, notes = find_named(photographs, settings.targets, control, pool.map)
+    notes += name_unused(named, control, distances, FEWEST_CONTROL)
     positions = map_positions([p.exif.place for p in photographs]) if control is None else None
     if positions is not None:
         notes.append(f"positions of the photographs by satellites: {positions.system}")
@@ -207,6 +210,12 @@ class _Making:
             named = (" and ".join(self.names[k] for k in p.images) for p in wrong)
             self.notes.append(f"{count(len(wrong), 'pair')} of photographs not used, which others "
                               f"contradict around three: {some(named, 3, str)}")  # fmt: skip
+        if len(wrong) > REPEATS * (len(wrong) + len(pairs)):
+            self.notes.append(
+                f"{len(wrong)} of {len(wrong) + len(pairs)} pairs contradict others: the object "
+                "repeats itself, and parts of it may have been laid upon one another; compare the "
+                "result with the object, or give --pairs sequence or positions"
+            )
         return pairs
 
     def _parts(self, features, matches, pairs: Sequence[Pair]) -> list[Part]:

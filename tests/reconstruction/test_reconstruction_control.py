@@ -1,11 +1,13 @@
 """Control points with their measurements: files of OpenDroneMap, tables, errors by line."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from jaxbundle.errors import InputError
 from jaxbundle.reconstruction.control import read_control_measurements
-from jaxbundle.reconstruction.named import read_distances
+from jaxbundle.reconstruction.named import Named, name_unused, read_distances
 
 
 def written(tmp_path, text):
@@ -57,6 +59,21 @@ def test_tables_with_and_without_measurements(tmp_path):
 def test_what_is_wrong_is_said_with_its_line(tmp_path, text, said):
     with pytest.raises(InputError, match=said):
         read_control_measurements(written(tmp_path, text))
+
+
+def test_scale_bars_and_control_that_no_photograph_shows(tmp_path):
+    seen = Named(np.array([0, 1, 0]), ("45", "45", "51"), np.zeros((3, 2)), np.ones((3, 2)))
+    bar = lambda a, b: {"from": a, "to": b, "value": 1.0, "sigma": 0.001}
+    assert name_unused(seen, None, [], 3) == []
+    with pytest.raises(InputError, match="no scale bar has both ends in two .*45 to 51"):
+        name_unused(seen, None, [bar("45", "51")], 3)
+    both = dataclasses.replace(seen, image=np.array([0, 1, 0, 1]), name=("45", "45", "51", "51"))
+    (note,) = name_unused(both, None, [bar("45", "51"), bar("45", "7")], 3)
+    assert "45 to 7" in note and "51" not in note
+    control = read_control_measurements(written(tmp_path, "id,X,Y,Z\n45,1,2,3\n7,1,2,4\n"))
+    with pytest.raises(InputError, match="1 control points are measured .* 3 are needed.*7"):
+        name_unused(both, control, [], 3)
+    assert name_unused(both, control, [], 1) == ["control points in no photograph: 7"]
 
 
 def test_distances(tmp_path):
