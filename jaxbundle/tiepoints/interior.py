@@ -38,7 +38,7 @@ USUAL, DOUBT = 1.0, 0.06
 """The usual principal distance, in parts of the longer side, and by which part a sum must be less
 to believe one that differs by a factor of e; for x = |ln| of another factor x·(1 + x)/2 times as
 much."""
-WIDE = 0.35
+WIDE = 0.12
 """Angle of intersection, radians, beyond which wider is no better."""
 FARTHEST = 0.35
 """|k1| beyond this is not believed."""
