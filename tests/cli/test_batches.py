@@ -209,3 +209,68 @@ def test_the_table_of_the_docs(start, tmp_path):
     assert table.index.tolist() == keys(tmp_path / "results.jsonl")
     assert table["status"].eq("converged").all()
     assert table["parameters.fx.value"].between(850, 1150).all()
+
+
+def test_the_population_beside_the_lines(start, command, tmp_path):
+    """Table, summary and page of the same lines; what cannot be written is refused first."""
+    path, file, _ = start
+    (tmp_path / "made.csv").write_text("id,made,batch\n" + "".join(
+        f"serial {i},2026-05-0{i + 1},{i % 2}\n" for i in range(4)
+    ))  # fmt: skip
+    given = ("batch", path, "--json-lines", file, "--free", ",".join(FREE))
+    told = command(*given, "--table", "cameras.csv", "--summary", "population.json", "--against",
+                   "made.csv", "--html", "page.html")  # fmt: skip
+    assert told.status == 0, told.err
+    table = [line.split(",") for line in Path("cameras.csv").read_text().splitlines()]
+    names = table[0]
+    assert {"key", "status", "rms", "fx", "sigma_fx", "farthest", "made", "batch"} <= {*names}
+    rows = [json.loads(line) for line in file.read_text().splitlines()]
+    for cells, row in zip(table[1:], rows, strict=True):
+        found = dict(zip(names, cells))
+        assert found["key"] == row["key"]
+        assert float(found["fx"]) == row["parameters"]["fx"]["value"]
+        assert float(found["batch"]) == int(row["key"][-1]) % 2
+    summary = json.loads(Path("population.json").read_text())
+    assert summary["status"] == {"converged": 4} and summary["parameters"]["fx"]["cameras"] == 4
+    assert summary["correlations"] == []  # of four cameras nothing is said
+    assert "Parameters of the population" in Path("page.html").read_text()
+    before = file.read_bytes()
+    for wrong, said in (
+        (("--table", "cameras.txt"), "ends with .csv or .parquet"),
+        (("--table", path), "part of the input"),
+        (("--summary", "made.csv"), "is not JSON"),
+        (("--against", "made.csv"), "goes with"),
+        (("--against", "none.csv", "--table", "a.csv"), "none.csv"),
+    ):
+        told = command(*given, *wrong)
+        assert told.status == 2 and said in told.err and told.err.count("\n") == 1, wrong
+    assert file.read_bytes() == before
+
+
+def test_a_table_as_parquet(start, command):
+    parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
+    path, file, _ = start
+    given = ("batch", path, "--json-lines", file, "--free", ",".join(FREE))
+    assert command(*given, "--table", "cameras.parquet").status == 0
+    table = parquet.read_table("cameras.parquet").to_pydict()
+    rows = [json.loads(line) for line in file.read_text().splitlines()]
+    assert table["key"] == [row["key"] for row in rows]
+    assert table["fx"] == [row["parameters"]["fx"]["value"] for row in rows]
+
+
+@pytest.mark.parametrize("model", ["brown", "spline-8x6-60"])
+def test_models_a_batch_cannot_have_are_refused_by_name(images, tmp_path, model):
+    path = write_cameras(tmp_path / "cameras.npz", images)
+    with pytest.raises(InputError, match=f"model '{model}'"):
+        run_batch([path], tmp_path / "results.jsonl", model=model)
+
+
+@pytest.mark.further
+@pytest.mark.parametrize("model", ["eucm", "radial-spline-3-80", "division"])
+def test_other_models_without_start_values(images, tmp_path, model):
+    """Of perspective cameras: the residuals are the noise."""
+    path, file = write_cameras(tmp_path / "cameras.npz", images), tmp_path / "results.jsonl"
+    given = {"eucm": ["fx", "fy", "alpha"], "division": ["fx", "fy", "k"]}
+    run_batch([path], file, model=model, free=given.get(model, ["fx", "fy", "s3"]))
+    for line in file.read_text().splitlines():
+        assert 0.1 < json.loads(line)["rms"] < 0.2
