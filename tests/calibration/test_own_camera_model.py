@@ -7,11 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_calibrate import TRUTH, VIEWS, normalised, simulated
+from test_rig import pair
 
 from jaxbundle import CameraModel
 from jaxbundle.batch.calibrate import calibrate_batch
-from jaxbundle.calibration import calibrate
+from jaxbundle.calibration import calibrate, calibrate_rig
 from jaxbundle.calibration.files import json_text
+from jaxbundle.calibration.report import rig_dict, rig_text
 from jaxbundle.calibration.start import start_values
 from jaxbundle.cameras import opencv
 from jaxbundle.errors import InputError
@@ -41,6 +43,21 @@ def test_opencv_said_again_has_the_figures_of_opencv():
     assert max(map(abs, normalised(one, TRUTH).values())) < 3
     document = json.loads(json_text(one.to_dict(brief=True)))
     assert document["cameras"]["cam"]["model"] == "again"
+
+
+@pytest.mark.further
+def test_a_rig_of_such_cameras():
+    """The same mounting as of `opencv`."""
+    found = []
+    for model in ("opencv", AGAIN):
+        alone = {
+            name: calibrate(views, model=model, free=NAMES, snooping=None, cross_validation=False)
+            for name, views in pair().items()
+        }
+        found.append(calibrate_rig(alone, snooping=None))
+    ours, again = found
+    assert again.rms == pytest.approx(ours.rms, rel=1e-7)
+    assert "Camera left" in rig_text(again) and rig_dict(again)["rms"] == again.rms
 
 
 def division(p, x, y):

@@ -18,6 +18,7 @@ from collections.abc import Mapping
 import jax
 import numpy as np
 
+from jaxbundle.arguments import shown
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.quality import kept_rays
 from jaxbundle.calibration.result import Calibration
@@ -59,9 +60,15 @@ def calibrate_rig(
     `NotSolvedError` where an adjustment does not settle.
     """
     check_test(snooping, significance)
+    if not isinstance(calibrations, Mapping):
+        raise InputError(f"calibrations are {shown(calibrations)}; expected them by name of the "
+                         "camera")  # fmt: skip
     if len(calibrations) < 2:
         raise InputError("a rig has two cameras or more: give --camera NAME=PATTERN for each")
     for name, one in calibrations.items():
+        if not isinstance(one, Calibration):
+            raise InputError(f"calibrations: {name!r} is {shown(one)}; expected what calibrate "
+                             "makes of the photographs of this camera")  # fmt: skip
         if not one.converged:
             why = one.adjustment.termination
             raise NotSolvedError(f"not solved: camera {name} by itself: {why}")
