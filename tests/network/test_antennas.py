@@ -270,3 +270,32 @@ def test_settings_that_cannot_be_end_in_a_line(flight, tmp_path, setting, messag
     path = jaxbundle.write_project(network, tmp_path / "flight")
     with pytest.raises(InputError, match=message):
         jaxbundle.make_problem(jaxbundle.read_network(path, overrides=[setting]))
+
+
+@pytest.mark.further
+def test_a_budget_of_lever_arm_and_boresight(flight):
+    """Against adjustments with the held lever arm, or a held angle of the boresight, changed."""
+    sensors = measured(flight.truth)
+
+    def adjusted(arm=ARM, turn=TURN):
+        held = {"antenna": {"lever_arm": list(arm), "free": ["shift", "drift"]},
+                "attitude": {"boresight": list(turn)}}  # fmt: skip
+        return jaxbundle.adjust(with_sensors(flight.network, *sensors, **held))
+
+    unit = np.eye(3)
+    cases = {
+        "lever arm:cam:az": (0.02, lambda h: adjusted(arm=ARM + h * unit[2])),
+        "boresight:cam:phi": (1e-4, lambda h: adjusted(turn=TURN + h * unit[1])),
+    }
+    found = adjusted()
+    budget = jaxbundle.sensitivity(found, {name: step for name, (step, _) in cases.items()})
+    names = [one.name for one in budget.results]
+    for effects, (step, again) in zip(budget.effects, cases.values()):
+        ends = [again(sign * step) for sign in (1, -1)]
+        plus, minus = (end.camera_parameters("cam")["x0"] for end in ends)
+        change = (plus - minus) / 2
+        assert effects[names.index("camera:cam:x0")] == pytest.approx(change, rel=1e-2, abs=1e-7)
+        moved = (ends[0].image_values - ends[1].image_values) / 2
+        known = np.sqrt((moved**2).mean(0))
+        at = [names.index(f"images:{p}") for p in ("X0", "Y0", "Z0", "omega", "phi", "kappa")]
+        assert (np.abs(effects[at] - known) < 1e-2 * known + 2e-3 * budget.sigma[at]).all()
