@@ -11,6 +11,8 @@ from rendered_photographs import SIZE, F, corner, write_photographs
 
 import jaxbundle
 from jaxbundle.errors import InputError
+from jaxbundle.io.cameras.calibrated import read_calibrated
+from jaxbundle.io.results.result_json import result_text
 from jaxbundle.orientation.alignment import similarity
 from jaxbundle.reconstruction.parts import connected
 from jaxbundle.reconstruction.photographs import assign_cameras, find_photographs
@@ -95,6 +97,16 @@ def test_weights_are_those_of_the_residuals(made):
     assert part.adjustment.global_test()["passed"] or abs(part.adjustment.sigma0 - 1) < 0.02
     assert 0.3 < part.factors["matched in the original"] < 1.6
     assert len(part.adjustment.removed) < 0.05 * len(part.adjustment.network.observations)
+
+
+def test_the_camera_of_a_result_can_be_given_to_another(made, tmp_path):
+    result = made[1].parts[0].adjustment
+    file = tmp_path / "result.json"
+    file.write_text("".join(result_text(result, True)))
+    ((camera, (names, C)),) = read_calibrated(file)
+    assert camera.parameters["fx"] == camera.parameters["fy"] and {"fx", "fy"} <= set(names)
+    x, y, other = (names.index(name) for name in ("fx", "fy", "cx"))
+    assert C[x, x] == C[y, y] == pytest.approx(C[x, y]) and C[x, other] == C[y, other]
 
 
 def test_stages_end_and_what_was_found_is_kept(made):

@@ -61,9 +61,22 @@ def _calibrated(path, id, entry, about) -> Calibrated:
     (camera,) = make_cameras([row], f"{path}, ")
     free = [name for name, p in parameters.items() if p["free"]]
     sigma = np.array([float(parameters[name]["sigma"]) for name in free])
+    known = entry["correlations"]
+    one = {name: _tied_to(name, parameters, known) for name in free}
     R = np.array([
-        [1.0 if a == b else float(entry["correlations"][a][b]) for b in free] for a in free
+        [1.0 if one[a] == one[b] else float(known[one[a]][one[b]]) for b in free] for a in free
     ]).reshape(len(free), len(free))  # fmt: skip
     if not (np.isfinite(sigma).all() and np.isfinite(R).all()):
         raise InputError(f"{path}, camera {id!r}: a σ or correlation is not a number")
     return camera, (free, sigma[:, None] * R * sigma)
+
+
+def _tied_to(name: str, parameters, known) -> str:
+    """The parameter whose correlations are those of this one: itself, or of tied ones, such as
+    fx and fy, the first, which has the same value and σ."""
+    if name in known:
+        return name
+    same = lambda other: all(
+        parameters[other][what] == parameters[name][what] for what in ("value", "sigma")
+    )
+    return next((other for other in known if same(other)), name)
