@@ -84,7 +84,7 @@ def shell(only_shell):
     only_shell.reset()
 
 
-FURTHER = ("lapan_a3", "next_photograph", "two_video_cameras")
+FURTHER = ("lapan_a3", "next_photograph", "two_strips_to_a_dsm", "two_video_cameras")
 """Whose functions another notebook calls."""
 
 

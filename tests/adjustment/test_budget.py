@@ -115,7 +115,7 @@ def test_errors_of_several_things_add_in_squares_and_a_common_one_by_amount():
 @pytest.mark.parametrize(
     ("network", "name", "step"),
     [
-        ("free", "camera:cam:K3", 1e-9),
+        pytest.param("free", "camera:cam:K3", 1e-9, marks=pytest.mark.further),
         pytest.param("one fixed point", "point:P0:X", 1e-3, marks=pytest.mark.further),
     ],
 )

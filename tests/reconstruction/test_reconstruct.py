@@ -116,6 +116,7 @@ def test_stages_end_and_what_was_found_is_kept(made):
     assert len(list(store.glob("*.npz"))) > 12 and not list(store.glob("*.part*"))
 
 
+@pytest.mark.further
 def test_two_scenes_by_the_positions_in_their_files(tmp_path):
     """Twenty metres for a unit of the rendered scenes, which lie a kilometre apart."""
     truth = {}
