@@ -214,7 +214,7 @@ class _Making:
             self.notes.append(
                 f"{len(wrong)} of {len(wrong) + len(pairs)} pairs contradict others: the object "
                 "repeats itself, and parts of it may have been laid upon one another; compare the "
-                "result with the object, or give --pairs sequence or positions"
+                "result with the object, or take photographs nearer to one another"
             )
         return pairs
 

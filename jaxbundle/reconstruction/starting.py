@@ -27,8 +27,9 @@ SHORTEST, LONGEST = 0.35, 12.0
 """Principal distances between which an adjusted one is believed, in parts of the longer side."""
 FEWEST_RAYS = 12
 """Image points a photograph needs; of fewer gross errors may be most."""
-LEAST_OF_IMAGES = 0.5
-"""Part of the photographs that start values by another principal distance must place."""
+LEAST_OF_IMAGES, OF_OTHERS = 0.5, 2
+"""Part of the photographs that start values by another principal distance must place; and how many
+of these are adjusted."""
 
 
 def start_values(network: Network, guessed: Sequence[str]) -> Iterator[Oriented]:
@@ -56,7 +57,7 @@ def start_values(network: Network, guessed: Sequence[str]) -> Iterator[Oriented]
             continue
     enough = [one for one in others
               if len(one.network.images) >= LEAST_OF_IMAGES * len(network.images)]  # fmt: skip
-    yield from sorted(enough, key=lambda one: -len(one.network.observations))
+    yield from sorted(enough, key=lambda one: -len(one.network.observations))[:OF_OTHERS]
     if failed is not None and not found and not enough:
         raise failed
 
