@@ -30,6 +30,9 @@ ROUNDS = 4
 FEWEST = 60
 """Measurements of a kind with a factor of its own."""
 SMALLEST, LARGEST = 0.3, 8.0
+MOST_ITERATIONS = 400
+"""Of one adjustment: photographs that hardly differ in direction, of an unknown camera, determine
+its principal distance by a trifle, and it takes a hundred and more to get there."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,7 +73,7 @@ def adjust_weighted(
 
 def _weighted(network: Network, kinds, names, significance, tell) -> Weighted:
     tell("adjustment")
-    result = adjust(network)
+    result = adjust(network, max_iterations=MOST_ITERATIONS)
     total = np.ones(len(network.observations))
     given, doubtful = network.observations.sigma, []
     if result.converged:
@@ -81,7 +84,8 @@ def _weighted(network: Network, kinds, names, significance, tell) -> Weighted:
     for _ in range(ROUNDS):
         tell("data snooping")
         network = _with_sigma(network, given * total[:, None])
-        result = adjust(network, snooping="pope", significance=significance, doubtful=doubtful)
+        result = adjust(network, snooping="pope", significance=significance, doubtful=doubtful,
+                        max_iterations=MOST_ITERATIONS)  # fmt: skip
         if not result.converged:
             break
         rows = _rows(result, network)

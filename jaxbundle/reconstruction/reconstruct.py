@@ -329,7 +329,8 @@ class _Making:
 
 def _not_solved(result: Adjustment) -> NotSolvedError:
     if not result.converged:
-        return NotSolvedError(f"not solved: {result.termination}", list(result.undetermined))
+        why = "; ".join([result.termination, *result.findings, *result.weakness.lines])
+        return NotSolvedError(f"not solved: {why}", list(result.undetermined))
     distances = ", ".join(f"{camera['parameters']['fx']['value']:.0f} px in {id}"
                           for id, camera in result.cameras.items())  # fmt: skip
     return NotSolvedError(
