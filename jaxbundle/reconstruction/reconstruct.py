@@ -85,8 +85,11 @@ class Reconstruction:
         lines = [
             f"{part.name}: {count(len(part.adjustment.network.images), 'photograph')}, "
             f"{count(len(part.adjustment.network.points), 'point')}, "
-            f"σ0 {part.adjustment.sigma0:.3f}" for part in self.parts
+            f"σ0 {part.adjustment.sigma0:.3f}{_distances_found(part.adjustment)}"
+            for part in self.parts
         ]  # fmt: skip
+        lines += [f"warning: {part.name}: {said}" for part in self.parts
+                  for said in (*part.adjustment.weakness.lines, *part.adjustment.doubts)]
         lines += [f"left out {name}: {why}" for name, why in self.left_out.items()]
         return "\n".join([*lines, *self.notes])
 
@@ -325,6 +328,14 @@ class _Making:
         kinds, named = _kinds(placed, measured, self.names)
         significance = self.settings.significance
         return adjust_weighted(placed, kinds, named, significance, self._begin), note
+
+
+def _distances_found(result: Adjustment) -> str:
+    """Principal distances that were free, with their σ."""
+    found = {id: camera["parameters"]["fx"] for id, camera in result.cameras.items()
+             if "fx" in camera["parameters"]}  # fmt: skip
+    return "".join(f", principal distance {c['value']:.2f} ± {c['sigma']:.2f} px ({id})"
+                   for id, c in found.items() if c["free"] and c["sigma"])  # fmt: skip
 
 
 def _not_solved(result: Adjustment) -> NotSolvedError:
