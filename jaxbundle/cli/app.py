@@ -152,7 +152,9 @@ def run(prepare: Callable[[], object] | None = None) -> None:
     except Exception as error:
         # Usage errors of the command line itself (unknown option, missing argument).
         if message := getattr(error, "format_message", None):
-            _end(message(), BAD_INPUT)
+            context = getattr(error, "ctx", None)
+            said = message() if message().endswith((".", "?")) else f"{message()}."
+            _end(f"{said} See {context.command_path} --help." if context else said, BAD_INPUT)
         traceback.print_exc()
         leave(1)
     sys.exit(status)

@@ -85,3 +85,14 @@ def test_verbose_tells_an_error_and_the_time(command):
 def test_both_together_are_refused(command):
     told = command(*PLAN, "--quiet", "--verbose")
     assert told.status == 2 and "give one of them" in told.err
+
+
+@pytest.mark.parametrize("given, said, help", [
+    ("adjst x", "No such command 'adjst'. Did you mean 'adjust'?", ""),
+    ("pushbroom locate", "Missing argument 'scanner'.", "pushbroom locate "),
+    ("adjust --frobnicate x", "No such option: --frobnicate", "adjust "),
+])  # fmt: skip
+def test_a_wrong_call_leads_to_the_help(command, given, said, help):
+    run = command(*given.split())
+    assert run.status == 2 and run.err.startswith(f"jaxbundle: {said}")
+    assert run.err.endswith(f" {help}--help.\n") and run.err.count("\n") == 1
