@@ -118,6 +118,7 @@ def test_jacobians(result):
     check_jacobians(result.problem, result.values)
 
 
+@pytest.mark.further
 def test_sigma_is_that_of_a_sample(simulated, result):
     problem = jaxbundle.make_problem(conditioned(simulated.truth, SIGMA, simulated.truth))
     names = [f"radius of {type}" for type in RADIUS]

@@ -153,6 +153,7 @@ def test_it_is_the_condition_left_minus_right(pair):
     assert np.abs(off).max() < 1e-5
 
 
+@pytest.mark.further
 def test_a_sigma_of_the_difference_lets_it_move():
     """With σ as large as those of the parameters themselves the difference is about halved."""
     free = jaxbundle.adjust(two_cameras((1e-4, 1.05e-4)))

@@ -152,6 +152,7 @@ def test_terrain_that_hides_terrain():
     np.testing.assert_array_equal(seen.line[places], all_.line[places])
 
 
+@pytest.mark.further
 def test_a_satellite_image_in_utm(tmp_path):
     """Whole numbers, georeferenced; the map shows what the truth locates."""
     flight = dataclasses.replace(

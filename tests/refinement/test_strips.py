@@ -74,6 +74,7 @@ def found(strips):
     )
 
 
+@pytest.mark.further
 def test_mounting_and_focal_length_of_both_strips_are_one(strips, found):
     X = strips[-1]
     names = [str(name) for name in found.names]
@@ -93,6 +94,7 @@ def test_mounting_and_focal_length_of_both_strips_are_one(strips, found):
     assert 0.7 < np.sqrt(np.mean(error**2)) < 1.4
 
 
+@pytest.mark.further
 def test_control_coordinates_with_sigma_are_tested_too(strips, found):
     X = strips[-1]
     removed = [(b.kind, b.row) for b in found.removed]
