@@ -2,7 +2,8 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -227,11 +228,12 @@ def pixel_model(name: str | CameraModel) -> CameraModel:
     return model
 
 
-def free_parameters(model: CameraModel, free) -> tuple[str, ...]:
+def free_parameters(model: CameraModel, free: Any) -> tuple[str, ...]:
     """The parameters to estimate, checked."""
     if free is None:
         free = model.free
-    if not isinstance(free, list | tuple):
+    one_by_one = isinstance(free, Iterable) and getattr(free, "ndim", 1) == 1
+    if isinstance(free, str | bytes) or not one_by_one:
         raise InputError(f"free must be a list of names, such as ['fx', 'fy'], but is {free!r}")
     free = list(free)
     for name in free:

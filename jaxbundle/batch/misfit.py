@@ -20,6 +20,8 @@ from jaxbundle.cameras import CameraModel
 TAIL = 1.5
 """1 for normal residuals, 1.2 for half the views five times as noisy as the others."""
 NORMAL = 2 / np.sqrt(np.pi)
+OF_DEVIATION = 1.4826
+"""The standard deviation of a normal distribution over its median absolute deviation."""
 FARTHER, DEVIATIONS = 3.0, 5.0
 FARTHER_OF_FEW = 10.0
 """Lenses, boards and focus of two good cameras may differ by less than this."""
@@ -45,7 +47,7 @@ def misfits(
     factor = FARTHER_OF_FEW
     if solved.sum() >= FEWEST:
         log = np.log(np.maximum(rms[solved], NEGLIGIBLE))
-        spread = 1.4826 * np.median(np.abs(log - np.median(log)))
+        spread = OF_DEVIATION * np.median(np.abs(log - np.median(log)))
         factor = np.exp(max(np.log(FARTHER), DEVIATIONS * spread))
     return found | (rms > factor * rms_beside(rms, solved))
 

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.batch.camera import CONVERGED, STATUS
+from jaxbundle.batch.misfit import OF_DEVIATION
 from jaxbundle.batch.result import SOLVED
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.distributions import f_tail
@@ -29,8 +30,6 @@ FEWEST = 8
 """Cameras that make a population."""
 APART = 5.0
 """So many robust standard deviations from the median is outlying."""
-NORMAL = 1.4826
-"""The standard deviation of a normal distribution over its median absolute deviation."""
 LEVEL = 0.01
 """Of all correlations of a batch together."""
 CLASSES, WIDE = 24, 4.0
@@ -88,7 +87,7 @@ class Population:
         if not len(found):
             return np.nan, np.nan
         middle = float(np.median(found))
-        return middle, NORMAL * float(np.median(np.abs(found - middle)))
+        return middle, OF_DEVIATION * float(np.median(np.abs(found - middle)))
 
     def _apart(self, values: np.ndarray) -> np.ndarray:
         middle, deviation = self.spread(values)

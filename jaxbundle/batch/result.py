@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from jaxbundle.batch.camera import CONVERGED, MISFIT, STATUS, WEAK
 from jaxbundle.cameras import CameraModel
+from jaxbundle.network.columns import data_frame
 
 SOLVED = (STATUS[CONVERGED], STATUS[WEAK], STATUS[MISFIT])
 """Statuses of cameras that have values."""
@@ -112,11 +113,7 @@ class BatchCalibration:
 
     def to_pandas(self):
         """`table` as a pandas data frame (extra `tables`)."""
-        try:
-            import pandas
-        except ImportError as error:
-            raise ImportError("data frames need pandas: pip install 'jaxbundle[tables]'") from error
-        return pandas.DataFrame(self.table())
+        return data_frame(self.table())
 
     def _repr_html_(self) -> str:
         """The cameras as a table, those that did not converge first."""

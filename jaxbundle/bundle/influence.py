@@ -18,6 +18,7 @@ from jaxbundle.bundle.sensitivity import looked_at
 from jaxbundle.bundle.tables import observations
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.response import pull_back
+from jaxbundle.network.columns import data_frame
 from jaxbundle.report.layout import significant, table
 from jaxbundle.statistics.results import CAMERAS, Asked, ask
 
@@ -66,11 +67,7 @@ class Influence:
 
     def to_pandas(self, result: str | None = None):
         """`table` as a pandas data frame (extra `tables`)."""
-        try:
-            import pandas
-        except ImportError as error:
-            raise ImportError("data frames need pandas: pip install 'jaxbundle[tables]'") from error
-        return pandas.DataFrame(self.table(result))
+        return data_frame(self.table(result))
 
 
 def influence(given: Adjustment | Problem, of: Any = CAMERAS) -> Influence:

@@ -36,7 +36,7 @@ from jaxbundle.leastsquares.solver import Minimum
 from jaxbundle.leastsquares.stopping import SINGULAR, TERMINATIONS
 from jaxbundle.leastsquares.stopping import converged as reached_minimum
 from jaxbundle.network.arrays import Values
-from jaxbundle.network.columns import some
+from jaxbundle.network.columns import data_frame, some
 from jaxbundle.network.declare import LEAST_IMAGES
 from jaxbundle.network.tables import Network, units_of
 from jaxbundle.network.unit_mistakes import name_pixels
@@ -484,11 +484,7 @@ class Adjustment:
 
     def to_pandas(self, name: str):
         """A table as a pandas data frame (extra `tables`)."""
-        try:
-            import pandas
-        except ImportError as error:
-            raise ImportError("data frames need pandas: pip install 'jaxbundle[tables]'") from error
-        return pandas.DataFrame(self.table(name))
+        return data_frame(self.table(name))
 
 
 @jax.jit

@@ -21,6 +21,7 @@ from jaxbundle.bundle.result import Adjustment
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.reduction import FACTORS
 from jaxbundle.leastsquares.response import follow
+from jaxbundle.network.columns import data_frame
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.report.budget import HEADER
 from jaxbundle.report.layout import significant, table
@@ -97,11 +98,7 @@ class Budget:
 
     def to_pandas(self):
         """`table` as a pandas data frame (extra `tables`)."""
-        try:
-            import pandas
-        except ImportError as error:
-            raise ImportError("data frames need pandas: pip install 'jaxbundle[tables]'") from error
-        return pandas.DataFrame(self.table())
+        return data_frame(self.table())
 
 
 def sensitivity(given: Adjustment | Problem, held: Mapping[Any, Any], of: Any = WORDS) -> Budget:

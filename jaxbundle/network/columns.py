@@ -231,3 +231,14 @@ def _plain_numbers(values: Column) -> np.ndarray | None:
     texts = [value for value in values if isinstance(value, str)]
     odd = texts and (not np.isfinite(numbers).all() or any("_" in text for text in texts))
     return None if odd else numbers
+
+
+def data_frame(columns: Mapping[str, np.ndarray]):
+    """Columns as a pandas data frame.
+
+    **Raises:** `ImportError` without pandas (extra `tables`)."""
+    try:
+        import pandas
+    except ImportError as error:
+        raise ImportError("data frames need pandas: pip install 'jaxbundle[tables]'") from error
+    return pandas.DataFrame(columns)

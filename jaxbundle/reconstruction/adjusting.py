@@ -31,8 +31,8 @@ FEWEST = 60
 """Measurements of a kind with a factor of its own."""
 SMALLEST, LARGEST = 0.3, 8.0
 MOST_ITERATIONS = 400
-"""Of one adjustment: photographs that hardly differ in direction, of an unknown camera, determine
-its principal distance by a trifle, and it takes a hundred and more to get there."""
+"""Of one adjustment. Photographs that all look the same way determine the principal distance of an
+unknown camera only weakly, and the search then needs more than a hundred."""
 
 
 @dataclasses.dataclass(frozen=True)

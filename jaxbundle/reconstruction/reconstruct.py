@@ -330,22 +330,28 @@ class _Making:
         return adjust_weighted(placed, kinds, named, significance, self._begin), note
 
 
+def _principal_distances(result: Adjustment) -> dict[str, dict]:
+    """Value and σ, by camera."""
+    return {id: camera["parameters"]["fx"] for id, camera in result.cameras.items()
+            if "fx" in camera["parameters"]}  # fmt: skip
+
+
 def _distances_found(result: Adjustment) -> str:
-    """Principal distances that were free, with their σ."""
-    found = {id: camera["parameters"]["fx"] for id, camera in result.cameras.items()
-             if "fx" in camera["parameters"]}  # fmt: skip
+    """The principal distances that were free, with their σ."""
     return "".join(f", principal distance {c['value']:.2f} ± {c['sigma']:.2f} px ({id})"
-                   for id, c in found.items() if c["free"] and c["sigma"])  # fmt: skip
+                   for id, c in _principal_distances(result).items()
+                   if c["free"] and c["sigma"])  # fmt: skip
 
 
 def _not_solved(result: Adjustment) -> NotSolvedError:
     if not result.converged:
         why = "; ".join([result.termination, *result.findings, *result.weakness.lines])
         return NotSolvedError(f"not solved: {why}", list(result.undetermined))
-    distances = ", ".join(f"{camera['parameters']['fx']['value']:.0f} px in {id}"
-                          for id, camera in result.cameras.items())  # fmt: skip
+    found = ", ".join(
+        f"{c['value']:.0f} px in {id}" for id, c in _principal_distances(result).items()
+    )
     return NotSolvedError(
-        f"not solved: principal distance {distances}, which no camera has; take photographs from "
+        f"not solved: principal distance {found}, which no camera has; take photographs from "
         "places that lie farther apart, or give --camera"
     )
 

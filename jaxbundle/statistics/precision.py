@@ -88,7 +88,7 @@ def precision(
     )
     of_points = problem.layout.coordinate_cofactors(data.start.point, found.own["point"])
     return Precision(
-        images=_root(_image_variances(problem, data.start, found.own["image"])) * sigma0,
+        images=_root(image_variances(problem, data.start, found.own["image"])) * sigma0,
         cameras=_camera_sigma(problem, data.start, found.own) * sigma0,
         points=_root(jnp.diagonal(of_points, axis1=1, axis2=2)) * sigma0,
         covariance=found.covariance * jnp.square(sigma0),
@@ -119,7 +119,7 @@ def _root(variance):
     return jnp.where(none, 0.0, jnp.sqrt(jnp.where(none, 1.0, variance)))
 
 
-def _image_variances(problem: Problem, values: Values, Q):
+def image_variances(problem: Problem, values: Values, Q):
     """Variances of X0, Y0, Z0 and of ω, φ, κ, by the Jacobian of the angles."""
     turn = jax.vmap(jax.jacfwd(angles_near, 1), (0, None, 0))
     A = turn(values.rotation, jnp.zeros(3), jnp.asarray(problem.network.images.angles))

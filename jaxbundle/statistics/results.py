@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -21,6 +22,7 @@ from jaxbundle.network.declare import Tables
 from jaxbundle.network.tables import EXTERIOR
 from jaxbundle.statistics.held import split_name
 from jaxbundle.statistics.inspection import Inspection
+from jaxbundle.statistics.precision import image_variances
 
 CAMERAS, IMAGES, POINTS = WORDS = ("cameras", "images", "points")
 """All free parameters of cameras; the root mean square of X0, Y0, Z0, ω, φ, κ of all images, and of
@@ -135,11 +137,8 @@ def _of_images(inspection: Inspection):
         angles = jax.vmap(angles_near, (0, None, 0))(values.rotation[rows], jnp.zeros(3), given)
         return jnp.concatenate([values.position[rows], angles], 1).ravel()
 
-    turn = jax.jit(jax.vmap(jax.jacfwd(angles_near, 1), (0, None, 0)))
-    A = np.zeros((len(rows), 6, 6))
-    A[:, :3, :3] = np.eye(3)
-    A[:, 3:, 3:] = turn(jnp.asarray(inspection.adjusted.rotation)[rows], jnp.zeros(3), given)
-    variance = np.einsum("nij,njk,nik->ni", A, inspection.image_cofactors[rows], A)
+    variances = jax.jit(partial(image_variances, problem))
+    variance = np.asarray(variances(inspection.adjusted, inspection.image_cofactors))[rows]
     names = [(f"images:{p}", f"{p} of images, RMS", p in EXTERIOR[3:]) for p in EXTERIOR]
     return poses, names, 6 * len(rows), np.sqrt(np.clip(variance.mean(0), 0, None))
 

@@ -340,7 +340,7 @@ def test_what_is_no_rig_is_refused(rig):
         calibrate_cameras({"right": views.take([0]), "left": views}, rig=True)
     with pytest.raises(InputError, match="a rig has two cameras or more"):
         calibrate_rig({"left": rig.cameras["left"]})
-    with pytest.raises(InputError, match="'left' is BoardViews.*expected what calibrate makes"):
+    with pytest.raises(InputError, match="'left' is BoardViews.*expected the Calibration"):
         calibrate_rig(pair())
     with pytest.raises(InputError, match="snooping must be one of pope, baarda or None"):
         calibrate_rig(rig.cameras, snooping="tau")

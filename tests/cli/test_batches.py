@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from batch_cameras import images_of, write_cameras
+from pyarrow.parquet import read_table
 
 from jaxbundle.batch import run as batches
 from jaxbundle.batch.run import key_of, run_batch
@@ -248,11 +249,10 @@ def test_the_population_beside_the_lines(start, command, tmp_path):
 
 
 def test_a_table_as_parquet(start, command):
-    parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
     path, file, _ = start
     given = ("batch", path, "--json-lines", file, "--free", ",".join(FREE))
     assert command(*given, "--table", "cameras.parquet").status == 0
-    table = parquet.read_table("cameras.parquet").to_pydict()
+    table = read_table("cameras.parquet").to_pydict()
     rows = [json.loads(line) for line in file.read_text().splitlines()]
     assert table["key"] == [row["key"] for row in rows]
     assert table["fx"] == [row["parameters"]["fx"]["value"] for row in rows]

@@ -61,14 +61,14 @@ def calibrate_rig(
     """
     check_test(snooping, significance)
     if not isinstance(calibrations, Mapping):
-        raise InputError(f"calibrations are {shown(calibrations)}; expected them by name of the "
-                         "camera")  # fmt: skip
+        raise InputError(f"calibrations are {shown(calibrations)}; expected a mapping from the "
+                         "name of each camera to its Calibration")  # fmt: skip
     if len(calibrations) < 2:
         raise InputError("a rig has two cameras or more: give --camera NAME=PATTERN for each")
     for name, one in calibrations.items():
         if not isinstance(one, Calibration):
-            raise InputError(f"calibrations: {name!r} is {shown(one)}; expected what calibrate "
-                             "makes of the photographs of this camera")  # fmt: skip
+            raise InputError(f"calibrations: {name!r} is {shown(one)}; expected the Calibration "
+                             "that calibrate returns for this camera")  # fmt: skip
         if not one.converged:
             why = one.adjustment.termination
             raise NotSolvedError(f"not solved: camera {name} by itself: {why}")
