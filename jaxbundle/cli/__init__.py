@@ -1,11 +1,11 @@
-"""The command line, a file for each command.
+"""The command line, one file per command.
 
-Help, the version and errors of usage are given without JAX, in 0.3 s: the file of a command imports
-at its top only what its arguments and options need, and the rooms it works with in the first lines
-of its functions. Where several functions need rooms, they have a file of their own.
+Help, version and usage errors take 0.3 s because they do not import JAX: a command's file imports
+at the top only what its arguments and options need, and the other subpackages in the first lines of
+its functions. Functions that share such imports are in a separate file.
 
-Exit status: 0 solved; 2 bad input (one line, nothing written); 3 not solved (says why); 130, 143,
-129 ended by Ctrl-C, SIGTERM, a lost terminal (`system.interrupts`); 141 nobody reads the output.
+Exit status: 0 solved; 2 bad input (one line, nothing written); 3 not solved (with the reason); 130,
+143, 129 ended by Ctrl-C, SIGTERM, a lost terminal (`system.interrupts`); 141 closed pipe.
 """
 
 import importlib
@@ -21,9 +21,9 @@ COMMANDS = (
 
 
 def main(prepare: Callable[[], object] | None = None) -> None:
-    """Run the command line. Only the command asked for is imported, for help all of them.
+    """Run the command line. Only the requested command is imported; all of them for the help.
 
-    `prepare`: called when the arguments are understood, before JAX computes anything.
+    `prepare`: called after parsing the arguments, before JAX computes anything.
     """
     asked = sys.argv[1:2]
     for command in asked if asked and asked[0] in COMMANDS else COMMANDS:

@@ -14,7 +14,7 @@ from jaxbundle.errors import InputError, NotSolvedError
 @app.command(example="examples/convergent4/project.toml --out out/convergent4")
 def adjust(
     input: Input,
-    json: Annotated[str, typer.Option(help="write the result as JSON; - for stdout alone")] = "",
+    json: Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")] = "",
     out: Annotated[
         Path | None, typer.Option(help="folder for report, page, JSON, tables, plots")
     ] = None,
@@ -26,45 +26,46 @@ def adjust(
     max_iterations: Annotated[int, typer.Option(min=1)] = 100,
     method: Annotated[str, choice(METHODS)] = "levenberg-marquardt",
     reduction: Annotated[
-        str | None, choice(REDUCTIONS, "of the reduced system, chosen if not given")
+        str | None, choice(REDUCTIONS, "solver of the reduced system; default: automatic")
     ] = None,
     robust: Annotated[str | None, choice(ESTIMATORS, "robust estimation")] = None,
-    snooping: Annotated[str | None, choice(TESTS, "remove blunders by a test")] = None,
+    snooping: Annotated[str | None, choice(TESTS, "remove blunders by data snooping")] = None,
     significance: Annotated[
-        float, typer.Option(
-            help="level of data snooping: of the largest (pope), of one (baarda); and of the "
-            "suspects of --robust (the largest)"
+        float,
+        typer.Option(
+            help="level of data snooping, for the largest (pope) or each test (baarda); and of the "
+            "suspects of --robust (for the largest)"
         ),
     ] = 0.001,
     eliminate: Annotated[
         bool, typer.Option("--eliminate", help="fix insignificant additional parameters (t < 2)")
     ] = False,
     components: Annotated[
-        bool, typer.Option("--components", help="estimate variance components of the groups")
+        bool, typer.Option("--components", help="estimate variance components")
     ] = False,
     budget: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME=SIGMA",
-            help="what an error of this σ in something held, such as camera:cam:K3 or point:*:Z, "
-            "does to the results; may be repeated",
+            help="effect on the results of this σ in a held quantity, such as camera:cam:K3 or "
+            "point:*:Z; repeatable",
         ),
     ] = None,
-    brief: Annotated[bool, typer.Option("--brief", help="no points and residuals in JSON")] = False,
+    brief: Annotated[
+        bool, typer.Option("--brief", help="omit points and residuals from the JSON")
+    ] = False,
     quiet: Quiet = False,
-    plots: Annotated[bool, typer.Option(help="plots in the folder of --out")] = True,
-    cores: Annotated[
-        int | None, typer.Option(min=1, help="cores that share the work; all if not given")
-    ] = None,
+    plots: Annotated[bool, typer.Option(help="write plots to --out")] = True,
+    cores: Annotated[int | None, typer.Option(min=1, help="number of cores; default: all")] = None,
     join: Annotated[
         tuple[str, int, int] | None,
         typer.Option(
             metavar="HOST:PORT NUMBER INDEX",
-            help="one of NUMBER processes, which find each other at the address of the first",
+            help="join NUMBER processes at the address of the first",
         ),
     ] = None,
     cluster: Annotated[
-        bool, typer.Option("--cluster", help="one of the processes started by srun (SLURM)")
+        bool, typer.Option("--cluster", help="join the processes started by srun (SLURM)")
     ] = False,
 ) -> None:
     """Adjust a network and report it."""

@@ -1,4 +1,4 @@
-"""The application the commands are registered with, and how it ends."""
+"""The typer application, its options, and exit statuses."""
 
 import os
 import sys
@@ -22,12 +22,13 @@ NO_READER = 128 + 13
 """As of a Unix tool whose reader has gone: ended by SIGPIPE, number 13."""
 
 EXIT_STATUS = (
-    "0 done; 2 bad input: one line, nothing written; 3 not solved: says why; 130, 143 interrupted; "
-    "141 nobody reads the output."
+    "0 done; 2 bad input: one line, nothing written; 3 not solved, with the reason; "
+    "130, 143 interrupted; 141 output pipe closed."
 )
 
+
 class Command(TyperCommand):
-    """A command that starts JAX when its arguments are understood: an error in them, and help, do
+    """A command that starts JAX after parsing its arguments, so that usage errors and help do
     not wait for that."""
 
     def invoke(self, ctx):
@@ -37,14 +38,14 @@ class Command(TyperCommand):
         return super().invoke(ctx)
 
     example: str = ""
-    """A line that calls it."""
+    """An example call."""
 
     def get_short_help_str(self, limit: int = 0) -> str:
-        """The first sentence, whole, for the list of commands."""
+        """The complete first sentence, for the list of commands."""
         return super().get_short_help_str(1000)
 
     def format_epilog(self, ctx, formatter) -> None:
-        """What every help ends with: an example, and what the exit status says."""
+        """The end of every help text: an example and the exit statuses."""
         with formatter.section("Example"):
             formatter.write(f"  {ctx.command_path} {self.example}\n")
         with formatter.section("Exit status"):
@@ -52,8 +53,8 @@ class Command(TyperCommand):
 
 
 class Application(typer.Typer):
-    """Commands of this kind; without one, their list. Help is plain text: rich would take as long
-    to import as all the rest."""
+    """A group of such commands; without a command it lists them. Help is plain text: rich takes as
+    long to import as all the rest."""
 
     def __init__(self, help: str, **options: Any):
         super().__init__(
@@ -87,21 +88,21 @@ app = Application(
     pretty_exceptions_enable=False,
 )
 
-Input = Annotated[Path, typer.Argument(help="project .toml, text list of photographs, …")]
-Settings = Annotated[list[str] | None, typer.Option(help="KEY=VALUE replaces a setting")]
-Format = Annotated[str | None, typer.Option(help="kind of input, if not recognised")]
+Input = Annotated[Path, typer.Argument(help="project .toml, list of photographs, COLMAP folder, …")]
+Settings = Annotated[
+    list[str] | None, typer.Option(help="KEY=VALUE overrides a setting; repeatable")
+]
+Format = Annotated[str | None, typer.Option(help="input format, if not recognised")]
 Control = Annotated[
     Path | None,
-    typer.Option(help="table id,X,Y,Z[,sX,sY,sZ] whose control replaces that of the input"),
+    typer.Option(help="table id,X,Y,Z[,sX,sY,sZ] that replaces the control of the input"),
 ]
-Force = Annotated[
-    bool, typer.Option("--force", help="replace files in the folder of --out of other origin")
-]
-Html = Annotated[str, typer.Option(help="write the result as one page of HTML")]
+Force = Annotated[bool, typer.Option("--force", help="replace foreign files in --out")]
+Html = Annotated[str, typer.Option(help="write the result as one HTML page")]
 
 
 def choice(words: Iterable[str], about: str = "", *names: str) -> Any:
-    """An option that is one of some words; another is refused with the closest of them. `names`:
+    """An option with a fixed set of values; others are refused with the closest match. `names`:
     of the option, if not that of the argument."""
     words = tuple(words)
     listed = ", ".join(words)
@@ -134,19 +135,20 @@ def _main(
 
 
 def run(prepare: Callable[[], object] | None = None) -> None:
-    """Run the application; errors of the input, the solution, the machine end in one line."""
+    """Run the application; errors in the input, the solution, or the machine are printed in one
+    line."""
     try:
         status = app(standalone_mode=False, obj=prepare)
         sys.stdout.flush()
     except (InputError, NotSolvedError) as error:
         _end(error, BAD_INPUT if isinstance(error, InputError) else NOT_SOLVED)
     except MemoryError:
-        _end("not enough memory for this", NOT_SOLVED)
+        _end("not enough memory", NOT_SOLVED)
     except (BrokenPipeError, SystemExit):  # typer ends a command that meets a broken pipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         leave(NO_READER)
     except typer.Abort as error:  # typer's word for EOFError
-        _end(f"a file ends too early: {error.__cause__}", BAD_INPUT)
+        _end(f"unexpected end of file: {error.__cause__}", BAD_INPUT)
     except (OSError, OverflowError, RecursionError) as error:
         _end(" ".join(str(error).split()), BAD_INPUT)
     except Exception as error:

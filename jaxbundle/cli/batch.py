@@ -19,46 +19,48 @@ MOST_REASONS = 5
 @app.command(example="cameras.npz PROJECT.toml --json-lines results.jsonl")
 def batch(
     inputs: Annotated[list[str], typer.Argument(help=".npz of many cameras; projects")],
-    json_lines: Annotated[str, typer.Option(help="file of results, one a line; is continued")],
+    json_lines: Annotated[
+        str, typer.Option(help="file of results, one per line; resumed if it exists")
+    ],
     model: Annotated[str, typer.Option(help="camera model of the .npz files")] = "opencv",
     free: Annotated[str, typer.Option(help="parameters to estimate: fx,fy,…")] = "",
     max_iterations: Annotated[int, typer.Option(min=1)] = 100,
     snooping: Annotated[str, choice(("pope", "none"), "removal of gross errors")] = "none",
     significance: Annotated[float, typer.Option(help="level of the test")] = 0.001,
-    portion: Annotated[int, typer.Option(min=1, help="cameras between two writes")] = 256,
-    brief: Annotated[bool, typer.Option("--brief", help="no poses, no covariances")] = False,
-    retry: Annotated[bool, typer.Option("--retry", help="again what has no result")] = False,
+    portion: Annotated[int, typer.Option(min=1, help="cameras computed between writes")] = 256,
+    brief: Annotated[bool, typer.Option("--brief", help="omit poses and covariances")] = False,
+    retry: Annotated[
+        bool, typer.Option("--retry", help="recompute inputs without a result")
+    ] = False,
     renew: Annotated[
-        bool, typer.Option("--renew", help="again what is from other settings or other data")
+        bool, typer.Option("--renew", help="recompute results of other settings or data")
     ] = False,
     table: Annotated[
         Path | None,
-        typer.Option(help="a row an input, CSV, or Parquet if the name ends with .parquet"),
+        typer.Option(help="one row per input: CSV, or Parquet if the name ends with .parquet"),
     ] = None,
     summary: Annotated[
         Path | None,
-        typer.Option(help="JSON: distributions, outlying cameras, what parameters go with"),
+        typer.Option(help="JSON: distributions, outlying cameras, correlations"),
     ] = None,
     against: Annotated[
         Path | None,
-        typer.Option(help="CSV of id and what parameters may go with: serial number, date"),
+        typer.Option(help="CSV of id and quantities to correlate with: serial number, date"),
     ] = None,
     html: Html = "",
     force: Annotated[
         bool,
         typer.Option(
-            "--force", help="let --html and --summary replace files that are no page, no JSON"
+            "--force", help="let --html and --summary replace files that are not HTML or JSON"
         ),
     ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Calibrate many cameras and adjust many networks; interrupted, it takes up where it was.
+    """Calibrate many cameras and adjust many networks; an interrupted run resumes.
 
-    Lines that are in the file already are not computed again. Those of other
-    settings or other data are refused, or computed again with --renew.
-
-    It is done when every input has its line, whatever the status in it; another
-    run that is writing the file is refused.
+    Inputs with a line in the file are not computed again. Lines of other settings or data are
+    refused, or recomputed with --renew. Status 0 means that every input has a line, whatever its
+    status. Only one run at a time may write the file.
     """
     from jaxbundle.batch.page import compose_batch
     from jaxbundle.batch.population import Population, read_against
@@ -80,12 +82,12 @@ def batch(
     columns = None if against is None else read_csv(against)
     if columns is not None:
         if not asked:
-            raise InputError("--against: goes with --html, --table or --summary")
+            raise InputError("--against: give --html, --table or --summary as well")
         read_against(columns, columns.ids("id") if "id" in columns.values else (), str(against))
     if not all(map(is_camera_stack, inputs)):
-        # Cameras fill the cores by threads of their own, and gain nothing.
+        # Cameras already use the cores by threads; devices gain nothing.
         jaxbundle.use_cores()
-    advise("run the same command again to go on")
+    advise("run the same command again to resume")
     with counting(quiet) as bar:
         task = bar.add_task("batch", total=None)
         counts = run_batch(
@@ -111,10 +113,10 @@ def batch(
     if not quiet:
         skipped = counts.pop("skipped", 0)
         said = ", ".join(f"{number} {status}" for status, number in counts.most_common() if number)
-        print(f"{json_lines}: {said}" + f" ({skipped} skipped, they were there)" * bool(skipped))
+        print(f"{json_lines}: {said}" + f" ({skipped} skipped, already computed)" * bool(skipped))
         if os.path.isfile(json_lines) and any(counts[status] for status in WITH_REASON):
             reasons = [f"{row['key']}: {row['error']}" for row in result_rows(inputs, json_lines)
                        if row.get("error")]  # fmt: skip
             print(*reasons[:MOST_REASONS], sep="\n")
             if len(reasons) > MOST_REASONS:
-                print(f"and {len(reasons) - MOST_REASONS} more: see \"error\" in {json_lines}")
+                print(f'and {len(reasons) - MOST_REASONS} more: see "error" in {json_lines}')

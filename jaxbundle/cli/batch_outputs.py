@@ -1,4 +1,4 @@
-"""The files `jaxbundle batch` writes besides its lines: a table, a summary of the population."""
+"""Further output of `jaxbundle batch`: a table and a summary of the population."""
 
 import json
 from collections.abc import Iterable, Mapping
@@ -26,7 +26,7 @@ def check_outputs(
         if table.suffix.lower() not in (".csv", ".parquet"):
             raise InputError(f"--table {table}: a name that ends with .csv or .parquet is expected")
         if summary is not None and table.resolve() == summary.resolve():
-            raise InputError(f"--summary {summary}: is the file of --table as well")
+            raise InputError(f"--summary {summary}: is also the file of --table")
         if is_parquet(table):
             try:
                 need_pyarrow()
@@ -39,7 +39,7 @@ def check_outputs(
 def write_outputs(
     found: Population, against: Mapping[str, np.ndarray], table: Path | None, summary: Path | None
 ) -> None:
-    """Write what is asked for."""
+    """Write the requested files."""
     if table is not None:
         columns = found.table(against)
         if is_parquet(table):

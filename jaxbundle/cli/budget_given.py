@@ -1,4 +1,4 @@
-"""What `jaxbundle adjust --budget` says."""
+"""The option `jaxbundle adjust --budget`."""
 
 from jaxbundle.arguments import positive
 from jaxbundle.errors import InputError
@@ -28,7 +28,7 @@ def held_of(given: list[str] | None, network: Network) -> dict[str, float]:
         try:
             number = float(sigma)
         except ValueError:
-            raise InputError(f"--budget {name}: {sigma!r} is no number") from None
+            raise InputError(f"--budget {name}: {sigma!r} is not a number") from None
         unit = ANGLE_UNITS[network.angle_unit] if parameter in ANGLES else 1.0
         found[name] = positive(f"--budget {name}", number) * unit
     return found

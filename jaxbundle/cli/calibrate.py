@@ -1,4 +1,4 @@
-"""`jaxbundle calibrate`: photographs of a board in, calibrated cameras out."""
+"""`jaxbundle calibrate`: calibrate cameras from photographs of a board."""
 
 import re
 from functools import partial
@@ -15,39 +15,40 @@ from jaxbundle.errors import InputError, NotSolvedError
 @app.command(example="examples/board --board 9x6 --square 0.03 --out out/board")
 def calibrate(
     photos: Annotated[
-        list[str] | None, typer.Argument(help="photographs, patterns or folders of one camera")
+        list[str] | None, typer.Argument(help="photographs of one camera: files, patterns, folders")
     ] = None,
     board: Annotated[
-        str, typer.Option(help="COLUMNSxROWS: inner corners, circles, or squares of charuco; or a "
-                          "target of Kalibr, FILE.yaml")
+        str,
+        typer.Option(
+            help="COLUMNSxROWS: inner corners, circles, or squares of charuco; or a "
+            "Kalibr target, FILE.yaml"
+        ),
     ] = "",
     square: Annotated[
-        float | None, typer.Option(help="side of a square, distance of circles, in --unit")
+        float | None, typer.Option(help="side of a square, spacing of circles, in --unit")
     ] = None,
     kind: Annotated[str, choice(BOARDS)] = "chessboard",
     camera: Annotated[
-        list[str] | None, typer.Option(help="NAME=PATTERN: one of several cameras")
+        list[str] | None, typer.Option(help="NAME=PATTERN: one of several cameras; repeatable")
     ] = None,
     rig: Annotated[
-        bool, typer.Option("--rig", help="the cameras are rigidly mounted, photographs in step")
+        bool, typer.Option("--rig", help="rigidly mounted cameras with simultaneous photographs")
     ] = False,
     model: Annotated[str, typer.Option(help="camera model")] = "opencv",
-    models: Annotated[
-        str, typer.Option(help="a,b,c: camera models to compare; which one suffices?")
-    ] = "",
-    folds: Annotated[int, typer.Option(help="of the photographs, for --models")] = 4,
+    models: Annotated[str, typer.Option(help="a,b,c: camera models to compare")] = "",
+    folds: Annotated[int, typer.Option(help="number of cross-validation folds, for --models")] = 4,
     free: Annotated[str, typer.Option(help="parameters to estimate: fx,fy,…")] = "",
     given: Annotated[
-        list[str] | None, typer.Option(help="NAME=VALUE of a parameter, held if not free")
+        list[str] | None, typer.Option(help="NAME=VALUE of a parameter; held if not free")
     ] = None,
     pixel_size: Annotated[float | None, typer.Option(help="mm, for models in mm")] = None,
     diameter: Annotated[
-        float | None, typer.Option(help="of the circles: their eccentricity is taken off")
+        float | None, typer.Option(help="of the circles, to correct their eccentricity")
     ] = None,
     marker: Annotated[float | None, typer.Option(help="side of a charuco marker")] = None,
     dictionary: Annotated[str, typer.Option(help="of charuco markers")] = "DICT_4X4_50",
     board_sigma: Annotated[
-        float | None, typer.Option(help="σ of a coordinate of the board, which is not flat")
+        float | None, typer.Option(help="σ of a board coordinate, for an inexact board")
     ] = None,
     board_free: Annotated[
         bool, typer.Option("--board-free", help="estimate the points of the board")
@@ -56,25 +57,27 @@ def calibrate(
         float, typer.Option(help="a priori σ of an image coordinate, pixels")
     ] = 0.1,
     snooping: Annotated[
-        str, choice((*TESTS, "none"), "removal of gross errors, and epochs of a rig")
+        str, choice((*TESTS, "none"), "removal of gross errors and of rig epochs")
     ] = "pope",
     significance: Annotated[float, typer.Option(help="level of the test")] = 0.001,
     robust: Annotated[str | None, choice(ESTIMATORS, "instead of removal")] = None,
     cross_validation: Annotated[
-        bool, typer.Option(help="calibrate again from halves of the photographs: 4 adjustments")
+        bool, typer.Option(help="calibrate from each half of the photographs: 4 adjustments")
     ] = True,
-    unit: Annotated[str, typer.Option(help="name of the unit of the board")] = "m",
-    json: Annotated[str, typer.Option(help="write the result as JSON; - for stdout alone")] = "",
+    unit: Annotated[str, typer.Option(help="unit of the board, a label")] = "m",
+    json: Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")] = "",
     out: Annotated[
         Path | None, typer.Option(help="folder for report, page, JSON, cameras, network, plots")
     ] = None,
     html: Html = "",
     force: Force = False,
-    brief: Annotated[bool, typer.Option("--brief", help="no points and residuals in JSON")] = False,
+    brief: Annotated[
+        bool, typer.Option("--brief", help="omit points and residuals from the JSON")
+    ] = False,
     quiet: Quiet = False,
-    plots: Annotated[bool, typer.Option(help="plots in the folder of --out")] = True,
+    plots: Annotated[bool, typer.Option(help="write plots to --out")] = True,
 ) -> None:
-    """Calibrate cameras from photographs of a board, and say how far to trust them."""
+    """Calibrate cameras from photographs of a board and assess their accuracy."""
     from jaxbundle.calibration import Calibrations, calibrate_cameras, compare_models
     from jaxbundle.calibration.files import (
         COMMAND,
@@ -139,7 +142,7 @@ def calibrate(
         choice = None
         try:
             if compared:
-                (name, photographed), = cameras.items()
+                ((name, photographed),) = cameras.items()
                 choice = compare_models(
                     photographed, known, models=compared, folds=folds, camera=name,
                     progress=lambda *_: tell(), **options,
@@ -157,7 +160,7 @@ def calibrate(
             with written(json, unsolved_text(error), place, COMMAND, names, force, html, page):
                 pass
             raise
-        bar.update(task, description="how good it is")
+        bar.update(task, description="assessing accuracy")
         document = calibrations_dict(found, brief) if json else {}
         if choice is not None and json:
             document["models"] = choice.to_dict()
@@ -192,13 +195,13 @@ def _board(
 
     if board.endswith((".yaml", ".yml")):
         if square is not None:
-            raise InputError(f"--square: {board} says how large the board is; leave it out")
+            raise InputError(f"--square: {board} gives the size of the board; omit it")
         return read_target(board)
     if not board:
         raise InputError("--board is missing: COLUMNSxROWS, inner corners of a chessboard, as 9x6")
     columns, rows = _size(board)
     if square is None:
-        raise InputError("--square is missing: the side of a square, or the distance of circles")
+        raise InputError("--square is missing: the side of a square, or the spacing of circles")
     circles = ("circles", "asymmetric-circles")
     for value, option, kinds in (
         (diameter, "--diameter", circles), (marker, "--marker", ("charuco",)),
@@ -209,18 +212,18 @@ def _board(
 
 
 def _check_compared(models, cameras, free, rig) -> None:
-    """Refuse what does not go with --models."""
+    """Refuse options that are incompatible with --models."""
     for given, option in ((rig, "--rig"), (free, "--free"), (len(cameras) > 1, "--camera")):
         if given:
             raise InputError(
-                f"--models compares the usual parameters of one camera: leave {option} out"
+                f"--models compares the standard parameters of one camera: omit {option}"
             )
     if len({*models}) < 2:
-        raise InputError("--models: give two different models or more, such as opencv,brown")
+        raise InputError("--models: give at least two different models, such as opencv,brown")
 
 
 def _check_names(cameras) -> None:
-    """Refuse cameras whose results would have one folder."""
+    """Refuse cameras that would share an output folder."""
     from jaxbundle.calibration.files import file_name
 
     folders: dict[str, str] = {}
@@ -241,7 +244,7 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _cameras(photos, named) -> dict[str, list[str]]:
-    """Photographs by camera: those named, or all of one."""
+    """Photographs by camera name, or all of one camera."""
     if photos and named:
         raise InputError("give photographs either as arguments or by --camera NAME=PATTERN")
     if not photos and not named:
@@ -256,7 +259,7 @@ def _cameras(photos, named) -> dict[str, list[str]]:
         if name in cameras:
             raise InputError(
                 f"--camera {name} is given twice: {name}={cameras[name][0]}, {name}={pattern}; "
-                "give each camera a name of its own, and its photographs by one folder or pattern"
+                "give each camera its own name and one folder or pattern"
             )
         cameras[name] = [pattern]
     return cameras or {"cam": list(photos)}

@@ -1,4 +1,4 @@
-"""`jaxbundle camera`: what a camera sees, and its distortion in steps of the radius."""
+"""`jaxbundle camera`: field of view of a camera, and its distortion by radius."""
 
 from pathlib import Path
 from typing import Annotated
@@ -16,18 +16,20 @@ MOST_ROWS = 100_000
 @app.command(example="examples/video_cameras/cameras.toml#1-indoor --step 1")
 def camera(
     files: Annotated[list[str], typer.Argument(help="files of cameras or networks, or FILE#ID")],
-    step: Annotated[float | None, typer.Option(help="of the radius, in the unit of the model")] = (
-        None
-    ),
+    step: Annotated[
+        float | None, typer.Option(help="step of the radius, in the unit of the model")
+    ] = (None),
     about_origin: Annotated[
         bool, typer.Option("--about-origin", help="radii from the image origin, as in BINGO")
     ] = False,
-    image_size: Annotated[str, typer.Option(help="W,H in pixels, if the file has none")] = "",
-    pixel_size: Annotated[str, typer.Option(help="W,H in mm, if the file has none")] = "",
-    csv: Annotated[Path | None, typer.Option(help="file for the table of the first")] = None,
-    plot: Annotated[Path | None, typer.Option(help="PNG file for the curves of all")] = None,
+    image_size: Annotated[str, typer.Option(help="W,H in pixels, if missing in the file")] = "",
+    pixel_size: Annotated[str, typer.Option(help="W,H in mm, if missing in the file")] = "",
+    csv: Annotated[Path | None, typer.Option(help="file for the table of the first camera")] = None,
+    plot: Annotated[
+        Path | None, typer.Option(help="PNG file for the curves of all cameras")
+    ] = None,
 ) -> None:
-    """Field of view, 35 mm equivalent, and the distortion in steps of the radius."""
+    """Print field of view, 35 mm equivalent, and distortion by radius."""
     import numpy as np
 
     from jaxbundle.cameras import get_model
@@ -55,7 +57,7 @@ def camera(
         units.add(unit)
     if plot is not None:
         if len(units) > 1:
-            raise InputError("--plot: cameras in mm and in pixels do not fit one figure")
+            raise InputError("--plot: cameras in mm and in pixels cannot share one figure")
         from jaxbundle.plotting.calibrations import radial_curves
 
         write_png(plot, (6.5, 4.2), lambda ax: radial_curves(curves, units.pop(), ax))

@@ -1,4 +1,4 @@
-"""What `jaxbundle camera` says of a camera: parameters, field of view, distortion."""
+"""The output of `jaxbundle camera`: parameters, field of view, distortion."""
 
 import numpy as np
 
@@ -16,9 +16,9 @@ from jaxbundle.network.tables import Camera
 
 
 def sizes_of(file: str, given: Camera, size, pitch):
-    """Image and pixel size of a camera, from the options or its own.
+    """Image and pixel size of a camera, from the options or the camera.
 
-    **Raises:** `InputError` where one is missing.
+    **Raises:** `InputError` if one is missing.
     """
     size, pitch = size or given.image_size, pitch or given.pixel_size
     if size is None or (get_model(given.model).unit == "mm" and pitch is None):
@@ -30,7 +30,7 @@ def sizes_of(file: str, given: Camera, size, pitch):
 
 
 def table_of(given: Camera, reach: float, step: float, about_origin: bool):
-    """Distortion in steps of the radius.
+    """Distortion by radius.
 
     **Raises:** `InputError` for a step that makes no table.
     """

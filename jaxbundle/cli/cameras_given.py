@@ -1,4 +1,4 @@
-"""What the commands about cameras share: FILE or FILE#ID, pairs of numbers, figures."""
+"""Shared by the camera commands: FILE or FILE#ID, pairs of numbers, figures."""
 
 import sys
 from collections.abc import Callable
@@ -24,7 +24,7 @@ def camera_given(text: str) -> Camera:
 
 
 def calibration_given(text: str) -> tuple[Camera, Covariance | None]:
-    """The same, with the covariance of its free parameters where it is from a result in JSON.
+    """The same, with the covariance of its free parameters if it is from a JSON result.
 
     **Raises:** `InputError`.
     """
@@ -40,7 +40,7 @@ def calibration_given(text: str) -> tuple[Camera, Covariance | None]:
         cameras = read_cameras(path)
     elif path.exists() and recognised_format(path) is None:
         raise InputError(
-            f"{path}: not recognised; a camera stands in a camera file ({LOOKS}), the result.json "
+            f"{path}: not recognised; expected a camera file ({LOOKS}), the result.json "
             f"of calibrate or adjust, or a network ({', '.join(FORMATS)})"
         )
     else:
@@ -52,7 +52,7 @@ def calibration_given(text: str) -> tuple[Camera, Covariance | None]:
 
 
 def pair(option: str, text: str) -> tuple[float, float] | None:
-    """Two numbers A,B of an option; None where it is not given.
+    """Two numbers A,B of an option; None if it is not given.
 
     **Raises:** `InputError`.
     """
@@ -66,7 +66,7 @@ def pair(option: str, text: str) -> tuple[float, float] | None:
 
 
 def write_png(path: Path, size: tuple[float, float], draw: Callable) -> None:
-    """Write a figure; `draw` is given its axes.
+    """Write a figure; `draw` receives its axes.
 
     **Raises:** `InputError` without matplotlib.
     """

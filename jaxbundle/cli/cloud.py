@@ -1,4 +1,4 @@
-"""`jaxbundle cloud`: a cloud filtered, thinned, converted, compared with another."""
+"""`jaxbundle cloud`: filter, thin, convert and compare point clouds."""
 
 import json as json_text
 from pathlib import Path
@@ -17,16 +17,16 @@ def cloud(
     out: Annotated[
         Path | None, typer.Option(help=f"file for the cloud: {', '.join(CLOUD_FILES)}")
     ] = None,
-    cube: Annotated[float | None, typer.Option(help="side of cubes, a point of each")] = None,
-    least: Annotated[int, typer.Option(min=1, help="points a cube must have")] = 1,
-    place: Annotated[str, choice(CUBE_POINTS, "the point of a cube")] = "mean",
-    max_sigma: Annotated[float | None, typer.Option(help="greatest σ on any axis")] = None,
-    min_rays: Annotated[int | None, typer.Option(min=1, help="rays a point must have")] = None,
+    cube: Annotated[float | None, typer.Option(help="side of cubes, one point per cube")] = None,
+    least: Annotated[int, typer.Option(min=1, help="minimum number of points of a cube")] = 1,
+    place: Annotated[str, choice(CUBE_POINTS, "which point replaces a cube")] = "mean",
+    max_sigma: Annotated[float | None, typer.Option(help="largest σ on any axis")] = None,
+    min_rays: Annotated[int | None, typer.Option(min=1, help="minimum number of rays")] = None,
     statistical: Annotated[
-        float | None, typer.Option(help="drop points this many σ lonelier than the others")
+        float | None, typer.Option(help="drop points this many σ farther from neighbours")
     ] = None,
     dsm: Annotated[Path | None, typer.Option(help="GeoTIFF for a DSM; needs --size")] = None,
-    size: Annotated[float | None, typer.Option(help="cells of the DSM")] = None,
+    size: Annotated[float | None, typer.Option(help="cell size of the DSM")] = None,
     against: Annotated[Path | None, typer.Option(help="another cloud to compare with")] = None,
     check: Annotated[
         Path | None, typer.Option(help="points X,Y,Z (.csv) whose heights are compared")
@@ -34,7 +34,7 @@ def cloud(
     plane: Annotated[bool, typer.Option("--plane", help="RMS to the best plane")] = False,
     json: Annotated[str, typer.Option(help="figures as JSON; - for standard output")] = "",
 ) -> None:  # fmt: skip
-    """Filter, thin and convert a cloud of points; compare two; accuracy and DSM."""
+    """Filter, thin, convert and compare point clouds; accuracy and DSM."""
     from jaxbundle.cli.outputs import check_json
     from jaxbundle.io.results.result_json import without_nan
     from jaxbundle.io.text.csv_tables import write_text

@@ -13,23 +13,21 @@ from jaxbundle.errors import InputError
 RINGS = 10
 
 
-@app.command(
-    example="cameras.toml#1-indoor cameras.toml#1-outdoor --plot out/difference.png"
-)
+@app.command(example="cameras.toml#1-indoor cameras.toml#1-outdoor --plot out/difference.png")
 def compare(
     a: Annotated[str, typer.Argument(help="camera: a file of cameras or a network, or FILE#ID")],
     b: Annotated[str, typer.Argument(help="the other one")],
     step: Annotated[float | None, typer.Option(help="width of rings, in the unit of A")] = None,
-    rotate: Annotated[bool, typer.Option(help="remove the implied rotation")] = True,
+    rotate: Annotated[bool, typer.Option(help="remove the best rotation")] = True,
     radius: Annotated[
-        float, typer.Option(help="about the middle where the rotation is fitted, unit of A")
+        float, typer.Option(help="of the central region for the fit of the rotation, unit of A")
     ] = float("inf"),
-    image_size: Annotated[str, typer.Option(help="W,H in pixels, if A has none")] = "",
-    pixel_size: Annotated[str, typer.Option(help="W,H in mm, if A has none")] = "",
+    image_size: Annotated[str, typer.Option(help="W,H in pixels, if missing in A")] = "",
+    pixel_size: Annotated[str, typer.Option(help="W,H in mm, if missing in A")] = "",
     csv: Annotated[Path | None, typer.Option(help="file for the table of rings")] = None,
     plot: Annotated[Path | None, typer.Option(help="PNG file for the map")] = None,
 ) -> None:
-    """Compare two calibrations: parameters, and how far images are apart over the image."""
+    """Compare two calibrations: parameters, and image differences."""
     import numpy as np
 
     from jaxbundle.cameras import get_model
@@ -43,7 +41,7 @@ def compare(
     sizes = [list(c.image_size) for c in (first, second) if c.image_size is not None]
     if len(sizes) == 2 and sizes[0] != sizes[1]:
         raise InputError(
-            f"{a}, {b}: images of {sizes[0]} and {sizes[1]} pixels are not of one camera"
+            f"{a}, {b}: images of {sizes[0]} and {sizes[1]} pixels are not from one camera"
         )
     size = pair("--image-size", image_size) or first.image_size or second.image_size
     pitch = pair("--pixel-size", pixel_size) or first.pixel_size or second.pixel_size

@@ -1,4 +1,4 @@
-"""`jaxbundle convert`: one format into another."""
+"""`jaxbundle convert`: convert between formats."""
 
 import sys
 from pathlib import Path
@@ -15,17 +15,19 @@ def convert(
     input: Input,
     output: Annotated[Path, typer.Argument(help="file or folder to write")],
     to: Annotated[
-        str | None, typer.Option(help="kind of output, if not recognised by its name")
+        str | None, typer.Option(help="output format, if not recognised by its name")
     ] = None,
     model: Annotated[str | None, typer.Option(help="camera model to convert to")] = None,
-    camera: Annotated[str | None, typer.Option(help="id, where the output holds one")] = None,
+    camera: Annotated[
+        str | None, typer.Option(help="camera id, for an output of one camera")
+    ] = None,
     measured: Annotated[
-        bool, typer.Option("--measured", help="fit models over what is measured, not the image")
+        bool, typer.Option("--measured", help="fit models over the measured area, not the image")
     ] = False,
-    image_size: Annotated[str, typer.Option(help="W,H in pixels, of cameras without")] = "",
-    pixel_size: Annotated[str, typer.Option(help="W,H in mm, of cameras without")] = "",
+    image_size: Annotated[str, typer.Option(help="W,H in pixels, if missing in the input")] = "",
+    pixel_size: Annotated[str, typer.Option(help="W,H in mm, if missing in the input")] = "",
     force: Annotated[
-        bool, typer.Option("--force", help="replace files that are there, of other origin")
+        bool, typer.Option("--force", help="replace existing or foreign files")
     ] = False,
     set: Settings = None,
     format: Format = None,

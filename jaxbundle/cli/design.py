@@ -1,4 +1,4 @@
-"""`jaxbundle design`: stations, photographs, a datum that make σ smallest."""
+"""`jaxbundle design`: stations, photographs or a datum that minimise σ."""
 
 import sys
 from pathlib import Path
@@ -14,56 +14,56 @@ SIX = "Xmin,Ymin,Zmin,Xmax,Ymax,Zmax"
 
 @app.command(example="PROJECT.toml --distance 1,6 --out out/designed")
 def design(
-    project: Annotated[Path, typer.Argument(help="cameras, targets, stations to start from")],
-    aim: Annotated[str, choice(AIMS, "what is to be small")] = "mean",
+    project: Annotated[Path, typer.Argument(help="cameras, targets and start stations")],
+    aim: Annotated[str, choice(AIMS, "quantity to minimise")] = "mean",
     of: Annotated[
         list[str] | None,
         typer.Option(help="σ of points, cameras, or of an unknown KIND:ID:NAME, such as "
-                     "camera:cam:c; may be repeated"),
+                     "camera:cam:c; repeatable"),
     ] = None,
     order: Annotated[
         str, choice(ORDERS, "datum, configuration, weights or densification")
     ] = "first",
     free: Annotated[
-        str, typer.Option(help=f"of first order: some of {','.join(DESIGNED)}")
+        str, typer.Option(help=f"first order: variables, from {','.join(DESIGNED)}")
     ] = ",".join(DESIGNED[:3]),
-    stations: Annotated[str, typer.Option(help="ids of the images that move, A,B; all")] = "",
+    stations: Annotated[str, typer.Option(help="ids of movable images, A,B; default: all")] = "",
     photographs: Annotated[
-        int | None, typer.Option(help="second order: how many are taken; third: how many more")
+        int | None, typer.Option(help="second order: number to select; third: number to add")
     ] = None,
     sigma_image: Annotated[
         float | None, typer.Option(help="σ of image coordinates, in the unit of the cameras")
     ] = None,
-    room: Annotated[str, typer.Option(help=f"where cameras can stand: {SIX}")] = "",
+    room: Annotated[str, typer.Option(help=f"allowed camera positions: {SIX}")] = "",
     distance: Annotated[str, typer.Option(help="shortest,longest ray")] = "",
     focus: Annotated[str, typer.Option(help="smallest,largest depth in focus")] = "",
-    edge: Annotated[float, typer.Option(help="part of the format not used, each side")] = 0.0,
+    edge: Annotated[float, typer.Option(help="unused margin of the format, each side")] = 0.0,
     incidence: Annotated[
         float | None, typer.Option(help="largest angle between normal and ray, degrees")
     ] = None,
     normals: Annotated[
-        str, typer.Option(help="of targets: NX,NY,NZ, or a table id,NX,NY,NZ")
+        str, typer.Option(help="of the targets: NX,NY,NZ, or a table id,NX,NY,NZ")
     ] = "",
-    apart: Annotated[float, typer.Option(help="smallest distance of two stations")] = 0.0,
+    apart: Annotated[float, typer.Option(help="smallest distance between stations")] = 0.0,
     obstacle: Annotated[
-        list[str] | None, typer.Option(help=f"a box that hides: {SIX}; may be repeated")
+        list[str] | None, typer.Option(help=f"an opaque box: {SIX}; repeatable")
     ] = None,
-    targets: Annotated[str, typer.Option(help=f"box of targets that move: {SIX}")] = "",
+    targets: Annotated[str, typer.Option(help=f"box for movable targets: {SIX}")] = "",
     starts: Annotated[int, typer.Option(help="searches, all but one from random stations")] = 1,
-    iterations: Annotated[int, typer.Option(min=1, help="of a round of the search")] = 60,
+    iterations: Annotated[int, typer.Option(min=1, help="per round of the search")] = 60,
     draws: Annotated[
-        int, typer.Option(help="networks simulated and adjusted as a proof; 0: none")
+        int, typer.Option(help="networks simulated and adjusted for verification; 0: none")
     ] = 200,
-    seed: Annotated[int, typer.Option(min=0, help="of what is random")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="random seed")] = 0,
     out: Annotated[
         Path | None, typer.Option(help="folder: designed project, report, JSON, figures")
     ] = None,
-    json: Annotated[str, typer.Option(help="file for the result as JSON, - for stdout")] = "",
-    plots: Annotated[bool, typer.Option(help="figures in the folder")] = True,
+    json: Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")] = "",
+    plots: Annotated[bool, typer.Option(help="write figures to --out")] = True,
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
-    """Design a network: where to photograph from, or which photographs to take."""
+    """Design a network: optimal stations, or a selection of photographs."""
     import numpy as np
 
     from jaxbundle.cli.cameras_given import pair

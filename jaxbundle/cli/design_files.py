@@ -1,4 +1,4 @@
-"""What `jaxbundle design` writes into its folder."""
+"""The output folder of `jaxbundle design`."""
 
 from functools import partial
 from pathlib import Path

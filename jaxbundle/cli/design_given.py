@@ -1,4 +1,4 @@
-"""What the options of `jaxbundle design` say."""
+"""The options of `jaxbundle design`."""
 
 from pathlib import Path
 
@@ -15,7 +15,8 @@ from jaxbundle.network_design.conditions import Box
 
 
 def sigma_of(project: Path, network: Network) -> float | None:
-    """`sigma_image` of a project without image points; None where they say it, or nothing does."""
+    """`sigma_image` of a project without image points; None if image points or no setting give
+    it."""
     if len(network.observations) or recognised_format(project) != "project":
         return None
     given = read_toml(project_file(project))["project"].get("sigma_image")
@@ -45,7 +46,7 @@ def aimed_at(given: list[str] | None):
 
 
 def box_of(option: str, text: str) -> Box | None:
-    """The box of an option; None where it is not given.
+    """The box of an option; None if it is not given.
 
     **Raises:** `InputError`.
     """
@@ -56,7 +57,7 @@ def box_of(option: str, text: str) -> Box | None:
 
 
 def words_of(text: str) -> tuple[str, ...]:
-    """Words with commas between."""
+    """Words separated by commas."""
     return tuple(word.strip() for word in text.split(",") if word.strip())
 
 
@@ -69,12 +70,12 @@ def _numbers(option: str, text: str, size: int) -> np.ndarray:
     except ValueError:
         found = np.zeros(0)
     if len(found) != size:
-        raise InputError(f"{option} {text!r}: {size} numbers with commas between are expected")
+        raise InputError(f"{option} {text!r}: {size} numbers separated by commas are expected")
     return found
 
 
 def normals_of(text: str, network: Network):
-    """The normal of all targets, or of each by a table.
+    """The normal of all targets, or one per target from a table.
 
     **Raises:** `InputError`.
     """
@@ -97,4 +98,4 @@ def normals_of(text: str, network: Network):
     try:
         return np.array([[float(x) for x in rows[id]] for id in used])
     except ValueError as error:
-        raise InputError(f"{text}: a normal is no number: {shown(str(error))}") from None
+        raise InputError(f"{text}: a normal is not a number: {shown(str(error))}") from None

@@ -1,4 +1,4 @@
-"""`jaxbundle example`: examples to begin with."""
+"""`jaxbundle example`: the packaged examples."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""`jaxbundle explore`: a network, a camera or a line scanner on a page that computes."""
+"""`jaxbundle explore`: a network, a camera or a line scanner on an interactive page."""
 
 from pathlib import Path
 from typing import Annotated
@@ -12,15 +12,19 @@ from jaxbundle.cli.app import Control, Format, Quiet, Settings, app, choice
 @app.command(example="examples/convergent4/project.toml")
 def explore(
     input: Annotated[
-        str, typer.Argument(help="network; camera (FILE or FILE#ID, result of calibrate); scanner "
-                            "or flight file")
+        str,
+        typer.Argument(
+            help="network; camera (FILE or FILE#ID, result of calibrate); scanner or flight file"
+        ),
     ],
     kind: Annotated[
-        str | None, choice(EXPLORED, "what INPUT is, if it is not recognised", "--as")
+        str | None, choice(EXPLORED, "type of INPUT, if not recognised", "--as")
     ] = None,
-    photo: Annotated[Path | None, typer.Option(help="photograph to undistort by a camera")] = None,
-    image_size: Annotated[str, typer.Option(help="W,H in pixels, if a camera has none")] = "",
-    pixel_size: Annotated[str, typer.Option(help="W,H in mm, if a camera has none")] = "",
+    photo: Annotated[
+        Path | None, typer.Option(help="photograph to undistort, for a camera")
+    ] = None,
+    image_size: Annotated[str, typer.Option(help="W,H in pixels, if missing in the camera")] = "",
+    pixel_size: Annotated[str, typer.Option(help="W,H in mm, if missing in the camera")] = "",
     truth: Annotated[Path | None, typer.Option(help="scanner file of the truth")] = None,
     set: Settings = None,
     format: Format = None,
@@ -29,9 +33,9 @@ def explore(
     browser: Annotated[bool, typer.Option(help="open the page in a browser")] = True,
     quiet: Quiet = False,
 ) -> None:
-    """Explore a network, a camera or a line scanner on a page that computes.
+    """Explore a network, a camera or a line scanner on an interactive page.
 
-    The page is at an address of this machine alone, which the terminal shows. Ctrl-C ends it.
+    The page is served on this machine only; the terminal shows its address. Ctrl-C ends it.
     """
     import webbrowser
 
@@ -46,7 +50,7 @@ def explore(
     server = Server(view, port, tell)
     print(server.address, flush=True)
     if not quiet:
-        tell("the first change compiles programs, once for this size; Ctrl-C ends")
+        tell("the first change compiles programs, once per size; Ctrl-C ends")
     if browser:
         webbrowser.open(server.address)
     server.serve_forever()

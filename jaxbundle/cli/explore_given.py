@@ -1,4 +1,4 @@
-"""What `jaxbundle explore` opens: a network adjusted, a camera, a line scanner."""
+"""The inputs of `jaxbundle explore`: an adjusted network, a camera, a line scanner."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -31,13 +31,13 @@ from jaxbundle.system.file_content import parse_json
 NETWORK, CAMERA, SCANNER = EXPLORED
 RESULT = "result.json"
 RESULTS = {"cameras", "calibrations"}
-"""What the result of an adjustment or a calibration has."""
+"""Keys of the result of an adjustment or a calibration."""
 
 
 def recognise(input: str) -> str:
     """Whether an input is a network, a camera or a line scanner.
 
-    **Raises:** `InputError` where there is no such file."""
+    **Raises:** `InputError` if there is no such file."""
     path = Path(input)
     if not path.exists():
         if "#" in input and Path(input.rpartition("#")[0]).exists():
@@ -65,7 +65,7 @@ def recognise(input: str) -> str:
 
 
 def is_of_calibrate(folder: Path) -> bool:
-    """Whether a folder is the --out of `jaxbundle calibrate`: it holds a network too."""
+    """Whether a folder is the --out of `jaxbundle calibrate`; it contains a network too."""
     marker = folder / MARKER
     if not ((folder / RESULT).is_file() and marker.is_file()):
         return False
@@ -91,7 +91,7 @@ def open_view(
         for option, value in named.items():
             if value and other != found:
                 raise InputError(f"{option}: is for a {other}, but {input} is a {found}"
-                                 + ("" if kind else "; --as says otherwise"))  # fmt: skip
+                                 + ("" if kind else "; change this with --as"))  # fmt: skip
     if found == NETWORK:
         return open_network(Path(input), settings, format, control, quiet)
     if found == CAMERA:
@@ -110,7 +110,7 @@ def open_network(
 
 
 def open_camera(input: str, photo: Path | None, image_size: str, pixel_size: str) -> CameraView:
-    """A camera of a file, with its σ where the file is the result of a calibration."""
+    """A camera of a file, with its σ if the file is the result of a calibration."""
     if (Path(input) / RESULT).is_file():
         input = str(Path(input) / RESULT)
     camera, found = calibration_given(input)
@@ -133,7 +133,7 @@ def open_flight_or_scanner(path: Path, truth: Path | None) -> ScannerView:
     origin = trace_files(files, {})
     if path.suffix.lower() == ".toml" and "track" in read_toml(path):
         if known is not None:
-            raise InputError("--truth: a flight file has its own; leave it out")
+            raise InputError("--truth: a flight file contains its truth; omit it")
         flight = read_flight(path)
         name = flight.file.section("scanner").text("name", path.stem)
         return ScannerView(name, flight.flight, flight.earth, origin=origin)

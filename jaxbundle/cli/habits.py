@@ -1,4 +1,4 @@
-"""What every command has: --quiet and --verbose, added to its function where it is registered."""
+"""Options of every command, --quiet and --verbose, added when it is registered."""
 
 import contextlib
 import functools
@@ -12,18 +12,18 @@ import typer
 
 from jaxbundle.errors import InputError
 
-Quiet = Annotated[bool, typer.Option("--quiet", help="print nothing but errors")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="print only errors")]
 Verbose = Annotated[
-    bool, typer.Option("--verbose", help="say versions, iterations, and how long stages take")
+    bool, typer.Option("--verbose", help="print versions, iterations, and times of stages")
 ]
 verbose: ContextVar[bool] = ContextVar("verbose", default=False)
-"""Whether the command that runs was called with --verbose."""
+"""Whether the running command was called with --verbose."""
 
 
 def add_habits(function: Callable) -> Callable:
-    """The function of a command with the options `quiet` and `verbose`. A function that has no
-    `quiet` of its own is silenced as a whole; what goes to standard output by name (`--json -`)
-    goes there all the same."""
+    """The function of a command with the options `quiet` and `verbose`. A function without a
+    `quiet` parameter is silenced as a whole, except explicit output to standard output (`--json
+    -`)."""
     given = inspect.signature(function)
     own = "quiet" in given.parameters
     added = {"verbose": Verbose} if own else {"quiet": Quiet, "verbose": Verbose}
@@ -51,7 +51,7 @@ _nothing = contextlib.nullcontext
 
 @contextlib.contextmanager
 def _silent(values: dict) -> Iterator[None]:
-    """Nothing is printed; errors come after it."""
+    """Discard all output; errors are printed afterwards."""
     named = any(str(values.get(name)) == "-" for name in ("json", "csv"))
     with open(os.devnull, "w") as nowhere, contextlib.redirect_stderr(nowhere):
         with _nothing() if named else contextlib.redirect_stdout(nowhere):

@@ -1,4 +1,4 @@
-"""`jaxbundle orient`: the start values of a network."""
+"""`jaxbundle orient`: start values of a network."""
 
 from pathlib import Path
 from typing import Annotated
@@ -21,7 +21,7 @@ def orient(
     control: Control = None,
     quiet: Quiet = False,
 ) -> None:
-    """Find the start values of images and points; what cannot be placed is named, with why."""
+    """Compute start values of images and points; list what cannot be oriented, with reasons."""
     from jaxbundle.cli.outputs import network_files
     from jaxbundle.io import read_network, write_project
     from jaxbundle.io.networks.project import FILES

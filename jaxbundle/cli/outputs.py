@@ -1,7 +1,7 @@
-"""What the command line writes: a JSON file, and a folder of report, JSON, tables, plots and the
+"""Output of the command line: a JSON file, and a folder of report, JSON, tables, plots and the
 adjusted network as a project.
 
-`check_targets` finds before an adjustment what could not be written after it.
+`check_targets` checks before an adjustment that its results can be written.
 """
 
 import os
@@ -43,21 +43,21 @@ FILES = (
     REPORT, PAGE, RESULT, *(f"{name}.csv" for name in (*TABLES, BUDGET)),
     *(f"{ADJUSTED}/{name}" for name in NETWORK_FILES), f"{ADJUSTED}/{PRECISION}", *FIGURES,
 )  # fmt: skip
-"""What is written into a folder, figures as patterns."""
+"""The files of a folder, figures as patterns."""
 
 NOTHING: Mapping = MappingProxyType({})
 
 JSON = re.compile(rb'\s*(\{\s*["}]|\[[\s\[]*([]{"\d-]|true|false|null))')
-"""How JSON begins; a table of TOML, `[project]`, does not."""
+"""The beginning of JSON; a TOML table, `[project]`, does not match."""
 HTML = re.compile(rb"\s*<(!doctype\s+html|html)\b", re.IGNORECASE)
-"""How a page begins."""
+"""The beginning of a page."""
 OR_FORCE = ", or --force to replace it"
 
 
 def network_files(
     input: Path, network: Network, control: Path | None = None
 ) -> tuple[str | Path, ...]:
-    """The files a network was read from."""
+    """The input files of a network."""
     tables = (network.images, network.points, network.observations, network.distances)
     files = (input, input / FILE_NAME, *(table.source.name for table in tables))
     return files if control is None else (*files, control)
@@ -66,12 +66,12 @@ def network_files(
 def trace_origin(
     input: Path, network: Network, control: Path | None, settings: Mapping[str, object]
 ) -> Origin:
-    """The fingerprints of the files a network was read from, and the settings that were chosen."""
+    """The fingerprints of the input files of a network, and the chosen settings."""
     return trace_files((*input_files(input), *network_files(input, network, control)), settings)
 
 
 def trace_files(files: Iterable[str | Path], settings: Mapping[str, object]) -> Origin:
-    """The fingerprints of files, and the settings that were chosen."""
+    """The fingerprints of files, and the chosen settings."""
     chosen = {name: value for name, value in settings.items() if value not in (None, False, "")}
     return Origin(fingerprint_files(files), chosen)
 
@@ -95,23 +95,24 @@ def check_writable(
     if not force:
         check_json(json, OR_FORCE)
     if html and json and os.path.realpath(html) == os.path.realpath(json):
-        raise InputError(f"--html {html}: is the file of --json as well; give another name")
+        raise InputError(f"--html {html}: is also the file of --json; give another name")
     check_page(html, out, inputs, force)
 
 
 def check_page(
     html: str, out: Path | None, inputs: Iterable[str | Path], force: bool = False
 ) -> None:
-    """Refuse a page that cannot be written, or would replace an input or what is no page."""
+    """Refuse a page that cannot be written, or would replace an input or a file that is not a
+    page."""
     if html == "-":
-        raise InputError("--html -: a page goes into a file; give the name of one")
+        raise InputError("--html -: a page cannot go to standard output; give a file")
     check_file("--html", html, out, inputs)
     if not force:
         _check_content("--html", html, HTML, "HTML", OR_FORCE)
 
 
 def check_file(option: str, file: str, out: Path | None, inputs: Iterable[str | Path]) -> None:
-    """Refuse the file of an option that cannot be written, or would replace one of the inputs."""
+    """Refuse the file of an option if it cannot be written or would replace an input."""
     if file in ("", "-"):
         return
     path = Path(file)
@@ -119,7 +120,7 @@ def check_file(option: str, file: str, out: Path | None, inputs: Iterable[str | 
     if path.is_dir():
         raise InputError(f"{option} {file}: is a folder; give the name of a file")
     if out is not None and Path(os.path.realpath(out)).is_relative_to(real):
-        raise InputError(f"{option} {file}: is to be the folder of --out; give the name of a file")
+        raise InputError(f"{option} {file}: is the folder of --out; give the name of a file")
     if name_inside(file, out) is None:
         if not os.path.isdir(path.parent):
             raise InputError(f"{option} {file}: there is no folder {path.parent}")
@@ -130,15 +131,14 @@ def check_file(option: str, file: str, out: Path | None, inputs: Iterable[str | 
 
 
 def check_json(json: str, way: str = "", option: str = "--json") -> None:
-    """Refuse to replace by JSON a file that is not JSON, for it was not meant, unless it is empty.
-
-    `way`: what else than to give another name the command offers, for the message.
+    """Refuse to replace a file that is not JSON, unless it is empty: it was probably named by
+    mistake. `way`: an alternative to another name, for the message.
     """
     _check_content(option, json, JSON, "JSON", way)
 
 
 def _check_content(option: str, file: str, like: re.Pattern[bytes], noun: str, way: str) -> None:
-    """Refuse to replace a file that neither is empty nor begins as the new one will."""
+    """Refuse to replace a file that is not empty and does not begin like the new one."""
     path = Path(file)
     if file in ("", "-") or not path.is_file():
         return
@@ -155,13 +155,13 @@ def check_targets(
     input: Path, network: Network, json: str, out: Path | None, control: Path | None = None,
     force: bool = False, html: str = "",
 ) -> None:  # fmt: skip
-    """Check what `adjust` is to write, before it is computed (`check_writable`)."""
+    """Check the output files of `adjust` before computing (`check_writable`)."""
     inputs = network_files(input, network, control)
     check_writable(json, out, "adjust", FILES, inputs, force, html)
 
 
 def name_inside(file: str, out: Path | None) -> str | None:
-    """The name of a file directly in the folder of --out, which it then belongs to."""
+    """The name of a file directly in the folder of --out, to which it then belongs."""
     if file in ("", "-") or out is None:
         return None
     path = Path(file)
@@ -173,11 +173,11 @@ def written(
     json: str, text: str | Iterable[str], out: Path | None, by: str, names: Iterable[str],
     force: bool, html: str = "", page: Callable[[], Iterable[str]] | None = None,
 ) -> Iterator[Path | None]:  # fmt: skip
-    """Write the JSON of a result (`-`: on standard output) and its `page`, and give the folder to
-    fill that becomes --out, None if there is none. The folder has the page in any case.
+    """Write the JSON of a result (`-`: standard output) and its `page`, and yield the folder to
+    fill, which becomes --out, or None. The folder always contains the page.
 
-    A file of --json or --html is written when the folder is in place; one in the folder belongs to
-    it.
+    Files of --json and --html are written after the folder is in place; files inside the folder
+    belong to it.
     """
     if json == "-":
         sys.stdout.writelines((text,) if isinstance(text, str) else text)
@@ -207,8 +207,8 @@ def write_targets(
     result: Adjustment | NotSolvedError, json: str, out: Path | None, brief: bool, plots: bool,
     force: bool = False, html: str = "", origin: Origin = UNKNOWN, budget: Budget | None = None,
 ) -> None:  # fmt: skip
-    """Write JSON (`-`: on standard output), page and folder of a result with its error `budget`, or
-    why there is none."""
+    """Write JSON (`-`: standard output), page and folder of a result with its error `budget`, or
+    the reason for a failure."""
     solved = isinstance(result, Adjustment)
     also = NOTHING if budget is None else {BUDGET: budget_dict(budget)}
 
@@ -238,7 +238,7 @@ def fill_results(
 ) -> None:  # fmt: skip
     """Write report, JSON, tables, the adjusted network and plots of a result into a folder.
 
-    `note`: text before the report; `also`: further entries of the JSON; `budget`: of errors."""
+    `note`: text before the report; `also`: further JSON entries; `budget`: the error budget."""
     write_text(folder / REPORT, note + report.text(result, budget=budget))
     write_text(folder / RESULT, result_text(result, False, also))
     if result.converged:
@@ -255,11 +255,11 @@ def fill_results(
 
 
 def why_not(result: Adjustment) -> str:
-    """Why an adjustment has not converged, and what to do."""
+    """Why an adjustment did not converge, and the remedy."""
     parts = [f"not solved: {result.termination}"]
     if result.undetermined:
         parts.append(f"not determined: {some(result.undetermined, 12, str)}")
-        parts.append("fix them, give them a prior σ, or measure what determines them")
+        parts.append("fix them, give them a prior σ, or add measurements that determine them")
         parts += result.findings
     elif result.findings or result.weakness.lines:
         parts += [*result.findings, *result.weakness.lines]
@@ -271,7 +271,7 @@ def why_not(result: Adjustment) -> str:
 
 
 def can_plot() -> bool:
-    """Whether there is matplotlib; where not, that is said on standard error."""
+    """Whether matplotlib is installed; if not, print a note on standard error."""
     try:
         need_matplotlib()
     except ImportError as error:

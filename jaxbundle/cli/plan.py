@@ -1,4 +1,4 @@
-"""`jaxbundle plan`: an aerial block before it is flown."""
+"""`jaxbundle plan`: plan an aerial block."""
 
 from pathlib import Path
 from typing import Annotated
@@ -11,29 +11,30 @@ from jaxbundle.errors import InputError
 MOST_PHOTOGRAPHS = 2000
 
 
-@app.command(
-    example="--c 100 --image 68,104 --area 1000,600 --sigma-image 0.003 --height 1000"
-)
+@app.command(example="--c 100 --image 68,104 --area 1000,600 --sigma-image 0.003 --height 1000")
 def plan(
     c: Annotated[float, typer.Option(help="principal distance, mm")],
     image: Annotated[str, typer.Option(help="format along,across the flight, mm")],
     area: Annotated[str, typer.Option(help="length,width of the area, m")],
     sigma_image: Annotated[float, typer.Option(help="σ of an image coordinate, mm")],
-    height: Annotated[float | None, typer.Option(help="of flight above ground, m")] = None,
+    height: Annotated[float | None, typer.Option(help="flying height above ground, m")] = None,
     scale: Annotated[float | None, typer.Option(help="scale number m of 1 : m")] = None,
-    ground_pixel: Annotated[float | None, typer.Option(help="pixel on the ground, m")] = None,
+    ground_pixel: Annotated[float | None, typer.Option(help="ground pixel size, m")] = None,
     pixel: Annotated[float | None, typer.Option(help="pixel size, mm")] = None,
     forward: Annotated[float, typer.Option(help="forward overlap")] = 0.6,
     side: Annotated[float, typer.Option(help="side overlap")] = 0.3,
     control_sigma: Annotated[float, typer.Option(help="σ of control points, m")] = 0.05,
     control_every: Annotated[
-        int | None, typer.Option(help="bases and strips between them; nine in all if not given")
+        int | None,
+        typer.Option(help="bases and strips between control points; default: nine in all"),
     ] = None,
-    network: Annotated[bool, typer.Option(help="σ by the covariance of a simulated block")] = True,
+    network: Annotated[
+        bool, typer.Option(help="σ from the covariance of a simulated block")
+    ] = True,
     out: Annotated[Path | None, typer.Option(help="folder for the block as a project")] = None,
     force: Force = False,
 ) -> None:
-    """Design a block of vertical photographs: strips, photographs, and expected precision."""
+    """Plan a block of vertical photographs: strips, photographs, expected precision."""
     import numpy as np
 
     from jaxbundle.cameras.field_of_view import angle_class, equivalent_35mm, field_of_view
@@ -66,12 +67,12 @@ def plan(
         ("base", f"{design.base:.6g} m  b/H {design.base_to_height:.3f}"),
         ("strips", f"{design.strips}, {design.spacing:.6g} m apart "
                    f"(side overlap {100 * design.side_overlap:.1f} %)"),
-        ("photographs", f"{design.photographs_per_strip} a strip, {design.photographs} in all"),
+        ("photographs", f"{design.photographs_per_strip} per strip, {design.photographs} in all"),
         ("σX, σH by formula", f"{design.sigma_plan:.4g} m, {design.sigma_height:.4g} m"),
     ]  # fmt: skip
     if network and design.photographs > MOST_PHOTOGRAPHS:
         raise InputError(
-            f"{design.photographs} photographs: the covariance of so many takes long; give "
+            f"{design.photographs} photographs: too many for a covariance; give "
             "--no-network, or plan a part of the area"
         )
     if network or out is not None:

@@ -1,4 +1,4 @@
-"""Several processes with one task: they find each other, and agree on what it is."""
+"""Several processes with one task: join them and check that they agree on it."""
 
 import hashlib
 import sys
@@ -10,7 +10,7 @@ from jaxbundle.errors import InputError, NotSolvedError
 
 
 def join_processes(join: tuple[str, int, int] | None, quiet: bool) -> bool:
-    """Join, and say whether this is the process that writes."""
+    """Join the processes and return whether this one writes."""
     if join and not quiet:
         print(f"jaxbundle: waiting for {join[1]} processes at {join[0]}", file=sys.stderr)
     address, processes, process = join or (None, None, None)
@@ -18,7 +18,7 @@ def join_processes(join: tuple[str, int, int] | None, quiet: bool) -> bool:
 
 
 def check_sameness(*given: object) -> None:
-    """Refuse, in all processes, what is not the same in all of them."""
+    """Refuse, in all processes, inputs or options that differ between them."""
     import jax
     from jax.experimental.multihost_utils import process_allgather
 
@@ -29,5 +29,5 @@ def check_sameness(*given: object) -> None:
     except jax.errors.JaxRuntimeError:
         raise NotSolvedError("one of the processes is lost; start all of them again") from None
     if not same:
-        jax.distributed.shutdown()  # All are here: none ends before the others have heard of it.
+        jax.distributed.shutdown()  # A barrier: no process ends before the others know.
         raise InputError("the processes were given different files or options")

@@ -1,4 +1,4 @@
-"""What long work shows on a terminal, nothing in a pipe; with --verbose lines on standard error."""
+"""Progress of long work: bars on a terminal, nothing in a pipe, lines on stderr with --verbose."""
 
 import time
 
@@ -17,8 +17,8 @@ from jaxbundle.cli.verbose import Stages, say
 
 
 class _Staged(Progress):
-    """Bars, of which each is a stage, as is each new description; with --verbose their times are
-    said."""
+    """Bars for stages; a new description begins a new stage. With --verbose their times are
+    printed."""
 
     stages: Stages | None = None
 
@@ -41,7 +41,7 @@ class _Staged(Progress):
 
 
 def counting(quiet: bool) -> Progress:
-    """A bar with the number done of the number there is."""
+    """A bar with the number done out of the total."""
     console = Console(stderr=True)
     columns = (*Progress.get_default_columns(), MofNCompleteColumn())
     bar = _Staged(
@@ -53,13 +53,12 @@ def counting(quiet: bool) -> Progress:
 
 BEGUN = "/jax/compilation_cache/compile_requests_use_cache"
 MADE = "/jax/core/compile/backend_compile_duration"
-"""What JAX tells of a program: it begins to read a kept one, or to compile it, as it then finds; it
-has it."""
+"""JAX's monitoring events of a program: looking it up in the cache or compiling it; done."""
 
 
 class iterating:
-    """A line with the iteration and vᵀPv; as a context gives what adjustment tells, or None. With
-    --verbose a line for each iteration."""
+    """A line with the iteration and vᵀPv; as a context it yields the callback of the adjustment, or
+    None. With --verbose one line per iteration."""
 
     def __init__(self, silent: bool):
         self.console = Console(stderr=True)
@@ -88,13 +87,15 @@ class iterating:
         self.bar.update(self.task, description=self.line)
 
     def tell_line(self, step, cost, damping) -> None:
-        """Say the iteration, and how long it is since the beginning."""
-        say(f"iteration {int(step)}: vᵀPv {2 * float(cost):.8g}, λ {float(damping):.2g}, "
-            f"{time.perf_counter() - self.begun:.2f} s")
+        """Print the iteration and the elapsed time."""
+        say(
+            f"iteration {int(step)}: vᵀPv {2 * float(cost):.8g}, λ {float(damping):.2g}, "
+            f"{time.perf_counter() - self.begun:.2f} s"
+        )
 
     def _hear(self, event: str, *_, **__) -> None:
         if event == BEGUN:
-            self.bar.update(self.task, description="preparing programs, compiled once for a size")
+            self.bar.update(self.task, description="compiling programs, once per size")
         elif event == MADE:
             self.bar.update(self.task, description=self.line)
 
@@ -106,7 +107,7 @@ class iterating:
 
 
 class staging:
-    """A bar for every stage of long work; as a context gives `tell(stage, done, total)`."""
+    """A bar for every stage of long work; as a context it yields `tell(stage, done, total)`."""
 
     def __init__(self, silent: bool):
         self.bar = counting(silent)
@@ -117,7 +118,7 @@ class staging:
         return self.tell
 
     def tell(self, stage: str, done: int, total: int) -> None:
-        """Move the bar of a stage."""
+        """Advance the bar of a stage."""
         if stage not in self.tasks:
             self.tasks[stage] = self.bar.add_task(stage, total=total)
         self.bar.update(self.tasks[stage], completed=done, total=total)

@@ -16,7 +16,8 @@ def reconstruct_command(
     photos: Annotated[list[Path], typer.Argument(help="photographs, or folders of them")],
     out: Annotated[Path, typer.Option(help="folder for report, page, JSON, tables, COLMAP model")],
     camera: Annotated[
-        str | None, typer.Option(help="calibrated camera of all: FILE or FILE#ID; held as it is")
+        str | None,
+        typer.Option(help="calibrated camera of all photographs: FILE or FILE#ID; held fixed"),
     ] = None,
     control: Annotated[
         Path | None,
@@ -27,22 +28,24 @@ def reconstruct_command(
         typer.Option(help=f"coded targets: {', '.join(CODED_TARGETS)}; :OPTION after it"),
     ] = None,
     distances: Annotated[
-        Path | None, typer.Option(help="scale bars: table from,to,value,sigma of named points")
+        Path | None, typer.Option(help="scale bars: table from,to,value,sigma between named points")
     ] = None,
     features: Annotated[str, choice(FEATURES)] = "sift",
     pairs: Annotated[str, choice(MATCHED_PAIRS, "matched")] = "auto",
-    points: Annotated[int, typer.Option(min=20, help="tie points wanted a photograph")] = 1500,
-    json: Annotated[str, typer.Option(help="write the result as JSON; - for stdout alone")] = "",
+    points: Annotated[int, typer.Option(min=20, help="desired tie points per photograph")] = 1500,
+    json: Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")] = "",
     html: Html = "",
-    brief: Annotated[bool, typer.Option("--brief", help="no points and residuals in JSON")] = False,
-    surface: Annotated[
-        bool, typer.Option("--surface", help="match the oriented photographs for a surface")
+    brief: Annotated[
+        bool, typer.Option("--brief", help="omit points and residuals from the JSON")
     ] = False,
-    plots: Annotated[bool, typer.Option(help="plots in the folder of --out")] = True,
+    surface: Annotated[
+        bool, typer.Option("--surface", help="match the oriented photographs to a surface")
+    ] = False,
+    plots: Annotated[bool, typer.Option(help="write plots to --out")] = True,
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
-    """Orient photographs by what they show: tie points, self-calibration, adjustment."""
+    """Reconstruct a network from photographs: tie points, self-calibration, adjustment."""
     from jaxbundle.cli.cameras_given import camera_given
     from jaxbundle.cli.outputs import check_writable, trace_files
     from jaxbundle.cli.progress import staging
@@ -68,7 +71,7 @@ def reconstruct_command(
     found, _ = find_photographs(photos)
     check_writable(json, out, BY, FILES, [*files, *(p.path for p in found)], force, html)
     store = make_store(out, force)
-    advise(f"run the same command again to go on: what was found is kept in {store}")
+    advise(f"run the same command again to resume; matches are kept in {store}")
     with staging(quiet or json == "-") as tell:
         result = reconstruct(photos, given, settings, store, tell, known, bars)
     origin = trace_files([*files, *(p.path for p in found)], {

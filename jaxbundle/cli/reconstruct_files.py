@@ -1,4 +1,4 @@
-"""What `jaxbundle reconstruct` writes: every part with its model and cloud, pairs, figures."""
+"""Output of `jaxbundle reconstruct`: every part with model and cloud, pairs, figures."""
 
 from functools import partial
 from pathlib import Path
@@ -30,7 +30,7 @@ SHOWN = 1200
 
 
 def make_store(out: Path, force: bool) -> Path:
-    """The folder in which features and matches are kept; --out is the command's own from now on."""
+    """The folder of stored features and matches; --out belongs to the command from now on."""
     if read_marker(out) is None:
         with replaced_folder(out, BY, (), force):
             pass
@@ -41,7 +41,7 @@ def write_reconstruction(
     found: Reconstruction, json: str, out: Path, brief: bool, plots: bool, force: bool,
     html: str = "", origin: Origin = UNKNOWN,
 ) -> None:  # fmt: skip
-    """Write JSON and page, and into the folder each part, the pairs and figures of them."""
+    """Write JSON and page, and the folder with each part, its pairs and figures."""
     first, plots = found.parts[0], plots and can_plot()
     also = {"reconstruction": _summary(found)}
     text = result_text(first.adjustment, brief, also)
@@ -75,7 +75,7 @@ def _write_part(
 
 
 def _thumbnail(path: Path):
-    """The grey values of a photograph, made small; where it has gone, nothing but paper."""
+    """The reduced grey values of a photograph; a blank image if the file is gone."""
     try:
         grey = read_photograph(path)
     except InputError:

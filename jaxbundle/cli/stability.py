@@ -14,11 +14,11 @@ def stability(
         list[str], typer.Argument(help="results (JSON) of calibrate or adjust, FILE or FILE#ID")
     ],
     at: Annotated[
-        str, typer.Option(help="a,b,c: a number for each, such as its temperature, for slopes")
+        str, typer.Option(help="a,b,c: a number per epoch, such as temperature, for slopes")
     ] = "",
-    json: Annotated[str, typer.Option(help="write the result as JSON; - for stdout alone")] = "",
+    json: Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")] = "",
 ) -> None:
-    """Test whether calibrations of one camera differ by more than their standard deviations."""
+    """Test whether calibrations of one camera differ significantly."""
     import sys
     from json import dumps
     from pathlib import Path

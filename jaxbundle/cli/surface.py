@@ -1,4 +1,4 @@
-"""`jaxbundle surface`: oriented images to a cloud with the σ of every point, and a DSM."""
+"""`jaxbundle surface`: match oriented images to a cloud with the σ of every point, and a DSM."""
 
 import json as json_text
 from pathlib import Path
@@ -14,21 +14,19 @@ FILES = ("cloud.csv", "cloud.ply", "surface.json", "report.txt", "dsm.tif", "dsm
          "orthophoto.tif")  # fmt: skip
 
 
-@app.command(
-    example="PROJECT.toml --photos PHOTOS --dsm 0.05 --out out/surface"
-)
+@app.command(example="PROJECT.toml --photos PHOTOS --dsm 0.05 --out out/surface")
 def surface(
     input: Annotated[
         list[Path],
         typer.Argument(
-            help="project or COLMAP folder of oriented photographs; or two or more scanner or RPC "
-            "images (GeoTIFF with RPC tags or a file beside it, scanner files)"
+            help="project or COLMAP folder of oriented photographs; or at least two scanner or RPC "
+            "images (GeoTIFF with RPC tags or companion file, scanner files)"
         ),
     ],
     out: Annotated[Path, typer.Option(help="folder for cloud, report, DSM")],
     photos: Annotated[Path | None, typer.Option(help="folder of the photographs")] = None,
     pairs: Annotated[
-        list[str] | None, typer.Option(help="BASE,OTHER[,OTHER…]: names; may be repeated")
+        list[str] | None, typer.Option(help="BASE,OTHER[,OTHER…]: names; repeatable")
     ] = None,
     zmin: Annotated[float | None, typer.Option(help="lowest height searched")] = None,
     zmax: Annotated[float | None, typer.Option(help="highest height searched")] = None,
@@ -37,30 +35,30 @@ def surface(
         int | None, typer.Option(min=1, help="pixels between points of the base images")
     ] = None,
     dense: Annotated[
-        bool, typer.Option("--dense", help="every pixel of the base images, or every --step-th")
+        bool, typer.Option("--dense", help="match every pixel of base images, or every --step-th")
     ] = False,
     dsm: Annotated[
-        float | None, typer.Option(help="size of the cells of a DSM, written as GeoTIFF")
+        float | None, typer.Option(help="cell size of a DSM, written as GeoTIFF")
     ] = None,
     orthophoto: Annotated[
-        bool, typer.Option("--orthophoto", help="all images over the DSM, as GeoTIFF")
+        bool, typer.Option("--orthophoto", help="orthophoto of all images on the DSM, as GeoTIFF")
     ] = False,
     orthophoto_of: Annotated[
-        list[str] | None, typer.Option(help="names of the images the orthophoto is made of")
+        list[str] | None, typer.Option(help="names of the images of the orthophoto")
     ] = None,
     check: Annotated[
         Path | None, typer.Option(help="points X,Y,Z (.csv) whose heights are compared")
     ] = None,
     crs: Annotated[
         str | None,
-        typer.Option(help="coordinate system of cloud and DSM; of scanner and RPC images, the zone "
-                     "of UTM if not given"),
+        typer.Option(help="coordinate system of cloud and DSM; for scanner and RPC images "
+        "the default is the UTM zone"),
     ] = None,
-    json: Annotated[str, typer.Option(help="counts and accuracy as JSON; - for stdout")] = "",
+    json: Annotated[str, typer.Option(help="counts and accuracy as JSON; - prints only JSON")] = "",
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:  # fmt: skip
-    """Match oriented images: a cloud with the σ of every point, and what it is worth."""
+    """Match oriented images to a cloud with the σ of every point, and report its accuracy."""
     import numpy as np
 
     from jaxbundle.cli.outputs import check_json

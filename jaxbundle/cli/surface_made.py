@@ -1,4 +1,4 @@
-"""How `jaxbundle surface` makes one: of photographs, or of images of line scanners and RPC."""
+"""Surfaces of `jaxbundle surface` from photographs, or from line scanner and RPC images."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -19,7 +19,7 @@ from jaxbundle.surface.views import OrientedImage
 
 
 class Found(NamedTuple):
-    """The surface, the images it is of, the way from the cloud's coordinates to theirs, and check
+    """The surface, its images, the transformation from cloud to image coordinates, and check
     points."""
 
     surface: Surface
@@ -41,7 +41,7 @@ def make_of_photographs(path, photos, heights, pairs, crs, options) -> Found:
 
 def make_of_ground(files, photos, heights, pairs, crs, options) -> Found:
     if len(files) < 2:
-        raise InputError(f"{files[0]}: one image; a surface needs two at least")
+        raise InputError(f"{files[0]}: one image; a surface needs at least two")
     views, around = read_ground_views(files, photos)
     bounds, messages = ground_bounds(views, heights)
     moved = align_all(views, bounds)
@@ -56,7 +56,7 @@ def make_of_ground(files, photos, heights, pairs, crs, options) -> Found:
 
 
 def choose(views, names):
-    """The images of these names, all if there are none."""
+    """The images with these names; all if none are given."""
     known = [view.name for view in views]
     for name in names or ():
         if name not in known:

@@ -1,5 +1,5 @@
-"""What --verbose says on standard error: versions first, then stages and iterations with their
-times (`progress`), at the end the time of the whole and what was compiled."""
+"""Output of --verbose on standard error: versions, then stages and iterations with their times
+(`progress`), finally the total time and the compiled programs."""
 
 import contextlib
 import sys
@@ -22,7 +22,7 @@ def say(words: str) -> None:
 
 @contextlib.contextmanager
 def telling() -> Iterator[None]:
-    """Versions, and at the end how long it took."""
+    """Print versions, and at the end the elapsed time."""
     say(", ".join(f"{name} {version}" for name, version in software_versions()))
     made: list[float] = []
     found: list[str] = []
@@ -43,27 +43,29 @@ def telling() -> Iterator[None]:
     finally:
         monitoring.unregister_event_duration_listener(hear_time)
         monitoring.unregister_event_listener(hear)
-        devices = jax.devices()  # not before: it is the command that says how many there are
-        say(f"{time.perf_counter() - begun:.2f} s in all, on {len(devices)} devices of JAX "
-            f"({devices[0].platform}); {len(made)} programs made ready in {sum(made):.2f} s, "
-            f"{len(found)} of them kept from before")
+        devices = jax.devices()  # only now: the command sets their number
+        say(
+            f"{time.perf_counter() - begun:.2f} s in all, on {len(devices)} devices of JAX "
+            f"({devices[0].platform}); {len(made)} programs prepared in {sum(made):.2f} s, "
+            f"{len(found)} of them from the cache"
+        )
 
 
 class Stages:
-    """Says how long each stage took; a stage ends when the next one begins."""
+    """Prints the time of each stage; a stage ends when the next one begins."""
 
     def __init__(self):
         self.name, self.begun = "", 0.0
 
     def begin(self, name: str) -> None:
-        """A stage begins, unless it is the one that goes on."""
+        """Begin a stage, unless it is already running."""
         if name == self.name:
             return
         self.end()
         self.name, self.begun = name, time.perf_counter()
 
     def end(self) -> None:
-        """The stage ends."""
+        """End the stage."""
         if self.name:
             say(f"{self.name}: {time.perf_counter() - self.begun:.2f} s")
         self.name = ""

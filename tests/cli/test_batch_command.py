@@ -75,7 +75,7 @@ def test_ended_at_any_moment_a_run_goes_on_where_it_was(run, cameras, tmp_path):
         lines, wait = int(random.integers(1, 8)), random.uniform(0, 0.01)
         found, told = ended(process, file, lines, how, wait)
         assert found == status, (how, lines, wait, told)
-        line = "jaxbundle: terminated; .* to go on\n"
+        line = "jaxbundle: terminated; .* to resume\n"
         assert re.fullmatch("" if how == signal.SIGKILL else line, told)
         after = file.read_bytes()
         whole = before[: before.rindex(b"\n") + 1] if before else b""

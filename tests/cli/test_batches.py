@@ -240,7 +240,7 @@ def test_the_population_beside_the_lines(start, command, tmp_path):
         (("--table", "cameras.txt"), "ends with .csv or .parquet"),
         (("--table", path), "part of the input"),
         (("--summary", "made.csv"), "is not JSON"),
-        (("--against", "made.csv"), "goes with"),
+        (("--against", "made.csv"), "as well"),
         (("--against", "none.csv", "--table", "a.csv"), "none.csv"),
     ):
         told = command(*given, *wrong)

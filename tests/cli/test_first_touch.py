@@ -99,7 +99,7 @@ def test_a_terminal_is_told_what_is_compiled(monkeypatch):
     with line as tell:
         monkeypatch.setattr(line.bar, "update", lambda _, description: said.append(description))
         jax.jit(lambda x: jnp.cos(x) + 0.125)(1.0)
-        assert said[0] == "preparing programs, compiled once for a size"
+        assert said[0] == "compiling programs, once per size"
         assert said[-1] == "starting"
         assert tell is not None
         tell(3, 0.5, 0.0)

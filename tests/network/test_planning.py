@@ -137,7 +137,7 @@ def test_the_command(monkeypatch, capsys, tmp_path):
     assert not code and "scale                 1 : 10000" in said.out
     assert "4 a strip, 8 in all" in said.out and (tmp_path / "block" / "project.toml").exists()
     code, said = run(monkeypatch, capsys, "plan", *options, "--height", 10)
-    assert code == 2 and "photographs: the covariance of so many takes long" in said.err
+    assert code == 2 and "photographs: too many for a covariance" in said.err
     code, said = run(monkeypatch, capsys, "plan", *options)
     assert code == 2 and "give one of height" in said.err
 
@@ -158,7 +158,7 @@ def test_compare_on_the_command_line(monkeypatch, capsys, tmp_path):
     assert (tmp_path / "r.csv").read_text().startswith("r,radial,tangential,rms,largest,points\n")
     (tmp_path / "c.toml").write_text(camera.format("1", 500.0).replace("640", "320"))
     code, said = run(monkeypatch, capsys, "compare", tmp_path / "a.toml", tmp_path / "c.toml")
-    assert code == 2 and "[640, 480] and [320, 480] pixels are not of one camera" in said.err
+    assert code == 2 and "[640, 480] and [320, 480] pixels are not from one camera" in said.err
     code, said = run(monkeypatch, capsys, "compare", tmp_path / "a.toml", tmp_path / "b.toml")
     assert code == 2 and "2 cameras (1, 2); name one of them" in said.err
 
@@ -173,6 +173,6 @@ def test_camera_on_the_command_line(monkeypatch, capsys, tmp_path):
     assert not code and said.out.count("90.000°, 90.000°, 109.471°") == 2
     (tmp_path / "a.foo").write_text("")
     code, said = run(monkeypatch, capsys, "camera", tmp_path / "a.foo")
-    assert code == 2 and "not recognised; a camera stands in a camera file (OpenCV's" in said.err
+    assert code == 2 and "not recognised; expected a camera file (OpenCV's" in said.err
     code, said = run(monkeypatch, capsys, "camera", tmp_path / "b.foo")
     assert code == 2 and "b.foo: no such file" in said.err

@@ -57,7 +57,7 @@ def test_a_scanner_is_fitted_as_well_as_its_wobble_allows(tmp_path, run):
     )
     told = json.loads(out)
     largest = max(v for k, v in told.items() if "largest" in k)
-    assert largest > 0.5 and f"leave up to {largest:.3g} pixel" in err
+    assert largest > 0.5 and f"residuals up to {largest:.3g} pixel" in err
     assert status == 0 and 0.05 < told["check_largest_line"] < 5
     assert float(read_rpc(tmp_path / "a.RPB").height_scale) == pytest.approx(500, abs=1e-6)
 

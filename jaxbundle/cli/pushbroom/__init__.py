@@ -1,4 +1,4 @@
-"""`jaxbundle pushbroom …`: line scanners, a file for each command."""
+"""`jaxbundle pushbroom …`: line scanners, one file per command."""
 
 from jaxbundle.cli.pushbroom import accuracy as accuracy
 from jaxbundle.cli.pushbroom import correct as correct

@@ -1,4 +1,4 @@
-"""`jaxbundle pushbroom accuracy`: what errors of the ancillary data do on the ground."""
+"""`jaxbundle pushbroom accuracy`: ground errors caused by errors of the ancillary data."""
 
 from pathlib import Path
 from typing import Annotated, cast
@@ -10,7 +10,9 @@ from jaxbundle.cli.app import choice
 from jaxbundle.cli.pushbroom.app import Csv, Dem, Geoid, Json, Level, ScannerFile, pushbroom
 from jaxbundle.errors import InputError
 
-Sigma = Annotated[float, typer.Option(min=0, help="standard deviation: degrees, metres, a second")]
+Sigma = Annotated[
+    float, typer.Option(min=0, help="standard deviation: degrees, metres, per second")
+]
 
 FEWEST_DRAWS = 20
 
@@ -25,16 +27,18 @@ def accuracy(
     position_bias: Sigma = 0.0,
     position_drift: Sigma = 0.0,
     position_white: Sigma = 0.0,
-    draws: Annotated[int, typer.Option(min=0, help="Monte Carlo beside the closed form")] = 0,
+    draws: Annotated[
+        int, typer.Option(min=0, help="Monte Carlo draws, in addition to propagation")
+    ] = 0,
     seed: int = 0,
-    grid: Annotated[str, typer.Option(help="LINESxPIXELS places over the image")] = "11x11",
+    grid: Annotated[str, typer.Option(help="LINESxPIXELS positions over the image")] = "11x11",
     table: Annotated[
-        str | None, choice(ATTITUDE_ERRORS, "the table of a flight file, given as SCANNER")
+        str | None, choice(ATTITUDE_ERRORS, "tabulate a flight file, given as SCANNER")
     ] = None,
-    levels: Annotated[str, typer.Option(help="accuracies of that table, degrees")] = "0.01,0.1",
+    levels: Annotated[str, typer.Option(help="attitude σ of that table, degrees")] = "0.01,0.1",
     map_: Annotated[
         Path | None,
-        typer.Option("--map", help="the error over the image: .tif (all columns), .png (a figure)"),
+        typer.Option("--map", help="map of the error: .tif (all columns), .png (a figure)"),
     ] = None,
     height: Level = None,
     dem: Dem = None,
@@ -42,7 +46,7 @@ def accuracy(
     csv: Csv = None,
     json: Json = "",
 ) -> None:
-    """RMS and CE90 on the ground of errors with given σ; or the errors against a known truth."""
+    """Ground RMS and CE90 for given σ of the ancillary data, or errors against a known truth."""
     import numpy as np
 
     from jaxbundle.cli.pushbroom.accuracy_table import table_of, write_table
@@ -55,14 +59,14 @@ def accuracy(
     keep_inputs([scanner, truth, dem], csv=csv, json=json, map=map_)
     if 0 < draws < FEWEST_DRAWS:
         raise InputError(
-            f"--draws {draws}: an RMS of so few says nothing; {FEWEST_DRAWS} at least, 1000 are "
-            "good to 3 %"
+            f"--draws {draws}: too few for an RMS; at least {FEWEST_DRAWS}, 1000 are "
+            "accurate to 3 %"
         )
     if map_ is not None:
         _check_map(map_, table)
     if table:
         if dem is not None:
-            raise InputError("--dem: with --table give --height; a terrain has no reverse mode")
+            raise InputError("--dem: use --height with --table; terrain has no reverse mode")
         kind = cast(AttitudeError, table)
         write_table(table_of(scanner, kind, levels, draws, seed, height), csv, json)
         return
@@ -85,7 +89,7 @@ def accuracy(
         if not any(noise):
             raise InputError("no σ is given: --attitude-white 0.01, for example, or --truth FILE")
         if isinstance(surface, Terrain):
-            raise InputError("--dem: with σ give --height instead; a terrain has no reverse mode")
+            raise InputError("--dem: use --height with σ; terrain has no reverse mode")
         found = propagated(file.image, surface, line, pixel, noise)
         columns |= {"rms": found.rms, "ce90": found.ce90}
         head = {"rms": found.overall, "ce90": found.overall_ce90}
@@ -104,7 +108,7 @@ def accuracy(
 
 def _check_map(path: Path, table: str | None) -> None:
     if table:
-        raise InputError("--map: a map is of one image; leave --table away")
+        raise InputError("--map: not available with --table; omit one of them")
     if path.suffix.lower() not in (".tif", ".tiff", ".png"):
         raise InputError(f"--map {path}: a name that ends in .tif or .png is expected")
     if not path.absolute().parent.is_dir():

@@ -1,4 +1,4 @@
-"""`jaxbundle pushbroom accuracy --table`: attitude trajectories against attitude accuracies."""
+"""`jaxbundle pushbroom accuracy --table`: attitude trajectories by attitude accuracies."""
 
 from pathlib import Path
 
@@ -31,7 +31,7 @@ def table_of(
 
 
 def write_table(table: AccuracyTable, csv: Path | None, json: str) -> None:
-    """As CSV or JSON, one row a trajectory and accuracy; or set out for a person."""
+    """As CSV or JSON, one row per trajectory and accuracy; or as a printed table."""
     if csv is None and not json:
         print(set_out(table))
         return
@@ -51,8 +51,8 @@ def write_table(table: AccuracyTable, csv: Path | None, json: str) -> None:
 
 
 def set_out(table: AccuracyTable) -> str:
-    """The table for a person: trajectories across, accuracies down."""
-    what = {"bias": "one error an image", "white": "an error in every row of the table"}
+    """The printed table: trajectories across, accuracies down."""
+    what = {"bias": "one error per image", "white": "an error in every record of the table"}
     text = [
         f"altitude {table.altitude / 1e3:.1f} km, field of view {_degrees(table.field_of_view):g}°",
         f"error of attitude about each axis: {what[table.kind]}; {table.draws} draws",

@@ -13,16 +13,16 @@ pushbroom = Application(
 app.add_typer(pushbroom, name="pushbroom")
 
 ScannerFile = Annotated[
-    Path, typer.Argument(help="scanner file .toml, or of a product (docs/pushbroom.md)")
+    Path, typer.Argument(help="scanner file .toml, or product file (docs/pushbroom.md)")
 ]
 Level = Annotated[
     float | None, typer.Option("--height", help="metres above the ellipsoid; Z in a local frame")
 ]
-Dem = Annotated[Path | None, typer.Option(help="raster of the terrain, heights as --height")]
+Dem = Annotated[Path | None, typer.Option(help="terrain raster, heights like --height")]
 Geoid = Annotated[
     Path | None,
-    typer.Option(help="grid of the geoid above the ellipsoid, for a --dem of orthometric heights: "
-                 "a raster, or the name of one of PROJ's grids"),
+    typer.Option(help="geoid heights, for a --dem of orthometric heights: "
+                 "a raster, or the name of a PROJ grid"),
 ]  # fmt: skip
-Csv = Annotated[Path | None, typer.Option(help="file for the table; - or none: standard output")]
-Json = Annotated[str, typer.Option(help="the table as JSON instead; - for standard output")]
+Csv = Annotated[Path | None, typer.Option(help="file for the table; default: standard output")]
+Json = Annotated[str, typer.Option(help="the table as JSON; - for standard output")]

@@ -1,4 +1,4 @@
-"""`jaxbundle pushbroom correct`: the image as a map."""
+"""`jaxbundle pushbroom correct`: rectify an image to a map."""
 
 from pathlib import Path
 from typing import Annotated, cast
@@ -16,22 +16,25 @@ def correct(
     scanner: ScannerFile,
     image: Annotated[Path, typer.Argument(help="the image: a raster of all lines and pixels")],
     out: Annotated[Path, typer.Option(help="GeoTIFF to write")],
-    crs: Annotated[str | None, typer.Option(help="EPSG:… of the map; longitude, latitude")] = None,
+    crs: Annotated[
+        str | None, typer.Option(help="EPSG:… of the map; default: longitude, latitude")
+    ] = None,
     spacing: Annotated[
-        float | None, typer.Option(help="size of its pixels, in its unit; else the image's own")
+        float | None,
+        typer.Option(help="pixel size of the map, in its unit; default: that of the image"),
     ] = None,
     height: Level = None,
     dem: Dem = None,
     geoid: Geoid = None,
     resampling: Annotated[str, choice(RESAMPLINGS)] = "bilinear",
     occlusion: Annotated[
-        bool, typer.Option("--occlusion", help="leave out what other terrain of --dem hides")
+        bool, typer.Option("--occlusion", help="no data where terrain of --dem hides the ground")
     ] = False,
     truth: Annotated[
         Path | None, typer.Option(help="scanner file of the truth, for --error-map")
     ] = None,
     error_map: Annotated[
-        Path | None, typer.Option(help="GeoTIFF of the errors of the map: east, north, length")
+        Path | None, typer.Option(help="GeoTIFF of the map errors: east, north, length")
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -53,9 +56,9 @@ def correct(
     if error_map is not None:
         _check_target("--error-map", error_map, image)
         if error_map.absolute() == out.absolute():
-            raise InputError(f"--error-map {error_map} is --out as well; give another name")
+            raise InputError(f"--error-map {error_map} is also --out; give another name")
     if occlusion and dem is None:
-        raise InputError("--occlusion: only terrain hides terrain; give --dem")
+        raise InputError("--occlusion: needs terrain; give --dem")
     file = open_scanner(scanner)
     surface = surface_of(file.earth, height, dem, file.image, geoid)
     system = MapSystem(file.earth, crs)
@@ -82,7 +85,7 @@ def correct(
 
 
 def _check_target(option: str, path: Path, image: Path) -> None:
-    """Refuse what cannot be written, before anything is computed."""
+    """Refuse output that cannot be written, before computing."""
     if not path.absolute().parent.is_dir():
         raise InputError(f"{option} {path}: there is no folder {path.parent}")
     if path.is_dir():
@@ -94,7 +97,7 @@ def _check_target(option: str, path: Path, image: Path) -> None:
 
 
 def _truth(path: Path, file):
-    """The true image, which must be one of the scene of a scanner file."""
+    """The true image, which must match the scanner file."""
     from jaxbundle.cli.pushbroom.shared import open_scanner
 
     truth = open_scanner(path)

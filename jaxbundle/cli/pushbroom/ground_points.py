@@ -1,4 +1,4 @@
-"""Points of the ground in a table: Earth-fixed, geographic, or of a local frame."""
+"""Ground points of a table: Earth-fixed, geographic, or in a local frame."""
 
 import numpy as np
 
@@ -9,25 +9,25 @@ from jaxbundle.network.columns import Columns, did_you_mean
 
 CARTESIAN, GEOGRAPHIC = ("X", "Y", "Z"), ("longitude", "latitude", "height")
 TOLD = ("id", "line", "pixel", "count", "status")
-"""What `locate` and `project` write beside the point: their tables are taken as they are."""
+"""Further columns written by `locate` and `project`: their tables are accepted as input."""
 
 
 def with_points(table: Columns) -> Columns:
-    """The rows that have a point: `locate` leaves those without one empty, and says why."""
+    """The rows that have a point: `locate` leaves the others empty, with a status."""
     if "status" not in table.values:
         return table
     given = [name for name in (*CARTESIAN, *GEOGRAPHIC) if name in table.values]
     empty = np.all([np.isnan(table.numbers(name)) for name in given], axis=0)
     if not np.any(empty):
         return table
-    warn(f"{table.source(int(empty.argmax()))}: no point ({empty.sum()} rows are left out)")
+    warn(f"{table.source(int(empty.argmax()))}: no point ({empty.sum()} rows are skipped)")
     kept = np.flatnonzero(~empty).tolist()
     values = {name: [column[row] for row in kept] for name, column in table.values.items()}
     return Columns(values, table.source.take(kept))
 
 
 def points_of(table: Columns, earth: Ellipsoid | None) -> np.ndarray:
-    """Points of a table, Earth-fixed or local; X, Y, Z where it has both.
+    """Points of a table, Earth-fixed or local; X, Y, Z have priority.
 
     **Raises:** `InputError`.
     """

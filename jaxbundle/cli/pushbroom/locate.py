@@ -16,7 +16,7 @@ def locate(
     scanner: ScannerFile,
     points: Annotated[Path | None, typer.Option(help="table line,pixel[,id]")] = None,
     grid: Annotated[
-        str, typer.Option(help="LINESxPIXELS places over the whole image, if no points")
+        str, typer.Option(help="LINESxPIXELS positions over the image, without --points")
     ] = "11x11",
     height: Level = None,
     dem: Dem = None,
@@ -24,7 +24,7 @@ def locate(
     csv: Csv = None,
     json: Json = "",
 ) -> None:
-    """Where on the ground places of the image are; (0, 0) is the centre of the first pixel."""
+    """Locate image positions on the ground; (0, 0) is the centre of the first pixel."""
     import dataclasses
 
     import jax
@@ -59,8 +59,9 @@ def locate(
     if missed.any():
         row = int(missed.argmax())
         remedy = (
-            f"give a model that covers the image instead of {dem}" if dem
-            else "look at attitude, mounting and height"
+            f"give a model that covers the image instead of {dem}"
+            if dem
+            else "check attitude, mounting and height"
         )
         said = (
             f"{source(row)}: the ray of line {line[row]:g}, pixel {pixel[row]:g}: {reason}; "

@@ -1,4 +1,4 @@
-"""Places in the image of a line scanner: of a table, or a grid over it."""
+"""Positions in a line scanner image: from a table, or a grid over it."""
 
 from pathlib import Path
 
@@ -12,11 +12,11 @@ from jaxbundle.pushbroom.image import PushbroomImage
 
 OFF = "off the image"
 TOLD = ("id", "X", "Y", "Z", "longitude", "latitude", "height", "count", "status")
-"""What `locate` and `project` write beside line and pixel: their tables are taken as they are."""
+"""Further columns written by `locate` and `project`: their tables are accepted as input."""
 
 
 def places(image: PushbroomImage, points: Path | None, grid: str):
-    """Ids, lines, pixels and their source: of a table, or a grid over the image.
+    """Ids, lines, pixels and their source: a table, or a grid over the image.
 
     **Raises:** `InputError`.
     """
@@ -40,7 +40,7 @@ def places(image: PushbroomImage, points: Path | None, grid: str):
 def off_image(
     image: PushbroomImage, line: np.ndarray, pixel: np.ndarray, source: Source
 ) -> np.ndarray:
-    """Which places are off the image; told, and refused if all are.
+    """Which positions are outside the image; reported, and refused if all are.
 
     **Raises:** `InputError`.
     """

@@ -9,7 +9,7 @@ from jaxbundle.cli.pushbroom.app import Csv, Json, ScannerFile, pushbroom
 from jaxbundle.errors import InputError
 
 MOST = 4
-"""So many lines that see one point are told."""
+"""Largest number of lines reported for one point."""
 
 
 @pushbroom.command(example="out/flight/scanner.toml --points points.csv")
@@ -21,7 +21,7 @@ def project(
     csv: Csv = None,
     json: Json = "",
 ) -> None:
-    """Where in the image points of the ground are: a row for every line that sees one."""
+    """Project ground points into the image: a row for every line that sees one."""
     import numpy as np
 
     from jaxbundle.cli.pushbroom.ground_points import points_of, with_points
@@ -39,7 +39,7 @@ def project(
     if (status != Status.SEEN).all():
         raise InputError(
             f"{table.source(0)}: no point is in the image; this one is "
-            f"{Status(int(status[0])).meaning}: look at coordinates, frame and units"
+            f"{Status(int(status[0])).meaning}: check coordinates, frame and units"
         )
     unseen = np.flatnonzero(status != Status.SEEN)
     if len(unseen):

@@ -1,4 +1,4 @@
-"""`jaxbundle pushbroom refine`: least squares on control and tie points."""
+"""`jaxbundle pushbroom refine`: adjust scanner images with control and tie points."""
 
 import dataclasses
 import json as json_
@@ -22,9 +22,9 @@ def refine(
     ] = None,
     html: Html = "",
     force: Force = False,
-    json: Annotated[str, typer.Option(help="write the result as JSON; - for stdout alone")] = "",
+    json: Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")] = "",
 ) -> None:
-    """Refine attitude, position and optics of scanner images by points; report what they tell."""
+    """Refine attitude, position and optics of scanner images with control and tie points."""
     from jaxbundle.cli.outputs import PAGE, REPORT, RESULT, check_writable, trace_files, written
     from jaxbundle.cli.pushbroom.shared import warn
     from jaxbundle.io.networks.project import FILES, fill_project

@@ -1,4 +1,4 @@
-"""`jaxbundle pushbroom rpc`: rational polynomial coefficients, fitted, applied, compensated."""
+"""`jaxbundle pushbroom rpc`: fit, apply and compensate rational polynomial coefficients."""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,7 +14,7 @@ rpc = Application(help="Rational polynomial coefficients (RPC00B).")
 pushbroom.add_typer(rpc, name="rpc")
 
 ENOUGH = 0.5
-"""A fit that leaves more than this, in pixels, is not one to work with in silence."""
+"""A fit with larger residuals, in pixels, is reported."""
 GROUND_SIGMA = ("seast", "snorth", "sheight")
 TERMS = ("shift", "by_line", "by_sample")
 
@@ -24,9 +24,7 @@ RpcFile = Annotated[
         help="coefficients: _RPC.TXT, .RPB, a tagged GeoTIFF, XML of DIMAP or DigitalGlobe, .geom"
     ),
 ]
-Figures = Annotated[
-    str, typer.Option(help="the figures and every point as JSON; - for standard output")
-]
+Figures = Annotated[str, typer.Option(help="figures and all points as JSON; - for standard output")]
 Out = Annotated[Path, typer.Option(help="file for the coefficients: .txt, .rpb, an existing .tif")]
 
 
@@ -39,10 +37,12 @@ def fit(
     heights: Annotated[
         str, typer.Option(help="LOW:HIGH of the ground, metres above the ellipsoid")
     ] = "0:3000",
-    ridge: Annotated[float | None, typer.Option(min=0, help="ridge, chosen if not given")] = None,
+    ridge: Annotated[
+        float | None, typer.Option(min=0, help="ridge parameter; default: automatic")
+    ] = None,
     json: Figures = "",
 ) -> None:
-    """Fit coefficients to a scanner, or to a table; tell what they leave, in pixels."""
+    """Fit coefficients to a scanner or a table; print the residuals in pixels."""
     from jaxbundle.cli.pushbroom.rpc_tables import figures_of, heights_of, table_of, tell
     from jaxbundle.cli.pushbroom.shared import check_spheroid, keep_inputs, open_scanner, warn
     from jaxbundle.geometry.ellipsoid import WGS84
@@ -60,7 +60,7 @@ def fit(
             raise InputError(f"{source}: a local frame has no longitudes; RPCs need an Earth")
         check_spheroid(file.earth)
         if file.earth != WGS84:
-            warn(f"{source}: the ellipsoid is not WGS84, which other programs will assume")
+            warn(f"{source}: the ellipsoid is not WGS84, as other programs assume")
         found, check = fit_image(file.image, file.earth, heights_of(heights), ridge=ridge)
         head = figures_of("check", check)
     if not found.converged:
@@ -72,8 +72,8 @@ def fit(
     largest = max(found.check.largest.max(), *(v for k, v in head.items() if "largest" in k), 0.0)
     if largest > ENOUGH:
         warn(
-            f"{source}: the coefficients leave up to {largest:.3g} pixel: they do not follow what "
-            "jitters faster than a cubic over the image; cut it into shorter pieces, or use the "
+            f"{source}: residuals up to {largest:.3g} pixel: the coefficients do not follow "
+            "jitter faster than a cubic over the image; cut it into shorter pieces, or use the "
             "rigorous model"
         )
     head = {"points": len(found.check.residuals), **figures_of("fit", found.check), **head}
@@ -94,7 +94,7 @@ def apply(
     csv: Csv = None,
     json: Json = "",
 ) -> None:
-    """Points of the ground to the image; places in the image to a surface."""
+    """Project ground points to the image, or locate image positions on a surface."""
     import numpy as np
 
     from jaxbundle.cli.pushbroom.rpc_tables import COLUMNS
@@ -125,7 +125,7 @@ def apply(
             f"({bad.sum()} of {len(status)} points)"
         )
         if (status == RpcStatus.NOT_CONVERGED).all():
-            raise InputError(f"{said}; look at coordinates and units")
+            raise InputError(f"{said}; check coordinates and units")
         warn(said)
     meaning = [RpcStatus(int(s)).meaning for s in status]
     write_rows({"id": ids, **columns, "status": meaning}, csv, json)
@@ -136,9 +136,7 @@ def compensate(
     coefficients: RpcFile,
     control: Annotated[
         Path,
-        typer.Option(
-            help="table longitude,latitude,height,line,sample[,id,seast,snorth,sheight]"
-        ),
+        typer.Option(help="table longitude,latitude,height,line,sample[,id,seast,snorth,sheight]"),
     ],
     out: Out,
     model: Annotated[str, choice(RPC_BIASES, "in the image")] = "shift",
@@ -146,7 +144,7 @@ def compensate(
     csv: Csv = None,
     json: Figures = "",
 ) -> None:
-    """Remove the bias that control points tell of; residuals, redundancy numbers and w of each."""
+    """Remove the bias found by control points; print residuals, redundancy numbers and w."""
     import numpy as np
 
     from jaxbundle.cli.pushbroom.rpc_tables import figures_of, table_of
@@ -154,7 +152,7 @@ def compensate(
     from jaxbundle.io.scanner.rpc import RASTERS, read_rpc, write_rpc
     from jaxbundle.pushbroom.rpc_bias import compensated, fit_bias
 
-    # the tags of a raster may be replaced in it
+    # the tags of a raster may be replaced in place
     keep_inputs([control], out=out, csv=csv, json=json)
     keep_inputs([coefficients], csv=csv, json=json, out=None if out.suffix in RASTERS else out)
     given = read_rpc(coefficients)

@@ -1,4 +1,4 @@
-"""Tables of `jaxbundle pushbroom rpc`: points read, figures and residuals told."""
+"""Tables of `jaxbundle pushbroom rpc`: input points, figures and residuals."""
 
 from pathlib import Path
 

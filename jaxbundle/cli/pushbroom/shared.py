@@ -1,4 +1,4 @@
-"""What the commands of line scanners share: surfaces, scanner files, tables."""
+"""Shared by the line scanner commands: surfaces, scanner files, tables."""
 
 import json
 import os
@@ -33,12 +33,12 @@ def surface_of(
     image: PushbroomImage | Rpc | None = None,
     geoid: Path | None = None,
 ) -> Surface:
-    """The surface that the options name: the ellipsoid (or Z = 0) if none.
+    """The surface selected by the options; default: the ellipsoid (or Z = 0).
 
-    Of a terrain model of an Earth what the image can see is read.
+    Only the visible part of a terrain model is read.
     """
     if geoid is not None and dem is None:
-        raise InputError("--geoid: it is added to a terrain model; give --dem")
+        raise InputError("--geoid: needs a terrain model; give --dem")
     if height is not None and not np.isfinite(height):
         raise InputError(f"--height {height}: a finite number is expected, in metres")
     if dem is not None:
@@ -69,7 +69,7 @@ def open_scanner(path: Path) -> Scanner:
 
 
 def keep_inputs(inputs: Sequence[str | Path | None], **outputs: str | Path | None) -> None:
-    """Refuse a file to write, by the name of its option, that is read; for JSON, `check_json`."""
+    """Refuse an output file, by option name, that is an input; for JSON, `check_json`."""
     read = {os.path.realpath(file) for path in inputs if path for file in files_read(path)}
     for option, path in outputs.items():
         if path and os.path.realpath(path) in read:
@@ -81,7 +81,7 @@ def keep_inputs(inputs: Sequence[str | Path | None], **outputs: str | Path | Non
 
 
 def check_spheroid(earth: Ellipsoid | None) -> None:
-    """Refuse heights above an ellipsoid of three different axes."""
+    """Refuse heights above a triaxial ellipsoid."""
     if earth is not None and earth.a != earth.b:
         raise InputError(
             "heights, longitude and latitude need an ellipsoid of revolution; make the first two "
@@ -92,7 +92,7 @@ def check_spheroid(earth: Ellipsoid | None) -> None:
 def geographic(table: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Columns longitude, latitude (degrees), height as radians and metres.
 
-    **Raises:** `InputError` with the row of an angle that is none of a place.
+    **Raises:** `InputError` with the row of an angle out of range.
     """
     names = "longitude", "latitude", "height"
     longitude, latitude, height = (table.numbers(name, required=True) for name in names)
@@ -101,7 +101,7 @@ def geographic(table: Columns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             row = int(beyond.argmax())
             raise InputError(
                 f"{table.source(row)}: {name} {values[row]:g} is beyond {most}°; degrees are "
-                "expected, look at the order of columns"
+                "expected; check the order of columns"
             )
     return np.radians(longitude), np.radians(latitude), height
 

@@ -1,4 +1,4 @@
-"""`jaxbundle pushbroom simulate`: a flight, its ancillary files, and the image it takes."""
+"""`jaxbundle pushbroom simulate`: simulate a flight, its ancillary files and its image."""
 
 from pathlib import Path
 from typing import Annotated, cast
@@ -17,14 +17,14 @@ def simulate(
     flight: Annotated[Path, typer.Argument(help="flight file, .toml (docs/pushbroom.md)")],
     out: Annotated[Path, typer.Option(help="folder for scanner.toml, tables, truth/, image.tif")],
     force: Force = False,
-    scene: Annotated[Path | None, typer.Option(help="raster with map coordinates to see")] = None,
+    scene: Annotated[Path | None, typer.Option(help="georeferenced raster to image")] = None,
     height: Level = None,
     dem: Dem = None,
     geoid: Geoid = None,
     resampling: Annotated[str, choice(RESAMPLINGS)] = "cubic",
     quiet: Quiet = False,
 ) -> None:
-    """Simulate a flight: what its instruments tell, the truth, and the image of a scene."""
+    """Simulate a flight: instrument records, the truth, and the image of a scene."""
     import jax.numpy as jnp
     import numpy as np
 
