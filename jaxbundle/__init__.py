@@ -7,13 +7,13 @@
     result = jaxbundle.adjust(network)
     print(result)
 
-Importing configures nothing; `enable_x64` switches JAX to the 64-bit floats adjustment needs,
-`use_cores` lets it work on big networks with all cores, `keep_programs` keeps what was compiled.
+Importing configures nothing. `enable_x64` switches JAX to the required 64-bit floats, `use_cores`
+uses all cores for large networks, `keep_programs` keeps compiled programs.
 """
 
 import importlib
 
-TYPE_CHECKING = False  # typing would be imported for nothing else
+TYPE_CHECKING = False  # avoids importing typing
 
 if TYPE_CHECKING:
     from jaxbundle.adjustment import Problem as Problem
@@ -105,8 +105,8 @@ __all__ = [*_MODULE]  # pyright: ignore[reportUnsupportedDunderAll]: the names a
 
 
 def __getattr__(name: str):
-    """Public names are imported when first used (PEP 562), so that the command line can say how JAX
-    and the linear algebra library are to start before they do."""
+    """Import public names on first use (PEP 562), so that the command line can configure JAX and
+    the linear algebra library before they start."""
     if name not in _MODULE:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(importlib.import_module(_MODULE[name]), name)

@@ -1,7 +1,7 @@
 """`jaxbundle` and `python -m jaxbundle`: the command line.
 
-One BLAS thread, unless the environment says otherwise: threads fight over small matrices, and the
-library reads it when it is imported.
+One BLAS thread, unless the environment says otherwise: threads are slow on small matrices. The
+library reads the variable on import.
 """
 
 import gc
@@ -12,8 +12,8 @@ import warnings
 from jaxbundle.system.interrupts import handle_interrupts, set_status
 
 SELDOM = 50_000, 20, 100
-"""Thresholds of Python's garbage collector. Tracing makes objects by the million, and nearly all of
-them stay: with the usual thresholds, looking for those that go takes a sixth of the tracing."""
+"""Thresholds of Python's garbage collector. Tracing makes millions of objects, nearly all of them
+permanent: with the default thresholds the collector takes a sixth of the tracing time."""
 
 
 def main() -> None:
@@ -39,7 +39,7 @@ def _keep_programs() -> None:
 
 
 def _tell_once_of_damage() -> None:
-    """JAX warns of every kept program it cannot read, at every run, for it does not replace it."""
+    """JAX warns of every unreadable cached program, in every run, since it does not replace it."""
     show, told = warnings.showwarning, []
 
     def tell(message, *where):
@@ -47,7 +47,7 @@ def _tell_once_of_damage() -> None:
             return show(message, *where)
         if not told and "--quiet" not in sys.argv:
             print(
-                "jaxbundle: kept programs cannot be read or written; to mend it, delete the folder"
+                "jaxbundle: compiled programs cannot be read or written; delete the folder"
                 f" {sys.modules['jax'].config.jax_compilation_cache_dir}",
                 file=sys.stderr,
             )

@@ -1,7 +1,7 @@
-"""Arguments checked before they are used: one line names the argument and what is expected.
+"""Checks of arguments: one line names the argument and what is expected.
 
-Masked arrays keep their mask: what is masked comes back as NaN. Complex numbers are refused, as are
-arrays that JAX traces (under `jax.jit`, `jax.vmap` or `jax.grad`), where numbers are needed.
+Masked values become NaN. Complex numbers are refused, and JAX tracers (under `jax.jit`, `jax.vmap`
+or `jax.grad`) where numbers are needed.
 """
 
 import math
@@ -18,11 +18,11 @@ from jax.core import Tracer
 from jaxbundle.errors import InputError
 
 MOST = 10**9
-"""Whole numbers go so far."""
+"""Largest integer."""
 
 
 def shown(value: Any) -> str:
-    """A value as a message shows it: what is long is cut."""
+    """A value for a message; long ones are cut."""
     text = " ".join(repr(value.item() if isinstance(value, np.generic) else value).split())
     return text if len(text) <= 60 else f"{text[:58]}…"
 
@@ -44,7 +44,7 @@ def whole(name: str, value: Any, least: int = 1, most: int = MOST) -> int:
 
 
 def number(name: str, value: Any, expected: str = "a number", good=math.isfinite) -> float:
-    """A number for which `good` holds, by default a finite one.
+    """A number that satisfies `good`, by default a finite one.
 
     **Raises:** `InputError`."""
     refuse_traced(name, value)
@@ -66,14 +66,14 @@ def positive(name: str, value: Any) -> float:
 
 
 def at_least_zero(name: str, value: Any) -> float:
-    """A number that is 0 or above, infinity as well.
+    """A non-negative number, possibly infinite.
 
     **Raises:** `InputError`."""
     return number(name, value, "0 or a positive number", lambda x: x >= 0)
 
 
 def one_of(name: str, value: Any, choices: Sequence[str], none: bool = False) -> str | None:
-    """One of some words, or None where there may be none.
+    """One of the given words, or None if allowed.
 
     **Raises:** `InputError`."""
     if (value is None and none) or (isinstance(value, str) and value in choices):
@@ -92,7 +92,7 @@ def truth(name: str, value: Any) -> bool:
 
 
 def text(name: str, value: Any) -> str:
-    """A text that is not empty.
+    """A non-empty text.
 
     **Raises:** `InputError`."""
     if not isinstance(value, str) or not value.strip():
@@ -110,8 +110,9 @@ def path(name: str, value: Any) -> str:
 
 
 def numeric_array(name: str, values: Any, expected: str, truths: bool = False) -> np.ndarray:
-    """Values as an array of real numbers, or also of truth values; a masked number is NaN, a masked
-    truth False.
+    """Values as an array of real numbers, or of Booleans; a masked number becomes NaN, a masked
+    Boolean False.
+    
 
     **Raises:** `InputError` that says what is expected."""
     refuse_traced(name, values)
@@ -141,7 +142,7 @@ def vector(name: str, value: Any, size: int, expected: str) -> np.ndarray:
 
 
 def refuse_traced(name: str, *values: Any) -> None:
-    """Refuse what JAX traces, wherever it is among the values.
+    """Refuse JAX tracers anywhere in the values.
 
     **Raises:** `InputError`."""
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values)):
@@ -152,7 +153,7 @@ def refuse_traced(name: str, *values: Any) -> None:
 
 
 def _stacked_masks(values: Any) -> np.ma.MaskedArray | None:
-    """A masked array, or one of a list of masked arrays, whose masks `np.asarray` would lose."""
+    """A masked array, also from a list of masked arrays, whose masks `np.asarray` would lose."""
     if isinstance(values, np.ma.MaskedArray):
         return values
     if isinstance(values, list | tuple) and any(

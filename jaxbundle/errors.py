@@ -1,16 +1,16 @@
-"""What can go wrong, said to a person: where it is, what is wrong, what to do."""
+"""Errors for the user: where, what is wrong, what to do."""
 
 import re
 from collections.abc import Sequence
 
 TOO_LONG = re.compile(r"([^\s/\\]{40})[^\s/\\]{260,}")
-"""A word of 300 characters or more: a name of a file, with what stands around it, has less."""
+"""A word of 300 characters or more, longer than any file name with its context."""
 
 
 class InputError(ValueError):
-    """The input cannot be used; the message names file, row and thing, and the remedy.
+    """The input cannot be used; the message names file, row, cause and remedy.
 
-    Of a word without end, which no person wrote, the message has the first 40 characters.
+    Extremely long words are cut to 40 characters.
     """
 
     def __init__(self, message: str = ""):
@@ -18,9 +18,9 @@ class InputError(ValueError):
 
 
 class NotSolvedError(RuntimeError):
-    """The adjustment has no trustworthy answer; the message says why and what to do.
+    """The adjustment has no reliable solution; the message gives reason and remedy.
 
-    `undetermined`: names of what the observations do not determine, where they are known.
+    `undetermined`: names of undetermined unknowns, if known.
     """
 
     def __init__(self, message: str, undetermined: Sequence[str] = ()):

@@ -1,14 +1,15 @@
-"""64-bit floats: one rule, and the only place that switches, refuses or checks.
+"""64-bit floats: the only module that enables, requires or checks them.
 
 | who | what |
 |---|---|
-| importing the package | switches nothing |
+| importing the package | changes nothing |
 | the user, once; the command line | `enable_x64()`, before the first JAX computation |
-| whatever ends in coordinates, orientations, calibrations | `require_x64()`: refuses without |
+| functions that return coordinates, orientations, calibrations | `require_x64()`: an error without
+|
 | NumPy in, NumPy out: reading, writing and converting files and cameras | `with local_x64():` |
 | formulas of one point, ray or exchange | nothing: they compute in the type of their arguments |
 
-Files can so be read, converted and compared before anything is switched on.
+Hence files can be read, converted and compared without enabling 64-bit floats.
 """
 
 import os
@@ -16,19 +17,18 @@ from contextlib import AbstractContextManager
 from importlib.metadata import version
 
 QUICK_LOOPS = "--xla_cpu_use_fusion_emitters=false"
-"""XLA writes loops in the older of its two ways: compiled in half the time and memory, as fast."""
+"""Use the older of XLA's two loop emitters: half the compile time and memory, the same speed."""
 ONE_AFTER_THE_OTHER = "--xla_cpu_enable_concurrency_optimized_scheduler=false"
-"""The operations of a program do not wait for each other inside XLA's pool of threads. jaxlib does
-so for the parts of a batched factorisation or triangular solve: as many of them at once as there
-are threads, as under `vmap`, wait for ever. Programs are as fast, and smaller."""
+"""Disable concurrent operations in XLA's thread pool. jaxlib waits there for the parts of a batched
+factorisation or triangular solve: as many of them at once as there are threads, as under `vmap`,
+deadlock. Programs are equally fast, and smaller."""
 
 
 def enable_x64() -> None:
-    """Switch JAX to the 64-bit floats adjustment needs; call it before the first JAX computation.
+    """Switch JAX to the required 64-bit floats; call it before the first JAX computation.
 
-    The compiler is set up for the processor, too, where it still has the choice (jaxlib 0.10):
-    `QUICK_LOOPS` and `ONE_AFTER_THE_OTHER` are put into the environment variable XLA_FLAGS, each
-    unless that speaks of it.
+    It also sets the CPU compiler options `QUICK_LOOPS` and `ONE_AFTER_THE_OTHER` in the environment
+    variable XLA_FLAGS (jaxlib 0.10), unless the variable already sets them.
     """
     import jax
 
@@ -41,7 +41,7 @@ def enable_x64() -> None:
 
 
 def require_x64() -> None:
-    """64-bit floats, without which nothing is adjusted.
+    """Require 64-bit floats.
 
     **Raises:** `RuntimeError` that says how to get them."""
     import jax
@@ -54,7 +54,7 @@ def require_x64() -> None:
 
 
 def local_x64() -> AbstractContextManager:
-    """64-bit floats for the computations inside, whatever the rest of the program has."""
+    """64-bit floats for the computations inside the context."""
     import jax
 
     return jax.enable_x64(True)

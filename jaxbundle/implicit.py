@@ -1,13 +1,13 @@
-"""Roots of equations as functions of what the equations depend on: derivatives of every order.
+"""Roots of equations as functions of their data, differentiable to any order.
 
-A root x(θ) of g(x, θ) = 0, however it was found, moves with θ by the implicit function theorem,
+By the implicit function theorem a root x(θ) of g(x, θ) = 0 moves with θ by
 
     ẋ = −(∂g/∂x)⁻¹·∂g/∂θ·θ̇,        everything at x(θ).
 
-The root in that rule is again the function x(θ), and the linear system in it is differentiated as
-one, A·x = b → A·ẋ = ḃ − Ȧ·x. So the rule holds to every order in forward, reverse and mixed mode
-(Griewank and Walther 2008, section 15.3). The iterations that found the root are never
-differentiated, nor is a factorisation of A.
+The root in this rule is again the function x(θ), and its linear system is differentiated by A·x = b
+→ A·ẋ = ḃ − Ȧ·x. So the rule holds to any order in forward, reverse and mixed mode (Griewank and
+Walther 2008, section 15.3). The iterations that found the root are never differentiated, nor is a
+factorisation of A.
 """
 
 from collections.abc import Callable
@@ -25,11 +25,11 @@ from jaxbundle.errors import InputError
 def implicit_root(
     equations: Callable, solve: Callable, root: PyTree, fixed: PyTree, data: PyTree
 ) -> PyTree:
-    """`root` as a function of `data`, differentiable to every order.
+    """`root` as a function of `data`, differentiable to any order.
 
     **Arguments:** `equations(x, fixed, data)`, zero at the root, in the form of x; `solve(times,
     fixed, b)`, the solution of A·x = b, where `times(x)` is A·x, A = ∂equations/∂x at the root;
-    it has to be differentiable in b and in what `times` depends on (`solve_dense`,
+    differentiable in b and in the dependencies of `times` (`solve_dense`,
     `jax.lax.custom_linear_solve`); `root` and `fixed` without derivatives (`stop_gradient`).
     """
     return root
@@ -47,7 +47,7 @@ def _(primals, tangents):
 
 
 def derivative_along(function: Callable, data: PyTree, change: PyTree) -> PyTree:
-    """The derivative of a function along a change of its data, None where that does not change."""
+    """The derivative of a function along a change of its data, None if there is no change."""
     value, moved = eqx.filter_jvp(function, (data,), (change,))
     return jax.tree.map(lambda x, d: jnp.zeros_like(x) if d is None else d, value, moved)
 
@@ -62,7 +62,7 @@ def solve_dense(times: Callable, fixed: PyTree, b: PyTree) -> PyTree:
 
 @eqx.filter_custom_jvp
 def differentiable_once(x: PyTree, message: str) -> PyTree:
-    """`x`, to be used in a rule for derivatives that is not to be differentiated again.
+    """`x`, for use in a derivative rule that must not be differentiated again.
 
     **Raises:** `InputError` with the message, where it is."""
     return x

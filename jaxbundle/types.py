@@ -1,6 +1,6 @@
-"""Types that annotations share; shapes are jaxtyping's.
+"""Types for annotations; shapes are those of jaxtyping.
 
-Functions of one point, ray or pose take arrays of JAX and NumPy alike and return those of JAX.
+Functions of one point, ray or pose accept JAX and NumPy arrays and return JAX arrays.
 Formulas of unpacked scalars work element by element: given arrays, they work on many at once.
 """
 
@@ -14,13 +14,13 @@ from jaxtyping import Float
 AnyArray = Array | np.ndarray
 Numbers = Sequence[float] | Float[np.ndarray, " n"]
 Column = Sequence[Any] | np.ndarray
-"""Cells of a table: numbers, text, or what a file has there."""
+"""Cells of a table: numbers, text, or other content of a file."""
 Index = int | np.integer
 Scalar = float | Float[AnyArray, "..."]
 T = TypeVar("T")
 
 
 def present(value: T | None) -> T:
-    """A value that is there by what was checked before, though its type allows for None."""
+    """A value that cannot be None because of earlier checks, although its type allows it."""
     assert value is not None
     return value

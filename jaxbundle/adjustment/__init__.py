@@ -1,7 +1,7 @@
-"""The adjustment of networks, cameras and rigs: declarations on the engine.
+"""The adjustment of networks, cameras and rigs, declared on the engine.
 
-`solve` is the differentiable core (arrays in, arrays out); `jaxbundle.adjust` puts a network in
-and statistics around it.
+`solve` is the differentiable core (arrays in, arrays out); `jaxbundle.adjust` adds networks and
+statistics.
 """
 
 from jaxbundle.adjustment.equations import design_matrix as design_matrix

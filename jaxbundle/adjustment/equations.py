@@ -27,9 +27,8 @@ def design_matrix(
 ) -> tuple[Float[Array, "rows unknowns"], list[Name]]:
     """J = ∂(v/σ)/∂(free unknowns), dense, for small networks, and the unknowns of its columns.
 
-    Rows set by set (image points, control points, priors, distances), columns table by table.
-
-    Rotations are turned by δθ (radians), about the axes of the camera."""
+    Rows are ordered by set (image points, control points, priors, distances), columns by table.
+    Rotations change by δθ (radians) about the camera axes."""
     system, layout = problem.system, problem.layout
     data = problem.data if data is None else data
     tables = layout.tables(values)

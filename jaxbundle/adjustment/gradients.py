@@ -1,4 +1,4 @@
-"""Derivatives against finite differences: for camera models, adjustments, any function."""
+"""Derivatives compared with finite differences, for camera models, adjustments, any function."""
 
 import dataclasses
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from jaxbundle.network.arrays import Data
 
 @dataclasses.dataclass(frozen=True)
 class GradientCheck:
-    """Largest relative differences over the directions tried.
+    """Largest relative differences over the tested directions.
 
     `forward`: jvp against central differences; `reverse`: vjp against jvp. Both are relative to
     the size of the derivative in that direction.

@@ -1,4 +1,4 @@
-"""A network made ready for the engine: plan, arrays, datum and the count of its rows."""
+"""A network prepared for the engine: plan, arrays, datum and counts of rows."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ from jaxbundle.network.tables import Network, require_network
 from jaxbundle.types import present
 
 HELD = 1e-6
-"""Of a datum's directions, the part of a motion that is none."""
+"""Below this part of a motion a datum direction counts as none."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,10 +53,10 @@ class Counts:
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """What `jaxbundle.solve` solves: a network as the engine sees it.
+    """The input of `jaxbundle.solve`: a network as the engine sees it.
 
     `network` is the network as adjusted (cameras in the order of the arrays); `data` its numbers,
-    `system` the engine's problem, `layout` how the arrays of the one stand in the other; `origin`
+    `system` the engine's problem, `layout` the mapping between their arrays; `origin`
     [3] was subtracted from all object coordinates.
     """
 
@@ -84,13 +84,13 @@ class Problem:
 
     @property
     def at_any_distance(self) -> Bool[np.ndarray, " points"]:
-        """Which points move as directions and distances up to infinity."""
+        """Which points are parametrised as directions and inverse distances."""
         lengths = self.layout.lengths
         return np.zeros(len(self.network.points), bool) if lengths is None else lengths > 0
 
     def interior(self, c: int) -> tuple[tuple[str, ...], Int[np.ndarray, " k"]]:
-        """The parameters of a camera that move in any camera of its model, and which of them are
-        free in this one."""
+        """The parameters free in any camera of the model, and which of them are free in this
+        camera."""
         table = next(t for t in self.layout.cameras if c in t.cameras)
         given = self.system.table(table.name)
         row = int(np.flatnonzero(table.cameras == c)[0])
@@ -98,33 +98,34 @@ class Problem:
 
     @property
     def reduction(self) -> str:
-        """How the reduced system is solved."""
+        """Solver of the reduced system."""
         return present(self.system.plan.reduction)
 
     def with_system(self, system: engine.Problem) -> "Problem":
-        """The same after its system was changed: weights, what is held, and where."""
+        """The same problem with a changed system: weights, held unknowns and their values."""
         data = self.layout.with_weights(self.data, system.data.weight)
         if self.layout.lengths is not None:
             data = dataclasses.replace(data, start=self.layout.values(system.data.start))
         return self._with(system, data)
 
     def with_factor(self) -> "Problem":
-        """The same with a reduced system that can be factorised, as statistics need it; unchanged
-        where no factor fits into memory."""
+        """The same problem with a reduced system that can be factorised for the statistics;
+        unchanged if no factor fits into memory."""
         return self.with_system(engine.with_factor(self.system))
 
     def with_data(self, data: Data) -> "Problem":
-        """The same with other numbers (not other start values of what moves the datum)."""
+        """The same problem with other data (except start values that define the datum)."""
         return self._with(engine.with_data(self.system, self.layout.data(data)), data)
 
     def hold(
         self, table: str, rows, columns: slice | Sequence[int] = slice(None)
     ) -> "Problem":
-        """The same with some unknowns held at their start values."""
+        """The same problem with some unknowns held at their start values."""
         return self._with(engine.hold(self.system, table, rows, columns), self.data)
 
     def with_free(self, table: str, free) -> "Problem":
-        """The same with these unknowns of a table free, the others held at their start values."""
+        """The same problem with only these unknowns of a table free, the others held at their start
+        values."""
         return self._with(engine.with_free(self.system, table, free), self.data)
 
     def _with(self, system, data: Data) -> "Problem":
@@ -138,15 +139,15 @@ def make_problem(
 ) -> Problem:
     """Plan, arrays and datum of a checked network (see `jaxbundle.network.check_network`).
 
-    Check points take no part: they and their rays are left out.
+    Check points and their rays are excluded.
 
-    `reduction`: how the reduced system is solved, "dense", "banded" or "iterative"; chosen by its
-    size and fill if not given. `also`: observations of further kinds, and tables of the unknowns
-    they bring (see `jaxbundle.adjust`). `lengths`: of points that may be at any distance, the unit
-    of theirs, 0 of the others (`leastsquares.any_distance`); those hold no datum.
+    `reduction`: solver of the reduced system, "dense", "banded" or "iterative"; by default chosen
+    by size and fill. `also`: observations of further kinds, and tables of their unknowns (see
+    `jaxbundle.adjust`). `lengths`: the unit of distance of points at any distance, 0 for the others
+    (`leastsquares.any_distance`); they are not datum points.
 
-    **Raises:** `InputError` where the datum asked for cannot be had; `RuntimeError` without
-    64-bit floats.
+    **Raises:** `InputError` if the requested datum is impossible; `RuntimeError` without 64-bit
+    floats.
     """
     require_x64()
     one_of("reduction", reduction, REDUCTIONS, none=True)
@@ -164,9 +165,9 @@ def make_problem(
         )  # fmt: skip
     except CannotHold as error:
         raise InputError(
-            f"the {int(chosen.sum())} datum points cannot hold the datum, of which "
+            f"the {int(chosen.sum())} datum points cannot fix the datum, of which "
             f"{error.defect} of 7 parameters are open: give at least three free points that "
-            "are not on one line (datum_points), or leave the choice to the program"
+            "are not collinear (datum_points), or omit the setting"
         ) from None
     data = jax.device_put(declared.data)
     counts = count_rows(declared.layout, system)
@@ -174,7 +175,7 @@ def make_problem(
 
 
 def _datum_points(network: Network):
-    """Which points hold the datum where it is open."""
+    """Which points carry the datum if it is open."""
     points = network.points
     if network.datum_points:
         return np.isin(np.array(points.id, dtype=object), network.datum_points)
@@ -183,7 +184,7 @@ def _datum_points(network: Network):
 
 
 def _datum(network: Network, gauge, origin, chosen):
-    """What holds the datum; refused where the network says that its observations do."""
+    """The datum constraints; refused if the setting requires the observations to fix the datum."""
     if network.datum == "control":
         points = network.points
         about = (points.position - origin)[points.has_role("control", "fixed")]
@@ -197,13 +198,13 @@ def _datum(network: Network, gauge, origin, chosen):
     if sized and np.abs(gauge[SEVEN.index("scale")]).max() > HELD:
         raise InputError(
             f"{sized[0].source.name}: a σ of {sized[0].TABLE} is a length, but nothing gives the "
-            "network a scale: measure a distance or control points, or say \"exact\" (no σ)"
+            "network a scale: add a distance or control points, or write \"exact\" (no σ)"
         )
     return {"point": np.repeat(chosen[:, None].astype(float), 3, 1)}, network.datum == "minimal"
 
 
 def count_rows(layout: Layout, system: engine.Problem) -> Counts:
-    """Rows that carry weight, datum conditions, free unknowns."""
+    """Rows with weight, datum conditions, free unknowns."""
     fields = "image", "control", "exterior", "interior", "distance"
     number: dict[str, int] = dict.fromkeys(fields, 0)
     for s, weight in zip(layout.sets, system.data.weight):
@@ -217,8 +218,8 @@ def count_rows(layout: Layout, system: engine.Problem) -> Counts:
 
 
 def shifted_problem(network: Network, like: Problem, values: Values) -> Problem:
-    """Other points of a network with the orientations and cameras of `values`, without priors and
-    datum: for points that took no part."""
+    """A problem of other points of the network with the orientations and cameras of `values`,
+    without priors and datum: for excluded points."""
     moving = tuple(f for f in network.further if isinstance(f, RollingShutter))
     declared = declare(network.replace(further=moving), like.origin)
     layout = declared.layout

@@ -18,10 +18,10 @@ def solve(
     max_iterations: int = 100,
     atol: float = 1e-7,
 ) -> Values:
-    """Adjusted unknowns as a differentiable function of the observations and all that is given.
+    """Adjusted unknowns as a differentiable function of the observations and all other data.
 
     Use it under `jax.jit`, `jax.vmap` (over any field of `data`), `jax.grad`, `jax.jacfwd` and
-    `jax.jacrev`, one inside the other to any order.
+    `jax.jacrev`, nested to any order.
 
     **Arguments:**
 
@@ -33,11 +33,11 @@ def solve(
       `jaxbundle.leastsquares.derivatives`.
     - `atol`: stop when no unknown would move by more than this fraction of its σ.
 
-    **Returns:** `Values`; NaN throughout, derivatives too, where the solver did not converge, so
-    that a failure can never be taken for an answer.
+    **Returns:** `Values`; all NaN, including derivatives, if the solver did not converge, so that a
+    failure is never mistaken for a solution.
 
-    **Raises:** `InputError` for arguments of another kind, and for a second derivative of the
-    Gauss–Newton form.
+    **Raises:** `InputError` for invalid arguments, and for a second derivative of the Gauss–Newton
+    form.
     """
     check_given(problem, data)
     one_of("method", method, METHODS)
@@ -50,12 +50,12 @@ def solve(
 
 
 def check_given(problem: Problem, data: Data | None) -> None:
-    """Refuse what is no problem, and numbers that are none.
+    """Refuse an invalid problem or invalid data.
 
     **Raises:** `InputError`."""
     if not isinstance(problem, Problem):
         raise InputError(
-            f"problem must be what jaxbundle.make_problem gives, but is {shown(problem)}"
+            f"problem must be a result of jaxbundle.make_problem, but is {shown(problem)}"
         )
     if data is not None and not isinstance(data, Data):
-        raise InputError(f"data must be a Data, as problem.data is one, but is {shown(data)}")
+        raise InputError(f"data must be a Data like problem.data, but is {shown(data)}")

@@ -1,4 +1,4 @@
-"""Unknowns of a network by name: which image, which parameter."""
+"""Unknowns of a network by name."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -25,8 +25,8 @@ def named(problem: Problem, names: Sequence[tuple[str, str, str]]) -> list[Name]
     """Unknowns by name, e.g. `("camera", "cam", "c")`, `("image", "12", "kappa")`,
     `("point", "7", "Z")`.
 
-    **Raises:** `InputError` where nothing is named, or a name has other than three parts;
-    `KeyError` for a name that is not there."""
+    **Raises:** `InputError` without names, or for a name that does not have three parts; `KeyError`
+    for an unknown name."""
     if not isinstance(names, list | tuple):
         raise InputError(f"covariance: a list of names is expected, but it is {shown(names)}")
     given: Sequence[Any] = names or (None,)
@@ -44,9 +44,9 @@ def named(problem: Problem, names: Sequence[tuple[str, str, str]]) -> list[Name]
 
 
 def value_of(problem: Problem, name: Name, values: Values):
-    """The unknown of this name; of an exterior orientation X0, Y0, Z0, ω, φ, κ (radians).
-
-    **Raises:** `KeyError` for a name that is not there."""
+    """The unknown with this name; exterior orientation as X0, Y0, Z0, ω, φ, κ (radians).
+    
+    **Raises:** `KeyError` for an unknown name."""
     network = problem.network
     if name.kind == "camera":
         c = place_of(name.id, [camera.id for camera in network.cameras], "camera")
@@ -60,20 +60,20 @@ def value_of(problem: Problem, name: Name, values: Values):
     if name.kind == "point":
         p = place_of(name.id, network.points.id, "point")
         return values.point[p, place_of(name.parameter, ("X", "Y", "Z"), "coordinate")]
-    raise KeyError(f"an unknown is of a camera, an image or a point, not of a {name.kind!r}")
+    raise KeyError(f"an unknown belongs to a camera, an image or a point, not a {name.kind!r}")
 
 
 def angles_near(rotation, d_theta, given):
-    """ω, φ, κ after a small rotation, on the turn and branch of the given ones."""
+    """ω, φ, κ after a small rotation, on the same turn and branch as the given ones."""
     return omega_phi_kappa_near(
         matrix_from_quaternion(retract_quaternion(rotation, d_theta)), given
     )
 
 
 def place_of(name: str, names: Sequence[str], thing: str) -> int:
-    """The place of a name among others.
-
-    **Raises:** `KeyError` where it is not there, with the nearest one that is."""
+    """The index of a name.
+    
+    **Raises:** `KeyError` if it is missing, with the closest existing name."""
     if name not in names:
         known = did_you_mean(name, names, listing=len(names) <= 20)
         raise KeyError(f"there is no {thing} {name!r}{known}")

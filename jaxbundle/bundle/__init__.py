@@ -1,1 +1,1 @@
-"""Bundle adjustment: a network in, start values, rounds of the engine, an `Adjustment` out."""
+"""Bundle adjustment: start values, rounds of the engine, and the `Adjustment`."""

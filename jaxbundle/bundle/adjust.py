@@ -1,4 +1,4 @@
-"""`adjust`: a network in, an `Adjustment` out."""
+"""`adjust`: from a network to an `Adjustment`."""
 
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -45,11 +45,11 @@ from jaxbundle.statistics.misfit import doubt_of_robust
 from jaxbundle.types import present
 
 MISFIT = 5.0
-"""A σ0 above this asks for its cause."""
+"""For a larger σ0, likely causes are searched for."""
 Begun = tuple[Problem, Minimum, tuple]
 """A problem, where its iterations ended, check points and their image points."""
 UNNAMED = ("a combination of unknowns that spreads over many of them",)
-"""What is not determined, where none stands out."""
+"""Name of the undetermined if no single unknown dominates."""
 
 
 def adjust(
@@ -68,40 +68,39 @@ def adjust(
     estimate_components: bool = False,
     progress: Callable | None = None,
 ) -> Adjustment:
-    """Adjust a network by least squares, with self-calibration of whatever is free.
+    """Adjust a network by least squares, with self-calibration of all free parameters.
 
     **Arguments:**
 
-    - `network`: see `jaxbundle.make_network`, `jaxbundle.read_network`, `jaxbundle.simulate`. Start
-      values it lacks are found first (`jaxbundle.orient`).
-    - `also`: observations of further kinds (`jaxbundle.leastsquares.Kind`), and tables of the
-      unknowns they bring. They touch the network's tables "image", "camera" and "point" by id, see
-      object coordinates as they are, and have a σ0 group, redundancy numbers and residuals of their
-      own (docs/engine.md).
+    - `network`: see `jaxbundle.make_network`, `jaxbundle.read_network`, `jaxbundle.simulate`.
+      Missing start values are computed first (`jaxbundle.orient`).
+    - `also`: observations of further kinds (`jaxbundle.leastsquares.Kind`), and tables of their
+      unknowns. They touch the network's tables "image", "camera" and "point" by id, receive object
+      coordinates unchanged, and have their own variance group, redundancy numbers and residuals
+      (docs/engine.md).
     - `method`: `"levenberg-marquardt"` or `"gauss-newton"`.
-    - `reduction`: how the reduced system of images and cameras is solved: `"dense"`, `"banded"` or
-      `"iterative"`; chosen by its size and fill if not given.
-    - `robust`: `"huber"`, `"cauchy"` or `"tukey"`: image points that fit badly count less, by the
-      a posteriori scale of their residuals (`jaxbundle.statistics.robust_scale`, a MAD). Their last
-      weights are those of the result, its σ by some per cent too small.
-    - `snooping`: `"pope"` or `"baarda"`: remove blunders at the level `significance`: with
-      `"pope"` the probability to lose anything of a network without blunders, with `"baarda"`
-      that of a single observation; also the probability that `robust` suspects anything. Where
-      blunders leave no solution to begin with, image points that contradict the start values
-      altogether are left out first (also of `robust`).
-    - `doubtful`: (image, point) by id of image points that data snooping begins without; those that
-      pass its test come back.
+    - `reduction`: solver of the reduced system of images and cameras: `"dense"`, `"banded"` or
+      `"iterative"`; by default chosen by size and fill.
+    - `robust`: `"huber"`, `"cauchy"` or `"tukey"`: image points that fit badly are downweighted by
+      the a posteriori scale of the residuals (`jaxbundle.statistics.robust_scale`, a MAD). The
+      result uses the last weights; its σ are a few per cent too small.
+    - `snooping`: `"pope"` or `"baarda"`: remove blunders at the level `significance`: for `"pope"`
+      the probability of removing anything from a network without blunders, for `"baarda"` that of
+      removing a single observation; also the probability that `robust` suspects anything. If
+      blunders prevent an initial solution, image points that grossly contradict the start values
+      are removed first (also with `robust`).
+    - `doubtful`: (image, point) by id of image points initially removed from data snooping; those
+      that pass its test are restored.
     - `eliminate`: fix additional parameters with t < `critical_t` at 0, the least significant
       first, adjusting again each time.
-    - `estimate_components`: scale the σ of each group of observations until its variance
-      component is 1; `Adjustment.sigma_factors` says by how much.
+    - `estimate_components`: scale the σ of each group of observations until its variance component
+      is 1; the factors are `Adjustment.sigma_factors`.
     - `progress(step, cost, λ)`: called after every evaluation.
 
-    **Returns:** an `Adjustment`; look at `converged` before anything else.
+    **Returns:** an `Adjustment`; check `converged` first.
 
-    **Raises:** `InputError` where the network cannot be adjusted as it stands; `NotSolvedError`
-    where it, or what data snooping, elimination or variance components leave of it, determines no
-    answer.
+    **Raises:** `InputError` if the network cannot be adjusted; `NotSolvedError` if it is not
+    determined, initially or after data snooping, elimination or variance components.
     """
     check_options(
         method=method, reduction=reduction, max_iterations=max_iterations, robust=robust,
@@ -129,7 +128,7 @@ def adjust(
 
 @dataclasses.dataclass(frozen=True)
 class _First:
-    """How the first minimum is found; `finding`: what is said of start values that were found."""
+    """How the first minimum is found; `finding`: the message about computed start values."""
 
     reduction: str | None
     also: Sequence[Table | Observations]
@@ -137,10 +136,11 @@ class _First:
     options: Mapping[str, Any]
 
     def find(self, given: Network, network: Network, outliers: bool) -> Begun:
-        """From start values of `network`, a part of `given`, in which there may be `outliers`."""
+        """Adjust from the start values of `network`, a part of `given` that may contain
+        `outliers`."""
         found = self._minimise(network)
         while len(network.observations) < len(given.observations) and misjudged(*found[:2]):
-            # What the principal distance given made impossible may agree with the one found.
+            # Observations excluded by a wrong principal distance may agree with the adjusted one.
             cameras, fewer = adjusted_cameras(found[0], found[1].values), network
             network = orient_again(given, fewer, cameras)
             if network is fewer:
@@ -159,7 +159,7 @@ class _First:
         make = partial(make_problem, network, self.reduction, self.also)
         try:
             problem = make()
-        except InputError as error:  # The datum, for want of the control points left out.
+        except InputError as error:  # The datum, if control points were excluded.
             raise InputError(f"{error} {self.finding}".strip()) from None
         start = start_with(problem, cameras)
         return *minimise_at_any_distance(problem, start, make, **self.options), tuple(check)
@@ -167,7 +167,7 @@ class _First:
 
 @dataclasses.dataclass
 class _Found:
-    """What an adjustment has found so far; each step changes it."""
+    """State of an adjustment; each step changes it."""
 
     network: Network
     problem: Problem
@@ -180,7 +180,7 @@ class _Found:
 
     @property
     def inspection(self) -> Inspection | None:
-        """The solution, if it is one; looked at once until a step changes it."""
+        """The solution, if there is one; evaluated once until a step changes it."""
         seen = self.inspected
         if seen is None or seen[0] is not self.problem or seen[1] is not self.minimum:
             seen = self.problem, self.minimum, solved(self.problem, self.minimum)
@@ -212,7 +212,7 @@ class _Found:
         self.said["eliminated"] = tuple(names)
 
     def adjustment(self, check) -> Adjustment:
-        """The result, and where there is none why."""
+        """The result, or the reason why there is none."""
         problem, minimum, inspection = self.problem, self.minimum, self.inspection
         names = () if inspection else names_of_defects(problem, minimum)
         if not inspection and converged(int(minimum.termination)):
@@ -245,7 +245,7 @@ def check_options(
     estimate_components=False,
     progress=None,
 ) -> None:
-    """Refuse options of `adjust` that cannot be.
+    """Refuse invalid options of `adjust`.
 
     **Raises:** `InputError`, naming the option and what is expected."""
     one_of("method", method, METHODS)
@@ -265,7 +265,7 @@ def check_options(
 def _likely_causes(
     problem: Problem, minimum: Minimum, inspection: Inspection | None
 ) -> tuple[str, ...]:
-    """Why there is no solution, or one that fits badly, in words."""
+    """Likely causes of a missing solution or a bad fit, in words."""
     network = problem.network
     tried = int(minimum.iterations)
     accepted = np.asarray(minimum.history.accepted)[:tried]
@@ -282,7 +282,7 @@ def _likely_causes(
 
 
 def _with_start_values(network: Network) -> tuple[Network, str]:
-    """The network with start values, found where it lacks them, and what is said of it then."""
+    """The network with missing start values computed, and the message about them."""
     if not lacks_start_values(network):
         return network, ""
     found = orient(network)
@@ -290,7 +290,7 @@ def _with_start_values(network: Network) -> tuple[Network, str]:
 
 
 def _placed(found: Oriented) -> Network:
-    """The network with start values; refused where it is half a network or less.
+    """The network with start values; refused if half or more is excluded.
 
     **Raises:** `NotSolvedError`."""
     network = found.network
@@ -301,8 +301,8 @@ def _placed(found: Oriented) -> Network:
             said = some((f"{thing} {id} ({why})" for id, why in reasons.items()), 5, str)
             cause = name_pixels(network)
             raise NotSolvedError(
-                f"not solved: no start values were found for {len(reasons)} of "
-                f"{count(len(reasons) + left, thing)}: {said}; jaxbundle orient lists all of them"
+                f"not solved: no start values for {len(reasons)} of "
+                f"{count(len(reasons) + left, thing)}: {said}; jaxbundle orient lists them all"
                 + (f"; {cause}" if cause else ""),
                 [f"{thing} {id}" for id in reasons],
             )

@@ -1,9 +1,9 @@
-"""Points of which nearly parallel rays tell the direction, but hardly the distance.
+"""Points with nearly parallel rays, which determine the direction but hardly the distance.
 
-Their distances drift for ever, or leave the normal equations singular. So points with parallel
-rays, and where an adjustment does not end all narrow ones, are adjusted as points at any distance
-(`leastsquares.any_distance`). One that its rays pull beyond infinity is held there, as a direction;
-it is let go again where they pull it back (an active set).
+Their distances drift without end, or make the normal equations singular. So points with parallel
+rays, and if an adjustment does not converge all narrow ones, are adjusted as points at any distance
+(`leastsquares.any_distance`). A point pulled beyond infinity by its rays is held there as a
+direction, and released when they pull it back (an active set).
 """
 
 import dataclasses
@@ -26,25 +26,25 @@ from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.types import present
 
 NARROW, PARALLEL = 0.03, 1e-3
-"""Radians between the rays of a point that may be at any distance; and of one that is from the
-beginning, unless half of the tie points are: then the images stand at one place, or nearly."""
+"""Largest angle between the rays, in radians, of a point that may be at any distance; and of one
+that is so from the start, unless half of the tie points are: then all images have nearly the same
+projection centre."""
 PATIENCE = 30
-"""Evaluations of a network with narrow points before they are at any distance; twice as many where
-half of the tie points are narrow."""
+"""Evaluations before narrow points are put at any distance; twice as many if half of the tie points
+are narrow."""
 ROUND = 4
-"""Evaluations until it is looked who is pulled beyond infinity, or back; twice as many each time
-that nobody was."""
+"""Evaluations between checks of points pulled beyond infinity, or back; doubled whenever no point
+changed."""
 RELEASES = 10
-"""A point that was let go so often stays at infinity."""
+"""A point released this often stays at infinity."""
 
 
 def minimise_at_any_distance(
     problem: Problem, start: Values, make: Callable, *, max_steps: int, **options
 ) -> tuple[Problem, Minimum]:
-    """Iterate from `start`, points with parallel rays at any distance; where that does not end, all
-    narrow ones. What is returned is that problem if it was solved, else the one given.
-
-    `make(lengths)`: the problem anew (see `make_problem`)."""
+    """Iterate from `start` with points with parallel rays at any distance; without convergence,
+    with all narrow ones. Returns that problem if it was solved, else the given one.
+    `make(lengths)`: makes the problem (see `make_problem`)."""
     angle = angle_of_rays(problem, start)
     if not (angle < NARROW).any():
         return problem, minimise(problem, start, max_steps=max_steps, **options)
@@ -72,8 +72,8 @@ def minimise_at_any_distance(
 def minimise_with_infinity(
     problem: Problem, start: Values, *, max_steps: int, **options
 ) -> tuple[Problem, Minimum]:
-    """Iterate from `start`; of points at any distance those stay at infinity that are pulled beyond
-    it. The problem that is returned holds them there."""
+    """Iterate from `start`; points at any distance that are pulled beyond infinity are held there,
+    also in the returned problem."""
     if problem.layout.lengths is None:
         return problem, minimise(problem, start, max_steps=max_steps, **options)
     held = _held(problem)
@@ -98,8 +98,8 @@ def minimise_with_infinity(
 
 
 def angle_of_rays(problem: Problem, values: Values) -> Float[np.ndarray, " points"]:
-    """About the largest angle between two rays of every tie point, radians; 180° of what is none,
-    or has no two rays."""
+    """Approximately the largest angle between two rays of every tie point, radians; 180° for other
+    points and points with fewer than two rays."""
     rays = (np.asarray(problem.data.image_weight) > 0).any(1)
     point, image = problem.point[rays], problem.image[rays]
     ray = _unit_vectors(np.asarray(values.point)[point] - np.asarray(values.position)[image])
@@ -114,8 +114,8 @@ def angle_of_rays(problem: Problem, values: Values) -> Float[np.ndarray, " point
 
 
 def _with_far_points(problem: Problem, values: Values, chosen, make: Callable):
-    """The problem with these points at any distance, and the values as its own; without those whose
-    coordinates other observations touch; None where none is left, or too few others for the datum.
+    """The problem and its values with these points at any distance, except those whose coordinates
+    other observations touch; None if none is left, or too few others for the datum.
     """
     lengths = np.where(chosen & ~problem.system.kept_rows, _unit(problem), 0.0)
     if not lengths.any():
@@ -124,7 +124,7 @@ def _with_far_points(problem: Problem, values: Values, chosen, make: Callable):
         far = make(lengths)
     except InputError:
         return None
-    if values.other:  # Frames and more that would have to move with the origin.
+    if values.other:  # Frames and other tables would have to move with the origin.
         return far, far.data.start
     shift = problem.origin - far.origin
     point = np.asarray(values.point) + shift
@@ -133,8 +133,7 @@ def _with_far_points(problem: Problem, values: Values, chosen, make: Callable):
 
 
 def _in_front(problem: Problem, values: Values) -> Float[np.ndarray, "points 3"]:
-    """The points; of those at any distance the ones that have drifted through infinity, or lie
-    beyond it, are at infinity."""
+    """The points, with those at any distance that drifted to or beyond infinity put at infinity."""
     network, X = problem.network, np.asarray(values.point)
     seen = sights(network.replace(cameras=tuple(adjusted_cameras(problem, values).values())))
     in_camera = np.column_stack([seen.xy, -np.ones(len(seen.xy))])
@@ -150,7 +149,7 @@ def _in_front(problem: Problem, values: Values) -> Float[np.ndarray, "points 3"]
 
 
 def at_infinity(problem: Problem, values: Values) -> Bool[np.ndarray, " points"]:
-    """Which points are there."""
+    """Which points are at infinity."""
     if problem.layout.lengths is None:
         return problem.at_any_distance
     return is_at_infinity(np.asarray(values.point), problem.layout.lengths)
@@ -174,7 +173,7 @@ def _hold_at_infinity(problem: Problem, held, values: Values) -> Problem:
 
 
 def _pulled_outward(problem: Problem, values: Values) -> Bool[np.ndarray, " points"]:
-    """Whether vᵀPv falls with the distance of a point."""
+    """Whether vᵀPv decreases with the distance of a point."""
     free = _hold_at_infinity(problem, np.zeros(len(values.point), bool), values)
     solution, slope = Inspection(free, values).solution, np.zeros(len(values.point))
     for o, s in enumerate(problem.layout.sets):
@@ -186,14 +185,14 @@ def _pulled_outward(problem: Problem, values: Values) -> Bool[np.ndarray, " poin
 
 
 def _unit(problem: Problem) -> float:
-    """The distance of projection centres from their middle, root of the mean square."""
+    """RMS distance of the projection centres from their centroid."""
     centres = problem.network.images.position
     return float(np.sqrt(((centres - np.round(centres.mean(0))) ** 2).sum(1).mean()))
 
 
 def _joined(legs: Sequence[Minimum]) -> Minimum:
-    """One minimum of several that were found one after the other; each but the first evaluates
-    first where the one before it ended."""
+    """Several successive minimisations combined into one; each but the first re-evaluates the end
+    point of the previous one."""
     if len(legs) == 1:
         return legs[0]
     rows = [slice(k > 0, int(leg.iterations)) for k, leg in enumerate(legs)]

@@ -23,16 +23,16 @@ from jaxbundle.report.layout import significant, table
 from jaxbundle.statistics.results import CAMERAS, Asked, ask
 
 MOST_ROWS = 20
-"""Measurements that are printed, of every result."""
+"""Number of printed measurements per result."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Influence:
-    """How results follow the measurements.
+    """The influence of measurements on results.
 
-    **Fields:** `results`, with their names and words; `sigma` of them (a posteriori; of a design a
+    **Fields:** `results`, with names and descriptions; their `sigma` (a posteriori; for a design a
     priori; angles in radians); `columns`: kind, image, point, axis of every measurement, as in the
-    table of residuals; `effects`: of one σ of every measurement, in the σ of each result;
+    residual table; `effects`: of one σ of every measurement, in units of the σ of each result;
     `derivatives`: ∂(result)/∂(measurement).
     """
 
@@ -43,10 +43,10 @@ class Influence:
     derivatives: Float[np.ndarray, "measurements results"]
 
     def table(self, result: str | None = None) -> dict[str, np.ndarray]:
-        """The measurements with their influence on one result, the first if none is named, the
-        largest first: kind, image, point, axis, effect, derivative.
-
-        **Raises:** `KeyError` for a result that was not asked for."""
+        """The measurements with their influence on one result (default: the first), largest first:
+        kind, image, point, axis, effect, derivative.
+        
+        **Raises:** `KeyError` for a result that was not requested."""
         names = [one.name for one in self.results]
         if result is not None and result not in names:
             raise KeyError(f"there is no result {result!r}; known: {', '.join(names)}")
@@ -76,13 +76,13 @@ def influence(given: Adjustment | Problem, of: Any = CAMERAS) -> Influence:
     **Arguments:**
 
     - `given`: an `Adjustment`; or a `Problem`, a design.
-    - `of`: results by name, as of `jaxbundle.sensitivity`, `"cameras"`, or a function of `Values`.
-      One solution each: thousands of measurements cost no more than one.
+    - `of`: results by name as in `jaxbundle.sensitivity`, `"cameras"`, or a function of `Values`.
+      The cost is one solution per result, regardless of the number of measurements.
 
     **Returns:** an `Influence`.
 
-    **Raises:** `InputError` for a name that is not there, and for results that are a mean over
-    images or points; `NotSolvedError` without a solution.
+    **Raises:** `InputError` for an unknown name, and for results that are means over images or
+    points; `NotSolvedError` without a solution.
     """
     inspection, sigma0, _ = looked_at(given)
     results = ask(inspection, of)

@@ -1,4 +1,4 @@
-"""One minimum: iterate to it, and see whether it is a solution."""
+"""Iterate to a minimum and check whether it is a solution."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -21,25 +21,25 @@ from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.statistics.weakness import Weakness, weakness_of_unsolved
 
 MISJUDGED = 1.03
-"""A principal distance that changed by more than this factor was too wrong for start values."""
+"""If a principal distance changed by more than this factor, start values are computed again."""
 
 EIGENVECTORS = 3000
 """Reduced systems with more unknowns are not searched for null vectors: that takes minutes."""
 
 RUNAWAY = 20.0
-"""A principal distance that changed by more than this factor belongs to no camera."""
+"""A principal distance that changed by more than this factor is implausible."""
 
 
 def minimise(problem: Problem, start: Values, **options) -> Minimum[Values]:
-    """Iterate from `start`; the datum and what is held stay those of the problem's own start."""
+    """Iterate from `start`; the datum and held values remain those of the problem's start."""
     found = find_minimum(problem.system, problem.layout.tables(start), **options)
     values = problem.layout.values(found.values)
     return Minimum(values, found.termination, found.iterations, found.history)
 
 
 def solved(problem: Problem, minimum: Minimum[Values]) -> Inspection | None:
-    """The solution, to be looked at: converged, no camera collapsed, all unknowns determined;
-    else None."""
+    """The solution if it converged, no camera collapsed and all unknowns are determined; else
+    None."""
     if not bool(converged(int(minimum.termination))) or _collapsed(problem, minimum.values):
         return None
     inspection = Inspection(problem, minimum.values)
@@ -47,8 +47,8 @@ def solved(problem: Problem, minimum: Minimum[Values]) -> Inspection | None:
 
 
 def names_of_defects(problem: Problem, minimum: Minimum[Values]) -> list[str]:
-    """What nothing determines where the iterations ended; of a large network, whose eigenvectors
-    nobody can wait for, what is weak where it is singular."""
+    """The undetermined unknowns where the iterations ended; for a large network, where eigenvectors
+    take too long, the weak ones if it is singular."""
     values = minimum.values
     if bool(converged(int(minimum.termination))) and _collapsed(problem, values):
         return _collapsed(problem, values)
@@ -60,19 +60,19 @@ def names_of_defects(problem: Problem, minimum: Minimum[Values]) -> list[str]:
 
 
 def weakness_without_solution(problem: Problem, minimum: Minimum[Values]) -> Weakness:
-    """What is poorly determined where the iterations ended."""
+    """The poorly determined unknowns where the iterations ended."""
     return weakness_of_unsolved(problem, _last(problem, minimum))
 
 
 def _last(problem: Problem, minimum: Minimum[Values]) -> Values:
-    """Where the iterations ended; the start where that is nowhere."""
+    """The values at the end of the iterations, or the start values if those are not finite."""
     values = minimum.values
     finite = all(np.isfinite(np.asarray(x)).all() for x in (values.camera, values.position))
     return values if finite else problem.data.start
 
 
 def require_solved(problem: Problem, minimum: Minimum[Values], when: str) -> Inspection:
-    """The solution of an adjustment repeated; one that was not solved is refused.
+    """The solution of a repeated adjustment; refused if it was not solved.
 
     **Raises:** `NotSolvedError`."""
     found = solved(problem, minimum)
@@ -87,26 +87,26 @@ def require_solved(problem: Problem, minimum: Minimum[Values], when: str) -> Ins
 
 
 def _collapsed(problem: Problem, values: Values) -> list[str]:
-    """Principal distances that ran away from their start values by a factor of `RUNAWAY`.
-
-    Where c and a scale of the image are free together, c = 0 makes all corrected residuals zero.
+    """Principal distances that diverged from their start values by a factor of `RUNAWAY`.
+    
+    If c and an image scale are both free, c = 0 makes all corrected residuals zero.
     """
     return [
-        f"{parameter} of camera {camera.id} (it ran away from its start)"
+        f"{parameter} of camera {camera.id} (it diverged from its start value)"
         for camera, parameter, ratio in _principal_distances(problem, values)
         if not 1 / RUNAWAY < ratio < RUNAWAY
     ]
 
 
 def misjudged(problem: Problem, minimum: Minimum[Values]) -> bool:
-    """Whether a principal distance came out otherwise than it was given, though not absurdly."""
+    """Whether an adjusted principal distance differs from the given one, but plausibly."""
     ratios = [ratio for *_, ratio in _principal_distances(problem, minimum.values)]
     sane = all(1 / RUNAWAY < ratio < RUNAWAY for ratio in ratios)
     return sane and any(not 1 / MISJUDGED < ratio < MISJUDGED for ratio in ratios)
 
 
 def adjusted_cameras(problem: Problem, values: Values) -> dict[str, Camera]:
-    """The cameras of the network by their ids, with the parameters of a solution."""
+    """The cameras of the network by id, with the parameters of a solution."""
     return {
         camera.id: dataclasses.replace(
             camera, parameters=dict(zip(get_model(camera.model).parameters, row))
@@ -116,7 +116,7 @@ def adjusted_cameras(problem: Problem, values: Values) -> dict[str, Camera]:
 
 
 def start_with(problem: Problem, cameras: Mapping[str, Camera]) -> Values:
-    """The start values of a problem, the parameters of these cameras replaced by theirs."""
+    """The start values of a problem with the parameters of these cameras."""
     start = problem.data.start
     rows = np.array(start.camera)
     for row, camera in zip(rows, problem.network.cameras):
@@ -127,7 +127,7 @@ def start_with(problem: Problem, cameras: Mapping[str, Camera]) -> Values:
 
 
 def _principal_distances(problem: Problem, values: Values):
-    """Camera, name and the factor by which it changed, of all principal distances."""
+    """Camera, name and change factor of all principal distances."""
     now, before = np.asarray(values.camera), np.asarray(problem.data.start.camera)
     for c, camera in enumerate(problem.network.cameras):
         model = get_model(camera.model)

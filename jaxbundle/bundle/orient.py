@@ -1,4 +1,5 @@
-"""`orient`: start values, with adjustments on the way; `screen`: what contradicts them."""
+"""`orient`: start values with intermediate adjustments; `screen`: observations that contradict
+them."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -18,31 +19,31 @@ from jaxbundle.orientation.network import Oriented, find_start_values
 from jaxbundle.orientation.sights import TOLERANCE, Sights
 
 STEPS = 12
-"""Iterations of an adjustment on the way: drift is what it takes away, and that goes first."""
+"""Iterations of an intermediate adjustment: it only has to remove drift, which vanishes first."""
 
 
 def orient(network: Network, tolerance: float = TOLERANCE) -> Oriented:
-    """Find the start values a network lacks; those it has stay.
+    """Compute missing start values of a network; given ones are kept.
 
-    The principal distance of a camera should be right to some per cent; its distortion may be
-    unknown, and some measurements wrong. Large networks are adjusted on the way, whenever they have
-    become two and a half times as large.
+    The principal distance of a camera should be correct to a few per cent; its distortion may be
+    unknown, and some measurements wrong. Large networks are adjusted whenever they have grown by a
+    factor of two and a half.
 
-    **Arguments:** `tolerance`: how far image points may miss, in parts of the extent of a picture;
-    as far as the distortion of a lens goes that is not known at all, if it is not given.
+    **Arguments:** `tolerance`: largest residual of image points, relative to the image extent; the
+    default allows for a completely unknown distortion.
 
-    **Returns:** the network with start values; images and points that could not be placed, and
-    image points that contradict everything else, are left out of it and named with the reason.
-
-    **Raises:** `InputError` for bad tables; `NotSolvedError` where no image could be placed.
+    **Returns:** the network with start values. Images and points that could not be oriented, and
+    image points that contradict all others, are excluded and listed with the reason.
+    
+    **Raises:** `InputError` for bad tables; `NotSolvedError` if no image could be oriented.
     """
     require_x64()
     return find_start_values(network, _adjusted, tolerance)
 
 
 def orient_again(given: Network, placed: Network, better: Mapping[str, Camera]) -> Network:
-    """The given network with start values found with better cameras, if that places more of its
-    image points than are in `placed`; its cameras stay the given ones."""
+    """The given network with start values computed with better cameras, if this uses more image
+    points than `placed`; the cameras of the network are kept."""
     try:
         cameras = tuple(better.get(camera.id, camera) for camera in given.cameras)
         found = orient(given.replace(cameras=cameras)).network
@@ -53,8 +54,8 @@ def orient_again(given: Network, placed: Network, better: Mapping[str, Camera]) 
 
 
 def screen(network: Network) -> Network:
-    """The network without the image points that contradict its start values altogether, and with
-    tie points intersected anew; it warns of what it left out."""
+    """The network without image points that grossly contradict its start values, and with tie
+    points intersected again; it warns of what it removed."""
     tie = network.points.has_role("tie")[:, None]
     position = np.where(tie, np.nan, network.points.position)
     points = dataclasses.replace(network.points, position=position)
@@ -62,7 +63,7 @@ def screen(network: Network) -> Network:
 
 
 def _adjusted(network: Network, sights: Sights, model: Model) -> None:
-    """A model adjusted in place with the interior orientation held, by the rays that agree."""
+    """Adjust a model in place with held interior orientation, using the rays that agree."""
     agree = misclosures(sights, model) < sights.tolerance[sights.image]
     rays = np.bincount(sights.point[agree], minlength=sights.points)
     use = model.known & (rays >= 2)
@@ -84,7 +85,7 @@ def _adjusted(network: Network, sights: Sights, model: Model) -> None:
 
 
 def _part(network: Network, model: Model, use, rows) -> Network:
-    """The placed images and the points in `use`, without priors, control held."""
+    """The oriented images and the points in `use`, without priors, with control held."""
     images, points = network.images, network.points
     angles = np.full((len(images), 3), np.nan)
     angles[model.placed] = many.angles(model.M[model.placed])

@@ -7,12 +7,12 @@ from jaxbundle.io.networks.orientation_covariance import OrientationCovariance, 
 from jaxbundle.network.tables import EXTERIOR
 
 LARGEST = 20_000_000
-"""Orientations times coordinates of points up to which it is computed."""
+"""Largest product of orientation unknowns and point coordinates for which it is computed."""
 
 
 def orientation_covariance(result: Adjustment) -> OrientationCovariance | None:
-    """Of X0 … kappa (radians) of all images, and of the parameters of cameras that were free, tied
-    ones included; None where nothing was free, or where it is too large to be computed."""
+    """Joint covariance of X0 … kappa (radians) of all images and the free camera parameters,
+    including tied ones; None if nothing was free, or if it is too large."""
     problem, network = result.problem, result.network
     free = np.asarray(problem.system.table("image").free, bool)
     unknowns: list[Unknown] = [("image", id, n) for id in network.images.id for n in EXTERIOR]
@@ -36,7 +36,7 @@ def orientation_covariance(result: Adjustment) -> OrientationCovariance | None:
         rows[name][n, row, column] = 1.0
     C = result.sigma0**2 * result.cofactors.solution.propagate_rows(rows)
     used = np.concatenate([free.ravel(), np.ones(len(places) - free.size)])
-    from scipy.linalg import block_diag  # not at the top: it takes a while, and few ask for it
+    from scipy.linalg import block_diag  # imported here: slow, and rarely needed
 
     turns = (block_diag(np.eye(3), A) for A in result.angle_jacobian)
     A = block_diag(*turns, np.eye(len(places) - free.size)) * used

@@ -1,4 +1,4 @@
-"""Adjustments repeated: robust estimation, data snooping, variance components, elimination."""
+"""Repeated adjustments: robust estimation, data snooping, variance components, elimination."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -27,10 +27,10 @@ from jaxbundle.statistics.misfit import contradicts, doubt_of_baarda
 def snooped(
     found: Inspection, minimum, again, test: str, significance: float, doubtful: Iterable = ()
 ):
-    """The problem and its minimum without blunders, what was removed, and what is to be said of σ
-    that the test trusts though the data contradict them.
-
-    `doubtful`: image and point, by id, of image points to begin without."""
+    """The problem and its minimum without blunders, the removed observations, and warnings about a
+    priori σ that the test relies on although the data contradict them.
+    
+    `doubtful`: image and point, by id, of initially removed image points."""
     problem, whole, doubt = found.problem, found.solution, None
     repeat = _Repeat(problem, again, "after data snooping", minimum)
     solution, removed = snoop(
@@ -51,9 +51,9 @@ def snooped(
 def _scale_of_good(found: Solution, repeat: "_Repeat") -> float:
     """The robust scale of the image points, whatever the a priori σ.
 
-    What Baarda's test leaves fits too well, for it is what fitted; and blunders spread over the
-    residuals of good points. So where the scale of all points is large, it is that of those which
-    Tukey's estimator does not suspect, whose own scale is a posteriori.
+    The observations left by Baarda's test fit too well, because they were selected for it; and
+    blunders spread over the residuals of good points. So if the scale of all points is large, the
+    scale of those that Tukey's estimator (with a posteriori scale) does not suspect is used.
     """
     problem = found.problem
     scale = robust_scale(problem, residual_lengths(found))
@@ -72,20 +72,20 @@ def _scale_of_good(found: Solution, repeat: "_Repeat") -> float:
 
 def robustly(problem: Problem, minimum, again, estimator: str):
     """The solution with the weights of a robust estimator, and its minimum. The first weights come
-    from the minimum, or from the start values if it is no solution."""
+    from the minimum, or from the start values without a solution."""
     repeat = _Repeat(problem, again, "by robust estimation", minimum)
     first = minimum.values if solved(problem, minimum) else problem.data.start
     reweighted = reweight(problem.system, problem.layout.tables(first), repeat, estimator)
     if not reweighted.rests:
         raise NotSolvedError(
-            f"not solved by robust estimation: the weights of {estimator} do not come to rest; use "
+            f"not solved by robust estimation: the weights of {estimator} do not converge; use "
             f"{'' if estimator == 'huber' else 'huber, or '}data snooping"
         )
     return reweighted, repeat.minimum
 
 
 class _Repeat:
-    """Adjusts a changed system of a problem, and keeps the minimum."""
+    """Adjusts a changed system of a problem and keeps the minimum."""
 
     def __init__(self, problem: Problem, again, when: str, minimum):
         self.problem, self.again, self.when, self.minimum = problem, again, when, minimum
@@ -97,8 +97,7 @@ class _Repeat:
 
 
 def with_components(problem: Problem, minimum, again):
-    """The problem with the σ of every group estimated, its minimum, and by group what the σ have
-    been multiplied by."""
+    """The problem with estimated σ of every group, its minimum, and the factors of σ by group."""
     repeat = _Repeat(problem, again, "with the estimated variance components", minimum)
     whole, of = Inspection(problem, minimum.values).solution, groups(problem)
     found, factors, unsettled = estimate(whole, of, repeat)
@@ -109,20 +108,20 @@ def with_components(problem: Problem, minimum, again):
 
 
 def _doubts(components: dict[str, Component], unsettled: list[str]):
-    """What is to be said of an estimate of variance components."""
+    """Warnings about an estimate of variance components."""
     if unsettled:
         yield (
-            f"the variance components did not settle in {ROUNDS} rounds ({', '.join(unsettled)}): "
-            "their σ are not final"
+            f"the variance components did not converge in {ROUNDS} rounds "
+            f"({', '.join(unsettled)}): their σ are not final"
         )
     for name, component in components.items():
         if not component.usable:
             why = "fit exactly" if component.redundancy >= 1 else "have too little redundancy"
-            yield f"variance components: {name} {why}; their σ are left as they are"
+            yield f"variance components: {name} {why}; their σ are unchanged"
 
 
 def eliminated_parameters(problem, minimum, again, critical_t):
-    """Fix insignificant additional parameters at 0, or their default, the weakest first."""
+    """Fix insignificant additional parameters at their default (mostly 0), the weakest first."""
     names = []
     models = {camera.id: get_model(camera.model) for camera in problem.network.cameras}
     while True:

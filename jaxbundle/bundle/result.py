@@ -1,8 +1,7 @@
 """The result of an adjustment: values with standard deviations, tests, tables, figures.
 
-Every σ here is a posteriori (times σ0) unless it says a priori. What is costly (cofactors,
-redundancy numbers) is computed when first asked for. A network that was not solved has no
-values to ask for: every accessor raises `NotSolvedError` and says why.
+Every σ is a posteriori (times σ0) unless called a priori. Cofactors and redundancy numbers are
+computed on first access. Without a solution every accessor raises `NotSolvedError` with the reason.
 """
 
 import functools
@@ -54,29 +53,28 @@ from jaxbundle.statistics.weakness import Weakness, weakness
 
 
 class Adjustment:
-    """An adjusted network. Print it, or let a notebook show it; `report()` is the whole protocol.
+    """An adjusted network. It prints as a summary; `report()` is the full report.
 
     **Attributes** (object unit, image unit and angle unit are the network's; angles in methods
     that return arrays are radians):
 
     - `converged`, `termination`, `iterations`, `sigma0`, `vtpv`, `redundancy`, `counts`
     - `cameras`, `images`, `points`, `residuals`: tables (dicts of numpy columns)
-    - `method`, `reduction`: of the solution; the latter of the reduced system of images and cameras
+    - `method`, `reduction`: solver, and solver of the reduced system of images and cameras
     - `warnings`, `removed` (data snooping), `eliminated` (insignificant parameters),
-      `undetermined` (names, where the network is singular), `weakness` (what is determined in name
-      only)
+      `undetermined` (names, if the network is singular), `weakness` (poorly determined unknowns)
     - `far_points`: direction and distance of the points at any distance, whose rays are nearly
-      parallel; None where there are none
-    - `sigma_factors`: where variance components were estimated, by group of observations, what its
-      a priori σ have been multiplied by; empty otherwise. Everything called a priori then means
-      the estimated σ, except in `variance_components`.
-    - `findings`: likely causes where there is no solution, or one that fits badly; in words, among
-      the `warnings`.
-    - `robust`, `weights`: the estimator, and the factors of the weights it gave the image points
-      in the order of the observations; None otherwise. A priori σ are then those after weighting.
+      parallel; None if there are none
+    - `sigma_factors`: with estimated variance components, the factor of the a priori σ by group of
+      observations; empty otherwise. A priori then refers to the estimated σ, except in
+      `variance_components`.
+    - `findings`: likely causes of a missing solution or a bad fit; in words, also among the
+      `warnings`.
+    - `robust`, `weights`: the estimator, and its weight factors of the image points in the order
+      of the observations; None otherwise. A priori σ are then those after weighting.
       `robust_scale`: of the residuals, a posteriori (MAD), in a priori σ; `suspects`: image points
-      whose residuals are too long for good ones.
-    - `doubts`: those of the warnings that the a priori σ, σ0 and blunders are about
+      whose residuals exceed the critical value.
+    - `doubts`: the warnings about a priori σ, σ0 and blunders
     """
 
     def __init__(
@@ -123,7 +121,7 @@ class Adjustment:
 
     @property
     def converged(self) -> bool:
-        """Whether a minimum was reached and everything in it is determined."""
+        """Whether a minimum was reached and all unknowns are determined."""
         return bool(reached_minimum(int(self.minimum.termination))) and not self.undetermined
 
     @property
@@ -135,13 +133,13 @@ class Adjustment:
 
     @property
     def iterations(self) -> int:
-        """Steps tried, the rejected ones counted; the evaluation of the start is not one."""
+        """Steps tried, including rejected ones, without the evaluation of the start."""
         return max(int(self.minimum.iterations) - 1, 0)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What was left out or looked strange, in words; also what is poorly determined,
-        distortions that turn back, and a σ0 far from 1."""
+        """Excluded or suspicious data, in words; also poorly determined unknowns, distortions that
+        are not one-to-one, and a σ0 far from 1."""
         found = self.distortion_reach.values() if self.converged else ()
         turns = (reach.message for reach in found if reach.message is not None)
         lines = (
@@ -152,11 +150,11 @@ class Adjustment:
 
     @functools.cached_property
     def weakness(self) -> Weakness:
-        """What is determined in name only: unknowns with a σ above a fiftieth of their extent, or,
-        without a solution, with such a σ a priori where the iterations ended.
-
-        The σ are a posteriori, but neither blunders, which the robust scale leaves out, nor a
-        contradiction that is named make good geometry weak."""
+        """Poorly determined unknowns: σ above a fiftieth of their reference length; without a
+        solution the a priori σ where the iterations ended.
+        
+        The σ are a posteriori with a robust scale, so that neither blunders nor a reported
+        contradiction make good geometry look weak."""
         if self._weakness is not None or not self.converged:
             return self._weakness or Weakness()
         scale = self._scale
@@ -170,8 +168,8 @@ class Adjustment:
 
     @functools.cached_property
     def doubts(self) -> tuple[str, ...]:
-        """The warnings that are about a priori σ, σ0 and blunders, with the remedy; the last one of
-        a global test that is far from passed."""
+        """The warnings about a priori σ, σ0 and blunders, with the remedy; the last one about a
+        global test that clearly fails."""
         if not self.converged:
             return self._doubts
         doubt, downweighted = None, self.robust and self.sigma0 < 1
@@ -182,7 +180,8 @@ class Adjustment:
 
     @functools.cached_property
     def distortion_reach(self) -> dict[str, Reach]:
-        """By camera, how far its distortion was looked at, and whether it turns back there."""
+        """By camera, the radius to which its distortion was checked, and whether it is one-to-one
+        there."""
         return distortion_reach(self.problem, self.values)
 
     @property
@@ -224,13 +223,13 @@ class Adjustment:
         return float(np.sqrt(self.vtpv / r)) if r > 0 else float("nan")
 
     def pope(self, w: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-        """Pope's τ = w/σ0 of Baarda's w; NaN where all observations fit exactly."""
+        """Pope's τ = w/σ0 from Baarda's w; NaN if all observations fit exactly."""
         return w / (self.sigma0 or float("nan"))
 
     def global_test(self, significance: float = 0.05) -> dict:
         """χ² test of vᵀPv against a variance factor of 1 (two-sided).
 
-        `passed` is None where variance components were estimated, which makes σ0 = 1.
+        `passed` is None with estimated variance components, which make σ0 = 1.
         """
         found = chi_squared_test(self.vtpv, self.redundancy, significance)
         return found | {"passed": None} if self.sigma_factors else found
@@ -239,20 +238,20 @@ class Adjustment:
 
     @functools.cached_property
     def inspection(self) -> Inspection:
-        """The solution as statistics look at it."""
+        """The inspection of the solution, for statistics."""
         self._require_solved()
         return self._inspection or Inspection(self.problem, self.values)
 
     @property
     def cofactors(self) -> Inspection:
-        """The inspection, where there is a factor to compute cofactors from.
+        """The inspection, if there is a factor for cofactors.
 
         **Raises:** `NotSolvedError`."""
         if self.problem.reduction not in FACTORS:
             raise NotSolvedError(
                 f"the reduced system of {self.problem.system.reduced_size} unknowns was solved "
-                "by iteration and its factor does not fit into memory: there are coordinates, σ0 "
-                "and covariances of single unknowns (`covariance`), but no others"
+                "by iteration and its factor does not fit into memory: only coordinates, σ0 "
+                            "and covariances of single unknowns (`covariance`) are available"
             )
         return self.inspection
 
@@ -263,13 +262,14 @@ class Adjustment:
 
     @functools.cached_property
     def variance_components(self) -> dict[str, Component]:
-        """For every group of observations σ̂ over the a priori σ it was given, and σ̂ itself."""
+        """For every group of observations the ratio of σ̂ to the given a priori σ, and σ̂
+        itself."""
         found = self.cofactors.solution
         return variance_components(found, groups(self.problem), self.sigma_factors)
 
     @functools.cached_property
     def check_points(self) -> CheckPoints | None:
-        """Check points intersected after the adjustment; None where there are none."""
+        """Check points intersected after the adjustment; None if there are none."""
         self._require_solved()
         return None if self._check is None else self._check(self)
 
@@ -277,15 +277,16 @@ class Adjustment:
 
     @functools.cached_property
     def image_values(self) -> Float[np.ndarray, "images 6"]:
-        """X0, Y0, Z0 (object unit), ω, φ, κ (radians, on the turn and branch of the start)."""
+        """X0, Y0, Z0 (object unit), ω, φ, κ (radians, on the turn and branch of the start
+        values)."""
         values = self.values
         position = np.asarray(values.position) + self.problem.origin
         return np.concatenate([position, np.asarray(self._angles[0])], 1)
 
     @functools.cached_property
     def _angles(self):
-        """ω, φ, κ of all images, next to the angles that were given, and their Jacobians by δθ; by
-        a program that small networks share."""
+        """ω, φ, κ of all images, nearest to the given angles, and their Jacobians by δθ; small
+        networks share the program."""
         given = self.problem.network.images.angles
         rows = max(rounded(len(given)), LEAST_IMAGES)
         wide = (np.resize(x, (rows, x.shape[1])) for x in (self.values.rotation, given))
@@ -326,8 +327,8 @@ class Adjustment:
 
     @functools.cached_property
     def far_points(self) -> FarPoints | None:
-        """The points that are adjusted at any distance, since their rays are nearly parallel; None
-        where there are none."""
+        """The points adjusted at any distance because their rays are nearly parallel; None if there
+        are none."""
         return find_far_points(self.cofactors, self.sigma0)
 
     def camera_parameters(self, camera: str) -> dict[str, float]:
@@ -353,7 +354,7 @@ class Adjustment:
     def insignificant(self, critical: float = 2.0) -> list[tuple[float, Name]]:
         """Free interior parameters with t = |value|/σ below `critical`, the least first.
 
-        **Raises:** `InputError` for a critical value that is negative or no number."""
+        **Raises:** `InputError` for a critical value that is negative or not a number."""
         critical = at_least_zero("critical", critical)
         found = [
             (entry["t"], Name("camera", camera, parameter))
@@ -367,8 +368,8 @@ class Adjustment:
         """Covariance of any unknowns by name, e.g. `("camera", "cam", "c")`,
         `("image", "12", "kappa")` (radians), `("point", "7", "Z")`.
 
-        **Raises:** `InputError` where nothing is named, or a name has other than three parts;
-        `KeyError` for a name that is not there."""
+        **Raises:** `InputError` without names, or for a name that does not have three parts;
+        `KeyError` for an unknown name."""
         wanted = named(self.problem, names)
 
         def pick(values: Values):
@@ -390,7 +391,7 @@ class Adjustment:
 
     @property
     def image_unit(self) -> str:
-        """The unit of image coordinates inside the adjustment: that of the cameras' models."""
+        """The unit of image coordinates in the adjustment: that of the camera models."""
         return units_of(self.problem.network.cameras)
 
     @functools.cached_property
@@ -400,8 +401,8 @@ class Adjustment:
         return result_tables.cameras(self)
 
     def unknowns(self, table: str) -> TableResult:
-        """Values, σ and covariances of a table of unknowns that came with further kinds of
-        observations (`also` of `jaxbundle.adjust`)."""
+        """Values, σ and covariances of a table of unknowns of further kinds of observations (`also`
+        of `jaxbundle.adjust`)."""
         if table not in self.values.other:
             known = ", ".join(self.values.other) or "none"
             raise KeyError(f"there is no further table {table!r}; known: {known}")
@@ -409,8 +410,8 @@ class Adjustment:
 
     @functools.cached_property
     def further_unknowns(self) -> dict[str, dict[str, dict[str, dict[str, float]]]]:
-        """By table, row and name: value and sigma of the unknowns that came with further kinds of
-        observations (angles in the network's unit)."""
+        """By table, row and name: value and sigma of the unknowns of further kinds of observations
+        (angles in the network's unit)."""
         return result_tables.further_unknowns(self)
 
     @functools.cached_property
@@ -426,12 +427,12 @@ class Adjustment:
 
     @functools.cached_property
     def residuals(self) -> dict[str, np.ndarray]:
-        """One row an observation: kind, image, point, axis, v, sigma (a priori), r, w (Baarda),
-        tau (Pope), mdb, external; image observations first, in the order they were given."""
+        """One row per observation: kind, image, point, axis, v, sigma (a priori), r, w (Baarda),
+        tau (Pope), mdb, external; image observations first, in the given order."""
         return result_tables.residuals(self)
 
     def table(self, name: str) -> dict[str, np.ndarray]:
-        """A table by name: images, points, residuals, cameras (one row a parameter), checks or
+        """A table by name: images, points, residuals, cameras (one row per parameter), checks or
         far_points."""
         made = {"cameras": result_tables.parameters, "checks": result_tables.checks,
                 "far_points": result_tables.far_points}  # fmt: skip
@@ -445,7 +446,7 @@ class Adjustment:
     # --- for people -------------------------------------------------------------------------
 
     def report(self, residual_limit: float = 3.0, **options) -> str:
-        """The whole protocol as text (options: see `jaxbundle.report.text`)."""
+        """The full report as text (options: see `jaxbundle.report.text`)."""
         residual_limit = at_least_zero("residual_limit", residual_limit)
         return report.text(self, residual_limit, **options)
 
@@ -459,7 +460,7 @@ class Adjustment:
         return report.html(self)
 
     def plot_plan(self, ax=None):
-        """The network seen from above, with error ellipses; matplotlib axes."""
+        """The network in plan view, with error ellipses; matplotlib axes."""
         return plotting.network_plan(self, ax)
 
     def plot_perspective(self, ax=None):
@@ -479,7 +480,7 @@ class Adjustment:
         return plotting.correlation_matrix(self, camera, ax)
 
     def plot_histogram(self, ax=None):
-        """The normalised residuals beside the normal distribution; matplotlib axes."""
+        """The normalised residuals compared with the normal distribution; matplotlib axes."""
         return plotting.residual_histogram(self, ax)
 
     def to_pandas(self, name: str):
@@ -490,7 +491,7 @@ class Adjustment:
 @jax.jit
 @jax.vmap
 def _all_angles(rotation, given):
-    """ω, φ, κ of all images near the given ones, and their Jacobians by δθ."""
+    """ω, φ, κ of all images nearest to the given ones, and their Jacobians by δθ."""
 
     def angles(d_theta):
         found = angles_near(rotation, d_theta, given)
@@ -500,7 +501,7 @@ def _all_angles(rotation, given):
 
 
 def _of_image_points(problem: Problem, weights) -> Float[np.ndarray, " rays"]:
-    """The factors of the weights of image points, from those of the sets of observations."""
+    """The weight factors of image points, from those of the observation sets."""
     found = np.ones(len(problem.network.observations))
     for o, s in enumerate(problem.layout.sets):
         if s.field == "image":

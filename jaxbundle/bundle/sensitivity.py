@@ -1,9 +1,9 @@
-"""A budget of errors: what is held fixed, and not known exactly, does to the results.
+"""Error budget: effects on the results of held quantities that are not known exactly.
 
-An error of one σ in something held (a K3 fixed at 0, a lever arm, the flatness of a board, a fixed
+An error of one σ in a held quantity (a K3 fixed at 0, a lever arm, the flatness of a board, a fixed
 control point) moves the solution by dx = −H⁻¹·(∂g/∂θ)·σ, exactly to first order
-(`leastsquares/response.py`). Independent errors add in squares, to each other and to the σ of the
-result, which knows the measurements only:
+(`leastsquares/response.py`). Independent errors add in squares, with each other and with the σ of
+the result, which contains only the measurements:
 
     total² = σ² + Σ effect²
 """
@@ -35,13 +35,13 @@ MEASUREMENTS, TOTAL = "measurements", "total"
 
 @dataclasses.dataclass(frozen=True)
 class Budget:
-    """What errors of things held do to results.
+    """Effects of errors of held quantities on results.
 
-    **Fields:** `results` and `causes`, with their names and words; `sigma` of every result, from
-    the measurements (a posteriori; of a design a priori); `effects`: of an error of one σ of each
-    cause on each result, with its sign where cause and result are one number each; else the root of
-    the sum of squares over independent errors, the root mean square over images or points. Angles
-    in radians; `angle_scale`: to the unit of tables.
+    **Fields:** `results` and `causes`, with names and descriptions; `sigma` of every result from
+    the measurements (a posteriori; for a design a priori); `effects` of an error of one σ of each
+    cause on each result, signed if cause and result are one number each; else the root of the sum
+    of squares over independent errors, or the root mean square over images or points. Angles in
+    radians; `angle_scale`: factor to the unit of tables.
     """
 
     results: tuple[Asked, ...]
@@ -57,13 +57,13 @@ class Budget:
 
     @property
     def shares(self) -> Float[np.ndarray, "causes+1 results"]:
-        """Of the measurements (first) and each cause, the part of the square of the total."""
+        """The share of the measurements (first) and of each cause in the squared total."""
         squares = np.concatenate([self.sigma[None], self.effects]) ** 2
         return squares / np.maximum(squares.sum(0), 1e-300)
 
     def table(self) -> dict[str, np.ndarray]:
-        """A row for every result and cause, the measurements and the total among them: result,
-        cause, sigma (of the cause), effect, share (of the square of the total)."""
+        """A row for every result and cause, including the measurements and the total: result,
+        cause, sigma (of the cause), effect, share (of the squared total)."""
         rows, shares, total = [], self.shares, self.total
         for r, result in enumerate(self.results):
             unit = self.angle_scale if result.angle else 1.0
@@ -80,7 +80,7 @@ class Budget:
         return {n: np.array(c, object if n in text else float) for n, c in columns.items()}
 
     def rows(self) -> list[tuple[str, str, str, str, str]]:
-        """`table` as text to be read, under `report.budget.HEADER`."""
+        """`table` as formatted text, under `report.budget.HEADER`."""
         found, columns = [], self.table()
         words = {MEASUREMENTS: "the measurements", TOTAL: "all together"}
         words |= {cause.name: cause.words for cause in self.causes}
@@ -102,25 +102,24 @@ class Budget:
 
 
 def sensitivity(given: Adjustment | Problem, held: Mapping[Any, Any], of: Any = WORDS) -> Budget:
-    """What an error of stated σ in each thing that is held does to each result.
+    """The effect of an error of given σ in each held quantity on each result.
 
     **Arguments:**
 
     - `given`: an `Adjustment`; or a `Problem`, a design: its start values are taken as adjusted, σ
-      are a priori, and its image coordinates do not count.
-    - `held`: by name the σ of its error. A name is KIND:ID:NAME, such as `"camera:cam:K3"`,
-      `"image:12:X0"`, `"point:7:Z"`, `"lever arm:cam:az"`, or a tuple of the three; `*` for the id
-      or the name stands for all that are held, with independent errors. Or, by any name, names and
-      amounts of one error that they have in common: `{"bent board": {"point:1:Z": 0.2, …}}`.
-      Angles in radians.
-    - `of`: results, by name as in `held` or in words: `"cameras"` (all free parameters), `"images"`
-      and `"points"` (the root mean square over all that are not held); or a function of `Values`
-      with one number or several. All words if not given.
+      are a priori, and its image coordinates are not used.
+    - `held`: σ of the error by name. A name is KIND:ID:NAME, such as `"camera:cam:K3"`,
+      `"image:12:X0"`, `"point:7:Z"`, `"lever arm:cam:az"`, or a tuple of the three; `*` as id or
+      name stands for all held ones, with independent errors. Or, under any name, the names and
+      amounts of one common error: `{"bent board": {"point:1:Z": 0.2, …}}`. Angles in radians.
+    - `of`: results, by name as in `held`, or `"cameras"` (all free parameters), `"images"` and
+      `"points"` (root mean square over those not held); or a function of `Values` returning one or
+      several numbers. Default: the three words.
 
     **Returns:** a `Budget`.
 
-    **Raises:** `InputError` for a name that is not there, for one of `held` that is estimated, and
-    a σ that is no positive number; `NotSolvedError` without a solution.
+    **Raises:** `InputError` for an unknown name, an estimated quantity in `held`, or a σ that is
+    not positive; `NotSolvedError` without a solution.
     """
     inspection, sigma0, unit = looked_at(given)
     problem = inspection.problem
@@ -141,7 +140,7 @@ def sensitivity(given: Adjustment | Problem, held: Mapping[Any, Any], of: Any = 
 
 
 def _together(effects: Float[np.ndarray, " k"]) -> float:
-    """Of independent errors; one keeps its sign."""
+    """The root sum of squares of independent errors; a single one keeps its sign."""
     return float(effects[0]) if len(effects) == 1 else float(np.sqrt((effects**2).sum()))
 
 
@@ -149,7 +148,7 @@ def looked_at(given: Any) -> tuple[Inspection, float, float]:
     """The inspection of an adjustment or a design, its σ0, and the factor from radians to its unit
     of angles.
 
-    **Raises:** `InputError` for anything else; where no factor fits into memory."""
+    **Raises:** `InputError` for other arguments, or if no factor fits into memory."""
     if isinstance(given, Problem):
         given = given.with_factor()
         if given.reduction not in FACTORS:
@@ -158,7 +157,8 @@ def looked_at(given: Any) -> tuple[Inspection, float, float]:
         return Inspection(given, given.data.start), 1.0, 1 / ANGLE_UNITS[given.network.angle_unit]
     if not isinstance(given, Adjustment):
         raise InputError(
-            f"what jaxbundle.adjust or jaxbundle.make_problem gives is expected, not {shown(given)}"
+            f"a result of jaxbundle.adjust or jaxbundle.make_problem is expected, not "
+            f"{shown(given)}"
         )
     return given.cofactors, given.sigma0, given.angle_scale
 

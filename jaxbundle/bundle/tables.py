@@ -1,6 +1,6 @@
-"""The tables of a result: an `Adjustment` in, columns by name out.
+"""The tables of a result: columns by name from an `Adjustment`.
 
-σ are a posteriori, angles in the network's unit; the tables of one kind of thing are one function.
+σ are a posteriori, angles in the network's unit; there is one function per kind of table.
 """
 
 from collections.abc import Iterator, Sequence
@@ -90,9 +90,9 @@ def points(adjustment) -> dict[str, np.ndarray]:
 
 
 def far_points(adjustment) -> dict[str, np.ndarray]:
-    """Of the points at any distance, if there are any: columns id, uX, uY, uZ (the direction from
-    the middle of the projection centres), su (its largest σ, angle unit), distance, nearer and
-    farther (one σ of the inverse distance from it), at_infinity."""
+    """The points at any distance, if any: columns id, uX, uY, uZ (the direction from the centroid
+    of the projection centres), su (its largest σ, angle unit), distance, nearer and farther (one σ
+    of the inverse distance from it), at_infinity."""
     found = adjustment.far_points
     if found is None:
         return {}
@@ -104,7 +104,7 @@ def far_points(adjustment) -> dict[str, np.ndarray]:
 
 
 def _rays_and_rms(adjustment, of_ray, n: int) -> dict[str, np.ndarray]:
-    """Columns rays and rms (of v, image unit) of what `of_ray` gives for every ray."""
+    """Columns rays and rms (of v, image unit) by the index `of_ray` of every ray."""
     weight = np.asarray(adjustment.problem.data.image_weight)
     used = weight > 0
     v = np.asarray(adjustment.inspection.residuals.image) / np.where(used, weight, 1.0)
@@ -117,9 +117,9 @@ def _rays_and_rms(adjustment, of_ray, n: int) -> dict[str, np.ndarray]:
 
 
 def residuals(adjustment) -> dict[str, np.ndarray]:
-    """One row an observation: kind, image, point, axis, v, sigma (a priori), r, w (Baarda),
-    tau (Pope), mdb, external, and weight (the factor) after robust estimation; image observations
-    first, in the order they were given."""
+    """One row per observation: kind, image, point, axis, v, sigma (a priori), r, w (Baarda), tau
+    (Pope), mdb, external, and weight (the factor) after robust estimation; image observations
+    first, in the given order."""
     found = adjustment.reliability
     parts = observations(adjustment.problem, found.residual, found.redundancy, found.w)
     return concatenate([
@@ -129,8 +129,8 @@ def residuals(adjustment) -> dict[str, np.ndarray]:
 
 
 def observations(problem: Problem, *found: Rows) -> Iterator[tuple[Any, ...]]:
-    """Of every kind of observations: kind, ids of images and of points, axes, the weights [things,
-    axes], and of each of `found` its part of that shape."""
+    """For every kind of observation: kind, ids of images and points, axes, the weights
+    [observations, axes], and the part of each of `found` in that shape."""
     data, network, given = problem.data, problem.network, problem.layout.given
     images = np.array(network.images.id, dtype=object)
     points = np.array(network.points.id, dtype=object)
@@ -154,7 +154,7 @@ def observations(problem: Problem, *found: Rows) -> Iterator[tuple[Any, ...]]:
 
 
 def _further(problem: Problem, found: Sequence[Rows]):
-    """Observations of further kinds: what they touch stands where the point does."""
+    """Observations of further kinds: the rows they touch are in the column of the point."""
     first = len(problem.layout.sets)
     for k, given in enumerate(problem.system.observations[first:]):
         weight = problem.system.weights(first + k)
@@ -169,7 +169,7 @@ def _further(problem: Problem, found: Sequence[Rows]):
 
 
 def further_unknowns(adjustment) -> dict[str, dict]:
-    """By table, row and name: value and sigma, as `Adjustment.further_unknowns`."""
+    """By table, row and name: value and sigma, like `Adjustment.further_unknowns`."""
     found: dict[str, dict] = {}
     names, origin = set(adjustment.values.other), adjustment.problem.origin
     if not names:
@@ -182,7 +182,7 @@ def further_unknowns(adjustment) -> dict[str, dict]:
 
 
 def checks(adjustment) -> dict[str, np.ndarray]:
-    """Of the check points, if there are any: columns id, X, Y, Z, dX, dY, dZ (against the given
+    """The check points, if any: columns id, X, Y, Z, dX, dY, dZ (against the given
     coordinates), sX, sY, sZ, rays."""
     found = adjustment.check_points
     if found is None:
@@ -196,7 +196,8 @@ def checks(adjustment) -> dict[str, np.ndarray]:
 
 
 def residual_rows(adjustment, kind, image, point, axes, v, weight, r, w):
-    """The rows of one kind of observation [things × axes] as columns; weightless rows left out."""
+    """The rows of one kind of observation [observations × axes] as columns, without weightless
+    rows."""
     v, weight, r, w = (np.asarray(x) for x in (v, weight, r, w))
     unit = np.ones(weight.shape[1])
     if kind in OF_ANGLES or (kind == "prior" and axes == EXTERIOR):
@@ -224,8 +225,8 @@ def residual_rows(adjustment, kind, image, point, axes, v, weight, r, w):
 
 
 def _significance(value: float, sigma: float) -> float:
-    """t = |value|/σ, the value counted from its default, mostly 0; where σ is 0, as after an exact
-    fit, infinite, or NaN for the value 0."""
+    """t = |value − default|/σ, the default mostly 0; for σ = 0, as after an exact fit, infinite, or
+    NaN for the value 0."""
     if sigma == 0:
         return float("inf") if value else float("nan")
     return abs(value) / float(sigma)

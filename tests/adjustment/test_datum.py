@@ -136,13 +136,13 @@ def test_an_open_datum_is_refused_unless_asked_for():
 @pytest.mark.parametrize("datum", ["inner", "minimal"])
 def test_datum_points_that_cannot_hold_the_datum_are_refused(datum, chosen):
     network = FREE.replace(datum=datum, datum_points=FREE.points.id[:chosen])
-    with pytest.raises(InputError, match="cannot hold the datum"):
+    with pytest.raises(InputError, match="cannot fix the datum"):
         make_problem(network)
     # Three on one line hold it no better.
     position = FREE.points.position.copy()
     position[2] = 0.3 * position[0] + 0.7 * position[1]
     points = dataclasses.replace(FREE.points, position=position)
-    with pytest.raises(InputError, match="not on one line"):
+    with pytest.raises(InputError, match="not collinear"):
         make_problem(network.replace(points=points, datum_points=FREE.points.id[:3]))
 
 
