@@ -1,4 +1,5 @@
-"""A least-squares engine on tables of unknowns and kinds of observations; it knows no photograph.
+"""A least-squares engine on tables of unknowns and kinds of observations, independent of
+photographs.
 
     from jaxbundle import leastsquares as ls
 """

@@ -1,4 +1,4 @@
-"""`adjust`: tables and observations in, a result with its statistics out.
+"""`adjust`: from tables and observations to a result with statistics.
 
     from jaxbundle import leastsquares as ls
 
@@ -36,14 +36,14 @@ from jaxbundle.leastsquares.stopping import SINGULAR, TERMINATIONS, converged
 
 DATUMS = ("given", "inner", "minimal")
 FEW = 60
-"""Problems with fewer unknowns are solved as a whole: nothing is eliminated."""
+"""Problems with fewer unknowns are solved without elimination."""
 
 
 @dataclasses.dataclass(frozen=True)
 class TableResult:
-    """A table after the adjustment: `value` as it was given; `sigma` a posteriori and `covariance`
-    of the directions in which a row moves, [rows, width] ([rows] of a table of numbers) and [rows,
-    width, width]; 0 where something is held."""
+    """A table after the adjustment: `value` in the given form; `sigma` a posteriori and
+    `covariance` of the directions of a row, [rows, width] ([rows] for a table of numbers) and
+    [rows, width, width]; 0 for held unknowns."""
 
     value: PyTree[np.ndarray]
     sigma: Float[np.ndarray, "rows *width"]
@@ -60,11 +60,11 @@ def table_result(found: Solution, table: str, sigma0: float) -> TableResult:
 
 
 class Result:
-    """An adjusted problem; look at `converged` before anything else.
+    """An adjusted problem; check `converged` first.
 
     `converged`, `termination`, `iterations`, `sigma0`, `vtpv`, `counts` (observations, unknowns,
     datum, redundancy); `result[table]`; `residuals(kind)`; `covariance(function)`; `removed`,
-    `suspects`, `components`; `undetermined`, names of what nothing determines.
+    `suspects`, `components`; `undetermined`, names of undetermined unknowns.
     """
 
     def __init__(
@@ -83,17 +83,17 @@ class Result:
 
     @property
     def iterations(self) -> int:
-        """Steps tried, the rejected ones counted; the evaluation of the start is not one."""
+        """Steps tried, including rejected ones, without the evaluation of the start."""
         return max(int(self.minimum.iterations) - 1, 0)
 
     @functools.cached_property
     def converged(self) -> bool:
-        """Whether a minimum was reached and everything in it is determined."""
+        """Whether a minimum was reached and all unknowns are determined."""
         return bool(converged(int(self.minimum.termination))) and self._solution.determined
 
     @functools.cached_property
     def undetermined(self) -> tuple[str, ...]:
-        """What nothing determines, most affected first; empty for a solved problem."""
+        """Undetermined unknowns, most affected first; empty for a solved problem."""
         return () if self.converged else tuple(undetermined(self.problem, self.minimum.values))
 
     @functools.cached_property
@@ -102,9 +102,9 @@ class Result:
 
     @property
     def solution(self) -> Solution:
-        """The solution as statistics look at it.
+        """The inspection of the solution, for statistics.
 
-        **Raises:** `NotSolvedError` where there is none."""
+        **Raises:** `NotSolvedError` if there is none."""
         if not self.converged:
             names = ", ".join(self.undetermined[:8])
             what = f"; not determined: {names}" if names else ""
@@ -132,13 +132,13 @@ class Result:
         return table_result(self.solution, table, self.sigma0)
 
     def redundancy(self, kind: str) -> Float[np.ndarray, "n *r"]:
-        """The redundancy numbers of the observations of a kind, in the order they were given."""
+        """The redundancy numbers of the observations of a kind, in the given order."""
         return self.residuals(kind)["r"]
 
     def residuals(self, kind: str) -> dict[str, Float[np.ndarray, "n *r"]]:
-        """Of the observations of a kind, in the order they were given: v (computed − observed, in
-        the unit of the kind; of those with a covariance L⁻¹·v), sigma (a priori), r, w (Baarda),
-        tau (Pope), mdb, external."""
+        """For the observations of a kind, in the given order: v (computed − observed, in the unit
+        of the kind; with a covariance L⁻¹·v), sigma (a priori), r, w (Baarda), tau (Pope), mdb,
+        external."""
         names = [given.kind.name for given in self.problem.observations]
         if kind not in names:
             raise KeyError(f"there is no kind {kind!r}; known: {', '.join(dict.fromkeys(names))}")
@@ -193,19 +193,20 @@ def adjust(
     snooping: str | None = None, significance: float = 0.001, estimate_components: bool = False,
     progress: Callable | None = None, **options,
 ) -> Result:  # fmt: skip
-    """Adjust a problem of one's own by least squares.
+    """Adjust your own problem by least squares.
 
     **Arguments:**
 
     - `tables`: the unknowns; `observations`: sets of them, made by calling a `Kind`.
-    - `datum`: what holds a problem that may float as a whole: `"given"`, the observations and what
-      is held; `"inner"`, inner constraints on all that moves; `"minimal"`, as few unknowns as
-      needed; or by table the rows that hold it, inner constraints on those.
-    - `motions`: in which the problem may float; a similarity of all tables of coordinates and poses
-      (a shift of a table of numbers) if not given, see `motions.py`. Which of them are open is
-      found from the observations.
-    - `eliminate`: the table that is eliminated row by row; chosen if not given, None: none.
-    - `reduction`: how the rest is solved, "dense", "banded" or "iterative"; chosen if not given.
+    - `datum`: for a problem that may float as a whole: `"given"`, defined by the observations and
+      held unknowns; `"inner"`, inner constraints on all unknowns; `"minimal"`, as few held unknowns
+      as needed; or datum rows by table, with inner constraints on these.
+    - `motions`: in which the problem may float; default: a similarity of all tables of coordinates
+      and poses (a shift of a table of numbers), see `motions.py`. The open ones are determined
+      from the observations.
+    - `eliminate`: the table that is eliminated row by row; default: automatic; None: none.
+    - `reduction`: solver of the reduced system, "dense", "banded" or "iterative"; default:
+      automatic.
     - `method`: "levenberg-marquardt" or "gauss-newton".
     - `robust`: "huber", "cauchy" or "tukey"; `snooping`: "pope" or "baarda", at the level
       `significance`.
@@ -214,8 +215,8 @@ def adjust(
 
     **Returns:** a `Result`.
 
-    **Raises:** `InputError` for declarations that do not fit together; `NotSolvedError` where what
-    robust estimation, snooping or components leave determines no answer.
+    **Raises:** `InputError` for inconsistent declarations; `NotSolvedError` if the problem is not
+    determined after robust estimation, snooping or variance components.
     """
     one_of("method", method, METHODS)
     one_of("robust", robust, ESTIMATORS, none=True)
@@ -259,7 +260,7 @@ def adjust(
 
 
 def kinds_as_groups(problem: Problem) -> list[Group]:
-    """Every kind of observations is a group of its own."""
+    """Every kind of observations is a separate group."""
     sets: dict[str, list] = {}
     for o, given in enumerate(problem.observations):
         sets.setdefault(given.kind.name, []).append((o, np.s_[:]))
@@ -267,8 +268,8 @@ def kinds_as_groups(problem: Problem) -> list[Group]:
 
 
 def choose_eliminated(tables: Sequence[Table], observations: Sequence[Observations]) -> str | None:
-    """The table with the most unknowns of which no observation touches two rows, if it is worth
-    it."""
+    """The table with the most unknowns of which no observation touches two rows, if elimination
+    pays."""
     twice = {t for given in observations for t in given.kind.of if given.kind.of.count(t) > 1}
     size = {t.name: int(t.free.sum()) for t in tables if t.name not in twice}
     total = sum(int(t.free.sum()) for t in tables)
@@ -286,11 +287,11 @@ def _motions(tables, datum, motions):
 
 
 def _hold_datum(tables, datum, gauge):
-    """By table what holds the datum, and whether by as few of them as needed."""
+    """The datum unknowns by table, and whether the datum is minimal."""
     every = {t.name: np.ones((t.rows, t.space.width)) for t in tables}
     if isinstance(datum, str):
         if datum == "given":
-            raise InputError(f"the datum is open in {gauge.shape[1]} parameters: say what holds it")
+            raise InputError(f"the datum is open in {gauge.shape[1]} parameters: give `datum`")
         return every, datum == "minimal"
     chosen = {}
     for name, rows in datum.items():

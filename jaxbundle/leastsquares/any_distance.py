@@ -1,4 +1,4 @@
-"""Points at any distance, up to infinity, as the engine moves them."""
+"""Points at any distance, up to infinity: their parametrisation in the engine."""
 
 import dataclasses
 
@@ -13,7 +13,7 @@ from jaxbundle.leastsquares.spaces import tangent_basis
 FARTHEST = 1e8
 """Infinity, in the unit s of a row: rays that differ by 1e-8 are parallel in every image."""
 THERE = 0.99
-"""Of it, from where a place counts as there."""
+"""The fraction of it from which a point counts as at infinity."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,8 +24,8 @@ class AnyDistance:
 
         X ← (X + A·δ)/(1 + |X|/s·δ₃),   A = (n·e₁, n·e₂, −s·u),  u = X/|X|,  n² = |X|² + s².
 
-    So nearly parallel rays give a direction well determined, and an inverse distance that may
-    become 0, not a distance that runs away. A step beyond infinity (`FARTHEST`) ends there.
+    So nearly parallel rays give a well-determined direction and an inverse distance that may become
+    0, instead of a diverging distance. A step beyond infinity (`FARTHEST`) ends there.
 
     Source: Förstner and Wrobel (2016), 5.1 and 10.2, spherically normalised homogeneous vectors.
     """
@@ -72,13 +72,13 @@ def derivative(value):
 
 
 def is_at_infinity(X: Float[np.ndarray, "n 3"], s: Float[np.ndarray, " n"]):
-    """Which places that may be at any distance are there."""
+    """Which points at any distance are at infinity."""
     return (np.linalg.norm(X, axis=1) > THERE * FARTHEST * s) & (s > 0)
 
 
 def shares(X: Float[np.ndarray, "n 3"], s: Float[np.ndarray, " n"]):
-    """Of places at any distance, what a change of 1 across the ray turns their directions by
-    (radians), and what one along it adds to 1/|X|."""
+    """For points at any distance, the change of direction (radians) by a unit change across the
+    ray, and the change of 1/|X| by a unit change along it."""
     square = (X**2).sum(1)
     return np.sqrt(1 + s**2 / square), s / square + 1 / s
 
@@ -90,7 +90,7 @@ def length(X):
 
 
 def _frame(value):
-    """A [3, 3] and |X|/s; the unit matrix and 0 where the coordinates move."""
+    """A [3, 3] and |X|/s; the unit matrix and 0 for points that move by coordinates."""
     X, s = value[:3], value[3]
     r = length(X)
     across = jnp.sqrt(r * r + s * s) * tangent_basis(X / r)
@@ -100,7 +100,7 @@ def _frame(value):
 
 
 def _transform(motion, value):
-    """A place that moves with space; at infinity its direction turns, and that is all."""
+    """A point that moves with space; at infinity only its direction rotates."""
     moved = transform_point(motion, value[:3])
     turned = moved - transform_point(motion, jnp.zeros(3))
     turned = turned * length(value[:3]) / length(turned)

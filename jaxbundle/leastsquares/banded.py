@@ -1,4 +1,4 @@
-"""The reduced system where the rows of one group can be put into an order in which it is banded.
+"""The reduced system if the rows of one group can be ordered so that it is banded.
 
 See `reduction.py`: a block tridiagonal matrix (diagonal blocks D, blocks E below them) with a
 border B for all other groups:
@@ -6,8 +6,8 @@ border B for all other groups:
     L_k·L_kᵀ = D_k − C_k·C_kᵀ,   C_{k+1} = E_k·L_k⁻ᵀ,   X_k = L_k⁻¹·(B_k − C_k·X_{k−1})
     L·Lᵀ of the corner = corner − ΣX_kᵀ·X_k
 
-The blocks of the inverse Q in the band and its border follow from the factor backwards, without
-the others (Takahashi, Fagan and Chin 1973):
+The blocks of the inverse Q in the band and its border follow from the factor by a backward
+recursion, without the other blocks (Takahashi, Fagan and Chin 1973):
 
     Q_kb     = −L_k⁻ᵀ·(C_{k+1}ᵀ·Q_{k+1,b} + X_k·Q_bb)               b: the border
     Q_k,k+1  = −L_k⁻ᵀ·(C_{k+1}ᵀ·Q_{k+1,k+1} + X_k·Q_b,k+1)
@@ -94,7 +94,7 @@ class BandFactor(eqx.Module):
 
 
 def factorise_band(plan: Plan, S: Reduced) -> BandFactor:
-    """The factor of a banded S; NaN where it is not positive definite."""
+    """The factor of a banded S; NaN if it is not positive definite."""
     g, others = _groups(plan)
     band = present(plan.band)
     place, width, blocks = band.place, band.width, band.blocks
@@ -136,7 +136,7 @@ def _groups(plan: Plan) -> tuple[str, tuple[str, ...]]:
 
 
 def _into_band(plan: Plan, rows: Float[Array, "rows w *q"]) -> Float[Array, "blocks m *q"]:
-    """Rows of the group at their places in the band; zero where it is filled."""
+    """Rows of the group at their positions in the band; zero for padding."""
     band, (_, w, *q) = present(plan.band), rows.shape
     whole = jnp.zeros((band.blocks * band.width, w, *q)).at[band.place].set(rows)
     return whole.reshape(band.blocks, band.width * w, *q)

@@ -5,11 +5,11 @@
     result = optimistix.least_squares(fn, solver, y0, args=problem.data)
     values = values_of(problem, result.value)
 
-The stock solvers add steps, so the unknowns y are changes of the start values, and damping is λ·1,
-so they are scaled by the columns of the Jacobian at the start. A linear solver is shown the
-Jacobian only as an operator, from which blocks cannot be read. So there is a *witness* beside the
-unknowns, always 0, and outputs witness·x beside the residuals, also 0, for everything x that N
-depends on: the derivative by the witness is x itself.
+The stock solvers add steps, so the unknowns y are changes of the start values; their damping is
+λ·1, so y is scaled by the columns of the Jacobian at the start. A linear solver sees the Jacobian
+only as an operator, from which blocks cannot be read. Hence an additional unknown, the *witness*,
+which is always 0, and additional outputs witness·x, also 0, for all quantities x that N depends on:
+their derivative by the witness is x.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ from jaxbundle.leastsquares.spaces import Space
 
 @dataclasses.dataclass(frozen=True)
 class Chart:
-    """A space in which changes add: a value is (start, scale, y) and stands for the start changed
+    """A space in which changes add: a value is (start, scale, y) and represents the start changed
     by scale·y."""
 
     space: Space
@@ -41,7 +41,7 @@ class Chart:
         return self.space.width
 
     def value(self, start, scale, y):
-        """The value of the space that is meant."""
+        """The represented value."""
         return self.space.retract(start, scale * y)
 
     def prepare(self, value):
@@ -61,9 +61,9 @@ class Chart:
 def stock_problem(problem: Problem):
     """Residual function fn(y, data), its start y0 = 0, and a linear solver for stock optimistix.
 
-    **Raises:** `ValueError` where the datum is open: the stock loop knows none."""
+    **Raises:** `ValueError` if the datum is open: the stock loop has no datum."""
     if problem.counts.datum:
-        raise ValueError("the stock solvers know no datum: fix it by what is held or observed")
+        raise ValueError("the stock solvers have no datum: fix it by held values or observations")
     declared, plan, scale = _charted(problem.declared), problem.plan, _scale(problem)
 
     def fn(y, data: Data):
@@ -97,7 +97,7 @@ def _values(problem: Problem, data: Data, scale, change):
 
 
 def _scale(problem: Problem):
-    """By table, the change of each unknown that counts as 1."""
+    """By table, the unit change of each unknown."""
     return _columns(problem.declared, problem.plan, pad_data(problem, problem.data))
 
 
@@ -109,7 +109,7 @@ def _columns(declared: Declared, plan: Plan, data: Data):
 
 
 class EliminationOfJacobian(lx.AbstractLinearSolver):
-    """Solves least squares of the Jacobian of `stock_problem`, or of it stacked on √λ·1."""
+    """Solves least squares for the Jacobian of `stock_problem`, optionally stacked on √λ·1."""
 
     declared: Declared = eqx.field(static=True)
     plan: Plan

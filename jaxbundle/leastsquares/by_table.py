@@ -1,7 +1,7 @@
-"""How tables move, by programs of one table each, called on the host.
+"""Motions of tables, by one program per table, called on the host.
 
-Those of one space and size share a program, all small ones too: they are filled to `LEAST_ROWS`. A
-program of a whole problem would be compiled for every problem of another shape.
+Tables of one space and size share a program, and so do all small ones, padded to `LEAST_ROWS`. A
+program for a whole problem would be compiled again for every other shape.
 """
 
 from functools import partial
@@ -18,9 +18,9 @@ from jaxbundle.leastsquares.rows import Declared, Values
 from jaxbundle.types import present
 
 HERE = "table"
-"""The name of a table that is looked at alone."""
+"""The name of a table treated alone."""
 LEAST_ROWS = 128
-"""So many rows at least are filled up."""
+"""Tables are padded to at least this many rows."""
 
 
 def directions_of_motions(declared: Declared, values: Values) -> Tangent:
@@ -38,7 +38,7 @@ def directions_of_motions(declared: Declared, values: Values) -> Tangent:
 def move_into_datum(
     declared: Declared, plan: Plan, values: Values, start: Values
 ) -> tuple[Values, bool]:
-    """`datum.move_to_datum` by Gauss–Newton steps alone."""
+    """`datum.move_to_datum` by Gauss–Newton steps only."""
     if plan.datum is None:
         return values, True
     if plan.datum.held:
@@ -73,7 +73,7 @@ def move_into_datum(
 
 
 def _moved(declared, free, motion, values):
-    """All tables moved; what is held stays."""
+    """All tables moved, except held values."""
     moved = dict(values)
     for name, act in present(declared.motions).actions:
         of_rows = partial(_move, declared.spaces[name], act, motion)
@@ -93,7 +93,7 @@ def _move(space, act, motion, values, free):
 
 
 def _of_rows(program, *given):
-    """A program of the rows of a table, filled up and cut again; in NumPy."""
+    """A program on the rows of a table, padded and cut again; in NumPy."""
     rows = jax.tree.leaves(given)[0].shape[0]
     more = max(LEAST_ROWS - rows, 0)
     wide = lambda x: np.pad(x, [(0, more), *[(0, 0)] * (np.ndim(x) - 1)], mode="edge")

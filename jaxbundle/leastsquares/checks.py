@@ -1,4 +1,4 @@
-"""Rows that took no part: determined from the solution, with the uncertainty of what it knows.
+"""Excluded rows, determined from the solution including its uncertainty.
 
 With V and W of their own observations and Q of the solution,
 
@@ -28,7 +28,7 @@ def determine(
     cofactors.
 
     **Arguments:** `problem`: with the kept tables of the solution's problem, at their adjusted
-    values and as free as they are there.
+    values and with the same free unknowns.
     """
     plan, e = problem.plan, present(problem.plan.eliminated)
     data = pad_data(problem, problem.data)

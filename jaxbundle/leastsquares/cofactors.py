@@ -1,4 +1,4 @@
-"""Cofactors: the blocks of the inverse normal matrix that statistics need, never all of it.
+"""Cofactors: only those blocks of the inverse normal matrix that statistics need.
 
 From the factor (`elimination.py`), with Q the inverse of S and Z = L⁻¹·Wᵀ of every incidence,
 
@@ -6,8 +6,8 @@ From the factor (`elimination.py`), with Q the inverse of S and Z = L⁻¹·Wᵀ
     Q_en = −L⁻ᵀ·K_n                     an eliminated row with the kept row of its incidence n
     Q_ee = L⁻ᵀ·(1 + Σ_n K_n·Z_nᵀ)·L⁻¹   an eliminated row
 
-These are marginal cofactors: the uncertainty of what is kept is in those of the eliminated rows.
-In a problem that may float they belong to the datum by the S-transformation Q ← S·Q·Sᵀ.
+These are marginal cofactors: those of eliminated rows include the uncertainty of kept rows. In a
+problem that may float they refer to the datum by the S-transformation Q ← S·Q·Sᵀ.
 """
 
 import equinox as eqx
@@ -32,10 +32,10 @@ from jaxbundle.types import present
 class Cofactors(eqx.Module):
     """Blocks of Q = N⁻¹.
 
-    `own`: of every row of every group, in the datum of the problem. The others are what residuals
-    need, in the regularised datum of the factor (use them for estimable quantities only): `kept`,
-    the blocks of the reduced system; `eliminated`; `coupled`, every eliminated row with the kept
-    row of its incidences; `lower_inverse`, L⁻¹ of the eliminated rows. What is held has zeros.
+    `own`: of every row of every group, in the datum of the problem. The others are for residuals,
+    in the regularised datum of the factor (use them for estimable quantities only): `kept`, the
+    blocks of the reduced system; `eliminated`; `coupled`, every eliminated row with the kept row of
+    its incidences; `lower_inverse`, L⁻¹ of the eliminated rows. Held unknowns have zeros.
     """
 
     own: dict[str, Float[Array, "rows w w"]]
@@ -48,7 +48,7 @@ class Cofactors(eqx.Module):
 def cofactors(
     declared: Declared, values: Values, factor: Factor, moves: Tangent | None = None
 ) -> Cofactors:
-    """All cofactor blocks of a solved problem; `moves`: the generators, where they are known."""
+    """All cofactor blocks of a solved problem; `moves`: the generators, if known."""
     plan = factor.plan
     Q = _without_held(plan, factor.inverse())
     eliminated, coupled = None, {}
@@ -70,7 +70,7 @@ def cofactors(
 
 
 def _without_held(plan: Plan, Q: Reduced) -> Reduced:
-    """The inverse of S with zeros, where S had ones, for what is held."""
+    """The inverse of S, with zeros for held unknowns, where S had ones."""
     mask = lambda B, g: B * plan.groups[g].free[:, :, None] * plan.groups[g].free[:, None, :]
     return Reduced({g: mask(B, g) for g, B in Q.own.items()}, Q.off)
 
@@ -92,8 +92,8 @@ def _couplings(factor: Factor, Q: Reduced):
 
 
 def _spread(pairs, a, b, Q, to_first, to_second, within: bool):
-    """To the first of the totals is added b·Qᵀ for every partner b of its row, to the second a·Q; Q
-    is the block of each pair. `within`: the two totals are one."""
+    """Add b·Qᵀ to the first total for every partner b of its row, and a·Q to the second; Q is the
+    block of each pair. `within`: the two totals are the same."""
     totals = (to_first,) if within else (to_first, to_second)
 
     def add(totals, i, j, k):
@@ -104,7 +104,7 @@ def _spread(pairs, a, b, Q, to_first, to_second, within: bool):
         return totals[0].at[i].add(back), totals[1].at[j].add(forth)
 
     totals = over_pairs(pairs, add, totals)
-    # What stands for nothing has collected what the fillings of chunks have in common.
+    # The row that represents nothing has accumulated the padding of chunks.
     return totals[0], totals[0 if within else 1]
 
 
@@ -127,7 +127,7 @@ def _in_datum(declared, values, factor, own, moves):
 
 
 def blocks_of_tables(declared: Declared, plan: Plan, own, values: Values):
-    """`Cofactors.own` row by row of the tables; zero where something is held."""
+    """`Cofactors.own` by table rows; zero for held unknowns."""
     empty = zeros_of_tables(declared, values)
     found = {name: jnp.zeros((*zero.shape, zero.shape[1])) for name, zero in empty.items()}
     for name, group in plan.groups.items():
@@ -141,7 +141,7 @@ def propagate(
     declared: Declared, values: Values, factor: Factor, rows: Tangent, moves: Tangent | None = None
 ) -> Float[Array, "f f"]:
     """F·Q·Fᵀ in the datum for any linear functions F of the unknowns (first axis of `rows`): one
-    structured solve for each function."""
+    structured solve per function."""
     plan = factor.plan
     from_datum = jax.vmap(lambda r: s_transform_transposed(declared, plan, values, r, moves))(rows)
     solved = jax.vmap(lambda r: solve(factor, r))(from_datum)

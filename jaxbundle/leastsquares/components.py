@@ -1,10 +1,10 @@
-"""Variance components: does each group of observations keep the precision it was given?
+"""Variance components: test and estimation of the a priori precision of each group.
 
     σ̂²_g = (vᵀPv)_g / r_g,    r_g = Σ redundancy numbers of the group
 
 (Förstner 1979). A value near 1 confirms the a priori σ of the group. Estimation repeats: scale
-the σ of every group by σ̂_g, adjust again, until all components are 1. The product of these
-scales is the *factor* of the group: what the σ it was given have been multiplied by.
+the σ of every group by σ̂_g, adjust again, until all components are 1. The product of these scales
+is the *factor* of the group, applied to its given σ.
 """
 
 import dataclasses
@@ -17,13 +17,13 @@ from jaxbundle.leastsquares.problem import Problem, with_data
 from jaxbundle.leastsquares.solution import Solution
 
 ROUNDS = 20
-"""Variance components are estimated at most so many times."""
+"""Largest number of estimations of variance components."""
 SETTLED = 1e-3
-"""Components that differ less from 1 are not estimated again."""
+"""Components closer to 1 are not estimated again."""
 LEAST_REDUNDANCY = 1.0
 """A group with less redundancy than this has no usable component."""
 EXACT = 1e-9
-"""Residuals below this fraction of their a priori σ are rounding: there is nothing to estimate."""
+"""Residuals below this fraction of their a priori σ are rounding errors: nothing to estimate."""
 
 
 class Group(NamedTuple):
@@ -36,10 +36,10 @@ class Group(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Component:
-    """A group of observations: how many, their redundancy, vᵀPv.
+    """A group of observations: number, redundancy, vᵀPv.
 
-    `given`: the smallest and the largest a priori σ it was given (in the unit of the group; NaN
-    where units differ). `factor`: what these were multiplied by before the adjustment, 1 unless
+    `given`: the smallest and the largest given a priori σ (in the unit of the group; NaN
+    if units differ). `factor`: applied to them before the adjustment, 1 unless
     components are estimated.
     """
 
@@ -63,7 +63,7 @@ class Component:
 
     @property
     def estimated(self) -> tuple[float, float]:
-        """The smallest and the largest σ of the group as they are estimated."""
+        """The smallest and the largest estimated σ of the group."""
         smallest, largest = self.given
         return self.sigma * smallest, self.sigma * largest
 
@@ -76,8 +76,8 @@ class Component:
 def variance_components(
     found: Solution, groups: Sequence[Group], factors: Mapping[str, float]
 ) -> dict[str, Component]:
-    """The components of groups of observations; `factors`: by group, what the weights have been
-    divided by (1 if not there)."""
+    """The components of groups of observations; `factors`: by group, the divisor of the weights (1
+    if absent)."""
     problem, tested, components = found.problem, found.reliability, {}
     for group in groups:
         take = lambda by_set, group=group: np.concatenate(
@@ -97,8 +97,8 @@ def variance_components(
 
 
 class Estimate(NamedTuple):
-    """Variance components when their estimation ends: the solution, by group what its σ have been
-    multiplied by, and the groups whose components have not settled."""
+    """Estimated variance components: the solution, the factors of σ by group, and the groups whose
+    components have not converged."""
 
     found: Solution
     factors: dict[str, float]
@@ -106,7 +106,7 @@ class Estimate(NamedTuple):
 
 
 def estimate(found: Solution, groups: Sequence[Group], again: Callable) -> Estimate:
-    """Repeat Förstner's estimate until every component is 1; `again(problem, values)` adjusts."""
+    """Repeat Förstner's estimate until every component is 1; `again(problem, values)` readjusts."""
     factors: dict[str, float] = {}
     for done in range(ROUNDS + 1):
         components = variance_components(found, groups, factors)

@@ -1,12 +1,12 @@
-"""The metric of the damping: λ·D is added to N, and the step becomes shorter as λ grows.
+"""The metric of the damping: λ·D is added to N; the step becomes shorter as λ grows.
 
-Marquardt (1963) takes D = diag(N), which depends on what the unknowns are. A space may say in which
-unknowns they are to be damped (`Space.chart`): D is diag(N) in these, carried back,
+Marquardt (1963) takes D = diag(N), which depends on the choice of unknowns. A space may define
+other unknowns for the damping (`Space.chart`): D is diag(N) in these, transformed back,
 
-    D = Tᵀ·diag(T⁻ᵀ·N·T⁻¹)·T,   T = ∂(those unknowns)/∂(ours).
+    D = Tᵀ·diag(T⁻ᵀ·N·T⁻¹)·T,   T = ∂(chart)/∂(unknowns).
 
-Without a chart D is a diagonal. Identity damping does not converge on real problems: radians stand
-beside metres and beside coefficients of 1e-8.
+Without a chart D is a diagonal. Identity damping does not converge on real problems, which mix
+radians, metres and coefficients of 1e-8.
 """
 
 import jax
@@ -20,8 +20,8 @@ Metric = dict[str, Float[Array, "rows w *w"]]
 
 
 def measure(declared: Declared, plan: Plan, values: Values, own) -> Metric:
-    """D of every group: matrices [rows, w, w] where a space has a chart, diagonals [rows, w] where
-    none has; 1 for what is held. `own`: the diagonal blocks of N."""
+    """D of every group: matrices [rows, w, w] if a space has a chart, else diagonals [rows, w]; 1
+    for held unknowns. `own`: the diagonal blocks of N."""
     return {name: _of_group(declared, plan.groups[name], values, B) for name, B in own.items()}
 
 
@@ -41,7 +41,7 @@ def _of_group(declared, group, values, blocks):
 
     def one(T, inverse, N, free):
         D = T.T @ (jnp.diagonal(inverse.T @ N @ inverse)[:, None] * T)
-        D = D * free * free[:, None]  # What is held takes no part in what is not.
+        D = D * free * free[:, None]  # Held unknowns are decoupled from free ones.
         return D + jnp.diag(jnp.where(jnp.diagonal(D) > 0, 0.0, 1.0))
 
     return jax.vmap(one)(T, inverse, blocks, group.free)

@@ -1,8 +1,8 @@
-"""The datum: which motions of the whole problem the observations leave open, and what pins them.
+"""The datum: the motions of the whole problem left open by the observations, and their constraints.
 
 A motion that changes no observation makes the normal equations singular along its directions G
-(Blaha 1971; Illner 1985). Which combinations of the declared motions stay open is found from the
-observations that are not invariant, and from what is held.
+(Blaha 1971; Illner 1985). The open combinations of the declared motions are computed from the
+non-invariant observations and the held unknowns.
 
 The datum is imposed by an S-transformation (Baarda 1973; Teunissen 1985): with a choice B of datum
 unknowns,
@@ -10,9 +10,9 @@ unknowns,
     δ ← δ − G(BᵀG)⁻¹Bᵀδ,      Q ← S·Q·Sᵀ,  S = I − G(BᵀG)⁻¹Bᵀ,
 
 B = G on the datum rows for inner constraints (trace of their covariance smallest), B = as many
-single unknowns as there are defects for a minimal datum. After convergence the whole problem is
-moved, by finite open motions, to where Bᵀ(x − x_start) = 0 holds exactly: the result does not
-depend on the path of the iterations.
+single unknowns as the defect for a minimal datum. After convergence the whole problem is moved by
+finite open motions so that Bᵀ(x − x_start) = 0 holds exactly: the result does not depend on the
+path of the iterations.
 """
 
 import dataclasses
@@ -29,18 +29,18 @@ from jaxbundle.leastsquares.rows import Declared, Values
 from jaxbundle.types import present
 
 HELD = 1e-7
-"""Relative size of the least motion of datum unknowns that hold the datum."""
+"""Smallest relative motion of datum unknowns that fix the datum."""
 NEAR = 1e-3
-"""A motion into the datum by less than this fraction of the problem is near its end."""
+"""A motion to the datum by less than this fraction of the problem is near convergence."""
 LONGEST = 1.0
-"""Of a single motion into the datum: radians, or a factor of e."""
+"""Largest single motion to the datum: radians, or a factor of e."""
 THERE = 1e-12
-"""A motion into the datum by less than this fraction of the problem is its last."""
+"""A motion to the datum by less than this fraction of the problem is the last."""
 MOST_MOTIONS = 50
 
 
 def generators(declared: Declared, values: Values) -> Tangent:
-    """How every table moves along each motion, [rows, width, motions]; zero where it does not."""
+    """The derivative of every table along each motion, [rows, width, motions]."""
     given = present(declared.motions)
     motions, actions = len(given.names), dict(given.actions)
 
@@ -57,8 +57,8 @@ def generators(declared: Declared, values: Values) -> Tangent:
 
 
 def of_groups(plan: Plan, of_tables) -> Tangent:
-    """What belongs to the directions of the tables, [rows, width, …], for the groups; zero where
-    something is held."""
+    """Quantities by table directions, [rows, width, …], rearranged by groups; zero for held
+    unknowns."""
     found = {}
     for name, group in plan.groups.items():
         parts = [
@@ -74,8 +74,8 @@ def of_groups(plan: Plan, of_tables) -> Tangent:
 def open_directions(
     declared: Declared, plan: Plan, values: Values, moves: Tangent | None = None
 ) -> Tangent:
-    """G: the directions of the open motions, [rows, w, defect]; `moves`: the `generators`, where
-    they are known."""
+    """G: the directions of the open motions, [rows, w, defect]; `moves`: the `generators`, if
+    known."""
     moves = generators(declared, values) if moves is None else moves
     gauge = present(leave_held(declared, plan, values, moves).datum).gauge
     return {name: rows @ gauge for name, rows in of_groups(plan, moves).items()}
@@ -84,9 +84,8 @@ def open_directions(
 def leave_held(
     declared: Declared, plan: Plan, values: Values, moves: Tangent | None = None
 ) -> Plan:
-    """The plan with open motions changed least so that what is held stays where it is now: a
-    rotation about a held point goes with the point. `moves`: the `generators`, where they are
-    known."""
+    """The plan with open motions minimally changed so that held unknowns keep their current values:
+    a rotation about a held point follows the point. `moves`: the `generators`, if known."""
     datum = present(plan.datum)
     held, gauge = datum.held, datum.gauge
     if not held:
@@ -108,7 +107,7 @@ def leave_held(
 def s_transform(
     declared: Declared, plan: Plan, values: Values, change: Tangent, moves: Tangent | None = None
 ) -> Tangent:
-    """A change with the datum imposed: δ − G(BᵀG)⁻¹Bᵀδ; unchanged where nothing is open."""
+    """A change with the datum imposed: δ − G(BᵀG)⁻¹Bᵀδ; unchanged if nothing is open."""
     if plan.datum is None:
         return change
     G, B = datum_directions(declared, plan, values, moves)
@@ -120,7 +119,7 @@ def s_transform(
 def s_transform_transposed(
     declared: Declared, plan: Plan, values: Values, row: Tangent, moves: Tangent | None = None
 ) -> Tangent:
-    """Sᵀ·f: f − B(GᵀB)⁻¹Gᵀf, nothing of which is along the open motions."""
+    """Sᵀ·f: f − B(GᵀB)⁻¹Gᵀf, orthogonal to the open motions."""
     if plan.datum is None:
         return row
     G, B = datum_directions(declared, plan, values, moves)
@@ -131,7 +130,7 @@ def s_transform_transposed(
 def datum_directions(
     declared: Declared, plan: Plan, values: Values, moves: Tangent | None = None
 ) -> tuple[Tangent, Tangent]:
-    """G and B of all groups, [rows, w, defect]; `moves`: the `generators`, where they are known."""
+    """G and B of all groups, [rows, w, defect]; `moves`: the `generators`, if known."""
     G = open_directions(declared, plan, values, moves)
     weight = of_groups(plan, zeros_of_tables(declared, values) | present(plan.datum).weight)
     return G, {name: g * weight[name][..., None] for name, g in G.items()}
@@ -140,12 +139,13 @@ def datum_directions(
 def move_to_datum(
     declared: Declared, plan: Plan, values: Values, start: Values
 ) -> tuple[Values, Bool[Array, ""]]:
-    """The problem moved along its open motions to where Bᵀ(x − x_start) = 0, and whether it is
-    there.
+    """The problem moved along its open motions so that Bᵀ(x − x_start) = 0, and whether this was
+    reached.
 
-    Gauss–Newton steps, of a radian and a factor e at most; Newton's when near, which take long to
-    compile, but reach what is deformed by half (without: `by_table.move_into_datum`). Until
-    rounding: no move at all, or a small one that is no smaller than the one before."""
+    Gauss–Newton steps, limited to a radian and a factor e; Newton steps near the solution, which
+    take long to compile but converge for strong deformations (without them:
+    `by_table.move_into_datum`). Iterated to rounding: no motion at all, or a small one that does
+    not decrease."""
     if plan.datum is None:
         return values, jnp.asarray(True)
     plan = leave_held(declared, plan, values)
@@ -174,19 +174,20 @@ def move_to_datum(
 
 
 def moves_on(size, distance, before, count):
-    """Whether a motion into the datum goes on: after steps of `distance`, and `before` that one."""
+    """Whether a motion to the datum continues after a step of `distance` and a previous one of
+    `before`."""
     falling = (distance > 1e-6 * size) | (distance < 0.5 * before)
     return (distance > THERE * size) & falling & (count < MOST_MOTIONS)
 
 
 def limited(step, curved: tuple[int, ...]):
-    """A step of the motions that is not longer than `LONGEST` in any of the curved ones."""
+    """A step of the motions, limited to `LONGEST` in the curved ones."""
     longest = abs(step[np.array(curved, int)]).max(initial=0.0)
     return step / (longest / LONGEST).clip(1.0)
 
 
 def largest(holding: Tangent, tables: Values):
-    """The largest number of the rows that hold the datum; in NumPy of what is NumPy's."""
+    """The largest value in the datum rows; NumPy for NumPy input."""
     where = np.where if all(isinstance(w, np.ndarray) for w in holding.values()) else jnp.where
     return max(
         where(weight.max(1) > 0, abs(x.reshape(len(weight), -1)).max(1), 0.0).max()
@@ -225,8 +226,8 @@ def _missing(tau, fixed, given):
 
 
 def attach_motion(declared: Declared, plan: Plan, values: Values, start: Values) -> Values:
-    """`values`, all but in the datum, moved into it; a function of the values and of what they
-    start from that can be differentiated to every order."""
+    """`values`, nearly in the datum, moved into it; a function of the values and their start values
+    that is differentiable to any order."""
     if plan.datum is None:
         return values
     still, fixed = jnp.zeros(plan.datum.gauge.shape[1]), (declared, plan)
@@ -235,7 +236,7 @@ def attach_motion(declared: Declared, plan: Plan, values: Values, start: Values)
         datum = present(leave_held(declared, plan, of).datum)
         return _moved(declared, plan, datum.gauge @ tau, values)
 
-    # What is missing first, so that derivatives are taken where nothing moves.
+    # First remove the remaining motion, so that derivatives are taken at zero motion.
     known = jax.lax.stop_gradient((values, start))
     slope = jax.jacfwd(_missing)(still, fixed, known)
     values = along(-jnp.linalg.solve(slope, _missing(still, fixed, known)), known[0], values)
@@ -244,7 +245,7 @@ def attach_motion(declared: Declared, plan: Plan, values: Values, start: Values)
 
 
 def _moved(declared, plan, motion, values):
-    """All tables moved; what is held stays."""
+    """All tables moved, except held values."""
     moved, free = dict(values), free_of_tables(plan, declared, values)
     for name, act in declared.motions.actions:
         if name not in values:
@@ -256,7 +257,7 @@ def _moved(declared, plan, motion, values):
 
 
 def free_of_tables(plan: Plan, declared: Declared, values: Values) -> dict[str, Array]:
-    """1 for every direction of every table that is free, 0 where it is held."""
+    """1 for every free direction of every table, 0 for held ones."""
     free = zeros_of_tables(declared, values)
     for group in plan.groups.values():
         for m in (m for m in group.members if m.table in free):
@@ -273,7 +274,7 @@ def zeros_of_tables(declared: Declared, values: Values) -> dict[str, Array]:
 
 
 def contract(plan: Plan, B: Tangent, x: Tangent):
-    """Bᵀx over all rows; x may have a last axis of its own."""
+    """Bᵀx over all rows; x may have an additional last axis."""
     parts = {name: jnp.einsum("nwk,nw...->k...", b, x[name]) for name, b in B.items()}
     e = plan.eliminated
     kept = sum(part for name, part in parts.items() if name != e)

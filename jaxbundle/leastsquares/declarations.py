@@ -1,6 +1,6 @@
-"""What a user declares: tables of unknowns, and kinds of observations of them.
+"""User declarations: tables of unknowns, and kinds of observations.
 
-A problem that is no network at all:
+A problem without photographs:
 
     height = Table("height", start)                                                   # [n]
     levelled = Kind("levelled difference", lambda a, b, dh: b - a - dh, of=("height", "height"))
@@ -20,23 +20,22 @@ from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Space, Vector
 
 OF_THE_VALUES: Any = None
-"""Stands for a space until a table is made: the one that its values suggest."""
+"""Placeholder: the space is derived from the values of the table."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """Unknowns of one sort: rows that move alike.
+    """Unknowns of one type.
 
     **Arguments:**
 
-    - `name`: as the kinds of observations call it.
+    - `name`: its name in kinds of observations.
     - `value`: start values, arrays whose first axis is the rows.
-    - `space`: how a row moves; numbers that add if not given.
+    - `space`: how a row is updated; default: numbers that add.
     - `free`: [rows, width], whether each direction of each row is free (one value for all, or one
-      a row); all are if not given. What is held is a given quantity, of which derivatives can be
-      taken.
-    - `labels`: a name for every row, and `parameters` for the directions in which rows move, for
-      people; `title`: what one row is called, if not as the table.
+      per row); default: all. Derivatives with respect to held values are available.
+    - `labels`: a name for every row, and `parameters` for its directions, for reports;
+      `title`: the name of one row, by default that of the table.
     """
 
     name: str
@@ -88,7 +87,7 @@ class Table:
         return len(jax.tree.leaves(self.value)[0])
 
     def rows_of(self, labels, kind: str) -> np.ndarray:
-        """The rows of these labels, which observations of a kind touch."""
+        """The rows with these labels, as touched by observations of a kind."""
         place = {self.label(row): row for row in range(self.rows)}
         missing = next((name for name in labels if name not in place), None)
         if missing is not None:
@@ -110,17 +109,17 @@ class Kind:
 
     **Arguments:**
 
-    - `name`: of the kind, as it is reported; a σ0 group of its own.
-    - `residual`: `(blocks…, measured) -> residuals`, computed minus observed. Of a table of vectors
-      a block is an array [m] (a number where the table is [rows]), of poses a `Posed`. It returns
-      one number or an array [r]; with `scalars`, blocks and `measured` are tuples of scalars, and
-      so is what it returns: quicker where there are many observations.
+    - `name`: of the kind, used in reports; each kind is a variance group.
+    - `residual`: `(blocks…, measured) -> residuals`, computed minus observed. A block of a table of
+      vectors is an array [m] (a number if the table is [rows]), of poses a `Posed`. It returns one
+      number or an array [r]; with `scalars`, blocks, `measured` and the return value are tuples of
+      scalars, which is faster for many observations.
     - `of`: the names of the tables it touches, one for each block (one table may be touched twice).
     - `axes`: names of the residuals ("x", "y"), for reports.
-    - `snooped`: how it is tested for blunders, and removed: `"whole"` with all of its residuals,
-      `"single"` each residual by itself, `""` never, as priors.
-    - `invariant`: it does not change when the whole problem is moved (see `Motions`), as image
-      points do not: such kinds are not asked about the datum.
+    - `snooped`: how it is tested for blunders and removed: `"whole"` with all of its residuals,
+      `"single"` each residual separately, `""` never, like priors.
+    - `invariant`: unchanged by motions of the whole problem (see `Motions`), like image
+      points: such kinds do not affect the datum defect.
     """
 
     name: str
@@ -141,15 +140,15 @@ class Kind:
 
 @dataclasses.dataclass(frozen=True)
 class Motions:
-    """Motions of the whole problem that may be left open by its observations, as similarities are
-    by image points: the datum.
+    """Motions of the whole problem that its observations may leave open, as image points leave
+    similarities open: the datum.
 
     **Arguments:**
 
     - `names`: of the parameters of a motion ("shift X", …, "scale").
-    - `actions`: by table, `(motion, value) -> value` of one row; motion 0 moves nothing, and moving
-      along one direction by 1 twice is moving by 2 (canonical coordinates).
-    - `curved`: parameters whose motions are no straight lines (rotations, scale).
+    - `actions`: by table, `(motion, value) -> value` of one row; motion 0 is the identity, and
+      moving twice by 1 along one direction is moving by 2 (canonical coordinates).
+    - `curved`: parameters whose motions are not straight lines (rotations, scale).
     """
 
     names: tuple[str, ...]
@@ -200,7 +199,7 @@ class Observations:
     def resolved(self, tables: Sequence[Table]) -> "Observations":
         """The same with row numbers for labels.
 
-        **Raises:** `InputError` for a table that is not there, or a label that it does not have."""
+        **Raises:** `InputError` for an unknown table or label."""
         called = {t.name: t for t in tables}
         unknown = next((name for name in self.kind.of if name not in called), None)
         if unknown is not None:
@@ -213,7 +212,7 @@ class Observations:
         return dataclasses.replace(self, rows=rows)
 
     def label(self, tables: Sequence[Table], row: int) -> str:
-        """An observation in words: its kind and what it touches."""
+        """An observation in words: its kind and the rows it touches."""
         called = {t.name: t for t in tables}
         rows = zip(self.kind.of, self.rows)
         touched = (f"{called[t].title} {called[t].label(int(r[row]))}" for t, r in rows)
@@ -244,7 +243,7 @@ class Observations:
 
 
 def _arrays(what: str, tree: PyTree) -> PyTree[np.ndarray]:
-    """A tree of arrays, or of lists of numbers, as arrays; what is masked is NaN."""
+    """A tree of arrays, or of lists of numbers, as arrays; masked values are NaN."""
     number = lambda x: numeric_array(what, x, "arrays of numbers").astype(float)
     return jax.tree.map(number, tree, is_leaf=lambda x: isinstance(x, list))
 

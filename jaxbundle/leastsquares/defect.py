@@ -1,7 +1,7 @@
-"""The datum defect: which motions of a problem its observations leave open, and what holds them.
+"""The datum defect: the motions of a problem left open by its observations, and their constraints.
 
-Found once at the start values, on the host, from one compiled survey of how every table moves and
-what its motions change.
+Computed once at the start values, on the host, from one compiled survey of the motions of every
+table and their effect on observations.
 """
 
 from functools import reduce
@@ -27,21 +27,21 @@ OPEN = 1e-10
 
 
 class CannotHold(InputError):
-    """The unknowns chosen cannot hold the datum; `defect` of its parameters are open."""
+    """The chosen unknowns cannot fix the datum; `defect` of its parameters are open."""
 
     def __init__(self, defect: int):
         super().__init__(
-            f"the chosen unknowns cannot hold the datum, of which {defect} parameters are open"
+            f"the chosen unknowns cannot fix the datum, of which {defect} parameters are open"
         )
         self.defect = defect
 
 
 class Survey(NamedTuple):
-    """What the motions do at the start values, filled rows included.
+    """The effect of the motions at the start values, including padded rows.
 
-    `products`: J·G of all observations that are not invariant; `terms`: the size of what cancels in
-    it; `held`: G on what is held; `moves`, `free`: G and what is free by table, [rows, width, …];
-    `of_groups`: G by group, 0 where something is held."""
+    `products`: J·G of all observations that are not invariant; `terms`: the magnitude of cancelling
+    terms; `held`: G on held unknowns; `moves`, `free`: G and free directions by table, [rows,
+    width, …]; `of_groups`: G by group, 0 for held unknowns."""
 
     products: Float[Array, "rows motions"]
     terms: Float[Array, "rows motions"]
@@ -54,7 +54,7 @@ class Survey(NamedTuple):
 def survey_motions(
     declared: Declared, plan: Plan, data: Data, real: dict[str, Bool[np.ndarray, " rows"]]
 ) -> Survey:
-    """See `Survey`; `real`: by table, which of its rows are not filled in."""
+    """See `Survey`; `real`: by table, which rows are not padding."""
     moves = directions_of_motions(declared, data.start)
     return _survey(declared, plan, data, real, moves)
 
@@ -92,12 +92,12 @@ def _survey(declared, plan, data, real, moves) -> Survey:
 
 
 def find_open_motions(survey: Survey) -> Float[np.ndarray, "motions defect"]:
-    """The combinations of the declared motions that change no observation and nothing held.
+    """The combinations of the declared motions that change no observation and no held unknown.
 
-    Found from the singular values of J·G, its columns scaled by the size of their terms, so that
+    Computed from the singular values of J·G, its columns scaled by the size of their terms, so that
     neither units nor the number of observations matter."""
     products, terms, held = (np.asarray(x) for x in survey[:3])
-    # What cannot be computed from the start values says nothing; the solver will complain.
+    # Non-finite values at the start are ignored here; the solver will report them.
     products, terms, held = (x[np.isfinite(x).all(1)] for x in (products, terms, held))
     scale = np.sqrt((np.concatenate([terms, held]) ** 2).sum(0))
     scale = np.where(scale > 0, scale, 1.0)
@@ -115,8 +115,8 @@ def make_datum(
     plan: Plan, survey: Survey, gauge: Float[np.ndarray, "motions defect"],
     weight: dict[str, np.ndarray], minimal: bool, real: dict[str, Bool[np.ndarray, " rows"]],
 ) -> Datum:  # fmt: skip
-    """The datum held by the unknowns with a `weight` (by table, [rows, width]); `minimal`: by as
-    many of them as there are defects, chosen well spread. `real`: see `survey_motions`.
+    """The datum fixed by the unknowns with a `weight` (by table, [rows, width]); `minimal`: by as
+    many of them as the defect, chosen well spread. `real`: see `survey_motions`.
 
     **Raises:** `CannotHold`."""
     along = lambda moves: {name: np.asarray(rows) @ gauge for name, rows in moves.items()}
@@ -126,7 +126,7 @@ def make_datum(
     directions = np.concatenate([moves[t].reshape(-1, defect) for t in weight])
     candidates = np.concatenate([w.ravel() for w in weight.values()])
     chosen = directions * candidates[:, None]
-    if np.isfinite(chosen).all():  # otherwise the solver will complain
+    if np.isfinite(chosen).all():  # otherwise the solver will report it
         singular = np.linalg.svd(chosen / np.linalg.norm(directions, axis=0), compute_uv=False)
         if len(singular) < defect or singular[-1] < HELD * singular[0]:
             raise CannotHold(defect)
@@ -143,8 +143,8 @@ def make_datum(
 
 
 def _choose_pins(plan: Plan, G) -> dict[str, np.ndarray]:
-    """As many kept unknowns as there are defects, chosen well spread; every kind of direction
-    counts by its own size, unless that is rounding."""
+    """As many kept unknowns as the defect, chosen well spread; every kind of direction is
+    normalised by its size, unless that is rounding."""
     rows, shapes = [], []
     size = {name: np.sqrt((G[name] ** 2).mean((0, 2), keepdims=True)) for name in plan.kept}
     least = max(1e-300, OPEN * max(x.max(initial=0) for x in size.values()))
@@ -163,7 +163,7 @@ def _choose_pins(plan: Plan, G) -> dict[str, np.ndarray]:
 
 
 def _pick_rows(G, candidates):
-    """1 for as many rows of G as it has columns, the independent ones, 0 for the others."""
+    """1 for as many independent rows of G as it has columns, 0 for the others."""
     q, _ = np.linalg.qr(G)
     rows = q * candidates[:, None]
     chosen = np.zeros(len(rows))

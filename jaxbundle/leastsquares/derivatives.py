@@ -1,22 +1,21 @@
-"""Derivatives of the solution with respect to everything that was given.
+"""Derivatives of the solution with respect to all data.
 
 At the minimum, g(y, θ) = ∂(½vᵀPv)/∂y = 0. By the implicit function theorem
 
     exact:          dy/dθ = −H⁻¹·∂g/∂θ,           H = JᵀPJ + Σ p·v·∂²v
     Gauss–Newton:   dy/dθ = −(JᵀPJ)⁻¹·JᵀP·∂v/∂θ
 
-The exact form is the derivative of what the program computes; finite differences confirm it. The
-Gauss–Newton form is the one of error propagation, (JᵀPJ)⁻¹JᵀP for the observations; the two
-differ by the curvature, of the order of the residuals. Both solve with the same structured
-factorisation as the adjustment, so the cost is one solve for each (co)tangent.
+The exact form is the derivative of the computed solution; finite differences confirm it. The
+Gauss–Newton form is that of error propagation, (JᵀPJ)⁻¹JᵀP for the observations; the two
+differ by the curvature, of the order of the residuals. Both use the structured
+factorisation of the adjustment, so the cost is one solve per (co)tangent.
 
-The exact form holds to every order, in forward, reverse and mixed mode: g = 0 is differentiated
-as an equation (`jaxbundle.implicit`), in the tangent space at the solution, and `retract`, the
-chart of that space, with it. A problem that may float is pinned meanwhile (a penalty, 0 in the
-solution, on changes of as many unknowns as there are defects) and moved into its datum as a whole.
-
-The Gauss–Newton form is not the gradient of anything that was computed: its own derivative would
-depend on the order of differentiation, so it is refused. Weights count in it as in JᵀPv.
+The exact form holds to any order, in forward, reverse and mixed mode: the equation g = 0 is
+differentiated (`jaxbundle.implicit`) in the tangent space at the solution, together with `retract`,
+its chart. A problem that may float is pinned meanwhile (by a penalty, zero in the
+solution, on changes of as many unknowns as the defect) and then moved to its datum as a whole.
+The Gauss–Newton form is not the gradient of a computed quantity: its derivative would
+depend on the order of differentiation and is refused. Weights enter it as in JᵀPv.
 """
 
 import dataclasses
@@ -52,27 +51,26 @@ def solve(
     problem: Problem, data: Data | None = None, *, sensitivity: Sensitivity = "exact",
     max_iterations: int = 100, atol: float = 1e-7, **options,
 ) -> Values:  # fmt: skip
-    """Adjusted tables as a differentiable function of the observations and all that is given.
+    """Adjusted tables as a differentiable function of the observations and all other data.
 
     Use it under `jax.jit`, `jax.vmap` (over any field of `data`), `jax.grad`, `jax.jacfwd` and
-    `jax.jacrev`, one inside the other to any order.
+    `jax.jacrev`, nested to any order.
 
     **Arguments:**
 
     - `problem`: from `make_problem`.
-    - `data`: numbers that replace `problem.data` (same shapes): start values, which are those of
-      what is held and of the rows that hold the datum (a rotation is free or held as a whole),
-      measurements, weights.
+    - `data`: numbers that replace `problem.data` (same shapes): start values, including held values
+      and datum rows (a rotation is free or held as a whole), measurements, weights.
     - `sensitivity`: `"exact"` (implicit function theorem with the full Hessian) or
       `"gauss-newton"` ((JᵀPJ)⁻¹JᵀP, error propagation, first order only); see the module.
     - `atol`: stop when no unknown would move by more than this fraction of its σ.
     - `options`: of the solver, see `LeastSquares`.
 
-    **Returns:** the tables; NaN throughout, derivatives too, where the solver did not converge, so
-    that a failure can never be taken for an answer.
+    **Returns:** the tables; all NaN, including derivatives, if the solver did not converge, so that
+    a failure is never mistaken for a solution.
 
-    **Raises:** `InputError` for arguments of another kind, and for a second derivative of the
-    Gauss–Newton form.
+    **Raises:** `InputError` for invalid arguments, and for a second derivative of the Gauss–Newton
+    form.
     """
     one_of("sensitivity", sensitivity, get_args(Sensitivity))
     steps, atol = whole("max_iterations", max_iterations), positive("atol", atol)
@@ -82,14 +80,14 @@ def solve(
     minimum = find(solver, fixed, fixed.start)
     good = converged(minimum.termination)
     values = attach_derivatives(problem.declared, problem.plan, minimum.values, data, sensitivity)
-    # A factor, not a choice: derivatives of what was not found are NaN as well, not 0.
+    # A factor, not `where`: derivatives of a failed solution are NaN as well, not 0.
     found = without_filling(problem, values)
     return jax.tree.map(lambda x: x * jnp.where(good, 1.0, jnp.nan), found)
 
 
 class Linearised(eqx.Module):
-    """The problem at a solution, held constant: what the rules for derivatives need of it. `pins`:
-    the penalty on changes of the kept unknowns, in units of g (none: nothing is open)."""
+    """The problem at a solution, as a constant for the derivative rules. `pins`: the penalty on
+    changes of the kept unknowns, in units of g (none if nothing is open)."""
 
     declared: Declared = eqx.field(static=True)
     plan: Plan
@@ -99,7 +97,7 @@ class Linearised(eqx.Module):
     pins: Tangent
 
     def given(self, data: Data) -> Values:
-        """The solution with everything that was held taken from the start values."""
+        """The solution with held values taken from the start values."""
         free = datum.free_of_tables(self.plan, self.declared, self.values)
         return {
             name: jax.vmap(space.hold)(self.values[name], data.start[name], free[name])
@@ -120,13 +118,15 @@ class Linearised(eqx.Module):
 def attach_derivatives(
     declared: Declared, plan: Plan, values: Values, data: Data, sensitivity: Sensitivity = "exact"
 ) -> Values:
-    """The solution `values` for `data`, in its datum, differentiable by every field of `data`.
+    """The solution `values` for `data`, in its datum, differentiable with respect to every field of
+    `data`.
 
-    One more Newton step makes it exact: the iterations end before their last digits do."""
+    One more Newton step makes it exact, since the iterations end before the last digits
+    converge."""
     values, fixed = jax.lax.stop_gradient((values, data))
     values, _ = datum.move_to_datum(declared, plan, values, fixed.start)
     at = linearise(declared, plan, values, fixed, sensitivity == "exact")
-    # Along what is open the gradient is rounding.
+    # Along open motions the gradient is rounding.
     gradient = gradient_after(zero_tangent(plan), at, fixed)
     gradient = datum.s_transform_transposed(declared, plan, values, gradient)
     step = jax.tree.map(jnp.negative, elimination.solve(at.factor, gradient))
@@ -144,7 +144,7 @@ def linearise(
     equations = exact_equations if exact else normal_equations
     laid = lay_out_data(plan, data)
     normal = Normal(plan, equations(declared, plan, values, laid)[-1])
-    # Conjugate gradients do not mind that something is open.
+    # Conjugate gradients tolerate open motions.
     datum = plan.datum if plan.reduction in FACTORS else None
     pins, own = {} if datum is None else datum.pins, normal.diagonal()
     pins = {g: p * jnp.where(own[g] > 0, own[g], 1.0) for g, p in pins.items()}
@@ -152,7 +152,7 @@ def linearise(
 
 
 def gradient_after(change: Tangent, at: Linearised, data: Data) -> Tangent:
-    """g: that of ½vᵀPv, and of the penalty on the pins, after a change of the unknowns."""
+    """g of ½vᵀPv and of the penalty on the pins, after a change of the unknowns."""
 
     def penalised(change):
         penalty = sum(jnp.sum(pins * change[g] ** 2) for g, pins in at.pins.items())
@@ -164,11 +164,11 @@ def gradient_after(change: Tangent, at: Linearised, data: Data) -> Tangent:
 def _solve_structured(times, at: Linearised, b: Tangent) -> Tangent:
     """H⁻¹·b by the factor, differentiable as the solution of H·x = b.
 
-    Improved once by what it leaves, found without N: as the seminormal equations corrected (Björck
-    1987) it loses the condition of the Jacobian, not its square. Second derivatives need that: of
-    the principal distance of four photographs (condition of N scaled: 1e7) they have 9 digits
-    with it, 5 without. Conjugate gradients have done so themselves."""
-    # In one vector: what is transposed must be linear as a whole.
+    Refined once with the residual, computed without N: like the corrected seminormal equations
+    (Björck 1987) it loses digits with the condition of the Jacobian, not its square. Second
+    derivatives need this: those of the principal distance of four photographs (condition of scaled
+    N: 1e7) have 9 digits with it, 5 without. Conjugate gradients already do this."""
+    # In one vector: the transpose requires one linear function.
     right, unravel = ravel_pytree(b)
     flat = lambda tree: ravel_pytree(tree)[0]
     factor = lambda b: flat(elimination.solve(at.factor, unravel(b)))
@@ -183,7 +183,7 @@ def _solve_structured(times, at: Linearised, b: Tangent) -> Tangent:
 
 @eqx.filter_custom_jvp
 def _propagated(change: Tangent, at: Linearised, data: Data) -> Tangent:
-    """`change` with the derivative of error propagation, which is not differentiated again."""
+    """`change` with the derivative of error propagation, which cannot be differentiated again."""
     return change
 
 
@@ -193,7 +193,7 @@ def _(primals, tangents):
     data, still = differentiable_once(data, ONCE), zero_tangent(at.plan)
 
     def right(data):
-        # J is held constant but for the weights in it.
+        # J is constant except for its weights.
         constant = dataclasses.replace(at.data, weight=data.weight)
         transposed = jax.vjp(lambda change: at.residuals(change, constant), still)[1]
         return transposed(at.residuals(still, data))[0]
@@ -206,7 +206,7 @@ def _(primals, tangents):
 
 
 def _change_of_start(at: Linearised, data: Data) -> Tangent:
-    """How far the start values of what holds the datum are from those at the solution."""
+    """The difference of the datum start values from those at the solution."""
     moved = datum.zeros_of_tables(at.declared, at.values)
     for name in () if at.plan.datum is None else at.plan.datum.weight:
         difference = jax.vmap(at.declared.spaces[name].difference)

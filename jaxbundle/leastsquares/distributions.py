@@ -7,7 +7,7 @@ import math
 
 @functools.cache
 def _special():
-    """scipy's functions: a tenth of a second to import, spared where no quantile is asked for."""
+    """scipy's functions, imported (a tenth of a second) only if needed."""
     return importlib.import_module("scipy.special")
 
 
@@ -48,10 +48,10 @@ def tau_quantile(probability: float, redundancy: float) -> float:
 def critical_w(
     test: str, significance: float, observations: int, redundancy: float, sigma0: float
 ) -> float:
-    """The greatest |w| that is no blunder.
+    """Critical value of |w|.
 
-    Of `"baarda"` (1968) that of a single observation, with the a priori σ; of `"pope"` (1976) that
-    of the largest of n observations, α' = 1 − (1 − α)^(1/n), with the a posteriori σ0.
+    `"baarda"` (1968): for a single observation, with the a priori σ; `"pope"` (1976): for the
+    largest of n observations, α' = 1 − (1 − α)^(1/n), with the a posteriori σ0.
     """
     if test == "baarda":
         return normal_quantile(1 - significance / 2)
@@ -59,10 +59,10 @@ def critical_w(
 
 
 def critical_length(significance: float, residuals: int) -> float:
-    """The greatest length of the longest of n residuals in the plane, in σ: t² ~ χ²₂."""
+    """Critical length of the longest of n residuals in the plane, in σ: t² ~ χ²₂."""
     return math.sqrt(-2 * math.log(_of_one(significance, residuals)))
 
 
 def _of_one(significance: float, observations: int) -> float:
-    """The level of each of n tests of which all together have the given one."""
+    """The level of each of n tests with the given joint level."""
     return -math.expm1(math.log1p(-significance) / max(observations, 1))

@@ -7,7 +7,7 @@ With N = [A W; Wᵀ V] and V block diagonal (Brown 1958; Triggs et al. 2000, sec
     S·x = b − Zᵀ·h                    (`reduced.py`)
     x_e = L⁻ᵀ·(h − Z·x)
 
-Three tiers: the plan is made once a problem, N once an accepted point, this once a damping.
+Three tiers: the plan is made once per problem, N per accepted point, this solve per damping.
 """
 
 import dataclasses
@@ -27,19 +27,19 @@ from jaxbundle.leastsquares.reduced import DenseFactor, Reduced, factorise_dense
 from jaxbundle.types import present
 
 EXACT = 1e-12
-"""Relative residual of a reduced system solved by iteration, where it must be as good as exact.
-With less, rounding may never get there, and what is open drifts."""
+"""Relative residual of a reduced system solved iteratively to full precision. A smaller one may be
+unreachable because of rounding, and open motions drift."""
 PIVOT = 1e-13
-"""A pivot below this fraction of its diagonal element is rounding: nothing determines it."""
+"""A pivot below this fraction of its diagonal element is rounding: the unknown is undetermined."""
 PAIR_ROWS_AT_ONCE = 8192
-"""Pairs whose products are held at the same time."""
+"""Pairs whose products are in memory at the same time."""
 LIFT = 1e-10
-"""Added to normal equations that cannot be solved, in parts of their diagonal."""
+"""Added to unsolvable normal equations, relative to their diagonal."""
 
 
 class Factor(eqx.Module):
-    """N factorised: what is needed to solve with it, and to read blocks of its inverse. `reduced`:
-    the factor of S scaled by `scale`."""
+    """Factorised N, for solving and for blocks of its inverse. `reduced`: the factor of S scaled by
+    `scale`."""
 
     plan: Plan
     reduced: DenseFactor | BandFactor | ConjugateGradients
@@ -62,7 +62,7 @@ def damp(normal: Normal, damping: Float[Array, ""]) -> Normal:
 
 
 def lift(normal: Normal) -> Normal:
-    """N lifted by a little of its diagonal, so that it can be factorised where it is singular."""
+    """N plus a small part of its diagonal, so that it can be factorised if it is singular."""
     N, e = normal.blocks, normal.plan.eliminated
     more = lambda B: B + LIFT * jnp.diagonal(B, axis1=1, axis2=2)[:, :, None] * jnp.eye(B.shape[1])
     own = {name: more(B) for name, B in N.own.items()}
@@ -73,9 +73,9 @@ def lift(normal: Normal) -> Normal:
 def factorise(
     normal: Normal, regular: Bool[Array, ""] | bool = True, tolerance: float = EXACT
 ) -> Factor:
-    """Factorise N, datum directions made regular if `regular`; `tolerance`: of a reduced system
-    solved by iteration. NaN where a pivot is rounding, as where it is negative: chance decides
-    between the two."""
+    """Factorise N, with regularised datum directions if `regular`; `tolerance`: of a reduced system
+    solved iteratively. NaN for pivots that are rounding, like negative ones: only chance separates
+    the two."""
     plan = normal.plan
     S, scale, lower_inverse, Z = reduced_system(normal, regular)
     if plan.reduction == "iterative":
@@ -90,9 +90,9 @@ def factorise(
 def reduced_system(normal: Normal, regular: Bool[Array, ""] | bool = True):
     """S scaled by the diagonal of A; the scale, L⁻¹ and Z.
 
-    What is held gets a one. A problem that may float is singular along its open motions, made
-    `regular` by adding a one to as many diagonal elements (`Datum.pins`): the solution changes
-    along these motions only."""
+    Held unknowns get a one. A problem that may float is singular along its open motions; it is made
+    `regular` by adding a one to as many diagonal elements (`Datum.pins`), which changes the
+    solution along these motions only."""
     plan = normal.plan
     S, lower_inverse, Z = eliminate(normal)
     diagonal = normal.diagonal()
@@ -149,8 +149,8 @@ def solve(factor: Factor, right: Tangent) -> Tangent:
 
 
 def sum_pairs(pairs: Pairs, blocks: int, a, b) -> Float[Array, "blocks w v"]:
-    """Σ aᵀb over the pairs of every block: chunk by chunk one small matrix product of depth
-    (length × w). A quarter of the time of outer products that are scattered."""
+    """Σ aᵀb over the pairs of every block: one small matrix product of depth (length × w) per
+    chunk, a quarter of the time of scattered outer products."""
     a, b = (x.reshape(-1, *x.shape[2:]) for x in (a, b))
     depth, m, n = a.shape[1], a.shape[2], b.shape[2]
 
@@ -179,8 +179,8 @@ def over_pairs(pairs: Pairs, add, sums):
 
 
 def inverse_cholesky(V: Float[Array, "n w w"]) -> Float[Array, "n w w"]:
-    """L⁻¹ of V = L·Lᵀ, written out over scalars (7 ns a row of three; a batched Cholesky takes
-    60); NaN where V is not positive definite."""
+    """L⁻¹ of V = L·Lᵀ, written out over scalars (7 ns per row of three; a batched Cholesky takes
+    60); NaN if V is not positive definite."""
     w = V.shape[-1]
     L, M = {}, {}
     for j in range(w):
@@ -206,9 +206,9 @@ def _lower_times(L, at, W):
 
 @jax.jit
 def _row_major(x):
-    """Blocks in row-major order. Left alone, XLA lays a shared array out to suit one of its readers
-    (the product by chunks), and the gathers of the pairs take three times as long.
+    """Blocks in row-major order. Otherwise XLA chooses the layout of a shared array for one of its
+    readers (the product by chunks), and the gathers of the pairs take three times as long.
 
-    In a function of its own: where a compiled function returns what it constrains, JAX (0.10) lets
-    XLA lay out the other results as it likes, but reads them in the usual order."""
+    A separate function: if a compiled function returns its constrained array, JAX (0.10) lets
+    XLA choose the layout of the other results, but reads them in the default order."""
     return with_layout_constraint(x, Layout(major_to_minor=tuple(range(x.ndim))))

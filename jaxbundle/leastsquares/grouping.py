@@ -1,6 +1,6 @@
-"""What is eliminated, and how the tables that are kept form the block rows of the equations.
+"""The eliminated rows, and the block rows formed by kept tables.
 
-See `plan.py` for the words."""
+See `plan.py` for the terms."""
 
 import dataclasses
 from collections.abc import Hashable, Sequence
@@ -15,21 +15,21 @@ from jaxbundle.leastsquares.plan import Group, Member
 from jaxbundle.types import present
 
 MASKED = 100_000
-"""Of so many eliminated rows it is compiled in whether all of them are free. Of fewer some may be
-held at any time, as data snooping does, by the same program: a mask costs little, compiling much.
+"""From this number of eliminated rows, whether all of them are free is compiled in. With fewer rows
+some may be held by the same program, as in data snooping: a mask costs little, compiling much.
 """
 
 
 @dataclasses.dataclass
 class Choices:
-    """What a plan may be free to choose (lengths of chunks, who shares a group): made once for a
-    large problem, and again for every part of it."""
+    """Free choices of a plan (lengths of chunks, sharing of groups): made once for a large problem
+    and reused for every part of it."""
 
     before: dict[Hashable, Any]
     made: dict[Hashable, Any] = dataclasses.field(default_factory=dict)
 
     def __call__(self, *key, found) -> Any:
-        """What was found, or what was chosen before."""
+        """The given choice, or an earlier one."""
         self.made[key] = self.before.get(key, found)
         return self.made[key]
 
@@ -64,8 +64,8 @@ class Grouping:
     # ------------------------------------------------------------------ what is eliminated
 
     def _rows_that_stay(self):
-        """Rows of the eliminated table that stay in the reduced system: those that one observation
-        ties to another of their table."""
+        """Rows of the eliminated table that stay in the reduced system: those tied by an
+        observation to another row of their table."""
         if self.eliminate is None:
             return None
         table = self.tables[self.eliminate]
@@ -77,14 +77,14 @@ class Grouping:
         return self.choose("stays", found=stays & table.free.any(1))
 
     def _share_observations(self):
-        """Observations of one kind, apart by which of their slots touches an eliminated row."""
+        """Observations of one kind, separated by the slot that touches an eliminated row."""
         shares = []
         for o, given in enumerate(self.observations):
             slots = [s for s, name in enumerate(given.kind.of) if name == self.eliminate]
             slot_of = np.full(given.number, -1)
             for s in slots:
                 slot_of[~present(self.stays)[given.rows[s]]] = s
-            # Two rows of the table that are both held may meet: the last is called eliminated.
+            # Two held rows of the table may meet: the last counts as eliminated.
             for slot in self.choose("slots", o, found=np.unique(slot_of).tolist()):
                 rows = np.flatnonzero(slot_of == slot)
                 shares.append(Share(o, rows, None if slot < 0 else slot))
@@ -119,12 +119,12 @@ class Grouping:
             rows = np.flatnonzero(~stays) if stays.any() else None
             self.members[name] = [(name, 0, rows)]
             self.row_in = place(~stays)
-        # In the order in which JAX has them, too, wherever the plan goes.
+        # In the order of JAX's pytrees.
         self.kept = sorted(g for g in self.members if g != name)
 
     def _meet_always(self, group, name):
-        """Whether the rows of a table occur in just the observations of eliminated rows in which
-        those of a group do, row by row."""
+        """Whether the rows of a table occur in exactly the same observations of eliminated rows as
+        those of a group."""
         first = self.members[group][0][0]
         if self.tables[first].rows != self.tables[name].rows:
             return False

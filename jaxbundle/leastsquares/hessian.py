@@ -2,7 +2,7 @@
 
 It differs from JᵀPJ by Σ p·v·∂²v, the curvature of the observation equations and, by
 `Space.moved`, which is right to second order, that of the manifolds. Second derivatives come from
-the function of one observation, forward over reverse, and go where those of Gauss and Newton go
+the function of one observation, forward over reverse, and are summed like those of Gauss–Newton
 (`normal.Sums`).
 """
 
@@ -29,7 +29,7 @@ from jaxbundle.types import present
 
 
 def exact_equations(declared: Declared, plan: Plan, values: Values, laid: Laid):
-    """½·vᵀPv, its gradient and its Hessian; as `normal.normal_equations`."""
+    """½·vᵀPv, its gradient and its Hessian, like `normal.normal_equations`."""
     plan, laid = fill_places(plan, laid)
     prepared, sums = prepare(declared, values), Sums(plan)
     for number, part in enumerate(plan.parts):
@@ -71,7 +71,7 @@ class _HalfSquare:
 
 
 def _blocks(declared: Declared, plan: Plan, part, g, H):
-    """What a part adds, see `Sums.add_part`."""
+    """The contribution of a part, see `Sums.add_part`."""
     widths = widths_of(declared, plan, part)
 
     def columns(slots, start, stop):

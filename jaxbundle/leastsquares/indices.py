@@ -1,12 +1,12 @@
-"""Index arrays of a plan while it is made on the host, and their last step.
+"""Index arrays of a plan during planning on the host, and their finishing.
 
-Three rules serve all of them:
+Three rules apply to all of them:
 
-- −1 stands for nothing. Every list that is pointed into ends with at least one empty row, and −1
+- −1 means none. Every list that is indexed ends with at least one empty row, and −1
   becomes the number of that row.
-- Every array knows along which list its first axis runs (`along`), so that filling up to rounder
+- Every array knows along which list its first axis runs (`along`), so that padding to round
   sizes, or to the common size of several devices, is one function for all.
-- What is filled in is nothing: −1 in an index, a stated value in a column.
+- Padding is −1 in an index and a given value in a column.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 STEPS = 8
-"""Round sizes between one power of two and the next: at most an eighth is filled in."""
+"""Round sizes between one power of two and the next: at most an eighth is padding."""
 
 
 @dataclasses.dataclass
@@ -32,7 +32,7 @@ class Index:
 
 @dataclasses.dataclass
 class Column:
-    """Values along a list; `multiple`: its size is one of so many."""
+    """Values along a list; `multiple`: its size is a multiple of this."""
 
     rows: np.ndarray
     along: Hashable
@@ -40,7 +40,7 @@ class Column:
 
 
 def as_index(rows: np.ndarray, along: Hashable, into: Hashable, times: int = 1) -> Any:
-    """An `Index`, which stands in a plan for the array that `finish` makes of it."""
+    """An `Index`, typed as the array that `finish` makes of it."""
     return Index(rows, along, into, times)
 
 
@@ -57,7 +57,7 @@ def is_leaf(x) -> bool:
 
 
 def count(plan) -> Sizes:
-    """The sizes of all lists of a plan as they are, an empty row at the end included."""
+    """The sizes of all lists of a plan, including an empty last row."""
     sizes: Sizes = {}
     for leaf in jax.tree.leaves(plan, is_leaf=is_leaf):
         if is_leaf(leaf):
@@ -66,7 +66,7 @@ def count(plan) -> Sizes:
 
 
 def common(all_sizes: Iterable[Sizes], rounder: Callable[[Hashable, int], int]) -> Sizes:
-    """Sizes that hold each of these, made rounder."""
+    """Rounded sizes that hold each of these."""
     largest: Sizes = {}
     for sizes in all_sizes:
         for key, size in sizes.items():

@@ -2,13 +2,13 @@
 
 S = A − Zᵀ·Z is only applied to vectors (Agarwal et al. 2010): Z·x spreads changes of kept rows over
 their incidences, Zᵀ gathers them again. No pair of incidences is ever listed, so time and memory
-grow with the incidences alone. The blocks of S of every kept row, L·Lᵀ, precondition
-(Schur–Jacobi): solved is
+grow with the incidences alone. The blocks of S of every kept row, L·Lᵀ, are the preconditioner
+(Schur–Jacobi):
 
     (L⁻¹·S·L⁻ᵀ)·y = L⁻¹·b,   x = L⁻ᵀ·y,
 
-where every element of y is a change in units of its conditional σ, so that one norm measures all.
-A problem that may float is singular but consistent, which conjugate gradients do not mind.
+where every element of y is a change in units of its conditional σ, so that one norm fits all. A
+problem that may float is singular but consistent, which conjugate gradients tolerate.
 """
 
 from functools import partial
@@ -25,11 +25,11 @@ from jaxbundle.leastsquares.normal import Normal, Tangent, agreed, gather, scatt
 from jaxbundle.leastsquares.reduced import Reduced
 
 MOST_STEPS, MOST_MORE = 2000, 100
-"""Steps of conjugate gradients, and those that improve what they found."""
+"""Steps of conjugate gradients, and of their refinement."""
 REACHED = 1e-10
-"""A relative residual that rounding allows in one go: below it the search directions are noise, and
-the steps may lead anywhere, above all along what is open. What is to be exact is improved once
-more, and is NaN if even this was not reached."""
+"""The relative residual that rounding allows in one run: below it the search directions are noise,
+and steps may drift, above all along open motions. Solutions of full precision are refined once
+more, and are NaN if even this was not reached."""
 LEAST = 1e-300
 
 
@@ -53,8 +53,8 @@ class ConjugateGradients(eqx.Module):
         operator = lx.FunctionLinearOperator(product, jax.eval_shape(lambda: right), tag)
 
         def improved(y, left, tolerance, steps):
-            """y with what the residual `left` tells, if that makes it less; and what is left."""
-            # lineax asks for a float, and takes an array
+            """y refined with the residual `left`, if that decreases it; and the new residual."""
+            # lineax annotates a float, but accepts an array
             limit: Any = jnp.maximum(tolerance * optx.two_norm(left), LEAST)
             method = lx.CG(rtol=0.0, atol=limit, norm=optx.two_norm, max_steps=steps)
             change = lx.linear_solve(operator, left, method, throw=False).value
@@ -76,7 +76,7 @@ class ConjugateGradients(eqx.Module):
 
     @property
     def pivots(self) -> Float[Array, " n"]:
-        """Those of every block by itself."""
+        """The pivots of every block alone."""
         roots = [jnp.diagonal(M, axis1=1, axis2=2).ravel() for M in self.lower_inverse.values()]
         return 1 / jnp.concatenate(roots)
 
@@ -97,10 +97,11 @@ def precondition(normal: Normal, Z, S: Reduced, scale: Tangent, tolerance) -> Co
 
 
 def inverse_of_lower(B: Float[Array, "rows w w"]) -> Float[Array, "rows w w"]:
-    """L⁻¹ of B = L·Lᵀ: elimination takes (B, 1) to (Lᵀ, L⁻¹); NaN where B is not positive definite.
+    """L⁻¹ of B = L·Lᵀ: elimination transforms (B, 1) to (Lᵀ, L⁻¹); NaN if B is not positive
+    definite.
 
-    A loop over the w columns: LAPACK's loop over the rows waits inside the pool of threads, in
-    which the programs of several devices would wait for each other.
+    A loop over the w columns: LAPACK's loop over the rows waits inside the thread pool, where
+    the programs of several devices could deadlock.
     """
     w = B.shape[1]
 

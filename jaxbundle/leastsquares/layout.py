@@ -8,16 +8,16 @@ from jaxbundle.leastsquares.plan import Key, Pairs
 
 CHUNK_LENGTHS = (256, 64, 16)
 MOST_EMPTY = 0.1
-"""Chunks may make a part longer by this fraction."""
+"""Chunks may pad a part by this fraction."""
 SMALL = 2000
-"""Parts with fewer observations have chunks of one, and compile in a tenth of the time."""
+"""Parts with fewer observations have chunks of length one, and compile in a tenth of the time."""
 PAIR_CHUNKS, FEW_PAIR_CHUNKS = (256, 32, 4), (8,)
 FEW_PAIRS = 50_000
 """Lists of fewer pairs have chunks of one length, which compiles in a third of the time."""
 
 
 def chunk_length(major: Int[np.ndarray, " n"]) -> int:
-    """The longest chunks of rows of one major that leave few places empty."""
+    """The longest chunks of rows of one major with little padding."""
     _, number = np.unique(major, return_counts=True)
     fits = (
         length for length in CHUNK_LENGTHS
@@ -27,8 +27,8 @@ def chunk_length(major: Int[np.ndarray, " n"]) -> int:
 
 
 def lay_out(major: Int[np.ndarray, " n"], minor: Int[np.ndarray, " n"], length: int):
-    """Rows sorted by (major, minor) in chunks of one major: the row in every place (a short chunk
-    repeats its last), and whether the place is used."""
+    """Rows sorted by (major, minor) in chunks of one major: the row at every position (a short
+    chunk repeats its last), and whether the position is used."""
     order = np.lexsort((minor, major))
     if not len(order):
         return order, np.zeros(0, bool)
@@ -50,7 +50,7 @@ def pairs_between(a: Int[np.ndarray, " n"], b: Int[np.ndarray, " m"]):
 
 
 def pair_chunk_lengths(pairs: int) -> tuple[int, ...]:
-    """The lengths of the chunks of so many pairs; none without pairs."""
+    """The chunk lengths for this number of pairs; none without pairs."""
     return () if not pairs else FEW_PAIR_CHUNKS if pairs < FEW_PAIRS else PAIR_CHUNKS
 
 

@@ -1,10 +1,9 @@
 """The derivatives of the observations, in blocks, by automatic differentiation.
 
 Each observation touches few rows, so its derivatives are a few small blocks. They come from one
-pure function of one observation (`rows.residual_of`): by reverse mode over its scalars where there
-are many observations (straight loops; measured 5 to 7 ms for 83 718 image points, 29 by forward
-mode), by forward mode along all directions at once where there are few (a tenth of the loops to
-compile).
+pure function of one observation (`rows.residual_of`): in reverse mode over its scalars for many
+observations (plain loops; measured 5 to 7 ms for 83 718 image points, 29 in forward mode), in
+forward mode along all directions at once for few (a tenth of the loops to compile).
 """
 
 import dataclasses
@@ -18,26 +17,26 @@ from jaxbundle.leastsquares.rows import Declared, Laid, Residual, diagonal_of, o
 
 
 def widths_of(declared: Declared, plan: Plan, part: Part) -> tuple[int, ...]:
-    """The directions of every slot of a part in which it is differentiated."""
+    """The directions in which every slot of a part is differentiated."""
     of = declared.kinds[part.observations].of
     used = {s for touch in part.touches for s, _ in touch.slots} | {part.slot}
     return tuple(declared.spaces[name].width if s in used else 0 for s, name in enumerate(of))
 
 
 def columns_of(widths, slots, start: int, stop: int) -> list[tuple[int, int] | None]:
-    """What stands in the columns of a touch: slot and direction, None where nothing."""
+    """The columns of a touch: slot and direction, None if unused."""
     place = {first + j: (slot, j) for slot, first in slots for j in range(widths[slot])}
     return [place.get(c) for c in range(start, stop)]
 
 
 def differentiate(declared: Declared, plan: Plan, number: int, prepared, laid: Laid):
     """Residuals [chunks, length, r] of a part, the blocks of its touches, [chunks, length, r, w]
-    each, and of its eliminated rows (None where it has none). Columns of what is held are zero."""
+    each, and of its eliminated rows (None without). Columns of held unknowns are zero."""
     part = plan.parts[number]
     kind, widths = declared.kinds[part.observations], widths_of(declared, plan, part)
     rows = _Rows(residual_of(declared, part), widths, part.large)
     r, found = over(part, kind, prepared, laid, number, rows)
-    # Computed once, not once more in every loop that takes some of its columns.
+    # Computed once, not again in every loop that uses some of its columns.
     r, found = (r, found) if part.large else jax.lax.optimization_barrier((r, found))
     shape, starts = r[0].shape, np.cumsum((0, *widths))
 
@@ -77,7 +76,7 @@ class _Rows:
 
 
 def _reverse(residual, widths, row):
-    """Residuals, and for each of them its derivatives: tuples of scalars."""
+    """Residuals and the derivatives of each: tuples of scalars."""
     weight = row[2]
     nil = jnp.zeros_like(jax.tree.leaves(weight)[0])
     still = tuple((nil,) * w for w in widths)
@@ -101,6 +100,6 @@ def _forward(residual, widths, row):
 
 
 def _where_weighted(weight, i, columns):
-    """Zero where an observation has no weight, even where it has no derivative."""
+    """Zero for an observation without weight, even if its derivative is not finite."""
     w = diagonal_of(weight)[i]
     return jax.tree.map(lambda x: jnp.where(w > 0, x, 0.0), columns)

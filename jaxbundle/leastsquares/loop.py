@@ -1,8 +1,8 @@
-"""The iterations of a problem whose normal equations have a layout of their own.
+"""The iterations of a problem with its own layout of the normal equations.
 
-Which step is accepted and how far the next one may go is the rule of `search.py`, when to stop and
-why that of `stopping.py`; here stands only their order. Everything is traced, so that many problems
-can be iterated under `vmap` or `lax.map`.
+Acceptance of steps and step sizes follow `search.py`, stopping `stopping.py`; this module only
+puts them in order. Everything is traced, so that many problems can be iterated under `vmap` or
+`lax.map`.
 """
 
 from collections.abc import Callable
@@ -18,8 +18,8 @@ from jaxbundle.leastsquares.stopping import LIMIT, Approach, Tolerance
 
 
 class Loop(eqx.Module):
-    """The accepted unknowns `at`, with the normal equations and ½vᵀPv there; the unknowns to be
-    tried next; why the iterations ended, and how many there were."""
+    """The accepted unknowns `at`, with the normal equations and ½vᵀPv there; the unknowns to try
+    next; the termination, and the number of iterations."""
 
     at: PyTree
     trial: PyTree
@@ -42,16 +42,16 @@ def iterate(
     max_steps: int | Int[Array, ""],
     go: bool | Array = True,
 ) -> Loop:
-    """Iterate from start values until the rule of stopping has a reason to end.
+    """Iterate from start values until a stopping criterion is met.
 
     **Arguments:**
 
     - `linearise(x)`: the normal equations at x, a tree of arrays, and ½vᵀPv, not finite where it
       cannot be computed.
     - `step(equations, λ)`: the change δ = −(N + λ·D)⁻¹·g, and the numbers −gᵀδ and δᵀ·D·δ.
-    - `retract(x, δ)`: where the change leads.
-    - `tolerance(equations)`: what counts as nothing.
-    - `go`: false, nothing is done.
+    - `retract(x, δ)`: applies the change.
+    - `tolerance(equations)`: the tolerances.
+    - `go`: if false, nothing is done.
     """
 
     def body(loop: Loop) -> Loop:

@@ -1,7 +1,7 @@
-"""Motions that observations may leave open: shifts, and similarities of places and poses.
+"""Motions that observations may leave open: shifts, and similarities of points and poses.
 
-Those that leave a place where it is do so as finite motions too: shift, rotation and scale are
-made together, for a unit of time, not one after the other (canonical coordinates).
+A motion that keeps a point fixed to first order also keeps it as a finite motion: shift, rotation
+and scale act simultaneously over a unit of time, not in sequence (canonical coordinates).
 """
 
 import dataclasses
@@ -23,25 +23,25 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(20)
 
 
 def similarity(points: Sequence[str] = ("point",), poses: Sequence[str] = ()) -> Motions:
-    """The seven parameters of space that move tables of points [n, 3] and of poses."""
+    """The seven similarity parameters of space, for tables of points [n, 3] and of poses."""
     moved = [(name, _move_point) for name in points] + [(name, move_pose) for name in poses]
     return Motions(SEVEN, tuple(moved), curved=(3, 4, 5, 6))
 
 
 def similarity_of_plane(points: Sequence[str]) -> Motions:
-    """Two shifts, a rotation and a scale that move tables of points [n, 2]."""
+    """Two shifts, a rotation and a scale, for tables of points [n, 2]."""
     names = ("shift X", "shift Y", "rotation", "scale")
     return Motions(names, tuple((name, _move_in_plane) for name in points), curved=(2, 3))
 
 
 def shift(table: str) -> Motions:
-    """One constant for all rows of a table of numbers, as the level of heights."""
+    """One constant for all rows of a table of numbers, such as the level of heights."""
     return Motions(("shift",), ((table, _shift),))
 
 
 def likely_motions(tables: Sequence[Table]) -> Motions | None:
-    """What is most likely open: a similarity of all tables of three coordinates and poses, else of
-    two, else a shift of the first table of numbers."""
+    """The default: a similarity of all tables of three coordinates and poses, else of two
+    coordinates, else a shift of the first table of numbers."""
     vectors = {n: [t.name for t in tables if t.space == Vector(n)] for n in (0, 2, 3)}
     poses = [t.name for t in tables if isinstance(t.space, Pose)]
     if poses or vectors[3]:
@@ -53,9 +53,8 @@ def likely_motions(tables: Sequence[Table]) -> Motions | None:
 
 @dataclasses.dataclass(frozen=True)
 class Together:
-    """`move(motion, value)` for motions whose shift comes after their rotation and scale, with all
-    of a motion made together; `transform(motion, place)` for the shifts, which are the first `size`
-    numbers."""
+    """`move(motion, value)` of motions whose shift follows rotation and scale, for simultaneous
+    motions; `transform(motion, place)` for the shifts, which are the first `size` numbers."""
 
     move: Callable
     transform: Callable
@@ -81,14 +80,14 @@ def _transform_in_plane(motion, value):
 
 _move_point = Together(transform_point, transform_point, 3)
 move_pose = Together(_transform_pose, transform_point, 3)
-"""A pose, or a frame, that moves with the places of space."""
+"""A pose, or a frame, that moves with space."""
 _move_in_plane = Together(_transform_in_plane, _transform_in_plane, 2)
 
 
 def _together(transform, motion, size: int):
-    """The motion whose shift comes after its rotation and scale, for one in which all are made
-    together: ∫₀¹ A(u)·t du, A(u) the rotation and scale after the time u (Gauss–Legendre, to
-    rounding up to two turns and a scale of e⁵)."""
+    """The motion with shift after rotation and scale that equals a simultaneous one: ∫₀¹ A(u)·t du,
+    A(u) the rotation and scale after the time u (Gauss–Legendre, to rounding up to two turns and a
+    scale of e⁵)."""
     still = motion.at[:size].set(0.0)
     moved = jax.vmap(lambda u: transform(u * still, motion[:size]))((NODES + 1) / 2)
     return still.at[:size].set(WEIGHTS / 2 @ moved)

@@ -1,4 +1,4 @@
-"""Names for the unknowns, for people, and for those that the observations do not determine."""
+"""Names of unknowns for reports, and the names of undetermined ones."""
 
 import dataclasses
 
@@ -17,14 +17,14 @@ from jaxbundle.leastsquares.rows import Data, Declared, Values, lay_out_data
 from jaxbundle.types import present
 
 INDETERMINATE = 1e-12
-"""Scaled eigenvalues of the normal matrix below this are rounding: nothing determines them."""
+"""Scaled eigenvalues of the normal matrix below this are rounding: undetermined directions."""
 SHARE = 0.05
-"""An unknown that takes part in undetermined directions by more than this is named."""
+"""An unknown with a larger part in undetermined directions is listed."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Name:
-    """One unknown: what it belongs to (kind and id), and which of its parameters it is."""
+    """One unknown: kind and id of its owner, and its parameter."""
 
     kind: str
     id: str
@@ -35,7 +35,7 @@ class Name:
 
 
 def place_of(problem: Problem, group: str, row: int, column: int) -> tuple[str, int, int]:
-    """Table, row and direction of what stands in a column of a row of a group."""
+    """Table, row and direction of a column of a row of a group."""
     for m in problem.plan.groups[group].members:
         if m.start <= column < m.start + m.width:
             return m.table, row if m.rows is None else int(m.rows[row]), column - m.start
@@ -63,7 +63,7 @@ def undetermined(problem: Problem, values: Values) -> list[str]:
     rows = [] if V is None else _undetermined_rows(problem, V)
     if not np.isfinite(S).all():
         return rows
-    if G.shape[1]:  # The datum is held otherwise.
+    if G.shape[1]:  # The datum is fixed separately.
         q, _ = np.linalg.qr(G)
         S = S + q @ q.T
     eigenvalues, vectors = np.linalg.eigh(S) if S.size else (np.zeros(0), S)
@@ -74,7 +74,7 @@ def undetermined(problem: Problem, values: Values) -> list[str]:
 
 
 def scaled_system(problem: Problem, values: Values):
-    """S scaled by the diagonal it has before anything is eliminated, in the order of
+    """S scaled by its diagonal before elimination, in the order of
     `kept_unknowns`; V of the eliminated rows (None: there are none); the open directions."""
     plan, data = problem.plan, pad_data(problem, problem.data)
     values = pad_values(problem, values)
@@ -97,7 +97,7 @@ def _scaled(declared: Declared, plan: Plan, values: Values, data: Data, moves):
 
 
 def _undetermined_rows(problem: Problem, V) -> list[str]:
-    """Eliminated rows that are not determined even with everything else given."""
+    """Eliminated rows that are undetermined even if all other unknowns are given."""
     e = present(problem.plan.eliminated)
     group, table = problem.plan.groups[e], problem.table(e)
     finite = np.isfinite(V).all((1, 2))

@@ -1,6 +1,6 @@
 """The normal equations N·δ = −g in blocks.
 
-    N = ⎡ A   W ⎤   A: kept groups, `own` diagonal blocks and `off` blocks beside them
+    N = ⎡ A   W ⎤   A: kept groups, `own` diagonal blocks and `off` off-diagonal blocks
         ⎣ Wᵀ  V ⎦   V: one small block for each eliminated row; W: one for each incidence
 
 They are filled either from the Jacobian (N = JᵀPJ, Gauss–Newton) or from second derivatives of
@@ -30,8 +30,8 @@ AnyTangent = Mapping[str, Rows]
 
 
 class NormalBlocks(eqx.Module):
-    """N in blocks; rows and columns of what is held are zero. `own` and `off` are sums over all
-    devices, the others belong to the eliminated rows of one. `metric`: D of the damping."""
+    """N in blocks; rows and columns of held unknowns are zero. `own` and `off` are sums over all
+    devices, the others belong to the eliminated rows of one device. `metric`: D of the damping."""
 
     own: dict[str, Float[Array, "rows w w"]]
     off: dict[Key, Float[Array, "blocks w v"]]
@@ -93,13 +93,13 @@ lx.diagonal.register(Normal)(lambda operator: operator.diagonal())
 
 
 def total(plan: Plan, parts):
-    """The sum over the devices of what each has found for its own eliminated rows."""
+    """The sum over the devices of the contributions of their eliminated rows."""
     return parts if plan.axis is None else jax.lax.psum(parts, plan.axis)
 
 
 def agreed(plan: Plan, value):
-    """The mean over the devices of what should be the same on all, so that it is, to the last
-    digit: devices that decide differently would wait for each other for ever."""
+    """The mean over the devices of values that should be the same on all, to make them identical to
+    the last digit: devices that decide differently would deadlock."""
     return value if plan.axis is None else jax.lax.pmean(value, plan.axis)
 
 
@@ -149,7 +149,7 @@ def normal_equations(
 ) -> tuple[Float[Array, ""], Tangent, NormalBlocks]:
     """½·vᵀPv, its gradient g = Jᵀr and N = JᵀJ at these values (the weights are in r and J).
 
-    Traced once for a plan: the solver needs the shapes of what it returns before the values."""
+    Traced once per plan: the solver needs the shapes of its results before the values."""
     prepared, sums = prepare(declared, values), Sums(plan)
     for number, part in enumerate(plan.parts):
         r, touches, E = differentiate(declared, plan, number, prepared, laid)
@@ -158,7 +158,7 @@ def normal_equations(
 
 
 def _products_of(part: Part, r, touches, E):
-    """What a part adds by Gauss and Newton, see `Sums.add_part`: products of the blocks of J."""
+    """The Gauss–Newton contribution of a part, see `Sums.add_part`: products of the blocks of J."""
     tall = [J.reshape(J.shape[0], -1, J.shape[-1]) for J in touches]
     right, eliminated, W = r.reshape(r.shape[0], -1), None, []
     if E is not None:
@@ -173,7 +173,7 @@ def _products_of(part: Part, r, touches, E):
 
 
 class Sums:
-    """Blocks and gradient as they are added up, part by part."""
+    """Sums of blocks and gradient over the parts."""
 
     def __init__(self, plan: Plan):
         self.plan = plan
@@ -204,7 +204,7 @@ class Sums:
             self._add_incidences(touch, N)
 
     def _add_couple(self, part, couple, N):
-        """A block beside the diagonal, or on it where the two rows are one."""
+        """An off-diagonal block, or a diagonal one if the two rows are the same."""
         first, second = part.touches[couple.first], part.touches[couple.second]
         key = first.group, second.group
         columns, others = slice(first.start, first.stop), slice(second.start, second.stop)
@@ -249,7 +249,8 @@ class Sums:
 
 
 def products(a, b):
-    """aᵀb of every row, written out: a batched product of tiny matrices takes thrice the time."""
+    """aᵀb of every row, written out: a batched product of tiny matrices takes three times as
+    long."""
     return reduce(
         jnp.add, (a[:, i, :, None] * b[:, i, None, :] for i in range(a.shape[1]))
     )
@@ -263,5 +264,5 @@ def dot(plan: Plan, a: Tangent, b: Tangent) -> Float[Array, ""]:
 
 
 def zero_tangent(plan: Plan) -> Tangent:
-    """No change at all."""
+    """The zero change."""
     return {name: jnp.zeros((g.rows, g.width)) for name, g in plan.groups.items()}

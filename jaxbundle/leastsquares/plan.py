@@ -1,22 +1,22 @@
-"""The plan of a problem: which rows every observation touches, what is eliminated, who pairs.
+"""The plan of a problem: the rows touched by every observation, the eliminated rows, the pairs.
 
-Made once on the host (`planner.make_plan`), from the declarations alone; nothing in it depends on
-a value.
+Made once on the host (`planner.make_plan`) from the declarations only; it does not depend on
+values.
 
 The normal equations of a problem are an arrow. The rows of one table (object points, say) are
-touched together with few other rows each, so they are *eliminated* row by row; everything else is
-*kept* and forms the reduced system.
+touched together with few other rows each, so they are *eliminated* row by row; the rest is *kept*
+and forms the reduced system.
 
 - A **group** is a block row of the equations: the rows of a kept table, or of several kept tables
   whose rows always occur together (a pose and the camera that took only this image): one block
   then serves for both.
-- A **part** is the observations of one kind in the order in which they are computed: by the kept
-  rows they touch, in chunks that touch the same ones, so that what belongs to these is looked up
-  once a chunk and sums over them are small matrix products.
-- An **incidence** is a couple of an eliminated row and a row of a group that are touched together,
-  with one block W, however many observations there are.
+- A **part** is the observations of one kind in the order of computation: sorted by the kept
+  rows they touch, in chunks that touch the same ones, so that the data of these rows are looked up
+  once per chunk and sums over them are small matrix products.
+- An **incidence** is a combination of an eliminated row and a row of a group that are touched
+  together, with one block W, regardless of the number of observations.
 - Two incidences of the same eliminated row are a **pair**: the product of their blocks is added to
-  the block of the reduced matrix where the two groups' rows meet.
+  the block of the reduced matrix of the two groups' rows.
 """
 
 import equinox as eqx
@@ -38,7 +38,7 @@ class Member(eqx.Module):
 
 
 class Group(eqx.Module):
-    """A block row of the normal equations; `free` is 0 where a direction is held."""
+    """A block row of the normal equations; `free` is 0 for held directions."""
 
     members: tuple[Member, ...]
     free: Float[Array, "n w"]
@@ -54,9 +54,9 @@ class Group(eqx.Module):
 
 
 class Touch(eqx.Module):
-    """How a part touches a kept group: by which slots of the kind (slot, first column), in which
-    columns, and which row in every chunk. `incidence`: where the W of every observation goes;
-    None: the observations are the incidences."""
+    """How a part touches a kept group: the slots of the kind (slot, first column), the columns, and
+    the row of every chunk. `incidence`: the index of W of every observation; None: the observations
+    are the incidences."""
 
     group: str = eqx.field(static=True)
     slots: tuple[tuple[int, int], ...] = eqx.field(static=True)
@@ -69,7 +69,7 @@ class Touch(eqx.Module):
 class Couple(eqx.Module):
     """Two touches of a part and the block of the reduced matrix where their rows meet: in every
     chunk the block's number, and whether the first row stands in its row (0) or its column (1).
-    `same`: 1 where both are the same row, None if nowhere."""
+    `same`: 1 if both are the same row, None if never."""
 
     first: int = eqx.field(static=True)
     second: int = eqx.field(static=True)
@@ -79,9 +79,9 @@ class Couple(eqx.Module):
 
 
 class Part(eqx.Module):
-    """Observations of a kind in the order of computing. `lookup`: the rows of the tables that the
-    slots see, one a chunk or (`by_row`) one an observation; `eliminated`: the eliminated row;
-    `source`: the observation; `place`: for every observation its place in this part."""
+    """Observations of a kind in the order of computation. `lookup`: the rows of the tables of the
+    slots, one per chunk or (`by_row`) one per observation; `eliminated`: the eliminated row;
+    `source`: the observation; `place`: for every observation its position in this part."""
 
     observations: int = eqx.field(static=True)
     slot: int | None = eqx.field(static=True)
@@ -120,10 +120,10 @@ class Blocks(eqx.Module):
 
 
 class Datum(eqx.Module):
-    """How a problem that may float is pinned down (`datum.py`): the motions that are open, as
-    combinations of all (`gauge`); the unknowns that hold the datum (`weight`, by table); elements
-    of the reduced matrix that make it regular (`pins`); by table, what is held of what the motions
-    would move (`held`, 1 or 0; no table of which nothing is)."""
+    """The datum of a problem that may float (`datum.py`): the open motions as combinations of all
+    (`gauge`); the datum unknowns (`weight`, by table); elements of the reduced matrix that make it
+    regular (`pins`); by table, the held ones among the unknowns moved by the motions (`held`, 1 or
+    0; only tables with held unknowns)."""
 
     gauge: Float[Array, "motions defect"]
     weight: dict[str, Float[Array, "rows width"]]
@@ -134,8 +134,8 @@ class Datum(eqx.Module):
 class Plan(eqx.Module):
     """See the module. `kept` is in the order of the groups; `blocks` has their pairs (later,
     earlier or same). `axis`: the name of the device axis over which eliminated rows with their
-    observations are distributed; None: one device. `reduction`: how the reduced system is solved
-    (`reduction.py`); `band`: where that is its way."""
+    observations are distributed; None: one device. `reduction`: solver of the reduced system
+    (`reduction.py`); `band`: if it is banded."""
 
     groups: dict[str, Group]
     eliminated: str | None = eqx.field(static=True)

@@ -27,10 +27,9 @@ def make_plan(
     choices: dict | None = None, ways: Sequence[str] = REDUCTIONS,
 ) -> tuple[Plan, Sizes, dict]:  # fmt: skip
     """The plan on the host, its arrays as `Index` and `Column` (`indices.finish`), the sizes of its
-    lists, and the choices made (lengths of chunks, blocks of the reduced matrix).
-
-    `choices`: those of a larger problem of which this is a part, to be made again; `ways`: how the
-    reduced system may be solved."""
+    lists, and the choices made (lengths of chunks, blocks of the reduced matrix). `choices`: those
+    of a larger problem of which this is a part, to be reused; `ways`: allowed solvers of the
+    reduced system."""
     choose = Choices(choices or {})
     plan = _Planner(Grouping(tables, observations, eliminate, choose), ways).plan()
     sizes = {("table", t.name): t.rows + 1 for t in tables}
@@ -40,7 +39,8 @@ def make_plan(
 
 @dataclasses.dataclass
 class _LaidPart:
-    """A part in its chunks of `length`, along the list `along`; `used`: which places are."""
+    """A part in its chunks of `length`, along the list `along`; `used`: which positions are
+    used."""
 
     part: Part
     used: Bool[np.ndarray, " places"]
@@ -48,7 +48,7 @@ class _LaidPart:
     along: Hashable
 
     def set(self, field: str, number: int, **changed) -> None:
-        """Replaces something in one of the touches or couples."""
+        """Replaces an item in one of the touches or couples."""
         items = list(getattr(self.part, field))
         items[number] = dataclasses.replace(items[number], **changed)
         self.part = dataclasses.replace(self.part, **{field: tuple(items)})
@@ -82,7 +82,7 @@ class _Planner:
         return Plan(groups, self.by.eliminate, parts, incidences, blocks, reduction, band)
 
     def reduce(self, parts, incidences, groups):
-        """The blocks of the reduced matrix, how it is solved, its band."""
+        """The blocks of the reduced matrix, its solver, its band."""
         rows = [np.zeros(0, np.int64), *(found.eliminated for found in incidences.values())]
         met, ways = np.bincount(np.concatenate(rows)).astype(float), self.ways
         if len(ways) > 1 and (met * (met - 1)).sum() / 2 > MOST_PAIRS:
@@ -97,7 +97,7 @@ class _Planner:
         return blocks if way in FACTORS else self.find_blocks(parts, {}), way, band
 
     def lay_out(self, k: int, share: Share) -> _LaidPart:
-        """The part k laid out in chunks, with its touches (couples and incidences come later)."""
+        """Part k in chunks, with its touches (couples and incidences are added later)."""
         given = self.by.observations[share.observations]
         of = given.kind.of
         rows = [np.asarray(r)[share.source] for r in given.rows]
@@ -146,7 +146,7 @@ class _Planner:
         return _LaidPart(made, used, length, along)
 
     def incidences_of(self, group, parts):
-        """The incidences of a group; fills in where the observations of the parts go."""
+        """The incidences of a group; sets the incidence of the observations of the parts."""
         at = [
             (k, t) for k, p in enumerate(parts) if p.part.slot is not None
             for t, touch in enumerate(p.part.touches) if touch.group == group
@@ -231,7 +231,7 @@ class _Planner:
             empty = np.zeros(0, np.int64)
             return empty, empty, empty, empty, None
         i, j = pairs_between(later.eliminated, earlier.eliminated)
-        if within:  # below the diagonal; an incidence with itself is summed by chunks
+        if within:  # below the diagonal; an incidence paired with itself is summed by chunks
             low = later.row[i] > earlier.row[j]
             i, j = i[low], j[low]
         return later.live[i], earlier.live[j], later.row[i], earlier.row[j], (

@@ -2,9 +2,9 @@
 
     C = σ0²·S·(JᵀPJ)⁻¹·Sᵀ,        S the S-transformation into the datum (`datum.py`)
 
-Nothing is adjusted: J is taken at the given values (`Data.start`), P are the weights of the data.
-What was measured enters only where J of a kind depends on it. The precision of a problem that was
-solved is that of its solution, `dataclasses.replace(data, start=solve(problem, data))`.
+Nothing is adjusted: J is evaluated at the given values (`Data.start`), P are the weights of the
+data. Measurements matter only if J of a kind depends on them. For the precision of a solved problem
+use its solution, `dataclasses.replace(data, start=solve(problem, data))`.
 
 Source: Grafarend (1974), Bollettino di Geodesia 33: design of first order (J) and second order (P).
 """
@@ -30,8 +30,8 @@ from jaxbundle.types import AnyArray
 
 
 class Precision(eqx.Module):
-    """Covariances of every row of every table (`own`, zero where something is held), of the
-    directions in which its space moves, and of the functions asked for."""
+    """Covariances of every row of every table (`own`, zero for held unknowns), in the directions of
+    its space, and of the requested functions."""
 
     own: dict[str, Float[Array, "rows width width"]]
     covariance: Float[Array, "functions functions"]
@@ -41,15 +41,15 @@ def precision(
     problem: Problem, data: Data | None = None, of: Callable[[Values], Array] | None = None,
     *, sigma0: float | Float[Array, ""] = 1.0,
 ) -> Precision:  # fmt: skip
-    """The precision of a design, differentiable to every order in all of it.
+    """The precision of a design, differentiable to any order.
 
     **Arguments:** `data`: numbers that replace `problem.data` (same shapes): the design in `start`,
-    and weights; `of`: functions of the tables, `values -> [functions]`, whose covariance is wanted;
+    and weights; `of`: functions of the tables, `values -> [functions]`, for their covariance;
     `sigma0`: of the unit weight, 1: a priori.
 
-    **Returns:** a `Precision`; NaN throughout where the design does not determine everything.
+    **Returns:** a `Precision`; all NaN if the design leaves unknowns undetermined.
 
-    **Raises:** `InputError` for data of other shapes; where no factor fits into memory.
+    **Raises:** `InputError` for data of other shapes, or if no factor fits into memory.
     """
     problem = with_factor(problem)
     if problem.plan.reduction not in FACTORS:
@@ -70,8 +70,8 @@ def precision(
 def covariances(
     declared: Declared, plan: Plan, data: Data, rows: Tangent
 ) -> tuple[dict[str, Float[Array, "rows width width"]], Float[Array, "functions functions"]]:
-    """Cofactors of all tables and of linear functions `rows` of the unknowns, of data that are
-    filled to the sizes of the plan (`problem.pad_data`): what designs of one shape share."""
+    """Cofactors of all tables and of linear functions `rows` of the unknowns, for data padded to
+    the sizes of the plan (`problem.pad_data`): shared by designs of one shape."""
     filled, laid = fill_places(plan, lay_out_data(plan, data))
     normal = normal_equations(declared, filled, data.start, laid)[-1]
     factor = factorise(Normal(plan, normal))
@@ -83,7 +83,7 @@ def covariances(
 def redundancy(
     declared: Declared, plan: Plan, data: Data
 ) -> Mapping[int, Float[AnyArray, "n r"]]:
-    """Redundancy numbers by set, of data that are filled to the sizes of the plan."""
+    """Redundancy numbers by set, for data padded to the sizes of the plan."""
     filled, laid = fill_places(plan, lay_out_data(plan, data))
     normal = normal_equations(declared, filled, data.start, laid)[-1]
     factor = factorise(Normal(plan, normal))

@@ -1,4 +1,4 @@
-"""A problem made ready for the solver: plan, numbers, and how many rows and unknowns it has."""
+"""A problem prepared for the solver: plan, numbers, and counts of rows and unknowns."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -27,13 +27,13 @@ from jaxbundle.leastsquares.solver import LeastSquares
 from jaxbundle.leastsquares.stopping import Tolerance
 
 LARGE = 200_000
-"""Problems of more observations are compiled for their own sizes."""
+"""Problems with more observations are compiled for their exact sizes."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """What is solved: declarations, plan and numbers. `sizes`: of the lists of the plan; `choices`:
-    what was chosen when it was made (`planner.make_plan`)."""
+    """A problem: declarations, plan and numbers. `sizes`: of the lists of the plan; `choices`:
+    those of its planning (`planner.make_plan`)."""
 
     tables: tuple[Table, ...]
     observations: tuple[Observations, ...]
@@ -50,13 +50,13 @@ class Problem:
         return next(t for t in self.tables if t.name == name)
 
     def weights(self, o: int, weight=None) -> Float[np.ndarray, "n r"]:
-        """1/σ of the residuals of a set of observations, 0 where they do not count; of those with a
+        """1/σ of the residuals of a set of observations, 0 without weight; for those with a
         covariance the diagonal of L⁻¹."""
         return np.asarray(diagonal_of(self.data.weight[o] if weight is None else weight))
 
     @property
     def reduced_size(self) -> int:
-        """Unknowns of the reduced system, the held ones counted."""
+        """Unknowns of the reduced system, including held ones."""
         e = self.plan.eliminated
         kept = sum(t.rows * t.space.width for t in self.tables if t.free.any() and t.name != e)
         return kept if e is None else kept + self.kept_rows.sum() * self.table(e).space.width
@@ -77,7 +77,7 @@ class Problem:
 
 @dataclasses.dataclass(frozen=True)
 class Counts:
-    """Rows that carry weight, and free unknowns."""
+    """Rows with weight, and free unknowns."""
 
     observations: int
     unknowns: int
@@ -95,12 +95,11 @@ def make_problem(
 ) -> Problem:  # fmt: skip
     """Plan and arrays of declared tables and observations.
 
-    `motions`: those that may be open. `datum(gauge)` is asked where some are, with the combinations
-    [motions, defect] that change no observation: which unknowns are to hold the datum, [rows,
-    width] by table, and whether as few of them as needed. `retraction(declared)` gives the function
-    `(plan, values, change)` that says where a change leads, if not `Retraction`. `reduction`: how
-    the reduced system is solved, "dense", "banded" or "iterative"; chosen by its size and fill if
-    not given."""
+    `motions`: those that may be open. If some are, `datum(gauge)` is called with the combinations
+    [motions, defect] that change no observation and returns the datum unknowns, [rows, width] by
+    table, and whether the datum is minimal. `retraction(declared)` gives the function `(plan,
+    values, change)` that applies a change, by default `Retraction`. `reduction`: solver of the
+    reduced system, "dense", "banded" or "iterative"; by default chosen by size and fill."""
     require_x64()
     one_of("reduction", reduction, REDUCTIONS, none=True)
     tables = tuple(tables)
@@ -124,14 +123,14 @@ def _make_plan(tables, observations, eliminate, ways):
 
 
 def rounder(observations) -> Callable:
-    """How the sizes of the plan of so many observations are rounded."""
+    """The rounding of plan sizes for this number of observations."""
     large = sum(o.number for o in observations) > LARGE
     return lambda key, n: n if large else rounded(n)
 
 
 def with_factor(problem: Problem) -> Problem:
-    """The problem with a reduced system that can be factorised, as statistics need it; the same
-    where no factor fits into memory."""
+    """The problem with a reduced system that can be factorised for statistics; unchanged if no
+    factor fits into memory."""
     if problem.plan.reduction in FACTORS:
         return problem
     given = problem.tables, problem.observations, problem.plan.eliminated
@@ -150,7 +149,7 @@ def _with_datum(problem: Problem, choose: Callable | None) -> Problem:
     if not gauge.shape[1]:
         return problem
     if choose is None:
-        raise InputError(f"the datum is open in {gauge.shape[1]} parameters: say what holds it")
+        raise InputError(f"the datum is open in {gauge.shape[1]} parameters: give `datum`")
     weight, minimal = choose(gauge)
     weight = {
         t: _longer(np.asarray(w, float), problem.sizes["table", t], "constant")
@@ -163,14 +162,14 @@ def _with_datum(problem: Problem, choose: Callable | None) -> Problem:
 
 
 def open_at(problem: Problem, values: Values) -> Problem:
-    """The problem with its open motions as they are at these values: those about a point that is
-    only weighted go with the point."""
+    """The problem with its open motions at these values: those about a weighted point follow the
+    point."""
     datum, invariant = problem.plan.datum, (kind.invariant for kind in problem.declared.kinds)
     if datum is None or all(invariant):
         return problem
     data = pad_data(problem, dataclasses.replace(problem.data, start=values))
     real = {t.name: np.arange(problem.sizes["table", t.name]) < t.rows for t in problem.tables}
-    floating = dataclasses.replace(problem.plan, datum=None)  # As when the problem was made.
+    floating = dataclasses.replace(problem.plan, datum=None)  # As in `make_problem`.
     gauge = find_open_motions(survey_motions(problem.declared, floating, data, real))
     if gauge.shape != datum.gauge.shape:
         return problem
@@ -181,7 +180,8 @@ def open_at(problem: Problem, values: Values) -> Problem:
 def hold(
     problem: Problem, table: str, rows, columns: slice | Sequence[int] = slice(None)
 ) -> Problem:
-    """The problem with some unknowns held at their start values; they hold no datum any more."""
+    """The problem with some unknowns held at their start values, removed from the datum
+    unknowns."""
     given = problem.table(table)
     free = given.free.copy()
     free[np.ix_(np.atleast_1d(rows), np.arange(given.space.width)[columns])] = 0.0
@@ -189,8 +189,8 @@ def hold(
 
 
 def with_free(problem: Problem, table: str, free: Float[np.ndarray, "rows width"]) -> Problem:
-    """The problem with these unknowns of a table free, the others held at their start values; of
-    those only what was free when the plan was made, and what is held holds no datum any more."""
+    """The problem with these unknowns of a table free (if free when planned) and the others held at
+    their start values and removed from the datum unknowns."""
     tables = tuple(
         dataclasses.replace(t, free=free) if t.name == table else t for t in problem.tables
     )
@@ -213,13 +213,13 @@ def with_free(problem: Problem, table: str, free: Float[np.ndarray, "rows width"
 
 
 def with_data(problem: Problem, data: Data) -> Problem:
-    """The problem with other numbers of the same shapes."""
+    """The problem with other data of the same shapes."""
     counts = dataclasses.replace(count(problem.tables, data), datum=problem.counts.datum)
     return dataclasses.replace(problem, data=data, counts=counts)
 
 
 def count(tables, data: Data) -> Counts:
-    """Rows that carry weight, and free unknowns."""
+    """Rows with weight, and free unknowns."""
     return Counts(
         sum(int((np.asarray(diagonal_of(w)) > 0).sum()) for w in data.weight),
         sum(int((t.free > 0).sum()) for t in tables),
@@ -227,7 +227,7 @@ def count(tables, data: Data) -> Counts:
 
 
 def check(tables, observations) -> None:
-    """Refuse tables of one name, observations of unknown tables, rows that do not exist."""
+    """Refuse duplicate table names, unknown tables, and rows that do not exist."""
     known = {}
     for table in tables:
         if table.name in known:
@@ -245,7 +245,7 @@ def check(tables, observations) -> None:
 
 
 def check_numbers(tables, observations, weights) -> None:
-    """Refuse start values, and measured values that carry weight, that are no finite numbers."""
+    """Refuse start values, and measured values with weight, that are not finite."""
     for table in tables:
         for rows in jax.tree.leaves(table.value):
             bad = ~np.isfinite(rows)
@@ -266,7 +266,7 @@ def check_numbers(tables, observations, weights) -> None:
 
 
 def make_data(declared: Declared, tables, observations) -> Data:
-    """The numbers of a problem as arrays."""
+    """The data of a problem as arrays."""
     start = {t.name: jax.tree.map(lambda x: np.asarray(x, float), t.value) for t in tables}
     weights = observed_weights(tables, observations)
     check_numbers(tables, observations, weights)
@@ -275,8 +275,8 @@ def make_data(declared: Declared, tables, observations) -> Data:
 
 
 def observed_weights(tables, observations) -> list[Float[np.ndarray, "n ..."]]:
-    """The weights of sets of observations; how many residuals a kind has is found from the shapes
-    alone."""
+    """The weights of sets of observations; the number of residuals of a kind is found from the
+    shapes."""
     called = {t.name: t for t in tables}
     one = lambda tree: jax.tree.map(lambda x: jax.ShapeDtypeStruct(np.shape(x)[1:], float), tree)
 
@@ -297,12 +297,12 @@ def _evaluate(kind, spaces, values, measured):
 
 
 def pad_data(problem: Problem, data: Data) -> Data:
-    """The numbers filled to the sizes of the plan, on the device."""
+    """The data padded to the sizes of the plan, on the device."""
     return jax.device_put(fill_data(problem, data))
 
 
 def fill_data(problem: Problem, data: Data) -> Data:
-    """The numbers filled to the sizes of the plan: weights are 0."""
+    """The data padded to the sizes of the plan, with weights 0."""
     fill = lambda o: lambda x: _longer(x, problem.sizes["observations", o], "constant")
     return Data(
         pad_values(problem, data.start),
@@ -312,13 +312,13 @@ def fill_data(problem: Problem, data: Data) -> Data:
 
 
 def pad_values(problem: Problem, values: Values) -> Values:
-    """The tables filled to the sizes of the plan: rows repeat the last one."""
+    """The tables padded to the sizes of the plan by repeating the last row."""
     fill = lambda t: lambda x: _longer(x, problem.sizes["table", t], "edge")
     return {t: jax.tree.map(fill(t), rows) for t, rows in values.items()}
 
 
 def without_filling(problem: Problem, values: Values) -> Values:
-    """The tables in their own sizes."""
+    """The tables without padding."""
     traced = any(isinstance(x, Tracer) for x in jax.tree.leaves(values))
     # On the host, where nothing is compiled for it.
     cut = lambda x, n: x[:n] if traced else jax.device_put(np.asarray(x)[:n])
@@ -327,16 +327,16 @@ def without_filling(problem: Problem, values: Values) -> Values:
 
 
 def _longer(x, n: int, mode: Literal["constant", "edge"]) -> Any:
-    """At least one row more, so that there is one to which nothing refers."""
+    """At least one row more, so that there is an unused one."""
     x = x if isinstance(x, Tracer) else np.asarray(x)
     room = [(0, n - len(x)), *[(0, 0)] * (x.ndim - 1)]
     return jnp.pad(x, room, mode) if isinstance(x, Tracer) else np.pad(x, room, mode)
 
 
 def given_data(problem: Problem, data: Data | None) -> Data:
-    """The numbers in the sizes of the plan: those of the problem, or others of the same shapes.
+    """The data in the sizes of the plan: those of the problem, or others of the same shapes.
 
-    **Raises:** `InputError` where the shapes are others."""
+    **Raises:** `InputError` if the shapes differ."""
     known, data = problem.data, problem.data if data is None else data
     shapes = lambda data: (jax.tree.structure(data), [jnp.shape(x) for x in jax.tree.leaves(data)])
     if shapes(data) != shapes(known):
@@ -345,13 +345,13 @@ def given_data(problem: Problem, data: Data | None) -> Data:
 
 
 LEAST_ROWS, MOST_ROWS = 128, 10_000
-"""Of the history of a solver; later steps are not recorded."""
+"""Rows of the solver history; later steps are not recorded."""
 
 
 def make_solver(
     problem: Problem, *, atol=1e-5, rtol=0.0, max_steps: int = 100, **options
 ) -> LeastSquares:
-    """The solver of a problem; `options` are those of `LeastSquares`. Other limits of steps share
+    """The solver of a problem; `options` are those of `LeastSquares`. Different step limits share
     its program."""
     squared = lambda w, m: np.where(w > 0, w * m.reshape(w.shape), 0.0) ** 2
     squares = sum(
@@ -370,7 +370,7 @@ def make_solver(
 
 @dataclasses.dataclass(frozen=True)
 class Retraction:
-    """Every table moves by the rule of its space."""
+    """The retraction of every table by its space."""
 
     declared: Declared
 

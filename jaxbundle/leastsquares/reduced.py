@@ -1,11 +1,11 @@
 """The reduced system S·x = b of the kept groups: its blocks, and its dense factor.
 
-It is solved by one dense Cholesky factorisation, here; or banded (`banded.py`); or not factorised
-at all, by conjugate gradients (`iterative.py`). All three have
+It is solved by a dense Cholesky factorisation (here), a banded one (`banded.py`), or without
+factorisation by conjugate gradients (`iterative.py`). All three have
 
 - `solve(b)`: S⁻¹·b for rows of the kept groups;
 - `inverse()`: the blocks of S⁻¹ where S has blocks;
-- `pivots`: the square roots of the pivots, 1 without correlation, 0 without determination.
+- `pivots`: the square roots of the pivots, 1 if uncorrelated, 0 if undetermined.
 """
 
 import equinox as eqx
@@ -79,19 +79,19 @@ class DenseFactor(eqx.Module):
 
 
 def factorise_dense(plan: Plan, S: Reduced) -> DenseFactor:
-    """The factor of S; NaN where it is not positive definite."""
+    """The factor of S; NaN if it is not positive definite."""
     return DenseFactor(plan, cholesky_of_lower(S.matrix(plan, plan.kept)))
 
 
 @jax.custom_jvp
 def cholesky_of_lower(S: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
-    """L of S = L·Lᵀ from the lower triangle of S; NaN where it is not positive definite."""
+    """L of S = L·Lᵀ from the lower triangle of S; NaN if it is not positive definite."""
     return jnp.linalg.cholesky(S, symmetrize_input=False)
 
 
 @cholesky_of_lower.defjvp
 def _(primals, tangents):
-    # JAX's own rule takes a change for the whole of it.
+    # JAX's derivative rule expects the full symmetric change.
     whole = lambda S: jnp.tril(S) + jnp.tril(S, -1).mT
     factor = lambda S: jnp.linalg.cholesky(whole(S), symmetrize_input=False)
     return jax.jvp(factor, primals, tangents)

@@ -1,14 +1,14 @@
-"""How the reduced system of the kept groups is solved: dense, banded, or by iteration.
+"""The choice of solver for the reduced system of the kept groups: dense, banded, or iterative.
 
-Two rows of a group share a block of the reduced matrix only where observations, or eliminated rows,
-tie them together. In the order of Cuthill and McKee (1969), reversed (George 1971), tied rows stand
-near each other: a drive along a street, a traverse, or strips flown one after the other become a
+Two rows of a group share a block of the reduced matrix only if observations or eliminated rows
+tie them. In the reverse order of Cuthill and McKee (1969; George 1971), tied rows are close
+together: a drive along a street, a traverse, or successive strips become a
 narrow band. Cut into super-blocks as wide as the band, the matrix is block tridiagonal. The group
-with most unknowns is put in order so; all others are a border.
+with most unknowns is ordered in this way; all others are a border.
 
-What is chosen is what needs the fewest operations by count: n³/3 for a dense factor, a few m³ for
-each of the super-blocks of m unknowns, and for conjugate gradients some forty passes over all
-observations, which need no pairs of incidences at all.
+The solver with the lowest operation count is chosen: n³/3 for a dense factor, a few m³ for
+each super-block of m unknowns, and for conjugate gradients about forty passes over all
+observations, without pairs of incidences.
 """
 
 from typing import Any
@@ -21,22 +21,22 @@ from jaxbundle.leastsquares.indices import as_column
 
 FACTORS = ("dense", "banded")
 SMALL = 1000
-"""Reduced systems with fewer unknowns are solved as they are."""
+"""Smaller reduced systems are always solved densely."""
 GAIN = 3.0
-"""By how much fewer operations than the dense one another way must need."""
+"""Required saving of operations relative to the dense solver."""
 LARGEST_FACTOR = 2e9 / 8
-"""Elements of a factor; what needs more is solved by iteration."""
+"""Largest factor, in elements; larger systems are solved iteratively."""
 MOST_PAIRS = 3e8
-"""Pairs of incidences; what has more is solved by iteration."""
+"""Largest number of pairs of incidences; systems with more are solved iteratively."""
 STEPS, WORK = 40, 600.0
-"""Of conjugate gradients: passes, and what an observation costs in one, in operations of a
+"""For conjugate gradients: number of passes, and cost per observation and pass, in operations of a
 factorisation."""
 NARROWEST = 32
-"""Unknowns of a super-block; with fewer the time goes into its steps, not into operations."""
+"""Minimum size of a super-block; with fewer unknowns overhead dominates."""
 
 
 class Band(eqx.Module):
-    """`place`: the position of every row of `group` in the band (the last for what is filled in);
+    """`place`: the position of every row of `group` in the band (the last for padding);
     super-blocks of `width` rows."""
 
     group: str = eqx.field(static=True)
@@ -46,8 +46,8 @@ class Band(eqx.Module):
 
 
 def plan_reduction(shapes: dict[str, tuple[int, int]], ties, observations: int, ways):
-    """The way for kept groups of these shapes (rows, width), None where none of `ways` fits into
-    memory, and the band where that is its way; a single one of `ways` is taken as it is.
+    """The solver for kept groups of these shapes (rows, width), None if none of `ways` fits into
+    memory, and the band if it is banded; a single one of `ways` is used regardless.
 
     `ties(group)`: row and column of its blocks beside the diagonal."""
     unknowns = sum(n * w for n, w in shapes.values())
@@ -64,19 +64,20 @@ def plan_reduction(shapes: dict[str, tuple[int, int]], ties, observations: int, 
 
 def find_band(group: str, row, column, rows: int, w: int) -> Band:
     """A narrow band of the blocks (row, column) of a group of so many rows of `w` unknowns."""
-    from scipy import sparse  # A tenth of a second, which small problems are spared.
+    from scipy import sparse  # imported here: a tenth of a second
     from scipy.sparse.csgraph import reverse_cuthill_mckee
 
     links = sparse.coo_matrix((np.ones(len(row)), (row, column)), (rows, rows))
     place = np.empty(rows, np.int32)
     place[reverse_cuthill_mckee((links + links.T).tocsr(), symmetric_mode=True)] = np.arange(rows)
     width = max(int(np.abs(place[row] - place[column]).max(initial=0)), -(-NARROWEST // w))
-    blocks = rows // width + 1  # The last place is empty.
+    blocks = rows // width + 1  # The last position is empty.
     return Band(group, as_column(place, ("group", group), blocks * width - 1), width, blocks)
 
 
 def choose_reduction(band: Band | None, w: int, unknowns: int, observations: int, ways):
-    """The way for so many unknowns, those of the band in blocks of `w`; None: none fits."""
+    """The solver for this number of unknowns, those of the band in blocks of `w`; None: none
+    fits."""
     n, work = float(unknowns), {"iterative": (STEPS * WORK * observations, 0.0)}
     work["dense"] = n**3 / 3, n**2
     if band is not None:

@@ -1,4 +1,4 @@
-"""Reliability of the observations: redundancy numbers, tests for blunders, what they could hide.
+"""Reliability of the observations: redundancy numbers, blunder tests, undetectable errors.
 
 With the residuals divided by their a priori σ (v/σ) and h = diag(J·Q·Jᵀ) (Baarda 1968; Förstner
 1985):
@@ -9,7 +9,7 @@ With the residuals divided by their a priori σ (v/σ) and h = diag(J·Q·Jᵀ) 
     MDB = σ·δ0/√r                   smallest blunder found with the chosen power
     δ̄   = δ0·√((1 − r)/r)           its largest effect on any unknown, in units of that σ
 
-Of observations with a covariance, v/σ stands for L⁻¹·v.
+For observations with a covariance, v/σ means L⁻¹·v.
 """
 
 from collections.abc import Mapping
@@ -37,13 +37,13 @@ from jaxbundle.leastsquares.rows import (
 from jaxbundle.types import AnyArray, present
 
 UNCONTROLLED = 1e-8
-"""Redundancy numbers below this are rounding: the observation is not controlled at all."""
+"""Redundancy numbers below this are rounding: the observation is uncontrolled."""
 ROWS_AT_ONCE = 1 << 16
 
 
 class Reliability(eqx.Module):
-    """By set of observations, [n, r]: v/σ, redundancy number, Baarda's w (NaN where r is zero), and
-    the part of h = 1 − r that the eliminated row of the observation alone has in it."""
+    """By set of observations, [n, r]: v/σ, redundancy number, Baarda's w (NaN if r is zero), and
+    the part of h = 1 − r due to the eliminated row of the observation alone."""
 
     residual: Mapping[int, Float[AnyArray, "n r"]]
     redundancy: Mapping[int, Float[AnyArray, "n r"]]

@@ -1,14 +1,14 @@
-"""What a solution owes to every single thing that was given, held quantities and measurements.
+"""The response of a solution to single data: held quantities and measurements.
 
-At the minimum g(y, θ) = ∂(½vᵀPv)/∂y = 0, for whatever is given as θ (`derivatives.py`), so that
+At the minimum g(y, θ) = ∂(½vᵀPv)/∂y = 0 for any data θ (`derivatives.py`), so that
 
     H·x = −∂g/∂θ                          x: how the unknowns follow one held quantity θ
     H·λ = f,     d(f·y)/dl = −λᵀ·∂g/∂l    how one function f·y follows every measurement l
 
-H is the exact Hessian, and it is never formed: H·x and ∂g/∂θ are one derivative of g along (x, θ),
-forward over reverse. Conjugate gradients solve, preconditioned by the factor of JᵀPJ that the
-cofactors come from. It differs from H by the curvature alone, so that a few steps suffice. One loop
-is compiled, with g in it once: seconds, where the Jacobian of the whole adjustment by reverse mode
+The exact Hessian H is never formed: H·x and ∂g/∂θ are one derivative of g along (x, θ), forward
+over reverse. The equations are solved by conjugate gradients, preconditioned by the factor of JᵀPJ
+from the cofactors. It differs from H only by the curvature, so a few steps suffice. One loop is
+compiled, containing g once: seconds, while the Jacobian of the whole adjustment in reverse mode
 took minutes.
 """
 
@@ -34,20 +34,20 @@ from jaxbundle.leastsquares.solver import half_square
 from jaxbundle.types import AnyArray
 
 AT_ONCE = 16
-"""Changes that one call of the program follows."""
+"""Changes handled by one call of the program."""
 REACHED, ENOUGH = 1e-11, 1e-6
 """Relative residual (norm of N⁻¹) at which conjugate gradients stop, and that a result has."""
 MOST_STEPS = 50
 
 Change = Sequence[tuple[str, int, PyTree]]
-"""A change of what is given: table, row, and by how much the row's value changes."""
+"""A change of data: table, row, and the change of the row's value."""
 
 
 def follow(found: Solution, changes: Sequence[Change]) -> Iterator[Values]:
-    """How all tables follow each change of held quantities: tangents of the values of every row,
-    [≤ AT_ONCE, rows, …], some changes at a time, to first order and exactly.
+    """The response of all tables to each change of held quantities: tangents of the values of every
+    row, [≤ AT_ONCE, rows, …], some changes at a time, exact to first order.
 
-    **Raises:** `NotSolvedError` where the values are no minimum."""
+    **Raises:** `NotSolvedError` if the values are not a minimum."""
     declared, plan, values, data = found.given
     still = jax.tree.map(np.asarray, values)
     for first in range(0, len(changes), AT_ONCE):
@@ -75,10 +75,10 @@ def pull_back(
     """The change of linear functions of the changes of tables by one σ (a priori) of every
     observation, by set.
 
-    An observation with a covariance changes by a column of its root L. Where what was measured is
-    not one number for each residual, its residual changes.
+    An observation with a covariance changes by a column of its root L. If the measurement does not
+    have one number per residual, the residual is changed.
 
-    **Raises:** `NotSolvedError` where the values are no minimum."""
+    **Raises:** `NotSolvedError` if the values are not a minimum."""
     declared, plan, values, data = found.given
     problem, number = found.problem, len(next(iter(functions.values())))
     size = {t.name: problem.sizes["table", t.name] for t in problem.tables}
@@ -108,7 +108,7 @@ def _require(left) -> None:
     if not worst < ENOUGH:
         raise NotSolvedError(
             "derivatives of the solution were not found: its residuals are so large, or so curved, "
-            "that it is no clear minimum"
+            "that it is not a clear minimum"
         )
 
 
@@ -127,7 +127,7 @@ def _follow(declared: Declared, plan: Plan, values: Values, data: Data, factor: 
 
 @eqx.filter_jit
 def _pull_back(declared: Declared, plan: Plan, values: Values, data: Data, factor: Factor, rows):
-    """By measurement, by residual, and what is left of the equations."""
+    """By measurement, by residual, and the residual of the equations."""
     at = Linearised(declared, plan, values, data, factor, {})
     still, unchanged = zero_tangent(plan), jax.tree.map(jnp.zeros_like, data.start)
 
@@ -156,7 +156,7 @@ def _pull_back(declared: Declared, plan: Plan, values: Values, data: Data, facto
 
 
 def _in_datum(at: Linearised, change: Tangent, start: Values) -> Values:
-    """The tables after a change, in the datum that `start` says."""
+    """The tables after a change, in the datum defined by `start`."""
     moved = at.moved(change, dataclasses.replace(at.data, start=start))
     return attach_motion(at.declared, at.plan, moved, start)
 
@@ -164,7 +164,7 @@ def _in_datum(at: Linearised, change: Tangent, start: Values) -> Values:
 def _solve(at: Linearised, right: Tangent, held: Values) -> tuple[Tangent, Float[Array, ""]]:
     """x of H·x = right − (∂g/∂θ)·held by conjugate gradients, and the relative residual.
 
-    The first pass of the loop finds the right-hand side, so that g stands in the program once."""
+    The first pass of the loop computes the right-hand side, so that the program contains g once."""
     plan, still, start = at.plan, zero_tangent(at.plan), at.data.start
     plus = lambda a, factor, b: jax.tree.map(lambda a, b: a + factor * b, a, b)
 

@@ -1,4 +1,4 @@
-"""Where a small change of the groups leads the tables."""
+"""The retraction: applying a small change of the groups to the tables."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from jaxbundle.leastsquares.rows import Declared, Values
 
 
 def retract(declared: Declared, plan: Plan, values: Values, change: Tangent) -> Values:
-    """The tables after a change; what is held must have a zero change."""
+    """The tables after a change; held unknowns must have a zero change."""
     moved = dict(values)
     for name, rows in changes_of_tables(plan, values, change).items():
         moved[name] = jax.vmap(declared.spaces[name].retract)(values[name], rows)

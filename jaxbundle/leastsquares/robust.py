@@ -1,4 +1,4 @@
-"""Robust estimation: observations that fit badly count less, by repeated weighting.
+"""Robust estimation by iterative reweighting.
 
 The length t of the residual vector of an observation, in units of its σ and of a robust scale s,
 gives it the weight
@@ -7,18 +7,18 @@ gives it the weight
     Cauchy   w = 1/(1 + (t/k)²)            k = 2.5486      Holland and Welsch (1977)
     Tukey    w = (1 − (t/k)²)², t < k      k = 5.1230      Beaton and Tukey (1974)
 
-and the problem is adjusted again with p = w/σ² until the weights rest (Krarup, Juhl and Kubik,
-1980). The scale is a posteriori, so the σ given matter only in proportion to each other:
+and the problem is adjusted again with p = w/σ² until the weights converge (Krarup, Juhl and Kubik,
+1980). The scale is a posteriori, so only the ratios of the given σ matter:
 
     s = median(t)/m·√(n/r),     m the median length of normal residuals,
 
-a median absolute deviation (MAD), smaller by the redundancy r of n observations. A few blunders do
-not move it, σ that are too small do.
+a median absolute deviation (MAD), corrected for the redundancy r of n observations. A few blunders
+do not change it; too small σ do.
 
 With ψ(t) = w·t the efficiency for normal errors in the plane is E[ψ' + ψ/t]²/(2·E[ψ²]), t² ~ χ²₂
 (Maronna, 1976): 0.95 for Cauchy's and Tukey's k. Huber's k leaves 99 of 100 good observations
-alone, so that the estimate of good data stays that of least squares. It has one solution, and is
-the start of the other two, which discard what is far off; they keep its scale.
+unchanged, so that good data give the least-squares estimate. It has a unique solution and provides
+start values and scale for the other two, which discard outliers.
 """
 
 import dataclasses
@@ -34,10 +34,10 @@ from jaxbundle.leastsquares.snooping import Adjust, readjust
 from jaxbundle.leastsquares.solution import Solution
 
 LEAST_WEIGHT = 1e-6
-"""Weights do not fall lower, so that the problem stays determined."""
+"""Smallest weight, so that the problem stays determined."""
 RESTING, NEARLY_RESTING = 1e-4, 1e-3
-"""Weights whose changes have a smaller root mean square are at rest; those that only give the
-start of another estimator need not be so near."""
+"""Weights with a smaller RMS change have converged; the limit is looser for those that only start
+another estimator."""
 ROUNDS = 100
 
 
@@ -61,8 +61,8 @@ _WEIGHT = {"huber": huber, "cauchy": cauchy, "tukey": tukey}
 
 @dataclasses.dataclass(frozen=True)
 class Suspect:
-    """An observation whose residual is too long for a good one: its set, row there, the length of
-    its residual t in units of σ and scale, the factor of its weight."""
+    """An observation whose residual exceeds the critical length: its set, row there, the length t
+    of its residual in units of σ and scale, its weight factor."""
 
     set: int
     row: int
@@ -73,7 +73,7 @@ class Suspect:
 @dataclasses.dataclass(frozen=True)
 class Reweighted:
     """The solution with the last weights; by set their factors w; the scale a posteriori; whether
-    the weights came to rest; `lengths` t in units of σ and scale."""
+    the weights converged; `lengths` t in units of σ and scale."""
 
     found: Solution
     weights: dict[int, Float[np.ndarray, " n"]]
@@ -82,8 +82,8 @@ class Reweighted:
     lengths: dict[int, Float[np.ndarray, " n"]]
 
     def suspects(self, significance: float = 0.001) -> list[Suspect]:
-        """Observations with longer residuals than the longest of good ones, the worst first; with
-        the probability `significance` there is any in data without blunders."""
+        """Observations with residuals above the critical length, the worst first; `significance` is
+        the probability of any in data without blunders."""
         used = {o: (self.found.problem.weights(o) > 0).any(1) for o in self.lengths}
         critical = critical_length(significance, sum(int(u.sum()) for u in used.values()))
         found = [
@@ -116,7 +116,7 @@ def robust_scale(problem: Problem, lengths: dict[int, Float[np.ndarray, " n"]]) 
 
 
 def reweight(problem: Problem, values: Values, adjust_from: Adjust, estimator: str) -> Reweighted:
-    """Adjust with weights of an estimator until they rest.
+    """Adjust with the weights of an estimator until they converge.
 
     **Arguments:** `adjust_from(problem, start)`: the solution of a changed problem; `estimator`:
     one of `ESTIMATORS`.

@@ -1,6 +1,6 @@
-"""From tables and measurements to the columns that observation equations are computed on.
+"""From tables and measurements to the columns of the observation equations.
 
-    values (tables)  ──prepare, once a row──▶  columns  ──look up──▶  blocks of every observation
+values (tables)  ──prepare, once a row──▶  columns  ──look up──▶  blocks of every observation
 
 Everything is a structure of arrays: one array for each scalar of a block.
 """
@@ -24,10 +24,10 @@ Values = dict[str, PyTree[Float[AnyArray, "rows ..."]]]
 
 
 class Data(eqx.Module):
-    """The numbers of a problem; all can be differentiated.
+    """The data of a problem, all differentiable.
 
-    `start`: the start values of the tables, and the values of what is held; for every set of
-    observations `measured` and `weight` (see `Observations`), in the order they were given.
+    `start`: the start values of the tables, including held values; for every set of
+    observations `measured` and `weight` (see `Observations`), in the given order.
     """
 
     start: Values
@@ -36,7 +36,7 @@ class Data(eqx.Module):
 
 
 class Laid(eqx.Module):
-    """Measurements and weights of every part in the order of computing, scalar by scalar."""
+    """Measurements and weights of every part in the order of computation, scalar by scalar."""
 
     measured: tuple[PyTree[Float[Array, "chunks length"]], ...]
     weight: tuple[PyTree[Float[Array, "chunks length"]], ...]
@@ -57,7 +57,7 @@ class Declared:
 
 
 def lay_out_data(plan: Plan, data: Data) -> Laid:
-    """The measurements, looked up once a solution."""
+    """The measurements, looked up once per solution."""
     of = lambda rows, part: look_up(scalars(rows), part.source)
     return Laid(
         tuple(of(data.measured[part.observations], part) for part in plan.parts),
@@ -76,7 +76,7 @@ def scalars(rows: PyTree[Float[Array, "n ..."]]) -> PyTree[Float[Array, " n"]]:
 
 
 def prepare(declared: Declared, values: Values) -> dict[str, PyTree[Float[Array, " rows"]]]:
-    """What observations see of every row of every table."""
+    """The prepared block of every row of every table."""
     return {name: jax.vmap(declared.spaces[name].prepare)(rows) for name, rows in values.items()}
 
 
@@ -119,7 +119,7 @@ def _stacked(block) -> Any:
 
 
 def _weighted(v, weight):
-    """L⁻¹·v, or v/σ; 0 where the weight is 0, whatever v is."""
+    """L⁻¹·v, or v/σ; 0 if the weight is 0, whatever v is."""
     if isinstance(weight[0], tuple):
         rows = [sum(w * x for w, x in zip(row, v)) for row in weight]
         return tuple(jnp.where(row[i] > 0, r, 0.0) for i, (row, r) in enumerate(zip(weight, rows)))
@@ -127,16 +127,16 @@ def _weighted(v, weight):
 
 
 def diagonal_of(weight) -> Any:
-    """The weight of every residual, 0 where it does not count: of observations [n, r] or [n, r, r],
-    or of one as scalars."""
+    """The weight of every residual, 0 if it does not count: of observations [n, r] or [n, r, r], or
+    of one as scalars."""
     if isinstance(weight, tuple):
         return tuple(w[i] if isinstance(w, tuple) else w for i, w in enumerate(weight))
     return weight if weight.ndim == 2 else weight.diagonal(axis1=1, axis2=2)
 
 
 def fill_places(plan: Plan, laid: Laid) -> tuple[Plan, Laid]:
-    """Places that carry no weight see what one that does sees: what cannot be computed there, a
-    distance of a point from itself, would be NaN in reverse mode in spite of its weight."""
+    """Positions without weight use the rows of one with weight: an undefined value, such as the
+    distance of a point from itself, would be NaN in reverse mode in spite of its zero weight."""
     parts, measured = [], []
     for part, values, weight in zip(plan.parts, laid.measured, laid.weight):
         shape = part.source.shape
@@ -164,7 +164,7 @@ def _over_rows(function, by_row, blocks, measured, weight):
 
 
 def look_up(columns: PyTree[Float[Array, " rows"]], at: Int[Array, "..."]):
-    """The elements of every column at these places of a plan, none of which is negative."""
+    """The elements of every column at these (non-negative) indices of a plan."""
     there = {"mode": "promise_in_bounds", "wrap_negative_indices": False}
     return jax.tree.map(lambda column: column.at[at].get(**there), columns)
 
@@ -180,8 +180,8 @@ def residuals(declared: Declared, plan: Plan, values: Values, laid: Laid):
 
 
 def in_given_order(plan: Plan, parts) -> dict[int, Float[Array, "n ..."]]:
-    """What belongs to the observations of every part, for each set of observations in the order
-    they were given."""
+    """Quantities by observation of every part, rearranged by set of observations in the given
+    order."""
     found: dict[int, Float[Array, "n ..."]] = {}
     for part, rows in zip(plan.parts, parts):
         flat = rows.reshape(-1, *rows.shape[2:])[part.place]

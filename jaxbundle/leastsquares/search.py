@@ -1,9 +1,9 @@
 """Descents and searches on optimistix's public interfaces; they compose with optimistix's own.
 
-A *descent* turns a step size into a change of the unknowns, a *search* accepts or refuses it and
-says the next step size. What both get is an `optimistix.FunctionInfo.EvalGradHessian`: ½vᵀPv, its
-gradient, and N as a linear operator (`normal.Normal`). Unknowns move on manifolds, so points are
-handed over in the tangent space of the accepted one: `y` is zero, `y_eval` the step tried.
+A *descent* turns a step size into a change of the unknowns, a *search* accepts or rejects it and
+gives the next step size. Both receive an `optimistix.FunctionInfo.EvalGradHessian`: ½vᵀPv, its
+gradient, and N as a linear operator (`normal.Normal`). Unknowns are on manifolds, so points are
+passed in the tangent space of the accepted one: `y` is zero, `y_eval` the step tried.
 """
 
 from typing import Any
@@ -22,8 +22,8 @@ from jaxbundle.leastsquares.normal import Normal, Tangent, dot
 
 
 class Info(optx.FunctionInfo.EvalGradHessian):
-    """What is known at an accepted point: ½vᵀPv, its gradient and N; `damping`: λ of the step that
-    is judged; `noise`: how much of a change of ½vᵀPv is rounding."""
+    """Quantities at an accepted point: ½vᵀPv, its gradient and N; `damping`: λ of the step under
+    test; `noise`: rounding error of a change of ½vᵀPv."""
 
     hessian: Normal
     damping: Float[Array, ""]
@@ -31,13 +31,13 @@ class Info(optx.FunctionInfo.EvalGradHessian):
 
 
 SUFFICIENT = 1e-3
-"""A step is accepted if it keeps this fraction of the decrease it promised."""
+"""A step is accepted if it achieves this fraction of the predicted decrease."""
 WIDEST = 1e16
 """Radius of the trust region beyond which damping is rounding."""
 UNDAMPED_DATUM = 1e8
-"""Steps less damped than this need the datum directions made regular."""
+"""Steps with less damping need regularised datum directions."""
 INEXACT = 1e-2
-"""Relative residual of a reduced system solved by iteration, in the steps of the solver."""
+"""Relative residual of an iteratively solved reduced system, in the steps of the solver."""
 
 
 class Elimination(lx.AbstractLinearSolver):
@@ -93,8 +93,8 @@ class RegionState(eqx.Module):
         return cls(jnp.asarray(radius), jnp.asarray(2.0))
 
     def after(self, first, kept) -> tuple[Bool[Array, ""], "RegionState"]:
-        """Whether a step that kept this fraction of its promise is accepted, and the region for the
-        next: widened by the rule of Nielsen (1999), narrowed by 2, 4, 8, …"""
+        """Whether a step with this fraction of the predicted decrease is accepted, and the next
+        region: widened by the rule of Nielsen (1999), narrowed by 2, 4, 8, …"""
         accept = first | (kept > SUFFICIENT)
         finite = jnp.minimum(self.radius, WIDEST)
         wider = jnp.minimum(finite / jnp.maximum(1 / 3, 1 - (2 * kept - 1) ** 3), WIDEST)
@@ -104,7 +104,8 @@ class RegionState(eqx.Module):
 
 
 class NielsenTrustRegion(optx.AbstractSearch):
-    """Accept what decreases vᵀPv, in a region by the rule of Nielsen (`RegionState`)."""
+    """Accept steps that decrease vᵀPv, with a trust region by the rule of Nielsen
+    (`RegionState`)."""
 
     initial: float = 1e4
 
@@ -134,8 +135,8 @@ SEARCHES: dict[str, NielsenTrustRegion | FullStep] = dict(
 
 
 def promise(info: Info, change: Tangent, cost: Float[Array, ""]):
-    """The decrease of ½vᵀPv that a damped step promised, ½(−gᵀδ + λ·δᵀDδ), and the fraction it
-    kept."""
+    """The decrease of ½vᵀPv predicted for a damped step, ½(−gᵀδ + λ·δᵀDδ), and the fraction
+    achieved."""
     plan, D = info.hessian.plan, info.hessian.blocks.metric
     damped = info.damping * dot(plan, change, times(D, change))
     promised = 0.5 * (damped - dot(plan, info.grad, change))
@@ -143,8 +144,8 @@ def promise(info: Info, change: Tangent, cost: Float[Array, ""]):
 
 
 def fraction_kept(promised, gain, noise):
-    """The fraction of the promise that ½vᵀPv has decreased by; −1 where that cannot be computed. A
-    promise below rounding is kept unless the sum of squares visibly grows."""
+    """The fraction of the predicted decrease of ½vᵀPv that was achieved; −1 if it is not finite. A
+    prediction below rounding counts as achieved unless the sum of squares visibly grows."""
     kept = jnp.where(promised > 0, gain / promised, -1.0)
     kept = jnp.where(jnp.isfinite(kept), kept, -1.0)
     unseen = (promised > 0) & (promised < noise) & (gain > -noise)

@@ -1,4 +1,4 @@
-"""Which suspicious observations can be removed together, and which cannot be told apart.
+"""Suspicious observations that can be removed together, and those that are inseparable.
 
 A blunder ∇_b (in σ) of observation b moves the test of observation a by
 
@@ -10,13 +10,13 @@ observation. With the leverage l = h̃/r
 
     |Δw_a| ≤ √(l_a·l_b)·|w_b|
 
-and a can go together with worse ones b when its test exceeds the critical value even without all
-they could have put into it. Of one eliminated unknown only one observation goes at a time. Between
-them there is a test of its own: T_A = v_Aᵀ·(R_AA)⁺·v_A is by how much vᵀv decreases without the
-observations A. If T_b is significant as T_a is, but T_ab − T_b is not, b explains all that a does:
-one of them is wrong, and nothing says which (separability: Förstner, 1983).
+and a can be removed together with worse ones b if its test exceeds the critical value even
+without their largest possible influence. Only one observation per eliminated unknown is removed at
+a time. These are compared by another test: T_A = v_Aᵀ·(R_AA)⁺·v_A is the decrease of vᵀv without
+the observations A. If T_b is significant like T_a, but T_ab − T_b is not, b explains everything
+that a does: one of them is wrong, and they cannot be separated (separability: Förstner, 1983).
 
-Nothing here knows what an observation is: rows, groups, numbers.
+This module works on rows, groups and numbers only, not on particular observations.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 UNSEEN = 1e-2
-"""Directions with a smaller redundancy number say nothing of the observations in them."""
+"""Directions with a smaller redundancy number carry no information."""
 
 
 def choose_together(
@@ -66,14 +66,14 @@ def find_alternatives(
     critical: float,
     apart: float,
 ) -> list[int]:
-    """Observations that explain what the suspect one does, so that either may be wrong.
+    """Observations that explain the same error as the suspect, so that either may be wrong.
 
     **Arguments:**
 
     - `design`, `residual`: the rows of one eliminated unknown, divided by their σ.
     - `observations`: the rows of each observation; `suspect` one of them.
-    - `critical`: others whose test is below this are above suspicion.
-    - `apart`: the suspect is wrong for certain if its test exceeds this without the other one.
+    - `critical`: others with a test below this are not suspected.
+    - `apart`: the suspect is certainly wrong if its test exceeds this without the other one.
     """
     R = np.eye(len(design)) - design @ np.linalg.pinv(design)
 

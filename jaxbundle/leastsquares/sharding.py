@@ -1,10 +1,10 @@
-"""One minimum on several devices: eliminated rows distributed, with the observations of them.
+"""Minimisation on several devices: eliminated rows are distributed with their observations.
 
-Every device eliminates its own rows. What is kept is on all of them: the sums over it, the reduced
+Every device eliminates its own rows. Kept rows are on all devices: their sums, the reduced
 matrix and its right-hand side are added up over the devices (`normal.total`), and every device
-solves the reduced system and moves its rows. What touches no eliminated row belongs to the first
-device. The same program runs on the cores of a processor (`jax_num_cpu_devices`), on several GPUs,
-and in several processes after `jax.distributed.initialize`.
+solves the reduced system and updates its rows. Observations without an eliminated row belong to the
+first device. The same program runs on the cores of a processor (`jax_num_cpu_devices`), on several
+GPUs, and in several processes after `jax.distributed.initialize`.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ from jaxbundle.types import present
 
 AXIS = "devices"
 OBSERVATION = 3.0
-"""What an observation costs, in units of a pair of incidences."""
+"""Cost of an observation, in units of a pair of incidences."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,7 +54,7 @@ def distribute(problem: Problem, devices=None) -> Shards:
     here, host = dataclasses.replace(problem, sizes=sizes), jax.tree.map(np.asarray, problem.data)
     take = lambda of_sets, at: tuple(_take(x, rows) for x, rows in zip(of_sets, at))
     data = [fill_data(here, Data({}, take(host.measured, m), take(host.weight, m))) for m in seen]
-    datum = problem.plan.datum  # What holds it is not asked before the end.
+    datum = problem.plan.datum  # The datum is applied only at the end.
     datum = datum and jax.tree.map(np.asarray, Datum(datum.gauge, {}, datum.pins, {}))
     whole = lambda plan: dataclasses.replace(finish(plan, sizes), datum=datum, axis=AXIS)
     mesh, plans = Mesh(np.array(devices), (AXIS,)), [whole(plan) for plan, _ in planned]
@@ -64,11 +64,10 @@ def distribute(problem: Problem, devices=None) -> Shards:
 def find_minimum_of_shards(
     shards: Shards, solver: LeastSquares, start: Values | None = None
 ) -> Minimum[Values]:
-    """As `solver.minimise`, with the solver of the whole problem; values are not moved into the
-    datum. `start` must be finite: devices that end at different steps would wait for each other
-    for ever.
+    """As `solver.minimise`, with the solver of the whole problem; values are not moved to the
+    datum. `start` must be finite: devices that end at different steps would deadlock.
 
-    **Raises:** `NotSolvedError` where one of several processes is lost."""
+    **Raises:** `NotSolvedError` if one of several processes is lost."""
     problem, e = shards.problem, present(shards.problem.plan.eliminated)
     here = dataclasses.replace(problem, sizes=shards.sizes)
     given = jax.tree.map(np.asarray, problem.data.start if start is None else start)
@@ -92,7 +91,7 @@ def find_minimum_of_shards(
 
 @eqx.filter_jit
 def _minimise(mesh: Mesh, solver: LeastSquares, data: Data, start: Values) -> Minimum[Values]:
-    """What all devices find; eliminated rows [devices, rows, …]."""
+    """The results of all devices; eliminated rows [devices, rows, …]."""
     arrays, static = eqx.partition((solver.plan, data, start), eqx.is_array)
 
     def on_device(arrays):
@@ -120,7 +119,7 @@ def _place(mesh: Mesh, parts):
 
 def _cut(problem: Problem, parts: int):
     """For every device the eliminated rows, and the observations of every set: parts of equal work,
-    in their order. Kept rows, and rows that share an observation, are the first's."""
+    in order. Kept rows, and rows that share an observation, belong to the first device."""
     e, given = problem.plan.eliminated, problem.observations
     touched = [[r for name, r in zip(o.kind.of, o.rows) if name == e] for o in given]
     stays = problem.choices["stays",]

@@ -1,11 +1,11 @@
-"""Least squares with a few unknowns on a manifold, dense: start values, closed forms refined.
+"""Dense least squares with few unknowns on a manifold: start values, refined closed forms.
 
     v(x) → vᵀv = min,        x ← x ⊞ δ,        (N + λ·diag N)·δ = −Jᵀv,        N = JᵀJ
 
 J = ∂v(x ⊞ δ)/∂δ at δ = 0 by forward differentiation; v contains the roots of the weights. Steps and
 stopping follow the engine's rules (`loop.py`). The iterations are not differentiated: the
-derivatives, of every order, are those of the root of ∂(vᵀv)/∂δ = 0 (`jaxbundle.implicit`),
-curvature of v included.
+derivatives, to any order, are those of the root of ∂(vᵀv)/∂δ = 0 (`jaxbundle.implicit`), curvature
+of v included.
 """
 
 from collections.abc import Callable
@@ -23,11 +23,11 @@ from jaxbundle.leastsquares.loop import iterate
 from jaxbundle.leastsquares.stopping import Tolerance
 
 DETERMINED = 1e-10
-"""Least eigenvalue of the normal matrix scaled to a unit diagonal, below it nothing is solved."""
+"""Smallest eigenvalue of the normal matrix scaled to a unit diagonal for a solvable problem."""
 MOST = 30
 """Evaluations."""
 SETTLED = 1e-8
-"""A last step moves no unknown by more than this part of its σ; one more, undamped, follows."""
+"""The last step moves no unknown by more than this fraction of its σ; an undamped step follows."""
 
 
 class Fit(eqx.Module):
@@ -53,10 +53,10 @@ def adjust(residuals: Callable, retract: Callable, start, data: tuple, unknowns:
 
 
 def minimise(residuals: Callable, retract: Callable, start, data: tuple, unknowns: int, steps=MOST):
-    """The estimate where the iterations ended, and its vᵀv, without derivative.
+    """The estimate at the end of the iterations, and its vᵀv, without derivatives.
 
-    **Arguments:** `residuals(x, *data)` [n], `retract(x, δ)`; `start`: x to begin with; `steps`:
-    evaluations at most.
+    **Arguments:** `residuals(x, *data)` [n], `retract(x, δ)`; `start`: initial x; `steps`: maximum
+    evaluations.
     """
     start, data = stop_gradient((start, data))
 
@@ -130,7 +130,7 @@ def _linearised(residuals, retract, x, data, unknowns):
 
 
 def inverse(N: Float[Array, "u u"]) -> Float[Array, "u u"]:
-    """N⁻¹ of a positive definite N; not finite of another."""
+    """N⁻¹ of a positive definite N; else not finite."""
     return _solve(N, jnp.eye(N.shape[0], dtype=N.dtype))
 
 

@@ -1,20 +1,20 @@
-"""Data snooping: remove what the test calls a blunder, adjust again, until nothing is worse.
+"""Data snooping: remove blunders found by the test and adjust again, until none is left.
 
-    |w|  > z(1 − α/2)                        Baarda (1968): each residual by itself
+    |w|  > z(1 − α/2)                        Baarda (1968): each residual separately
     |τ|  > τ(1 − α'/2, redundancy)           Pope (1976): the largest of n, α' = 1 − (1 − α)^(1/n)
 
-One blunder spoils the residuals of its neighbours. So only what cannot mask each other goes at a
-time (`separation.py`): of every eliminated row only the worst observation, of a kept row only those
-that stay significant whatever the worse ones there put into their tests, and only those at least
-half as bad as the worst of all; what touches no eliminated row, or whose residuals are tested one
-by one, goes alone. An eliminated row that is left with too few residuals is set aside with them.
-Where observations of a row cannot be told apart, as the two of a point that has no more, nothing
-says which is wrong: when nothing else is left, all of them go and stand in the list as one ("either
-of").
+One blunder affects the residuals of its neighbours. So only observations that cannot mask each
+other are removed together (`separation.py`): of every eliminated row only the worst, of a kept row
+only those that stay significant whatever the influence of the worse ones, and only those at least
+half as bad as the worst of all. Observations without an eliminated row, or with residuals tested
+individually, are removed alone. An eliminated row left with too few residuals is excluded too.
 
-In the end whatever was removed is held against the adjustment it took no part in, by its predicted
-residual v and the variance σ²·(1 + h) of that: what passes comes back. Removed observations keep
-their rows with weight zero, so nothing is compiled again.
+If observations of a row are inseparable, as the two of a two-ray point, nothing decides which is
+wrong: when no others are left, all of them are removed and listed as one ("either of").
+
+Finally every removed observation is tested against the adjustment without it, by its predicted
+residual v with variance σ²·(1 + h), and restored if it passes. Removed observations keep their rows
+with weight zero, so nothing is compiled again.
 """
 
 import dataclasses
@@ -32,18 +32,19 @@ from jaxbundle.leastsquares.separation import choose_together, find_alternatives
 from jaxbundle.leastsquares.solution import Solution, take_step
 
 TOGETHER = 0.5
-"""Observations go together with the worst one if their test is at least this part of its."""
+"""Observations are removed together with the worst if their test is at least this fraction of
+its."""
 STEPPING = 20_000
-"""Problems of so many observations take single steps from one removal to the next."""
+"""Problems with at least this many observations take single steps between removals."""
 
 Adjust = Callable[[Problem, Values], Solution]
-"""The solution of a problem, from start values; refuses what is not solved."""
+"""The solution of a problem from start values; raises if there is none."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Removed:
-    """A removed observation: its set, its row there, which of its residuals (None: all), its test
-    value. `others`: rows of observations that may be the wrong ones instead, removed with it."""
+    """A removed observation: its set, row, residual (None: all) and test value. `others`: rows of
+    inseparable observations, removed with it."""
 
     set: int
     row: int
@@ -58,8 +59,8 @@ class Removed:
 
 
 def check_test(test: str | None, significance: float, option: str = "") -> None:
-    """Refuse a test that is none, and a level that is no probability; `option` stands before the
-    names in the message.
+    """Refuse an unknown test, and a level that is not a probability; `option` precedes the names in
+    the message.
 
     **Raises:** `InputError`.
     """
@@ -68,10 +69,9 @@ def check_test(test: str | None, significance: float, option: str = "") -> None:
 
 
 def readjust(problem: Problem, values: Values, adjust_from: Adjust) -> Solution:
-    """The solution of a problem that was changed a little, less weight here, none there. A large
-    one takes a single Gauss–Newton step, which lands within the square of the change, if it
-    decreases vᵀPv; a small one would wait longer for the compilation of the step. What is final is
-    to be adjusted once more."""
+    """The solution of a problem with slightly changed weights. A large one takes a single
+    Gauss–Newton step if this decreases vᵀPv, with an error of the square of the change; for a small
+    one compiling the step would take longer. A final result must be adjusted once more."""
     if sum(given.number for given in problem.observations) >= STEPPING:
         before = Solution(problem, values)
         after = Solution(problem, take_step(problem, values))
@@ -96,16 +96,16 @@ def snoop(
     - `found`: the solution with all observations.
     - `adjust_from(problem, start)`: the solution of a changed problem.
     - `test`: `"pope"` (σ a posteriori, the largest of all) or `"baarda"` (σ a priori, each).
-    - `significance`: α, two-sided: with `"pope"` the probability to lose anything of data without
-      blunders, with `"baarda"` that of one residual. Observations of one eliminated row that cannot
-      be told apart at this level are removed together.
-    - `limit`: at most so many removals.
-    - `doubtful`: what is left out to begin with, and comes back if it passes in the end.
+    - `significance`: α, two-sided: for `"pope"` the probability of removing anything from data
+      without blunders, for `"baarda"` that of removing one residual. Observations of one eliminated
+      row that are inseparable at this level are removed together.
+    - `limit`: maximum number of removals.
+    - `doubtful`: initially removed observations, restored if they pass in the end.
 
     **Returns:** the solution without the removed observations, and what was removed in the order
     of removal.
 
-    **Raises:** `InputError` for another test, or a level that is no probability.
+    **Raises:** `InputError` for an unknown test, or a level that is not a probability.
     """
     check_test(test, significance)
     whole, removed, returned = found.problem, [*doubtful], set()
@@ -137,8 +137,8 @@ def snoop(
 
 
 class _Touched:
-    """What the observations that are tested touch: by set the eliminated row of each (−1: none) and
-    a number for its first kept row; `whole`: sets whose observations are removed as a whole."""
+    """The rows touched by tested observations: by set the eliminated row of each (−1: none) and an
+    index of its first kept row; `whole`: sets whose observations are removed as a whole."""
 
     def __init__(self, problem: Problem):
         self.eliminated = problem.plan.eliminated
@@ -161,15 +161,15 @@ class _Touched:
         self.single = [o for o, policy in enumerate(kinds) if policy == "single"]
 
     def tested(self, problem: Problem) -> int:
-        """How many residuals are tested."""
+        """The number of tested residuals."""
         weight = [problem.weights(o) for o in (*self.whole, *self.single)]
         return sum(int((w > 0).sum()) for w in weight)
 
 
 def _worst(found, touched: _Touched, unit, critical: float, apart: float) -> list[Removed]:
-    """What has to go now, the worst first; tests in `unit`.
+    """The observations to remove now, the worst first; tests in `unit`.
 
-    Observations of a row are told apart if the test of the suspect exceeds `apart` without the
+    Observations of a row are separable if the test of the suspect exceeds `apart` without the
     other."""
     tests = {o: _finite(w) / unit for o, w in found.reliability.w.items()}
     alone = [Removed(o, *_place(tests[o]), tests[o].max(initial=0.0)) for o in touched.single]
@@ -212,8 +212,8 @@ def _place(tests):
 
 
 def _leverage(found: Solution):
-    """h̃/r of every observation, the largest of its residuals: h less what its eliminated row alone
-    has in it."""
+    """h̃/r of every observation, the largest of its residuals: h minus the part of its eliminated
+    row alone."""
     tested, tiny = found.reliability, np.finfo(float).tiny
     return {
         o: (np.clip(1 - r - tested.own[o], 0.0, None) / np.maximum(r, tiny)).max(1, initial=0.0)
@@ -222,7 +222,7 @@ def _leverage(found: Solution):
 
 
 class _Neighbours:
-    """The observations of every eliminated row, to tell them apart."""
+    """The observations of every eliminated row, to test their separability."""
 
     def __init__(self, found: Solution, touched: _Touched, unit: float):
         self.found, self.unit, self.sets = found, unit, touched.own
@@ -233,7 +233,7 @@ class _Neighbours:
             self.sorted[o] = own[self.order[o]]
 
     def alternatives(self, o: int, row: int, critical: float, apart: float) -> tuple[int, ...]:
-        """Rows of the same set and eliminated row that may be wrong instead."""
+        """Inseparable rows of the same set and eliminated row."""
         own = self.sets[o][row]
         rows = {
             s: self.order[s][slice(*np.searchsorted(self.sorted[s], [own, own + 1]))]
@@ -251,7 +251,8 @@ class _Neighbours:
 
 
 def _passing(whole: Problem, found: Solution, touched, removed: Sequence[Removed], critical: float):
-    """Sets, rows and residuals of what was removed that agree with the adjustment without them."""
+    """Sets, rows and residuals of removed observations that agree with the adjustment without
+    them."""
     if not removed:
         return set()
     tests = {o: _finite(t) for o, t in found.predicted_tests(whole.data).items()}
@@ -268,7 +269,7 @@ def _passing(whole: Problem, found: Solution, touched, removed: Sequence[Removed
 
 
 def _tested(whole: Problem, found: Solution, removed: Sequence[Removed]) -> Iterable[Removed]:
-    """The same with the tests of what was doubtful from the beginning."""
+    """The same with the tests of initially doubtful observations."""
     tests = {o: _finite(t) for o, t in found.predicted_tests(whole.data).items()}
     for r in removed:
         yield r if np.isfinite(r.test) else dataclasses.replace(
@@ -277,8 +278,8 @@ def _tested(whole: Problem, found: Solution, removed: Sequence[Removed]) -> Iter
 
 
 def _without_passing(removed: Sequence[Removed], passing) -> Iterable[Removed]:
-    """What stays removed. Where all that may be wrong pass one by one, they still contradict each
-    other, and all of them stay away."""
+    """The observations that stay removed. If all inseparable ones pass individually, they still
+    contradict each other and all stay removed."""
     for r in removed:
         stay = tuple(row for row in r.rows if (r.set, row, r.residual) not in passing)
         if stay == r.rows or (not stay and r.others):
@@ -288,14 +289,14 @@ def _without_passing(removed: Sequence[Removed], passing) -> Iterable[Removed]:
 
 
 def _finite(tests) -> Float[np.ndarray, "..."]:
-    """|tests|, 0 where there is none."""
+    """|tests|, 0 if there is none."""
     tests = np.abs(np.asarray(tests))
     return np.where(np.isfinite(tests), tests, 0.0)
 
 
 def without(problem: Problem, removed: Sequence[Removed]) -> Problem:
-    """The problem with the weights of what was removed set to zero; eliminated rows that are left
-    with too few residuals are set aside."""
+    """The problem with the weights of removed observations set to zero; eliminated rows left with
+    too few residuals are excluded."""
     weight = [np.array(w) for w in problem.data.weight]
     for r in removed:
         weight[r.set][list(r.rows), r.residual if r.residual is not None else slice(None)] = 0.0

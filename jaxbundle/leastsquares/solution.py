@@ -1,7 +1,6 @@
-"""A solution looked at: its factor, cofactors and reliability, each computed when first asked for.
+"""Inspection of a solution: factor, cofactors and reliability, each computed on first access.
 
-What is filled into the arrays, so that problems of nearly the same size share their compiled
-programs, is taken off again here.
+The padding that lets problems of similar size share compiled programs is removed here.
 """
 
 import dataclasses
@@ -44,22 +43,22 @@ from jaxbundle.leastsquares.solver import LeastSquares, Minimum, find
 from jaxbundle.leastsquares.stopping import converged
 
 HERE = "the plan"
-"""Stands for it in a factor that leaves a compiled function."""
+"""Placeholder of the plan in a factor returned by a compiled function."""
 
 TO_SHARE = 10_000
-"""Problems of so many observations are distributed over the devices, where there are several:
-with fewer, devices wait for each other longer than they compute."""
+"""Problems with at least this many observations are distributed over several devices; for smaller
+ones waiting exceeds computing."""
 
 RETURNS, SAME = 10, 1e-12
-"""From the datum to the minimum, at most; vᵀPv that differ by less are the same."""
+"""Largest number of returns from the datum to the minimum; relative tolerance of vᵀPv."""
 
 Rows = dict[int, Float[np.ndarray, "n r"]]
-"""By set of observations, in the order they were given."""
+"""By set of observations, in the given order."""
 
 
 def find_minimum(problem: Problem, start: Values | None = None, **options) -> Minimum[Values]:
-    """Iterate from `start` (the problem's own if not given) and move the solution into the datum;
-    `options`: of the solver (`make_solver`). What is held, and the datum, stay the problem's."""
+    """Iterate from `start` (default: that of the problem) and move the solution to the datum;
+    `options`: of the solver (`make_solver`). Held values and datum are those of the problem."""
     given = pad_values(problem, problem.data.start)
     start = given if start is None else pad_values(problem, start)
     minimise_from = _on_all_devices if _worth_sharing(problem, start) else _on_one_device
@@ -70,8 +69,8 @@ def find_minimum(problem: Problem, start: Values | None = None, **options) -> Mi
         values = _move_to_datum(there, minimum.values, given)
         if there is problem or not bool(converged(minimum.termination)):
             break
-        # What leaves one height of a point open, say, is no group of motions: the way into the
-        # datum may have left the minimum.
+        # Open combinations need not form a group (one open height of a point, say): the motion to #
+        # the datum may have left the minimum.
         before, after = (
             Solution(problem, without_filling(problem, v)).vtpv for v in (minimum.values, values)
         )
@@ -98,7 +97,7 @@ def _on_all_devices(problem: Problem, solver: LeastSquares):
 
 
 def _worth_sharing(problem: Problem, start: Values) -> bool:
-    """Whether there are devices to share a problem, and rows to distribute over them."""
+    """Whether there are several devices, and rows to distribute over them."""
     if len(jax.devices()) == 1 or problem.plan.eliminated is None:
         return False
     if sum(o.number for o in problem.observations) < TO_SHARE:
@@ -135,14 +134,14 @@ def _step(declared, plan, values, data, retraction):
 
 
 class Solution:
-    """What statistics need of a problem at some `values`, which should be its adjusted ones."""
+    """Quantities for the statistics of a problem at its (adjusted) `values`."""
 
     def __init__(self, problem: Problem, values: Values):
         self._as_given, self.values = problem, values
 
     @functools.cached_property
     def problem(self) -> Problem:
-        """The problem with its open motions as they are here."""
+        """The problem with its open motions at these values."""
         return open_at(self._as_given, self.values)
 
     @functools.cached_property
@@ -188,12 +187,12 @@ class Solution:
 
     @functools.cached_property
     def moves(self):
-        """How all tables move along the motions; None where none is open."""
+        """The generators of all tables along the motions; None if none is open."""
         declared, plan, values = self.given[:3]
         return None if plan.datum is None else directions_of_motions(declared, values)
 
     def cofactor(self, table: str) -> Float[np.ndarray, "rows width width"]:
-        """The cofactors of every row of a table among themselves; zero where it is held."""
+        """The cofactor block of every row of a table; zero for held unknowns."""
         return self._own[table]
 
     @functools.cached_property
@@ -209,20 +208,20 @@ class Solution:
         return Reliability(**{f: self._rows(rows) for f, rows in vars(found).items()})
 
     def predicted_tests(self, data: Data) -> Rows:
-        """v/√(1 + h) of all observations with the weights of `data`, as if none of them had taken
-        part: normalised residuals of those that did not."""
+        """v/√(1 + h) of all observations with the weights of `data`: the normalised residuals of
+        excluded observations."""
         given = (*self.given[:3], pad_data(self.problem, data))
         return self._rows(_held_against(*given, self.cofactors))
 
     @functools.cached_property
     def by_eliminated(self) -> Rows:
         """The derivatives [n, r, w] of all observations by the eliminated rows they touch, divided
-        by their σ; nothing of those that touch none."""
+        by their σ; without those that touch none."""
         return self._rows(_by_eliminated(*self.given))
 
     def propagate(self, function: Callable[[Values], Array]) -> Float[np.ndarray, "n n"]:
-        """The cofactors of any differentiable function (`Values` → [n]) of the unknowns; it is
-        compiled, once for the same function."""
+        """The cofactors of any differentiable function (`Values` → [n]) of the unknowns, compiled
+        once per function."""
         return self.propagate_rows(self.slopes(function))
 
     def slopes(self, function: Callable[[Values], Array]) -> dict[str, Array]:
@@ -263,13 +262,13 @@ def _factor(declared: Declared, plan: Plan, values: Values, data: Data) -> Facto
 
 
 def without_plan(factor: Factor) -> Factor:
-    """A factor without its plan, which a compiled function would return as a copy."""
+    """A factor without its plan, which a compiled function would copy."""
     is_plan = lambda x: isinstance(x, Plan)
     return jax.tree.map(lambda x: HERE if is_plan(x) else x, factor, is_leaf=is_plan)
 
 
 def with_plan(factor: Factor, plan: Plan) -> Factor:
-    """And with it again."""
+    """The factor with its plan restored."""
     return jax.tree.map(lambda x: plan if isinstance(x, str) else x, factor)
 
 

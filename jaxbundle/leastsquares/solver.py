@@ -1,8 +1,8 @@
-"""Least squares on manifolds, carried by `optimistix.least_squares`.
+"""Least squares on manifolds with `optimistix.least_squares`.
 
-The solver walks from one accepted point to the next: a search accepts or refuses the step tried, a
-descent computes the next one, and `stopping` judges. Residuals, Jacobian and normal equations are
-formed once for each accepted point; a refused step costs a factorisation and the residuals.
+From one accepted point to the next, a search accepts or rejects the step tried, a
+descent computes the next one, and `stopping` decides. Residuals, Jacobian and normal equations are
+formed once per accepted point; a rejected step costs a factorisation and the residuals.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ from jaxbundle.leastsquares.stopping import LIMIT, NOT_FINITE, SETTLED, Approach
 
 
 class History(eqx.Module):
-    """One row an evaluation: ½vᵀPv there, λ of the step that led to it, accepted or not."""
+    """One row per evaluation: ½vᵀPv, λ of its step, accepted or not."""
 
     cost: Float[Array, " steps"]
     damping: Float[Array, " steps"]
@@ -46,8 +46,7 @@ class History(eqx.Module):
 
 
 class Known(eqx.Module):
-    """What is known at an accepted point: ½vᵀPv, its gradient, N. `damping`: λ of the step from
-    there."""
+    """Quantities at an accepted point: ½vᵀPv, its gradient, N. `damping`: λ of the next step."""
 
     cost: Float[Array, ""]
     gradient: Tangent
@@ -56,8 +55,7 @@ class Known(eqx.Module):
 
 
 class State(eqx.Module):
-    """What the loop carries besides the accepted unknowns: what is known there, and the step to be
-    tried."""
+    """The loop state besides the accepted unknowns: the quantities there, and the step to try."""
 
     first: Bool[Array, ""]
     known: Known
@@ -75,10 +73,10 @@ class State(eqx.Module):
 class LeastSquares(optx.AbstractLeastSquaresSolver):
     """The solver of a planned problem; see the module.
 
-    **Arguments:** `descent` and `search`: optimistix's interfaces, ours or its own (those that keep
-    no memory of earlier points); `retract(plan, values, change)`: where a change leads;
-    `max_steps`: evaluations at most, and `rows` of the history, which are compiled in;
-    `progress(step, cost, λ)` is called on the host after every evaluation.
+    **Arguments:** `descent` and `search`: ours or optimistix's (those without memory of earlier
+    points); `retract(plan, values, change)`: applies a change; `max_steps`: maximum evaluations,
+    and `rows` of the history, which are compiled in; `progress(step, cost, λ)` is called on the
+    host after every evaluation.
     """
 
     declared: Declared
@@ -139,7 +137,7 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
         return ended, optx.RESULTS.successful
 
     def postprocess(self, fn, y, aux, args, options, state: State, tags, result):
-        # optimistix itself ends the loop where unknowns are not finite, before any step.
+        # optimistix ends the loop at non-finite unknowns before any step.
         termination = jnp.where(_all_finite(y), state.termination, NOT_FINITE)
         stats = {
             "termination": termination, "iterations": state.steps, "history": state.history,
@@ -151,12 +149,12 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
         return Known(*equations, damping=jnp.asarray(0.0))
 
     def _info(self, known: Known) -> Info:
-        """What searches and descents are told."""
+        """The information passed to searches and descents."""
         normal, noise = Normal(self.plan, known.normal), self.tolerance.noise(known.cost)
         return Info(known.cost, known.gradient, normal, known.damping, noise)
 
     def _accepted_point(self, accept, y, args, state: State):
-        """The last accepted point and what is known there: the one tried, or the old one."""
+        """The last accepted point and its quantities: the one tried, or the old one."""
         return jax.lax.cond(
             accept,
             lambda: (state.trial, self._linearise(state.trial, args)),
@@ -164,7 +162,7 @@ class LeastSquares(optx.AbstractLeastSquaresSolver):
         )
 
     def _next_change(self, known: Known, step_size, descent_state):
-        """The descent's step from the accepted point, none where it cannot be computed."""
+        """The descent's step from the accepted point, zero if it cannot be computed."""
         asked = self.descent.query(zero_tangent(self.plan), self._info(known), descent_state)
         change, _ = self.descent.step(step_size, asked)
         finite = total(self.plan, 1 - _all_finite(change).astype(int)) == 0
@@ -187,8 +185,8 @@ V = TypeVar("V")
 
 
 class Minimum(eqx.Module, Generic[V]):
-    """Where the loop ended: unknowns (tables, or as a network has them), why
-    (`stopping.TERMINATIONS`), how many steps, their history."""
+    """The end of the loop: unknowns (tables, or those of a network), termination
+    (`stopping.TERMINATIONS`), number of steps, history."""
 
     values: V
     termination: Int[Array, ""]
@@ -208,7 +206,7 @@ def minimise(solver: LeastSquares, data: Data, start: Values) -> Minimum[Values]
 
 
 find = eqx.filter_jit(minimise)
-"""`minimise`, compiled once and shared by all that call it."""
+"""`minimise`, compiled once for all callers."""
 
 
 def half_square(plan: Plan, residual) -> Float[Array, ""]:

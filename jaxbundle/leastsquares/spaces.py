@@ -1,15 +1,15 @@
-"""How one row of a table of unknowns moves: vectors, rotations, poses, directions.
+"""Parametrisation of one row of a table of unknowns: vectors, rotations, poses, directions.
 
-A space says, for ONE row, how many directions it is free to move in (`width`), what an observation
-sees of it (`prepare`, a block of scalars), how a small change δ moves that block (`moved`, right to
-second order at δ = 0, the only place where derivatives are taken), where a finite change leads
-(`retract`), and which change leads from one value to another (`difference`). `hold` is a value
-with what is held taken from another; `chart` gives the unknowns in which damping is measured,
-T = ∂(those)/∂δ and T⁻¹.
+A space defines, for ONE row, the number of directions (`width`), the block of scalars that an
+observation receives (`prepare`), the effect of a small change δ on that block (`moved`, correct to
+second order at δ = 0, where all derivatives are taken), the application of a finite change
+(`retract`), and the change between two values (`difference`). `hold` is a value
+with its held part taken from another; `chart` gives the unknowns of the damping metric,
+T = ∂(chart)/∂δ and T⁻¹.
 
 Blocks consist of scalars, not of small arrays: under `vmap` every scalar becomes one long array,
-and XLA turns the observation equations into straight loops over the observations (a third of the
-time of small matrix products).
+and XLA compiles the observation equations to plain loops over the observations (a third of the time
+of small matrix products).
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ Matrix = Float[Array, "width width"]
 
 @runtime_checkable
 class Space(Protocol):
-    """What the engine asks of a space; instances are hashable and compare by their fields."""
+    """The interface of a space; instances are hashable and compare by their fields."""
 
     @property
     def width(self) -> int: ...
@@ -52,9 +52,9 @@ class Space(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class Vector:
-    """Numbers that add. `size`: how many (0: a single number, not in a tuple); `columns`: those of
-    them that move (None: all); `tied`: further ones that move as one of these does, (column, which
-    of `columns`) each."""
+    """Numbers that add. `size`: how many (0: a single number, not in a tuple); `columns`: the free
+    ones (None: all); `tied`: further ones that change with one of these, (column, index in
+    `columns`) each."""
 
     size: int
     columns: tuple[int, ...] | None = None
@@ -70,7 +70,7 @@ class Vector:
 
     @property
     def moves(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """The columns that move, and which number of a change moves each."""
+        """The columns that change, and the component of a change for each."""
         pairs = (*((column, k) for k, column in enumerate(self.moving)), *self.tied)
         return tuple(column for column, _ in pairs), tuple(k for _, k in pairs)
 
@@ -109,7 +109,7 @@ class Vector:
 
 
 class Turned(NamedTuple):
-    """A rotation M as observations see it: `rows`, 9 scalars, and a small turn on top of it."""
+    """A rotation M for observations: `rows`, 9 scalars, and a small additional rotation."""
 
     rows: tuple[Scalar, ...]
     turn: tuple[Scalar, Scalar, Scalar] | None = None
@@ -140,17 +140,17 @@ class Turned(NamedTuple):
 
 
 class Posed(NamedTuple):
-    """A pose as observations see it: rotation M and projection centre X0."""
+    """A pose for observations: rotation M and projection centre X0."""
 
     rotation: Turned
     centre: tuple[Scalar, Scalar, Scalar]
 
     def ray(self, X):
-        """M·(X − X0): a place of object space in the frame of the pose."""
+        """M·(X − X0): a point of object space in the frame of the pose."""
         return self.rotation.apply(tuple(a - b for a, b in zip(X, self.centre)))
 
     def place(self, x):
-        """X0 + Mᵀ·x: a place of the frame of the pose in object space."""
+        """X0 + Mᵀ·x: a point in the frame of the pose, in object space."""
         return tuple(a + b for a, b in zip(self.centre, self.rotation.apply_inverse(x)))
 
 
@@ -190,10 +190,10 @@ class PoseValue(NamedTuple):
 class Pose:
     """A projection centre X0 and a rotation M, `PoseValue`; a change is (δX0, δθ).
 
-    Damping weighs a turn δθ and a shift δX0 as programs do that store [R t]: by the turn and by the
-    change of t = −M·X0, the place of the origin of object space in the camera frame. A turn is
-    then about that origin and weighs the more the farther away it is; with both damped lightly,
-    long steps of one against the other would be tried and refused.
+    Damping weights a rotation δθ and a shift δX0 like programs that store [R t]: by the rotation
+    and the change of t = −M·X0, the origin of object space in the camera frame. A rotation is then
+    about that origin and weighs more the farther away it is; with light damping of both, long steps
+    of one against the other would be tried and rejected.
     """
 
     width = 6
@@ -235,9 +235,9 @@ class Pose:
 
 @dataclasses.dataclass(frozen=True)
 class Frame:
-    """A pose, `PoseValue`, that moves along and about its own axes, δ = (shift along x, y, z, turn
-    about x, y, z), of which `columns` count: a figure that is the same when it is shifted or turned
-    in another way (a plane along itself, a cylinder about its axis)."""
+    """A pose, `PoseValue`, that moves along and about its own axes, δ = (shift along x, y, z,
+    rotation about x, y, z), restricted to `columns`: for a figure invariant to the other shifts and
+    rotations (a plane along itself, a cylinder about its axis)."""
 
     columns: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
 
@@ -322,7 +322,7 @@ def tangent_basis(value: Float[Array, " n"]) -> Float[Array, "n n-1"]:
 
 
 def turn_by(angle, x):
-    """exp([angle]×)·x for turns below a third of a radian, by series: exact to rounding, with
+    """exp([angle]×)·x for rotations below a third of a radian, by series: exact to rounding, with
     derivatives at 0."""
     square = sum(a * a for a in angle)
     sine = 1 - square / 6 * (1 - square / 20 * (1 - square / 42 * (1 - square / 72)))

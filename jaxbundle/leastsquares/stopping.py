@@ -1,9 +1,9 @@
-"""When to stop, and why: one rule for everything that is adjusted.
+"""Stopping criteria and terminations: one rule for all adjustments.
 
 With the undamped step δ and g = JᵀPv, the decrement d² = −gᵀδ = δᵀNδ bounds every single unknown:
 |δᵢ| ≤ d/σ₀·σᵢ. A problem is *settled* when d ≤ `atol`·σ₀: no unknown would move by more than `atol`
 of its own standard deviation. Near the solution the damping is therefore dropped altogether; a
-problem whose undamped equations cannot be solved ends as *singular*, never as converged.
+problem whose undamped equations cannot be solved is *singular*, never converged.
 """
 
 import equinox as eqx
@@ -27,28 +27,28 @@ def converged(termination):
 
 
 ROUNDING = 2e-14
-"""A promised decrease of vᵀPv below this fraction of it is rounding noise."""
+"""A predicted relative decrease of vᵀPv below this is rounding noise."""
 COST_ROUNDING = 1e-15
-"""Relative precision of a measured value, to estimate that of vᵀPv."""
+"""Relative precision of a measured value, for estimating that of vᵀPv."""
 NOISE_FLOOR, NOISE_FLOOR_WITHOUT_REDUNDANCY = 1e-14, 1e-12
-"""Relative precision of a measured value; residuals below it are noise of the arithmetic.
+"""Relative precision of a measured value; residuals below it are arithmetic noise.
 
-Without redundancy all residuals vanish and no σ0 says when to stop: the wider floor does.
+Without redundancy all residuals vanish and there is no σ0 for stopping: this wider floor is used.
 """
 NEAR = 1e-3
-"""Near the solution: the last step promised to decrease vᵀPv by less than this fraction."""
+"""Near the solution: the last step was predicted to decrease vᵀPv by less than this fraction."""
 KEPT, FALLING = 0.95, 0.1
-"""And it kept so much of the promise, which was less than this fraction of the one before."""
+"""The fraction of its prediction that it must achieve, and its limit relative to the one before."""
 REFUSALS = 2
-"""So many undamped steps refused where the damped ones have settled: singular, if not exactly."""
+"""Number of rejected undamped steps, after damped ones settled, that means (nearly) singular."""
 SHORTEST = 1e-20
-"""A step size below which nothing can be tried any more."""
+"""The smallest step size worth trying."""
 
 
 class Tolerance(eqx.Module):
-    """What counts as nothing. `atol`: see the module; `rtol`: stop when an accepted step decreases
-    vᵀPv by less than this fraction (0: never for this reason); `squares`: the sum of the squares
-    of all measured values, divided by their σ."""
+    """Tolerances. `atol`: see the module; `rtol`: stop when an accepted step decreases vᵀPv by less
+    than this fraction (0: disabled); `squares`: the sum of the squares of all measured values,
+    divided by their σ."""
 
     redundancy: Float[Array, ""]
     squares: Float[Array, ""]
@@ -56,20 +56,20 @@ class Tolerance(eqx.Module):
     rtol: Float[Array, ""]
 
     def limit(self, cost):
-        """The decrement d² below which a problem is settled."""
+        """The decrement d² below which a problem has settled."""
         sigma0_squared = 2 * cost / jnp.maximum(self.redundancy, 1.0)
         precision = jnp.where(self.redundancy > 0, NOISE_FLOOR, NOISE_FLOOR_WITHOUT_REDUNDANCY)
         floor = precision**2 * self.squares
         return jnp.maximum(self.atol**2 * sigma0_squared, ROUNDING * cost) + floor
 
     def noise(self, cost):
-        """How much of a change of ½vᵀPv is rounding."""
+        """Rounding error of a change of ½vᵀPv."""
         return COST_ROUNDING * jnp.sqrt(self.squares * 2 * cost)
 
 
 class Approach(eqx.Module):
-    """How near the end is: what the step before promised, how often undamped steps were refused,
-    whether the undamped equations could not be solved."""
+    """State near convergence: the predicted decrease of the previous step, the number of rejected
+    undamped steps, whether the undamped equations could not be solved."""
 
     near: Float[Array, ""]
     promised: Float[Array, ""]
@@ -84,8 +84,8 @@ class Approach(eqx.Module):
         return cls(jnp.asarray(NEAR), jnp.asarray(0.0), no, no, no, jnp.asarray(0))
 
     def choose_step(self, step_size, last_size, first, accept, promised, kept, cost):
-        """The step size, infinite where the damping is to be dropped; and the approach after it."""
-        # An undamped step that was refused was tried too early.
+        """The step size, infinite for an undamped step; and the approach after it."""
+        # A rejected undamped step was tried too early.
         near = jnp.where(jnp.isinf(last_size) & ~accept, 0.1 * self.near, self.near)
         quadratic = accept & (kept > KEPT) & ~self.singular & ~first
         quadratic &= (promised < near * cost) & (promised < FALLING * self.promised)
@@ -107,7 +107,7 @@ class Approach(eqx.Module):
         settled = small & undamped
         again = self.singular & undamped & ~finite
         singular = self.singular | (~finite & undamped) | (self.refusals >= REFUSALS)
-        # Steps that are all accepted may grow: what grows visibly has not stalled.
+        # Accepted steps may grow: visible growth is not stalling.
         stalled = accept & ~first & (before - tried < tolerance.rtol * before)
         stalled &= tried - before <= tolerance.noise(before)
         reasons = (
@@ -121,7 +121,7 @@ class Approach(eqx.Module):
         termination = jnp.asarray(LIMIT)
         for happened, reason in reversed(reasons):
             termination = jnp.where(happened, reason, termination)
-        # A small step that still was damped: try it undamped before calling it settled.
+        # A small damped step: try it undamped before declaring convergence.
         trial = small & ~singular & ~settled
         approach = Approach(self.near, self.promised, singular, trial, self.tried, self.refusals)
         return termination, approach

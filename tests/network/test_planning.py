@@ -135,7 +135,7 @@ def test_the_command(monkeypatch, capsys, tmp_path):
     code, said = run(monkeypatch, capsys, "plan", *options, "--height", 1530, "--no-network",
                      "--out", tmp_path / "block")  # fmt: skip
     assert not code and "scale                 1 : 10000" in said.out
-    assert "4 a strip, 8 in all" in said.out and (tmp_path / "block" / "project.toml").exists()
+    assert "4 per strip, 8 in all" in said.out and (tmp_path / "block" / "project.toml").exists()
     code, said = run(monkeypatch, capsys, "plan", *options, "--height", 10)
     assert code == 2 and "photographs: too many for a covariance" in said.err
     code, said = run(monkeypatch, capsys, "plan", *options)
