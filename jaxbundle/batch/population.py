@@ -196,7 +196,22 @@ def _row(row: Mapping) -> dict:
     removed = row.get("removed")
     found["removed"] = len(removed) if isinstance(removed, list) else removed
     found["remark"] = row.get("remark") or row.get("error", "")
-    return found | {"parameters": row.get("parameters", {})}
+    return found | {"parameters": row["parameters"] if "parameters" in row else _of_network(row)}
+
+
+def _of_network(row: Mapping) -> dict[str, dict]:
+    """Estimates of a network that belong to no single image: free parameters of its cameras (with
+    the camera's id where there are several), mountings, boresights and the like."""
+    found, cameras = {}, row.get("cameras") or {}
+    for id, camera in cameras.items():
+        for name, one in camera["parameters"].items():
+            if one.get("free"):
+                found[name if len(cameras) == 1 else f"{id} {name}"] = one
+    for table, unknowns in (row.get("further_unknowns") or {}).items():
+        for of, estimates in unknowns.items():
+            if of not in row.get("images", {}):
+                found |= {f"{table} {of} {name}": one for name, one in estimates.items()}
+    return found
 
 
 def _correlation(column: str, name: str, with_it, values) -> Correlation:
@@ -249,11 +264,18 @@ def _numbers(given: Columns, column: str) -> np.ndarray:
     for row, cell in enumerate(cells):
         if cell in ("", "nan", "None", "NaT"):
             continue
-        try:
-            found[row] = float(cell)
-        except ValueError:
-            found[row] = _days(cell, f"{given.source(row)}: {column}")
+        found[row] = number_or_days(cell, f"{given.source(row)}: {column}")
     return found
+
+
+def number_or_days(cell: str, where: str) -> float:
+    """A number, or a date such as 2026-05-01 as days since 1970.
+
+    **Raises:** `InputError` for what is neither."""
+    try:
+        return float(cell)
+    except ValueError:
+        return _days(cell, where)
 
 
 def _days(cell: str, where: str) -> float:

@@ -8,9 +8,12 @@ and the fingerprint of its `data`; where those are others, nothing is taken for 
 """
 
 import dataclasses
+import itertools
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -20,17 +23,29 @@ from jaxbundle.arguments import one_of, whole
 from jaxbundle.batch.calibrate import BatchCalibration, calibrate_batch
 from jaxbundle.batch.camera import LIMIT, STATUS
 from jaxbundle.batch.input import free_parameters, pixel_model
+from jaxbundle.batch.photographs import (
+    PhotographFolders,
+    calibrate_views,
+    is_photograph_folder,
+    of_photographs,
+)
 from jaxbundle.batch.result import SOLVED
 from jaxbundle.batch.snooping import TESTS
 from jaxbundle.batch.stacks import is_camera_stack, read_camera_stack
 from jaxbundle.bundle.adjust import adjust
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.io import read_network
+from jaxbundle.io.boards.kept_corners import KeptCorners
 from jaxbundle.io.results.json_lines import JsonLines
 from jaxbundle.io.results.result_json import result_dict
 from jaxbundle.io.writing.fingerprints import of_input
 from jaxbundle.io.writing.locks import locked
 from jaxbundle.leastsquares.snooping import check_test
+from jaxbundle.measure.boards import Board, require_board
+from jaxbundle.measure.views import search_alone
+from jaxbundle.photographs.opencv import need_opencv
+from jaxbundle.system.configuration import available_cores
+from jaxbundle.system.workers import Workers
 
 SNOOPING = ("snooping", "significance")
 """Settings that only a line has whose measurements were searched for blunders."""
@@ -48,13 +63,16 @@ def run_batch(
     max_iterations: int = 100,
     snooping: str | None = None,
     significance: float = 0.001,
+    board: Board | None = None,
+    part: tuple[int, int] = (1, 1),
     brief: bool = False,
     retry: bool = False,
     renew: bool = False,
     portion: int = CAMERAS_A_WRITE,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Counter:
-    """Calibrate the cameras of `.npz` files and adjust all other inputs as networks.
+    """Calibrate the cameras of `.npz` files and of folders of photographs, and adjust all other
+    inputs as networks.
 
     **Arguments:**
 
@@ -62,11 +80,15 @@ def run_batch(
     - `model`, `free`: as of `calibrate_batch`, for the cameras.
     - `max_iterations`: for each camera and each network.
     - `snooping`, `significance`: data snooping, `"pope"`, of every camera and every network.
+    - `board`: what is in the photographs; every folder that holds no network is then one of
+      photographs of one camera. What was found in them is kept in `FILE.corners` beside the file.
+    - `part`: (I, N): of all cameras and networks the I-th and every N-th after it, I from 1.
     - `brief`: no poses and covariances of cameras.
     - `retry`: compute again what has no result in the file.
     - `renew`: compute again what the file has from other settings or other data.
     - `portion`: cameras between two writes.
-    - `progress(done, total)`: called after every write; what was skipped counts as done.
+    - `progress(done, total)`: called after every write, and while photographs are searched; what
+      was skipped counts as done.
 
     **Returns:** how many of the inputs have which status in the file, and how many of them were
     `"skipped"`, for they were there.
@@ -79,39 +101,42 @@ def run_batch(
     max_iterations = whole("max_iterations", max_iterations)
     one_of("snooping", snooping, TESTS, none=True)
     check_test(snooping, significance)
+    if board is not None:
+        require_board(board)
+        need_opencv()
+    check_part(part)
     for path in inputs:
         if not os.path.exists(path):
             raise InputError(f"{path}: no such file or folder")
     options = dict(model=model, free=free, max_iterations=max_iterations)
     if snooping is not None:
         options |= dict(snooping=snooping, significance=significance)
-    works = {}
-    for path in map(str, inputs):
-        name = key_of(path, file)
-        if name not in works:
-            of_its_kind = _cameras if is_camera_stack(path) else _network
-            works[name] = of_its_kind(path, name, options, brief)
-    total = sum(len(work.keys) for work in works.values())
-    with locked(file):
+    with ExitStack() as held:
+        held.enter_context(locked(file))
+        works = _works(inputs, file, board, options, brief, held)
+        ours = _shares([len(work.keys) for work in works], part)
+        total = sum(map(len, ours))
         lines = JsonLines(file)
-        again = [key for work in works.values() for key in _again(work, lines, retry, renew)]
+        again = [key for work, share in zip(works, ours)
+                 for key in _again(work, share, lines, retry, renew)]  # fmt: skip
         if again:
             lines.drop(again)
         counts, done, networks = Counter(), 0, 0
-        for work in works.values():
-            chosen = np.array([i for i, key in enumerate(work.keys) if key not in lines], int)
-            counts["skipped"] += len(work.keys) - len(chosen)
-            done += len(work.keys) - len(chosen)
+        for work, share in zip(works, ours):
+            chosen = np.array([i for i in share if work.keys[i] not in lines], int)
+            counts["skipped"] += len(share) - len(chosen)
+            done += len(share) - len(chosen)
             progress(done, total)
             for first in range(0, len(chosen), portion):
-                rows = _rows(work, chosen[first : first + portion].tolist())
+                some = chosen[first : first + portion].tolist()
+                rows = _rows(work, some, partial(_tell, progress, done, len(some), total))
                 lines.append(rows)
                 done += len(rows)
                 progress(done, total)
-                networks += not work.is_cameras
-                if not work.is_cameras and networks % NETWORKS_A_CACHE == 0:
+                networks += work.is_network
+                if work.is_network and networks % NETWORKS_A_CACHE == 0:
                     jax.clear_caches()
-    heads = (lines.heads[key] for work in works.values() for key in work.keys)
+    heads = (lines.heads[work.keys[i]] for work, share in zip(works, ours) for i in share)
     return Counter(str(head.get("status", "unknown")) for head in heads) + counts
 
 
@@ -135,55 +160,130 @@ def key_of(path: str | Path, file: str | Path) -> str:
     return Path(path).as_posix()
 
 
+def check_part(part: Sequence[int]) -> None:
+    """Refuse what is no (I, N), 1 ≤ I ≤ N.
+
+    **Raises:** `InputError`."""
+    if len(part) != 2 or not 1 <= whole("part", part[0]) <= whole("part", part[1]):
+        raise InputError(f"part {part}: (I, N) is expected, the I-th of N parts, I from 1 to N")
+
+
+def _shares(numbers: Sequence[int], part: tuple[int, int]) -> list[list[int]]:
+    """Which of so many cameras or networks of each input belong to a part."""
+    ends = [0, *itertools.accumulate(numbers)]
+    own = [range(first, last) for first, last in zip(ends, ends[1:])]
+    return [[i - of.start for i in of if i % part[1] == part[0] - 1] for of in own]
+
+
+Tell = Callable[[float], None]
+
+
 @dataclasses.dataclass(frozen=True)
 class _Work:
-    """What is to be done for an input.
+    """What is to be done for an input, or for all folders of photographs.
 
     **Fields:** `keys` of its lines; their `settings`; `data`, the fingerprint of number i; `solve`,
-    the rows of some, from their numbers.
+    the rows of some, from their numbers, telling what part of them is done; `made_of`: what the
+    fingerprint is of, in words.
     """
 
     keys: tuple[str, ...]
     settings: dict
     data: Callable[[int], str]
-    solve: Callable[[Sequence[int]], Iterable[dict]]
-    is_cameras: bool
+    solve: Callable[[Sequence[int], Tell], Iterable[dict]]
+    made_of: str = "the measurements"
+    is_network: bool = False
+
+
+def _works(
+    inputs: Sequence[str | Path], file: str | Path, board: Board | None, options: dict, brief: bool,
+    held: ExitStack,
+) -> list[_Work]:  # fmt: skip
+    """What is to be done, each input once."""
+    works, folders = {}, {}
+    for path in map(str, inputs):
+        name = key_of(path, file)
+        if name in works or name in folders:
+            continue
+        if is_camera_stack(path):
+            works[name] = _cameras(path, name, options, brief)
+        elif board is not None and is_photograph_folder(path):
+            folders[name] = path
+        else:
+            works[name] = _network(path, name, options)
+    if board is not None and folders:
+        regular = os.path.isfile(file) or not os.path.exists(file)
+        kept = held.enter_context(KeptCorners(f"{file}.corners" if regular else ":memory:"))
+        workers = held.enter_context(Workers(search_alone, available_cores()))
+        found = PhotographFolders(tuple(folders.values()), board, kept, workers)
+        works["photographs"] = _photographed(found, tuple(folders), options, brief)
+    return [*works.values()]
 
 
 def _cameras(path: str, name: str, options: dict, brief: bool) -> _Work:
     stack = read_camera_stack(path)
-    free = free_parameters(pixel_model(options["model"]), options["free"])
 
-    def solve(chosen):
+    def solve(chosen, _):
         batch = calibrate_batch(**stack.arguments(chosen), **options)
         return [camera_row(batch, i, brief) for i in range(len(chosen))]
 
-    settings = options | {"model": str(options["model"]), "free": list(free), "brief": brief}
     keys = tuple(f"{name}#{camera}" for camera in stack.ids)
-    return _Work(keys, settings, stack.fingerprint, solve, True)
+    return _Work(keys, _settings(options, brief), stack.fingerprint, solve)
 
 
-def _network(path: str, name: str, options: dict, brief: bool) -> _Work:
+def _photographed(
+    found: PhotographFolders, keys: tuple[str, ...], options: dict, brief: bool
+) -> _Work:
+    settings = _settings(options, brief) | {"board": repr(found.board)}
+
+    def solve(chosen, tell):
+        measured = found.measure(chosen, tell)
+        rows = {i: {"status": "bad input", "error": why}
+                for i, why in measured.items() if isinstance(why, str)}  # fmt: skip
+        views = {i: one for i, one in measured.items() if not isinstance(one, str)}
+        for i, batch, place in calibrate_views(views, options):
+            rows[i] = camera_row(batch, place, brief, len(views[i]))
+            rows[i] |= of_photographs(views[i], brief)
+        return [rows[i] for i in chosen]
+
+    return _Work(keys, settings, found.fingerprint, solve, "its photographs")
+
+
+def _settings(options: dict, brief: bool) -> dict:
+    """Of the lines of cameras."""
+    free = free_parameters(pixel_model(options["model"]), options["free"])
+    return options | {"model": str(options["model"]), "free": list(free), "brief": brief}
+
+
+def _network(path: str, name: str, options: dict) -> _Work:
     options = {key: value for key, value in options.items() if key not in ("model", "free")}
-    solve = lambda chosen: [network_row(path, **options)]
-    return _Work((name,), options, lambda i: of_input(path), solve, False)
+    solve = lambda chosen, _: [network_row(path, **options) for _ in chosen]
+    return _Work((name,), options, lambda i: of_input(path), solve, "its files", True)
 
 
-def _rows(work: _Work, chosen: Sequence[int]) -> list[dict]:
+def _tell(progress, done: int, number: int, total: int, part: float) -> None:
+    """Of so many that are being computed a part is done."""
+    progress(done + int(part * number), total)
+
+
+def _rows(work: _Work, chosen: Sequence[int], tell: Tell) -> list[dict]:
     # Before the work: what is changed meanwhile is seen to be changed.
     data = [work.data(i) for i in chosen]
     return [
         {"key": work.keys[i], "status": row["status"], "settings": work.settings, "data": of} | row
-        for i, of, row in zip(chosen, data, work.solve(chosen))
+        for i, of, row in zip(chosen, data, work.solve(chosen, tell))
     ]
 
 
-def _again(work: _Work, lines: JsonLines, retry: bool, renew: bool) -> list[str]:
+def _again(
+    work: _Work, share: Sequence[int], lines: JsonLines, retry: bool, renew: bool
+) -> list[str]:
     """The keys of an input that are in the file, and are to be computed again.
 
     **Raises:** `InputError` for a line that was made of something else, without `renew`."""
     again, other = [], {}
-    for i, key in enumerate(work.keys):
+    for i in share:
+        key = work.keys[i]
         head = lines.heads.get(key)
         if head is None:
             continue
@@ -212,8 +312,7 @@ def _difference(head: dict, work: _Work, i: int) -> str:
         matters = name != "max_iterations" or head.get("status") == STATUS[LIMIT]
         if matters and old.get(name) != value:
             return f"{name} was {_shown(old.get(name))}, is {_shown(value)}"
-    others = "the measurements were others" if work.is_cameras else "its files were others"
-    return "" if head["data"] == work.data(i) else others
+    return "" if head["data"] == work.data(i) else f"{work.made_of} were others"
 
 
 def _shown(value) -> str:
@@ -233,15 +332,18 @@ def network_row(path: str, **options) -> dict:
         return {"status": "failed", "error": f"{type(error).__name__}: {error}"}
 
 
-def camera_row(batch: BatchCalibration, i: int, brief: bool = False) -> dict:
-    """The result of camera i as plain dicts and numbers (angles in radians)."""
+def camera_row(
+    batch: BatchCalibration, i: int, brief: bool = False, views: int | None = None
+) -> dict:
+    """The result of camera i as plain dicts and numbers (angles in radians); `views`: how many it
+    has, without those it was filled up with; all if not given."""
     row = {
         "status": str(batch.status[i]),
         "model": str(batch.model),
         "iterations": int(batch.iterations[i]),
         "redundancy": int(batch.redundancy[i]),
         "views": int(batch.views[i].sum()),
-        "views_left_out": np.flatnonzero(~batch.views[i]).tolist(),
+        "views_left_out": np.flatnonzero(~batch.views[i][:views]).tolist(),
     }
     if batch.remark[i]:
         row["remark"] = str(batch.remark[i])
@@ -260,7 +362,7 @@ def camera_row(batch: BatchCalibration, i: int, brief: bool = False) -> dict:
     }
     if not brief:
         names = ("position", "angles", "sigma_position", "sigma_angles")
-        columns = zip(*(getattr(batch, name)[i].tolist() for name in names))
+        columns = zip(*(getattr(batch, name)[i][:views].tolist() for name in names))
         row |= {
             "covariance": batch.covariance[i].tolist(),
             "poses": [dict(zip(names, values)) for values in columns],

@@ -24,10 +24,11 @@ import numpy as np
 
 from jaxbundle.arguments import number, positive, shown, text, vector
 from jaxbundle.bundle.adjust import adjust, check_options
-from jaxbundle.calibration.pixels import in_model_units, in_pixels, unit_size
+from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.start import Start, start_values
 from jaxbundle.cameras import CameraModel, check_own, get_model, is_own
+from jaxbundle.cameras.pixel_frame import in_model_units, in_pixels
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.geometry import matrix_from_quaternion

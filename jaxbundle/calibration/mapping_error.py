@@ -21,10 +21,11 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.calibration.pixels import in_model_units, unit_size
+from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.quality import grid_of
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.convert_fit import GRID
+from jaxbundle.cameras.pixel_frame import in_model_units
 from jaxbundle.statistics.projection import slopes_of_images
 
 DRAWS = 20_000

@@ -1,4 +1,4 @@
-"""Pixels of photographs in the unit and axes of a camera model, and the image of a board."""
+"""The size of a pixel in the unit of a camera model, and the image of a board."""
 
 from functools import partial
 
@@ -8,24 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.cameras import CameraModel, project
-from jaxbundle.cameras.pixel_frame import pixel_frame
 from jaxbundle.errors import InputError
-
-
-def in_model_units(
-    uv: Float[np.ndarray, "*any 2"], model: CameraModel, image_size, pixel_size=None
-) -> Float[np.ndarray, "*any 2"]:
-    """Pixels (v down) as the model counts: as they are; from the image centre, y up; in mm."""
-    origin, step = pixel_frame(model, image_size, pixel_size)
-    return (np.asarray(uv, float) - origin) / step
-
-
-def in_pixels(
-    xy: Float[np.ndarray, "*any 2"], model: CameraModel, image_size, pixel_size=None
-) -> Float[np.ndarray, "*any 2"]:
-    """The inverse of `in_model_units`."""
-    origin, step = pixel_frame(model, image_size, pixel_size)
-    return origin + step * np.asarray(xy, float)
 
 
 def unit_size(model: CameraModel, pixel_size) -> tuple[float, float]:

@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbundle.bundle.adjust import adjust
-from jaxbundle.calibration.pixels import in_model_units, in_pixels, unit_size
+from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.compare import Comparison, compare_cameras
+from jaxbundle.cameras.pixel_frame import in_model_units, in_pixels
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.statistics.projection import (

@@ -16,7 +16,9 @@ says which part μ of the image motion by a change s no rotation removes. Change
 tenth (a shift of the principal point is nearly a rotation) are taken out: χ² of the others.
 
 **Between epochs.** For each parameter τ², a variance on top of its σᵢ², by Paule and Mandel:
-Σ (pᵢ − m)²/(σᵢ² + τ²) = n − 1, m the mean with these weights. In the image, rotation removed, the
+Σ (pᵢ − m)²/(σᵢ² + τ²) = n − 1, m the mean with these weights. Against a temperature or a date the
+same with a straight line a + b·xᵢ in place of m, and n − 2: its slope b has its own τ, about the
+line, for a trend is no scatter. In the image, rotation removed, the
 variance between epochs is that of the differences less what is expected by chance,
 
     Σ (pᵢ − p̄ₐ)ᵀ·H·(pᵢ − p̄ₐ)/(n − 1) − mean of tr(H·Cᵢ),        p̄ₐ the arithmetic mean
@@ -34,7 +36,7 @@ from jaxtyping import Float
 from jaxbundle.calibration.mapping_error import mapping_form
 from jaxbundle.cameras import default_parameters, get_model
 from jaxbundle.errors import InputError
-from jaxbundle.leastsquares.distributions import chi2_tail
+from jaxbundle.leastsquares.distributions import chi2_tail, f_tail
 from jaxbundle.network.tables import Camera
 from jaxbundle.statistics.difference import Covariance
 
@@ -64,7 +66,8 @@ class Stability:
     """**Fields:** `names` of the free parameters; `values`, `sigma` [epochs, k]; `mean`,
     `mean_sigma`, `between` (τ), `probability` (of its χ² alone) [k]; `all_parameters`,
     `rotation_removed`: tests of homogeneity; `image_found`, `image_expected`, `image_between`: RMS
-    over the image of an epoch against the mean, pixels; `at`, `slope`, `slope_sigma`: with what
+    over the image of an epoch against the mean, pixels; `at`, `slope`, `slope_sigma`,
+    `slope_probability` (of as large a slope by chance), `about_slope` (τ about the line): with what
     the epochs were at (temperatures), else None."""
 
     names: tuple[str, ...]
@@ -82,6 +85,8 @@ class Stability:
     at: Float[np.ndarray, " epochs"] | None = None
     slope: Float[np.ndarray, " k"] | None = None
     slope_sigma: Float[np.ndarray, " k"] | None = None
+    slope_probability: Float[np.ndarray, " k"] | None = None
+    about_slope: Float[np.ndarray, " k"] | None = None
 
     def to_dict(self) -> dict:
         """As in JSON."""
@@ -94,9 +99,12 @@ class Stability:
                 "between": float(self.between[k]), "probability": float(self.probability[k]),
                 "epochs": self.values[:, k].tolist(), "sigma_epochs": self.sigma[:, k].tolist(),
             }
-            if self.slope is not None and self.slope_sigma is not None:
-                rows[name] |= {"slope": float(self.slope[k]),
-                               "sigma_slope": float(self.slope_sigma[k])}  # fmt: skip
+            for key, value in {
+                "slope": self.slope, "sigma_slope": self.slope_sigma,
+                "probability_slope": self.slope_probability, "about_slope": self.about_slope,
+            }.items():  # fmt: skip
+                if value is not None:
+                    rows[name][key] = float(value[k])
         return {
             "parameters": rows, "all_parameters": test(self.all_parameters),
             "rotation_removed": test(self.rotation_removed),
@@ -122,7 +130,7 @@ def stability(
     p = np.array([[camera.parameters[name] for name in names] for camera in cameras])
     C = np.array([_ordered(covariance, names) for _, covariance in calibrations])
     sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
-    columns = [_between(p[:, k], sigma[:, k]) for k in range(len(names))]
+    columns = [_line_of(p[:, k], sigma[:, k]) for k in range(len(names))]
     mean, mean_sigma, tau, probability = np.array(columns).T
     model = get_model(cameras[0].model)
     whole = {**default_parameters(model), **cameras[0].parameters, **dict(zip(names, mean))}
@@ -132,14 +140,15 @@ def stability(
     d = p - p.mean(0)
     found = float(np.einsum("nk,kl,nl->", d, H, d)) / (len(p) - 1)
     expected = float(np.einsum("kl,nlk->", H, C)) / len(p)
-    slope = slope_sigma = x = None
+    x, trend = None, (None,) * 4
     if at is not None:
         x = np.array(at, float)
-        slope, slope_sigma = _slopes(x, p, sigma**2 + tau**2)
+        columns = [_line_of(p[:, k], sigma[:, k], x) for k in range(len(names))]
+        trend = np.array([_trend(*column[:3], len(x)) for column in columns]).T
     return Stability(
         names, p, sigma, mean, mean_sigma, tau, probability, _homogeneity(p, C),
         _homogeneity(p @ F.T, F @ C @ F.T), np.sqrt(found), np.sqrt(expected),
-        float(np.sqrt(max(found - expected, 0.0))), x, slope, slope_sigma,
+        float(np.sqrt(max(found - expected, 0.0))), x, *trend,
     )  # fmt: skip
 
 
@@ -147,7 +156,9 @@ def _check(calibrations, at) -> tuple[str, ...]:
     """The names of the free parameters."""
     if len(calibrations) < 2:
         raise InputError("stability: give two calibrations of a camera or more")
-    if at is not None and (len(at) != len(calibrations) or len({*at}) < 3):
+    if at is not None and not (
+        len(at) == len(calibrations) and len({*at}) >= 3 and np.isfinite(at).all()
+    ):
         raise InputError(
             f"stability: {len(at)} numbers for {len(calibrations)} calibrations; one for each is "
             "expected, and three different ones at least"
@@ -190,29 +201,30 @@ def _without_rotation(G, H, scale) -> Float[np.ndarray, "m k"]:
     return vectors.T @ (G * unit) / scale
 
 
-def _between(x, sigma) -> tuple[float, float, float, float]:
-    """Mean, its σ, τ, and the probability of χ² without τ."""
+def _line_of(p, sigma, x=None) -> tuple[float, float, float, float]:
+    """Mean, or slope against x, and its σ; τ about it, and the probability of χ² without τ."""
+    A = np.ones((len(p), 1)) if x is None else np.stack([np.ones(len(p)), x - x.mean()], 1)
+    degrees = len(p) - A.shape[1]
 
     def at(variance):
         w = 1 / (sigma**2 + variance)
-        mean = w @ x / w.sum()
-        return mean, 1 / np.sqrt(w.sum()), float(w @ (x - mean) ** 2)
+        Q = np.linalg.inv(A.T @ (w[:, None] * A))
+        found = Q @ A.T @ (w * p)
+        return found[-1], np.sqrt(Q[-1, -1]), float(w @ (p - A @ found) ** 2)
 
-    n, low, high = len(x), 0.0, float(np.var(x, ddof=1) * len(x))
+    low, high = 0.0, float(np.var(p, ddof=1) * len(p))
     chi2 = at(0.0)[2]
-    if chi2 <= n - 1:
+    if chi2 <= degrees:
         high = 0.0
     for _ in range(200 if high else 0):
         middle = (low + high) / 2
-        low, high = (middle, high) if at(middle)[2] > n - 1 else (low, middle)
-    mean, of_mean, _ = at(high)
-    return float(mean), float(of_mean), float(np.sqrt(high)), chi2_tail(chi2, n - 1)
+        low, high = (middle, high) if at(middle)[2] > degrees else (low, middle)
+    value, of_value, _ = at(high)
+    return float(value), float(of_value), float(np.sqrt(high)), chi2_tail(chi2, degrees)
 
 
-def _slopes(x, p, variance):
-    """Of every parameter against x, and their σ."""
-    w = 1 / variance
-    middle = (w * x[:, None]).sum(0) / w.sum(0)
-    away = x[:, None] - middle
-    square = (w * away**2).sum(0)
-    return (w * away * p).sum(0) / square, 1 / np.sqrt(square)
+def _trend(slope, sigma, tau, epochs):
+    """Slope, σ, probability, τ; by Student's t where τ was estimated, else by the normal one."""
+    square = (slope / sigma) ** 2
+    by_chance = f_tail(square, 1, epochs - 2) if tau else chi2_tail(square, 1)
+    return slope, sigma, by_chance, tau

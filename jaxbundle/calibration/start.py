@@ -20,8 +20,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.batch.calibrate import BatchCalibration, calibrate_batch
-from jaxbundle.calibration.pixels import images_of_board, in_model_units
+from jaxbundle.calibration.pixels import images_of_board
 from jaxbundle.cameras import CameraModel, convert_camera, get_model, is_own
+from jaxbundle.cameras.pixel_frame import in_model_units
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.columns import count

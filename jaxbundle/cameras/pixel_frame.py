@@ -43,6 +43,22 @@ def pixel_frame(
     return centre, np.array([1.0, -1.0]) / np.asarray(pixel_size, float)
 
 
+def in_model_units(
+    uv: Float[np.ndarray, "*any 2"], model: CameraModel, image_size, pixel_size=None
+) -> Float[np.ndarray, "*any 2"]:
+    """Pixels (v down) as the model counts: as they are; from the image centre, y up; in mm."""
+    origin, step = pixel_frame(model, image_size, pixel_size)
+    return (np.asarray(uv, float) - origin) / step
+
+
+def in_pixels(
+    xy: Float[np.ndarray, "*any 2"], model: CameraModel, image_size, pixel_size=None
+) -> Float[np.ndarray, "*any 2"]:
+    """The inverse of `in_model_units`."""
+    origin, step = pixel_frame(model, image_size, pixel_size)
+    return origin + step * np.asarray(xy, float)
+
+
 def between_frames(
     source: CameraModel,
     target: CameraModel,

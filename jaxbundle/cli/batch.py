@@ -1,12 +1,14 @@
 """`jaxbundle batch`: many cameras, many networks."""
 
 import os
+import re
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 import jaxbundle
+from jaxbundle.choices import BOARDS
 from jaxbundle.cli.app import Html, Quiet, app, choice
 from jaxbundle.errors import InputError
 from jaxbundle.system.interrupts import advise
@@ -18,12 +20,27 @@ MOST_REASONS = 5
 
 @app.command(example="cameras.npz PROJECT.toml --json-lines results.jsonl")
 def batch(
-    inputs: Annotated[list[str], typer.Argument(help=".npz of many cameras; projects")],
+    inputs: Annotated[
+        list[str],
+        typer.Argument(help=".npz of many cameras; projects; with --board folders of photographs"),
+    ],
     json_lines: Annotated[
         str, typer.Option(help="file of results, one per line; resumed if it exists")
     ],
     model: Annotated[str, typer.Option(help="camera model of the .npz files")] = "opencv",
     free: Annotated[str, typer.Option(help="parameters to estimate: fx,fy,…")] = "",
+    board: Annotated[
+        str, typer.Option(help="of photographs, COLUMNSxROWS as of calibrate; a folder a camera")
+    ] = "",
+    square: Annotated[
+        float | None, typer.Option(help="side of a square, distance of circles")
+    ] = None,
+    kind: Annotated[str, choice(BOARDS)] = "chessboard",
+    marker: Annotated[float | None, typer.Option(help="side of a charuco marker")] = None,
+    dictionary: Annotated[str, typer.Option(help="of charuco markers")] = "DICT_4X4_50",
+    part: Annotated[
+        str, typer.Option(help="I/N: the I-th of N parts of the inputs; each has its own file")
+    ] = "",
     max_iterations: Annotated[int, typer.Option(min=1)] = 100,
     snooping: Annotated[str, choice(("pope", "none"), "removal of gross errors")] = "none",
     significance: Annotated[float, typer.Option(help="level of the test")] = 0.001,
@@ -58,19 +75,29 @@ def batch(
 ) -> None:
     """Calibrate many cameras and adjust many networks; an interrupted run resumes.
 
+    With --board, a folder without a network holds the photographs of one camera; corners are kept
+    next to the file of results.
+
     Inputs with a line in the file are not computed again. Lines of other settings or data are
     refused, or recomputed with --renew. Status 0 means that every input has a line, whatever its
     status. Only one run at a time may write the file.
     """
     from jaxbundle.batch.page import compose_batch
+    from jaxbundle.batch.photographs import is_photograph_folder
     from jaxbundle.batch.population import Population, read_against
     from jaxbundle.batch.run import result_rows, run_batch
     from jaxbundle.batch.stacks import is_camera_stack
     from jaxbundle.cli.batch_outputs import check_outputs, write_outputs
+    from jaxbundle.cli.board_given import board_given
     from jaxbundle.cli.outputs import check_page, trace_files
     from jaxbundle.cli.progress import counting
     from jaxbundle.io.text.csv_tables import read_csv, write_text
 
+    known = None
+    if board:
+        known = board_given(board, square, kind, None, marker, dictionary)
+    elif square is not None or marker is not None:
+        raise InputError("--board is missing: COLUMNSxROWS, inner corners of a chessboard, as 9x6")
     check_page(html, None, [*inputs, json_lines], force)
     given = [*inputs, json_lines, *filter(None, (html, against and str(against)))]
     check_outputs(table, summary, given, force)
@@ -84,7 +111,7 @@ def batch(
         if not asked:
             raise InputError("--against: give --html, --table or --summary as well")
         read_against(columns, columns.ids("id") if "id" in columns.values else (), str(against))
-    if not all(map(is_camera_stack, inputs)):
+    if not all(is_camera_stack(one) or known and is_photograph_folder(one) for one in inputs):
         # Cameras already use the cores by threads; devices gain nothing.
         jaxbundle.use_cores()
     advise("run the same command again to resume")
@@ -95,8 +122,7 @@ def batch(
             free=[name.strip() for name in free.split(",")] if free else None,
             max_iterations=max_iterations,
             snooping=None if snooping == "none" else snooping, significance=significance,
-            portion=portion, brief=brief, retry=retry,
-            renew=renew,
+            board=known, part=_part(part), portion=portion, brief=brief, retry=retry, renew=renew,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )  # fmt: skip
     if asked:
@@ -106,7 +132,8 @@ def batch(
     if html:
         origin = trace_files(inputs, {
             "--model": model, "--free": free, "--max-iterations": max_iterations,
-            "--snooping": snooping, "--significance": significance,
+            "--snooping": snooping, "--significance": significance, "--board": board,
+            "--square": square, "--kind": kind if board else "", "--part": part,
             "--against": "" if against is None else str(against),
         })  # fmt: skip
         write_text(Path(html), compose_batch(found, origin, beside))
@@ -120,3 +147,10 @@ def batch(
             print(*reasons[:MOST_REASONS], sep="\n")
             if len(reasons) > MOST_REASONS:
                 print(f'and {len(reasons) - MOST_REASONS} more: see "error" in {json_lines}')
+
+
+def _part(text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"\s*(\d{1,9})\s*/\s*(\d{1,9})\s*", text or "1/1")
+    if not found or not 1 <= int(found[1]) <= int(found[2]):
+        raise InputError(f"--part {text}: I/N is expected, the I-th of N parts, such as 1/4")
+    return int(found[1]), int(found[2])

@@ -1,6 +1,5 @@
 """`jaxbundle calibrate`: calibrate cameras from photographs of a board."""
 
-import re
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -89,6 +88,7 @@ def calibrate(
         json_text,
     )
     from jaxbundle.calibration.page import KIND, compose_calibrations
+    from jaxbundle.cli.board_given import board_given
     from jaxbundle.cli.outputs import (
         can_plot,
         check_writable,
@@ -105,7 +105,7 @@ def calibrate(
 
     test = None if snooping == "none" else snooping
     check_test(test, significance, "--")
-    known = _board(board, square, kind, diameter, marker, dictionary)
+    known = board_given(board, square, kind, diameter, marker, dictionary)
     cameras = _cameras(photos, camera)
     need_opencv()
     files = [path for paths in cameras.values() for path in photographs(paths)]
@@ -185,32 +185,6 @@ def calibrate(
         )
 
 
-def _board(
-    board: str, square: float | None, kind: str, diameter: float | None, marker: float | None,
-    dictionary: str,
-):  # fmt: skip
-    """The board, or the target, that the options name."""
-    from jaxbundle.calibration import Board
-    from jaxbundle.io.boards.targets import read_target
-
-    if board.endswith((".yaml", ".yml")):
-        if square is not None:
-            raise InputError(f"--square: {board} gives the size of the board; omit it")
-        return read_target(board)
-    if not board:
-        raise InputError("--board is missing: COLUMNSxROWS, inner corners of a chessboard, as 9x6")
-    columns, rows = _size(board)
-    if square is None:
-        raise InputError("--square is missing: the side of a square, or the spacing of circles")
-    circles = ("circles", "asymmetric-circles")
-    for value, option, kinds in (
-        (diameter, "--diameter", circles), (marker, "--marker", ("charuco",)),
-    ):  # fmt: skip
-        if value is not None and kind not in kinds:
-            raise InputError(f"{option} is not for --kind {kind}, but for {' and '.join(kinds)}")
-    return Board(columns, rows, square, kind, diameter, marker, dictionary)
-
-
 def _check_compared(models, cameras, free, rig) -> None:
     """Refuse options that are incompatible with --models."""
     for given, option in ((rig, "--rig"), (free, "--free"), (len(cameras) > 1, "--camera")):
@@ -234,13 +208,6 @@ def _check_names(cameras) -> None:
                 f"--camera: {other!r} and {name!r} would have the same folder {file_name(name)!r}; "
                 "choose other names"
             )
-
-
-def _size(text: str) -> tuple[int, int]:
-    found = re.fullmatch(r"\s*(\d{1,4})\s*[x×X,]\s*(\d{1,4})\s*", text)
-    if not found:
-        raise InputError(f"--board {text!r}: COLUMNSxROWS is expected, such as 9x6")
-    return int(found[1]), int(found[2])
 
 
 def _cameras(photos, named) -> dict[str, list[str]]:

@@ -14,7 +14,7 @@ def stability(
         list[str], typer.Argument(help="results (JSON) of calibrate or adjust, FILE or FILE#ID")
     ],
     at: Annotated[
-        str, typer.Option(help="a,b,c: a number per epoch, such as temperature, for slopes")
+        str, typer.Option(help="a,b,c: a number or date per epoch, such as temperature, for slopes")
     ] = "",
     json: Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")] = "",
 ) -> None:
@@ -23,6 +23,7 @@ def stability(
     from json import dumps
     from pathlib import Path
 
+    from jaxbundle.batch.population import number_or_days
     from jaxbundle.calibration.stability import stability as compare_epochs
     from jaxbundle.cli.cameras_given import calibration_given
     from jaxbundle.io.text.csv_tables import write_bytes
@@ -36,10 +37,8 @@ def stability(
                 f"{file}: has no covariance; give the result.json of calibrate or adjust"
             )
         calibrations.append((camera, covariance))
-    try:
-        numbers = [float(word) for word in at.split(",")] if at else None
-    except ValueError:
-        raise InputError(f"--at {at}: numbers are expected, such as 10,20,30") from None
+    words = [word.strip() for word in at.split(",")] if at else []
+    numbers = [number_or_days(word, "--at") for word in words] or None
     found = compare_epochs(calibrations, numbers)
     if json:
         text = dumps(found.to_dict(), indent=1) + "\n"
@@ -51,10 +50,14 @@ def stability(
     for k, name in enumerate(found.names):
         row = [name, *(f"{x:.6g}" for x in (found.mean[k], found.mean_sigma[k], found.between[k])),
                f"{found.probability[k]:.2g}"]  # fmt: skip
-        if found.slope is not None and found.slope_sigma is not None:
-            row += [f"{found.slope[k]:.4g}", f"{found.slope_sigma[k]:.2g}"]
+        if found.slope is not None:
+            row += [f"{x[k]:.{digits}g}" for x, digits in (
+                (found.slope, 4), (found.slope_sigma, 2), (found.slope_probability, 2),
+                (found.about_slope, 2),
+            ) if x is not None]  # fmt: skip
         rows.append(row)
-    head = ["parameter", "mean", "σ", "between", "p", "slope", "σ slope"][: len(rows[0])]
+    head = ["parameter", "mean", "σ", "between", "p", "slope", "σ slope", "p", "about it"]
+    head = head[: len(rows[0])]
     print("\n".join(table(head, rows, "l" + "r" * (len(head) - 1))))
     print(f"\nall epochs the same, all parameters: {found.all_parameters}")
     print(f"the same, rotation removed:          {found.rotation_removed}")

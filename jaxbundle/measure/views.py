@@ -13,8 +13,10 @@ from jaxtyping import Bool, Float
 
 from jaxbundle.arguments import numeric_array
 from jaxbundle.errors import InputError
+from jaxbundle.float64 import enable_x64
 from jaxbundle.measure.boards import Board, require_board
 from jaxbundle.measure.corners import find_board, largest_chessboard, other_sizes
+from jaxbundle.photographs.opencv import need_opencv
 from jaxbundle.photographs.reading import read_photograph
 from jaxbundle.system.configuration import available_cores
 from jaxbundle.system.file_content import read_content
@@ -29,6 +31,8 @@ SEARCHED = 3
 """In so many photographs boards of other sizes are looked for: in those without a board, where few
 have it, and in the others, whether the board they have is a part of a larger one."""
 
+Look = tuple[tuple[int, int], Float[np.ndarray, "points 2"]] | str
+"""What was found of a board in a photograph: image size and image points, or why nothing."""
 HINT = "give --board"
 HINTS = (HINT, "give --dictionary")
 
@@ -128,20 +132,32 @@ def measure_boards(
     files = photographs(paths)
     if not files:
         raise InputError("no photographs are given")
-    names = _names(files)
-    file_of = dict(zip(names, files))
+    file_of = name_photographs(files)
     repeated = _repeated(file_of)
-    found, failed = [], {}
-    look = lambda name: repeated.get(name) or _look(file_of[name], board)
+    search = lambda name: repeated.get(name) or search_board(file_of[name], board)
+    looks = {}
     with ThreadPoolExecutor(available_cores()) as pool:
-        for done, (name, result) in enumerate(zip(names, pool.map(look, names)), 1):
-            if isinstance(result, str):
-                failed[name] = result
-            else:
-                found.append((name, *result))
+        for done, (name, look) in enumerate(zip(file_of, pool.map(search, file_of)), 1):
+            looks[name] = look
             if progress is not None:
-                progress(done, len(names))
-    if len(found) < len(names) / 2:
+                progress(done, len(file_of))
+    views = collect_views(file_of, looks, board)
+    return dataclasses.replace(views, warnings=_part_of_a_larger(file_of, views.names, board))
+
+
+def collect_views(
+    file_of: Mapping[str, Path], looks: Mapping[str, Look], board: Board, hints: bool = True
+) -> BoardViews:
+    """The views of photographs in which the board was sought, of the image size most of them have.
+
+    **Arguments:** `file_of`: the photographs by name (`name_photographs`); `looks`: of each what
+    `search_board` has found.
+
+    **Raises:** `InputError` where no photograph shows the board.
+    """
+    failed = {name: look for name, look in looks.items() if isinstance(look, str)}
+    found = [(name, *look) for name, look in looks.items() if not isinstance(look, str)]
+    if hints and len(found) < len(looks) / 2:
         failed |= _other_boards(file_of, board, failed)
     if not found:
         raise InputError(_nothing_found(file_of, failed))
@@ -156,12 +172,28 @@ def measure_boards(
     used = [(name, xy) for name, other, xy in found if other == size]
     failed |= _saved_again(used)
     used = [(name, xy) for name, xy in used if name not in failed]
-    order = {name: i for i, name in enumerate(names)}
+    order = {name: i for i, name in enumerate(file_of)}
     return BoardViews(
         board, tuple(name for name, _ in used), size, np.array([xy for _, xy in used]),
         tuple(sorted(failed.items(), key=lambda item: order[item[0]])),
-        _part_of_a_larger(file_of, [name for name, _ in used], board),
     )  # fmt: skip
+
+
+def search_board(path: str | Path, board: Board) -> Look:
+    """Image size (columns, rows) and image points of a board in one photograph, or why there are
+    none, without the path."""
+    try:
+        grey = read_photograph(path)
+        return (grey.shape[1], grey.shape[0]), find_board(grey, board)
+    except InputError as error:
+        return str(error).removeprefix(f"{path}: ")
+
+
+def search_alone(task: tuple[str | Path, Board]) -> Look:
+    """`search_board` in a process of its own, one of several on this machine."""
+    enable_x64()
+    need_opencv().setNumThreads(1)
+    return search_board(*task)
 
 
 def _repeated(paths: Mapping[str, Path]) -> dict[str, str]:
@@ -197,15 +229,6 @@ def _saved_again(used: Sequence[tuple[str, np.ndarray]]) -> dict[str, str]:
                 )
                 break
     return found
-
-
-def _look(path, board):
-    """Size and image points, or why there are none, without the path."""
-    try:
-        grey = read_photograph(path)
-        return (grey.shape[1], grey.shape[0]), find_board(grey, board)
-    except InputError as error:
-        return str(error).removeprefix(f"{path}: ")
 
 
 def _nothing_found(paths: Mapping[str, Path], failed: Mapping[str, str]) -> str:
@@ -255,10 +278,10 @@ def _part_of_a_larger(paths: Mapping[str, Path], used, board: Board) -> tuple[st
     )
 
 
-def _names(files: Sequence[Path]) -> list[str]:
-    """File names, with as much of the folders as makes each one different."""
-    for parts in range(1, max(len(p.parts) for p in files) + 1):
+def name_photographs(files: Sequence[Path]) -> dict[str, Path]:
+    """Photographs by file name, with as much of the folders as makes each one different."""
+    for parts in range(1, max((len(p.parts) for p in files), default=0) + 1):
         names = ["/".join(p.parts[-parts:]) for p in files]
         if len({*names}) == len(names):
-            return names
-    return [str(p) for p in files]
+            return dict(zip(names, files))
+    return {str(p): p for p in files}

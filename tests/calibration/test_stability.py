@@ -76,6 +76,26 @@ def test_a_slope_with_temperature():
     assert found.to_dict()["parameters"]["fx"]["slope"] == found.slope[0]
 
 
+def test_scatter_about_a_slope():
+    """Seven epochs on a line with scatter: the line's τ is the scatter alone, the slope's σ and its
+    probability are honest where there is no trend."""
+    at, tau, none, steep = np.array([3.0, 8, 12, 15, 22, 26, 31]), 0.4, [], []
+    random = np.random.default_rng(7)
+    for seed in range(60):
+        change = np.zeros((7, 6))
+        change[:, :2] = tau * random.normal(size=(7, 1))
+        none.append(stability(epochs(change, seed), at))
+        change[:, :2] += 0.5 * at[:, None]
+        steep.append(stability(epochs(change, seed), at))
+    of = lambda series, name: np.array([getattr(one, name)[0] for one in series])
+    assert np.mean(of(steep, "about_slope") ** 2) == pytest.approx(tau**2, rel=0.3)
+    error = (of(steep, "slope") - 0.5) / of(steep, "slope_sigma")
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(1, abs=0.45)
+    assert of(steep, "slope_probability").max() < 0.01
+    assert 0.01 < np.mean(of(none, "slope_probability") < 0.1) < 0.25
+    np.testing.assert_allclose(of(steep, "about_slope"), of(none, "about_slope"), atol=1e-6)
+
+
 def test_what_is_not_one_camera_is_refused():
     given = epochs(np.zeros((2, 6)))
     with pytest.raises(InputError, match="two calibrations"):
@@ -112,4 +132,7 @@ def test_the_command_reads_results(command, tmp_path):
     found = json.loads((tmp_path / "found.json").read_text())
     assert found["all_parameters"]["degrees"] == 12 and found["at"] == [1.0, 2.0, 3.0]
     assert command("stability", files[0]).status == 2
-    assert "numbers are expected" in command("stability", *files, "--at", "1,x").err
+    dates = "2026-05-01,2026-08-01,2026-05-31"
+    told = command("stability", *files, "--at", dates, "--json", "-")
+    assert np.diff(json.loads(told.out)["at"]).tolist() == [92, -62]
+    assert "a number or a date" in command("stability", *files, "--at", "1,x,3").err

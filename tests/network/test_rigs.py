@@ -6,6 +6,8 @@ from further_checks import check_jacobians, sample
 from scipy.spatial.transform import Rotation
 
 import jaxbundle
+from jaxbundle.batch.population import Population
+from jaxbundle.batch.run import network_row
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, omega_phi_kappa_from_matrix
 from jaxbundle.network.build import make_further
@@ -71,6 +73,21 @@ def test_the_mounting_is_found(simulated, result):
     c = lambda r: r.cameras["right"]["parameters"]["c"]["sigma"] / r.sigma0
     assert c(result) < c(alone)
     assert "Mounting" in result.report()
+
+
+def test_in_a_batch(simulated, result, tmp_path):
+    """The line of a rig names its mountings, and the population has them."""
+    path = jaxbundle.write_project(mounted(simulated.network), tmp_path / "pair")
+    row = network_row(str(path), max_iterations=100)
+    of = row["further_unknowns"]["mounting"]["right of pair"]
+    expected = result.further_unknowns["mounting"]["right of pair"]
+    for name, one in expected.items():
+        assert of[name]["value"] == pytest.approx(one["value"], abs=1e-6 * one["sigma"])
+        assert of[name]["sigma"] == pytest.approx(one["sigma"], rel=1e-6)
+    table = Population([row | {"key": str(k)} for k in range(2)]).table()
+    for name in expected:
+        assert table[f"mounting right of pair {name}"].tolist() == [of[name]["value"]] * 2
+    assert table["sigma_left c"][0] == row["cameras"]["left"]["parameters"]["c"]["sigma"]
 
 
 def test_mountings_are_equal(result):

@@ -8,6 +8,8 @@ from further_checks import check_jacobians, sample
 from scipy.spatial.transform import Rotation
 
 import jaxbundle
+from jaxbundle.batch.population import Population
+from jaxbundle.batch.run import network_row
 from jaxbundle.cameras import get_model, project
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa
@@ -136,6 +138,12 @@ def test_a_project_keeps_them(flown, result, tmp_path):
     assert again.further[0].settings["line_time"] == 2e-5
     assert list(again.further[0].settings["free"]) == ["vX", "vY", "vZ", "wx", "wy", "wz"]
     assert again.further[0].image == network.further[0].image
+    row = network_row(str(path), max_iterations=100)  # the line of a batch
+    found = row["further_unknowns"]["velocity"]
+    assert list(found) == list(network.images.id) and row["status"] == "converged"
+    vx = result.further_unknowns["velocity"][network.images.id[0]]["vX"]
+    assert found[network.images.id[0]]["vX"]["sigma"] == pytest.approx(vx["sigma"], rel=1e-6)
+    assert not any("velocity" in name for name in Population([row | {"key": "moving"}]).values)
 
 
 # --- velocities from neighbours -------------------------------------------------------------

@@ -17,9 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbundle.calibration.pixels import in_model_units, in_pixels, unit_size
+from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.quality import GRID, Coverage, UncertaintyMap, coverage, grid_of
 from jaxbundle.cameras import get_model, image_ray, project
+from jaxbundle.cameras.pixel_frame import in_model_units, in_pixels
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares import Pose, PoseValue
 from jaxbundle.network.columns import did_you_mean

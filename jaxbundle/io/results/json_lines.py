@@ -33,6 +33,7 @@ class JsonLines:
         # A link stays a link; a pipe of a process has no other name.
         self._file = Path(os.path.realpath(path)) if regular else self.path
         self.heads: dict[str, dict] = {}
+        self._shared: dict[str, object] = {}
         end, twice, whole = 0, False, True
         for number, line in enumerate(self._lines() if regular else (), 1):
             row, whole = _row(line), line.endswith(b"\n")
@@ -45,7 +46,7 @@ class JsonLines:
                 )
             end += len(line)
             twice |= row["key"] in self.heads
-            self.heads.setdefault(row["key"], _head(row))
+            self.heads.setdefault(row["key"], self._head(row))
         self._write(lambda file: None)
         if regular and not whole:
             self._mend(end)
@@ -61,7 +62,7 @@ class JsonLines:
         # A name that is no UTF-8 is escaped, as JSON escapes it.
         text = "".join(_text(row) + "\n" for row in rows).encode(errors="backslashreplace")
         self._write(lambda file: file.write(text))
-        self.heads.update((row["key"], _head(row)) for row in rows)
+        self.heads.update((row["key"], self._head(row)) for row in rows)
 
     def rows(self, keys: Iterable[str]) -> Iterator[dict]:
         """The rows of some keys, in the order of the file."""
@@ -104,6 +105,14 @@ class JsonLines:
         except OSError as error:
             raise InputError(f"{self.path}: cannot be written: {error.strerror}") from None
 
+    def _head(self, row: dict) -> dict:
+        """What is remembered; settings that are alike are one object, for all lines have some."""
+        found = {name: row[name] for name in HEAD if name in row}
+        if "settings" in found:
+            key = json.dumps(found["settings"], sort_keys=True, default=str)
+            found["settings"] = self._shared.setdefault(key, found["settings"])
+        return found
+
     def _mend(self, end: int) -> None:
         """Cut off a torn line that begins at `end`, or give the last line its line feed."""
         if end < self._file.stat().st_size:
@@ -135,7 +144,3 @@ def _parsed(line: bytes):
         return json.loads(line)
     except (ValueError, RecursionError):
         return None
-
-
-def _head(row: dict) -> dict:
-    return {name: row[name] for name in HEAD if name in row}

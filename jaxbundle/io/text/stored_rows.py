@@ -1,14 +1,18 @@
 """Rows of an array in an `.npz`, read when they are asked for: memory does not grow with the file.
 
 An archive of NumPy stores its members as they are (`numpy.savez`) or compressed
-(`numpy.savez_compressed`). Of the first the rows can be read where they lie; the second must be
-unpacked as a whole.
+(`numpy.savez_compressed`). Of the first the rows are read where they lie; the second are unpacked
+into a temporary file without a name, which is gone with the process.
 """
 
 import dataclasses
+import shutil
 import struct
+import tempfile
 import zipfile
+from contextlib import nullcontext
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -27,12 +31,14 @@ AT_ONCE = 2**20
 
 @dataclasses.dataclass(frozen=True)
 class StoredRows:
-    """Rows of an array of numbers in a file, from `offset` on."""
+    """Rows of an array of numbers in a file, from `offset` on; `unpacked`: where they are, if not
+    in the file itself."""
 
     path: Path
     offset: int
     shape: tuple[int, ...]
     dtype: np.dtype
+    unpacked: BinaryIO | None = None
 
     @property
     def ndim(self) -> int:
@@ -47,7 +53,8 @@ class StoredRows:
         found = np.empty((len(wanted), *self.shape[1:]), self.dtype)
         size = int(np.prod(self.shape[1:]))
         ends = [0, *(np.flatnonzero(np.diff(wanted) != 1) + 1), len(wanted)]
-        with self.path.open("rb") as stream:
+        there = self.path.open("rb") if self.unpacked is None else nullcontext(self.unpacked)
+        with there as stream:
             for first, last in zip(ends, ends[1:]):
                 stream.seek(self.offset + int(wanted[first]) * size * self.dtype.itemsize)
                 read = np.fromfile(stream, self.dtype, (last - first) * size)
@@ -67,7 +74,7 @@ def find_stored_rows(path: str | Path, name: str) -> StoredRows | None:
             member = archive.getinfo(f"{name}.npy")
         except KeyError:
             return None
-        if member.compress_type != zipfile.ZIP_STORED or member.file_size < WORTH:
+        if member.file_size < WORTH:
             return None
         with archive.open(member) as stream:
             version = np.lib.format.read_magic(stream)
@@ -75,11 +82,16 @@ def find_stored_rows(path: str | Path, name: str) -> StoredRows | None:
                 return None
             shape, by_columns, dtype = READERS[version](stream)
             head = stream.tell()
+            whole = head + int(np.prod(shape)) * dtype.itemsize
+            if by_columns or dtype.kind not in "biuf" or not shape or member.file_size != whole:
+                return None
+            if member.compress_type != zipfile.ZIP_STORED:
+                unpacked = tempfile.TemporaryFile()
+                shutil.copyfileobj(stream, unpacked, AT_ONCE)
+                unpacked.flush()
+                return StoredRows(Path(path), 0, tuple(shape), dtype, unpacked)
             while stream.read(AT_ONCE):
                 pass
-    whole = head + int(np.prod(shape)) * dtype.itemsize
-    if by_columns or dtype.kind not in "biuf" or not shape or member.file_size != whole:
-        return None
     with open(path, "rb") as stream:
         stream.seek(member.header_offset)
         signature, *lengths = LOCAL_HEADER.unpack(stream.read(LOCAL_HEADER.size))

@@ -2,7 +2,7 @@
 
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -25,6 +25,14 @@ def of_arrays(*arrays: np.ndarray) -> str:
     for array in arrays:
         found.update(repr(array.shape).encode())
         found.update(np.ascontiguousarray(array, "<f8").tobytes())
+    return found.hexdigest()
+
+
+def of_words(words: Iterable[str]) -> str:
+    """The fingerprint of texts in their order."""
+    found = _hash()
+    for word in words:
+        found.update(word.encode(errors="surrogateescape") + b"\n")
     return found.hexdigest()
 
 

@@ -1,0 +1,125 @@
+"""Cameras of a batch from folders of photographs of a board, one folder a camera.
+
+The board is sought by processes of their own, a photograph each at a time: an image that OpenCV
+dies of spoils itself alone. What is found is kept (`io.boards.kept_corners`), so that no photograph
+is searched twice. Cameras of one image size are then calibrated together (`calibrate_batch`).
+"""
+
+import dataclasses
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxbundle.batch.calibrate import calibrate_batch
+from jaxbundle.batch.input import pixel_model
+from jaxbundle.batch.result import BatchCalibration
+from jaxbundle.cameras.pixel_frame import in_model_units
+from jaxbundle.errors import InputError
+from jaxbundle.io.boards.kept_corners import KeptCorners
+from jaxbundle.io.formats import recognised_format
+from jaxbundle.io.writing.fingerprints import of_words
+from jaxbundle.measure.boards import Board
+from jaxbundle.measure.views import (
+    BoardViews,
+    Look,
+    collect_views,
+    name_photographs,
+    photographs,
+)
+from jaxbundle.system.workers import Failed, Workers
+
+
+def is_photograph_folder(path: str | Path) -> bool:
+    """Whether an input is a folder, and none that holds a network."""
+    return os.path.isdir(path) and recognised_format(Path(path)) is None
+
+
+@dataclasses.dataclass(frozen=True)
+class PhotographFolders:
+    """Folders of photographs of one board, what was found in them, and who searches."""
+
+    folders: Sequence[str]
+    board: Board
+    kept: KeptCorners
+    workers: Workers
+
+    def fingerprint(self, folder: int) -> str:
+        """Of the content of the photographs."""
+        files = self._files(folder)
+        return of_words(f"{name} {self.kept.content(path)}" for name, path in files.items())
+
+    def measure(
+        self, chosen: Sequence[int], tell: Callable[[float], None] = lambda part: None
+    ) -> dict[int, BoardViews | str]:
+        """The views of some of the folders, or why there are none.
+
+        `tell(part)`: of the photographs that were to be searched, so many are."""
+        files = {folder: self._files(folder) for folder in chosen}
+        contents = {path: self.kept.content(path) for of in files.values() for path in of.values()}
+        tasks = {
+            content: (path, self.board) for path, content in contents.items()
+            if content and self.kept.look(content, self.board) is None
+        }  # fmt: skip
+        died: dict[str, str] = {}
+        for done, (task, look) in enumerate(self.workers.run(tasks.values()), 1):
+            content = contents[task[0]]
+            if isinstance(look, Failed):
+                died[content] = look.why  # not kept: another run may have more memory
+            else:
+                self.kept.keep(content, self.board, look)
+            tell(done / len(tasks))
+        return {folder: self._views(folder, files[folder], contents, died) for folder in chosen}
+
+    def _views(self, folder, files, contents, died) -> BoardViews | str:
+        if not files:
+            return f"{self.folders[folder]}: no photographs in this folder"
+        looks: dict[str, Look] = {}
+        first: dict[str, str] = {}
+        for name, path in files.items():
+            content = contents[path]
+            looks[name] = (
+                "cannot be read" if not content
+                else f"is the same file as {first[content]}" if content in first
+                else died.get(content) or self.kept.look(content, self.board) or "was not searched"
+            )  # fmt: skip
+            first.setdefault(content, name)
+        try:
+            return collect_views(files, looks, self.board, hints=not {*died} & {*first})
+        except InputError as error:
+            return str(error)
+
+    def _files(self, folder: int) -> dict[str, Path]:
+        try:
+            return name_photographs(photographs([self.folders[folder]]))
+        except (InputError, OSError):
+            return {}
+
+
+def calibrate_views(
+    views: Mapping[int, BoardViews], options: Mapping[str, Any]
+) -> Iterable[tuple[int, BatchCalibration, int]]:
+    """Calibrate cameras from views of a board, those of one image size together: of each camera its
+    number, the batch it was calibrated in, and its place there; `options` of `calibrate_batch`."""
+    model = pixel_model(options["model"])
+    for size in dict.fromkeys(one.image_size for one in views.values()):
+        numbers = [number for number, one in views.items() if one.image_size == size]
+        most = max(len(views[number]) for number in numbers)
+        board = views[numbers[0]].board
+        xy = np.full((len(numbers), most, len(board.ids), 2), np.nan)
+        for place, number in enumerate(numbers):
+            xy[place, : len(views[number])] = in_model_units(views[number].xy, model, size)
+        batch = calibrate_batch(board.points, xy, size, visible=~np.isnan(xy).any(-1), **options)
+        yield from ((number, batch, place) for place, number in enumerate(numbers))
+
+
+def of_photographs(views: BoardViews, brief: bool) -> dict:
+    """What a line says of the photographs of a camera."""
+    row: dict[str, Any] = {"image_size": list(views.image_size)}
+    if not brief:
+        row["photographs"] = list(views.names)
+    if views.failed:
+        row["photographs_not_used"] = dict(views.failed)
+    return row

@@ -1,0 +1,111 @@
+"""Corners found in photographs, kept for the next run: an SQLite file.
+
+What was found belongs to the content of a photograph, not to its name: one that was changed is
+searched again, one that was moved or copied is not. Whether a file has the content it had is told
+by its size and time of change; where these are others, it is read.
+
+| table | |
+|---|---|
+| `photographs` | path, size, time of change [ns], fingerprint of the content |
+| `boards` | fingerprint, board; columns and rows of the photograph, image points, or why none |
+"""
+
+import hashlib
+import os
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.measure.boards import Board
+from jaxbundle.measure.views import Look
+from jaxbundle.system.file_content import read_content
+
+TABLES = """
+CREATE TABLE IF NOT EXISTS photographs
+    (path TEXT PRIMARY KEY, size INTEGER, changed INTEGER, content TEXT);
+CREATE TABLE IF NOT EXISTS boards
+    (content TEXT, board TEXT, columns INTEGER, rows INTEGER, xy BLOB, why TEXT,
+     PRIMARY KEY (content, board));
+"""
+
+
+class KeptCorners:
+    """What is in such a file, and what is added to it; a context. Only one process at a time.
+
+    **Raises:** `InputError` if the file cannot be read or written, or is of another kind.
+    """
+
+    def __init__(self, path: str | Path):
+        self.path = path
+        try:
+            self._file = sqlite3.connect(path, isolation_level=None)
+            self._file.executescript(TABLES)
+        except sqlite3.Error as error:
+            raise self._error(error) from None
+
+    def __enter__(self) -> "KeptCorners":
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._file.close()
+
+    def content(self, photograph: Path) -> str:
+        """The fingerprint of a photograph's content; empty if it cannot be read."""
+        try:
+            state = os.stat(photograph)
+        except OSError:
+            return ""
+        path = os.fsencode(os.path.abspath(photograph)).decode(errors="backslashreplace")
+        now = state.st_size, state.st_mtime_ns
+        known = self._first("SELECT size, changed, content FROM photographs WHERE path = ?", path)
+        if known is not None and known[:2] == now:
+            return known[2]
+        try:
+            read = read_content(photograph, text=False)
+        except InputError:
+            return ""
+        content = hashlib.blake2b(read, digest_size=16).hexdigest()
+        self._write("INSERT OR REPLACE INTO photographs VALUES (?, ?, ?, ?)", path, *now, content)
+        return content
+
+    def look(self, content: str, board: Board) -> Look | None:
+        """What was found of a board in a photograph of this content; None: it was not sought."""
+        found = self._first(
+            "SELECT columns, rows, xy, why FROM boards WHERE content = ? AND board = ?",
+            content, repr(board),
+        )  # fmt: skip
+        if found is None:
+            return None
+        columns, rows, xy, why = found
+        if xy is None:
+            return why
+        return (columns, rows), np.frombuffer(xy, "<f8").reshape(-1, 2)
+
+    def keep(self, content: str, board: Board, look: Look) -> None:
+        """Add what was found; it is in the file when this returns."""
+        (columns, rows), xy = ((None, None), None) if isinstance(look, str) else look
+        points = None if xy is None else np.ascontiguousarray(xy, "<f8").tobytes()
+        self._write(
+            "INSERT OR REPLACE INTO boards VALUES (?, ?, ?, ?, ?, ?)",
+            content, repr(board), columns, rows, points, look if xy is None else None,
+        )  # fmt: skip
+
+    def _first(self, question: str, *given) -> tuple | None:
+        try:
+            return self._file.execute(question, given).fetchone()
+        except sqlite3.Error as error:
+            raise self._error(error) from None
+
+    def _write(self, order: str, *given) -> None:
+        try:
+            self._file.execute(order, given)
+        except sqlite3.Error as error:
+            raise self._error(error) from None
+
+    def _error(self, error: sqlite3.Error) -> InputError:
+        return InputError(
+            f"{self.path}: the corners found before cannot be kept there ({error}); remove it, or "
+            "give another file to --json-lines"
+        )

@@ -1,0 +1,97 @@
+"""Tasks done by processes of their own: what one of them dies of spoils its task alone.
+
+A process is a fresh interpreter that is handed a task at a time through a pipe. It ends when the
+pipe is closed, and so with the process that started it, however that ends.
+"""
+
+import dataclasses
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Iterable, Iterator
+from multiprocessing.connection import Connection, wait
+from typing import Any
+
+PATIENCE = 5.0
+"""Seconds for a process without work to end."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Failed:
+    """In place of a result: what went wrong, in words."""
+
+    why: str
+
+
+class Workers:
+    """So many processes at most, started when they are needed, that call one function; a context.
+
+    `function` is importable; it, its tasks and results are pickled.
+    """
+
+    def __init__(self, function: Callable[[Any], Any], number: int):
+        self._function, self._number = function, number
+        self._idle: list[tuple[Connection, Any]] = []
+        self._busy: dict[Connection, tuple[Any, Any]] = {}
+
+    def __enter__(self) -> "Workers":
+        return self
+
+    def __exit__(self, *_) -> None:
+        for connection, process in (*self._idle, *((c, p) for c, (p, _) in self._busy.items())):
+            connection.close()
+            if connection in self._busy:
+                process.terminate()
+            process.join(PATIENCE)
+        self._idle, self._busy = [], {}
+
+    def run(self, tasks: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
+        """Every task with its result or `Failed`, as they come to an end."""
+        left = list(tasks)[::-1]
+        while left or self._busy:
+            while left and len(self._busy) < self._number:
+                connection, process = self._idle.pop() if self._idle else self._start()
+                try:
+                    connection.send(left[-1])
+                except OSError:  # it died without work
+                    continue
+                self._busy[connection] = process, left.pop()
+            ready = wait([*self._busy])
+            for connection in [one for one in self._busy if one in ready]:
+                process, task = self._busy.pop(connection)
+                try:
+                    result = connection.recv()
+                except (EOFError, OSError):
+                    process.join()
+                    yield task, Failed(f"the process that worked on it died ({_ended(process)})")
+                    continue
+                self._idle.append((connection, process))
+                yield task, result
+
+    def _start(self) -> tuple[Connection, Any]:
+        context = multiprocessing.get_context("spawn")
+        ours, theirs = context.Pipe()
+        process = context.Process(target=_serve, args=(theirs, self._function), daemon=True)
+        process.start()
+        theirs.close()
+        return ours, process
+
+
+def _ended(process) -> str:
+    code = process.exitcode
+    return f"signal {-code}" if code is not None and code < 0 else f"status {code}"
+
+
+def _serve(connection: Connection, function: Callable[[Any], Any]) -> None:
+    """The life of a process: Ctrl-C is for the one that started it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        while True:
+            task = connection.recv()
+            try:
+                result = function(task)
+            except Exception as error:
+                result = Failed(f"{type(error).__name__}: {error}")
+            connection.send(result)
+    except (EOFError, OSError):
+        os._exit(0)  # nobody is there any more

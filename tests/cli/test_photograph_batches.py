@@ -1,0 +1,160 @@
+"""`jaxbundle batch` of folders of photographs, a camera each."""
+
+import json
+import os
+import shutil
+import signal
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import render
+from board_photographs import poses
+
+from jaxbundle.batch import run as batches
+from jaxbundle.batch.run import run_batch
+from jaxbundle.errors import InputError
+from jaxbundle.io.boards.kept_corners import KeptCorners
+from jaxbundle.measure.boards import Board
+from jaxbundle.measure.views import search_board
+from jaxbundle.system.workers import Failed, Workers
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "board"
+BOARD = Board(9, 6, 0.03)
+FREE = ["fx", "fy", "cx", "cy", "k1"]
+VIEWS = 7
+
+
+def folder_of(path: Path, numbers) -> Path:
+    path.mkdir()
+    for number in numbers:
+        shutil.copy(EXAMPLE / f"photo_{number:02d}.jpg", path)
+    return path
+
+
+def rows(file: Path) -> list[dict]:
+    return [json.loads(line) for line in file.read_text().splitlines()]
+
+
+@pytest.fixture
+def searched(monkeypatch):
+    """Photographs that are searched, here and at once."""
+    found = []
+
+    class Here(Workers):
+        def run(self, tasks):
+            for path, board in tasks:
+                found.append(path.name)
+                yield (path, board), search_board(path, board)
+
+    monkeypatch.setattr(batches, "Workers", Here)
+    return found
+
+
+def test_a_folder_a_camera(command, tmp_path, monkeypatch):
+    """By processes of their own, from the command; a bad folder has its line, the others theirs."""
+    monkeypatch.chdir(tmp_path)
+    folder_of(tmp_path / "first", range(1, 8))
+    (tmp_path / "first" / "text.jpg").write_text("no photograph")
+    shutil.copy(tmp_path / "first" / "photo_01.jpg", tmp_path / "first" / "z.jpg")
+    folder_of(tmp_path / "bad", [13])
+    (tmp_path / "none").mkdir()
+    folder_of(tmp_path / "second", range(7, 14))
+    told = command(
+        "batch", "first", "bad", "none", "second", "--board", "9x6", "--square", 0.03, "--free",
+        ",".join(FREE), "--json-lines", "results.jsonl", "--table", "cameras.csv",
+    )  # fmt: skip
+    assert told.status == 0, told.err
+    assert "2 converged, 2 bad input" in told.out and "no photographs in this folder" in told.out
+    first, bad, none, second = rows(Path("results.jsonl"))
+    assert [row["key"] for row in (first, bad, none, second)] == ["first", "bad", "none", "second"]
+    assert "inner corners" in bad["error"] and none["status"] == "bad input"
+    for row, used in ((first, 7), (second, 6)):
+        assert row["views"] == used == len(row["photographs"]) == len(row["poses"])
+        assert row["image_size"] == [480, 360] and row["views_left_out"] == []
+        fx = row["parameters"]["fx"]
+        assert abs(fx["value"] - 620) < 4 * fx["sigma"] < 4
+        assert row["rms"] < 0.06
+    left = first["photographs_not_used"]
+    assert "not an image" in left["text.jpg"]
+    assert left["z.jpg"] == "is the same file as photo_01.jpg"
+    assert list(second["photographs_not_used"]) == ["photo_13.jpg"]
+    assert sorted(p.name for p in tmp_path.iterdir() if p.is_file()) == [
+        "cameras.csv", "results.jsonl", "results.jsonl.corners",
+    ]  # fmt: skip
+
+
+def test_no_photograph_is_searched_twice_and_a_changed_one_is_noticed(searched, tmp_path):
+    folders = [folder_of(tmp_path / "a", range(1, 8)), folder_of(tmp_path / "b", range(6, 13))]
+    file = tmp_path / "results.jsonl"
+    again = lambda **options: run_batch(
+        folders, file, **dict(board=BOARD, free=FREE, brief=True) | options
+    )
+    assert again() == {"converged": 2}
+    assert len(searched) == 12  # two are in both
+    assert again() == {"converged": 2, "skipped": 2}
+    before = rows(file)
+    # Killed before its line was written, moved and copied: corners are there.
+    file.write_text(file.read_text().splitlines()[0] + "\n")
+    os.utime(folders[1] / "photo_08.jpg", (0, 0))
+    assert again() == {"converged": 2, "skipped": 1}
+    assert rows(file) == before and len(searched) == 12
+    shutil.copy(EXAMPLE / "photo_02.jpg", folders[1] / "photo_12.jpg")
+    with pytest.raises(InputError, match="has 1 of .*, b: its photographs were others"):
+        again()
+    with pytest.raises(InputError, match="board was Board.*9.*, is Board.*8"):
+        again(board=Board(8, 6, 0.03))
+    os.remove(folders[1] / "photo_12.jpg")
+    shutil.copy(EXAMPLE / "photo_13.jpg", folders[1])
+    assert again(renew=True) == {"converged": 2, "skipped": 1}
+    assert searched[12:] == ["photo_13.jpg"] and rows(file)[0] == before[0]
+    assert again(part=(2, 2)) == {"converged": 1, "skipped": 1}
+    with pytest.raises(InputError, match="I from 1 to N"):
+        again(part=(3, 2))
+    (tmp_path / "results.jsonl.corners").write_text("a diary " * 1000)
+    with pytest.raises(InputError, match=r"results.jsonl.corners: .*remove it"):
+        again()
+
+
+def test_charuco_boards_with_missing_corners(searched, tmp_path):
+    """Every photograph shows another part of the board: less than half of it to all but a corner;
+    the camera within its σ."""
+    board = Board(10, 7, 0.027, "charuco")
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    drawn = cv2.aruco.CharucoBoard((10, 7), 0.027, 0.75 * 0.027, dictionary)
+    picture = drawn.generateImage((1000, 700), marginSize=0)
+    pattern = render.print_of(picture, 10 * 0.027, 0.03)
+    (tmp_path / "camera").mkdir()
+    for i, (M, X0) in enumerate(poses(VIEWS, turned=False, middle=(0.135, 0.0945))):
+        taken = render.photograph(render.LENS, M, X0, pattern, seed=i)
+        taken[:, (70 * (i % 3)) :][:, :90] = 128
+        cv2.imwrite(f"{tmp_path}/camera/{i}.png", taken)
+    file = tmp_path / "results.jsonl"
+    assert run_batch([tmp_path / "camera"], file, board=board, free=FREE) == {"converged": 1}
+    (row,) = rows(file)
+    with KeptCorners(tmp_path / "results.jsonl.corners") as kept:
+        looks = [kept.look(kept.content(p), board) for p in (tmp_path / "camera").iterdir()]
+    seen = np.array([~np.isnan(xy).any(1) for _, xy in looks])
+    assert row["views"] == VIEWS and 20 < seen.sum(1).min() < 27 and (seen.sum(1) < 54).sum() > 4
+    assert row["redundancy"] == 2 * seen.sum() - 6 * VIEWS - len(FREE)
+    truth = dict(zip(["fx", "fy", "cx", "cy"], render.LENS.parameters))
+    for name, value in truth.items():
+        found = row["parameters"][name]
+        assert abs(found["value"] - value) < 4 * found["sigma"], name
+
+
+def die(number: int):
+    if number == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if number == 3:
+        raise ValueError("three")
+    return number**2
+
+
+def test_what_a_process_dies_of_spoils_its_task_alone():
+    with Workers(die, 1) as workers:
+        found = dict(workers.run(range(5)))
+    assert {n: r for n, r in found.items() if n not in (2, 3)} == {0: 0, 1: 1, 4: 16}
+    assert found[2] == Failed("the process that worked on it died (signal 9)")
+    assert found[3] == Failed("ValueError: three")
