@@ -111,7 +111,7 @@ def calibrate_views(
         xy = np.full((len(numbers), most, len(board.ids), 2), np.nan)
         for place, number in enumerate(numbers):
             xy[place, : len(views[number])] = in_model_units(views[number].xy, model, size)
-        batch = calibrate_batch(board.points, xy, size, visible=~np.isnan(xy).any(-1), **options)
+        batch = calibrate_batch(board.points, xy, size, visible=~np.isnan(xy[..., 0]), **options)
         yield from ((number, batch, place) for place, number in enumerate(numbers))
 
 

@@ -68,7 +68,7 @@ class Workers:
                 self._idle.append((connection, process))
                 yield task, result
 
-    def _start(self) -> tuple[Connection, Any]:
+    def _start(self) -> tuple[Any, Any]:
         context = multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
         process = context.Process(target=_serve, args=(theirs, self._function), daemon=True)
