@@ -48,7 +48,7 @@ CERES = ("pycolmap", "ceres")
 READ = """
 import sys, jaxbundle
 try:
-    jaxbundle.read_network(sys.argv[1], "bal")
+    jaxbundle.read_network(sys.argv[1], format="bal")
 except jaxbundle.InputError as error:
     sys.exit(str(error))
 """

@@ -12,6 +12,7 @@ uses all cores for large networks, `keep_programs` keeps compiled programs.
 """
 
 import importlib
+from difflib import get_close_matches
 
 TYPE_CHECKING = False  # avoids importing typing
 
@@ -23,8 +24,11 @@ if TYPE_CHECKING:
     from jaxbundle.batch.calibrate import BatchCalibration as BatchCalibration
     from jaxbundle.batch.calibrate import calibrate_batch as calibrate_batch
     from jaxbundle.bundle.adjust import adjust as adjust
+    from jaxbundle.bundle.compare import AdjustmentComparison as AdjustmentComparison
+    from jaxbundle.bundle.compare import compare as compare
     from jaxbundle.bundle.influence import Influence as Influence
     from jaxbundle.bundle.influence import influence as influence
+    from jaxbundle.bundle.load import load_adjustment as load_adjustment
     from jaxbundle.bundle.orient import orient as orient
     from jaxbundle.bundle.result import Adjustment as Adjustment
     from jaxbundle.bundle.sensitivity import Budget as Budget
@@ -96,6 +100,8 @@ _HOME = {
     "jaxbundle.orientation.network": ("Oriented",),
     "jaxbundle.bundle.orient": ("orient",),
     "jaxbundle.bundle.result": ("Adjustment",),
+    "jaxbundle.bundle.load": ("load_adjustment",),
+    "jaxbundle.bundle.compare": ("AdjustmentComparison", "compare"),
     "jaxbundle.bundle.sensitivity": ("Budget", "sensitivity"),
     "jaxbundle.bundle.influence": ("Influence", "influence"),
     "jaxbundle.statistics.precision": ("Precision", "precision"),
@@ -108,7 +114,9 @@ def __getattr__(name: str):
     """Import public names on first use (PEP 562), so that the command line can configure JAX and
     the linear algebra library before they start."""
     if name not in _MODULE:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        close = [] if name.startswith("_") else get_close_matches(name, __all__, 1)
+        mean = f"; did you mean {close[0]!r}?" if close else ""
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}{mean}")
     value = getattr(importlib.import_module(_MODULE[name]), name)
     globals()[name] = value
     return value

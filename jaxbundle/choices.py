@@ -14,6 +14,33 @@ ESTIMATORS = ("huber", "cauchy", "tukey")
 TESTS = ("pope", "baarda")
 """Tests of data snooping."""
 
+CAMERA_MODELS = (
+    "brown", "brown-projected", "usgs", "bingo", "opencv", "snavely", "division",
+    "kannala-brandt", "kannala-brandt-tangential", "thin-prism-fisheye",
+    "rad-tan-thin-prism-fisheye", "fov", "eucm", "double-sphere", "mei", "scaramuzza",
+    "equidistant", "stereographic", "equisolid", "orthographic", "equirectangular",
+)  # fmt: skip
+_DEGREES = r"(\d+(?:\.\d+)?)"
+MODEL_FAMILIES = {
+    "radial-spline-N-FOV": rf"radial-spline-(\d+)-{_DEGREES}",
+    "spline-NXxNY-FOV": rf"spline-(\d+)x(\d+)-{_DEGREES}",
+}
+"""Camera models whose names say numbers, and how they read."""
+
+FORMATS = (
+    "project", "photo-list", "bal", "column-map", "colmap", "bingo", "metashape", "photomodeler",
+    "bundler", "openmvg", "opensfm", "transforms", "kalibr", "micmac", "jaicov", "mrcal",
+)  # fmt: skip
+"""Kinds of inputs that are networks."""
+TARGETS = (
+    "ply", "dxf", "csv", "bundler", "bal", "colmap", "colmap-text", "openmvg", "opensfm",
+    "transforms", "kalibr", "micmac", "jaicov", "mrcal", "project",
+)  # fmt: skip
+CAMERA_FILES = (
+    "colmap-cameras", "opensfm-cameras", "ros", "cameramodel", "autocal", "opencv", "cameras",
+)  # fmt: skip
+"""Kinds of outputs: networks, and cameras alone."""
+
 AIMS = ("mean", "worst", "determinant", "reliability")
 """Measures of σ that a design minimises."""
 ORDERS = {

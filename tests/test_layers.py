@@ -11,6 +11,7 @@ LAYERS = (
     "errors",
     "choices",
     "types",
+    "display",
     "arguments",
     "float64",
     "system",
@@ -45,7 +46,7 @@ PACKAGE = Path(__file__).parent.parent / "jaxbundle"
 FILES = sorted(p for p in PACKAGE.rglob("*.py") if p != PACKAGE / "__init__.py")
 OPTIONAL = {
     "matplotlib", "pandas", "cv2", "pyproj", "rasterio", "erfa", "sgp4", "ezdxf", "laspy", "plotly",
-    "PIL", "pyarrow",
+    "PIL", "pyarrow", "xarray", "anywidget", "traitlets",
 }  # fmt: skip
 LIGHT = {"geometry", "cameras"}
 

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbundle.arguments import one_of
 from jaxbundle.choices import REDUCTIONS
+from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.leastsquares import problem as engine
@@ -51,6 +52,7 @@ class Counts:
         return self.observations + self.pseudo_observations + self.datum - self.unknowns
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Problem:
     """The input of `jaxbundle.solve`: a network as the engine sees it.
@@ -134,7 +136,8 @@ class Problem:
 
 
 def make_problem(
-    network: Network, reduction: str | None = None, also: Sequence[Table | Observations] = (),
+    network: Network, *, reduction: str | None = None,
+    also: Sequence[Table | Observations] = (),
     lengths: Float[np.ndarray, " points"] | None = None,
 ) -> Problem:
     """Plan, arrays and datum of a checked network (see `jaxbundle.network.check_network`).

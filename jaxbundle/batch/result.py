@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from jaxbundle.batch.camera import CONVERGED, MISFIT, STATUS, WEAK
 from jaxbundle.cameras import CameraModel
+from jaxbundle.display import shows_itself
 from jaxbundle.network.columns import data_frame
 
 SOLVED = (STATUS[CONVERGED], STATUS[WEAK], STATUS[MISFIT])
@@ -18,6 +19,7 @@ MOST_REMARKS = 10
 """Remarks that differ, in the text."""
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class BatchCalibration:
     """The cameras of a batch; everything of a camera that has no solution is NaN.

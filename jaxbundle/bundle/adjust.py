@@ -39,7 +39,6 @@ from jaxbundle.orientation.exchanges import CONTRADICTION, name_contradiction
 from jaxbundle.orientation.network import Oriented, lacks_start_values
 from jaxbundle.orientation.one_place import name_one_place
 from jaxbundle.statistics.blunders import name_suspect
-from jaxbundle.statistics.check_points import intersect_check_points
 from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.statistics.misfit import doubt_of_robust
 from jaxbundle.types import present
@@ -156,7 +155,7 @@ class _First:
         self, network: Network, cameras: Mapping[str, Camera] = MappingProxyType({})
     ) -> Begun:
         network, *check = split_check_points(check_network(network))
-        make = partial(make_problem, network, self.reduction, self.also)
+        make = partial(make_problem, network, reduction=self.reduction, also=self.also)
         try:
             problem = make()
         except InputError as error:  # The datum, if control points were excluded.
@@ -218,14 +217,9 @@ class _Found:
         if not inspection and converged(int(minimum.termination)):
             names = names or UNNAMED
         unnamed = not inspection and not names
-        points, rays = check
-        factors = self.said.get("sigma_factors", {})
-        intersected = lambda result: intersect_check_points(
-            result.inspection, points, rays, factors
-        )
         return Adjustment(
             self.network, problem, minimum, undetermined=tuple(names),
-            check=intersected if len(points) else None, method=self.method,
+            check=check if len(check[0]) else None, method=self.method,
             reduction=self.reduction, inspection=inspection,
             weakness=weakness_without_solution(problem, minimum) if unnamed else None,
             findings=_likely_causes(problem, minimum, inspection), **self.said,

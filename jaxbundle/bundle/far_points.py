@@ -44,7 +44,7 @@ def minimise_at_any_distance(
 ) -> tuple[Problem, Minimum]:
     """Iterate from `start` with points with parallel rays at any distance; without convergence,
     with all narrow ones. Returns that problem if it was solved, else the given one.
-    `make(lengths)`: makes the problem (see `make_problem`)."""
+    `make(lengths=…)`: makes the problem (see `make_problem`)."""
     angle = angle_of_rays(problem, start)
     if not (angle < NARROW).any():
         return problem, minimise(problem, start, max_steps=max_steps, **options)
@@ -121,7 +121,7 @@ def _with_far_points(problem: Problem, values: Values, chosen, make: Callable):
     if not lengths.any():
         return None
     try:
-        far = make(lengths)
+        far = make(lengths=lengths)
     except InputError:
         return None
     if values.other:  # Frames and other tables would have to move with the origin.

@@ -16,6 +16,7 @@ from jaxbundle.adjustment.problem import Problem
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.bundle.sensitivity import looked_at
 from jaxbundle.bundle.tables import observations
+from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.response import pull_back
 from jaxbundle.network.columns import data_frame
@@ -26,6 +27,7 @@ MOST_ROWS = 20
 """Number of printed measurements per result."""
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Influence:
     """The influence of measurements on results.

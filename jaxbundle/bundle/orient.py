@@ -22,7 +22,7 @@ STEPS = 12
 """Iterations of an intermediate adjustment: it only has to remove drift, which vanishes first."""
 
 
-def orient(network: Network, tolerance: float = TOLERANCE) -> Oriented:
+def orient(network: Network, *, tolerance: float = TOLERANCE) -> Oriented:
     """Compute missing start values of a network; given ones are kept.
 
     The principal distance of a camera should be correct to a few per cent; its distortion may be

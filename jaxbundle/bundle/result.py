@@ -6,6 +6,7 @@ computed on first access. Without a solution every accessor raises `NotSolvedErr
 
 import functools
 from collections.abc import Callable, Mapping
+from os import PathLike
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +22,9 @@ from jaxbundle.adjustment.unknowns import (
     value_of,
 )
 from jaxbundle.arguments import at_least_zero
+from jaxbundle.arguments import path as given_path
 from jaxbundle.bundle import tables as result_tables
+from jaxbundle.bundle.stored import network_fingerprint, store
 from jaxbundle.cameras import get_model
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.adjust import TableResult, table_result
@@ -37,12 +40,12 @@ from jaxbundle.leastsquares.stopping import converged as reached_minimum
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.columns import data_frame, some
 from jaxbundle.network.declare import LEAST_IMAGES
-from jaxbundle.network.tables import Network, units_of
+from jaxbundle.network.tables import Network, Observations, Points, units_of
 from jaxbundle.network.unit_mistakes import name_pixels
 from jaxbundle.network.units import ANGLE_UNITS
 from jaxbundle.orientation.exchanges import CONTRADICTION
 from jaxbundle.statistics.blunders import Removed, Suspect
-from jaxbundle.statistics.check_points import CheckPoints
+from jaxbundle.statistics.check_points import CheckPoints, intersect_check_points
 from jaxbundle.statistics.components import groups
 from jaxbundle.statistics.far_points import FarPoints, find_far_points
 from jaxbundle.statistics.global_test import chi_squared_test
@@ -75,6 +78,7 @@ class Adjustment:
       `robust_scale`: of the residuals, a posteriori (MAD), in a priori σ; `suspects`: image points
       whose residuals exceed the critical value.
     - `doubts`: the warnings about a priori σ, σ0 and blunders
+    - `fingerprint`: of the adjusted network; `save` writes the result into a file
     """
 
     def __init__(
@@ -86,7 +90,7 @@ class Adjustment:
         removed: tuple[Removed, ...] = (),
         eliminated: tuple[Name, ...] = (),
         undetermined: tuple[str, ...] = (),
-        check: Callable[["Adjustment"], CheckPoints] | None = None,
+        check: tuple[Points, Observations] | None = None,
         method: str = "levenberg-marquardt",
         reduction: str | None = None,
         sigma_factors: Mapping[str, float] | None = None,
@@ -111,11 +115,11 @@ class Adjustment:
         self.weights = None if reweighted is None else _of_image_points(problem, reweighted.weights)
         self.robust_scale = None if reweighted is None else reweighted.scale
         self.suspects = suspects
-        self._doubts = doubts
+        self.given_doubts = doubts
         self.findings = findings
         self._weakness = weakness
         self._inspection = inspection
-        self._check = check
+        self.check = check
 
     # --- how it ended -----------------------------------------------------------------------
 
@@ -171,12 +175,12 @@ class Adjustment:
         """The warnings about a priori σ, σ0 and blunders, with the remedy; the last one about a
         global test that clearly fails."""
         if not self.converged:
-            return self._doubts
+            return self.given_doubts
         doubt, downweighted = None, self.robust and self.sigma0 < 1
         if not (self.sigma_factors or downweighted or report.unit_weights(self)):
             in_pixels = bool(name_pixels(self.problem.network))
             doubt = doubt_of_fit(self.sigma0, self._scale, self.redundancy, in_pixels)
-        return self._doubts if doubt is None else (*self._doubts, doubt)
+        return self.given_doubts if doubt is None else (*self.given_doubts, doubt)
 
     @functools.cached_property
     def distortion_reach(self) -> dict[str, Reach]:
@@ -271,7 +275,9 @@ class Adjustment:
     def check_points(self) -> CheckPoints | None:
         """Check points intersected after the adjustment; None if there are none."""
         self._require_solved()
-        return None if self._check is None else self._check(self)
+        if self.check is None:
+            return None
+        return intersect_check_points(self.inspection, *self.check, self.sigma_factors)
 
     # --- unknowns ---------------------------------------------------------------------------
 
@@ -443,6 +449,24 @@ class Adjustment:
             raise KeyError(f"tables are {known}; not {name!r}")
         return getattr(self, name)
 
+    # --- as a file --------------------------------------------------------------------------
+
+    @functools.cached_property
+    def fingerprint(self) -> str:
+        """16 hex digits of the network that was adjusted: cameras, start values, measurements and
+        settings, wherever they were read."""
+        return network_fingerprint(self.problem.network)
+
+    def save(self, path: str | PathLike) -> None:
+        """Write the whole result into a file, which `jaxbundle.load_adjustment` reads; a file of
+        this name is replaced when the new one is complete. Camera models and observations of one's
+        own (`also`) are functions: they are named in it, and have to be given when it is loaded.
+
+        **Raises:** `NotSolvedError` where there is no result; `InputError` where the file cannot
+        be written."""
+        self._require_solved()
+        store(self, given_path("path", path))
+
     # --- for people -------------------------------------------------------------------------
 
     def report(self, residual_limit: float = 3.0, **options) -> str:
@@ -483,9 +507,15 @@ class Adjustment:
         """The normalised residuals compared with the normal distribution; matplotlib axes."""
         return plotting.residual_histogram(self, ax)
 
-    def to_pandas(self, name: str):
-        """A table as a pandas data frame (extra `tables`)."""
-        return data_frame(self.table(name))
+    def units(self, name: str) -> dict[str, str]:
+        """The units of the columns of a table; of residuals and camera parameters, whose units
+        differ from row to row, none."""
+        return result_tables.units(self, list(self.table(name)), name)
+
+    def to_pandas(self, name: str, *, units: bool = False):
+        """A table as a pandas data frame (extra `tables`). The units of its columns are in
+        `attrs["units"]`; with `units` they are the second level of its columns."""
+        return data_frame(self.table(name), self.units(name), heads=units)
 
 
 @jax.jit

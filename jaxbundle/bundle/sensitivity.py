@@ -18,6 +18,7 @@ from jaxtyping import Float
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.arguments import shown
 from jaxbundle.bundle.result import Adjustment
+from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.reduction import FACTORS
 from jaxbundle.leastsquares.response import follow
@@ -33,6 +34,7 @@ from jaxbundle.statistics.results import WORDS, Asked, ask, effects_on
 MEASUREMENTS, TOTAL = "measurements", "total"
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Budget:
     """Effects of errors of held quantities on results.

@@ -103,6 +103,18 @@ def far_points(adjustment) -> dict[str, np.ndarray]:
     return table | {"at_infinity": found.at_infinity}
 
 
+def units(adjustment, columns: Sequence[str], name: str) -> dict[str, str]:
+    """The units of columns of a table that have one for all rows."""
+    if name in ("residuals", "cameras"):
+        return {}
+    length, angle = adjustment.network.object_unit, adjustment.network.angle_unit
+    known = dict.fromkeys((*"XYZ", *EXTERIOR[:3], "distance", "nearer", "farther"), length)
+    known |= dict.fromkeys((*EXTERIOR[3:], "su"), angle)
+    known["rms"] = adjustment.image_unit
+    of = lambda column: known.get(column) or known.get(column[1:] if column[:1] in "sd" else "")
+    return {column: unit for column in columns if (unit := of(column))}
+
+
 def _rays_and_rms(adjustment, of_ray, n: int) -> dict[str, np.ndarray]:
     """Columns rays and rms (of v, image unit) by the index `of_ray` of every ray."""
     weight = np.asarray(adjustment.problem.data.image_weight)

@@ -37,6 +37,7 @@ from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.quality import at_result, kept_rays, part, residuals_in_pixels
 from jaxbundle.calibration.result import Calibration
 from jaxbundle.cameras import CameraModel, Comparison, compare_cameras, get_model
+from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.measure.boards import Board
 from jaxbundle.measure.views import BoardViews
@@ -48,6 +49,7 @@ FEWEST = 4
 """Photographs of a fold's camera and, at least, folds' worth of them."""
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Candidate:
     """A model, calibrated from the common observations.
@@ -75,6 +77,7 @@ class Candidate:
         return get_model(self.calibration.camera.model), self.calibration.parameters
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Difference:
     """How far a model's images are from those of the best: the map, its lengths in pixels, and the

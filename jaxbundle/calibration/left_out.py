@@ -14,12 +14,14 @@ from jaxtyping import Float
 
 from jaxbundle.calibration.linearised import lagrange_multipliers, linearise_image_points
 from jaxbundle.cameras import get_model, is_own
+from jaxbundle.display import shows_itself
 
 AFFINE = ("b1", "b2")
 CRITICAL = 4.0
 """|b|/σ above which a parameter is missed."""
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class LeftOut:
     """Parameters that were held at 0: what they would be, σ, and the largest displacement of a

@@ -12,6 +12,7 @@ from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.cameras import get_model
 from jaxbundle.cameras.compare import Comparison, compare_cameras
 from jaxbundle.cameras.pixel_frame import in_model_units, in_pixels
+from jaxbundle.display import data_set, shows_itself
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.network.tables import Camera, Network
 from jaxbundle.statistics.projection import (
@@ -30,6 +31,7 @@ HELD_OUT_FEWEST = 4
 """Photographs that are needed to calibrate from each half."""
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class UncertaintyMap:
     """Standard deviations of a projected point over the image.
@@ -47,6 +49,17 @@ class UncertaintyMap:
     @property
     def sigma(self) -> Float[np.ndarray, "rows columns"]:
         return np.sqrt(np.trace(self.covariance, axis1=2, axis2=3) / 2)
+
+    def to_xarray(self):
+        """σ and covariance over u and v (pixels), as an `xarray.Dataset` (extra `grids`)."""
+        axes = np.array(["u", "v"])
+        return data_set(
+            {"sigma": (("v", "u"), self.sigma, "px"),
+             "covariance": (("v", "u", "axis", "other_axis"), self.covariance, "px²")},
+            {"v": (self.uv[:, 0, 1], "px"), "u": (self.uv[0, :, 0], "px"),
+             "axis": (axes, ""), "other_axis": (axes, "")},
+            frame=self.frame, distance=self.distance,
+        )  # fmt: skip
 
     @property
     def middle(self) -> float:
@@ -129,6 +142,7 @@ def over_distance(
     return of(middle), np.nanmax(of(variance.T), axis=0, initial=0.0)
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Coverage:
     """Where in the image points were measured.

@@ -120,7 +120,7 @@ def _solve(views: BoardViews, model: CameraModel, free) -> BatchCalibration:
         if start is None and direct:
             wanted = (*held, *wanted)
         solved = calibrate_batch(
-            views.board.points, xy[None], size, name, views.visible[None],
+            views.board.points, xy[None], size, model=name, visible=views.visible[None],
             free=wanted, start=start, threads=1,
         )  # fmt: skip
         if solved.solved[0]:

@@ -32,6 +32,7 @@ from jaxbundle.cameras.scaramuzza import SCARAMUZZA
 from jaxbundle.cameras.snavely import SNAVELY
 from jaxbundle.cameras.spline import spline
 from jaxbundle.cameras.usgs import USGS
+from jaxbundle.choices import MODEL_FAMILIES
 
 MODELS = {
     model.name: model
@@ -44,13 +45,11 @@ MODELS = {
 }  # fmt: skip
 MODEL_NAMES: tuple[str, ...] = tuple(MODELS)
 
-_DEGREES = r"(\d+(?:\.\d+)?)"
-FAMILIES: dict[str, tuple[str, Callable[..., CameraModel]]] = {
-    "radial-spline-N-FOV": (
-        rf"radial-spline-(\d+)-{_DEGREES}", lambda n, fov: radial_spline(int(n), float(fov))),
-    "spline-NXxNY-FOV": (
-        rf"spline-(\d+)x(\d+)-{_DEGREES}", lambda x, y, fov: spline(int(x), int(y), float(fov))),
-}  # fmt: skip
+_MAKERS: dict[str, Callable[..., CameraModel]] = {
+    "radial-spline-N-FOV": lambda n, fov: radial_spline(int(n), float(fov)),
+    "spline-NXxNY-FOV": lambda x, y, fov: spline(int(x), int(y), float(fov)),
+}
+FAMILIES = {name: (form, _MAKERS[name]) for name, form in MODEL_FAMILIES.items()}
 """Models whose names say numbers: how they read, and who makes them."""
 
 

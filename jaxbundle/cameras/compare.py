@@ -25,12 +25,14 @@ from jaxbundle.cameras.convert_fit import GRID, image_grid, images_of, rays_of
 from jaxbundle.cameras.model import CameraModel, project
 from jaxbundle.cameras.parameters import default_parameters
 from jaxbundle.cameras.pixel_frame import between_frames
+from jaxbundle.display import data_set, shows_itself
 from jaxbundle.float64 import local_x64
 from jaxbundle.geometry import matrix_from_rotation_vector
 from jaxbundle.leastsquares.small import minimise
 from jaxbundle.types import Numbers
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Comparison:
     """A difference map, in the unit and axes of the first calibration.
@@ -54,6 +56,17 @@ class Comparison:
     def length(self) -> Float[np.ndarray, "rows columns"]:
         """Lengths of the differences."""
         return np.linalg.norm(self.difference, axis=2)
+
+    def to_xarray(self):
+        """The difference along both axes and its length over x and y of the image, as an
+        `xarray.Dataset` (extra `grids`)."""
+        dims, d = ("y", "x"), self.difference
+        return data_set(
+            {"dx": (dims, d[..., 0], self.unit), "dy": (dims, d[..., 1], self.unit),
+             "length": (dims, self.length, self.unit)},
+            {"y": (self.y, self.unit), "x": (self.x, self.unit)},
+            rotation_removed=self.rotation, rms=self.rms,
+        )  # fmt: skip
 
     def __str__(self) -> str:
         x, y = self.where

@@ -17,6 +17,7 @@ from jaxbundle.cli.app import run
 COMMANDS = (
     "reconstruct", "orient", "adjust", "calibrate", "batch", "design", "plan", "camera",
     "compare", "stability", "explore", "convert", "surface", "cloud", "pushbroom", "example",
+    "completion",
 )  # fmt: skip
 
 

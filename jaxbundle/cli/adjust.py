@@ -19,6 +19,9 @@ def adjust(
         Path | None, typer.Option(help="folder for report, page, JSON, tables, plots")
     ] = None,
     html: Html = "",
+    save: Annotated[
+        str, typer.Option(help="save the whole result, for load_adjustment and compare")
+    ] = "",
     force: Force = False,
     set: Settings = None,
     format: Format = None,
@@ -93,11 +96,11 @@ def adjust(
             reduction, robust, snooping, significance, eliminate, components, budget,
         )  # fmt: skip
         if not first:
-            json, out, html, quiet = "", None, "", True
-    network = read_network(input, format, tuple(set or ()), control)
+            json, out, html, save, quiet = "", None, "", "", True
+    network = read_network(input, format=format, overrides=tuple(set or ()), control=control)
     check_test(snooping, significance, "--")
     held = held_of(budget, network)
-    check_targets(input, network, json, out, control, force, html)
+    check_targets(input, network, json, out, control, force, html, save)
     origin = UNKNOWN
     if html or out is not None:
         origin = trace_origin(input, network, control, {
@@ -124,6 +127,8 @@ def adjust(
         raise
     found = sensitivity(result, held) if held and result.converged else None
     write_targets(result, json, out, brief, plots, force, html, origin, found)
+    if save and result.converged:
+        result.save(save)
     if json != "-" and not quiet and result.converged:
         print(report.text(result, budget=found))
         for doubt in result.doubts:

@@ -1,9 +1,10 @@
 """The typer application, its options, and exit statuses."""
 
 import os
+import re
 import sys
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -12,6 +13,7 @@ import typer
 from typer.core import TyperCommand
 
 import jaxbundle
+from jaxbundle.choices import CAMERA_MODELS, FORMATS, MODEL_FAMILIES
 from jaxbundle.cli.habits import Quiet as Quiet
 from jaxbundle.cli.habits import add_habits
 from jaxbundle.errors import InputError, NotSolvedError
@@ -31,14 +33,16 @@ class Command(TyperCommand):
     """A command that starts JAX after parsing its arguments, so that usage errors and help do
     not wait for that."""
 
-    def invoke(self, ctx):
-        if ctx.obj is not None:
-            ctx.obj()
-        jaxbundle.enable_x64()
-        return super().invoke(ctx)
-
     example: str = ""
     """An example call."""
+    computes: bool = True
+
+    def invoke(self, ctx):
+        if self.computes:
+            if ctx.obj is not None:
+                ctx.obj()
+            jaxbundle.enable_x64()
+        return super().invoke(ctx)
 
     def get_short_help_str(self, limit: int = 0) -> str:
         """The complete first sentence, for the list of commands."""
@@ -62,10 +66,12 @@ class Application(typer.Typer):
             callback=_list_commands, **options,
         )  # fmt: skip
 
-    def command(self, name: str | None = None, *, example: str, **options: Any):
+    def command(
+        self, name: str | None = None, *, example: str, computes: bool = True, **options: Any
+    ):
         """As of typer, with --quiet and --verbose. `example`: the arguments of a line that calls
-        it, for its help."""
-        kind = type("Command", (Command,), {"example": example})
+        it, for its help; `computes`: whether it works with JAX."""
+        kind = type("Command", (Command,), {"example": example, "computes": computes})
         register = super().command(name, cls=kind, **options)
 
         def add(function):
@@ -92,7 +98,6 @@ Input = Annotated[Path, typer.Argument(help="project .toml, list of photographs,
 Settings = Annotated[
     list[str] | None, typer.Option(help="KEY=VALUE overrides a setting; repeatable")
 ]
-Format = Annotated[str | None, typer.Option(help="input format, if not recognised")]
 Control = Annotated[
     Path | None,
     typer.Option(help="table id,X,Y,Z[,sX,sY,sZ] that replaces the control of the input"),
@@ -101,20 +106,38 @@ Force = Annotated[bool, typer.Option("--force", help="replace foreign files in -
 Html = Annotated[str, typer.Option(help="write the result as one HTML page")]
 
 
-def choice(words: Iterable[str], about: str = "", *names: str) -> Any:
-    """An option with a fixed set of values; others are refused with the closest match. `names`:
-    of the option, if not that of the argument."""
-    words = tuple(words)
+def choice(
+    words: Iterable[str], about: str = "", *names: str, forms: Mapping[str, str] | None = None,
+    listing: bool = True, argument: bool = False,
+) -> Any:  # fmt: skip
+    """An option, or an `argument`, with a fixed set of values, or one of `forms` (patterns by what
+    they look like); others are refused with the closest match. `names`: of the option, if not that
+    of the argument; `listing`: list the values in the help."""
+    forms = dict(forms or {})
+    words = (*words, *forms)
     listed = ", ".join(words)
 
     def check(option: typer.CallbackParam, value: str | None) -> str | None:
-        if value is not None and value not in words:
-            close = get_close_matches(value, words, 1)
-            mean = f"; did you mean {close[0]!r}?" if close else ""
-            raise InputError(f"{option.opts[0]} {value!r}: one of {listed} is expected{mean}")
-        return value
+        matching = value and any(re.fullmatch(form, value) for form in forms.values())
+        if value is None or matching or (value in words and value not in forms):
+            return value
+        close = get_close_matches(value.casefold(), words, 1)
+        mean = f"; did you mean {close[0]!r}?" if close else ""
+        raise InputError(f"{option.opts[0]} {value!r}: one of {listed} is expected{mean}")
 
-    return typer.Option(*names, help=f"{about}: {listed}" if about else listed, callback=check)
+    told = (f"{about}: {listed}" if about else listed) if listing else about
+    complete = lambda: [word for word in words if word not in forms]
+    if argument:
+        return typer.Argument(help=told, callback=check, autocompletion=complete)
+    return typer.Option(*names, help=told, callback=check, autocompletion=complete)
+
+
+Format = Annotated[str | None, choice(FORMATS, "input format, if not recognised")]
+
+
+def model_choice(about: str) -> Any:
+    """An option that is the name of a camera model."""
+    return choice(CAMERA_MODELS, about, forms=MODEL_FAMILIES, listing=False)
 
 
 def _version(asked: bool) -> None:

@@ -9,7 +9,7 @@ import typer
 
 import jaxbundle
 from jaxbundle.choices import BOARDS
-from jaxbundle.cli.app import Html, Quiet, app, choice
+from jaxbundle.cli.app import Html, Quiet, app, choice, model_choice
 from jaxbundle.errors import InputError
 from jaxbundle.system.interrupts import advise
 
@@ -27,7 +27,7 @@ def batch(
     json_lines: Annotated[
         str, typer.Option(help="file of results, one per line; resumed if it exists")
     ],
-    model: Annotated[str, typer.Option(help="camera model of the .npz files")] = "opencv",
+    model: Annotated[str, model_choice("camera model of the .npz files")] = "opencv",
     free: Annotated[str, typer.Option(help="parameters to estimate: fx,fy,…")] = "",
     board: Annotated[
         str, typer.Option(help="of photographs, COLUMNSxROWS as of calibrate; a folder a camera")

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from jaxbundle.choices import BOARDS, ESTIMATORS, TESTS
-from jaxbundle.cli.app import Force, Html, Quiet, app, choice
+from jaxbundle.cli.app import Force, Html, Quiet, app, choice, model_choice
 from jaxbundle.errors import InputError, NotSolvedError
 
 
@@ -33,7 +33,7 @@ def calibrate(
     rig: Annotated[
         bool, typer.Option("--rig", help="rigidly mounted cameras with simultaneous photographs")
     ] = False,
-    model: Annotated[str, typer.Option(help="camera model")] = "opencv",
+    model: Annotated[str, model_choice("camera model")] = "opencv",
     models: Annotated[str, typer.Option(help="a,b,c: camera models to compare")] = "",
     folds: Annotated[int, typer.Option(help="number of cross-validation folds, for --models")] = 4,
     free: Annotated[str, typer.Option(help="parameters to estimate: fx,fy,…")] = "",

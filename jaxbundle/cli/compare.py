@@ -11,11 +11,18 @@ from jaxbundle.cli.app import app
 from jaxbundle.errors import InputError
 
 RINGS = 10
+SAVED = b"PK\x03\x04"
+"""How a saved adjustment begins, which no file of cameras does."""
 
 
 @app.command(example="cameras.toml#1-indoor cameras.toml#1-outdoor --plot out/difference.png")
 def compare(
-    a: Annotated[str, typer.Argument(help="camera: a file of cameras or a network, or FILE#ID")],
+    a: Annotated[
+        str, typer.Argument(
+            help="camera: a file of cameras or a network, or FILE#ID; or an adjustment saved by "
+            "jaxbundle adjust --save"
+        ),
+    ],
     b: Annotated[str, typer.Argument(help="the other one")],
     step: Annotated[float | None, typer.Option(help="width of rings, in the unit of A")] = None,
     rotate: Annotated[bool, typer.Option(help="remove the best rotation")] = True,
@@ -27,7 +34,17 @@ def compare(
     csv: Annotated[Path | None, typer.Option(help="file for the table of rings")] = None,
     plot: Annotated[Path | None, typer.Option(help="PNG file for the map")] = None,
 ) -> None:
-    """Compare two calibrations: parameters, and image differences."""
+    """Compare two calibrations: parameters, and image differences. Of two saved adjustments, all
+    common unknowns, with a test of each difference."""
+    from jaxbundle.system.file_content import beginning
+
+    saved = [beginning(name, len(SAVED)) == SAVED for name in (a, b)]
+    if any(saved):
+        if not all(saved):
+            raise InputError(f"{a}, {b}: a saved adjustment is compared with another one; give two")
+        if plot is not None:
+            raise InputError("--plot: of calibrations only; --csv writes the table")
+        return _compare_adjustments(a, b, csv)
     import numpy as np
 
     from jaxbundle.cameras import get_model
@@ -86,3 +103,15 @@ def compare(
         from jaxbundle.plotting.calibrations import difference_maps
 
         write_png(plot, (7.5, 6) if C is None else (14, 6), partial(difference_maps, found, C))
+
+
+def _compare_adjustments(a: str, b: str, csv: Path | None) -> None:
+    from jaxbundle.bundle.compare import compare as compare_adjustments
+    from jaxbundle.bundle.load import load_adjustment
+    from jaxbundle.io.text.csv_tables import table_rows, write_csv
+
+    found = compare_adjustments(load_adjustment(a), load_adjustment(b))
+    print(found)
+    if csv is not None:
+        columns = found.table()
+        write_csv(csv, list(columns), table_rows(columns))

@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from jaxbundle.cli.app import Control, Format, Input, Quiet, Settings, app
+from jaxbundle.choices import CAMERA_FILES, TARGETS
+from jaxbundle.cli.app import Control, Format, Input, Quiet, Settings, app, choice, model_choice
 from jaxbundle.errors import InputError
 
 
@@ -15,9 +16,10 @@ def convert(
     input: Input,
     output: Annotated[Path, typer.Argument(help="file or folder to write")],
     to: Annotated[
-        str | None, typer.Option(help="output format, if not recognised by its name")
+        str | None,
+        choice((*TARGETS, *CAMERA_FILES), "output format, if not recognised by its name"),
     ] = None,
-    model: Annotated[str | None, typer.Option(help="camera model to convert to")] = None,
+    model: Annotated[str | None, model_choice("camera model to convert to")] = None,
     camera: Annotated[
         str | None, typer.Option(help="camera id, for an output of one camera")
     ] = None,
@@ -43,8 +45,9 @@ def convert(
     if size is not None and not all(number.is_integer() for number in size):
         raise InputError(f"--image-size {image_size}: whole numbers of pixels are expected")
     done = convert_file(
-        input, output, to, model, camera, format, overrides, measured,
-        size and tuple(map(int, size)), pair("--pixel-size", pixel_size), force, control,
+        input, output, to=to, model=model, camera=camera, format=format, overrides=overrides,
+        measured=measured, image_size=size and tuple(map(int, size)),
+        pixel_size=pair("--pixel-size", pixel_size), force=force, control=control,
     )  # fmt: skip
     if not quiet:
         print(str(done).split("\n", 1)[0])

@@ -103,7 +103,7 @@ def open_network(
     path: Path, settings: Sequence[str], format: str | None, control: Path | None, quiet: bool
 ) -> NetworkView:
     """A network, adjusted."""
-    network = read_network(path, format, tuple(settings), control)
+    network = read_network(path, format=format, overrides=tuple(settings), control=control)
     origin = trace_origin(path, network, control, {"--set": ", ".join(settings)})
     with iterating(quiet) as tell:
         return NetworkView(adjust(network, progress=tell), origin)

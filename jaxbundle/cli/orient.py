@@ -27,11 +27,11 @@ def orient(
     from jaxbundle.io.networks.project import FILES
     from jaxbundle.io.writing.folders import check_folder
 
-    network = read_network(input, format, tuple(set or ()), control)
+    network = read_network(input, format=format, overrides=tuple(set or ()), control=control)
     if out is not None:
         check_folder(out, "orient", FILES, network_files(input, network, control), force)
     found = jaxbundle.orient(network)
-    path = None if out is None else write_project(found.network, out, force, "orient")
+    path = None if out is None else write_project(found.network, out, force=force, by="orient")
     if not quiet:
         print(found)
         if path is not None:

@@ -49,6 +49,8 @@ NOTHING: Mapping = MappingProxyType({})
 
 JSON = re.compile(rb'\s*(\{\s*["}]|\[[\s\[]*([]{"\d-]|true|false|null))')
 """The beginning of JSON; a TOML table, `[project]`, does not match."""
+SAVED = re.compile(rb"PK\x03\x04")
+"""The beginning of a saved adjustment, an .npz."""
 HTML = re.compile(rb"\s*<(!doctype\s+html|html)\b", re.IGNORECASE)
 """The beginning of a page."""
 OR_FORCE = ", or --force to replace it"
@@ -153,11 +155,16 @@ def _check_content(option: str, file: str, like: re.Pattern[bytes], noun: str, w
 
 def check_targets(
     input: Path, network: Network, json: str, out: Path | None, control: Path | None = None,
-    force: bool = False, html: str = "",
+    force: bool = False, html: str = "", save: str = "",
 ) -> None:  # fmt: skip
     """Check the output files of `adjust` before computing (`check_writable`)."""
     inputs = network_files(input, network, control)
     check_writable(json, out, "adjust", FILES, inputs, force, html)
+    if save == "-":
+        raise InputError("--save -: it goes into a file; give the name of one")
+    check_file("--save", save, None, inputs)
+    if not force:
+        _check_content("--save", save, SAVED, "a saved adjustment", OR_FORCE)
 
 
 def name_inside(file: str, out: Path | None) -> str | None:

@@ -87,7 +87,7 @@ def plan(
             for axis, (mean, low, high) in found.summary().items():
                 lines.append((f"σ{axis} of tie points", f"{mean:.4g} m ({low:.4g} to {high:.4g})"))
         if out is not None:
-            lines.append(("written", str(write_project(block, out, force, "plan"))))
+            lines.append(("written", str(write_project(block, out, force=force, by="plan"))))
     for name, value in lines:
         print(f"{name:22}{value}")
 

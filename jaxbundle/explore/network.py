@@ -55,6 +55,10 @@ from jaxbundle.statistics.precision import Precision, precision
 
 MOST_ROWS = 200
 """Points whose σ before and after are listed, those that change most first."""
+MOST_ELLIPSOIDS = 3000
+"""Points whose ellipsoids are drawn anew."""
+UPPER = [0, 1, 2, 4, 5, 8]
+"""Of the nine elements of a covariance."""
 MEANING = {"omega": "ω", "phi": "φ", "kappa": "κ"}
 
 
@@ -164,13 +168,18 @@ class NetworkView:
 
     def answer(self, given: Given) -> dict[str, Any]:
         """`parts`; `stations`: by id the values of those moved, in the units of the network, and
-        their pyramids; `sigma`: before and after, of points, the cameras' parameters and images."""
+        their pyramids; `sigma`: before and after, of points, the cameras' parameters and images;
+        `ellipsoids`: after, of not too many points and of stations, six elements each."""
         moves = self.moves(given)
         if not moves:
             return {"parts": {"moved": paragraph("No station is moved.", "hint")}, "stations": {}}
         before, after = self.before, self.sigma(self.start(moves))
         parts = [self._say_visibility(moves), self._compare(moves, before, after)]
+        six = lambda C: C.reshape(-1, 9)[:, UPPER].ravel().tolist()
+        few = len(after.points) <= MOST_ELLIPSOIDS
         return {
+            "ellipsoids": {"points": six(after.point_covariance) if few else [],
+                           "images": six(after.centre_covariance)},
             "parts": {"moved": "".join(parts)},
             "stations": {self.ids[m.row]: self._describe(m) for m in moves},
             "sigma": {

@@ -70,14 +70,25 @@ EDGE = 9
 """Places along a side of the footprint."""
 LEVELS = (0.01, 0.1)
 """σ of the attitude in the accuracy table, degrees."""
+POSITIVE = ("altitude", "speed", "height")
 FLIGHT_FILE, TABLE_FILE, PICTURE_FILE = "flight.zip", "accuracy.csv", "error_map.png"
 
 
+TRACK = {
+    "height": ("height of the orbit", "m"), "inclination": ("inclination", "°"),
+    "node": ("right ascension of the node", "°"), "argument": ("argument of latitude", "°"),
+    "altitude": ("altitude of the track", "m"), "speed": ("speed over ground", "m/s"),
+    "heading": ("heading, clockwise from y", "°"),
+}  # fmt: skip
+"""What an orbit, or a straight track, is chosen by: label and unit."""
+
+
 class Chosen(NamedTuple):
-    """An image with what was chosen, and the surface it is located on."""
+    """An image with what was chosen, the surface it is located on, and the image that is true."""
 
     image: PushbroomImage
     surface: Surface
+    truth: PushbroomImage
 
 
 class ScannerView:
@@ -98,6 +109,7 @@ class ScannerView:
             self.image if self.flight is None else true_image(self.flight)
         )
         self.known = truth is not None or self.flight is not None
+        self.track = {} if self.flight is None else _track_values(self.flight.track)
 
     # --- values -----------------------------------------------------------------------------
 
@@ -117,6 +129,8 @@ class ScannerView:
             Number(name, f"error of {name}", 0.0, "°", -0.2, 0.2) for name in ANGLES
         ]
         if self.flight is not None:
+            found += [Number(name, TRACK[name][0], value, TRACK[name][1])
+                      for name, value in self.track.items()]  # fmt: skip
             found += [
                 Number("position_rate", "samples of the orbit", self.flight.position_rate, "Hz"),
                 Number("attitude_rate", "samples of the attitude", self.flight.attitude_rate, "Hz"),
@@ -130,7 +144,7 @@ class ScannerView:
                 Switch(name, name.replace("_", " "), on)
                 for name, on in zip(Corrections._fields, self.image.corrections)
             ]
-        return [*found, Number("height", "height of the ground", 0.0, "m")]
+        return [*found, Number("ground", "height of the ground", 0.0, "m")]
 
     def values(self, given: Given) -> dict[str, Any]:
         """All values by key, those of the file where the page sends none.
@@ -140,7 +154,7 @@ class ScannerView:
         found: dict[str, Any] = {}
         for one in self.controls:
             if isinstance(one, Number):
-                lowest = 0.0 if one.key.endswith("white") else -np.inf
+                lowest = 0.0 if one.key.endswith("white") or one.key in POSITIVE else -np.inf
                 found[one.key] = number(given, one.key, one.value, lowest)
                 if one.key.endswith("rate") and not 0 < found[one.key] <= 1000:
                     raise InputError(f"{one.key} is {found[one.key]:g}; above 0, to 1000 Hz")
@@ -154,9 +168,12 @@ class ScannerView:
         """The image with these values.
 
         **Raises:** `InputError`."""
-        image = self.image
+        image, truth = self.image, self.truth
         if self.flight is not None:
-            image = measured_image(self._flight_with(values))
+            flight = self._flight_with(values)
+            image = measured_image(flight)
+            if flight.track != self.flight.track:
+                truth = true_image(flight)
         trajectory = Trajectory(
             _table_with(image.trajectory.position, values["position_interpolation"]),
             _attitude_with(image.trajectory.attitude, values["attitude_interpolation"]),
@@ -172,7 +189,7 @@ class ScannerView:
         if error.any():
             errors = no_errors(image)._replace(attitude_bias=jnp.asarray(error))
             image = with_errors_in_rows(image, errors)
-        return Chosen(image, self._surface(values["height"]))
+        return Chosen(image, self._surface(values["ground"]), truth)
 
     def _flight_with(self, values) -> Flight:
         assert self.flight is not None
@@ -183,7 +200,10 @@ class ScannerView:
                 noise = noise._replace(**{name: unit * values[name]})
         names = ("position_interpolation", "attitude_interpolation", "position_rate",
                  "attitude_rate")  # fmt: skip
-        return dataclasses.replace(self.flight, noise=noise, **{n: values[n] for n in names})
+        return dataclasses.replace(
+            self.flight, noise=noise, track=_track_with(self.flight.track, self.track, values),
+            **{n: values[n] for n in names},
+        )  # fmt: skip
 
     def _surface(self, height: float) -> Surface:
         if self.earth is None:
@@ -238,7 +258,7 @@ class ScannerView:
         controls = [_with_value(control, values[control.key]) for control in self.controls]
         image = self.image
         if self.flight is not None:
-            against = "the true trajectory of the flight file"
+            against = "the true trajectory of the flight"
         else:
             against = "the given truth" if self.known else "the image as its file has it"
         exports = {"Flight file (zip)": FLIGHT_FILE, "Table (CSV)": TABLE_FILE,
@@ -266,11 +286,13 @@ class ScannerView:
         return np.repeat(lines, PLACES[1]), np.tile(pixels, PLACES[0])
 
     def _errors(self, chosen: Chosen) -> Float[np.ndarray, "n 2"]:
-        return ground_errors(chosen.image, self.truth, chosen.surface, *self._places())
+        return ground_errors(
+            chosen.image, chosen.truth, chosen.surface, *self._places()
+        )
 
     def _expected(self, chosen: Chosen) -> list[dict[str, float]]:
         """RMS and CE90 of attitudes with given σ about every axis, one error an image."""
-        image, surface = chosen
+        image, surface, _ = chosen
         altitude, view = altitude_and_view(image, surface)
         rows = []
         for level in LEVELS:
@@ -283,33 +305,33 @@ class ScannerView:
             })  # fmt: skip
         return rows
 
-    def _map(self, X) -> np.ndarray:
+    def _map(self, truth: PushbroomImage, X) -> np.ndarray:
         """East and north [km] of points [3, n] from the middle of the image on the ground."""
         surface = self._surface(0.0)
         middle = np.array([(self.image.lines - 1) / 2]), np.array([(self.image.pixels - 1) / 2])
-        O = np.asarray(_locate(self.image, surface, *middle))[:, 0]
+        O = np.asarray(_locate(truth, surface, *middle))[:, 0]
         axes = np.asarray(east_north(surface, tuple(O)))
         return 1e-3 * axes @ (np.asarray(X) - O[:, None])
 
     def _draw_ground(self, chosen: Chosen) -> str:
-        image, surface = chosen
+        image, surface, truth = chosen
         curves = []
-        for one, label, kind in ((self.truth, "footprint, reference", "second"),
+        for one, label, kind in ((truth, "footprint, reference", "second"),
                                  (image, "footprint", "first")):  # fmt: skip
             X = np.asarray(_locate(one, surface, *_outline(one)))
-            east, north = self._map(X)
+            east, north = self._map(truth, X)
             curves.append(Curve(label, east, north, None, kind))
         lines = np.linspace(0, image.lines - 1, 4 * EDGE)
         P = np.asarray(_positions(image, jnp.asarray(lines))).T
         if self.earth is not None and self.earth.a == self.earth.b:
             longitude, latitude, _ = _geodetic(self.earth, tuple(P))
             below = _earth_fixed(self.earth, (longitude, latitude, 0 * longitude))
-            east, north = self._map(np.stack(below))
+            east, north = self._map(truth, np.stack(below))
             curves.append(Curve("ground track, below the platform", east, north, None, "given"))
         elif self.earth is None:
             P = np.array(P)
             P[2] = 0.0
-            east, north = self._map(P)
+            east, north = self._map(truth, P)
             curves.append(Curve("track, from above", east, north, None, "given"))
         return figure(draw_plan(curves, "east [km]", "north [km]"),
                       "From the middle of the image; both axes at one scale")  # fmt: skip
@@ -372,6 +394,37 @@ class ScannerView:
             ))  # fmt: skip
         except ImportError as error:
             raise InputError(str(error)) from None
+
+
+def _track_values(track: Mapping[str, Any]) -> dict[str, float]:
+    """The orbit, or the straight track, by the numbers of its controls (degrees); none of one state
+    vector."""
+    if "start" in track:
+        x, y, _ = velocity = np.asarray(track["velocity"], float)
+        heading = float(np.degrees(np.arctan2(x, y)))
+        return {"altitude": float(track["start"][2]), "speed": float(np.linalg.norm(velocity)),
+                "heading": float(f"{heading:.12g}")}  # fmt: skip
+    if "height" not in track:
+        return {}
+    angles = {name: _degrees(track.get(name, 0.0)) for name in ("inclination", "node", "argument")}
+    return {"height": float(track["height"]), **angles}
+
+
+def _track_with(
+    track: Mapping[str, Any], known: Mapping[str, float], values: Mapping[str, Any]
+) -> Mapping[str, Any]:
+    """The track with the values of its controls; as it was where none is changed."""
+    if all(values[name] == value for name, value in known.items()):
+        return track
+    if "start" in track:
+        heading = np.radians(values["heading"])
+        velocity = np.array(track["velocity"], float)
+        level = np.sqrt(max(values["speed"] ** 2 - velocity[2] ** 2, 0.0))
+        start = [*track["start"][:2], values["altitude"]]
+        turned = [level * np.sin(heading), level * np.cos(heading), float(velocity[2])]
+        return {"start": start, "velocity": turned}
+    angles = {name: float(np.radians(values[name])) for name in known if name != "height"}
+    return {**track, "height": values["height"], **angles}
 
 
 def _table_with(table: Table, method: str) -> Table:

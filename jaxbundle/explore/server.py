@@ -141,18 +141,24 @@ class Handler(BaseHTTPRequestHandler):
     def _get(self, action: str, _: bytes) -> File:
         if action or not self.path.endswith("/"):
             raise Refused(HTTPStatus.NOT_FOUND, "there is one page, at /TOKEN/")
-        return _page(self.server.view, {}, live=True)
+        return page_file(self.server.view, {}, live=True)
 
     def _post(self, action: str, body: bytes) -> File:
-        view, given = self.server.view, _parse(body)
-        if action == "answer":
-            return _json(view.answer(given))
-        if action == "save":
-            return _page(view, given, live=False)
-        room, _, name = action.partition("/")
-        if room == "export" and name:
-            return view.export(name, given)
-        raise Refused(HTTPStatus.NOT_FOUND, f"there is no {action:.100}")
+        return respond(self.server.view, action, _parse(body))
+
+
+def respond(view: View, action: str, given: Given) -> File:
+    """What a view says to the values of its page: `answer`, `save`, or `export/NAME`.
+
+    **Raises:** `Refused` for anything else, and what the view raises."""
+    if action == "answer":
+        return _json(view.answer(given))
+    if action == "save":
+        return page_file(view, given, live=False)
+    room, _, name = action.partition("/")
+    if room == "export" and name:
+        return view.export(name, given)
+    raise Refused(HTTPStatus.NOT_FOUND, f"there is no {action:.100}")
 
 
 def _parse(body: bytes) -> Given:
@@ -166,7 +172,8 @@ def _parse(body: bytes) -> Given:
     return given
 
 
-def _page(view: View, given: Given, live: bool) -> File:
+def page_file(view: View, given: Given, live: bool) -> File:
+    """The page of a view with these values."""
     content = "".join(write(view.page(given, live)))
     return File("page.html", HTML, content.encode("utf-8", "replace"))
 

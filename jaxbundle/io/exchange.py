@@ -61,6 +61,7 @@ class Converted:
 def convert(
     input: str | Path,
     output: str | Path,
+    *,
     to: str | None = None,
     model: str | CameraModel | None = None,
     camera: str | None = None,
@@ -106,7 +107,9 @@ def convert(
         return dataclasses.replace(
             made, warnings=(*fits_told(cameras), *outside_warnings(cameras))
         )
-    network = read_network(input, format, overrides, control, models)
+    network = read_network(
+        input, format=format, overrides=overrides, control=control, models=models
+    )
     network = network.replace(cameras=_sized(network.cameras, image_size, pixel_size))
     network = network.warn(*outside_warnings(network.cameras, network))
     _keep_input(input, network, output, kind, control)

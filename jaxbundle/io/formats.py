@@ -287,6 +287,7 @@ def read_oriented(path: str | Path) -> Network:
 
 def read_network(
     path: str | Path,
+    *,
     format: str | None = None,
     overrides: Sequence[str] = (),
     control: str | Path | None = None,

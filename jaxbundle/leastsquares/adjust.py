@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxbundle.arguments import one_of, truth, whole
 from jaxbundle.choices import ESTIMATORS, METHODS
+from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.leastsquares.components import Component, Group, estimate, variance_components
 from jaxbundle.leastsquares.declarations import Motions, Observations, Table
@@ -39,6 +40,7 @@ FEW = 60
 """Problems with fewer unknowns are solved without elimination."""
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class TableResult:
     """A table after the adjustment: `value` in the given form; `sigma` a posteriori and

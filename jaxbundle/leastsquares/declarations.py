@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int, PyTree
 
 from jaxbundle.arguments import numeric_array
+from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Space, Vector
 
@@ -23,6 +24,7 @@ OF_THE_VALUES: Any = None
 """Placeholder: the space is derived from the values of the table."""
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Table:
     """Unknowns of one type.
@@ -156,6 +158,7 @@ class Motions:
     curved: tuple[int, ...] = ()
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Observations:
     """Observations of one kind.

@@ -55,14 +55,14 @@ def critical_w(
     """
     if test == "baarda":
         return normal_quantile(1 - significance / 2)
-    return sigma0 * tau_quantile(1 - _of_one(significance, observations) / 2, redundancy)
+    return sigma0 * tau_quantile(1 - level_of_one(significance, observations) / 2, redundancy)
 
 
 def critical_length(significance: float, residuals: int) -> float:
     """Critical length of the longest of n residuals in the plane, in σ: t² ~ χ²₂."""
-    return math.sqrt(-2 * math.log(_of_one(significance, residuals)))
+    return math.sqrt(-2 * math.log(level_of_one(significance, residuals)))
 
 
-def _of_one(significance: float, observations: int) -> float:
+def level_of_one(significance: float, tests: int) -> float:
     """The level of each of n tests with the given joint level."""
-    return -math.expm1(math.log1p(-significance) / max(observations, 1))
+    return -math.expm1(math.log1p(-significance) / max(tests, 1))

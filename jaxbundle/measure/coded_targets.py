@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxbundle.choices import CODED_TARGETS
+from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
 from jaxbundle.measure.boards import Board
 from jaxbundle.measure.corners import find_board
@@ -41,6 +42,7 @@ CLEAR = 0.3
 """Part of the contrast by which sectors and the gap may differ from light and dark."""
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class NamedPoints:
     """Points found in a photograph: names, pixels, σ in pixels."""

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import affine
 from jaxbundle.leastsquares.small import adjust
@@ -28,6 +29,7 @@ from jaxbundle.types import AnyArray
 UNKNOWNS = {"similarity": 4, "affine": 6, "projective": 8}
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Transformation:
     """A transformation of the plane with what it leaves.

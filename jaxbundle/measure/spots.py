@@ -11,6 +11,7 @@ import dataclasses
 import numpy as np
 import scipy  # whose parts are loaded when they are used
 
+from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
 
 FIRST, LARGEST = 8, 256
@@ -24,6 +25,7 @@ MARGIN = 3
 """Pixels beyond the spot that its blurred edge may reach."""
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Spot:
     """A spot in its window: the window's corner (column, row) in the photograph, grey values, the

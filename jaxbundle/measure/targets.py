@@ -21,6 +21,7 @@ import numpy as np
 import scipy  # whose parts are loaded when they are used
 from jaxtyping import Float
 
+from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
 from jaxbundle.measure.ellipses import fit_ellipse
 from jaxbundle.measure.spots import MARGIN, find_spot
@@ -37,6 +38,7 @@ SAMPLING = 0.045
 """
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Target:
     """The measured centre of a target.

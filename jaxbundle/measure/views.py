@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbundle.arguments import numeric_array
+from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import enable_x64
 from jaxbundle.measure.boards import Board, require_board
@@ -37,6 +38,7 @@ HINT = "give --board"
 HINTS = (HINT, "give --dictionary")
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class BoardViews:
     """What was measured of a board: image points of every view, and which photographs failed.

@@ -23,6 +23,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbundle.arguments import shown
 from jaxbundle.cameras import CameraModel, get_model, key_of
+from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
 
 ROLES = ("tie", "control", "fixed", "check")
@@ -86,6 +87,7 @@ def units_of(cameras: Iterable[Camera]) -> str:
     return "/".join(sorted({get_model(camera.model).unit for camera in cameras}))
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Images:
     """Exposures with the start values of their exterior orientation."""
@@ -109,6 +111,7 @@ class Images:
         )  # fmt: skip
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Points:
     """Object points: role, coordinates (start values, given values) and σ."""
@@ -135,6 +138,7 @@ class Points:
         return np.isin(np.array(self.role, dtype=object), roles)
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Observations:
     """Measured image points: which point in which image, where, and how well (σ)."""
@@ -156,6 +160,7 @@ class Observations:
         )
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Distances:
     """Measured distances between two points, in the object unit."""
@@ -174,6 +179,7 @@ class Distances:
         return Distances(np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0))
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Network:
     """A photogrammetric network: everything an adjustment needs, checked before it is used.

@@ -11,12 +11,14 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.arguments import at_least_zero, number, numeric_array, positive, shown
+from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
 from jaxbundle.types import Numbers
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Conditions:
     """Conditions of stations and rays; lengths in the object unit, angles in radians.

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxbundle.adjustment.problem import Problem
 from jaxbundle.arguments import whole
+from jaxbundle.display import shows_itself
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.problem import with_data
 from jaxbundle.leastsquares.solution import find_minimum
@@ -22,6 +23,7 @@ from jaxbundle.network_design.aims import Aim, aim_of, functions_of, measure, of
 FIELDS = ("image", "control", "exterior", "interior", "distance")
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Proof:
     """The aim as predicted and as found from `draws` adjustments of simulated measurements."""

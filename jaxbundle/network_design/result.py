@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.choices import ORDERS
+from jaxbundle.display import shows_itself
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.columns import some
 from jaxbundle.network.tables import Network
@@ -45,6 +46,7 @@ class State:
         return len(self.network.images)
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Design:
     """A designed network.

@@ -20,6 +20,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool
 
+from jaxbundle.display import shows_itself
 from jaxbundle.errors import NotSolvedError
 from jaxbundle.network.check import check_tables
 from jaxbundle.network.columns import count, some
@@ -62,6 +63,7 @@ WIDE = 0.5
 """Angle of intersection, radians, beyond which wider is no better."""
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Oriented:
     """A network with start values; `images`, `points`: why those that are not in it were not

@@ -21,6 +21,7 @@ from jaxtyping import Float, Int, UInt8
 from jaxbundle.arguments import at_least_zero, numeric_array, vector, whole
 from jaxbundle.cameras import default_parameters, get_model, image_ray
 from jaxbundle.cameras.pixel_frame import pixel_frame
+from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.network.tables import Camera
@@ -68,6 +69,7 @@ class Sensor:
         whole("sensor: fine", self.fine, most=16)
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Rendered:
     """A photograph: grey values; `point`: the true object point of every pixel's centre, NaN where

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.arguments import number, numeric_array, positive, shown, vector, whole
+from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import omega_phi_kappa_from_matrix
 from jaxbundle.types import Numbers
@@ -19,6 +20,7 @@ COORDINATES = "finite coordinates X, Y, Z"
 LARGEST_SEED = 2**128
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Stations:
     """Exterior orientations: projection centres [I, 3] and ω, φ, κ [I, 3] in radians.

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxbundle.bundle.result import Adjustment
+from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.float64 import require_x64
 from jaxbundle.network.columns import count, some
@@ -69,6 +70,7 @@ class Part:
     factors: Mapping[str, float]
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Reconstruction:
     """`parts`, the largest first; photographs that are in none of them, with the reason; notes;

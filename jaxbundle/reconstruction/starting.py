@@ -64,7 +64,7 @@ def start_values(network: Network, guessed: Sequence[str]) -> Iterator[Oriented]
 
 def _oriented(network: Network, tolerance: float) -> Oriented:
     """Start values, without photographs that are hardly tied to the others."""
-    found = orient(network, tolerance)
+    found = orient(network, tolerance=tolerance)
     network, images = found.network, dict(found.images)
     while True:
         rays = np.bincount(network.observations.point, minlength=len(network.points))

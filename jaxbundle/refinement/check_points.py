@@ -15,6 +15,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from jaxbundle.display import shows_itself
 from jaxbundle.leastsquares.checks import determine
 from jaxbundle.leastsquares.rows import fill_places, in_given_order, lay_out_data, residuals
 from jaxbundle.leastsquares.solution import Solution
@@ -22,6 +23,7 @@ from jaxbundle.refinement.declare import Rays, declare
 from jaxbundle.refinement.inspection import Inspection, Shared
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class CheckPoints:
     """Differences computed − given along the axes of the points, metres, NaN where the height is

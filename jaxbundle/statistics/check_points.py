@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.adjustment.problem import shifted_problem
+from jaxbundle.display import shows_itself
 from jaxbundle.leastsquares.checks import determine
 from jaxbundle.leastsquares.components import rescale
 from jaxbundle.network.tables import Distances, Observations, Points
@@ -18,6 +19,7 @@ from jaxbundle.statistics.components import groups
 from jaxbundle.statistics.inspection import Inspection
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class CheckPoints:
     """Intersected check points: coordinates, cofactors (times σ0² for variances), differences."""

@@ -5,11 +5,13 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxbundle.display import shows_itself
 from jaxbundle.leastsquares.any_distance import is_at_infinity, shares
 from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.types import present
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class FarPoints:
     """Points of which the rays tell the direction well, and the distance badly or not at all.

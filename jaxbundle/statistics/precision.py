@@ -38,12 +38,15 @@ class Precision(eqx.Module):
 
     `images`: of X0, Y0, Z0 (object unit) and ω, φ, κ (radians); `cameras`: in the order of the
     parameters of the model, in their units; `points`: of X, Y, Z (object unit).
+    `point_covariance` of X, Y, Z; `centre_covariance` of X0, Y0, Z0.
     """
 
     images: Float[AnyArray, "images 6"]
     cameras: Float[AnyArray, "cameras parameters"]
     points: Float[AnyArray, "points 3"]
     covariance: Float[AnyArray, "names names"]
+    point_covariance: Float[AnyArray, "points 3 3"]
+    centre_covariance: Float[AnyArray, "images 3 3"]
 
 
 def precision(
@@ -92,6 +95,8 @@ def precision(
         cameras=_camera_sigma(problem, data.start, found.own) * sigma0,
         points=_root(jnp.diagonal(of_points, axis1=1, axis2=2)) * sigma0,
         covariance=found.covariance * jnp.square(sigma0),
+        point_covariance=of_points * jnp.square(sigma0),
+        centre_covariance=found.own["image"][:, :3, :3] * jnp.square(sigma0),
     )
 
 

@@ -6,9 +6,11 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Cloud:
     """Points X [n, 3] with covariance, object unit; `rays`; `image`, index into `images`, and `uv`,

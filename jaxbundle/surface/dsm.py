@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from scipy import ndimage
 
 from jaxbundle.arguments import positive
+from jaxbundle.display import data_set, shows_itself
 from jaxbundle.errors import InputError
 from jaxbundle.io.rasters.writing import written_raster
 from jaxbundle.surface.cloud import Cloud
@@ -28,6 +29,7 @@ SLOPE = 0.3
 NO_DATA = -9999.0
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Dsm:
     """Heights and σ [rows, columns], north up, NaN: none; `x`, `y`: outer corner of the first cell;
@@ -44,6 +46,19 @@ class Dsm:
     def place(self, X: Float[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray]:
         """Row and column, whole numbers at the centres of cells, of points."""
         return (self.y - X[:, 1]) / self.size - 0.5, (X[:, 0] - self.x) / self.size - 0.5
+
+    def to_xarray(self):
+        """Height, σ and number of points over x and y (centres of cells), as an `xarray.Dataset`
+        (extra `grids`)."""
+        rows, columns = self.height.shape
+        x = self.x + (np.arange(columns) + 0.5) * self.size
+        y = self.y - (np.arange(rows) + 0.5) * self.size
+        dims = ("y", "x")
+        return data_set(
+            {"height": (dims, self.height, ""), "sigma": (dims, self.sigma, ""),
+             "count": (dims, self.count, "1")},
+            {"y": (y, ""), "x": (x, "")}, crs=self.system, cell_size=self.size,
+        )  # fmt: skip
 
     def centres(self) -> tuple[np.ndarray, np.ndarray]:
         """x and y of all cells."""

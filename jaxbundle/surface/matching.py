@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import stats
 
+from jaxbundle.display import shows_itself
 from jaxbundle.measure.least_squares_matching import MatchingStatus
 from jaxbundle.surface.bending import corrected, sharpen
 from jaxbundle.surface.correlation import Pyramid
@@ -61,6 +62,7 @@ class Settings:
     least_angle: float = np.radians(1.0)
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Matches:
     """Points found from a base image: places there, points, what became of the others by reason.

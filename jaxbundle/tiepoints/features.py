@@ -13,6 +13,7 @@ from jaxtyping import Float, UInt8
 
 from jaxbundle.arguments import one_of, whole
 from jaxbundle.choices import FEATURES
+from jaxbundle.display import shows_itself
 from jaxbundle.photographs.opencv import need_opencv
 
 CELLS = 16
@@ -38,6 +39,7 @@ class Detection:
         whole("features: number", self.number)
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Features:
     """`xy`: pixels of the original; `size`: diameter, in them; `angle`: radians from x to y;

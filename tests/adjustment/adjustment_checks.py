@@ -256,7 +256,7 @@ DEFECTS = {"free": 7, "minimal": 7, "free with distances": 6, "one fixed point":
 @cache
 def make(name, reduction=None):
     """The problem of one of `NETWORKS`."""
-    return make_problem(synthetic(**NETWORKS[name])[0], reduction)
+    return make_problem(synthetic(**NETWORKS[name])[0], reduction=reduction)
 
 
 @cache

@@ -29,7 +29,7 @@ def test_opencv_said_again_has_the_figures_of_opencv():
     """By `calibrate_batch`; and `calibrate`, whose start is of another model, finds the same."""
     views = simulated()
     ours, batch = (
-        calibrate_batch(taken.BOARD.points, views.xy[None], views.image_size, model)
+        calibrate_batch(taken.BOARD.points, views.xy[None], views.image_size, model=model)
         for model in ("opencv", AGAIN)
     )
     assert batch.converged.all() and batch.model is AGAIN
@@ -92,7 +92,7 @@ def test_what_is_refused():
     views = simulated()
     model = CameraModel("division-mm", ("c", "x0", "y0", "L"), correct=division)
     with pytest.raises(InputError, match="model 'division-mm' is in mm; a batch needs"):
-        calibrate_batch(taken.BOARD.points, views.xy[None], (480, 360), model)
+        calibrate_batch(taken.BOARD.points, views.xy[None], (480, 360), model=model)
     with pytest.raises(InputError, match="'wrong': distort.*must take the parameters"):
         calibrate(views, model=CameraModel("wrong", ("f",), distort=lambda x: x, unit="px"))
     with pytest.raises(InputError, match="'opencv' is built in"):

@@ -154,7 +154,7 @@ def test_without_a_command(command, arguments, status, said):
     (RecursionError("too deep"), 2), (MemoryError(), 3),
 ])  # fmt: skip
 def test_what_nobody_thought_of_ends_in_one_line(command, error, status, monkeypatch):
-    def fail(*_):
+    def fail(*_, **__):
         raise error
 
     monkeypatch.setattr(exchange, "convert", fail)

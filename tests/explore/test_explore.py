@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 import zipfile
+from importlib.resources import files
 from pathlib import Path
 
 import cv2
@@ -31,8 +32,9 @@ from jaxbundle.explore.camera import CameraView
 from jaxbundle.explore.network import NetworkView
 from jaxbundle.explore.page import Number, draw_controls, draw_tools, make_page, place
 from jaxbundle.explore.scanner import FLIGHT_FILE, PICTURE_FILE, TABLE_FILE, ScannerView
-from jaxbundle.explore.server import MOST_BYTES, Server
+from jaxbundle.explore.server import MOST_BYTES, Server, page_file
 from jaxbundle.explore.view import File, check_keys, number
+from jaxbundle.explore.widget import reply, show
 from jaxbundle.io.scanner.flight import read_flight
 from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.network.tables import Camera
@@ -518,3 +520,63 @@ def test_in_a_browser_a_control_changes_the_numbers(kind, network, scanner, tmp_
     finally:
         server.shutdown()
         server.server_close()
+
+
+# --- in a notebook --------------------------------------------------------------------------
+
+
+def test_the_page_of_a_widget_is_answered_by_its_view():
+    ask = lambda action, given: reply(Doubling(), {"number": 7, "action": action, "given": given})
+    told, (content,) = ask("answer", {"x": 21})
+    assert told == {"number": 7, "type": "application/json"}
+    assert json.loads(content)["twice"] == 42
+    assert ask("export/x.txt", {"x": 2})[1] == [b"2"]
+    for action, given, said in (
+        ("answer", {"y": 1}, "there is no value"), ("answer", {"x": 13}, "ZeroDivisionError"),
+        ("elsewhere", {}, "there is no elsewhere"), ("answer", [], "values by name"),
+    ):  # fmt: skip
+        told, content = ask(action, given)
+        assert said in told["error"] and content == []
+
+
+def test_a_widget_is_one_of_anywidget():
+    pytest.importorskip("anywidget")
+    widget = show(Doubling(), height=300)
+    assert "doubling" in widget.page and widget.height == 300
+    sent = []
+    widget.send = lambda *message: sent.append(message)
+    widget._handle_custom_msg({"number": 1, "action": "answer", "given": {"x": 2}}, [])
+    assert json.loads(sent[0][1][0])["twice"] == 4
+
+
+HARNESS = """<!doctype html><div id="here"></div><script type="module">
+%s
+const back = [];
+const answer = { parts: { twice: "<p>42 by Python</p>" }, twice: 42 };
+render({ el: document.getElementById("here"), model: {
+  get: name => ({ page: %s, height: 400 })[name],
+  on: (_, f) => back.push(f), off: () => {},
+  send: data => { window.asked = data; const content = new TextEncoder().encode(
+    JSON.stringify(answer)); back[0]({ number: data.number, type: "application/json" },
+    [new DataView(content.buffer)]); },
+} });
+</script>"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium is missing")
+def test_in_the_frame_of_a_widget_a_control_changes_the_numbers(tmp_path):
+    script = files("jaxbundle.explore.page").joinpath("widget.js").read_text(encoding="utf-8")
+    script = script.replace("export default", "//")
+    script = script.replace("allow-scripts", "allow-scripts allow-same-origin")  # to look into it
+    page = page_file(Doubling(), {}, live=True).content.decode()
+    page = json.dumps(page).replace("</script", "<\\/script").replace("<!--", "<\\!--")
+    (tmp_path / "notebook.html").write_text(HARNESS % (script, page), encoding="utf-8")
+    with Browser(tmp_path) as browser:
+        browser.open((tmp_path / "notebook.html").as_uri())
+        inside = "document.querySelector('iframe').contentDocument"
+        browser.until(f"{inside}?.querySelector('[data-slides=x]') != null")
+        browser.value(f"""(() => {{ const slider = {inside}.querySelector('[data-slides=x]');
+            slider.value = 3; slider.dispatchEvent(new Event("input")); }})()""")
+        browser.until(f"{inside}.getElementById('twice').innerText === '42 by Python'")
+        assert browser.value("window.asked.given.x") == 3
+        assert [line for line in browser.console if "can escape its sandboxing" not in line] == []

@@ -35,7 +35,7 @@ def brown(tmp_path):
 )  # fmt: skip
 def test_kinds_of_output(opencv, tmp_path, name, to, kind):
     (tmp_path / "sparse").mkdir()
-    done = convert(opencv, tmp_path / name, to)
+    done = convert(opencv, tmp_path / name, to=to)
     assert done.kind == kind and not done.conversions and (tmp_path / name).exists()
     if kind in ("colmap", "colmap-text", "project"):
         assert_same(network("opencv", ("a", "b", "c")), read_network(tmp_path / name))

@@ -61,7 +61,7 @@ def read(tmp_path, text, overrides=()):
     path = tmp_path / "export.txt"
     path.write_bytes(text.encode("latin-1"))
     assert is_photomodeler(path) == text.startswith("Bundle Soln")
-    return read_network(path, "photomodeler", overrides)
+    return read_network(path, format="photomodeler", overrides=overrides)
 
 
 def test_the_network_comes_back(tmp_path):

@@ -17,6 +17,7 @@ from jaxbundle.calibration.result import Calibration
 from jaxbundle.calibration.rig.declare import Rig, used_rays
 from jaxbundle.calibration.rig.quality import rig_coverage, rig_points, rig_uncertainty
 from jaxbundle.cameras import get_model
+from jaxbundle.display import shows_itself
 from jaxbundle.geometry import omega_phi_kappa_from_matrix
 from jaxbundle.leastsquares import Pose, PoseValue, Result
 from jaxbundle.network.kinds import exterior
@@ -28,6 +29,7 @@ POSE = Pose.width
 DEGREES = np.array([1, 1, 1, *[180 / np.pi] * 3])
 
 
+@shows_itself
 @dataclasses.dataclass(frozen=True)
 class Mounting:
     """Where a camera sits in the frame of the reference camera.

@@ -34,6 +34,10 @@ class Moves {
       ? network.place(...this.places.get(row).map((x, i) => x - network.centre[i]))
       : NetworkView.prototype.placeOf.call(network, table, row, names));
     this.corners = network.corners.slice();
+    // Its ellipsoids, and those of all others, are then those to expect.
+    this.expected = new Map();
+    network.covarianceOf = (table, row) => this.expected.get(table)?.slice(6 * row, 6 * row + 6)
+      ?? NetworkView.prototype.covarianceOf.call(network, table, row);
   }
 
   choose(table, row, at, before) {
@@ -93,8 +97,15 @@ class Moves {
     const [table, id] = point === undefined
       ? [this.tables.images, image] : [this.tables.points, point];
     const row = table.row(id);
-    return row < 0 ? "" : table.shown
-      .map(name => `${table.columns[name].label} ${table.cell(name, row)}`).join(", ");
+    if (row < 0) return "";
+    const told = table.shown.map(name => `${table.columns[name].label} ${table.cell(name, row)}`);
+    const six = this.expected.get(table)?.slice(6 * row, 6 * row + 6);
+    if (six !== undefined) {
+      const names = table === this.tables.images ? STATION : POINT;
+      const sigma = [six[0], six[3], six[5]].map(v => Math.sqrt(Math.max(v, 0)).toPrecision(3));
+      told.push(`with the stations moved: ${names.map((n, i) => `σ${n} ${sigma[i]}`).join(", ")}`);
+    }
+    return told.join(", ");
   }
 
   fill() {
@@ -116,8 +127,13 @@ class Moves {
     if (explored.live) ask();
   }
 
-  show({ stations }) {
-    const { network } = this, { images } = this.tables;
+  show({ stations, ellipsoids }) {
+    const { network } = this, { images, points } = this.tables;
+    this.expected.clear();
+    if (ellipsoids !== undefined) {
+      this.expected.set(images, ellipsoids.images);
+      if (ellipsoids.points.length > 0) this.expected.set(points, ellipsoids.points);
+    }
     network.corners.set(this.corners);
     this.places.clear();
     for (const [id, { values, pyramid }] of Object.entries(stations ?? {})) {

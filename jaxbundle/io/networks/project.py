@@ -172,7 +172,7 @@ def _read_table(document: Document, table: str, path: Path) -> Columns | None:
 
 
 def write_project(
-    network: Network, folder: str | Path, force: bool = False, by: str = "write_project"
+    network: Network, folder: str | Path, *, force: bool = False, by: str = "write_project"
 ) -> Path:
     """Write `project.toml` and its tables into a folder; returns the path of the former.
 

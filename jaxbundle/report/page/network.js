@@ -146,9 +146,12 @@ class NetworkView {
     }
   }
 
+  covarianceOf(table, row) {
+    return ["c00", "c01", "c02", "c11", "c12", "c22"].map(name => table.numbers(name)[row]);
+  }
+
   outline(table, row) {
-    const [xx, xy, xz, yy, yz, zz] = ["c00", "c01", "c02", "c11", "c12", "c22"]
-      .map(name => table.numbers(name)[row]);
+    const [xx, xy, xz, yy, yz, zz] = this.covarianceOf(table, row);
     const times = (u, v) => u[0] * (xx * v[0] + xy * v[1] + xz * v[2])
       + u[1] * (xy * v[0] + yy * v[1] + yz * v[2]) + u[2] * (xz * v[0] + yz * v[1] + zz * v[2]);
     const [right, up] = this.frame.axes;

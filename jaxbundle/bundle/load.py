@@ -1,0 +1,108 @@
+"""`load_adjustment`: a saved adjustment as the `Adjustment` it was."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jaxbundle.adjustment.problem import Problem, make_problem
+from jaxbundle.arguments import path as given_path
+from jaxbundle.bundle.result import Adjustment
+from jaxbundle.bundle.stored import CLASSES, FORMAT, State, Stored, with_own_models
+from jaxbundle.cameras import CameraModel
+from jaxbundle.errors import InputError
+from jaxbundle.io.results.stored_tree import read_tree
+from jaxbundle.leastsquares import problem as engine
+from jaxbundle.leastsquares.declarations import Observations, Table
+from jaxbundle.leastsquares.solver import History, Minimum
+from jaxbundle.network.columns import some
+
+SAME_SIGMA0 = 1e-6
+"""σ0 of a loaded adjustment that differs by more, relatively, is not that of the saved one."""
+WHAT = "a saved adjustment (Adjustment.save, jaxbundle adjust --save)"
+
+
+def load_adjustment(
+    path: str | Path,
+    *,
+    models: Sequence[CameraModel] = (),
+    also: Sequence[Table | Observations] = (),
+) -> Adjustment:
+    """Load what `Adjustment.save` has written: the whole result, without iterating again.
+
+    **Arguments:** `models`: camera models of one's own that its cameras have; `also`: what `adjust`
+    was given under this name. Both are functions, which no file holds.
+
+    **Returns:** an `Adjustment` with everything that the saved one has, every covariance included.
+
+    **Raises:** `InputError` for a file that is none, and where `models` or `also` are missing;
+    `RuntimeError` without 64-bit floats.
+    """
+    given_path("path", path)
+    found = read_tree(path, CLASSES, WHAT)
+    if not isinstance(found, Stored) or found.format != FORMAT:
+        raise InputError(f"{path}: is not {WHAT} of this version of jaxbundle")
+    missing = sorted(set(found.own_models) - {model.name for model in models})
+    if missing:
+        raise InputError(f"{path}: the camera models {some(missing)} are not built in; give them "
+                         "as models=[…]")  # fmt: skip
+    found = dataclasses.replace(found, network=with_own_models(found.network, models))
+    try:
+        result = _restore(found, _problem(found, also, path))
+        sigma0 = result.sigma0
+    except (ValueError, TypeError, LookupError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: is damaged, or of another version of jaxbundle") from None
+    if not math.isclose(sigma0, found.sigma0, rel_tol=SAME_SIGMA0) and not math.isnan(found.sigma0):
+        raise InputError(
+            f"{path}: its σ0 is {found.sigma0:.6g}, but its measurements and values give "
+            f"{sigma0:.6g}: it is damaged, or was saved by another version ({found.version})"
+        )
+    return result
+
+
+def _problem(found: Stored, also: Sequence[Table | Observations], path: str | Path) -> Problem:
+    """The problem as the adjustment left it."""
+    state = found.state
+    problem = make_problem(
+        found.network, reduction=state.reduction, also=also, lengths=state.lengths
+    )
+    tables = tuple(t.name for t in problem.system.tables)
+    kinds = tuple(o.kind.name for o in problem.system.observations)
+    if (tables, kinds) != (state.tables, state.kinds):
+        other = set(state.tables + state.kinds) ^ set(tables + kinds)
+        raise InputError(f"{path}: was adjusted with other tables and observations of one's own "
+                         f"({some(sorted(other))}); give the same as also=[…]")  # fmt: skip
+    start = _tree(problem.data.start, state.start)
+    problem = problem.with_data(dataclasses.replace(problem.data, start=start))
+    for table, free in zip(problem.system.tables, state.free):
+        if not np.array_equal(np.asarray(table.free), free):
+            problem = problem.with_free(table.name, free)
+    system, weight = problem.system, _tree(problem.system.data.weight, state.weights)
+    data = dataclasses.replace(system.data, weight=weight)
+    return problem.with_system(engine.with_data(system, data))
+
+
+def _restore(found: Stored, problem: Problem) -> Adjustment:
+    state: State = found.state
+    history = History(*(jax.device_put(column) for column in state.history))
+    values = _tree(problem.data.start, state.values)
+    termination, iterations = map(np.int64, (state.termination, state.iterations))
+    minimum = Minimum(
+        values, jax.device_put(termination), jax.device_put(iterations), history
+    )
+    result = Adjustment(problem.network, problem, minimum, check=found.check, **found.notes)
+    result.weights, result.robust_scale = found.image_weights, found.robust_scale
+    return result
+
+
+def _tree(like, leaves):
+    """Arrays in the structure of others of the same shapes."""
+    known, structure = jax.tree.flatten(like)
+    if [np.shape(x) for x in known] != [np.shape(x) for x in leaves]:
+        raise ValueError
+    return jax.device_put(jax.tree.unflatten(structure, leaves))

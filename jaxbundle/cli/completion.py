@@ -1,0 +1,118 @@
+"""`jaxbundle completion`: what a shell needs to complete the command line, from the parsers."""
+
+import importlib
+import shlex
+from collections.abc import Iterator
+from typing import Annotated, Any, NamedTuple
+
+import typer
+
+from jaxbundle.cli import COMMANDS
+from jaxbundle.cli.app import app, choice
+
+SHELLS = ("bash", "zsh", "fish")
+
+
+class Place(NamedTuple):
+    """A command: the words that lead to it, the commands below it, its options and their words."""
+
+    words: tuple[str, ...]
+    below: tuple[str, ...]
+    options: dict[str, tuple[str, ...]]
+    """By name what it is one of; nothing: a flag, or any value."""
+    flags: frozenset[str]
+    helps: dict[str, str]
+
+
+@app.command(example="bash", computes=False)
+def completion(shell: Annotated[str, choice(SHELLS, argument=True)]) -> None:
+    """Print what a shell needs to complete commands, options and their words.
+
+    Put it where the shell looks: of bash ~/.local/share/bash-completion/completions/jaxbundle, of
+    zsh a file that ~/.zshrc sources after compinit, of fish
+    ~/.config/fish/completions/jaxbundle.fish.
+    """
+    for command in COMMANDS:
+        importlib.import_module(f"jaxbundle.cli.{command}")
+    parser = typer.main.get_command(app)
+    places = list(walk(parser, typer.Context(parser, info_name="jaxbundle"), ("jaxbundle",)))
+    print(for_fish(places) if shell == "fish" else for_bash(places, shell == "zsh"), end="")
+
+
+def walk(command: Any, context: Any, words: tuple[str, ...]) -> Iterator[Place]:
+    """All commands, from the program down."""
+    options: dict[str, tuple[str, ...]] = {}
+    flags, helps = set(), {}
+    for parameter in command.get_params(context):
+        if parameter.param_type_name != "option":
+            continue
+        for name in (*parameter.opts, *parameter.secondary_opts):
+            words_of = () if parameter.is_flag else parameter.shell_complete(context, "")
+            options[name] = tuple(item.value for item in words_of if item.type == "plain")
+            helps[name] = (parameter.help or "").split("; ")[0]
+            if parameter.is_flag:
+                flags.add(name)
+    below = dict(getattr(command, "commands", {}))
+    yield Place(words, tuple(below), options, frozenset(flags), helps)
+    for name, one in below.items():
+        yield from walk(one, type(context)(one, parent=context, info_name=name), (*words, name))
+
+
+def for_bash(places: list[Place], zsh: bool = False) -> str:
+    """Of zsh by its own emulation."""
+    ways = [" ".join(place.words) for place in places if len(place.words) > 1]
+    lines = ["autoload -U +X bashcompinit && bashcompinit"] if zsh else []
+    lines += [
+        "_jaxbundle() {",
+        "  local current=${COMP_WORDS[COMP_CWORD]} before=${COMP_WORDS[COMP_CWORD-1]}",
+        "  local way=jaxbundle words= k",
+        "  for ((k = 1; k < COMP_CWORD; k++)); do",
+        '    case "$way ${COMP_WORDS[k]}" in',
+        f"      {'|'.join(map(_quoted, ways))}) way=\"$way ${{COMP_WORDS[k]}}\" ;;",
+        "    esac",
+        "  done",
+        '  case "$way:$before" in',
+    ]
+    for place in places:
+        way = " ".join(place.words)
+        for name, words in place.options.items():
+            if words:
+                lines.append(f"    {_quoted(f'{way}:{name}')}) words={_quoted(' '.join(words))} ;;")
+            elif name not in place.flags:
+                lines.append(f"    {_quoted(f'{way}:{name}')}) return ;;")
+    lines += ["    *)", '      case "$way:$current" in']
+    for place in places:
+        way = " ".join(place.words)
+        options = " ".join(place.options)
+        lines.append(f"        {_quoted(f'{way}:')}-*) words={_quoted(options)} ;;")
+        if place.below:
+            below = _quoted(" ".join(place.below))
+            lines.append(f"        {_quoted(f'{way}:')}*) words={below} ;;")
+    lines += [
+        "      esac ;;", "  esac", '  COMPREPLY=($(compgen -W "$words" -- "$current"))', "}",
+        "complete -o default -F _jaxbundle jaxbundle",
+    ]  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+def for_fish(places: list[Place]) -> str:
+    """One line for each command and option."""
+    lines = []
+    for place in places:
+        seen = "; and ".join(f"__fish_seen_subcommand_from {word}" for word in place.words[1:])
+        if place.below:
+            first = f"{seen}; and not" if seen else "not"
+            when = f"{first} __fish_seen_subcommand_from {' '.join(place.below)}"
+            below = _quoted(" ".join(place.below))
+            lines.append(f"complete -c jaxbundle -f -n {_quoted(when)} -a {below}")
+        for name, words in place.options.items():
+            if not (seen and name.startswith("--")):
+                continue
+            line = f"complete -c jaxbundle -n {_quoted(seen)} -l {name[2:]}"
+            line += f" -x -a {_quoted(' '.join(words))}" if words else ""
+            line += "" if words or name in place.flags else " -r"
+            lines.append(f"{line} -d {_quoted(place.helps[name])}")
+    return "\n".join(lines) + "\n"
+
+
+_quoted = shlex.quote

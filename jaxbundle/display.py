@@ -1,0 +1,81 @@
+"""How results show themselves: in one screen, and as gridded data of xarray where it is installed.
+
+Arrays are shown by type and shape, long lists by their first entries; nothing is computed for it.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+import numpy as np
+
+LINES, WIDTH = 24, 100
+FEW = 4
+"""Numbers of an array, or entries of a list, that are shown."""
+T = TypeVar("T", bound=type)
+
+
+def shows_itself(cls: T) -> T:
+    """A dataclass of results whose `repr` is one screen: what `str` says, else its fields."""
+    setattr(cls, "__repr__", describe)  # noqa: B010
+    return cls
+
+
+def describe(value: Any) -> str:
+    """One screen about a result: what its class says of it, else its fields in short."""
+    if type(value).__str__ is not object.__str__:
+        lines = [line if len(line) <= WIDTH else f"{line[: WIDTH - 1]}…"
+                 for line in str(value).splitlines()]  # fmt: skip
+    else:
+        fields = [f for f in dataclasses.fields(value) if f.repr]
+        lines = [f"  {f.name}={in_short(getattr(value, f.name))}," for f in fields]
+        lines = [f"{type(value).__name__}(", *lines, ")"]
+    return "\n".join(lines if len(lines) <= LINES else [*lines[: LINES - 1], "…"])
+
+
+def in_short(value: Any, depth: int = 0) -> str:
+    """A value in less than a line."""
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        few = value.size <= FEW and isinstance(value, np.ndarray | np.generic)
+        text = " ".join(str(value).split()) if few else f"{value.dtype}{[*value.shape]}"
+    elif isinstance(value, Mapping) and type(value).__repr__ is not describe:
+        parts = [f"{k!r}: {in_short(value[k], depth + 1)}" for k in [*value][:FEW]]
+        text = f"{{{', '.join(_more(parts, len(value), depth))}}}"
+    elif isinstance(value, tuple | list):
+        parts = [in_short(one, depth + 1) for one in value[:FEW]]
+        text = "({})" if isinstance(value, tuple) else "[{}]"
+        text = text.format(", ".join(_more(parts, len(value), depth)))
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        size = getattr(value, "__len__", None)
+        number = "" if size is None else f" of {size()}"
+        text = f"<{type(value).__name__}{number}>"
+    else:
+        text = " ".join(repr(value).split())
+    return text if len(text) <= WIDTH - 24 else f"{text[: WIDTH - 25]}…"
+
+
+def _more(parts: list[str], number: int, depth: int) -> list[str]:
+    """With how many there are, if they are not all; deep inside only that."""
+    if depth > 1 and number:
+        return [f"{number} entries"]
+    return parts if number <= FEW else [*parts, f"… {number} in all"]
+
+
+def data_set(
+    arrays: Mapping[str, tuple[tuple[str, ...], np.ndarray, str]],
+    coordinates: Mapping[str, tuple[np.ndarray, str]],
+    **about: Any,
+):
+    """Gridded arrays as an `xarray.Dataset`: by name dimensions, values and unit; coordinates with
+    theirs; attributes.
+
+    **Raises:** `ImportError` without xarray (extra `grids`)."""
+    try:
+        import xarray
+    except ImportError as error:
+        raise ImportError("data sets need xarray: pip install 'jaxbundle[grids]'") from error
+    return xarray.Dataset(
+        {name: (dims, values, {"units": unit}) for name, (dims, values, unit) in arrays.items()},
+        {name: (name, values, {"units": unit}) for name, (values, unit) in coordinates.items()},
+        {name: value for name, value in about.items() if value is not None},
+    )

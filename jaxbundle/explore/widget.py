@@ -1,0 +1,58 @@
+"""A view as a widget of a notebook: the page of the explorer, without a server.
+
+    show(NetworkView(result))
+
+The page stands in a frame; what its controls ask goes through the notebook to the view in this
+process, and the answer back. It works wherever anywidget does: Jupyter, VS Code, Colab, marimo.
+"""
+
+import functools
+from importlib.resources import files
+from typing import Any
+
+from jaxbundle.arguments import whole
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.explore.server import Refused, page_file, respond
+from jaxbundle.explore.view import View
+
+LOWEST, HIGHEST = 200, 4000
+"""Pixels of the frame."""
+
+
+def show(view: View, *, height: int = 800) -> Any:
+    """A widget that shows a view (`NetworkView`, `CameraView`, `ScannerView`) and answers its
+    controls; `height` of the frame in pixels.
+
+    **Raises:** `ImportError` without anywidget (extra `widgets`)."""
+    height = whole("height", height, LOWEST, HIGHEST)
+    page = page_file(view, {}, live=True).content.decode()
+    widget = _widget_class()(page=page, height=height)
+    widget.on_msg(lambda one, content, buffers: one.send(*reply(view, content)))
+    return widget
+
+
+def reply(view: View, asked: Any) -> tuple[dict[str, Any], list[bytes]]:
+    """The message that answers one of the page (`number`, `action`, `given`), and its content."""
+    number = asked.get("number") if isinstance(asked, dict) else None
+    try:
+        given = asked["given"]
+        if not isinstance(given, dict):
+            raise InputError("values by name are expected")
+        file = respond(view, str(asked["action"]), given)
+    except (InputError, NotSolvedError, Refused) as error:
+        return {"number": number, "error": str(error)}, []
+    except Exception as error:  # A fault of the program: the page says it, the notebook goes on.
+        return {"number": number, "error": f"{type(error).__name__}: {error}"}, []
+    return {"number": number, "type": file.type}, [file.content]
+
+
+@functools.cache
+def _widget_class() -> Any:
+    try:
+        import anywidget
+        import traitlets
+    except ImportError as error:
+        raise ImportError("widgets need anywidget: pip install 'jaxbundle[widgets]'") from error
+    script = files("jaxbundle.explore.page").joinpath("widget.js").read_text(encoding="utf-8")
+    traits = {"page": traitlets.Unicode().tag(sync=True), "height": traitlets.Int().tag(sync=True)}
+    return type("Explorer", (anywidget.AnyWidget,), {"_esm": script, **traits})

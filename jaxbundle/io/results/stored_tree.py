@@ -1,0 +1,112 @@
+"""Tables and settings as one file: numbers as the arrays of an .npz, the rest as JSON text in it.
+
+Only dataclasses that the reader lists become objects again, and nothing in a file is executed: one
+of unknown origin can be read.
+"""
+
+import dataclasses
+import hashlib
+import json
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxbundle.errors import InputError
+from jaxbundle.io.writing.replacing import replaced_file
+from jaxbundle.system.file_content import check_plain
+
+HEAD = "head"
+"""The array of the file that holds the JSON text."""
+
+
+def write_tree(path: str | Path, tree: Any, classes: Sequence[type]) -> None:
+    """Write a tree of numbers, texts, arrays, tuples, lists, maps and dataclasses of `classes`.
+
+    **Raises:** `InputError` for anything else, and where the file cannot be written."""
+    head, arrays = flatten(tree, classes)
+    with replaced_file(path) as temporary, temporary.open("wb") as file:
+        content: dict[str, Any] = {HEAD: np.frombuffer(head, np.uint8), **arrays}
+        np.savez_compressed(file, **content)
+
+
+def read_tree(path: str | Path, classes: Sequence[type], what: str) -> Any:
+    """Read what `write_tree` wrote; `what` the file should be, for the message.
+
+    **Raises:** `InputError` for a file that is missing, or is something else."""
+    check_plain(Path(path))
+    try:
+        with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        head = json.loads(arrays.pop(HEAD).tobytes())
+        return _restore(head, arrays, {one.__name__: one for one in classes})
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or 'damaged'}") from None
+    except (ValueError, TypeError, AttributeError, LookupError, EOFError, RecursionError,
+            zipfile.BadZipFile, zlib.error):  # fmt: skip
+        raise InputError(f"{path}: is not {what}, or is damaged") from None
+
+
+def fingerprint(tree: Any, classes: Sequence[type], without: Sequence[type] = ()) -> str:
+    """16 hex digits of a tree; objects `without` which it is the same count as nothing."""
+    head, arrays = flatten(tree, classes, without)
+    found = hashlib.blake2b(head, digest_size=8)
+    for array in arrays.values():
+        found.update(np.ascontiguousarray(array).tobytes())
+    return found.hexdigest()
+
+
+def flatten(
+    tree: Any, classes: Sequence[type], without: Sequence[type] = ()
+) -> tuple[bytes, dict[str, np.ndarray]]:
+    """JSON text, and the arrays it refers to by name."""
+    arrays: dict[str, np.ndarray] = {}
+    names = {one: one.__name__ for one in classes}
+
+    def plain(value: Any) -> Any:
+        if value is None or isinstance(value, bool | int | float | str):
+            return value
+        if isinstance(value, tuple(without)):
+            return None
+        if isinstance(value, np.generic):
+            return plain(value.item())
+        if isinstance(value, np.ndarray | jax.Array):
+            array = np.asarray(value)
+            if array.dtype.kind in "biuf":
+                arrays[f"array{len(arrays)}"] = array
+                return {"array": f"array{len(arrays) - 1}"}
+        if isinstance(value, tuple):
+            return {"tuple": [plain(one) for one in value]}
+        if isinstance(value, list):
+            return [plain(one) for one in value]
+        if isinstance(value, Mapping):
+            return {"map": [[plain(key), plain(one)] for key, one in value.items()]}
+        if type(value) in names:
+            kind: Any = type(value)
+            fields = [f.name for f in dataclasses.fields(kind)]
+            return {names[kind]: {name: plain(getattr(value, name)) for name in fields}}
+        raise InputError(f"a {type(value).__name__} cannot be saved")
+
+    return json.dumps(plain(tree), ensure_ascii=False).encode(), arrays
+
+
+def _restore(value: Any, arrays: Mapping[str, np.ndarray], classes: Mapping[str, type]) -> Any:
+    again = lambda one: _restore(one, arrays, classes)
+    if isinstance(value, list):
+        return [again(one) for one in value]
+    if not isinstance(value, dict):
+        return value
+    ((kind, content),) = value.items()
+    if kind == "array":
+        return arrays[content]
+    if kind == "tuple":
+        return tuple(again(one) for one in content)
+    if kind == "map":
+        return {again(key): again(one) for key, one in content}
+    return classes[kind](**{name: again(one) for name, one in content.items()})
