@@ -29,7 +29,7 @@ import numpy as np
 
 import jaxbundle
 from jaxbundle.orientation import many
-from jaxbundle.planning.render import Scene, Sensor, render
+from jaxbundle.planning.render import Rendered, Scene, Sensor, render
 from jaxbundle.planning.shapes import HeightField, Rectangle
 from jaxbundle.planning.stations import stations_looking_at
 from jaxbundle.planning.texture import Texture
@@ -41,7 +41,8 @@ WIDTH = 1600
 @dataclasses.dataclass(frozen=True)
 class Shot:
     """A photograph to be rendered: its scene and camera, centre and rotation; how it is stored;
-    `part`: photographs of one number belong together, 0: it belongs to nothing."""
+    `part`: photographs of one number belong together, 0: it belongs to nothing; `finish`: what
+    makes a photograph of what is rendered."""
 
     name: str
     scene: Scene
@@ -53,6 +54,7 @@ class Shot:
     upright: bool = False
     exif: tuple[str, float] | None = None
     part: int = 1
+    finish: Callable[[Rendered, "Shot"], np.ndarray] | None = None
 
 
 def camera(width: int, focal: float = FOCAL) -> jaxbundle.Camera:
@@ -247,21 +249,21 @@ def write(shots: Sequence[Shot], folder: Path) -> None:
     for shot in shots:
         path = folder / shot.name
         if not path.exists():
-            grey = render(shot.scene, shot.camera, shot.X0, shot.M, shot.sensor).grey
-            _store(grey, shot, path)
+            rendered = render(shot.scene, shot.camera, shot.X0, shot.M, shot.sensor)
+            _store(shot.finish(rendered, shot) if shot.finish else rendered.grey, shot, path)
 
 
-def _store(grey, shot: Shot, path: Path) -> None:
+def _store(pixels, shot: Shot, path: Path) -> None:
     from PIL import Image
 
     head = Image.Exif()
     if shot.exif is not None:
         model, focal = shot.exif
         head[0x010F], head[0x0110] = "Rendered", f"Rendered {model}"
-        columns, rows = grey.shape[::-1]
+        rows, columns = pixels.shape[:2]
         head.get_ifd(0x8769)[0xA405] = round(focal * columns * 43.2666 / np.hypot(columns, rows))
-    grey = np.rot90(grey, -1) if shot.upright else grey
-    Image.fromarray(np.ascontiguousarray(grey)).save(path, quality=shot.quality, exif=head)
+    pixels = np.rot90(pixels, -1) if shot.upright else pixels
+    Image.fromarray(np.ascontiguousarray(pixels)).save(path, quality=shot.quality, exif=head)
 
 
 def main():

@@ -3,8 +3,9 @@
     python benchmarks/reconstruct.py [--set NAME | all] [--photographs N] [--width PIXELS]
                                      [--json FILE] [--folder FOLDER] [--colmap]
 
-Photographs of a set (`photograph_sets.py`) are rendered into FOLDER/NAME (kept there for the next
-run), by a camera whose principal distance and distortion the reconstruction is not told.
+Photographs of a set (`photograph_sets.py`, `lifelike_sets.py`) are rendered into FOLDER/NAME (kept
+there for the next run), by a camera whose principal distance and distortion the reconstruction is
+not told.
 `--photographs` is of the set `convergent`. Errors of the projection centres are those after a
 similarity, in parts of the distance from their middle; c in σ. With --colmap the incremental mapper
 of pycolmap runs on the same folder in the same process, where it is installed. The exit status is 1
@@ -24,6 +25,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import machine
 import numpy as np
+from lifelike_sets import LIFELIKE
 from photograph_sets import SETS, WIDTH, Shot, convergent, write
 
 import jaxbundle
@@ -32,6 +34,7 @@ from jaxbundle.errors import NotSolvedError
 from jaxbundle.orientation.alignment import similarity
 from jaxbundle.reconstruction.reconstruct import Part, reconstruct
 
+SETS = SETS | LIFELIKE
 LIMIT = 4.0
 
 
