@@ -8,8 +8,9 @@ import jaxbundle
 from jaxbundle.tiepoints.features import Detection, Features
 from jaxbundle.tiepoints.interior import estimate_interior
 from jaxbundle.tiepoints.loops import split_contradicted
-from jaxbundle.tiepoints.matching import distances_within, match_features
+from jaxbundle.tiepoints.matching import Matches, distances_within, match_features
 from jaxbundle.tiepoints.pairs import candidate_pairs
+from jaxbundle.tiepoints.still import without_marks
 from jaxbundle.tiepoints.store import Store
 from jaxbundle.tiepoints.tracks import choose_tracks, make_tracks
 from jaxbundle.tiepoints.verification import Pair, verify_pairs
@@ -221,3 +222,21 @@ def test_what_is_in_a_photograph_twice_matches_nothing():
     assert np.all(own[0][np.r_[:20, 60:80]] < 0.3 * np.median(own[0][20:60]))
     rows, _ = match_features(twice, one, own=own)
     assert set(range(20, 60)) <= set(rows[:, 0].tolist()) and len(rows) <= 42
+
+
+def test_marks_at_the_same_pixels_of_photographs_match_nothing(cloud):
+    rng, X, views = cloud
+    marks = rng.uniform([900, 800], [1100, 860], (30, 2))
+    size = np.full(len(X) + len(marks), 8.0)
+    photographs = [
+        Features(np.r_[pixels(seen(X, *view), rng), marks + 0.1 * rng.normal(size=marks.shape)],
+                 size, np.zeros(len(size)), np.zeros((len(size), 128), np.uint8))
+        for view in views
+    ]  # fmt: skip
+    rows = np.tile(np.arange(len(size))[:, None], 2)
+    pair = lambda i, j: Matches((i, j), rows, np.full(len(rows), 0.5), np.ones(len(rows), bool))
+    matches = [pair(i, j) for i in range(5) for j in range(i)]
+    found, marked = without_marks(matches, photographs, [SIZE] * 5)
+    assert marked == 5 and all(set(m.rows[:, 0]) == set(range(len(X))) for m in found)
+    same = [photographs[0]] * 5
+    assert without_marks(matches, same, [SIZE] * 5)[1] == 0, "photographs from one place"
