@@ -35,7 +35,9 @@ SHIFT = 3.0
 """Farthest a match may lie from its feature, pixels of its level."""
 WORST = 0.4
 """σ above which a match is not believed, pixels of its level."""
-LEAST_SIGMA = 0.02
+REACH = 7
+"""Pixels over which residuals within a window go together."""
+LEAST_SIGMA = 0.01
 """σ below this, pixels of its level, is not believed: interpolation and sampling add as much."""
 FEATURE = 0.12
 """σ of the place of a feature, in parts of its diameter."""
@@ -173,7 +175,7 @@ def _pieces(picture, corner, side):
 
 @partial(jax.jit)
 def _match(windows: Array, pieces: Array, start: Array):
-    found = jax.vmap(match_least_squares)(
+    found = jax.vmap(partial(match_least_squares, reach=REACH))(
         windows.astype(np.float32), pieces.astype(np.float32), start
     )
     return found.affine, found.covariance, found.correlation, found.status
