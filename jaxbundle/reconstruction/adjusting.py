@@ -30,6 +30,8 @@ ROUNDS = 4
 FEWEST = 60
 """Measurements of a kind with a factor of its own."""
 SMALLEST, LARGEST = 0.3, 8.0
+LOSSES = 6
+"""How often points are left out that data snooping leaves undetermined."""
 MOST_ITERATIONS = 400
 """Of one adjustment. Photographs that all look the same way determine the principal distance of an
 unknown camera only weakly, and the search then needs more than a hundred."""
@@ -58,17 +60,37 @@ def adjust_weighted(
     **Raises:** as `jaxbundle.adjust`.
     """
     try:
-        found = _weighted(network, kinds, names, significance, tell)
+        found = _without_lost(network, kinds, names, significance, tell)
         if found.adjustment.converged:
             return found
     except NotSolvedError:
         pass
     rays = network.observations
     number = np.bincount(rays.point, minlength=len(network.points))
-    known = (number > 2) | ~network.points.has_role("tie")
-    rows = np.flatnonzero(known[rays.point])
-    clear = keep_points(network, known)
-    return _weighted(clear, kinds[rows], names, significance, tell)
+    clear, kinds = _keep(network, kinds, (number > 2) | ~network.points.has_role("tie"))
+    return _without_lost(clear, kinds, names, significance, tell)
+
+
+def _without_lost(network: Network, kinds, names, significance, tell) -> Weighted:
+    """As `_weighted`, without tie points that what data snooping leaves of their rays does not
+    determine."""
+    tie = network.points.has_role("tie")
+    for _ in range(LOSSES):
+        try:
+            return _weighted(network, kinds, names, significance, tell)
+        except NotSolvedError as error:
+            lost = {name.rpartition(" ")[2] for name in error.undetermined}
+            kept = ~(tie & np.isin(np.array(network.points.id, object), [*lost]))
+            if kept.all():
+                raise
+            network, kinds = _keep(network, kinds, kept)
+            tie = network.points.has_role("tie")
+    return _weighted(network, kinds, names, significance, tell)
+
+
+def _keep(network: Network, kinds, points) -> tuple[Network, Int[np.ndarray, " rays"]]:
+    """The network with these points alone, and the kinds of the observations of it."""
+    return keep_points(network, points), kinds[points[network.observations.point]]
 
 
 def _weighted(network: Network, kinds, names, significance, tell) -> Weighted:
