@@ -108,6 +108,15 @@ def angles(M):
     return in_lanes(_angles, POINT_LANES, M)[0]
 
 
+def prepare() -> None:
+    """Compile what places images and points, ahead of its data."""
+    rng = np.random.default_rng(0)
+    xy, X, one = rng.uniform(-0.5, 0.5, (1, SLOTS, 2)), rng.normal(size=(1, SLOTS, 3)), np.ones(1)
+    resect(xy, X, 1e-3 * one)
+    refine((np.zeros((1, 3)), np.eye(3)[None]), xy, X, np.ones((1, SLOTS)))
+    intersect(rng.normal(size=(1, RAYS, 3)), rng.normal(size=(1, RAYS, 3)), np.ones((1, RAYS)))
+
+
 def spread(number: int, most: int = SLOTS) -> np.ndarray:
     """Up to `most` of a number of rows, evenly."""
     if number <= most:

@@ -17,6 +17,7 @@ from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.float64 import require_x64
 from jaxbundle.network.columns import count, some
 from jaxbundle.network.tables import Camera, Network
+from jaxbundle.orientation import many
 from jaxbundle.orientation.network import Oriented
 from jaxbundle.photographs.places import map_positions
 from jaxbundle.photographs.reading import read_photograph
@@ -35,6 +36,7 @@ from jaxbundle.reconstruction.photographs import (
 from jaxbundle.reconstruction.settings import Settings
 from jaxbundle.reconstruction.starting import believable, start_again, start_values
 from jaxbundle.system.configuration import available_cores
+from jaxbundle.tiepoints import refinement
 from jaxbundle.tiepoints.features import Features
 from jaxbundle.tiepoints.refinement import Measurements, measure_tracks
 from jaxbundle.tiepoints.search import (
@@ -46,6 +48,7 @@ from jaxbundle.tiepoints.search import (
     verify,
     without_contradicted,
 )
+from jaxbundle.tiepoints.still import without_marks
 from jaxbundle.tiepoints.store import Store
 from jaxbundle.tiepoints.tracks import choose_tracks, make_tracks
 from jaxbundle.tiepoints.verification import Pair
@@ -53,8 +56,9 @@ from jaxbundle.tiepoints.verification import Pair
 DEFAULT = Settings()
 NAMED = 99
 """Kind of the measurements of named points."""
-REPEATS = 0.3
-"""Part of the pairs that contradict others from which on the whole is doubtful."""
+REPEATS, FOLDED, MANY = 0.3, 0.4, 20
+"""Part of the pairs that contradict others from which on the whole is doubtful; from which on, of
+so many pairs, no answer is trustworthy."""
 TEXTURE = 16
 """Features a photograph needs."""
 
@@ -151,12 +155,14 @@ class _Making:
 
     def run(self) -> Reconstruction:
         with ThreadPoolExecutor(1) as ahead:
-            # compiled while features are searched and matched
-            prepared = ahead.submit(prepare)
+            # compiled while features are searched and matched, and pairs verified
+            prepared = [ahead.submit(one) for one in (prepare, refinement.prepare, many.prepare)]
             features, matches = self._matches()
-            prepared.result()
-        self._calibrate(features, matches)
-        pairs = self._verify(features, matches)
+            prepared[0].result()
+            self._calibrate(features, matches)
+            pairs = self._verify(features, matches)
+            for one in prepared:
+                one.result()
         parts = self._parts(features, matches, pairs)
         said = tuple((self.names[p.images[0]], self.names[p.images[1]], p.found, len(p), p.kind)
                      for p in pairs)  # fmt: skip
@@ -170,6 +176,12 @@ class _Making:
         matches = match(features, prints, self.settings.pairs, place, self.store, self.workers,
                         self.tell)  # fmt: skip
         self.store.drop_unused()
+        matches, marked = without_marks(matches, features, [p.size for p in self.photographs])
+        if marked:
+            self.notes.append(
+                f"matches of marks at the same pixels of {marked} photographs (a date, a name, "
+                "dirt on the sensor) are not used"
+            )
         return features, matches
 
     def _features(self) -> list[Features]:
@@ -215,12 +227,19 @@ class _Making:
             named = (" and ".join(self.names[k] for k in p.images) for p in wrong)
             self.notes.append(f"{count(len(wrong), 'pair')} of photographs not used, which others "
                               f"contradict around three: {some(named, 3, str)}")  # fmt: skip
-        if len(wrong) > REPEATS * (len(wrong) + len(pairs)):
-            self.notes.append(
-                f"{len(wrong)} of {len(wrong) + len(pairs)} pairs contradict others: the object "
-                "repeats itself, and parts of it may have been laid upon one another; compare the "
-                "result with the object, or take photographs nearer to one another"
+        every = len(wrong) + len(pairs)
+        if len(wrong) > REPEATS * every:
+            said = (
+                f"{len(wrong)} of {every} pairs contradict others: the object repeats itself, and "
+                "parts of it may have been laid upon one another"
             )
+            if every >= MANY and len(wrong) > FOLDED * every:
+                raise NotSolvedError(
+                    f"not solved: {said}; take photographs nearer to one another, or leave out "
+                    "those that show repeated parts alone", self.names,
+                )  # fmt: skip
+            self.notes.append(f"{said}; compare the result with the object, or take photographs "
+                              "nearer to one another")  # fmt: skip
         return pairs
 
     def _parts(self, features, matches, pairs: Sequence[Pair]) -> list[Part]:

@@ -10,7 +10,9 @@ the rotation, and moves the camera: only the bases do not close.
 
 Pairs are taken one after another, sure ones first, and of these the ones with many matches and
 loops that close. One that contradicts pairs already taken, in more loops than it agrees with, is
-left out. Where it would have been alone to connect photographs there is no loop: it stays.
+left out. Where it is alone to connect photographs there is no loop: it stays, unless it is not sure
+and its photographs are connected already: any two photographs of a long row of windows match, the
+far ones as if they stood side by side, and agree with one another in that.
 
 Zach, Klopschitz and Pollefeys (2010), Disambiguating visual relations using loop constraints.
 """
@@ -46,12 +48,15 @@ def split_contradicted(
         return pair.sure, len(pair) * (1 + good) / (1 + good + bad)
 
     taken: set[tuple[int, int]] = set()
+    group = {k: k for pair in pairs for k in pair.images}
     for pair in sorted(pairs, key=strength, reverse=True):
         i, j = pair.images
         found = [loops.closes((i, j), k) for k in loops.thirds((i, j))
                  if {_pair(i, k), _pair(j, k)} <= taken]  # fmt: skip
-        if found.count(False) <= found.count(True):
+        needed = pair.sure or group[i] != group[j]
+        if found.count(False) <= found.count(True) and (needed or any(found)):
             taken.add((i, j))
+            group = {k: group[i] if g == group[j] else g for k, g in group.items()}
     return ([p for p in pairs if p.images in taken], [p for p in pairs if p.images not in taken])
 
 

@@ -11,7 +11,7 @@ from jaxbundle.network.columns import count
 from jaxbundle.network.tables import Camera
 from jaxbundle.network.units import from_image_unit
 from jaxbundle.orientation.sights import ideal_points
-from jaxbundle.tiepoints import interior, refinement, verification
+from jaxbundle.tiepoints import interior, verification
 from jaxbundle.tiepoints.features import Detection, Features, find_features
 from jaxbundle.tiepoints.interior import CANDIDATES, Start, estimate_interior
 from jaxbundle.tiepoints.loops import split_contradicted
@@ -42,9 +42,9 @@ TRIED = 24
 
 
 def prepare() -> None:
-    """Compile the programs of start values, verification and measurement, ahead of their data."""
-    for module in (interior, verification, refinement):
-        module.prepare()
+    """Compile the programs of principal distances and verification, ahead of their data."""
+    interior.prepare()
+    verification.prepare()
 
 
 def detect(
@@ -136,9 +136,9 @@ def start_cameras(
             explained = lambda camera, clear=clear, own=own: _explained(
                 _with_lens(cameras, own, camera), of, features, clear
             )
-            now = explained(start.camera)
-            if now < PLENTY * sum(len(m.rows) for m in clear):
-                least = (MORE_THAN_TOLD if told else MORE) * now
+            now, every = explained(start.camera), sum(len(m.rows) for m in clear)
+            least = (MORE_THAN_TOLD if told else MORE) * now
+            if now < PLENTY * every and least < every:
                 start = _most_explained(start, begin, xy, explained, least)
         p = start.camera.parameters
         better = _with_lens(better, own, start.camera)

@@ -129,14 +129,22 @@ def verify_pairs(
 
 def _agreed(rows: dict[int, np.ndarray], xy1, xy2, tolerance):
     """Of pairs the matches that agree with the orientation by some of them (`rows`), M and b, where
-    enough of these agree."""
+    enough of these agree. Where they do not by the clear ones, which are many, the clearest are
+    asked: of photographs far apart most matches may be wrong."""
     rows = {k: r for k, r in rows.items() if len(r) >= LEAST}
+    found = _by_some(rows, _clear_rows, xy1, xy2, tolerance)
+    again = {k: r for k, r in rows.items() if k not in found and CLEAR * len(r) > many.SLOTS}
+    return {**_by_some(again, lambda _: np.arange(many.SLOTS), xy1, xy2, tolerance), **found}
+
+
+def _by_some(rows: dict[int, np.ndarray], clear, xy1, xy2, tolerance):
+    """As `_agreed`, sought by the matches that `clear` gives of their number."""
     if not rows:
         return {}
     keys = np.array(list(rows))
-    clear = [rows[k][_clear_rows(len(rows[k]))] for k in rows]
+    few = [rows[k][clear(len(rows[k]))] for k in rows]
     M, b, part, _ = many.orient_pairs(
-        [xy1[k][r] for k, r in zip(rows, clear)], [xy2[k][r] for k, r in zip(rows, clear)],
+        [xy1[k][r] for k, r in zip(rows, few)], [xy2[k][r] for k, r in zip(rows, few)],
         LOOSE * tolerance[keys],
     )  # fmt: skip
     poses = {k: (M[i], b[i]) for i, k in enumerate(rows) if part[i] > 0}
