@@ -111,8 +111,8 @@ def angles(M):
 def prepare() -> None:
     """Compile what places images and points, ahead of its data."""
     rng = np.random.default_rng(0)
-    xy, X, one = rng.uniform(-0.5, 0.5, (1, SLOTS, 2)), rng.normal(size=(1, SLOTS, 3)), np.ones(1)
-    resect(xy, X, 1e-3 * one)
+    xy, X = [rng.uniform(-0.5, 0.5, (SLOTS, 2))], [rng.normal(size=(SLOTS, 3))]
+    resect(xy, X, np.full(1, 1e-3))
     refine((np.zeros((1, 3)), np.eye(3)[None]), xy, X, np.ones((1, SLOTS)))
     intersect(rng.normal(size=(1, RAYS, 3)), rng.normal(size=(1, RAYS, 3)), np.ones((1, RAYS)))
 
