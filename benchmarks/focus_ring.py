@@ -3,7 +3,7 @@ every photograph costs where it does not.
 
     python benchmarks/focus_ring.py [--draws N] [--json FILE]
 
-Twelve convergent photographs of 60 targets in a ball of 2 m, c = 28 mm, σ = 0.5 µm of an image
+Twelve convergent photographs of 60 targets in a box of 2 m, c = 28 mm, σ = 0.5 µm of an image
 coordinate, every third rolled; four targets are control (0.01 mm). The principal distance of every
 photograph is off by a normal deviate of τ, a fraction of c. Each draw is adjusted three times:
 
