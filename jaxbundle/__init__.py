@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from jaxbundle.network import Network as Network
     from jaxbundle.network.arrays import Data as Data
     from jaxbundle.network.arrays import Values as Values
+    from jaxbundle.network.build import add_further as add_further
     from jaxbundle.network.build import make_network as make_network
     from jaxbundle.network.check import check_network as check_network
     from jaxbundle.network_design.aims import Aim as Aim
@@ -66,6 +67,7 @@ if TYPE_CHECKING:
     from jaxbundle.planning.stations import stations_looking_at as stations_looking_at
     from jaxbundle.statistics.precision import Precision as Precision
     from jaxbundle.statistics.precision import precision as precision
+    from jaxbundle.statistics.precision import redundancy as redundancy
     from jaxbundle.system.configuration import join_processes as join_processes
     from jaxbundle.system.configuration import keep_programs as keep_programs
     from jaxbundle.system.configuration import use_cores as use_cores
@@ -85,7 +87,7 @@ _HOME = {
     "jaxbundle.io": ("convert", "read_network", "write_project"),
     "jaxbundle.network": ("Camera", "Network"),
     "jaxbundle.network.arrays": ("Data", "Values"),
-    "jaxbundle.network.build": ("make_network",),
+    "jaxbundle.network.build": ("add_further", "make_network"),
     "jaxbundle.network.check": ("check_network",),
     "jaxbundle.network_design.aims": ("Aim",),
     "jaxbundle.network_design.conditions": ("Conditions",),
@@ -104,7 +106,7 @@ _HOME = {
     "jaxbundle.bundle.compare": ("AdjustmentComparison", "compare"),
     "jaxbundle.bundle.sensitivity": ("Budget", "sensitivity"),
     "jaxbundle.bundle.influence": ("Influence", "influence"),
-    "jaxbundle.statistics.precision": ("Precision", "precision"),
+    "jaxbundle.statistics.precision": ("Precision", "precision", "redundancy"),
 }
 _MODULE = {name: module for module, names in _HOME.items() for name in names}
 __all__ = [*_MODULE]  # pyright: ignore[reportUnsupportedDunderAll]: the names above

@@ -53,6 +53,7 @@ from jaxbundle.network.tables import (
     Observations,
     Points,
     Source,
+    require_network,
 )
 from jaxbundle.network.units import ANGLE_UNITS, from_image_unit
 
@@ -146,6 +147,29 @@ def make_network(
         network = network.warn(
             f"sigma_image is not given: image coordinates without σ have σ = 1 {image_unit}"
         )
+    return network
+
+
+def add_further(network: Network, *, angle_unit: str = "rad", **further: Any) -> Network:
+    """The network with further observations, in place of those it has of the same kinds.
+
+        jaxbundle.add_further(
+            network, velocities={"image": network.images.id},
+            rolling_shutter={"line_time": 3e-5, "free": ["vX", "vY", "vZ", "wx", "wy", "wz"]},
+        )
+
+    **Arguments:** `further`: tables and the settings of their sections, as of `make_network`;
+    `angle_unit` of what is an angle in them.
+
+    **Raises:** `InputError` naming table, row and column.
+    """
+    check_choice("angle_unit", angle_unit, CHOICES["angle_unit"])
+    made = make_further(further, ANGLE_UNITS[angle_unit])
+    new = {one.TABLE for one in made}
+    kept = tuple(one for one in require_network(network).further if one.TABLE not in new)
+    network = network.replace(further=(*kept, *made))
+    for one in made:
+        one.check(network)
     return network
 
 

@@ -14,8 +14,13 @@ from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.leastsquares.rows import evaluate, scalars
 from jaxbundle.network.declare import declare
+from jaxbundle.network.further import RollingShutter
 from jaxbundle.network.tables import Network, require_network
 from jaxbundle.planning.stations import LARGEST_SEED
+
+MOST_ROUNDS, SETTLED = 50, 1e-13
+"""Of the search for the line of an image point, and the change, as a part of the largest image
+coordinate, at which it ends."""
 
 
 def simulate_further(
@@ -23,13 +28,18 @@ def simulate_further(
 ) -> Network:
     """The network with its further observations measured anew, of a truth, with noise of their σ.
 
+    Of a rolling shutter the image points are: those of the truth are moved to where the moving
+    camera has them, and keep the noise they have in the network.
+
     **Arguments:** `network`: whose rows say what is measured, and how well (antennas, attitudes,
     differences, angles: what they hold as measured does not matter); `truth`: as
     `simulate_with_truth` gives it; `unknowns`: true values of the tables that further observations
     bring, by name, such as `{"GNSS strip": shifts}` [strips, 6] (sorted by name); those of the
-    settings, lever arms and boresights, are true if not given.
+    settings, lever arms and boresights, are true if not given, and so are the `"velocity"`
+    [images, 6] (object unit and radians a second) and the line times of a rolling shutter.
 
-    **Raises:** `InputError` for a table that is not there.
+    **Raises:** `InputError` for a table that is not there; for a rolling shutter also where network
+    and truth have other image points.
     """
     require_x64()
     random = np.random.default_rng(whole("seed", seed, least=0, most=LARGEST_SEED))
@@ -41,6 +51,9 @@ def simulate_further(
         values = {t.name: t.value for t in declared.tables}
         known |= set(values)
         values |= {name: v for name, v in (unknowns or {}).items() if name in values}
+        if isinstance(rows, RollingShutter):
+            shift = _moved_image_points(truth, rows, values) - truth.observations.xy
+            network = _shifted(network, truth, shift)
         if field:
             rows = rows.among(truth)
             seen = declared.observations[len(declared.layout.sets)]
@@ -53,6 +66,35 @@ def simulate_further(
         if name not in known:
             raise InputError(f"unknowns: there is no table {name!r}; known: {', '.join(known)}")
     return network.replace(further=tuple(made))
+
+
+def _moved_image_points(truth: Network, rows: RollingShutter, values):
+    """Where the moving camera has the image points of the truth: an image point is exposed with
+    its line, which it determines itself."""
+    truth = truth.replace(further=(rows,), residuals="measured")
+    for _ in range(MOST_ROUNDS):
+        declared, rays = declare(truth, np.zeros(3)), truth.observations
+        values = {t.name: t.value for t in declared.tables} | values
+        xy = rays.xy.copy()
+        for part, seen in zip(declared.layout.sets, declared.observations):
+            if part.field == "image":
+                at = slice(None) if part.rows is None else part.rows
+                xy[at] += _residuals(declared, seen, values)
+        change = np.abs(xy - rays.xy).max(initial=0.0)
+        truth = truth.replace(observations=dataclasses.replace(rays, xy=xy))
+        if change <= SETTLED * np.abs(xy).max(initial=0.0):
+            return xy
+    raise InputError(
+        "simulate_further: the camera moves so fast that an image point has no line of its own"
+    )
+
+
+def _shifted(network: Network, truth: Network, shift) -> Network:
+    rays, others = network.observations, truth.observations
+    same = len(rays) == len(others) and (rays.image == others.image).all()
+    if not (same and (rays.point == others.point).all()):
+        raise InputError("simulate_further: network and truth have other image points")
+    return network.replace(observations=dataclasses.replace(rays, xy=rays.xy + shift))
 
 
 def _residuals(declared, seen, values):

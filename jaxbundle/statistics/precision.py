@@ -24,9 +24,12 @@ from jaxbundle.adjustment.solve import check_given
 from jaxbundle.adjustment.unknowns import angles_near, named, value_of
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.precision import precision as engine_precision
+from jaxbundle.leastsquares.precision import redundancy as engine_redundancy
+from jaxbundle.leastsquares.problem import given_data
 from jaxbundle.leastsquares.reduction import FACTORS
 from jaxbundle.leastsquares.spaces import Pose, PoseValue
 from jaxbundle.network.arrays import Data, Values
+from jaxbundle.network.declare import Rows
 from jaxbundle.types import AnyArray
 
 ROUNDING = 1e-14
@@ -98,6 +101,28 @@ def precision(
         point_covariance=of_points * jnp.square(sigma0),
         centre_covariance=found.own["image"][:, :3, :3] * jnp.square(sigma0),
     )
+
+
+def redundancy(problem: Problem, data: Data | None = None) -> Rows:
+    """The redundancy numbers of a design, differentiable to every order in all of it.
+
+    r = 1 − diag(J·Q·Jᵀ) of every observation: 0, nothing controls it, to 1. Use it as `precision`;
+    nothing is adjusted, and image coordinates are those that the given values have.
+
+    **Returns:** `Rows`: `image` [rays, 2], `control`, `exterior`, `interior`, `distance` and
+    `other` in the order of `Data`; 0 where the weight is 0.
+
+    **Raises:** `InputError` where no factor of the network fits into memory.
+    """
+    check_given(problem, data)
+    problem = problem.with_factor()
+    if problem.reduction not in FACTORS:
+        raise InputError("redundancy: the network is too large for its cofactors; take part of it")
+    data, system = problem.data if data is None else data, problem.system
+    given = given_data(system, problem.layout.data(predicted(problem, data)))
+    found = engine_redundancy(system.declared, system.plan, given)
+    found = {o: found[o][: one.number] for o, one in enumerate(system.observations)}
+    return problem.layout.rows(found, data)
 
 
 def predicted(problem: Problem, data: Data) -> Data:

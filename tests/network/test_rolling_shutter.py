@@ -64,11 +64,10 @@ def seen(truth, velocity):
 
 def moving(network, xy, **section):
     section = {"line_time": LINE, "free": ["vX", "vY", "vZ", "wx", "wy", "wz"]} | section
-    further = make_further(
-        {"velocities": {"image": list(network.images.id)}, "rolling_shutter": section}, 1.0
+    network = jaxbundle.add_further(
+        network, velocities={"image": list(network.images.id)}, rolling_shutter=section
     )
-    rays = dataclasses.replace(network.observations, xy=xy)
-    return network.replace(observations=rays, further=further)
+    return network.replace(observations=dataclasses.replace(network.observations, xy=xy))
 
 
 def noisy(flown):
@@ -87,6 +86,34 @@ def test_at_rest_it_is_the_camera_of_always(flown):
     made, velocity = flown
     np.testing.assert_allclose(seen(made.truth, 0 * velocity), made.truth.observations.xy,
                                atol=1e-8)  # fmt: skip
+
+
+def test_image_points_are_simulated_as_the_formula_says(flown):
+    """Those of `seen`, with the noise they had; of one that moves too fast there are none."""
+    made, velocity = flown
+    network = moving(made.network, made.network.observations.xy)
+    noise = made.network.observations.xy - made.truth.observations.xy
+    found = jaxbundle.simulate_further(network, made.truth, unknowns={"velocity": velocity})
+    np.testing.assert_allclose(found.observations.xy - noise, seen(made.truth, velocity), atol=1e-7)
+    assert len(found.further) == 1
+    with pytest.raises(InputError, match="so fast that an image point has no line"):
+        unknowns = {"velocity": 300 * velocity}
+        jaxbundle.simulate_further(network, made.truth, unknowns=unknowns)
+    with pytest.raises(InputError, match="network and truth have other image points"):
+        fewer = network.replace(observations=network.observations.take(np.arange(100)))
+        jaxbundle.simulate_further(fewer, made.truth, unknowns={"velocity": velocity})
+
+
+def test_further_observations_are_added_in_place_of_their_kind(flown):
+    network = moving(flown[0].network, flown[0].network.observations.xy)
+    levelled = {"from": ["1"], "to": ["2"], "dZ": [1.0], "sdZ": [0.1]}
+    both = jaxbundle.add_further(network, differences=levelled)
+    assert [one.TABLE for one in both.further] == ["velocities", "differences"]
+    again = moving(both, both.observations.xy, line_time=1e-5)
+    assert [one.TABLE for one in again.further] == ["differences", "velocities"]
+    assert again.further[1].settings["line_time"] == 1e-5
+    with pytest.raises(InputError, match="row 1: .*point 'P'"):
+        jaxbundle.add_further(network, differences=levelled | {"to": ["P"]})
 
 
 def test_velocities_are_found(flown, result):

@@ -119,6 +119,25 @@ def test_a_station_moves_the_precision_of_the_principal_distance_in_a_batch(prob
     assert first[0] == pytest.approx(stencil(value), rel=1e-6)
 
 
+def test_redundancy_numbers_and_their_derivative_by_a_weight(problem):
+    def of(weight):
+        data = dataclasses.replace(problem.data, image_weight=weight)
+        return jaxbundle.redundancy(problem, data).image
+
+    weight, at, h = jnp.asarray(problem.data.image_weight), (5, 1), 1e-3
+    towards = jnp.zeros_like(weight).at[at].set(1.0)
+    program = jax.jit(lambda w: jax.jvp(of, (w,), (towards,)))
+    r, slope = map(np.asarray, program(weight))
+    dense = linearise(problem)  # of measurements without noise, in the measured image
+    h_dense = np.einsum("ij,jk,ik->i", dense.J, dense.Q, dense.J)
+    np.testing.assert_allclose(r.ravel(), 1 - h_dense, atol=1e-9)
+    assert r.sum() == pytest.approx(problem.counts.redundancy)
+    ends = [np.asarray(program(weight + k * h * towards)[0]) for k in (-1, 1)]
+    difference = (ends[1] - ends[0]) / (2 * h)
+    assert difference[at] < 0  # what weighs more controls itself less
+    np.testing.assert_allclose(slope, difference, atol=1e-5 * np.abs(difference).max())
+
+
 @pytest.mark.usefixtures("wrong_types")
 def test_names_that_are_not_there(problem):
     with pytest.raises(KeyError, match="no camera parameter 'c'"):
