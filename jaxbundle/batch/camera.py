@@ -26,6 +26,8 @@ STATUS = (
     "converged", "iteration limit", "singular", "not finite", "too few points", "weak", "misfit"
 )  # fmt: skip
 CONVERGED, LIMIT, SINGULAR, NOT_FINITE, TOO_FEW, WEAK, MISFIT = range(7)
+SOLVED = (STATUS[CONVERGED], STATUS[WEAK], STATUS[MISFIT])
+"""Statuses of cameras that have values."""
 MEANING = {
     stopping.LIMIT: LIMIT, stopping.SETTLED: CONVERGED, stopping.RELATIVE_COST: CONVERGED,
     stopping.SINGULAR: SINGULAR, stopping.STUCK: LIMIT, stopping.NOT_FINITE: NOT_FINITE,

@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxbundle.batch.camera import CONVERGED, STATUS
+from jaxbundle.batch.camera import CONVERGED, SOLVED, STATUS
 from jaxbundle.batch.misfit import OF_DEVIATION
-from jaxbundle.batch.result import SOLVED
 from jaxbundle.errors import InputError
 from jaxbundle.leastsquares.distributions import f_tail
 from jaxbundle.network.columns import Columns, as_columns

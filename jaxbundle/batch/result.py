@@ -1,18 +1,20 @@
 """The result of `calibrate_batch`: numbers by camera, as arrays, a table, or HTML."""
 
 import dataclasses
+from collections.abc import Sequence
 from html import escape
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from jaxbundle.batch.camera import CONVERGED, MISFIT, STATUS, WEAK
+from jaxbundle.arguments import shown as quoted
+from jaxbundle.batch.camera import CONVERGED, SOLVED, STATUS
+from jaxbundle.batch.population import Population
 from jaxbundle.cameras import CameraModel
 from jaxbundle.display import shows_itself
+from jaxbundle.errors import InputError
 from jaxbundle.network.columns import data_frame
 
-SOLVED = (STATUS[CONVERGED], STATUS[WEAK], STATUS[MISFIT])
-"""Statuses of cameras that have values."""
 MOST_ROWS = 20
 """Cameras in the HTML table; those that need attention first."""
 MOST_REMARKS = 10
@@ -98,6 +100,53 @@ class BatchCalibration:
         if len(lines) > MOST_REMARKS:
             lines[MOST_REMARKS:] = [f"and {len(lines) - MOST_REMARKS} more remarks, see `remark`"]
         return "\n".join(said + lines)
+
+    def row(self, i: int, brief: bool = False, views: int | None = None) -> dict:
+        """The result of camera i as plain dicts and numbers (angles in radians), as a line of
+        `jaxbundle batch`; `brief`: without covariance and poses; `views`: how many it has, without
+        those it was filled up with; all if not given."""
+        row = {
+            "status": str(self.status[i]),
+            "model": str(self.model),
+            "iterations": int(self.iterations[i]),
+            "redundancy": int(self.redundancy[i]),
+            "views": int(self.views[i].sum()),
+            "views_left_out": np.flatnonzero(~self.views[i][:views]).tolist(),
+        }
+        if self.remark[i]:
+            row["remark"] = str(self.remark[i])
+        if self.removed is not None:
+            removed = np.argwhere(self.removed[i])
+            row["removed"] = len(removed) if brief else removed.tolist()
+        if self.undetermined[i].any():
+            row["undetermined"] = np.array(self.parameters)[self.undetermined[i]].tolist()
+        if not self.solved[i]:
+            return row
+        estimates = zip(self.parameters, self.values[i].tolist(), self.sigma[i].tolist())
+        row |= {
+            "rms": float(self.rms[i]),
+            "sigma0": float(self.sigma0[i]),
+            "parameters": {name: {"value": v, "sigma": s} for name, v, s in estimates},
+        }
+        if not brief:
+            names = ("position", "angles", "sigma_position", "sigma_angles")
+            columns = zip(*(getattr(self, name)[i][:views].tolist() for name in names))
+            row |= {
+                "covariance": self.covariance[i].tolist(),
+                "poses": [dict(zip(names, values)) for values in columns],
+            }
+        return row
+
+    def population(self, ids: Sequence | None = None) -> Population:
+        """How the cameras are distributed, which are outlying, what their parameters go with.
+
+        **Arguments:** `ids` of the cameras; 0, 1, 2, … if not given.
+
+        **Raises:** `InputError` where there are not as many ids as cameras."""
+        ids = range(len(self)) if ids is None else ids
+        if np.shape(ids) != (len(self),):
+            raise InputError(f"ids must be {len(self)}, one a camera, but are {quoted(ids)}")
+        return Population({"key": str(id)} | self.row(i, True) for i, id in enumerate(ids))
 
     def table(self) -> dict[str, np.ndarray]:
         """A row a camera: status, remark, rms and sigma0 (pixels), redundancy, iterations, views,

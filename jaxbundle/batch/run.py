@@ -20,8 +20,8 @@ import jax
 import numpy as np
 
 from jaxbundle.arguments import one_of, whole
-from jaxbundle.batch.calibrate import BatchCalibration, calibrate_batch
-from jaxbundle.batch.camera import LIMIT, STATUS
+from jaxbundle.batch.calibrate import calibrate_batch
+from jaxbundle.batch.camera import LIMIT, SOLVED, STATUS
 from jaxbundle.batch.input import free_parameters, pixel_model
 from jaxbundle.batch.photographs import (
     PhotographFolders,
@@ -29,7 +29,6 @@ from jaxbundle.batch.photographs import (
     is_photograph_folder,
     of_photographs,
 )
-from jaxbundle.batch.result import SOLVED
 from jaxbundle.batch.snooping import TESTS
 from jaxbundle.batch.stacks import is_camera_stack, read_camera_stack
 from jaxbundle.bundle.adjust import adjust
@@ -225,7 +224,7 @@ def _cameras(path: str, name: str, options: dict, brief: bool) -> _Work:
 
     def solve(chosen, _):
         batch = calibrate_batch(**stack.arguments(chosen), **options)
-        return [camera_row(batch, i, brief) for i in range(len(chosen))]
+        return [batch.row(i, brief) for i in range(len(chosen))]
 
     keys = tuple(f"{name}#{camera}" for camera in stack.ids)
     return _Work(keys, _settings(options, brief), stack.fingerprint, solve)
@@ -242,7 +241,7 @@ def _photographed(
                 for i, why in measured.items() if isinstance(why, str)}  # fmt: skip
         views = {i: one for i, one in measured.items() if not isinstance(one, str)}
         for i, batch, place in calibrate_views(views, options):
-            rows[i] = camera_row(batch, place, brief, len(views[i]))
+            rows[i] = batch.row(place, brief, len(views[i]))
             rows[i] |= of_photographs(views[i], brief)
         return [rows[i] for i in chosen]
 
@@ -330,41 +329,3 @@ def network_row(path: str, **options) -> dict:
         return {"status": status, "error": str(error)}
     except (ValueError, ArithmeticError, RuntimeError, OSError, MemoryError) as error:
         return {"status": "failed", "error": f"{type(error).__name__}: {error}"}
-
-
-def camera_row(
-    batch: BatchCalibration, i: int, brief: bool = False, views: int | None = None
-) -> dict:
-    """The result of camera i as plain dicts and numbers (angles in radians); `views`: how many it
-    has, without those it was filled up with; all if not given."""
-    row = {
-        "status": str(batch.status[i]),
-        "model": str(batch.model),
-        "iterations": int(batch.iterations[i]),
-        "redundancy": int(batch.redundancy[i]),
-        "views": int(batch.views[i].sum()),
-        "views_left_out": np.flatnonzero(~batch.views[i][:views]).tolist(),
-    }
-    if batch.remark[i]:
-        row["remark"] = str(batch.remark[i])
-    if batch.removed is not None:
-        removed = np.argwhere(batch.removed[i])
-        row["removed"] = len(removed) if brief else removed.tolist()
-    if batch.undetermined[i].any():
-        row["undetermined"] = np.array(batch.parameters)[batch.undetermined[i]].tolist()
-    if not batch.solved[i]:
-        return row
-    estimates = zip(batch.parameters, batch.values[i].tolist(), batch.sigma[i].tolist())
-    row |= {
-        "rms": float(batch.rms[i]),
-        "sigma0": float(batch.sigma0[i]),
-        "parameters": {name: {"value": v, "sigma": s} for name, v, s in estimates},
-    }
-    if not brief:
-        names = ("position", "angles", "sigma_position", "sigma_angles")
-        columns = zip(*(getattr(batch, name)[i][:views].tolist() for name in names))
-        row |= {
-            "covariance": batch.covariance[i].tolist(),
-            "poses": [dict(zip(names, values)) for values in columns],
-        }
-    return row

@@ -214,6 +214,15 @@ def test_bad_cameras_do_not_change_the_others(three, solved):
     assert str(found).startswith("6 cameras") and "1 not finite" in str(found)
 
 
+def test_a_batch_is_a_population(three, solved):
+    population = solved.population(["a", "b", "c"])
+    assert list(population.keys) == ["a", "b", "c"] and population.fit.all()
+    np.testing.assert_array_equal(population.values["fx"], solved.values[:, 0])
+    assert population.summary()["parameters"]["fx"]["median"] == np.median(solved.values[:, 0])
+    with pytest.raises(jaxbundle.InputError, match="ids must be 3, one a camera"):
+        solved.population(["a"])
+
+
 def frontal(p, views, tilt=0.0):
     """Images of the board parallel to it, but for `tilt` (radians); [views, 40, 2]."""
     rng = np.random.default_rng(7)
