@@ -10,5 +10,6 @@ from jaxbundle.calibration.rig.calibrate import calibrate_rig as calibrate_rig
 from jaxbundle.calibration.rig.result import RigCalibration as RigCalibration
 from jaxbundle.calibration.several import Calibrations as Calibrations
 from jaxbundle.calibration.several import calibrate_cameras as calibrate_cameras
+from jaxbundle.calibration.simulate import simulate_views as simulate_views
 from jaxbundle.measure import Board as Board
 from jaxbundle.measure.views import BoardViews as BoardViews

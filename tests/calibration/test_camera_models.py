@@ -4,6 +4,7 @@
 import json
 from pathlib import Path
 
+import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,11 +12,20 @@ import render
 from test_calibrate import normalised
 
 from jaxbundle.batch.calibrate import calibrate_batch
-from jaxbundle.calibration import Board, BoardViews, calibrate, compare_models
+from jaxbundle.calibration import (
+    Board,
+    BoardViews,
+    calibrate,
+    compare_models,
+    simulate_views,
+)
 from jaxbundle.calibration.files import json_text
 from jaxbundle.cameras import CameraModel, compare_cameras, get_model
 from jaxbundle.cameras.convert_fit import images_of
 from jaxbundle.errors import InputError
+from jaxbundle.geometry import matrix_from_omega_phi_kappa
+from jaxbundle.network import Camera
+from jaxbundle.planning.stations import stations_looking_at
 from jaxbundle.statistics.projection import interior_covariance_of_images
 
 NOISE = 0.1
@@ -221,3 +231,27 @@ def test_the_command_compares_models(fisheye, command, tmp_path, monkeypatch):
     said = command("calibrate", folder, "--board", "9x6", "--square", "0.03", "--models",
                    "opencv,brown", "--rig")  # fmt: skip
     assert said.status == 2 and "leave --rig out" in said.err
+
+
+def test_simulated_views_are_what_cv2_projects():
+    """The board seen from Z > 0 with Y up; what is outside the image is not there."""
+    camera = Camera("cam", "opencv", dict(fx=400.0, fy=402.0, cx=240.0, cy=178.0, k1=-0.2),
+                    image_size=SIZE)  # fmt: skip
+    middle = BOARD.points.mean(0)
+    places = middle + [[0.05, 0.02, 0.3], [-0.1, 0.1, 0.2]]
+    stations = stations_looking_at(places, middle + [0.04, 0, 0], up=(0, 1, 0), roll=0.3)
+    views = simulate_views(BOARD, camera, stations, noise=0.0)
+    K = np.array([[400, 0, 240], [0, 402, 178], [0, 0, 1.0]])
+    for xy, X0, angles in zip(views.xy, stations.position, stations.angles):
+        R = np.diag([1.0, -1, -1]) @ np.asarray(matrix_from_omega_phi_kappa(angles))
+        expected = cv2.projectPoints(BOARD.points, cv2.Rodrigues(R)[0], -R @ X0, K,
+                                     np.array([-0.2, 0, 0, 0]))[0][:, 0]  # fmt: skip
+        inside = ((expected >= -0.5) & (expected <= np.array(SIZE) - 0.5)).all(1)
+        np.testing.assert_array_equal(inside, np.isfinite(xy).all(1))
+        np.testing.assert_allclose(xy[inside], expected[inside], atol=1e-9)
+    assert views.visible.any(1).all() and not views.visible.all()
+    noisy = simulate_views(BOARD, camera, stations, noise=0.5, seed=1).xy - views.xy
+    assert 0.3 < np.nanstd(noisy) < 0.7
+    with pytest.raises(InputError, match="station 2 stands behind the board"):
+        behind = stations_looking_at(places * [[1, 1, 1], [1, 1, -1]], middle)
+        simulate_views(BOARD, camera, behind, noise=0.0)
