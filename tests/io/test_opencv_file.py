@@ -79,6 +79,26 @@ def test_fisheye_and_the_files_of_ros(tmp_path):
     assert camera.parameters["p2"] == 0.002
 
 
+@pytest.mark.parametrize("listed", [True, False])
+@pytest.mark.parametrize("names", ["kdrp", "KDRP"])
+def test_messages_of_ros(tmp_path, names, listed):
+    """CameraInfo as `ros2 topic echo` prints it, lists in lines or in brackets."""
+    K, d = [500.0, 0.0, 320.5, 0.0, 501.0, 240.0, 0.0, 0.0, 1.0], [0.1, -0.2, 0.001, 0.002, 0.0]
+    shown = lambda x: "\n" + "".join(f"- {v}\n" for v in x) if listed else f" {x}\n"
+    values = zip(names, (K, d, np.eye(3).ravel().tolist(), [*K, 0.0, 0.0, 0.0]))
+    path = tmp_path / "info.yaml"
+    path.write_text(
+        "header:\n  stamp: {sec: 17, nanosec: 3}\n  frame_id: left\nheight: 480\nwidth: 640\n"
+        "distortion_model: plumb_bob\n" + "".join(f"{k}:{shown(x)}" for k, x in values)
+        + "binning_x: 0\nroi:\n  x_offset: 0\n  do_rectify: false\n---\n"
+    )
+    assert is_opencv(path)
+    camera = read_opencv(path)
+    assert camera.image_size == (640, 480) and camera.model == "opencv"
+    assert [camera.parameters[n] for n in ("fx", "fy", "cx", "cy")] == [500, 501, 320.5, 240]
+    assert [camera.parameters[n] for n in ORDER[:5]] == d
+
+
 GOOD = {
     "image_width": 640, "image_height": 480,
     "camera_matrix": {"rows": 3, "cols": 3, "dt": "d", "data": [5e2, 0, 320, 0, 5e2, 240, 0, 0, 1]},
@@ -161,7 +181,8 @@ def test_broken_files_are_refused(tmp_path, name):
 @pytest.mark.parametrize(
     "text, message",
     [
-        ("", "camera_matrix is missing"),
+        ("", "the file is empty"),
+        ("name: x", "camera_matrix is missing"),
         ("camera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   data: [ 1, 2", "no end"),
         ("camera_matrix: 5\ncamera_matrix: 6\n", "twice"),
         ("camera_matrix: 5\n", "list of finite numbers"),

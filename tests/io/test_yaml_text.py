@@ -52,3 +52,10 @@ def test_what_is_read():
 def test_what_is_refused(text, message):
     with pytest.raises(InputError, match=f"f.*{message}"):
         parse_yaml("f", text)
+
+
+def test_what_nobody_asks_for_is_none():
+    text = "---\na: {b: 1,\n  c: [2, 3]}\nd: &e 1\nf: [4]\n---\n"
+    assert parse_yaml("f", text, lenient=True) == {"a": None, "d": None, "f": [4]}
+    with pytest.raises(InputError, match="line 2: .*braces"):
+        parse_yaml("f", text)

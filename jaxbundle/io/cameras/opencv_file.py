@@ -13,8 +13,9 @@
        …
        data: [ k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 ]      4, 5, 8, 12 or 14 of them
 
-The files of ROS, which look alike, are read as well: with `distortion_model` "equidistant" or
-"fisheye" the four coefficients are those of `kannala-brandt`. Pixels have their origin at the
+The files of ROS, which look alike, are read as well, and its message CameraInfo as it is printed
+(height, width, K and D, in ROS 2 k and d): with `distortion_model` "equidistant" or "fisheye" the
+four coefficients are those of `kannala-brandt`. Pixels have their origin at the
 centre of the first pixel, as ours. A skew and a tilted sensor (τx, τy),
 
     s·[x'', y'', 1] = [R33, 0, −R13; 0, R33, −R23; 0, 0, 1]·R·[x', y', 1]
@@ -24,7 +25,7 @@ centre of the first pixel, as ours. A skew and a tilted sensor (τx, τy),
 
 have no place in our models: where they are not 0 the nearest is fitted, which needs the image size.
 
-The reader knows what cameras need of YAML, and nothing else of it; other entries are skipped.
+Other entries are skipped.
 
 Source: OpenCV 4 documentation, XML/YAML/JSON file storages; ROS wiki, camera_calibration_parsers.
 """
@@ -46,6 +47,7 @@ from jaxbundle.io.cameras.nearest_camera import FittedCamera, Foreign, fitted_ca
 from jaxbundle.io.networks.assemble import all_parameters
 from jaxbundle.io.networks.losses import size_of, the_rest_is_0
 from jaxbundle.io.text.csv_tables import read_text, write_text
+from jaxbundle.io.text.yaml_text import parse_yaml
 from jaxbundle.network.columns import shown
 from jaxbundle.network.rules import check_camera
 from jaxbundle.network.tables import Camera
@@ -53,20 +55,20 @@ from jaxbundle.system.file_content import beginning, parse_json
 
 YAML = (".yaml", ".yml")
 SUFFIXES = (*YAML, ".json")
-MATRIX = ("camera_matrix", "cameraMatrix", "K")
-COEFFICIENTS = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "D")
+MATRIX = ("camera_matrix", "cameraMatrix", "K", "k")
+COEFFICIENTS = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "D", "d")
+OF_A_MESSAGE = b"distortion_model"
+"""What a file with a `k` alone must have, to be a message of ROS 2."""
 ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
 LENGTHS = (4, 5, 8, 12)
 FISHEYE = ("equidistant", "fisheye")
-
-_TOP = re.compile(r"([A-Za-z_]\w*)\s*:\s*(.*)")
-_INNER = re.compile(r"\s+([A-Za-z_]\w*)\s*:\s*(.*)")
 
 
 def is_opencv(path: Path) -> bool:
     """Whether a file has a name of this kind and mentions a camera matrix."""
     text = beginning(path, 1_000_000) if path.suffix.lower() in SUFFIXES else b""
-    return any(re.search(rb"^[\s{]*\"?%s\"?\s*:" % name.encode(), text, re.M) for name in MATRIX)
+    names = MATRIX if OF_A_MESSAGE in text else MATRIX[:-1]
+    return any(re.search(rb"^[\s{]*\"?%s\"?\s*:" % name.encode(), text, re.M) for name in names)
 
 
 def read_opencv(path: str | Path) -> Camera:
@@ -77,7 +79,7 @@ def read_opencv(path: str | Path) -> Camera:
     path = Path(path)
     text = read_text(path)
     is_json = path.suffix.lower() == ".json" or text.lstrip().startswith("{")
-    entries = _from_json(path, text) if is_json else _from_yaml(path, text)
+    entries = _from_json(path, text) if is_json else parse_yaml(path, text, lenient=True)
     name, K = _matrix(path, entries, MATRIX, (3, 3))
     for row, column, wanted in ((1, 0, 0), (2, 0, 0), (2, 1, 0), (2, 2, 1)):
         if K[row, column] != wanted:
@@ -226,47 +228,6 @@ def _from_json(path: Path, text: str) -> dict[str, Any]:
     if not isinstance(document, dict):
         raise InputError(f"{path}: an object with camera_matrix is expected")
     return document
-
-
-def _from_yaml(path: Path, text: str) -> dict[str, Any]:
-    """Entries of the first two levels: words, numbers, and lists of numbers."""
-    entries: dict[str, Any] = {}
-    top, lines = "", iter(enumerate(text.splitlines(), 1))
-    for number, line in lines:
-        if outer := _TOP.fullmatch(line.rstrip()):
-            top, value = outer.groups()
-            if top in entries:
-                raise InputError(f"{path}, line {number}: {top} stands there twice")
-            entries[top] = {} if not value or value.startswith("!!") else value
-            place = (entries, top)
-        elif (inner := _INNER.fullmatch(line.rstrip())) and isinstance(entries.get(top), dict):
-            key, value = inner.groups()
-            entries[top][key] = value
-            place = (entries[top], key)
-        else:
-            continue
-        if value.startswith("[") and "]" not in value:
-            parts = [value]
-            for _, more in lines:
-                parts.append(more)
-                if "]" in more:
-                    break
-            else:
-                raise InputError(f"{path}, line {number}: the list {place[1]} has no end")
-            value = " ".join(parts)
-        place[0][place[1]] = entries[top] if value.startswith("!!") or not value else _value(value)
-    return entries
-
-
-def _value(text: str):
-    """A number, a list of numbers, or the text itself."""
-    text = text.strip()
-    if text.startswith("["):
-        return [_value(word) for word in text.strip("[] \t").split(",") if word.strip()]
-    try:
-        return float(text)
-    except ValueError:
-        return text.strip("\"'")
 
 
 def _matrix(path: Path, entries: Mapping, names, shape):

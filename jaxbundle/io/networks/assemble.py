@@ -4,6 +4,7 @@ The readers give rotation matrices and numbers; here they become tables, with th
 command line put in.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -90,6 +91,12 @@ def network_of_cameras(cameras: Sequence[Camera], where: str) -> Network:
     )
     project = {"datum": "inner", "residuals": "measured", "object_unit": "model"}
     return _without_points(cameras, images, project).replace(warnings=())
+
+
+def unique_labels(labels: Sequence[str], ids: Sequence) -> list[str]:
+    """The labels, those that stand twice with their id."""
+    number = Counter(labels)
+    return [f"{label}#{id}" if number[label] > 1 else label for label, id in zip(labels, ids)]
 
 
 def image_columns(

@@ -31,7 +31,12 @@ import numpy as np
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import flip_rows
 from jaxbundle.io.cameras.nearest_camera import NoPlaceError
-from jaxbundle.io.networks.assemble import assemble, foreign_document, image_columns
+from jaxbundle.io.networks.assemble import (
+    assemble,
+    foreign_document,
+    image_columns,
+    unique_labels,
+)
 from jaxbundle.io.networks.control import with_control
 from jaxbundle.io.networks.metashape_camera import (
     label_of,
@@ -39,8 +44,7 @@ from jaxbundle.io.networks.metashape_camera import (
     sensor_camera,
 )
 from jaxbundle.io.networks.poses import check_rotations
-from jaxbundle.io.text.csv_tables import read_text
-from jaxbundle.io.text.xml_fields import number_in
+from jaxbundle.io.text.xml_fields import number_in, read_xml
 from jaxbundle.network.columns import Columns, count, some
 from jaxbundle.network.tables import Network, Points, Source
 from jaxbundle.system.file_content import beginning
@@ -77,10 +81,10 @@ def read_metashape(path: str | Path, overrides: Sequence[str] = ()) -> Network:
         raise InputError(f"{path}: no camera is enabled and aligned")
     entries, told = _entries(path, sensors, used)
     used = [camera for camera in used if camera.get("sensor_id") in entries]
-    labels = _unique([label_of(c) for c in used], [c.get("id", "") for c in used])
+    labels = unique_labels([label_of(c) for c in used], [c.get("id", "") for c in used])
     poses = [_pose(f"{path}, camera {label!r}", camera, chunk)
              for label, camera in zip(labels, used)]  # fmt: skip
-    names = _unique([e["id"] for e in entries.values()], list(entries))
+    names = unique_labels([e["id"] for e in entries.values()], list(entries))
     for entry, name in zip(entries.values(), names):
         entry["id"] = name
     M, X0 = (np.stack(part) for part in zip(*poses))
@@ -127,15 +131,7 @@ def _entries(path: Path, sensors: dict, used: Sequence[ET.Element]):
 
 
 def _chunk(path: Path) -> ET.Element:
-    text = read_text(path)
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise InputError(f"{path}: a document type or entities are not expected in this file")
-    try:
-        root = ET.fromstring(text)
-    except (ET.ParseError, ValueError) as error:
-        raise InputError(f"{path}: not valid XML: {error}") from None
-    except RecursionError:
-        raise InputError(f"{path}: not valid XML: elements are nested too deeply") from None
+    root = read_xml(path)
     chunks = root.findall("chunk")
     if root.tag != "document" or len(chunks) != 1:
         raise InputError(
@@ -182,7 +178,7 @@ def _markers(path: Path, chunk: ET.Element, images: dict):
             seen[id] = None
     if not rows:
         return None, None, None
-    names = dict(zip(seen, _unique([label_of(markers[id]) for id in seen], list(seen))))
+    names = dict(zip(seen, unique_labels([label_of(markers[id]) for id in seen], list(seen))))
     none = [None] * len(seen)
     image, point, x, y = zip(*rows)
     return (
@@ -247,9 +243,3 @@ def _accuracy(chunk: ET.Element) -> float:
 def _true(word: str | None) -> bool:
     """Whether an attribute is not switched off; old versions write 0 and 1."""
     return (word or "true").lower() not in ("false", "0")
-
-
-def _unique(labels: Sequence[str], ids: Sequence[str]) -> list[str]:
-    """The labels, those that stand twice with their id."""
-    return [f"{label}#{id}" if labels.count(label) > 1 else label
-            for label, id in zip(labels, ids)]  # fmt: skip

@@ -31,7 +31,12 @@ import numpy as np
 
 from jaxbundle.errors import InputError
 from jaxbundle.geometry.pose_conventions import flip_rows
-from jaxbundle.io.networks.assemble import assemble, foreign_document, image_columns
+from jaxbundle.io.networks.assemble import (
+    assemble,
+    foreign_document,
+    image_columns,
+    unique_labels,
+)
 from jaxbundle.io.networks.control import with_control
 from jaxbundle.io.networks.losses import (
     need_values,
@@ -98,7 +103,8 @@ def read_openmvg(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     ) if ids]  # fmt: skip
     if any(view.get("use_pose_center_prior") for view in views.values()):
         told.append("priors of projection centres (use_pose_center_prior) are not read")
-    image_ids = _unique({key: _name(view) for key, view in views.items()})
+    labels = unique_labels([_name(view) for view in views.values()], list(views))
+    image_ids = dict(zip(views, labels))
     network = assemble(
         path, foreign_document(path.stem, cameras.values()), overrides,
         _images(path, views, image_ids, poses),
@@ -189,12 +195,6 @@ def _views(scene: JsonFields, cameras: Mapping, spherical: set[int]):
 
 def _name(view: JsonFields) -> str:
     return "/".join(filter(None, (view.get("local_path"), view.text("filename"))))
-
-
-def _unique(names: Mapping[int, str]) -> dict[int, str]:
-    """The names, those that stand twice with their number."""
-    given = list(names.values())
-    return {k: f"{name}#{k}" if given.count(name) > 1 else name for k, name in names.items()}
 
 
 def _images(path: Path, views: Mapping, names: Mapping, poses: Mapping) -> Columns:

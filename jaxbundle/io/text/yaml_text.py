@@ -3,7 +3,7 @@
 Blocks of keys and of lists by indentation, lists in brackets (over several lines too), texts with
 and without quotes, numbers, true, false, null, comments. Tags (`!!opencv-matrix`), the `%YAML` line
 and `---` are skipped. Dictionaries in braces, anchors, texts over several lines, and a second
-document are refused by name.
+document are refused by name; or, where a file has much that nobody asks for, read as None.
 
 Source: YAML 1.2, the chapters on block and flow collections.
 """
@@ -20,6 +20,7 @@ KEY = re.compile(r"""("[^"]*"|'[^']*'|[^\s\[\]{},"'#&*!|>%@-][^\s:]*|-[^\s:]+)\s
 NUMBER = re.compile(r"[-+]?(\d{1,300}\.?\d*|\.\d+)([eE][-+]?\d{1,4})?")
 COMMENT = re.compile(r"""((?:"[^"]*"|'[^']*'|[^"'#]|(?<=\S)#)*)(?:(?:^|(?<=\s))#.*)?""")
 TAG = re.compile(r"!\S*\s*")
+OPEN, CLOSE = re.compile(r"[\[{]"), re.compile(r"[\]}]")
 WORDS = {"true": True, "false": False, "null": None, "~": None, "": None}
 NOT_READ = {
     "{": "a dictionary in braces", "&": "an anchor", "*": "an alias", "|": "a block of text",
@@ -30,8 +31,8 @@ NOT_READ = {
 class Line:
     """A line that counts: its number, its indentation, and the rest."""
 
-    def __init__(self, path: str | Path, number: int, text: str):
-        self.path, self.number = path, number
+    def __init__(self, path: str | Path, number: int, text: str, lenient: bool = False):
+        self.path, self.number, self.lenient = path, number, lenient
         self.indent, self.text = len(text) - len(text.lstrip()), text.strip()
 
     def error(self, message: str) -> InputError:
@@ -39,12 +40,13 @@ class Line:
         return InputError(f"{self.path}, line {self.number}: {message}")
 
 
-def parse_yaml(path: str | Path, text: str) -> dict[str, Any]:
-    """The document of a text, which must be one of keys.
+def parse_yaml(path: str | Path, text: str, *, lenient: bool = False) -> dict[str, Any]:
+    """The document of a text, which must be one of keys; `lenient`: a value of a sort that is not
+    read here is None.
 
     **Raises:** `InputError` naming the line.
     """
-    lines = _lines(path, text)
+    lines = _lines(path, text, lenient)
     if not lines:
         raise InputError(f"{path}: the file is empty; keys and values are expected")
     value, rest = _block(lines, lines[0].indent, 0)
@@ -55,25 +57,27 @@ def parse_yaml(path: str | Path, text: str) -> dict[str, Any]:
     return value
 
 
-def _lines(path: str | Path, text: str) -> list[Line]:
-    """The lines without comments; a list in brackets is one line."""
+def _lines(path: str | Path, text: str, lenient: bool) -> list[Line]:
+    """The lines without comments; a list in brackets, or what is in braces, is one line."""
     lines: list[Line] = []
-    open_brackets = 0
+    open_brackets, ended = 0, 0
     for number, raw in enumerate(text.splitlines(), 1):
         found = COMMENT.match(raw)
         bare = (found[1] if found else raw).rstrip()
         if not bare or (raw.startswith(("%", "---", "...")) and not open_brackets):
             if raw.startswith("---") and lines:
-                raise InputError(f"{path}, line {number}: a second document is not expected")
+                ended = ended or number
             continue
+        if ended:
+            raise InputError(f"{path}, line {ended}: a second document is not expected")
         if "\t" in bare[: len(bare) - len(bare.lstrip())] and not open_brackets:
             raise InputError(f"{path}, line {number}: indentation by tabs; YAML has blanks")
         if open_brackets:
             lines[-1].text += " " + bare.strip()
         else:
-            lines.append(Line(path, number, bare))
+            lines.append(Line(path, number, bare, lenient))
         plain = re.sub(r"\"[^\"]*\"|'[^']*'", "", bare)
-        open_brackets = max(0, open_brackets + plain.count("[") - plain.count("]"))
+        open_brackets = max(0, open_brackets + len(OPEN.findall(plain)) - len(CLOSE.findall(plain)))
     if open_brackets:
         raise lines[-1].error(f"the list {shown(lines[-1].text)} has no end")
     return lines
@@ -95,7 +99,7 @@ def _items(lines: list[Line], indent: int, depth: int) -> tuple[list, list[Line]
     values = []
     while lines and lines[0].indent == indent and _is_item(lines[0]):
         line, lines = lines[0], lines[1:]
-        inner = Line(line.path, line.number, " " * (indent + 1) + line.text[1:])
+        inner = Line(line.path, line.number, " " * (indent + 1) + line.text[1:], line.lenient)
         if inner.text and not _is_item(inner) and not KEY.fullmatch(inner.text):
             values.append(_value(inner, inner.text))
         elif inner.text:
@@ -136,6 +140,8 @@ def _nested(lines: list[Line], indent: int, depth: int) -> tuple[Any, list[Line]
 def _value(line: Line, text: str) -> Any:
     """A scalar, or a list in brackets."""
     text = text.strip()
+    if text[:1] in NOT_READ and line.lenient:
+        return None
     if text[:1] in NOT_READ:
         raise line.error(f"{shown(text)}: {NOT_READ[text[0]]} is not read here")
     if not text.startswith("["):
