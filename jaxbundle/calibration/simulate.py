@@ -3,8 +3,9 @@
 import numpy as np
 
 from jaxbundle.arguments import at_least_zero
-from jaxbundle.calibration.pixels import in_pixels, unit_size
+from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.cameras import get_model
+from jaxbundle.cameras.pixel_frame import in_pixels
 from jaxbundle.errors import InputError
 from jaxbundle.measure.boards import Board, require_board
 from jaxbundle.measure.views import BoardViews
