@@ -1,4 +1,4 @@
-"""What is adjusted: the tables of a network, their checks, and how the engine sees them."""
+"""Networks: tables, checks, and their declaration to the engine."""
 
 from jaxbundle.network.arrays import Data as Data
 from jaxbundle.network.arrays import Values as Values

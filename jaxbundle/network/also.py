@@ -1,7 +1,7 @@
-"""Observations of a user's own kinds, and the tables of unknowns they bring, for a network.
+"""Observations of user-defined kinds, and their tables of unknowns, for a network.
 
-They touch the network's rows by id ("image", "camera", "point") and see object coordinates as they
-are, not relative to the network's origin.
+They touch the network's rows by id ("image", "camera", "point") and receive unreduced object
+coordinates, not relative to the network's origin.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ OWN = ("image", "camera", "point")
 @dataclasses.dataclass(frozen=True)
 class InObjectSpace:
     """A residual whose blocks of points and poses (`of`) are moved from the network's origin to
-    where they are."""
+    object coordinates."""
 
     residual: Callable
     of: tuple[str, ...]
@@ -44,7 +44,7 @@ class InObjectSpace:
 def split(also: Sequence[Table | Observations]) -> tuple[list[Table], list[Observations]]:
     """The tables and the observations of them.
 
-    **Raises:** `InputError` for anything else, and for a table that the network has itself."""
+    **Raises:** `InputError` for anything else, and for the name of a table of the network."""
     tables = [item for item in also if isinstance(item, Table)]
     observations = [item for item in also if isinstance(item, Observations)]
     for item in also:
@@ -55,7 +55,7 @@ def split(also: Sequence[Table | Observations]) -> tuple[list[Table], list[Obser
             )
     for table in tables:
         if table.name.split(",")[0] in OWN:
-            raise InputError(f"also: the network has a table {table.name!r} itself")
+            raise InputError(f"also: the network already has a table {table.name!r}")
     return tables, observations
 
 

@@ -1,4 +1,4 @@
-"""The arrays an adjustment works on, in the order of the network: unknowns and observations.
+"""The arrays of an adjustment, in the order of the network: unknowns and observations.
 
 Rotations live on the manifold: an image carries a unit quaternion, and its change is a rotation
 vector δθ in the camera frame, M ← exp([δθ]×)·M. Everything else adds. Object coordinates are
@@ -14,12 +14,12 @@ from jaxbundle.types import AnyArray
 
 
 class Values(eqx.Module):
-    """All quantities of the network, the free and the fixed ones.
+    """All quantities of the network, free and fixed.
 
     `camera`: interior orientation in the order of the model's parameters (padded with 0);
     `position`: projection centres; `rotation`: unit quaternions (w, x, y, z), object → camera;
     `point`: object coordinates. Positions and points are relative to the network's origin.
-    `other`: the tables that came with further kinds of observations, by name.
+    `other`: the tables of further kinds of observations, by name.
     """
 
     camera: Float[AnyArray, "cameras parameters"]
@@ -30,11 +30,11 @@ class Values(eqx.Module):
 
 
 class Data(eqx.Module):
-    """What was measured or is given; every field can be differentiated.
+    """Measured and given data; every field is differentiable.
 
     A weight is 1/σ (a priori), in the reciprocal unit of its value; 0 switches a row off.
-    `start` holds the start values of the unknowns, the values of what is fixed, and the
-    coordinates the datum refers to; `other` (measured, weight) of observations of further kinds.
+    `start` contains the start values of the unknowns, the values of fixed quantities, and the
+    coordinates that define the datum; `other` (measured, weight) of observations of further kinds.
     """
 
     start: Values
@@ -51,8 +51,7 @@ class Data(eqx.Module):
     other: tuple[tuple[PyTree[Array], AnyArray], ...] = ()
 
     def measured(self, kind: str) -> AnyArray:
-        """What was measured, or is given, of a kind: image, control, exterior, interior,
-        distance."""
+        """The data of a kind: image, control, exterior, interior, distance."""
         return self.image_xy if kind == "image" else getattr(self, kind)
 
     def weight(self, kind: str) -> AnyArray:

@@ -11,8 +11,8 @@ The columns are those of the project format:
 | distances | from, to, value, sigma |
 | antennas, attitudes, differences, angles, figures, shapes | `jaxbundle.network.further` |
 
-The columns X0, Y0, Z0 of images, and omega, phi, kappa, may be left out, all three together.
-Missing values (None, NaN, empty text) mean: no start value, no σ. A σ of an image may be "fixed"
+The columns X0, Y0, Z0 of images, and omega, phi, kappa, are optional, all three together.
+Missing values (None, NaN, empty text) mean no start value or no σ. A σ of an image may be "fixed"
 (the value is held), a σ of a control point "free" (this axis is not controlled).
 """
 
@@ -60,12 +60,12 @@ from jaxbundle.network.units import ANGLE_UNITS, from_image_unit
 CAMERA_FIELDS = ("id", "model", "image_size", "pixel_size", "free", "sigma", "tie")
 IMAGE_COLUMNS = ("id", "camera", *EXTERIOR)
 GROUPS = EXTERIOR[:3], EXTERIOR[3:]
-"""Columns of images that may be left out, together."""
+"""Columns of images that may be omitted together."""
 IMAGE_SIGMAS = tuple(f"s{name}" for name in EXTERIOR)
 POINT_COLUMNS = ("id", "role", *AXES)
 POINT_SIGMAS = tuple(f"s{name}" for name in AXES)
 POINT_ERRORS = ("error_px", "error_mm")
-"""Reprojection errors, as tables of points are written with them; not used."""
+"""Reprojection errors in written point tables; not used."""
 OBSERVATION_COLUMNS = ("image", "point", "x", "y")
 OBSERVATION_SIGMAS = ("sx", "sy")
 DISTANCE_COLUMNS = ("from", "to", "value", "sigma")
@@ -88,22 +88,21 @@ def make_network(
     name: str = "network",
     **further: Any,
 ) -> Network:
-    """A network from plain tables (see the module's docstring for their columns).
+    """Make a network from plain tables (see the module's docstring for their columns).
 
     **Arguments:**
 
     - `cameras`: `Camera`s, dict rows, or a data frame; parameters in the unit of the model.
     - `images`: exterior orientation, start values (object unit, `angle_unit`) and prior σ.
     - `points`: object coordinates (object unit) and σ.
-    - `observations`: image coordinates and σ in `image_unit`; they are converted to the unit of
-      the camera's model, which needs its image_size and pixel_size. A row is a measurement: a
-      coordinate that is NaN or masked is refused with its row, while in the arrays of
-      `calibrate_batch`, where every view has a place for every point, it was not measured.
+    - `observations`: image coordinates and σ in `image_unit`; they are converted to the unit of the
+      camera's model, which needs its image_size and pixel_size. A NaN or masked coordinate is an
+      error (unlike in `calibrate_batch`, where it means a missing measurement).
     - `sigma_image`: σ of image coordinates without their own (None: 1, with a warning).
     - `further`: tables of further kinds of observations, and the settings of their sections, by
       name: `antennas=table, antenna={"lever_arm": [0.1, 0, 0.3], "free": ["shift"]}`.
 
-    **Raises:** `InputError` naming table, row and column. `check_network` does the rest.
+    **Raises:** `InputError` naming table, row and column. `check_network` makes the other checks.
     """
     given: dict[str, Any] = {"datum": datum, "residuals": residuals,
              "angle_unit": angle_unit, "image_unit": image_unit}  # fmt: skip
@@ -176,7 +175,7 @@ def add_further(network: Network, *, angle_unit: str = "rad", **further: Any) ->
 def make_further(given: Mapping[str, Any], radians: float, where: str = "") -> tuple[Further, ...]:
     """Observations of further kinds from their tables and the settings of their sections.
 
-    **Raises:** `InputError`, also for a name of neither, and for settings without a table."""
+    **Raises:** `InputError`, also for an unknown name, and for settings without a table."""
     known = (*KINDS, *SECTIONS)
     for name in given:
         if name not in known:
@@ -196,7 +195,7 @@ def make_cameras(
 ) -> tuple[Camera, ...]:
     """Checked cameras from `Camera`s, dict rows, or a table; `where` begins every message.
 
-    `models`: own models that the rows may name.
+    `models`: user-defined models that the rows may name.
     """
     if isinstance(cameras, Camera):
         cameras = [cameras]

@@ -14,8 +14,8 @@ from jaxbundle.network.tables import Camera
 
 @dataclasses.dataclass(frozen=True)
 class CameraTable:
-    """The cameras of one model, and of one way in which its parameters are tied: the name of their
-    table, the model, its parameters, and which of the network's cameras they are."""
+    """The cameras of one model with the same ties: the name of their table, the model, its
+    parameters, and the indices of the cameras."""
 
     name: str
     model: str | CameraModel
@@ -24,7 +24,7 @@ class CameraTable:
     tie: tuple[tuple[str, ...], ...] = ()
 
     def unknowns(self, cameras: Sequence[Camera]) -> ls.Table:
-        """The table; only parameters that are free in some camera of it move."""
+        """The table; only parameters that are free in some camera are unknowns."""
         own = [cameras[c] for c in self.cameras]
         unknowns = [camera.unknowns for camera in own]
         free = np.array([[name in names for name in self.parameters] for names in unknowns])
@@ -42,7 +42,7 @@ class CameraTable:
 
 
 def camera_tables(cameras: Sequence[Camera]) -> tuple[CameraTable, ...]:
-    """Which cameras share a table: those of one model and the same ties."""
+    """Groups of cameras that share a table: those of one model with the same ties."""
     sorts = [(get_model(c.model), c.tie) for c in cameras]
     different = tuple(dict.fromkeys(sorts))
     named = lambda model, tie: ", ".join(["camera", model.name, *(" = ".join(g) for g in tie)])

@@ -1,7 +1,7 @@
-"""Everything is checked before the solver sees it; what is wrong is said with its place.
+"""Checks of a network before the adjustment; errors are reported with their location.
 
-`check_network` looks at every value of every table, then (`jaxbundle.network.sightings`) at
-what can be determined from them: rays a point, points an image, connected parts, redundancy.
+`check_network` checks every value of every table, then (`jaxbundle.network.sightings`)
+determinability: rays per point, points per image, connected parts, redundancy.
 """
 
 import math
@@ -45,13 +45,13 @@ from jaxbundle.network.units import ANGLE_UNITS
 
 
 def check_network(network: Network) -> Network:
-    """The network as it can be adjusted, or a complaint a person can act on.
+    """The adjustable network, or an error that tells the user what to do.
 
-    Control points without σ become fixed; cameras no image uses, points with too few rays and
-    distances between fixed points are left out, each with a warning on the network. Check points
-    stay in it but count for nothing: set them aside with `split_check_points`.
+    Control points without σ become fixed; unused cameras, points with too few rays and
+    distances between fixed points are removed, each with a warning on the network. Check points
+    are kept but not counted: remove them with `split_check_points`.
 
-    **Raises:** `InputError`, one line with file, row, thing and remedy.
+    **Raises:** `InputError`, one line with file, row, cause and remedy.
     """
     everything = network = check_tables(network)
     network = leave_out_undetermined(network)
@@ -66,8 +66,8 @@ def check_network(network: Network) -> Network:
 
 
 def check_tables(network: Network) -> Network:
-    """The network with every value looked at, whatever can be determined from them; start values
-    may be missing. As in `check_network`."""
+    """The network with every value checked as in `check_network`, but not determinability; start
+    values may be missing."""
     require_network(network)
     for key, choices in CHOICES.items():
         check_choice(key, getattr(network, key), choices)
@@ -81,7 +81,7 @@ def check_tables(network: Network) -> Network:
 
 
 def _check_sizes(network: Network) -> None:
-    """Tables have rows, columns of one length, and indices that stay inside."""
+    """Check that tables have rows, columns of equal length, and valid indices."""
     if not network.cameras:
         raise InputError("the network has no camera; give at least one")
     images, points, observations = network.images, network.points, network.observations
@@ -178,7 +178,7 @@ def _check_images(network: Network) -> None:
 
 
 def _check_points(network: Network) -> Network:
-    """Also: control points without σ become fixed, those with no controlled axis tie."""
+    """Also make control points without σ fixed, and those without a controlled axis tie points."""
     points, sigma = network.points, network.points.sigma
     check_unique(points.id, points.source, "point")
     _refuse(
@@ -251,12 +251,12 @@ def _check_observations(network: Network) -> None:
         first, second = int(order[k]), int(order[k + 1])
         raise InputError(
             f"{observations.source(second)}: {_sighting(network, second)} "
-            f"stands already in {observations.source(first)}; remove one of them"
+            f"is already in {observations.source(first)}; remove one of them"
         )
 
 
 def _check_distances(network: Network) -> Network:
-    """Also: distances between two fixed points are left out."""
+    """Also remove distances between two fixed points."""
     distances, points = network.distances, network.points
     names = [" to ".join(repr(points.id[k]) for k in ends) for ends in distances.points]
     for row in np.flatnonzero(distances.points[:, 0] == distances.points[:, 1])[:1]:
@@ -272,8 +272,8 @@ def _check_distances(network: Network) -> Network:
             )
     for row in np.flatnonzero(points.has_role("check")[distances.points].any(1))[:1]:
         raise InputError(
-            f"{distances.source(row)}: distance {names[row]}: a check point takes no part in the "
-            "adjustment; make it a tie point or remove the distance"
+            f"{distances.source(row)}: distance {names[row]}: a check point is excluded from the "
+                "adjustment; make it a tie point or remove the distance"
         )
     idle = np.all(points.has_role("fixed")[distances.points], axis=1)
     if idle.any():
@@ -325,7 +325,7 @@ def _refuse_missing(table, values, names, thing):
 
 
 def _warn_of_points_behind(network: Network) -> Network:
-    """A warning where a start value puts a point behind the camera that sees it (q ≥ 0)."""
+    """A warning if a start value puts a point behind the camera that sees it (q ≥ 0)."""
     images, rays = network.images, network.observations
     omega, phi, _ = images.angles.T
     axis = np.stack([np.sin(phi), -np.cos(phi) * np.sin(omega), np.cos(phi) * np.cos(omega)], 1)

@@ -1,8 +1,7 @@
 """A table as columns of raw values, and their conversion to ids and numbers.
 
-What a user gives as a data frame, a dict of columns or a list of dicts, and what a file reader
-finds as text, all pass through `Columns`; so a bad cell is reported in the same words wherever
-it came from.
+Data frames, dicts of columns, lists of dicts, and text from file readers all pass through
+`Columns`, so that a bad cell is always reported in the same words.
 """
 
 import dataclasses
@@ -23,7 +22,8 @@ from jaxbundle.network.tables import Source
 from jaxbundle.types import Column
 
 NO_NUMBERS = (bool, np.bool_, complex, np.complexfloating, type(np.ma.masked))
-"""Python or numpy converts them: truth values to 0 and 1, complex numbers to their real parts."""
+"""Types that Python or NumPy would convert silently: Booleans to 0 and 1, complex numbers to their
+real parts."""
 NO_UNITS: Mapping[str, str] = MappingProxyType({})
 
 
@@ -59,7 +59,7 @@ class Columns:
             raise InputError(f"{self.source.name}: the table is empty; give at least one row")
 
     def ids(self, name: str) -> tuple[str, ...]:
-        """A column of ids or words; whole numbers become text, surrounding blanks go."""
+        """A column of ids or words; integers become text, surrounding blanks are removed."""
         values = self.values[name]
         if isinstance(values, np.ndarray) and values.dtype.kind in "iu":
             return tuple(map(str, values.tolist()))
@@ -109,7 +109,7 @@ class Columns:
     def indices(self, name: str, thing: str, of: Mapping[str, int], where: str) -> Int[
         np.ndarray, " rows"
     ]:
-        """A column of ids as indices into another table (`thing`s that stand in `where`)."""
+        """A column of ids as indices into another table (`thing`s in `where`)."""
         ids = self.ids(name)
         try:
             return np.fromiter(map(of.__getitem__, ids), np.int64, len(ids))
@@ -175,7 +175,7 @@ def _column(values: Any, column: str, name: str) -> Column:
 
 
 def is_missing(value: Any) -> bool:
-    """None, NaN, empty text, what is masked, and the missing values of pandas."""
+    """None, NaN, empty text, masked values, and the missing values of pandas."""
     if value is None or value is np.ma.masked:
         return True
     if isinstance(value, str):
@@ -199,14 +199,14 @@ def quoted(name: Any) -> str:
 
 
 def some(names: Iterable[Any], most: int = 5, as_text: Callable[[Any], str] = quoted) -> str:
-    """The first few names of a list, and how many more there are."""
+    """The first few names of a list, and the number of others."""
     names = list(names)
     text = ", ".join(map(as_text, names[:most]))
     return f"{text} and {len(names) - most} more" if len(names) > most else text
 
 
 def count(number: SupportsIndex, thing: str, rest: str = "") -> str:
-    """A number of things, in words: "1 image", "3 images", "3 images held"."""
+    """A count in words: "1 image", "3 images", "3 images held"."""
     return f"{number} {thing}{'' if index(number) == 1 else 's'}{rest}"
 
 
@@ -221,7 +221,7 @@ def _id(value: Any) -> str:
 
 
 def _plain_numbers(values: Column) -> np.ndarray | None:
-    """The fast way, for columns without a missing or odd cell; else None."""
+    """Fast conversion of columns without missing or unusual cells; else None."""
     if isinstance(values, np.ndarray) and values.dtype.kind in "iuf":
         return values.astype(float)
     if any(isinstance(value, NO_NUMBERS) for value in values):

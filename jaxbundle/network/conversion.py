@@ -1,10 +1,10 @@
 """A network with its cameras in another model: parameters, image points and their σ.
 
-Exterior orientations and object points stay as they are. An image point keeps its pixel, or, where
-source and target have the same unit and axes, its coordinates. The one exception is `snavely`,
-which has no principal point: its image points count from the camera's own.
+Exterior orientations and object points are unchanged. An image point keeps its pixel, or, if
+source and target have the same unit and axes, its coordinates. The only exception is `snavely`,
+which has no principal point: its image points are relative to that of the source camera.
 
-What a fit costs is told for every camera (`jaxbundle.cameras.Conversion`).
+The error of a fit is reported for every camera (`jaxbundle.cameras.Conversion`).
 """
 
 import dataclasses
@@ -24,21 +24,21 @@ COUNTERPARTS = (
     ("c", "f", "fx", "fy"), ("x0", "cx"), ("y0", "cy"), ("K1", "k1"), ("K2", "k2"), ("K3", "k3"),
     ("P1", "P2", "p1", "p2"),
 )  # fmt: skip
-"""Parameters of different models that mean the same; what is free in one is free in the other."""
+"""Corresponding parameters of different models; free in one means free in the other."""
 
 
 def convert_cameras(
     network: Network, model: str | CameraModel, r0: float = 0.0, only: Sequence[str] | None = None,
     measured: bool = False,
 ) -> tuple[Network, dict[str, Conversion]]:  # fmt: skip
-    """The network with all cameras, or `only` some, in the model of this name, or an own one.
+    """The network with all cameras, or `only` some, in the model with this name, or a given one.
 
-    **Arguments:** `r0` of the target, mm, where it has one; `measured`: a fit looks at the area the
-    measurements cover, as it does where the camera has no image size, and not at the whole image.
+    **Arguments:** `r0` of the target, mm, if it has one; `measured`: fit over the measured area, as
+    is done for a camera without image size, instead of the whole image.
 
-    **Returns:** the network, and by camera what its conversion cost.
+    **Returns:** the network, and by camera its `Conversion`.
 
-    **Raises:** `InputError` where a size is missing, or nothing can be fitted.
+    **Raises:** `InputError` if a size is missing, or nothing can be fitted.
     """
     model = key_of(model_of(model))
     rays = network.observations
@@ -63,12 +63,12 @@ def convert_cameras(
     kept = tuple(one for one in network.further if not isinstance(one, Edges))
     if done and len(kept) < len(network.further):
         converted = converted.replace(further=kept).warn(
-            "edges are left out: their image points belong to the models before the conversion"
+            "edges are dropped: their image points refer to the models before the conversion"
         )
     dropped = [c.id for c in network.cameras if c.id in done and c.sigma]
     if dropped:
         converted = converted.warn(
-            f"prior σ of the parameters of {', '.join(dropped)} are dropped: they belong to the "
+            f"prior σ of the parameters of {', '.join(dropped)} are dropped: they refer to the "
             "model before the conversion"
         )
     return converted, done
@@ -77,7 +77,7 @@ def convert_cameras(
 def convert_one(
     camera: Camera, model: str | CameraModel, r0: float = 0.0
 ) -> tuple[Camera, Conversion]:
-    """A camera in the model of this name, or an own one, and what the conversion cost."""
+    """A camera in the model with this name, or a given one, and its `Conversion`."""
     made, conversion, _, _ = _converted(camera, model, r0, np.zeros((0, 2)))
     return made, conversion
 
@@ -122,8 +122,8 @@ def _centred(camera: Camera):
 
 
 def _counterparts(free: Sequence[str], source: CameraModel, target: CameraModel):
-    """What is free of the target. Distortion of an own model has no counterparts: of such a model,
-    or from one, all of it is free that is free if nothing is said, or none."""
+    """The free parameters of the target. Distortion parameters of user-defined models have no
+    counterparts: to or from such a model either all default free parameters are free, or none."""
     if is_own(source) or is_own(target):
         fields = "principal_distance", "principal_point"
         wanted = {n for f in fields if {*getattr(source, f)} & {*free} for n in getattr(target, f)}

@@ -9,7 +9,7 @@ from jaxbundle.network.kinds import SIMILARITY
 def open_directions_in_words(gauge: Float[np.ndarray, "7 defect"], about=(0.0, 0.0, 0.0)) -> str:
     """Which of shift, rotation and scale the observations leave open, for messages.
 
-    Rotation and scale are about the place `about`: with one point known, no shift is open."""
+    Rotation and scale are about the point `about`: with one point known, no shift is open."""
     gauge = np.array(gauge)
     gauge[:3] += np.cross(gauge[3:6].T, about).T + np.outer(about, gauge[6])
     q, _ = np.linalg.qr(gauge / np.linalg.norm(gauge, axis=0)) if gauge.size else (gauge, None)

@@ -1,8 +1,8 @@
 """A network as tables of unknowns and sets of observations for the engine.
 
-Cameras of one model share a table, which is called "camera" where there is one model only. A
-`Layout` knows where each array of `Data` and `Values`, in the order of the network, stands among
-the engine's tables and sets.
+Cameras of one model share a table, which is named "camera" if there is only one model. A `Layout`
+maps the arrays of `Data` and `Values`, in the order of the network, to the engine's tables and
+sets.
 """
 
 import dataclasses
@@ -33,13 +33,13 @@ from jaxbundle.network.further.rolling_shutter import RollingShutter
 from jaxbundle.network.tables import EXTERIOR, Network
 
 LEAST_IMAGES = 64
-"""So many rotations at least are computed at once, so that small networks share the program."""
+"""Smallest batch of rotations, so that small networks share the program."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Set:
     """A set of observations: the field of `Data`, its rows and columns there (None: all);
-    `constant`: what its kind is told of every row besides what was measured."""
+    `constant`: further constants per row for its kind."""
 
     field: str
     rows: Int[np.ndarray, " n"] | None = None
@@ -47,7 +47,7 @@ class Set:
     constant: Float[np.ndarray, " n"] | None = None
 
     def measured(self, data: Data):
-        """What was measured, as the kind takes it."""
+        """The measurements, in the form of the kind."""
         xy = self.cut(data.measured(self.field))
         return xy if self.constant is None else (xy, self.constant)
 
@@ -65,9 +65,9 @@ class Set:
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Where the arrays of a network stand; `width`: of `Values.camera`; `given`: the points, images
-    and cameras that the rows of control, exterior and interior belong to; `lengths`: where points
-    move at any distance, the unit of theirs, 0 of the others."""
+    """The mapping of the arrays of a network; `width`: of `Values.camera`; `given`: the points,
+    images and cameras of the rows of control, exterior and interior; `lengths`: the unit of
+    distance of points at any distance, 0 for the others."""
 
     cameras: tuple[CameraTable, ...]
     sets: tuple[Set, ...]
@@ -106,21 +106,21 @@ class Layout:
         return module.concatenate([point, self.lengths[:, None]], 1)
 
     def coordinate_cofactors(self, point, Q):
-        """The cofactors of X, Y, Z of all points, of those of the directions in which they move."""
+        """The cofactors of X, Y, Z of all points, from those of their directions of change."""
         if self.lengths is None:
             return Q
         A = jax.vmap(derivative)(jnp.asarray(self._points(point)))
         return A @ Q @ A.transpose(0, 2, 1)
 
     def data(self, data: Data) -> EngineData:
-        """The numbers of a network as the engine's."""
+        """The data of a network for the engine."""
         measured = tuple(s.measured(data) for s in self.sets)
         weight = tuple(_of_rows(s.cut(data.weight(s.field))) for s in self.sets)
         other = tuple(zip(*data.other)) or ((), ())
         return EngineData(self.tables(data.start), measured + other[0], weight + other[1])
 
     def with_weights(self, data: Data, weight) -> Data:
-        """The numbers with the weights of the engine's sets."""
+        """The data with the weights of the engine's sets."""
         found = {}
         for s, w in zip(self.sets, weight):
             name = f"{s.field}_weight"
@@ -130,7 +130,7 @@ class Layout:
         return dataclasses.replace(data, other=other, **jax.device_put(found))
 
     def rows(self, by_set, data: Data) -> "Rows":
-        """What the engine has found for every set of observations, in the order of `Data`."""
+        """The engine's results by set of observations, in the order of `Data`."""
         found = {}
         for field in ("image", "control", "exterior", "interior", "distance"):
             found[field] = np.zeros(np.shape(data.weight(field)))
@@ -140,7 +140,7 @@ class Layout:
 
 
 class Rows(NamedTuple):
-    """One number for every residual, by kind, in the order of `Data`."""
+    """One number per residual, by kind, in the order of `Data`."""
 
     image: Float[np.ndarray, "rays 2"]
     control: Float[np.ndarray, "control 3"]
@@ -151,7 +151,7 @@ class Rows(NamedTuple):
 
 
 def _put(whole, at, part):
-    """The array with a part in it: on the host, where nothing is compiled for it, unless traced."""
+    """The array with a part set: on the host, to avoid compiling, unless traced."""
     if isinstance(part, Tracer) or isinstance(whole, Tracer):
         return jnp.asarray(whole).at[at].set(part)
     whole[at] = part
@@ -159,13 +159,13 @@ def _put(whole, at, part):
 
 
 def _of_rows(weight):
-    """[n, r], also of kinds with one residual."""
+    """[n, r], also for kinds with one residual."""
     return weight if weight.ndim == 2 else weight[:, None]
 
 
 @dataclasses.dataclass(frozen=True)
 class Declared:
-    """What the engine is asked, and how its arrays are those of the network (`layout`, `data`);
+    """The engine's problem, and the mapping to the arrays of the network (`layout`, `data`);
     `origin` [3] was subtracted from all object coordinates."""
 
     tables: tuple[ls.Table, ...]
@@ -179,7 +179,7 @@ class Declared:
 def declare(network: Network, origin=None, also=(), lengths=None) -> Declared:
     """The tables and observations of a checked network (`check_network`) without check points.
 
-    `origin`: of its coordinates, the middle of its points if not given; `also`: further tables, and
+    `origin`: of its coordinates, default the centroid of its points; `also`: further tables, and
     observations of further kinds (`also.py`); `lengths`: of points at any distance (`Layout`)."""
     data, origin, priors = _data(network, origin)
     further, others = split(also)
@@ -228,8 +228,8 @@ def declare(network: Network, origin=None, also=(), lengths=None) -> Declared:
 
 
 def _observed(network: Network, data: Data, priors, cameras: tuple[CameraTable, ...]):
-    """Image points, control, priors and distances: which rows of the network they are (`Set`), and
-    the observations."""
+    """Image points, control, priors and distances: their rows in the network (`Set`), and the
+    observations."""
     images, observations = network.images, network.observations
     row_of_camera = np.zeros(len(network.cameras), np.int64)
     for t in cameras:
@@ -266,8 +266,8 @@ def _observed(network: Network, data: Data, priors, cameras: tuple[CameraTable, 
 
 
 def order_cameras(network: Network) -> Network:
-    """The same network with its cameras in the order of the images, where each has its own: the
-    engine then has one block for an image and its camera."""
+    """The same network with its cameras in the order of the images, if each image has its own: the
+    engine then uses one block for an image and its camera."""
     used = network.images.camera
     if len(used) == len(network.cameras) and len(set(used)) == len(used):
         images = dataclasses.replace(network.images, camera=np.arange(len(used)))
@@ -276,7 +276,7 @@ def order_cameras(network: Network) -> Network:
 
 
 def _quaternions(angles):
-    """By a program that small networks share."""
+    """Rotations, by a program shared by small networks."""
     wide = np.resize(angles, (max(rounded(len(angles)), LEAST_IMAGES), 3))
     return np.asarray(_quaternions_of(wide))[: len(angles)]
 

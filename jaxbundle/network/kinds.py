@@ -8,9 +8,9 @@
 | interior orientation | the camera's parameters | camera |
 | distances | d | two points |
 
-Residuals are computed minus observed. Nothing else in the package knows how an image coordinate
-depends on an unknown. A similarity of object space changes no image coordinate: what is left open
-by the others of these is the datum.
+Residuals are computed minus observed. Only this module defines how an image coordinate depends on
+the unknowns. A similarity of object space changes no image coordinate: the freedoms left open by
+the other kinds are the datum defect.
 """
 
 import dataclasses
@@ -29,8 +29,8 @@ from jaxbundle.network.further.rolling_shutter import READ_OUT, VELOCITIES
 @dataclasses.dataclass(frozen=True)
 class ImagePoint:
     """The two residuals of an image point, in the unit of the camera model; of poses, cameras and
-    points it takes scalars. Each of the poses (of a network one) leads into the frame of the next,
-    the last into that of the camera."""
+    points it takes scalars. Each of the poses (one in a network) transforms to the frame of the
+    next, the last to that of the camera."""
 
     model: str | cameras.CameraModel
     domain: str
@@ -44,7 +44,7 @@ class ImagePoint:
 
 @dataclasses.dataclass(frozen=True)
 class MovingImagePoint(ImagePoint):
-    """The same of a camera that moves while its lines are exposed (`further.rolling_shutter`)."""
+    """The same for a moving camera with a rolling shutter (`further.rolling_shutter`)."""
 
     def __call__(self, pose, velocity, read_out, interior, point, measured):
         xy, line = measured
@@ -75,7 +75,8 @@ def _difference(value, given):
 
 
 def exterior(pose, given):
-    """Projection centre and ω, φ, κ (on the branch of the given ones) less the given values [6]."""
+    """Projection centre and ω, φ, κ (on the branch of the given ones) minus the given values
+    [6]."""
     angles = omega_phi_kappa_near(pose.rotation.matrix(), given[3:])
     return jnp.concatenate([jnp.stack(pose.centre), angles]) - given
 

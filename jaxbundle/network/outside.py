@@ -1,5 +1,5 @@
-"""What lies outside the image of its camera: coordinates that count from another origin, or a wrong
-image size, show so."""
+"""Points outside the image of their camera, which indicate another origin of coordinates or a wrong
+image size."""
 
 from collections.abc import Sequence
 
@@ -13,8 +13,8 @@ from jaxbundle.network.tables import Camera, Network
 
 
 def is_outside(camera: Camera, xy: Float[np.ndarray, "any 2"]) -> Bool[np.ndarray, " any"]:
-    """Whether image points, in the unit of the model, are outside the camera's image; none is where
-    its size is not known."""
+    """Whether image points, in the unit of the model, are outside the camera's image; False if its
+    size is unknown."""
     try:
         low, high = image_area(get_model(camera.model), camera.image_size, camera.pixel_size)
     except ValueError:
@@ -23,7 +23,7 @@ def is_outside(camera: Camera, xy: Float[np.ndarray, "any 2"]) -> Bool[np.ndarra
 
 
 def outside_warnings(cameras: Sequence[Camera], network: Network | None = None) -> tuple[str, ...]:
-    """A line for every camera whose principal point, or image points of a network, are outside."""
+    """A message for every camera whose principal point or image points are outside."""
     found = []
     for c, camera in enumerate(cameras):
         model, size = get_model(camera.model), camera.image_size
@@ -35,7 +35,7 @@ def outside_warnings(cameras: Sequence[Camera], network: Network | None = None) 
         if point.size and is_outside(camera, point).any():
             found.append(
                 f"{where}the principal point ({point[0, 0]:.6g}, {point[0, 1]:.6g}) {model.unit} "
-                f"is outside the image of {size[0]} × {size[1]} pixels; it counts from the {origin}"
+                f"is outside the image of {size[0]} × {size[1]} pixels; relative to the {origin}"
             )
         if network is None:
             continue
@@ -49,6 +49,6 @@ def outside_warnings(cameras: Sequence[Camera], network: Network | None = None) 
                 f"{size[0]} × {size[1]} pixels, such as point "
                 f"{network.points.id[rays.point[out[0]]]!r} of image "
                 f"{images.id[rays.image[out[0]]]!r} at ({x:.6g}, {y:.6g}) {model.unit} from the "
-                f"{origin}; do the coordinates count from there, and is the size right?"
+                f"{origin}; check the origin of the coordinates and the image size"
             )
     return tuple(found)

@@ -1,6 +1,6 @@
 """The same measurements under two names: an image, or a point, that repeats another.
 
-They count twice in σ, and a point as well as its repetition is a second opinion of nothing.
+They count twice in σ, and the repetition is no independent information.
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from jaxbundle.network.columns import count, some
 from jaxbundle.network.tables import Network
 
 LEAST = 3
-"""Image points that agree to the last digit before an image repeats another; of a point, images."""
+"""Number of exactly equal image points for an image to repeat another; of images for a point."""
 
 
 MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
@@ -19,7 +19,7 @@ MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.
 
 
 def warn_of_repetitions(network: Network) -> Network:
-    """The network with a warning for images, and points, whose measurements are those of others."""
+    """The network with a warning for images and points that repeat the measurements of others."""
     rays, images, points = network.observations, network.images, network.points
     for thing, ids, of, by, remedy in (
         ("image", images.id, rays.image, rays.point, "is it one photograph under two names?"),
@@ -36,7 +36,7 @@ def warn_of_repetitions(network: Network) -> Network:
 
 
 def _repetitions(of, by, xy) -> Sequence[tuple[int, int]]:
-    """(first, repetition) of the things whose rows (`by`, x, y) are all the same.
+    """Pairs (first, repetition) whose rows (`by`, x, y) are all equal.
 
     Sums of hashed rows, modulo 2⁶⁴ and so in any order, find candidates among millions of points;
     only these are compared row by row."""

@@ -1,10 +1,9 @@
-"""How far the image points of an object point are from where the network projects it.
+"""The reprojection error: distance between projected and measured image points.
 
     e = |x(X; X0, M, camera) − x measured|        in the measured image; of a point: the mean over
                                                   its image points
 
-as COLMAP's `ERROR` has it. In pixels where the cameras have them or their pixel size is known, else
-in mm.
+as in COLMAP's `ERROR`. In pixels if the cameras have pixels or a pixel size, else in mm.
 """
 
 from functools import partial
@@ -21,7 +20,7 @@ from jaxbundle.geometry import matrix_from_omega_phi_kappa
 from jaxbundle.network.tables import Network
 
 AT_ONCE = 4096
-"""Image points of a portion: all networks share a program for each camera model."""
+"""Batch size of image points: all networks share one program per camera model."""
 
 
 def point_errors(network: Network) -> tuple[Float[np.ndarray, " points"], str]:

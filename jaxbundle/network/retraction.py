@@ -1,4 +1,4 @@
-"""Where a step leads: images turn about what they see."""
+"""The retraction of a network: images rotate about the points they see."""
 
 import dataclasses
 
@@ -16,14 +16,14 @@ from jaxbundle.network.kinds import ImagePoint
 
 @dataclasses.dataclass(frozen=True)
 class TurnAboutSeen:
-    """`retract`, but every image turns about the middle of the points it sees.
+    """`retract`, but every image rotates about the centre of the points it sees.
 
-    To first order the same. A long step that turns an image and shifts it, so that it keeps its
-    points, keeps them only if the turn is about them: about its own projection centre they leave
-    the image by the second-order terms. (A problem of 16 images of close-up scenes: 12 steps to
-    the minimum instead of 21.) The middle is that of the points weighted by 1/distance², as much as
-    they say about the position; so far ones do not pull it away. Images whose position is held
-    turn about it.
+    To first order the same. A long step that rotates and shifts an image so that it keeps its
+    points keeps them only if the rotation is about them: a rotation about the projection centre
+    moves them out of the image by second-order terms. (A problem of 16 images of close-up scenes:
+    12 steps to the minimum instead of 21.) The centre is weighted by 1/distance², the information
+    of a point about the position, so that far points do not dominate it. Images with held position
+    rotate about it.
     """
 
     declared: Declared
@@ -47,7 +47,7 @@ class TurnAboutSeen:
         return moved | {"image": PoseValue(jnp.where(free, turned, new.position), new.rotation)}
 
     def _middle(self, plan: Plan, values: Values):
-        """The middle of the points that each image sees; 0 where it sees none."""
+        """The centre of the points that each image sees; 0 if it sees none."""
         position, points = values["image"].position, values["point"][:, :3]
         seen = jnp.zeros((position.shape[0], 4))
         for part in plan.parts:

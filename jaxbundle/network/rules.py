@@ -1,4 +1,4 @@
-"""Rules that one value, one id or one camera must obey; readers use them before `check_network`."""
+"""Checks of single values, ids and cameras, used by readers before `check_network`."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -29,7 +29,7 @@ CHOICES = {
     "angle_unit": tuple(ANGLE_UNITS),
     "image_unit": IMAGE_UNITS,
 }
-"""The settings that are one of a few words."""
+"""The settings with a fixed set of values."""
 
 
 def check_choice(key: str, value: str, choices: Sequence[str], where: str = "") -> None:
@@ -38,28 +38,28 @@ def check_choice(key: str, value: str, choices: Sequence[str], where: str = "") 
 
 
 def check_unique(ids: Sequence[str], source: Source, thing: str) -> None:
-    """Refuse an id that stands in two rows of a table."""
+    """Refuse an id that occurs in two rows of a table."""
     if len(set(ids)) == len(ids):
         return
     first: dict[str, int] = {}
     for row, id in enumerate(ids):
         if first.setdefault(id, row) != row:
             raise InputError(
-                f"{source(row)}: {thing} {id!r} stands already in {source(first[id])}; "
+                f"{source(row)}: {thing} {id!r} is already in {source(first[id])}; "
                 "an id must be unique"
             )
 
 
 def model_of(model: str | CameraModel, where: str = "") -> CameraModel:
-    """The camera model of this name, or the own model that is given.
+    """The camera model with this name, or the given user-defined one.
 
-    **Raises:** `InputError`, for a name of none, or the name of another."""
+    **Raises:** `InputError` for an unknown name, or the name of another model."""
     if not isinstance(model, CameraModel) and not is_known(model):
         known = did_you_mean(model, (*MODEL_NAMES, *FAMILIES))
         raise InputError(
             f"{where}unknown {'' if where else 'camera '}model {shown(model)}{known}"
-            f"{'' if known.endswith('?') else ';'} one of your own is given as a CameraModel, to a "
-            "file that names it by read_network(path, models=[…])"
+            f"{'' if known.endswith('?') else ';'} pass your own as a CameraModel, for a "
+        "file that names it by read_network(path, models=[…])"
         )
     try:
         return get_model(model)
@@ -68,21 +68,22 @@ def model_of(model: str | CameraModel, where: str = "") -> CameraModel:
 
 
 def check_models(cameras: Sequence[Camera], where: str = "") -> None:
-    """Refuse two different models of one name: files and reports could not tell them apart."""
+    """Refuse two different models with the same name: files and reports could not distinguish
+    them."""
     first: dict[str, Camera] = {}
     for camera in cameras:
         other = first.setdefault(str(camera.model), camera)
         if other.model != camera.model:
             raise InputError(
-                f"{where}cameras {other.id!r} and {camera.id!r} have different models of the name "
-                f"{str(camera.model)!r}; give one of them another name, or both the same object"
+                f"{where}cameras {other.id!r} and {camera.id!r} have different models named "
+                f"{str(camera.model)!r}; rename one of them, or give both the same object"
             )
 
 
 def check_camera(camera: Camera, where: str = "") -> None:
     """Refuse an unknown model or parameter, and impossible values, σ and sizes.
 
-    `where` begins the message: "project.toml, ".
+    `where`: prefix of the message, such as "project.toml, ".
     """
     text(f"{where}id of a camera", camera.id)
     where = f"{where}camera {camera.id!r}: "
@@ -102,14 +103,14 @@ def check_camera(camera: Camera, where: str = "") -> None:
                 f"{did_you_mean(name, model.parameters)}"
             )
         if name in model.never_free:
-            raise InputError(f"{where}{name} cannot be estimated; take it out of free")
+            raise InputError(f"{where}{name} cannot be estimated; remove it from free")
         if camera.free.count(name) > 1:
             raise InputError(f"{where}free names {name} twice")
     for name, sigma in camera.sigma.items():
         if name not in camera.free:
             raise InputError(
-                f"{where}sigma is given for {name!r}, which is not free; add it to free, or take "
-                f"its sigma away (free: {', '.join(camera.free) or 'none'})"
+                f"{where}sigma is given for {name!r}, which is not free; add it to free, or remove "
+                f"its sigma (free: {', '.join(camera.free) or 'none'})"
             )
         if not _positive(sigma):
             raise InputError(f"{where}sigma of {name} is {sigma}; it must be finite and positive")
@@ -119,7 +120,7 @@ def check_camera(camera: Camera, where: str = "") -> None:
 
 
 def _check_fields(camera: Camera, where: str) -> None:
-    """Refuse fields that are no numbers by name, names, or groups of names."""
+    """Refuse fields that are not numbers by name, names, or groups of names."""
     if not isinstance(camera.model, str | CameraModel):
         raise InputError(f"{where}model is {shown(camera.model)}; expected a name or a CameraModel")
     for field in ("parameters", "sigma"):
@@ -152,7 +153,7 @@ def _check_ties(camera: Camera, values, where: str) -> None:
     for group in camera.tie:
         if len({values.get(name, 0.0) for name in group}) > 1:
             start = ", ".join(f"{name} {values.get(name, 0.0):g}" for name in group)
-            raise InputError(f"{where}tied parameters are one unknown, but start with different "
+            raise InputError(f"{where}tied parameters are one unknown, but have different "
                              f"values: {start}")  # fmt: skip
 
 
@@ -163,7 +164,7 @@ def _check_pair(where, name, pair, meaning):
 
 
 def check_sigma_image(sigma: float, where: str = "") -> None:
-    """Refuse a default σ of image coordinates that is no finite positive number."""
+    """Refuse a default σ of image coordinates that is not finite and positive."""
     if isinstance(sigma, bool) or not isinstance(sigma, int | float | np.number):
         raise InputError(f"{where}sigma_image is {shown(sigma)}; a number is expected")
     if not _positive(sigma):

@@ -1,8 +1,8 @@
-"""Who sees whom: what the rays of a network can determine, and what has to be left out.
+"""Visibility: what the rays of a network can determine, and what must be excluded.
 
 A point needs three equations: two from every ray, one from every distance and every controlled
-axis. An image needs six: two from every ray, one from every prior. Parts of the network that no
-common point connects each need a datum of their own.
+axis. An image needs six: two from every ray, one from every prior. Disconnected parts of the
+network each need their own datum.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ def split_check_points(network: Network) -> tuple[Network, Points, Observations]
 
 
 def keep_points(network: Network, keep: Bool[np.ndarray, " points"]) -> Network:
-    """The network with some of its points; rays and distances of the others go with them."""
+    """The network with some of its points, without rays and distances of the others."""
     if keep.all():
         return network
     index = np.cumsum(keep) - 1
@@ -49,7 +49,7 @@ def keep_points(network: Network, keep: Bool[np.ndarray, " points"]) -> Network:
 
 
 def keep_images(network: Network, keep: Bool[np.ndarray, " images"]) -> Network:
-    """The network with some of its images; the rays of the others go with them."""
+    """The network with some of its images, without the rays of the others."""
     if keep.all():
         return network
     observations = network.observations.take(keep[network.observations.image])
@@ -71,7 +71,7 @@ def without_distances(network: Network, drop: Bool[np.ndarray, " distances"]) ->
 
 
 def with_roles(points: Points, mask: Bool[np.ndarray, " points"], role: str) -> Points:
-    """The same points, some of them in another role."""
+    """The same points with another role for some of them."""
     if not mask.any():
         return points
     roles = tuple(role if new else old for new, old in zip(mask, points.role))
@@ -79,7 +79,7 @@ def with_roles(points: Points, mask: Bool[np.ndarray, " points"], role: str) -> 
 
 
 def controlled_axes(points: Points):
-    """How many coordinates of each point are known: fixed 3, control those with a finite σ."""
+    """The number of known coordinates of each point: fixed 3, control those with a finite σ."""
     axes = np.isfinite(points.sigma).sum(1)
     return np.where(
         points.has_role("fixed"), 3, np.where(points.has_role("control"), axes, 0)
@@ -87,7 +87,8 @@ def controlled_axes(points: Points):
 
 
 def equations_of(network: Network, things: str) -> Int[np.ndarray, " things"]:
-    """How many equations of further kinds touch every image ("IMAGES") or point ("POINTS")."""
+    """The number of equations of further kinds that touch every image ("IMAGES") or point
+    ("POINTS")."""
     table = network.images if things == "IMAGES" else network.points
     number = np.zeros(len(table), int)
     for one in among(network):
@@ -97,7 +98,7 @@ def equations_of(network: Network, things: str) -> Int[np.ndarray, " things"]:
 
 
 def leave_out_undetermined(network: Network) -> Network:
-    """The network without points that too few rays determine, with warnings that name them."""
+    """The network without points with too few rays, with warnings that list them."""
     points, distances = network.points, network.distances
     fixed, check = points.has_role("fixed"), points.has_role("check")
     rays = np.bincount(network.observations.point, minlength=len(points))
@@ -125,7 +126,7 @@ def leave_out_undetermined(network: Network) -> Network:
     for one in network.further:
         gone = len(one) - len(one.among(keep_points(network, keep)))
         if gone:
-            messages.append(f"{one.TABLE}: left out {count(gone, 'row')} of what was left out")
+            messages.append(f"{one.TABLE}: left out {count(gone, 'row')} about excluded objects")
     lost = (~keep[distances.points].all(1)).sum()
     if lost:
         messages.append(f"left out {count(lost, 'distance')} to a point that was left out")
@@ -137,9 +138,9 @@ def leave_out_undetermined(network: Network) -> Network:
 
 
 def check_images(before: Network, network: Network) -> None:
-    """Refuse an image with too few points; `before` is the network with nothing left out.
+    """Refuse an image with too few points; `before` is the complete network.
 
-    **Raises:** `InputError`; `NotSolvedError` where the image has points enough, but no other
+    **Raises:** `InputError`; `NotSolvedError` if the image has enough points, but no other
     image sees them.
     """
     images, points = network.images, before.points
@@ -173,7 +174,7 @@ def check_images(before: Network, network: Network) -> None:
 
 
 def check_parts(network: Network) -> None:
-    """Refuse parts of the network that nothing connects and nothing positions."""
+    """Refuse parts of the network that are neither connected nor positioned."""
     images, points, rays = network.images, network.points, network.observations
     known = controlled_axes(points) == 3
     ties = ~(known | points.has_role("check"))[rays.point]
@@ -191,8 +192,8 @@ def check_parts(network: Network) -> None:
         smallest = loose[size[loose].argmin()]
         names = [id for id, p in zip(images.id, part) if p == smallest]
         raise InputError(
-            f"{images.source.name}: the network falls into {len(labels)} parts with no tie point "
-            f"in common, and a part has only {count(known_points[smallest], 'known point')}: "
+            f"{images.source.name}: the network consists of {len(labels)} parts without common tie "
+            f"points, and one part has only {count(known_points[smallest], 'known point')}: "
             f"{count(len(names), 'image')} {some(names)}; measure common points, or at least 3 "
             "control points in it"
         )
@@ -218,8 +219,8 @@ def connected_parts(image, point, images: int, points: int):
 
 
 def check_redundancy(network: Network) -> None:
-    """Refuse fewer observations, priors and datum conditions than unknowns; with observations of
-    further kinds, which bring unknowns of their own, the adjustment finds that out."""
+    """Refuse fewer observations, priors and datum conditions than unknowns; with further kinds,
+    which have their own unknowns, the adjustment detects this."""
     if network.further:
         return
     images, points = network.images, network.points

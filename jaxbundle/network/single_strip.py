@@ -1,7 +1,7 @@
-r"""Projection centres on one line, and nothing else that fixes the datum: a single strip with GNSS.
+r"""A datum fixed only by collinear projection centres: a single strip with GNSS.
 
 Their coordinates fix position, scale and two rotations; the third, about the line, moves none of
-them. Centres that lie off it by s fix the roll of the block to about σ/(s·√n).
+them. Centres off the line by s fix the roll of the block to about σ/(s·√n).
 """
 
 import numpy as np
@@ -10,19 +10,19 @@ from jaxbundle.errors import InputError
 from jaxbundle.network.tables import Network
 
 ON_A_LINE = 1e-7
-"""Distances from a line, in parts of its length, that are none."""
+"""Relative distances from a line that count as zero."""
 WEAK = 1.0
-"""Degrees: a σ of the roll above this is told."""
+"""Degrees: a larger σ of the roll is reported."""
 REMEDY = (
     "give a control point beside the strip, a σ of omega or phi, or photographs of a crossing strip"
 )
 
 
 def check_single_strip(network: Network) -> Network:
-    """The network, with a warning where the rotation about the line of its projection centres is
-    hardly determined.
+    """The network, with a warning if the rotation about the line of its projection centres is
+    poorly determined.
 
-    **Raises:** `InputError` where it is not at all.
+    **Raises:** `InputError` if it is undetermined.
     """
     images, points = network.images, network.points
     sigma = images.sigma[:, :3]
@@ -47,6 +47,6 @@ def check_single_strip(network: Network) -> Network:
     if roll > WEAK:
         return network.warn(
             f"{where} but for {off.max():.2g} {network.object_unit}: the rotation about the axis "
-            f"of the strip (its roll) is known to some {roll:.2g}° only; {REMEDY}"
+            f"of the strip (its roll) is known only to about {roll:.2g}°; {REMEDY}"
         )
     return network

@@ -1,8 +1,7 @@
 """The tables of a network: cameras, images, points, observations, distances.
 
-A table is a frozen dataclass of numpy columns. It knows where its rows came from (`Source`), so
-that every complaint can name the file and the row. Rows refer to each other by index; the ids
-are kept beside them for people.
+A table is a frozen dataclass of numpy columns with the source of its rows (`Source`), so that every
+message can name file and row. Rows refer to each other by index; ids are kept for reports.
 
 | column | meaning |
 |---|---|
@@ -34,14 +33,14 @@ EXTERIOR = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
 
 @dataclasses.dataclass(frozen=True)
 class Source:
-    """Where a table was read: a name, and the number of each row in it (None: counted from 1)."""
+    """The source of a table: a name, and the number of each row in it (None: counted from 1)."""
 
     name: str
     numbers: Int[np.ndarray, " rows"] | None = None
     word: str = "row"
 
     def __call__(self, row: SupportsIndex) -> str:
-        """The place of a row, as a person would look it up."""
+        """The location of a row, for messages."""
         number = index(row) + 1 if self.numbers is None else self.numbers[row]
         return f"{self.name}, {self.word} {number}"
 
@@ -55,10 +54,10 @@ class Source:
 
 @dataclasses.dataclass(frozen=True)
 class Camera:
-    """One camera: a model of `jaxbundle.cameras`, its start values, what is free, its priors.
+    """One camera: a model of `jaxbundle.cameras`, start values, free parameters, priors.
 
-    `model` is the name of a built-in model, or a `CameraModel`, one's own. `parameters` not given
-    start at 0 (or the model's own default); `sigma` gives a parameter a prior: a pseudo-observation
+    `model` is the name of a built-in model, or your own `CameraModel`. Missing `parameters`
+    start at 0 (or the model's default); `sigma` gives a parameter a prior: a pseudo-observation
     of its start value. `image_size` is (columns, rows), `pixel_size` (width, height) in mm. `tie`:
     groups of parameters that are one unknown, such as `(("fx", "fy"),)`.
     """
@@ -77,13 +76,13 @@ class Camera:
 
     @property
     def unknowns(self) -> tuple[str, ...]:
-        """The names of what is free, of tied parameters the first."""
+        """The names of the free parameters; of tied ones the first."""
         first = {name: group[0] for group in self.tie for name in group}
         return tuple(dict.fromkeys(first.get(name, name) for name in self.free))
 
 
 def units_of(cameras: Iterable[Camera]) -> str:
-    """The unit of image coordinates, that of the cameras' models."""
+    """The unit of image coordinates, that of the camera models."""
     return "/".join(sorted({get_model(camera.model).unit for camera in cameras}))
 
 
@@ -103,7 +102,7 @@ class Images:
         return len(self.id)
 
     def take(self, rows) -> "Images":
-        """The chosen images (a mask or indices), their places kept for messages."""
+        """The chosen images (a mask or indices), with their source rows."""
         rows = np.flatnonzero(rows) if np.asarray(rows).dtype == bool else np.asarray(rows)
         return Images(
             tuple(self.id[row] for row in rows), self.camera[rows], self.position[rows],
@@ -126,7 +125,7 @@ class Points:
         return len(self.id)
 
     def take(self, rows) -> "Points":
-        """The chosen points (a mask or indices), their places kept for messages."""
+        """The chosen points (a mask or indices), with their source rows."""
         rows = np.flatnonzero(rows) if np.asarray(rows).dtype == bool else np.asarray(rows)
         return Points(
             tuple(self.id[row] for row in rows), tuple(self.role[row] for row in rows),
@@ -134,14 +133,14 @@ class Points:
         )
 
     def has_role(self, *roles: str) -> Bool[np.ndarray, " points"]:
-        """Which points play one of these roles."""
+        """Which points have one of these roles."""
         return np.isin(np.array(self.role, dtype=object), roles)
 
 
 @shows_itself
 @dataclasses.dataclass(frozen=True)
 class Observations:
-    """Measured image points: which point in which image, where, and how well (σ)."""
+    """Measured image points: image, point, coordinates, σ."""
 
     image: Int[np.ndarray, " rays"]
     point: Int[np.ndarray, " rays"]
@@ -153,7 +152,7 @@ class Observations:
         return len(self.image)
 
     def take(self, rows) -> "Observations":
-        """The chosen rows (a mask or indices), their places kept for messages."""
+        """The chosen rows (a mask or indices), with their source rows."""
         return Observations(
             self.image[rows], self.point[rows], self.xy[rows], self.sigma[rows],
             self.source.take(rows),
@@ -175,20 +174,20 @@ class Distances:
 
     @staticmethod
     def none() -> "Distances":
-        """No distances at all."""
+        """An empty table of distances."""
         return Distances(np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0))
 
 
 @shows_itself
 @dataclasses.dataclass(frozen=True)
 class Network:
-    """A photogrammetric network: everything an adjustment needs, checked before it is used.
+    """A photogrammetric network: the complete input of an adjustment, checked before use.
 
     `datum` is "control" (given by control points, priors), "inner" (inner constraints on
     `datum_points`, all tie points if empty) or "minimal" (as many coordinates held as the network
     has datum defects). `residuals` names the domain in which v = computed − observed is formed.
     `further`: observations of further kinds (`network/further`), which name images and points by
-    id. `warnings` tell what was left out and why; they end up in the report.
+    id. `warnings` list exclusions with their reasons, for the report.
     """
 
     cameras: tuple[Camera, ...]
@@ -211,7 +210,7 @@ class Network:
         return dataclasses.replace(self, **changes)
 
     def warn(self, *messages: str) -> "Network":
-        """A copy that carries further warnings."""
+        """A copy with further warnings."""
         return self.replace(warnings=(*self.warnings, *messages))
 
     def __str__(self) -> str:
@@ -223,14 +222,14 @@ class Network:
 
 
 def require_network(network: Network, name: str = "network") -> Network:
-    """The network, or a complaint about what was given instead.
+    """The network, or an error for anything else.
 
     **Raises:** `InputError`."""
     if isinstance(network, Network):
         return network
     is_path = isinstance(network, str | os.PathLike)
     remedy = f"jaxbundle.read_network({os.fspath(network)!r})" if is_path else (
-        "jaxbundle.read_network(path), make_network or simulate give one"
+        "use jaxbundle.read_network(path), make_network or simulate"
     )
     raise InputError(f"{name} must be a Network, but is {shown(network)}: {remedy}"
                      + " reads it" * is_path)  # fmt: skip

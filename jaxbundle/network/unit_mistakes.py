@@ -1,10 +1,10 @@
-"""Numbers in the wrong unit, where no camera and no object could explain them.
+"""Detection of wrong units: numbers that no camera or object can explain.
 
 The widest lenses show 90° from the axis, where r/c is 2 in a stereographic image and less in other
-fisheyes; 84° in a central projection are r/c = 10. Nothing is refused for a narrow field: c may be
-as long as it likes, and microscopes and telescopes have fields of any size. Where it is narrower
-than `NARROW_FIELD` and the same number in pixels would be that of a usual lens, that is said: as a
-warning if the size of the pixels tells, else as a likely cause where the adjustment fails.
+fisheyes; 84° in a central projection are r/c = 10. A narrow field is never refused: c may be
+arbitrarily long, as in microscopes and telescopes. If the field is narrower than `NARROW_FIELD` and
+the same number in pixels would be a common lens, this is reported: as a warning if the pixel size
+confirms it, else as a likely cause if the adjustment fails.
 """
 
 import numpy as np
@@ -15,9 +15,9 @@ from jaxbundle.network.columns import count, some
 from jaxbundle.network.tables import Camera, Network
 
 WIDEST = 10.0
-"""r/c above which no image point is: half of those of a camera, so that blunders do not count."""
+"""Largest possible median r/c of the image points of a camera (a median, to ignore blunders)."""
 FIELDS = (0.02, 5.0)
-"""r/c that cameras commonly have; asked of a remedy only."""
+"""Common range of r/c, used only to check a remedy."""
 COARSE, FINE, NARROW = 0.1, 1e-4, 1e-3
 """Pixels, mm, larger or smaller than those of sensors; and r/c less than those of cameras."""
 NARROW_FIELD = 0.02
@@ -36,7 +36,7 @@ THOUSAND = (300.0, 3000.0)
 def check_units(network: Network) -> Network:
     """The network, with warnings for lengths that seem to be in another unit.
 
-    **Raises:** `InputError` where half of a camera's image points would lie beyond any lens."""
+    **Raises:** `InputError` if half of a camera's image points would be outside any lens."""
     of_camera = network.images.camera[network.observations.image]
     said = []
     for c, camera in enumerate(network.cameras):
@@ -74,9 +74,8 @@ def _check_field(camera: Camera, xy) -> str:
 
 
 def name_pixels(network: Network) -> str:
-    """Which principal distance in mm may be one in pixels, in words; empty where none may.
-
-    A likely cause only: a telescope cannot be told from it where pixels have no size."""
+    """A message about a principal distance in mm that may be in pixels; else empty. Only a likely
+    cause: without pixel size it cannot be distinguished from a telescope."""
     of_camera = network.images.camera[network.observations.image]
     rows = (network.observations.xy[of_camera == c] for c in range(len(network.cameras)))
     first, *more = [
@@ -126,7 +125,7 @@ def _remedy(camera: Camera, unit: str, name: str, c: float, usual: float) -> str
 
 
 def _control_against_ties(network: Network) -> str:
-    """Control in millimetres and start values in metres, or the other way round."""
+    """Control in millimetres and start values in metres, or vice versa."""
     points = network.points
     there = np.isfinite(points.position).all(1)
     control = there & points.has_role("control", "fixed")
@@ -144,7 +143,7 @@ def _control_against_ties(network: Network) -> str:
 
 
 def _distances_against_control(network: Network) -> str:
-    """Distances in millimetres between control points in metres, or the other way round."""
+    """Distances in millimetres between control points in metres, or vice versa."""
     points, distances = network.points, network.distances
     known = points.has_role("control", "fixed") & np.isfinite(points.position).all(1)
     if not len(distances):
@@ -160,7 +159,7 @@ def _distances_against_control(network: Network) -> str:
         return ""
     return (
         f"distances a thousand times those of the control points, or a thousandth: {some(off)}; "
-        f"are they in {network.object_unit}, as the control points?"
+        f"are they in {network.object_unit}, like the control points?"
     )
 
 

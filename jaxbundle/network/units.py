@@ -6,9 +6,10 @@ origin is the image centre, x to the right, y up:
     x = (u − (w − 1)/2)·p_x        y = −(v − (h − 1)/2)·p_y
 
 with the image size (w, h) in pixels and the pixel size (p_x, p_y) in mm. Inside a network an
-image coordinate has the unit and axes of its camera's model, whatever the project's unit is.
-A model in pixels takes the pixels of a project as they are; where its y points up (`snavely`),
-they count from the image centre, as in BAL.
+image coordinate has the unit and axes of its camera's model, regardless of the project's unit.
+
+A model in pixels uses the pixels of a project unchanged; if its y axis points up (`snavely`),
+they are relative to the image centre, as in BAL.
 """
 
 import math
@@ -68,7 +69,7 @@ def from_image_unit(
 ) -> tuple[Float[np.ndarray, "rays 2"], Float[np.ndarray, "rays 2"]]:
     """Image coordinates and their σ from the project's unit to that of each camera's model.
 
-    **Raises:** `InputError` where a conversion needs an image or pixel size that is not given.
+    **Raises:** `InputError` if a conversion needs a missing image or pixel size.
     """
     return _convert(cameras, camera, xy, sigma, [image_unit] * len(cameras), _units(cameras))
 

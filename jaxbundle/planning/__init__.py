@@ -1,1 +1,1 @@
-"""Networks before there are photographs: stations, targets, simulated and rendered measurements."""
+"""Planned networks: stations, targets, simulated and rendered measurements."""

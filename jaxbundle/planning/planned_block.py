@@ -11,11 +11,12 @@ from jaxbundle.planning.stations import aerial_block
 from jaxbundle.planning.vertical_photographs import BlockDesign
 
 LEAST = 5
-"""Rows and columns of tie points, at least; odd, so that control finds the middles."""
+"""Minimum rows and columns of tie points; odd, so that control points can be at the middles."""
 RELIEF = 0.02
-"""Heights of tie points vary by this part of the flying height, either way."""
+"""Heights of tie points vary by ± this fraction of the flying height."""
 MARGIN = 0.03
-"""Of the footprint: how far inside the area points stand, or relief moves their images out."""
+"""Margin of points inside the area, relative to the footprint, so that relief does not move their
+images out."""
 
 
 def planned_network(
@@ -30,9 +31,9 @@ def planned_network(
 ) -> Network:
     """A simulated network of the block, datum by control.
 
-    Tie points stand half a base apart along the strips and half a strip spacing across. Control
+    Tie points are half a base apart along the strips and half a strip spacing across. Control
     points are the nine at the corners of the area, the middles of its edges and its centre, or,
-    with `control_every`, one every so many bases along and strips across.
+    with `control_every`, one per this number of bases along and strips across.
 
     **Arguments:** `camera` of a model in mm; `image_format` and `sigma_image` in mm; `area` as in
     `design_block`; `control_sigma` object unit.
@@ -61,7 +62,7 @@ def planned_network(
 
 
 def _control(points: int, every: int | None) -> list[int]:
-    """Which of a row of points, two a base, are control points; the last is one."""
+    """Which points of a row, two per base, are control points, always including the last."""
     if every is None:
         return [0, points // 2, points - 1]
     if every < 1:

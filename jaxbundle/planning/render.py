@@ -5,10 +5,10 @@
     photo = render(scene, camera, position, M, Sensor(noise=2.0, seed=5))
     photo.grey, photo.point
 
-The ray of every pixel, by the camera's own model, meets the first surface (`shapes.py`): what is
-hidden is hidden. The grey value of a pixel is the mean of its area on the tangent plane there:
-`Sensor.fine` × `fine` places, each of the width of its share (`texture.py`). So the photograph is
-sharp and without aliasing, and the surface lies where the truth says to far below 0.01 pixel.
+The ray of every pixel, by the camera model, is intersected with the first surface (`shapes.py`), so
+occlusions are correct. The grey value of a pixel is the mean over its area on the tangent plane:
+`Sensor.fine` × `fine` samples, each of the width of its share (`texture.py`). So the photograph is
+sharp and without aliasing, and agrees with the true surface to far below 0.01 pixel.
 """
 
 import dataclasses
@@ -32,12 +32,13 @@ from jaxbundle.system.configuration import available_cores
 STRIP = 1 << 17
 """Pixels that are rendered together."""
 RAYS = 1 << 16
-"""Rays that are computed together: one program for all sizes of photographs."""
+"""Batch size of rays: one program for all sizes of photographs."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """Surfaces, and a texture for each (or one for all); the first surface a ray meets is seen."""
+    """Surfaces, and a texture for each (or one for all); the first surface along a ray is
+    visible."""
 
     shapes: tuple[Shape, ...]
     textures: tuple[Texture, ...]
@@ -51,10 +52,10 @@ class Scene:
 
 @dataclasses.dataclass(frozen=True)
 class Sensor:
-    """How light becomes a grey value: g = offset + 255·gain·texture + noise, 0 to 255.
+    """The sensor: g = offset + 255·gain·texture + noise, 0 to 255.
 
-    `noise`: σ in grey values, drawn by `seed`; `fine`: places a side of a pixel; `background`: grey
-    value where there is no surface.
+    `noise`: σ in grey values, drawn by `seed`; `fine`: samples per pixel side; `background`: grey
+    value without a surface.
     """
 
     gain: float = 1.0
@@ -131,7 +132,7 @@ def render_rays(
     directions: Float[np.ndarray, "rows+1 columns+1 3"],
     sensor: Sensor = Sensor(),
 ) -> Rendered:
-    """The picture along any rays, of a line scanner for example.
+    """The image along any rays, of a line scanner for example.
 
     **Arguments:** of all pixels, of one more row and column as well: their differences are the size
     of a pixel.
@@ -166,7 +167,7 @@ def visible(
     position: Float[np.ndarray, "3"],
     tolerance: float = 1e-4,
 ) -> np.ndarray:
-    """Which points on the surfaces nothing hides from a position; `tolerance` as a part of the
+    """Which points on the surfaces are visible from a position; `tolerance` relative to the
     distance."""
     X = np.asarray(X, float)
     d = X - position

@@ -6,8 +6,8 @@ f cannot vanish within a step of
 
     f/(|d_z| + L·√(d_x² + d_y²)),
 
-so no summit is stepped over (sphere tracing). Blocks of rays go first, by their middle ray; what
-the others are away from it is taken off f. The last steps are those of the secant method.
+so no summit is stepped over (sphere tracing). Blocks of rays are traced first by their central ray,
+with f reduced by the distance of the others. The last steps use the secant method.
 
 Source: Hart (1996), Sphere tracing.
 """
@@ -26,15 +26,15 @@ BLOCKS = (32, 8)
 """Sides of the blocks of rays, rows and columns, before single rays."""
 STEPS, SECANTS = 400, 12
 NEAR = 1e-3
-"""A ray is followed to f below this part of the relief, then by secants."""
+"""A ray is traced to f below this fraction of the relief, then by secants."""
 GRAZING = 1e-9
-"""As `NEAR`, where the secants leave the place: the ray grazes a summit."""
+"""Like `NEAR`, if the secants diverge because the ray grazes a summit."""
 SETTLED = 1e-9
-"""Remaining f, as a part of the length of the ray, of a point on the surface."""
+"""Tolerance of f for a point on the surface, relative to the length of the ray."""
 SAMPLES = 256
-"""Heights a side from which bounds of height and slope are found, where they are not given."""
+"""Samples per side for bounds of height and slope if these are not given."""
 ALLOWANCE = 1.3
-"""By which slopes and heights between the samples may exceed them."""
+"""Margin of slopes and heights between the samples."""
 
 
 @dataclasses.dataclass(frozen=True)

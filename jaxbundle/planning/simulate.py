@@ -1,4 +1,4 @@
-"""Simulated networks: stations and targets in, a network with noise out, in one call.
+"""Simulated networks: from stations and targets to a network with noise in one call.
 
     stations = jaxbundle.ring_of_stations(8, radius=3.0, height=2.0, roll_every=2)
     targets = jaxbundle.grid_of_targets(9, 9, 0.2, relief=0.1)
@@ -7,9 +7,9 @@
         jaxbundle.simulate(stations, targets, camera, noise=0.001, seed=1, image_format=(36, 24))
     )
 
-A target is imaged where its image lies inside the format and the ray of that image leads back to
-it. So nothing behind a camera is imaged, and nothing beyond the radius where a distortion formula
-turns back (`jaxbundle.cameras.turning_radius`). Nothing is hidden by anything else.
+A target is imaged if its image is inside the format and the ray of that image leads back to it. So
+nothing behind a camera is imaged, and nothing beyond the radius to which a distortion is one-to-one
+(`jaxbundle.cameras.turning_radius`). Targets do not occlude each other.
 """
 
 import dataclasses
@@ -44,7 +44,7 @@ from jaxbundle.planning.stations import LARGEST_SEED, Stations, rows_of_three
 RAYS_AT_ONCE = 2_000_000
 """Rays projected in one call, so that memory does not grow with stations × targets."""
 LEAST_STATIONS, LEAST_TARGETS = 16, 128
-"""So many at least are filled up, and so small networks share one program."""
+"""Smaller batches are padded to this size, so that small networks share one program."""
 
 SAME_DIRECTION = 1e-6
 """Largest distance of two unit vectors taken for one direction (rounding gives 1e-12)."""
@@ -110,16 +110,16 @@ def simulate_with_truth(
     - `stations`: exterior orientations, see `Stations`, `stations_looking_at`,
       `ring_of_stations`, `aerial_block`.
     - `targets`: object points [P, 3], object unit; the k-th has the id `str(k + 1)`.
-    - `camera`: with its TRUE parameters; what is `free` and its prior σ are taken over. Several
-      cameras: one for each station, or as `camera_of_station` [I] says (indices).
+    - `camera`: with its TRUE parameters; its `free` parameters and prior σ are kept. Several
+      cameras: one per station, or by the indices `camera_of_station` [I].
     - `noise`: σ of the image coordinates (or of x and y), in the unit of the camera's model;
       also their σ in the network. 0: exact coordinates, with σ 1.
     - `seed`: of `numpy.random.default_rng`; equal arguments give equal networks.
     - `image_format`: (width, height) of the image in the unit of the model, centred on the image
       origin (pixel models with v down: from −½ to width − ½). Default: the camera's `image_size`
-      and `pixel_size`; unlimited where it has none.
-    - `start`: cameras with the start values of the parameters, default the true ones; what they
-      say is free, and their priors, go first.
+      and `pixel_size`; unlimited without them.
+    - `start`: cameras with the start values of the parameters, default the true ones; their `free`
+      parameters and priors take precedence.
     - `disturb`: σ of the errors of the start values: positions, angles, points (object unit,
       radians, object unit); or one fraction f, for f times the mean length of a ray, f radians
       and f times the mean length again. Only tie points are disturbed.
@@ -128,21 +128,21 @@ def simulate_with_truth(
     - `distances`: pairs of indices of points with a measured distance of `distance_sigma`.
     - `max_incidence`: largest angle, radians, between a target's normal (`normals`, [P, 3] or one
       for all) and the direction to the camera.
-    - `max_rays`: of a point; which ones is drawn at random. Tie and check points with fewer than
-      `min_rays` rays are left out.
+    - `max_rays`: per point, selected at random. Tie and check points with fewer than
+      `min_rays` rays are dropped.
 
-    **Returns:** a `Simulation`: network and truth, with the `datum` and the domain of `residuals`
-    given.
+    **Returns:** a `Simulation`: network and truth, with the given `datum` and domain of
+    `residuals`.
 
-    **Raises:** `InputError` for impossible arguments, and where no target is imaged.
+    **Raises:** `InputError` for impossible arguments, or if no target is imaged.
     """
     require_x64()
     check_choice("datum", datum, CHOICES["datum"])
     check_choice("residuals", residuals, CHOICES["residuals"])
     if not isinstance(stations, Stations):
         raise InputError(
-            f"stations must be Stations, but is {shown(stations)}: ring_of_stations, aerial_block "
-            "or stations_looking_at give them"
+            f"stations must be Stations, but is {shown(stations)}: use ring_of_stations, "
+            "aerial_block or stations_looking_at"
         )
     targets = rows_of_three(targets, "targets")
     seed = whole("seed", seed, least=0, most=LARGEST_SEED)
@@ -190,7 +190,7 @@ def simulate_with_truth(
 
 
 def _imaged(rays, kept, need):
-    """The rays that are kept of targets with as many as they need, and which targets these are.
+    """The rays of targets with enough rays, and these targets.
 
     **Raises:** `InputError` where there are none."""
     used = np.bincount(rays[1][kept], minlength=len(need)) >= need
@@ -350,7 +350,7 @@ def _normals(normals, targets):
 
 
 def _at_most(point, max_rays: int, rng):
-    """A mask that keeps at most so many rays of every point, drawn at random."""
+    """A mask that keeps at most this number of rays per point, drawn at random."""
     order = np.lexsort((rng.random(len(point)), point))
     sorted_point = point[order]
     first = np.searchsorted(sorted_point, sorted_point)
@@ -373,7 +373,7 @@ def _look(stations, targets, cameras, of_station, image_format):
         some = max(LEAST_STATIONS, rounded(len(index)))
         at_once = int(np.clip(RAYS_AT_ONCE // wide, 1, some))
         for begin in range(0, len(index), at_once):
-            # The last batch is filled up, so that all have one shape and compile once.
+            # The last batch is padded, so that all have one shape and compile once.
             batch = np.resize(index[begin : begin + at_once], at_once)
             xy, back = _images_of(
                 model, p, stations.position[batch], stations.angles[batch], targets

@@ -1,4 +1,4 @@
-"""Further observations as they would be measured of a simulated network."""
+"""Simulated further observations of a simulated network."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ coordinate, at which it ends."""
 def simulate_further(
     network: Network, truth: Network, *, unknowns: Mapping[str, PyTree] | None = None, seed: int = 0
 ) -> Network:
-    """The network with its further observations measured anew, of a truth, with noise of their σ.
+    """The network with its further observations simulated from a truth, with noise of their σ.
 
     Of a rolling shutter the image points are: those of the truth are moved to where the moving
     camera has them, and keep the noise they have in the network.
@@ -118,7 +118,7 @@ def _evaluated(kind, spaces, touched, measured):
 
 
 def _noise(random, weight):
-    """Errors of observations with these weights, 1/σ or L⁻¹; none where nothing was measured."""
+    """Errors of observations with these weights, 1/σ or L⁻¹; zero without measurement."""
     errors = random.normal(size=weight.shape[:2])
     if weight.ndim == 3:
         return np.linalg.solve(weight, errors[..., None])[..., 0]

@@ -1,4 +1,4 @@
-"""Where the cameras stand and what they look at: the design of a simulated network.
+"""Camera stations and targets of a simulated network.
 
 Generators of stations (a ring around an object, an aerial block) and of targets (a grid, a cloud)
 for `jaxbundle.simulate`. Lengths are in the object unit, angles in radians.
@@ -51,7 +51,7 @@ class Stations:
 
 
 def rows_of_three(values, name: str) -> Float[np.ndarray, "rows 3"]:
-    """Finite numbers [rows, 3], or a complaint that names them."""
+    """Finite numbers [rows, 3], or an error that names them."""
     values = numeric_array(name, values, "numbers [rows, 3]").astype(float)
     if values.ndim != 2 or values.shape[1] != 3 or not len(values):
         raise InputError(f"{name} has the shape {values.shape}; expected [rows, 3]")
@@ -93,7 +93,7 @@ def stations_looking_at(
     z = position - look_at
     length = np.linalg.norm(z, axis=1, keepdims=True)
     for row in np.flatnonzero(length[:, 0] == 0)[:1]:
-        raise InputError(f"stations: station {row + 1} stands on the point it looks at")
+        raise InputError(f"stations: station {row + 1} is at the point it looks at")
     z = z / length
     x = np.cross(above, z)
     along = np.linalg.norm(x, axis=1, keepdims=True) < 1e-9 * np.linalg.norm(above)
@@ -117,9 +117,9 @@ def ring_of_stations(
 ) -> Stations:
     """Stations evenly on a horizontal circle around the vertical through `look_at`.
 
-    **Arguments:** `radius` and `height` above `look_at`, object unit; `roll_every`: every so
-    many-th camera is turned by 90° about its axis (2: every other one; 0: none). Without turned
-    cameras, or an object with depth, the principal point is poorly determined.
+    **Arguments:** `radius` and `height` above `look_at`, object unit; `roll_every`: every n-th
+    camera is rolled by 90° (2: every other one; 0: none). Without rolled cameras, or an object with
+    depth, the principal point is poorly determined.
     """
     stations = whole("stations", stations)
     radius, height = positive("radius", radius), number("height", height)
@@ -155,8 +155,8 @@ def aerial_block(
     - `forward_overlap`, `side_overlap`: fractions of the footprint.
     - `heading`: direction of the first strip, radians counter-clockwise from X.
     - `tilt`: of the optical axis forward, radians, so that strips flown in opposite directions
-      look at each other. Vertical photographs alone cannot give the principal distance: heights
-      stretched with c change no image coordinate.
+      look at each other. Vertical photographs alone cannot determine the principal distance:
+      scaling heights with c changes no image coordinate.
 
     **Returns:** strips × images_per_strip stations, centred above `centre`.
     """

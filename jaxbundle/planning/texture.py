@@ -2,12 +2,12 @@
 
 A periodic tile holds fractal noise, whose amplitude falls with the wavelength λ as 1/f, and flat
 patches with sharp edges at several scales. A pyramid of means over 2 × 2 texels has the tile at
-twice, four times … the texel; between its levels it is interpolated linearly. So a place has the
-mean grey value of a patch of about the `width` that is asked for, and nothing is shifted: a mean is
+twice, four times … the texel; between its levels it is interpolated linearly. So a sample is the
+mean grey value of a patch of about the requested `width`, without shift, since a mean is
 symmetrical about its centre.
 
-Two rotated copies of the tile at scales whose ratio is no fraction, and one much larger, keep the
-texture from repeating itself; with a `period` it does, as brickwork.
+Two rotated copies of the tile at scales with an irrational ratio, and a much larger one, prevent
+repetition; with a `period` the texture repeats, like brickwork.
 
 Source: Williams (1983), Pyramidal parametrics.
 """
@@ -23,7 +23,7 @@ from jaxbundle.arguments import number, positive, whole
 
 OCTAVES_OF_EDGES = 4
 AT_ONCE = 1 << 15
-"""Places that are interpolated together, so that they stay in the cache."""
+"""Batch size of interpolated samples, which stay in the cache."""
 TURN = (1.0, 1.0), (0.7236, 0.6180), (2.1, 0.0731)
 """Rotation, radians, and scale of the copies of the tile; the first is not turned."""
 
@@ -40,8 +40,8 @@ class Texture:
       the photographs shows detail at all their scales.
     - `seed`: of the noise. `side`: texels of the tile, a power of two.
     - `mean`, `contrast`: mean and standard deviation of the grey values.
-    - `period`: the texture repeats itself after this length in both directions; None: never.
-    - `blank`: where there is no texture, a function of the two surface coordinates.
+    - `period`: the texture repeats after this length in both directions; None: never.
+    - `blank`: a function of the two surface coordinates, true without texture.
     """
 
     texel: float

@@ -116,4 +116,4 @@ def test_a_conversion_of_the_camera_leaves_them_out(simulated):
     camera = dataclasses.replace(network.cameras[0], image_size=(3000, 2000),
                                  pixel_size=(0.012, 0.012))  # fmt: skip
     converted, _ = convert_cameras(network.replace(cameras=(camera,)), "opencv")
-    assert converted.further == () and "edges are left out" in " ".join(converted.warnings)
+    assert converted.further == () and "edges are dropped" in " ".join(converted.warnings)

@@ -1,5 +1,5 @@
-"""Observations of further kinds that a network carries: one file a kind, all alike to the rest of
-the package (`base.Further`)."""
+"""Further kinds of observations of a network: one file per kind, with a common interface
+(`base.Further`)."""
 
 from jaxbundle.network.further import attitudes, differences
 from jaxbundle.network.further.antennas import Antennas as Antennas

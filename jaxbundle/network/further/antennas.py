@@ -1,8 +1,8 @@
 """Projection centres measured by GNSS: table `antennas`, section `[antenna]`.
 
-The antenna stands at the lever arm a from the projection centre, told in the camera frame; every
-strip may have a shift s and a drift d, and the clock of the exposures may differ from that of GNSS
-by δt (Ackermann and Schade 1993; Kraus 2007, 5.2):
+The antenna is at the lever arm a from the projection centre, in the camera frame; every strip may
+have a shift s and a drift d, and the exposure clock may differ from that of GNSS by δt (Ackermann
+and Schade 1993; Kraus 2007, 5.2):
 
     X_A = X0 + Mᵀ·a + s + d·(t − ts) + V·δt − measured
 
@@ -48,8 +48,8 @@ SECTION = "antenna"
 
 
 def antenna(pose, arm, strip, clock, given):
-    """The position of an antenna less the measured one; `given`: it, the time since the middle of
-    the strip, the velocity."""
+    """The position of an antenna minus the measured one; `given`: the measured one, the time since
+    the mean of the strip, the velocity."""
     measured, since, velocity = given
     return tuple(
         x + strip[k] + strip[3 + k] * since + velocity[k] * clock[0] - measured[k]
@@ -112,7 +112,7 @@ class Antennas(Further):
                                                   {"t": self.time})  # fmt: skip
 
     def begin(self, network):
-        """The places of antennas stand for projection centres without start values."""
+        """Antenna positions serve as start values of projection centres."""
         images = network.images
         row = {id: k for k, id in enumerate(self.image)}
         position = images.position.copy()
@@ -158,13 +158,13 @@ class Antennas(Further):
 
 
 def _shift_back(motion, strip):
-    """The shifts of strips that make up for one of object space: where all are free, it is open."""
+    """The shifts of strips that compensate a shift of object space: if all are free, it is open."""
     return strip.at[:3].add(-motion[:3])
 
 
 def _track(position, strip, time):
-    """The time since the middle of its strip of every position, and the velocity there (0 where a
-    strip has fewer than three)."""
+    """The time of every position since the mean of its strip, and the velocity there (0 if a strip
+    has fewer than three)."""
     since, velocity = np.zeros(len(time)), np.zeros_like(position)
     if np.isnan(time).any():
         return since, velocity

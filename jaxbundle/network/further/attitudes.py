@@ -1,7 +1,7 @@
 """Attitudes measured by an INS: table `attitudes`, section `[attitude]`.
 
-The camera is turned against the INS by a boresight ΔM that is the same for all images of a camera,
-M = ΔM·M_INS (Cramer and Stallmann 2002). Residuals are ω, φ, κ of ΔMᵀ·M less the measured ones.
+The camera is rotated relative to the INS by a boresight ΔM common to all images of a camera,
+M = ΔM·M_INS (Cramer and Stallmann 2002). Residuals are ω, φ, κ of ΔMᵀ·M minus the measured ones.
 
 Columns: `image`, `omega`, `phi`, `kappa` and their σ `somega`, `sphi`, `skappa`, in the project's
 unit of angles. Section: `boresight = [omega, phi, kappa]` of ΔM, start values in that unit (0 if
@@ -41,13 +41,14 @@ SECTION = "attitude"
 
 
 def attitude(pose, boresight, measured):
-    """ω, φ, κ of ΔMᵀ·M, next to the measured ones, less these."""
+    """ω, φ, κ of ΔMᵀ·M, nearest to the measured ones, minus these."""
     M = boresight.matrix().T @ pose.rotation.matrix()
     return omega_phi_kappa_near(M, measured) - measured
 
 
 def turned(boresight, given):
-    """The rotation vector of a boresight against the given one [3, 3], for small differences."""
+    """The rotation vector of a boresight relative to the given one [3, 3], for small
+    differences."""
     R = boresight.matrix() @ given.T
     return 0.5 * jnp.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
 

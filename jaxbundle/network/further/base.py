@@ -1,4 +1,4 @@
-"""What observations of a further kind have in common: tables of rows that touch things by id."""
+"""The interface of further kinds of observations: tables of rows that refer to objects by id."""
 
 import abc
 import dataclasses
@@ -18,8 +18,8 @@ LENGTHS = frozenset((
     "ax", "ay", "az", "shift X", "shift Y", "shift Z", "shift x", "shift y", "shift z", "R",
 ))  # fmt: skip
 ANGLES = frozenset(("omega", "phi", "kappa", "turn x", "turn y", "turn z"))
-"""Unknowns of further tables that are lengths of object space, and angles: their σ are compared
-with the distance of the points and with a radian."""
+"""Unknowns of further tables that are lengths or angles: their σ are compared with the point
+distance and with a radian."""
 
 
 class Declared(NamedTuple):
@@ -33,19 +33,19 @@ class Declared(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Further(abc.ABC):
-    """Rows of one further kind. A subclass has a column (a tuple or an array) for each field but
-    `settings` and `source`, and says what its columns of ids touch.
+    """Rows of one further kind. A subclass has a column (a tuple or an array) for each field except
+    `settings` and `source`, and declares what its id columns refer to.
 
     `settings`: of the section `SECTION` of a project."""
 
     TABLE: ClassVar[str]
-    """What `make_network` and a project call the table."""
+    """The name of the table in `make_network` and in a project."""
     SECTION: ClassVar[str] = ""
     IMAGES: ClassVar[tuple[str, ...]] = ()
     POINTS: ClassVar[tuple[str, ...]] = ()
     """The fields that hold ids of images, of points."""
     MEASURED: ClassVar[str] = ""
-    """The field that holds what was measured; none of conditions."""
+    """The field of measurements; none for conditions."""
 
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     source: Source = Source("table")
@@ -53,15 +53,15 @@ class Further(abc.ABC):
     @classmethod
     @abc.abstractmethod
     def of(cls, table: Columns, settings: Mapping[str, Any], radians: float) -> Self:
-        """From the columns of a table; `radians` in one unit of angle."""
+        """Rows from the columns of a table; `radians` per angle unit."""
 
     @abc.abstractmethod
     def columns(self, radians: float) -> dict[str, Sequence[Any]]:
-        """The columns of the table, as `of` takes them."""
+        """The columns of the table, in the form of `of`."""
 
     @abc.abstractmethod
     def declare(self, network, origin: Float[np.ndarray, "3"]) -> Declared:
-        """The tables and observations for a network, of which all rows are (`among`)."""
+        """The tables and observations for a network that contains all rows (`among`)."""
 
     def __len__(self) -> int:
         return len(getattr(self, (*self.IMAGES, *self.POINTS)[0]))
@@ -75,7 +75,7 @@ class Further(abc.ABC):
         return dataclasses.replace(self, source=self.source.take(rows), **chosen)
 
     def among(self, network) -> Self:
-        """The rows of which the network has all images and points."""
+        """The rows whose images and points are all in the network."""
         return self.take(self._present(network))
 
     def _present(self, network) -> np.ndarray:
@@ -87,7 +87,7 @@ class Further(abc.ABC):
         return keep
 
     def check(self, network) -> None:
-        """Refuse rows about images and points that are not there.
+        """Refuse rows about unknown images and points.
 
         **Raises:** `InputError`."""
         for fields, table, thing in (
@@ -103,28 +103,28 @@ class Further(abc.ABC):
                         )
 
     def begin(self, network):
-        """The network with start values that these rows give, where it has none."""
+        """The network with missing start values taken from these rows."""
         return network
 
     @property
     def has_size(self) -> bool:
-        """Whether a σ is a length, while nothing else has one: as the network shrinks its residuals
-        do, so that its scale must be known."""
+        """Whether a σ is a length that does not define the scale: the residuals shrink with the
+        network, so its scale must be known."""
         return False
 
     def number_of_equations(self) -> int:
-        """How many a row is; they help to determine every image and point it touches."""
+        """Equations per row; they help to determine every image and point it touches."""
         return 1
 
 
 def rows_of(ids: Sequence[str], table: Images | Points) -> Int[np.ndarray, " n"]:
-    """The rows of a table that have these ids, all of which are there."""
+    """The rows of a table with these (existing) ids."""
     row = {id: k for k, id in enumerate(table.id)}
     return np.array([row[id] for id in ids], int)
 
 
 def among(network) -> list[Further]:
-    """The observations of further kinds of a network whose images and points all take part."""
+    """The observations of further kinds of a network whose images and points are all included."""
     present = (one.among(network) for one in network.further)
     return [one for one in present if len(one)]
 
@@ -132,9 +132,9 @@ def among(network) -> list[Further]:
 def positive_sigma(
     table: Columns, name: str, *, required: bool = True, words: Mapping[str, float] | None = None
 ) -> Float[np.ndarray, " rows"]:
-    """A column of σ; NaN where there is none.
+    """A column of σ; NaN if missing.
 
-    **Raises:** `InputError` for one that is not positive, or is missing but needed."""
+    **Raises:** `InputError` for one that is not positive, or is missing but required."""
     sigma = table.numbers(name, required=required, words=words)
     for row in np.flatnonzero(~(sigma > 0) & ~np.isnan(sigma))[:1]:
         raise InputError(f"{table.source(row)}: {name} is {sigma[row]:g}; it must be positive")
@@ -151,7 +151,7 @@ def check_settings(section: str, given: Mapping[str, Any], known: Sequence[str])
 
 
 def numbers(section: str, key: str, value: Any, length: int) -> Float[np.ndarray, " length"]:
-    """So many numbers of a setting.
+    """A setting of this many numbers.
 
     **Raises:** `InputError`."""
     try:

@@ -1,7 +1,7 @@
 """Differences of coordinates and angles between points: tables `differences`, `angles`.
 
-`differences`: `from`, `to`, and of `dX`, `dY`, `dZ` with `sdX`, `sdY`, `sdZ` those measured (a
-levelled height difference has dZ alone). `angles`: `from`, `at`, `to`, `value`, `sigma`: the angle
+`differences`: `from`, `to`, and the measured ones of `dX`, `dY`, `dZ` with `sdX`, `sdY`, `sdZ` (a
+levelled height difference has only dZ). `angles`: `from`, `at`, `to`, `value`, `sigma`: the angle
 at a point between the directions to two others, 0 to π, in the project's unit of angles.
 """
 
@@ -22,12 +22,12 @@ AXES = ("dX", "dY", "dZ")
 
 
 def difference(a, b, measured):
-    """b − a less the measured difference."""
+    """b − a minus the measured difference."""
     return b - a - measured
 
 
 def angle(a, at, b, measured):
-    """The angle at a point between two others less the measured one, radians."""
+    """The angle at a point between two others minus the measured one, radians."""
     u, v = a - at, b - at
     sine = jnp.sqrt(jnp.sum(jnp.cross(u, v) ** 2))
     return jnp.arctan2(sine, u @ v) - measured
@@ -39,7 +39,7 @@ ANGLE = Kind("angles", angle, ("point", "point", "point"), ("angle",))
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Differences(Further):
-    """Coordinates of `to` less those of `start`; σ infinite where nothing was measured."""
+    """Coordinates of `to` minus those of `start`; σ infinite if not measured."""
 
     start: tuple[str, ...]
     to: tuple[str, ...]

@@ -3,21 +3,20 @@
 A figure is a frame whose z axis is the normal of a plane or a circle, the axis of a line or a
 cylinder, and a radius; residuals are signed distances (Luhmann et al. 2014, 2.3):
 
-| figure | residuals of a point (x, y, z) of its frame | what moves |
+| figure | residuals of a point (x, y, z) of its frame | unknowns |
 |---|---|---|
-| plane | z | a shift along z, turns about x and y |
-| line | x, y | shifts along and turns about x and y |
-| circle | √(x² + y²) − R, z | three shifts, turns about x and y, R |
+| plane | z | a shift along z, rotations about x and y |
+| line | x, y | shifts along and rotations about x and y |
+| circle | √(x² + y²) − R, z | three shifts, rotations about x and y, R |
 | sphere | √(x² + y² + z²) − R | three shifts, R |
-| cylinder | √(x² + y²) − R | shifts along and turns about x and y, R |
+| cylinder | √(x² + y²) − R | shifts along and rotations about x and y, R |
 
-Table `figures`, a row a point: `figure` (its name), `type`, `point`; `sigma` of the distance of the
-point, "exact" or nothing: a thousandth of the σ that a ray gives; `radius` where it is
-known.
+Table `figures`, one row per point: `figure` (its name), `type`, `point`; `sigma` of the distance of
+the point, "exact" or empty: a thousandth of the σ of one ray; `radius` if known.
 
-Table `shapes`, a row a point: `shape` (the name of one place of it), `point`, its coordinates `x`,
-`y`, `z` in the frame of the shape, and `sigma` likewise: a board, a scale cross, in as many places
-as there are names.
+Table `shapes`, one row per point: `shape` (the name of one placement), `point`, its coordinates
+`x`, `y`, `z` in the frame of the shape, and `sigma` likewise: a board, a scale cross, with one name
+per placement.
 """
 
 import dataclasses
@@ -40,8 +39,9 @@ from jaxbundle.network.further.base import Declared, Further, positive_sigma, ro
 from jaxbundle.network.further.fit_figures import FEWEST, TYPES, fit
 
 EXACT = 1e-3
-"""The σ of what is exact, in σ of a point across a ray: the error falls with its square (points
-move by 1e-5 of their σ here, by 1e-3 with 1e-2); the normal equations stay far from singular."""
+"""The σ of exact conditions, relative to the σ of a point across a ray: the error decreases with
+its square (points move by 1e-5 of their σ, by 1e-3 with 1e-2); the normal equations stay well
+conditioned."""
 SHIFTS, TILTS = (0, 1, 2), (3, 4)
 MOVES = {
     "plane": (2, *TILTS), "line": (0, 1, *TILTS), "circle": (*SHIFTS, *TILTS), "sphere": SHIFTS,
@@ -149,7 +149,7 @@ class Figures(Further):
             own = rows[figure == k]
             if len(np.unique(point[own])) < FEWEST[type]:
                 raise InputError(
-                    f"{self.source(own[0])}: {type} {name!r} has {len(own)} points that take part; "
+                    f"{self.source(own[0])}: {type} {name!r} has {len(own)} usable points; "
                     f"at least {FEWEST[type]} are needed"
                 )
             fitted.append(fit(type, place[point[own]]))
@@ -178,9 +178,9 @@ class Figures(Further):
 
     @staticmethod
     def _seen(type, tables, figure, point, sigma, invariant=True):
-        """The conditions of points on figures. Where nothing says how large a figure is, it moves
-        with its points: what is left of that, as long as they are not on it, is not to be taken
-        for an observation of scale or rotation (`invariant`)."""
+        """The conditions of points on figures. A figure of unknown size moves with its points;
+        residuals of points not yet on it must not count as observations of scale or rotation
+        (`invariant`)."""
         residual, axes = RESIDUALS[type]
         kind = Kind(f"{type}s", residual, (*tables, "point"), axes, invariant=invariant)
         zero = np.zeros((len(point), len(axes))[: len(axes)])
@@ -189,7 +189,7 @@ class Figures(Further):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Shapes(Further):
-    """Points of shapes that are known, each in its place; σ 0: exact."""
+    """Points of known shapes, each in its placement; σ 0: exact."""
 
     shape: tuple[str, ...]
     point: tuple[str, ...]
@@ -221,8 +221,8 @@ class Shapes(Further):
         for k, name in enumerate(names):
             own = np.flatnonzero(shape == k)
             if len(own) < 3:
-                raise InputError(f"{self.source(own[0])}: shape {name!r} has {len(own)} points "
-                                 "that take part; at least 3 are needed")  # fmt: skip
+                raise InputError(f"{self.source(own[0])}: shape {name!r}: {len(own)} usable points; "
+                    "at least 3 are needed")  # fmt: skip
             X0, M = _placed(self.place[own], places[point[own]])
             centre.append(X0)
             rotation.append(np.asarray(quaternion_from_matrix(M)))
@@ -243,7 +243,7 @@ def _placed(x, X):
 
 
 def across_rays(network) -> float:
-    """The σ of a point across a ray, σ·s/c, in the middle of all rays."""
+    """The σ of a point across a ray, σ·s/c, median of all rays."""
     rays, images = network.observations, network.images
     shortest = []
     for camera in network.cameras:
@@ -255,7 +255,7 @@ def across_rays(network) -> float:
 
 
 def sigma_or_exact(table: Columns):
-    """σ of distances; 0 where they are exact."""
+    """σ of distances; 0 if exact."""
     sigma = table.numbers("sigma", words={"exact": 0.0})
     for row in np.flatnonzero(sigma < 0)[:1]:
         raise InputError(f"{table.source(row)}: sigma is {sigma[row]:g}; it must be positive")

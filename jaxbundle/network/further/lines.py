@@ -1,6 +1,6 @@
 """Image points on straight lines of object space: table `edges`.
 
-A measured point lies anywhere on the image of a line; no point of another image corresponds to it.
+A measured point is anywhere on the image of a line, without corresponding points in other images.
 The residual is the distance of the corrected image point from the projected line, in the plane of
 the ideal image, in the unit of the image coordinates (Mulawa and Mikhail 1988; Schmid and Zisserman
 1997):
@@ -10,8 +10,8 @@ the ideal image, in the unit of the image coordinates (Mulawa and Mikhail 1988; 
 A a point of the line, d its direction, r the ray of the image point without distortion.
 
 Columns: `line` (its name), `image`, `x`, `y` in the image unit, `sigma` of the distance (that of
-image points if absent). Start values: the line in which the planes through the points of two or
-more images meet best.
+image points if absent). Start values: the best intersection line of the planes through the points
+of two or more images.
 """
 
 import dataclasses
@@ -35,7 +35,7 @@ from jaxbundle.network.units import from_image_unit
 
 LINE = "object line"
 LEAST_ANGLE = 1e-3
-"""Between the planes in which two images see a line, radians, at least."""
+"""Smallest angle between the planes of a line from two images, radians."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,8 +108,8 @@ class Edges(Further):
         return Declared((lines,), observed, ((LINE, move_pose),))
 
     def _start(self, network, origin, rows, image, xy):
-        """Where the planes of the images meet: a point, and a rotation whose last row is the
-        direction."""
+        """The intersection of the planes of the images: a point, and a rotation whose last row is
+        the direction."""
         normals, through = [], []
         for i in np.unique(image[rows]):
             own = rows[image[rows] == i]

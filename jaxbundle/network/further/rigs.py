@@ -1,15 +1,14 @@
 """Cameras mounted together: table `rigs`, section `[rig]`.
 
-Images taken at one epoch of a rig; every camera has one mounting to the reference camera, at all
-epochs the same, exactly or within a σ (a mounting that works loose):
+Images taken at one epoch of a rig; every camera has one mounting relative to the reference camera,
+the same at all epochs, exactly or within a σ (an unstable mounting):
 
     t = M_ref·(X0 − X0_ref) = t_mounting        M·M_refᵀ = R_mounting
 
 Columns: `rig`, `epoch`, `image`. The reference of a rig is the camera that most of its epochs have,
 or the one the section names: `reference = "left"`. Section: `sigma_position` (object unit) and
-`sigma_angle` (unit of angles) of one epoch, exact where not given. An epoch without an image of the
-reference leaves its images as they are, unless they are several: then the first is tied to the
-others by both mountings.
+`sigma_angle` (angle unit) of one epoch, exact if not given. At an epoch without an image of the
+reference, several images are tied to the first by both mountings; a single one stays free.
 """
 
 import dataclasses
@@ -37,8 +36,8 @@ AXES = ("X", "Y", "Z", "turn x", "turn y", "turn z")
 
 
 def mounted(one, other, mounting_of_one, mounting_of_other, given):
-    """Place and turn of the reference camera by two of its images' cameras, their difference in the
-    frame of the first; the turn a vector, for small ones. Of the reference the mounting is none.
+    """Difference of position and rotation of the reference camera derived from two cameras, in the
+    frame of the first; the rotation as a vector. The reference has no mounting.
     """
     R1, R2 = mounting_of_one.rotation.matrix(), mounting_of_other.rotation.matrix()
     M1, M2 = one.rotation.matrix(), other.rotation.matrix()
@@ -51,7 +50,7 @@ def mounted(one, other, mounting_of_one, mounting_of_other, given):
     return jnp.concatenate([shift, turn]) - given
 
 
-# Invariant: what is left of a condition at the start grows with the network, but is no scale.
+# Invariant: residuals of a condition at the start scale with the network but define no scale.
 MOUNTED = Kind(
     "mountings", mounted, ("image", "image", MOUNTING, MOUNTING), AXES, invariant=True
 )  # fmt: skip
@@ -59,7 +58,7 @@ MOUNTED = Kind(
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Rigs(Further):
-    """Which images were taken together."""
+    """Images taken simultaneously."""
 
     rig: tuple[str, ...]
     epoch: tuple[str, ...]
@@ -97,7 +96,7 @@ class Rigs(Further):
             if seen.setdefault(key, row) != row:
                 raise InputError(
                     f"{self.source(row)}: camera {key[2]!r} has two images at epoch {key[1]!r} of "
-                    f"rig {key[0]!r}; the other stands in {self.source(seen[key])}"
+                    f"rig {key[0]!r}; the other is in {self.source(seen[key])}"
                 )
 
     def declare(self, network, origin) -> Declared:
@@ -158,7 +157,7 @@ class Rigs(Further):
 
 
 def _mounting(epochs, reference, camera, position, M):
-    """Start values: those of the epoch whose place is the middle one."""
+    """Start values: those of the epoch with the median position."""
     found = [
         (M[e[reference]] @ (position[e[camera]] - position[e[reference]]),
          M[e[camera]] @ M[e[reference]].T)
@@ -172,5 +171,5 @@ def _mounting(epochs, reference, camera, position, M):
 
 
 def _move_mounting(motion, value: PoseValue) -> PoseValue:
-    """Only its size changes with object space."""
+    """Only the scale of object space affects it."""
     return PoseValue(jnp.exp(motion[6]) * value.position, value.rotation)

@@ -1,25 +1,24 @@
-"""Cameras whose lines are exposed one after the other, and move meanwhile: table `velocities`,
-section `[rolling_shutter]`.
+"""Moving cameras with a rolling shutter: table `velocities`, section `[rolling_shutter]`.
 
 Line v is exposed at t = τ·(v − vm), vm the middle line, at which the exterior orientation holds
 (Meingast et al. 2005; Vautherin et al. 2016):
 
     X0(t) = X0 + V·t        M(t) = exp([ω·t]×)·M
 
-V in object space, ω about the axes of the camera. The line is the measured one, so that the image
-coordinates stay explicit.
+V in object space, ω about the camera axes. v is the measured line, so that the image coordinates
+stay explicit.
 
-Columns: `image`, and of `vX`, `vY`, `vZ` (object unit a second), `wx`, `wy`, `wz` (radians a
-second) the start values, 0 if not given; `svX` … `swz`: their prior σ. All images of the cameras
-with a line time move; those without a row start at rest. `t`, the time of exposure in seconds, and
-`strip` (all one if absent), where neighbours tell the velocity.
+Columns: `image`, and start values of `vX`, `vY`, `vZ` (object unit per second), `wx`, `wy`, `wz`
+(radians per second), default 0; `svX` … `swz`: their prior σ. All images of cameras with a line
+time have velocities; those without a row start at rest. `t`, the time of exposure in seconds, and
+`strip` (default: all one) for velocities from neighbours.
 
-Section: `line_time = 3e-5`, seconds a line, or by camera `{ left = 3e-5 }`, cameras that are not
-named have none; `free`: of `vX` … `wz` and `line_time`; `sigma`: a table of prior σ of the start
-values, of all images alike where a row has none of its own. Velocities and the line time cannot
-be free together without any prior: only their product shows. `neighbours = { v = 0.5, w = 0.02 }`:
-a velocity is that from the image before to the image after (of the same camera and strip; at the
-ends the image itself stands for the one that is missing), with these σ.
+Section: `line_time = 3e-5`, seconds per line, or by camera `{ left = 3e-5 }` (others have none);
+`free`: of `vX` … `wz` and `line_time`; `sigma`: a table of prior σ of the start values, for all
+images without their own. Velocities and the line time cannot be free together without a prior: only
+their product is determined. `neighbours = { v = 0.5, w = 0.02 }`: a velocity equals, within these
+σ, that between the preceding and the following image (of the same camera and strip; at the ends the
+image itself replaces the missing one).
 """
 
 import dataclasses
@@ -52,12 +51,12 @@ VELOCITY = ("vX", "vY", "vZ", "wx", "wy", "wz")
 FREE = (*VELOCITY, "line_time")
 SECTION = "rolling_shutter"
 VELOCITIES, READ_OUT = "velocity", "read-out"
-"""The tables of velocities, a row an image, and of line times, a row a camera."""
+"""The tables of velocities, one row per image, and of line times, one row per camera."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RollingShutter(Further):
-    """Velocities of images; σ NaN: no prior of its own."""
+    """Velocities of images; σ NaN: no individual prior."""
 
     image: tuple[str, ...]
     velocity: Float[np.ndarray, "n 6"]
@@ -104,7 +103,7 @@ class RollingShutter(Further):
                                  f"{did_you_mean(id, ids)}")  # fmt: skip
 
     def line_times(self, network) -> Float[np.ndarray, " cameras"]:
-        """Seconds a line of every camera, 0 of those that expose all at once."""
+        """Seconds per line of every camera, 0 for a global shutter."""
         given = self.settings["line_time"]
         ids = [camera.id for camera in network.cameras]
         by_camera = given if isinstance(given, Mapping) else dict.fromkeys(ids, given)
@@ -114,7 +113,7 @@ class RollingShutter(Further):
         return np.array([float(by_camera.get(id, 0.0)) for id in ids])
 
     def lines(self, network) -> Float[np.ndarray, " rays"]:
-        """How many lines every image point was measured after the middle one."""
+        """The line of every image point relative to the middle one."""
         rays, of = network.observations, network.images.camera[network.observations.image]
         moving = self.line_times(network)[of] != 0
         lines = np.zeros(len(rays))
@@ -122,7 +121,7 @@ class RollingShutter(Further):
             camera, own = network.cameras[c], of == c
             if camera.image_size is None:
                 raise InputError(
-                    f"camera {camera.id!r}: image_size is needed to know when a line was exposed"
+                    f"camera {camera.id!r}: image_size is needed for the exposure time of a line"
                 )
             xy, sigma = rays.xy[own], rays.sigma[own]
             uv, _ = to_image_unit(network.cameras, of[own], xy, sigma, "px")
@@ -155,7 +154,7 @@ class RollingShutter(Further):
 
 
     def _from_neighbours(self, network, free):
-        """Velocities between the images before and after, as observations."""
+        """Velocities between the preceding and following images, as observations."""
         given = self.settings.get("neighbours", {})
         sigma = np.repeat([given.get("v", np.inf), given.get("w", np.inf)], 3)
         image, rows = rows_of(self.image, network.images), []
@@ -177,7 +176,7 @@ class RollingShutter(Further):
 
 
 def between_neighbours(velocity, before, after, time):
-    """A velocity less that from the pose before to the pose after."""
+    """A velocity minus that from the preceding to the following pose."""
     shift = jnp.stack([b - a for a, b in zip(before.centre, after.centre)])
     turn = rotation_vector_from_matrix(after.rotation.matrix() @ before.rotation.matrix().T)
     return velocity - jnp.concatenate([shift, turn]) / time
@@ -201,6 +200,6 @@ PRIOR = Kind("velocities", less, (VELOCITIES,), VELOCITY, snooped="")
 
 
 def _move_velocity(motion, value):
-    """Velocities of object space turn and grow with it; those of the camera do not."""
+    """Velocities in object space rotate and scale with it; those in the camera frame do not."""
     V = jnp.exp(motion[6]) * matrix_from_rotation_vector(motion[3:6]) @ value[:3]
     return jnp.concatenate([V, value[3:]])

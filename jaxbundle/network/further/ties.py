@@ -1,8 +1,8 @@
 """Parameters that two cameras have in common: table `ties`.
 
-A row: `camera`, `other`, `parameter`, and `sigma` of the difference, "exact" or nothing where there
-is none: σ is then a thousandth of what the rays of the two cameras give for the parameter. (Ties
-within a camera are its own: `tie` of a `Camera`.)
+A row: `camera`, `other`, `parameter`, and `sigma` of the difference, "exact" or empty if it is
+zero: σ is then a thousandth of the σ of the parameter from the rays of the two cameras. (For ties
+within a camera see `tie` of a `Camera`.)
 """
 
 import dataclasses
@@ -24,12 +24,12 @@ from jaxbundle.network.further.base import Declared, Further
 from jaxbundle.network.further.figures import EXACT, sigma_or_exact
 
 SAMPLE = 256
-"""Rays of a camera that tell how much a parameter moves image points."""
+"""Number of rays used for the effect of a parameter on image points."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SameParameter:
-    """The parameter of one camera less that of the other; columns in their tables."""
+    """The parameter of one camera minus that of the other; columns in their tables."""
 
     one: int
     other: int
@@ -40,7 +40,7 @@ class SameParameter:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Ties(Further):
-    """Parameters of two cameras that are the same; σ 0: exactly."""
+    """Equal parameters of two cameras; σ 0: exactly."""
 
     camera: tuple[str, ...]
     other: tuple[str, ...]
@@ -116,8 +116,8 @@ class Ties(Further):
         ))  # fmt: skip
 
     def _from_rays(self, network, index) -> Float[np.ndarray, " n"]:
-        """σ of the parameters from the rays of their cameras, everything else given; the smaller
-        one of the two."""
+        """σ of the parameters from the rays of their cameras, all else given; the smaller of the
+        two."""
         used = {index[id] for id in (*self.camera, *self.other)}
         of = {c: parameter_sigmas(network, c) for c in used}
         return np.array([
@@ -131,7 +131,7 @@ def _kind(one: str, other: str, name: str, residual: SameParameter) -> Kind:
 
 
 def parameter_sigmas(network, c: int) -> dict[str, float]:
-    """By parameter of a camera, its σ from all its image points where everything else is known."""
+    """By parameter of a camera, its σ from all its image points, all else given."""
     camera, rays = network.cameras[c], network.observations
     model = get_model(camera.model)
     own = np.flatnonzero(network.images.camera[rays.image] == c)
