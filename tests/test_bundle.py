@@ -199,7 +199,7 @@ def test_components_that_do_not_settle_are_told(simulation, monkeypatch):
         network.observations, sigma=2 * network.observations.sigma
     )
     found = adjust(network.replace(observations=observations), estimate_components=True)
-    assert any("did not settle in 1 rounds (" in warning for warning in found.warnings)
+    assert any("did not converge in 1 rounds (" in warning for warning in found.warnings)
     assert found.sigma_factors["image coordinates"] != 1
 
 

@@ -167,7 +167,7 @@ def test_cameras_of_several_models():
     assert np.asarray(values.camera)[0, 2] == 0.3
     other = dataclasses.replace(BULGE, iterations=7)
     twice = (cameras[0], dataclasses.replace(cameras[0], id="b", model=other))
-    with pytest.raises(InputError, match="'a' and 'b' have different models of the name"):
+    with pytest.raises(InputError, match="'a' and 'b' have different models named"):
         adjust(found.network.replace(cameras=twice))
     with pytest.raises(InputError, match="camera 'a': unknown model .*read_network.path, models"):
         adjust(found.network.replace(cameras=(Camera("a", "divided", VALUES), cameras[1])))

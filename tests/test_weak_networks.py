@@ -178,7 +178,7 @@ def test_c_in_pixels_is_the_first_cause_of_a_far_off_chi_square():
     assert result.converged and misfit.converged and misfit.sigma0 > 5 * result.sigma0
     assert "in pixels" not in said(result)
     assert "is c in pixels" in said(misfit)
-    assert "the likeliest first: a principal distance in pixels for mm" in misfit.doubts[-1]
+    assert "the likeliest first: a principal distance in pixels instead of mm" in misfit.doubts[-1]
 
 
 def test_c_in_pixels_is_named_where_no_start_values_are_found():

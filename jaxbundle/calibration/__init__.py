@@ -1,4 +1,4 @@
-"""From photographs of a board to a calibrated camera, and how far to trust it."""
+"""Camera calibration from photographs of a board, and its accuracy."""
 
 from jaxbundle.calibration.calibrate import calibrate as calibrate
 from jaxbundle.calibration.choice import ModelComparison as ModelComparison

@@ -1,4 +1,4 @@
-"""What a calibration lacks, in words, and what to photograph next."""
+"""Weaknesses of a calibration in words, and advice on further photographs."""
 
 from collections.abc import Iterator
 
@@ -11,18 +11,18 @@ from jaxbundle.leastsquares.weakness import VAGUE
 
 FEW_VIEWS = 8
 TURNED = 60.0
-"""Degrees between two photographs' turns about the line of sight; 90 is best."""
+"""Minimum difference of roll between two photographs, degrees; 90 is best."""
 TILTED = 15.0
-"""Degrees of a line of sight from the board's normal."""
+"""Minimum angle between line of sight and board normal, degrees."""
 FEW_TILTED = 3
 RANGE = 1.3
-"""Farthest over nearest distance of the board."""
+"""Minimum ratio of farthest to nearest distance of the board."""
 REACH, PART = 0.85, 0.6
 LARGE = 1.0
-"""An RMS of this many pixels does not come from finding corners."""
+"""A larger RMS, in pixels, is not caused by corner detection."""
 CONTRADICTION = 3.0
 WEAK = 1.0
-"""A distortion coefficient with |value|/σ below this says nothing."""
+"""A distortion coefficient with smaller |value|/σ is insignificant."""
 
 
 def advice(
@@ -36,22 +36,22 @@ def advice(
     model: CameraModel,
     validation: CrossValidation | None = None,
 ) -> list[str]:
-    """Warnings in words, the gravest first; none if nothing is to be said.
+    """Warnings in words, the most serious first; empty if there are none.
 
     **Arguments:** X0 and M of the views of a board in the plane Z = const, whose centre is
     `middle`; `covered`; `rms` of the residuals in pixels; `t` = |value|/σ by parameter of
     the `model`.
     """
     found = [
-        f"{name} is known to {100 / max(t[name], 1e-9):.0f} % only: the photographs do not "
-        "determine the principal distance; they need tilts and distances that differ"
+        f"{name} is known only to {100 / max(t[name], 1e-9):.0f} %: the photographs do not "
+        "determine the principal distance; they need varied tilts and distances"
         for name in model.principal_distance if t.get(name, np.inf) < VAGUE
     ]  # fmt: skip
     found += [*_geometry(position, rotation, middle, unit), *_image(covered)]
     if rms > LARGE:
         found.append(
-            f"the residuals are large (RMS {rms:.2f} px): look for blur, movement, a board that "
-            "bends (--board-sigma), or free more parameters"
+            f"the residuals are large (RMS {rms:.2f} px): look for blur, movement, a bent "
+            "board (--board-sigma), or free more parameters"
         )
     if validation is not None and validation.test > CONTRADICTION:
         found.append(
@@ -69,7 +69,7 @@ def advice(
 
 
 def turns(rotation: Float[np.ndarray, "views 3 3"]) -> Float[np.ndarray, " views"]:
-    """The turn of every photograph about its line of sight, degrees: of the image's x axis in the
+    """The roll of every photograph about its line of sight, degrees: of the image's x axis in the
     plane of the board."""
     return np.degrees(np.arctan2(rotation[:, 0, 1], rotation[:, 0, 0]))
 
@@ -98,14 +98,14 @@ def _geometry(position, rotation, middle, unit) -> Iterator[str]:
     apart = np.abs(turn[:, None] - turn) % 180
     if np.minimum(apart, 180 - apart).max() < TURNED:
         yield (
-            "no photograph is turned by 90° about the line of sight: the principal point leans on "
-            "the tilts alone; take some with the camera turned"
+            "no photograph is rolled by 90° about the line of sight: only the tilts determine the "
+            "principal point; take some with the camera rolled"
         )
     away = np.linalg.norm(position - middle, axis=1)
     if away.max() < RANGE * away.min():
         yield (
             f"all photographs are from nearly one distance ({away.min():.3g} to {away.max():.3g} "
-            f"{unit}): take some from nearer and some from farther away"
+            f"{unit}): take some nearer and some farther away"
         )
 
 

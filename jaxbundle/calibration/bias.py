@@ -1,35 +1,36 @@
-r"""Is a calibration biased? Its residuals beside the noise of the corners, found without them.
+r"""Bias test of a calibration: its residuals compared with an independent estimate of corner noise.
 
-The residuals contain the noise of the measured corners, and whatever camera model
-or board do not describe: a missing coefficient, a bent board, a rolling shutter.
+The residuals contain the noise of the measured corners, and systematic errors of camera model
+and board: a missing coefficient, a bent board, a rolling shutter.
 
-**Cells.** Four neighbouring corners are a board of their own. Its pose is estimated anew, with the
-camera as calibrated: what is systematic hardly changes over so small a board, and the pose takes it
-up; noise remains. In linear form, with J the derivatives of four corners by the pose, and N an
-orthonormal basis of what is left of 8 − 6 = 2 dimensions,
+**Cells.** Four neighbouring corners form a small board. Its pose is estimated separately, with the
+calibrated camera: systematic errors are nearly constant over a cell and absorbed by the
+pose; noise remains. In linear form, with J the derivatives of four corners by the pose, and N an
+orthonormal basis of the remaining 8 − 6 = 2 dimensions,
 
     NᵀJ = 0,        t = Nᵀ·v/σ
 
-The robust estimate of the corners' σ is that of the median of |t|. The bias ratio, the part of the
-residual variance that is systematic, compares it with that of the calibration, σ0:
+The σ of the corners is estimated robustly from the median of |t|. The bias ratio, the systematic
+fraction of the residual variance, compares it with σ0 of the calibration:
 
     BR = 1 − σ²_corner/σ0²
 
-To decide, the two are nested linear models: the calibration, Ω = vᵀPv with r degrees of freedom,
+The test compares two nested linear models: the calibration, Ω = vᵀPv with r degrees of freedom,
 and the one in which every cell has a pose of its own (camera, board and priors are estimated from
 all t), Ω' with r'. Without a bias
 
     F = ((Ω − Ω')/(r − r')) / (Ω'/r')   ~   F(r − r', r')
 
-**Smooth biases.** That test sees everything, and so nothing well. Two more add a smooth field with
-q free coefficients b to the calibration (`linearised.lagrange_multipliers`, no second adjustment),
+**Smooth biases.** The cell test has little power because it is unspecific. Two more tests add a
+smooth field with q free coefficients b to the calibration (`linearised.lagrange_multipliers`, no
+second adjustment),
 
     F = (bᵀSb/q) / ((Ω − bᵀSb)/(r − q))   ~   F(q, r − q)
 
 "camera": polynomials of the fifth degree in the image, the same in all photographs; "board":
-polynomials of the fourth degree on the board for its heights, of the second in its plane. What the
-unknowns can do to 99 % already is left out and does not count in q. Each of the three is tested at
-a third of the level.
+polynomials of the fourth degree on the board for its heights, of the second in its plane. Fields
+that the unknowns can absorb to 99 % are dropped and do not count in q. Each of the three is tested
+at a third of the level.
 
 Source: Hagemann, Knorr, Janssen, Stiller (2022), Inferring bias and uncertainty in camera
 calibration, International Journal of Computer Vision 130 (cells, robust noise, bias ratio); F tests
@@ -52,18 +53,18 @@ SIGNIFICANCE = 0.01
 NORMAL_MEDIAN = 0.6744897501960817
 """The median of |x| of a standard normal x."""
 FEWEST = 10
-"""Cells below which nothing is said."""
+"""Minimum number of cells."""
 
 
 DEGREES = {"camera": 5, "heights": 4, "plane": 2}
-"""Of the polynomials of a smooth bias."""
+"""Degrees of the polynomials of a smooth bias."""
 ABSORBED = 0.01
-"""Of the square of a field, what the unknowns leave of it; below it they can do the same."""
+"""Smallest fraction of the square of a field that the unknowns must leave."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FTest:
-    """F, its degrees of freedom, and the probability of so large a value by chance."""
+    """F, its degrees of freedom, and its p-value."""
 
     F: float
     degrees: tuple[int, int]
@@ -76,11 +77,11 @@ class FTest:
 
 @dataclasses.dataclass(frozen=True)
 class Bias:
-    """The noise of the corners beside the residuals of a calibration.
+    """Corner noise compared with the residuals of a calibration.
 
     **Fields:** `cells` of four corners; `corner_sigma`: σ of a coordinate from them, robust;
     `residual_sigma`: σ0 of the calibration as σ of a coordinate, both pixels; `tests`: by "cells",
-    "camera", "board" (not where its points are free).
+    "camera", "board" (not if its points are free).
     """
 
     cells: int
@@ -90,19 +91,19 @@ class Bias:
 
     @property
     def ratio(self) -> float:
-        """The bias ratio; without a bias around 0, negative as well."""
+        """The bias ratio; without a bias around 0, possibly negative."""
         return 1 - (self.corner_sigma / self.residual_sigma) ** 2
 
     @property
     def found(self) -> tuple[str, ...]:
-        """The tests that find a bias, the most certain first; together at a level of 1 %."""
+        """The tests that detect a bias, the most significant first; joint level 1 %."""
         tests = sorted(self.tests.items(), key=lambda item: (item[1].probability, -item[1].F))
         level = SIGNIFICANCE / len(tests)
         return tuple(name for name, test in tests if test.probability < level)
 
     @property
     def sentence(self) -> str:
-        """What it means, in words."""
+        """The conclusion in words."""
         if not self.found:
             return "no bias is found at a level of 1 %"
         smooth = [name for name in self.found if name != "cells"]
@@ -119,7 +120,7 @@ def find_bias(adjustment, grid: tuple[int, int]) -> Bias | None:
     **Arguments:** the adjustment; `grid`: rows and columns of the board, whose points follow each
     other row by row.
 
-    **Returns:** None where there are too few whole cells, or no redundancy.
+    **Returns:** None if there are too few complete cells, or no redundancy.
     """
     problem = adjustment.problem
     cells = cells_of_four(problem, grid)
@@ -155,7 +156,7 @@ def _f_test(gain: float, q: int, rest: float, r: int) -> FTest:
 
 
 def _gain(adjustment, found, B) -> tuple[float, int]:
-    """How far vᵀPv falls with the parameters of B, and how many of them are new."""
+    """The decrease of vᵀPv by the parameters of B, and the number of independent ones."""
     B = B / np.maximum(np.sqrt((B**2).sum((0, 1))), 1e-300)
     score, S = lagrange_multipliers(adjustment, found, B)
     size, V = np.linalg.eigh(S)
@@ -172,7 +173,7 @@ def _powers(xy, least: int, most: int) -> Float[np.ndarray, "n terms"]:
 
 
 def _image_fields(problem) -> Float[np.ndarray, "n 2 k"]:
-    """Over σ: displacements in x and in y that are smooth over the image."""
+    """Smooth displacements in x and y over the image, divided by σ."""
     field = _powers(np.asarray(problem.data.image_xy), 0, DEGREES["camera"])
     each = np.asarray(problem.data.image_weight)[:, :, None] * field[:, None]
     none = np.zeros_like(each[:, 0])
@@ -180,7 +181,7 @@ def _image_fields(problem) -> Float[np.ndarray, "n 2 k"]:
 
 
 def _board_fields(problem, found) -> Float[np.ndarray, "n 2 k"]:
-    """Over σ: by displacements of the points that are smooth over the board."""
+    """Image effects of smooth displacements of the board points, divided by σ."""
     XY = problem.network.points.position[problem.point, :2]
     plane, height = _powers(XY, 0, DEGREES["plane"]), _powers(XY, 2, DEGREES["heights"])
     of = found.slopes["point"]
@@ -191,7 +192,7 @@ def _board_fields(problem, found) -> Float[np.ndarray, "n 2 k"]:
 
 
 def cells_of_four(problem, grid) -> Int[np.ndarray, "cells 4"]:
-    """The image points of every whole cell of 2 × 2 points, in all photographs."""
+    """The image points of every complete cell of 2 × 2 points, in all photographs."""
     rows, columns = grid
     used = np.flatnonzero((np.asarray(problem.data.image_weight) > 0).all(1))
     place = np.full((len(problem.network.images), rows * columns), -1)
@@ -205,8 +206,8 @@ def cells_of_four(problem, grid) -> Int[np.ndarray, "cells 4"]:
 def _equations(
     adjustment, found, cells
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m u"]]:
-    """t of all cells, after it the pseudo-observations, and their derivatives by what is free of
-    camera and board."""
+    """t of all cells, followed by the pseudo-observations, and their derivatives by the free
+    parameters of camera and board."""
     problem = adjustment.problem
     (name,) = (table.name for table in problem.layout.cameras)
     cut = lambda x: x[cells].reshape(len(cells), 8, -1)
@@ -222,7 +223,7 @@ def _equations(
             of_points[np.arange(len(cells)), :, problem.point[cells[:, corner]]] = part
     flat = lambda x: x.reshape(len(t), -1)
     A = np.concatenate([flat(of_camera), flat(of_points)[:, free.ravel()]], 1)
-    # Pseudo-observations: of a known board, and of the camera.
+    # Pseudo-observations of a weighted board, and of the camera.
     v, data, width = adjustment.inspection.residuals, problem.data, of_camera.shape[2]
     place = np.full(free.shape, -1)
     place[free] = width + np.arange(free.sum())

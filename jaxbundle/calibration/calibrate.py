@@ -1,7 +1,7 @@
-"""`calibrate`: photographs of a board in, a calibrated camera out.
+"""`calibrate`: from photographs of a board to a calibrated camera.
 
-1. The board is found in every photograph (`measure`), or its image points are given.
-2. Start values of camera and poses; views that cannot be right are left out (`start`).
+1. The board is detected in every photograph (`measure`), or its image points are given.
+2. Start values of camera and poses; impossible views are excluded (`start`).
 3. Adjustment as a network with residuals in the measured image, with data snooping or robust. The
    board is
 
@@ -9,7 +9,7 @@
        weighted   its points are control points with a σ: a print is not exact and not flat
        free       its points are estimated, inner constraints on all of them (scale included)
 
-4. Where circles have a known diameter, the eccentricity of their images is taken off and the
+4. For circles of known diameter, the eccentricity of their images is corrected and the
    adjustment repeated.
 """
 
@@ -42,7 +42,7 @@ from jaxbundle.orientation.pose import Pose
 from jaxbundle.types import present
 
 SIGMA = 0.1
-"""A priori σ of an image coordinate in pixels; σ0 of the result says what it was."""
+"""A priori σ of an image coordinate in pixels; σ0 of the result shows the actual one."""
 ECCENTRICITY_ROUNDS = 2
 
 
@@ -70,23 +70,23 @@ def calibrate(
     **Arguments:**
 
     - `photographs`: files, patterns or folders; or `BoardViews`, image points already measured.
-    - `board`: what is in the photographs; its unit is the object unit.
+    - `board`: the board in the photographs; its unit is the object unit.
     - `model`, `free`: camera model, by name or a `CameraModel`, and the parameters to estimate; the
-      model's usual ones if not named. `given`: values of parameters, held where they are not free.
+      model's standard ones by default. `given`: values of parameters, held if they are not free.
     - `pixel_size`: mm, for models in mm.
     - `sigma_image`: a priori σ of an image coordinate, pixels.
     - `board_sigma`: σ of a coordinate of the board (object unit); `board_free`: its points are
-      estimated. Neither: the board is exact.
-    - `robust`: "huber", "cauchy" or "tukey": points that fit badly count less, instead of being
-      removed; `snooping`: how they are removed, None: not at all. Both, and further `options`
+      estimated. Default: the board is exact.
+    - `robust`: "huber", "cauchy" or "tukey": points that fit badly are downweighted instead of
+      removed; `snooping`: the test for removal, None: no removal. Both, and further `options`
       (`significance`, `max_iterations`, …), are those of `jaxbundle.adjust`.
-    - `cross_validation`: False: the camera is not calibrated again from halves of the photographs.
+    - `cross_validation`: False: do not calibrate from halves of the photographs.
     - `camera`: its name. `progress(done, total)`: photographs searched.
 
-    **Returns:** a `Calibration`; look at `converged` before anything else.
+    **Returns:** a `Calibration`; check `converged` first.
 
-    **Raises:** `InputError` where nothing can be calibrated; `NotSolvedError` where the photographs
-    determine no camera.
+    **Raises:** `InputError` if nothing can be calibrated; `NotSolvedError` if the photographs
+    do not determine the camera.
     """
     require_x64()
     camera_model, free = _model(model, free)
@@ -126,7 +126,7 @@ def calibrate(
 
 
 def views_of(photographs, board: Board | None, progress=None) -> BoardViews:
-    """The board measured in photographs; `BoardViews` are it already."""
+    """The board measured in photographs; `BoardViews` are returned unchanged."""
     if isinstance(photographs, BoardViews):
         return photographs
     if board is None:
@@ -178,15 +178,15 @@ def board_network(
         network = network.warn(warning)
     if board_free and not board.unique:
         network = network.warn(
-            f"a photograph does not tell the {board} from itself turned by 180°: its points are "
-            "estimated rightly only if it was never turned upside down"
+            f"the {board} looks the same rotated by 180°: its points are estimated "
+            "correctly only if it was never upside down"
         )
     return network
 
 
 def _without_eccentricity(start: Start, result, camera: Camera) -> BoardViews:
-    """The views as measured, their points moved from the centres of the ellipses to the images of
-    the centres of the circles."""
+    """The measured views with points moved from the ellipse centres to the images of the circle
+    centres."""
     views, model = start.views, get_model(camera.model)
     p = np.asarray(result.values.camera)[0][: len(model.parameters)]
     M = jax.vmap(matrix_from_quaternion)(result.values.rotation)
@@ -207,7 +207,7 @@ def _shifts(model, p, poses, centres, radius):
 
 
 def check_model(name: str | CameraModel) -> CameraModel:
-    """The model of this name, or an own one.
+    """The model with this name, or a user-defined one.
 
     **Raises:** `InputError`.
     """

@@ -1,20 +1,20 @@
-r"""Which camera model suffices? Several models calibrated from the same views of a board.
+r"""Choice of the camera model: several models calibrated from the same views of a board.
 
-**Cross-validation.** The views fall into folds. For each the camera is estimated from the other
-folds, and the poses of its own views with that camera; their residuals are what the model leaves
-in photographs it has not seen. It is one adjustment a fold, in which the σ of its views are
-`FAINT` times as large: they say nothing about the camera, and determine their own poses only.
+**Cross-validation.** The views fall into folds. For each fold the camera is estimated from the
+other folds, and the poses of its own views with that camera; their residuals show the error of the
+model in unseen photographs. This is one adjustment per fold, in which the σ of its views are
+`FAINT` times as large, so that they determine only their own poses.
 
 **Information criteria**, for n image coordinates with the weighted sum of squares S, and k
-parameters as the trace of n·I less their redundancy numbers (unknowns with a prior count in part):
+parameters as the trace of n·I minus their redundancy numbers (unknowns with a prior count in part):
 
     AIC = n·ln(S/n) + 2·k        BIC = n·ln(S/n) + k·ln(n)
 
-**Difference.** How far the images of two calibrations are apart, the rotation that every pose takes
-up removed (`cameras.compare`), against the σ of the difference of two such calibrations.
+**Difference.** The image difference of two calibrations, without the rotation that every pose
+absorbs (`cameras.compare`), relative to the σ of the difference of two such calibrations.
 
-**The choice**: the model of fewest parameters whose mean square residual of a view left out exceeds
-the best model's by no more than the standard error of that excess over the views.
+**The choice**: the model with fewest parameters whose mean square residual of left-out views
+exceeds that of the best model by no more than the standard error of this excess over the views.
 
 Source: Akaike (1974), IEEE Transactions on Automatic Control 19(6); Schwarz (1978), Annals of
 Statistics 6(2); Breiman, Friedman, Olshen and Stone (1984), Classification and Regression Trees,
@@ -46,7 +46,7 @@ from jaxbundle.statistics.difference import expected_difference
 
 FAINT = 1e3
 FEWEST = 4
-"""Photographs of a fold's camera and, at least, folds' worth of them."""
+"""Minimum number of photographs for the camera of a fold."""
 
 
 @shows_itself
@@ -54,10 +54,10 @@ FEWEST = 4
 class Candidate:
     """A model, calibrated from the common observations.
 
-    **Fields:** `calibration`, as `calibrate` gives it; `free` parameters of the camera; `unknowns`:
-    k of the criteria, poses included; `sigma0` of the image coordinates; `rms` of their residuals,
-    and `left_out` of those of views left out, pixels (|v| of a point); `by_view`: mean squares of
-    the latter [views]; `aic`, `bic`.
+    **Fields:** `calibration`, the result of `calibrate`; `free` parameters of the camera;
+    `unknowns`: k of the criteria, poses included; `sigma0` of the image coordinates; `rms` of their
+    residuals, and `left_out` for left-out views, pixels (|v| of a point); `by_view`: mean squares
+    of the latter [views]; `aic`, `bic`.
     """
 
     model: str
@@ -80,8 +80,8 @@ class Candidate:
 @shows_itself
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """How far a model's images are from those of the best: the map, its lengths in pixels, and the
-    RMS of the lengths over the σ of the difference."""
+    """The image difference of a model from the best: the map, its lengths in pixels, and the RMS of
+    the lengths over the σ of the difference."""
 
     comparison: Comparison
     covariance: Float[np.ndarray, "rows columns 2 2"]
@@ -91,12 +91,12 @@ class Difference:
 
 
 class ModelComparison:
-    """The models side by side. Print it for the table and the sentence.
+    """Comparison of models. Printing shows the table and the conclusion.
 
-    **Attributes:** `candidates`, in the order given; `failed`: model and reason; `folds`; `views`
-    compared; `gross`: (image, point) that no model explains, left out for all; `best`: the
-    candidate with the least left-out RMS; `suffices`: the one to take; `differences` from the best
-    by model (None: nothing to compare).
+    **Attributes:** `candidates`, in the given order; `failed`: model and reason; `folds`; `views`
+    compared; `gross`: (image, point) that no model explains, removed for all; `best`: the candidate
+    with the smallest left-out RMS; `suffices`: the recommended one; `differences` from the best by
+    model (None: nothing to compare).
     """
 
     def __init__(self, candidates, failed, folds, views, gross):
@@ -108,8 +108,8 @@ class ModelComparison:
         self.suffices = min(enough, key=lambda one: (one.free, one.left_out))
 
     def excess(self, one: Candidate) -> tuple[float, float]:
-        """The mean square residual of a view left out beyond the best model's, and its standard
-        error over the views, pixels²."""
+        """The excess of the mean square residual of left-out views over that of the best model, and
+        its standard error over the views, pixels²."""
         d = one.by_view - self.best.by_view
         return float(d.mean()), float(d.std(ddof=1) / np.sqrt(len(d)))
 
@@ -120,7 +120,7 @@ class ModelComparison:
 
     @property
     def sentence(self) -> str:
-        """Which model suffices, and why."""
+        """The sufficient model and the reason."""
         chosen, best = self.suffices, self.best
         text = (
             f"{chosen.model} suffices: in photographs left out it leaves an RMS of "
@@ -171,19 +171,19 @@ def compare_models(
     progress: Callable[[int, int], None] | None = None,
     **options,
 ) -> ModelComparison:
-    """Calibrate one camera by several models and say which suffices.
+    """Calibrate one camera with several models and choose the sufficient one.
 
     **Arguments:** `models`: names or `CameraModel`s, two or more; `folds` of the cross-validation;
-    the others and `options` as of `calibrate`. Each model estimates its usual parameters.
+    the others and `options` as in `calibrate`. Each model estimates its standard parameters.
 
     **Returns:** a `ModelComparison`. A model that cannot be calibrated is listed with the reason.
 
-    **Raises:** `InputError` for models that do not exist, and too few photographs for the folds;
-    `NotSolvedError` where no model can be calibrated.
+    **Raises:** `InputError` for unknown models, and too few photographs for the folds;
+    `NotSolvedError` if no model can be calibrated.
     """
     if isinstance(models, str) or not isinstance(models, Iterable) or len({*models}) < 2:
         raise InputError(
-            "models: give two different ones or more, such as ['opencv', 'kannala-brandt'], not "
+            "models: give at least two different ones, such as ['opencv', 'kannala-brandt'], not "
             f"{shown(models)}"
         )
     folds = whole("folds", folds, 2)
@@ -226,7 +226,7 @@ def compare_models(
 
 
 def _removed(calibration: Calibration) -> set[tuple[str, str]]:
-    """Image and point of what was removed as a gross error."""
+    """Image and point of removed gross errors."""
     adjustment = calibration.adjustment
     ids = _ids(adjustment.problem.network)
     return {ids[i] for i in np.flatnonzero(~kept_rays(adjustment))}
@@ -240,7 +240,7 @@ def _ids(network: Network) -> list[tuple[str, str]]:
 
 
 def _candidate(name, calibration, common, gross, folds) -> Candidate | str:
-    """A model with its statistics; or why it has none."""
+    """A model with its statistics, or the reason for a failure."""
     result = calibration.adjustment
     network = result.problem.network
     keep = np.array([pair not in gross for pair in _ids(network)])
@@ -271,7 +271,7 @@ def _candidate(name, calibration, common, gross, folds) -> Candidate | str:
 
 
 def _faint(network: Network, left: Bool[np.ndarray, " rays"]) -> Network:
-    """The network with some rays that say nothing about the camera."""
+    """The network with negligible weight for some rays, which then do not affect the camera."""
     rays = network.observations
     sigma = np.where(left[:, None], FAINT * rays.sigma, rays.sigma)
     return network.replace(observations=dataclasses.replace(rays, sigma=sigma))

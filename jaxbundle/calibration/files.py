@@ -1,17 +1,17 @@
-"""What a calibration writes into a folder.
+"""The output folder of a calibration.
 
 | file | |
 |---|---|
-| report.txt, report.html, result.json | the whole protocol; the same as a page; its numbers |
-| CAMERA.toml | the camera, to stand in a project; σ as comments |
+| report.txt, report.html, result.json | the full report; the same as a page; its numbers |
+| CAMERA.toml | the camera for a project; σ as comments |
 | CAMERA.yaml, colmap/ | the camera for OpenCV; camera, poses and board for COLMAP |
-| network/ | the adjusted network: `jaxbundle adjust FOLDER/network` goes on from it |
-| coverage, uncertainty, uncertainty_far, uncertainty_distance, halves .png | how good it is |
-| models.txt, models.json, difference_MODEL.png | of `--models`: the models side by side |
-| plan, perspective, histogram, residuals_…, distortion_…, correlations_… .png | as of `adjust` |
+| network/ | the adjusted network, for `jaxbundle adjust FOLDER/network` |
+| coverage, uncertainty, uncertainty_far, uncertainty_distance, halves .png | accuracy |
+| models.txt, models.json, difference_MODEL.png | comparison of `--models` |
+| plan, perspective, histogram, residuals_…, distortion_…, correlations_… .png | as in `adjust` |
 
-A model that OpenCV and COLMAP do not have is converted to `opencv` for them, or to `kannala-brandt`
-where rays may be 90° and more from the axis; what that costs stands as a comment in the TOML.
+A model that OpenCV and COLMAP lack is converted to `opencv`, or to `kannala-brandt`
+if rays may be 90° and more from the axis; the error is a comment in the TOML.
 """
 
 import json
@@ -58,12 +58,12 @@ def camera_text(camera: Camera, sigma: Mapping[str, float], *remarks: str) -> st
 
 
 def file_name(name: str) -> str:
-    """A name that can stand in a file system."""
+    """A name that is valid in a file system."""
     return re.sub(r"[^\w.-]+", "_", name, flags=re.ASCII).strip("._")[:60] or "camera"
 
 
 def files_of(names: Sequence[str]) -> list[str]:
-    """What a calibration of these cameras may write into its folder, figures as patterns."""
+    """Files that a calibration of these cameras may write, figures as patterns."""
     found = [REPORT, PAGE, RESULT]
     for name in map(file_name, names):
         place = "" if len(names) == 1 else f"{name}/"
@@ -79,11 +79,11 @@ def files_of(names: Sequence[str]) -> list[str]:
 def write_calibration(
     calibration, folder: str | Path, plots: bool = True, force: bool = False
 ) -> None:
-    """Write everything about a calibration into a folder (see the module's docstring).
+    """Write a calibration into a folder (see the module's docstring).
 
-    **Arguments:** `force`: replace what no calibration has written.
+    **Arguments:** `force`: replace foreign files.
 
-    **Raises:** `InputError` where the folder may not or cannot be written
+    **Raises:** `InputError` if the folder may not or cannot be written
     (`jaxbundle.io.writing.folders`); `ImportError` for plots without matplotlib.
     """
     if plots:
@@ -110,7 +110,7 @@ def _fill(calibration, folder: Path, plots: bool, origin: Origin, choice=None) -
 
 
 def _write_foreign(network: Network, folder: Path, name: str) -> list[str]:
-    """The camera for OpenCV and COLMAP; what a conversion of its model cost, in words."""
+    """The camera for OpenCV and COLMAP; the error of a conversion of its model, in words."""
     remark = []
     model = get_model(network.cameras[0].model)
     if model.name not in FOREIGN:
@@ -128,12 +128,11 @@ def _write_foreign(network: Network, folder: Path, name: str) -> list[str]:
 def write_calibrations(
     found, folder: str | Path, plots: bool = True, force: bool = False
 ) -> None:
-    """Write one calibration into a folder, several into folders of their own, and the rig beside.
+    """Write one calibration into a folder, several into separate subfolders.
 
-    Several have report.txt, report.html and result.json of the whole beside them; a rig adds its
+    Several have a common report.txt, report.html and result.json; a rig adds its
     cameras as rig_CAMERA.toml, and figures of their coverage and uncertainty in it.
-
-    Arguments and errors as of `write_calibration`.
+    Arguments and errors as in `write_calibration`.
     """
     if plots:
         need_matplotlib()
@@ -144,7 +143,7 @@ def write_calibrations(
 def fill_calibrations(
     found, folder: Path, plots: bool, origin: Origin = UNKNOWN, choice=None
 ) -> None:
-    """Write the same beside what is in a folder; `origin` and `choice` are for the page."""
+    """Write the same into an existing folder; `origin` and `choice` are for the page."""
     if len(found.cameras) == 1:
         return _fill(next(iter(found.cameras.values())), folder, plots, origin, choice)
     for name, one in found.cameras.items():
@@ -172,7 +171,7 @@ def calibrations_dict(found, brief: bool = False) -> dict:
 
 
 def fill_comparison(choice, folder: Path, plots: bool) -> None:
-    """Write a comparison of models (`choice.ModelComparison`) beside what is in a folder."""
+    """Write a comparison of models (`choice.ModelComparison`) into an existing folder."""
     write_text(folder / "models.txt", choice.report())
     write_text(folder / "models.json", json_text(choice.to_dict()))
     if plots:
@@ -200,7 +199,7 @@ def save_plots(calibration, folder: Path) -> None:
 
 
 def save_rig_plots(rig, folder: Path) -> None:
-    """Coverage and uncertainty of every camera, as it is in the rig."""
+    """Coverage and uncertainty of every camera in the rig."""
     drawings = {}
     for name in rig.names:
         file = f"rig_{file_name(name)}"
@@ -214,7 +213,7 @@ def save_rig_plots(rig, folder: Path) -> None:
 
 
 def json_text(document: dict) -> str:
-    """One JSON object; what is not a finite number is null."""
+    """One JSON object; non-finite numbers are null."""
     return json.dumps(_plain(document), ensure_ascii=False, indent=1) + "\n"
 
 

@@ -1,9 +1,9 @@
-r"""The affinity a camera model has but was not given: is it missed?
+r"""Test for a missing affinity of the camera model.
 
-`brown` and `brown-projected` have one principal distance; pixels that are not square, or a shear,
-are left to b1 and b2, which a calibration does not estimate unless asked. Whether the residuals v
-(over their σ) miss them is told by one step from the adjusted values, all other unknowns moving
-with it, S·b = −Bᵀ·v (`linearised.lagrange_multipliers`); the cofactors of b are S⁻¹. It is the
+`brown` and `brown-projected` have one principal distance; non-square pixels and shear
+are modelled by b1 and b2, which are not estimated by default. Whether the residuals v
+(over their σ) require them is tested by one step from the adjusted values, with all other unknowns
+adapting, S·b = −Bᵀ·v (`linearised.lagrange_multipliers`); the cofactors of b are S⁻¹. This is the
 score (Lagrange multiplier) test: no second adjustment is needed.
 """
 
@@ -18,14 +18,14 @@ from jaxbundle.display import shows_itself
 
 AFFINE = ("b1", "b2")
 CRITICAL = 4.0
-"""|b|/σ above which a parameter is missed."""
+"""|b|/σ above which a parameter is missing."""
 
 
 @shows_itself
 @dataclasses.dataclass(frozen=True)
 class LeftOut:
-    """Parameters that were held at 0: what they would be, σ, and the largest displacement of a
-    point in the image they stand for, pixels."""
+    """Parameters that were held at 0: their estimates, σ, and the largest image displacement they
+    cause, pixels."""
 
     names: tuple[str, ...]
     values: Float[np.ndarray, " k"]
@@ -41,14 +41,14 @@ class LeftOut:
             f"{n} {b:.2g} ± {s:.1g}" for n, b, s in zip(self.names, self.values, self.sigma)
         )
         return (
-            f"{' and '.join(self.names)} of the model are left out, and the residuals ask for them "
-            f"({each}): points are displaced by up to {self.largest:.2f} px; pixels that are not "
-            "square, or an affinity: free them (--free)"
+            f"{' and '.join(self.names)} of the model are held, but the residuals require them "
+            f"({each}): points are displaced by up to {self.largest:.2f} px; non-square "
+            "pixels, or an affinity: free them (--free)"
         )
 
 
 def left_out(adjustment) -> LeftOut | None:
-    """The affine parameters of an adjusted camera that are not free; None where it has none.
+    """The affine parameters of an adjusted camera that are not free; None if it has none.
 
     **Arguments:** the adjustment of one camera, with `image_size` and `pixel_size`.
     """

@@ -1,6 +1,6 @@
 """The observation equations of the image points of one camera at its adjusted values, dense.
 
-For tests that add parameters to a calibration, or divide it, without adjusting it again.
+For tests that add parameters to a calibration, or divide it, without a new adjustment.
 """
 
 from functools import partial
@@ -18,7 +18,7 @@ class Linearised(NamedTuple):
     """Residuals over their σ, and their derivatives.
 
     `v` [n, 2]; `slopes`: by table, the derivatives by the changes of the row that is touched;
-    `touched`: by table, which row that is; `by_columns`: by parameters of the camera that are held.
+    `touched`: by table, the row; `by_columns`: derivatives by held parameters of the camera.
     """
 
     v: Float[np.ndarray, "n 2"]
@@ -28,9 +28,9 @@ class Linearised(NamedTuple):
 
 
 def linearise_image_points(problem, values, columns: tuple[int, ...] = ()) -> Linearised:
-    """All image points of a network of one camera; 0 where one has no weight.
+    """All image points of a network of one camera; 0 without weight.
 
-    **Arguments:** `columns`: parameters of the camera, held or not, whose derivatives are wanted.
+    **Arguments:** `columns`: parameters of the camera, held or not, for derivatives.
     """
     camera = problem.network.cameras[0].model
     of, declared = ImagePoint(camera, problem.network.residuals), problem.system.declared
@@ -48,11 +48,12 @@ def linearise_image_points(problem, values, columns: tuple[int, ...] = ()) -> Li
 def lagrange_multipliers(
     adjustment, found: Linearised, B: Float[np.ndarray, "n 2 k"]
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
-    """Bᵀv and S of parameters b that were left out, B = ∂v/∂b:
+    """Bᵀv and S of omitted parameters b, B = ∂v/∂b:
 
         S·b = −Bᵀ·v,      S = BᵀB − (JᵀB)ᵀ·Q·(JᵀB),      vᵀv falls by bᵀ·S·b
 
-    with J = ∂v/∂unknowns, Q their cofactors. S is singular along what the unknowns can do already.
+    with J = ∂v/∂unknowns, Q their cofactors. S is singular along directions that the unknowns
+    absorb.
 
     Source: Rao (1948), Proceedings of the Cambridge Philosophical Society 44, 50-57.
     """

@@ -1,9 +1,8 @@
 r"""The expected mapping error of a calibration: one number, comparable between camera models.
 
-With true parameters p + Δp in place of p, the image of every ray moves. The rotation that every
-later orientation takes up removed (A' of `statistics.projection`, frame "rotation"), the mean of
-the squared displacement, over the places `cameras.compare` looks at, is, to first order, the
-quadratic form
+With true parameters p + Δp in place of p, the image of every ray moves. After removing the rotation
+that later orientations absorb (A' of `statistics.projection`, frame "rotation"), the mean squared
+displacement over the grid of `cameras.compare` is, to first order, the quadratic form
 
     K = Δpᵀ·H·Δp,       H = mean of A'ᵀA' over the image
 
@@ -30,7 +29,7 @@ from jaxbundle.display import shows_itself
 from jaxbundle.statistics.projection import slopes_of_images
 
 DRAWS = 20_000
-"""Of K, for its quantile: exact to 1 %."""
+"""Samples of K for its quantile, accurate to 1 %."""
 
 
 @shows_itself
@@ -47,11 +46,11 @@ class MappingError:
 
     @property
     def rms(self) -> float:
-        """√EME: how far images over the whole image are off, pixels."""
+        """√EME: the RMS image error over the whole image, pixels."""
         return float(np.sqrt(self.expected))
 
     def quantile(self, probability: float = 0.95) -> float:
-        """√K that is not exceeded with this probability, pixels; from a sample, always the same."""
+        """The quantile of √K for this probability, pixels; from a reproducible sample."""
         z = np.random.default_rng(0).normal(size=(DRAWS, len(self.weights)))
         return float(np.sqrt(np.quantile(z**2 @ self.weights, probability)))
 
@@ -59,13 +58,13 @@ class MappingError:
 def mapping_error(adjustment, camera: str, grid: tuple[int, int] = GRID) -> MappingError:
     """The mapping error of an adjusted camera, whose image size is known.
 
-    **Arguments:** `grid`: columns and rows of the places the mean is taken over.
+    **Arguments:** `grid`: columns and rows of the grid for the mean.
     """
     (given,) = (one for one in adjustment.problem.network.cameras if one.id == camera)
     names, C = adjustment.camera_covariance(camera)
     p = np.array(list(adjustment.camera_parameters(camera).values()))
     H = mapping_form(given, p, names, grid)
-    # By a root of H, in units of σ: C may be singular to rounding, as where two parameters are one.
+    # By a root of H, in units of σ: C may be numerically singular, as for tied parameters.
     sigma = np.sqrt(np.diagonal(C))
     unit = np.where(sigma > 0, sigma, 1.0)
     size, V = np.linalg.eigh(H * np.outer(unit, unit))

@@ -43,13 +43,13 @@ from jaxbundle.report.page.verdict import BAD, DOUBTFUL, GOOD, in_words
 
 KIND = "calibration of cameras"
 BOARD = ("Control",)
-"""What the page of an adjustment judges and a board does not have."""
+"""Findings of the adjustment page that do not apply to a board."""
 
 
 def compose_calibrations(found, origin: Origin = UNKNOWN, choice=None) -> Iterator[str]:
-    """The page of one calibration, of several the one of the whole, with the rig.
+    """The page of one calibration, or the common page of several, with the rig.
 
-    **Arguments:** `found`: `Calibrations`; `choice`: the comparison of models they come from.
+    **Arguments:** `found`: `Calibrations`; `choice`: the underlying comparison of models.
     """
     if len(found.cameras) == 1:
         return compose_calibration(next(iter(found.cameras.values())), origin, choice)
@@ -57,7 +57,7 @@ def compose_calibrations(found, origin: Origin = UNKNOWN, choice=None) -> Iterat
 
 
 def compose_calibration(calibration, origin: Origin = UNKNOWN, choice=None) -> Iterator[str]:
-    """The page of one camera: that of its adjustment, and how good it is."""
+    """The page of one camera: that of its adjustment, and its accuracy."""
     return compose(calibration.adjustment, origin, also=_describe_one(calibration, choice))
 
 
@@ -97,7 +97,7 @@ def _halves(calibration) -> list[Finding]:
 
 
 def _quality(covered, maps, unit: str, name: str = "", number: int = 0) -> Section:
-    """Where points were measured, and how well a projected point is known over the image."""
+    """Coverage, and the uncertainty of a projected point over the image."""
     counts = np.where(covered.counts > 0, covered.counts, np.nan)
     caption = f"Measured points by cell: {coverage_in_words(covered)}"
     parts = [figure(draw_field(counts, 0), caption)]
@@ -112,7 +112,7 @@ def _quality(covered, maps, unit: str, name: str = "", number: int = 0) -> Secti
 
 
 def _validation(calibration) -> Section:
-    """σ over the distance, and the two halves of the photographs."""
+    """σ against distance, and the two halves of the photographs."""
     distances, middle, corners, reported = calibration.uncertainty_curves()
     x = np.log10(distances)
     curves = [Curve("middle of the image", x, np.log10(middle)),
@@ -120,7 +120,7 @@ def _validation(calibration) -> Section:
     unit = _unit(calibration)
     drawing = draw_curves(curves, f"distance [{unit}]", "σ of a projected point [px]", "xy",
                           (float(np.log10(reported[0, 0])), "median distance of the board"))
-    parts = [figure(drawing, "Uncertainty over the distance of the point, in the scene"),
+    parts = [figure(drawing, "Uncertainty against the distance of the point, in the scene"),
              "<h3>Cross-validation</h3>\n"]  # fmt: skip
     parts += [paragraph(words[:1].upper() + words[1:])
               for words in cross_validation_in_words(calibration)]  # fmt: skip
@@ -144,7 +144,7 @@ def _models(choice) -> Section:
 
 
 def _describe_several(found, origin: Origin) -> Page:
-    """The whole: a finding a camera, the rig, the parameters of all."""
+    """The common page: one finding per camera, the rig, the parameters of all."""
     findings, sections, tables = [], [], {"cameras": _table_of_cameras(found)}
     for name, one in found.cameras.items():
         if not one.converged:
@@ -172,7 +172,7 @@ def _describe_several(found, origin: Origin) -> Page:
             if one.converged:
                 maps = one.reported_maps
                 sections.append(_quality(one.coverage, maps, _unit(one), name, number))
-    more = paragraph("Every camera by itself has a page of its own in its folder of --out.")
+    more = paragraph("Every camera has its own page in its folder of --out.")
     title = f"{KIND.capitalize()} {', '.join(map(clean, found.cameras))}"
     first = give_verdict(findings, (), more)
     return Page(title, [first, *sections], describe_origin((), origin), tables)
@@ -190,7 +190,7 @@ def _rig(rig, unit: str) -> Section:
 
 
 def _table_of_cameras(found) -> Listing:
-    """A row a parameter of every camera by itself."""
+    """One row per parameter of every separately calibrated camera."""
     rows = [
         (name, one.camera.model, parameter, value, one.sigma.get(parameter))
         for name, one in found.cameras.items() if one.converged
@@ -198,7 +198,7 @@ def _table_of_cameras(found) -> Listing:
     ]  # fmt: skip
     camera, model, parameter, value, sigma = zip(*rows) if rows else ((),) * 5
     words = lambda values: np.array(values, dtype=object)
-    return Listing("Cameras, each by itself", {
+    return Listing("Cameras, calibrated separately", {
         "camera": Column(words(camera), "camera"), "model": Column(words(model), "model"),
         "parameter": Column(words(parameter), "parameter"),
         "value": Column(numbers(value), "value", -9, True), "sigma": Column(numbers(sigma), "σ"),

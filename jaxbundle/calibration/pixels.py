@@ -14,7 +14,7 @@ from jaxbundle.errors import InputError
 def unit_size(model: CameraModel, pixel_size) -> tuple[float, float]:
     """Width and height of a pixel in the unit of the model.
 
-    **Raises:** `InputError` where the model is in mm and the size of a pixel is not given.
+    **Raises:** `InputError` if the model is in mm and the pixel size is missing.
     """
     if model.unit == "px":
         return 1.0, 1.0

@@ -1,4 +1,4 @@
-"""How good is a calibration: maps of uncertainty, coverage of the image, two halves compared."""
+"""Accuracy of a calibration: uncertainty maps, coverage of the image, comparison of two halves."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -22,13 +22,13 @@ from jaxbundle.statistics.projection import (
 )
 
 GRID = (11, 9)
-"""Columns and rows of the places a map is computed at."""
+"""Columns and rows of the grid of a map."""
 DRAWN = (21, 17)
-"""The same for a figure: between them σ is interpolated."""
+"""The same for a figure, with σ interpolated in between."""
 CELLS = (12, 9)
 """Columns and rows of the cells in which coverage is counted."""
 HELD_OUT_FEWEST = 4
-"""Photographs that are needed to calibrate from each half."""
+"""Minimum number of photographs for calibrations from halves."""
 
 
 @shows_itself
@@ -36,9 +36,9 @@ HELD_OUT_FEWEST = 4
 class UncertaintyMap:
     """Standard deviations of a projected point over the image.
 
-    **Fields:** `frame`, `distance`: what the point is held in, see
-    `jaxbundle.statistics.projection`; `uv` pixels of the places; `covariance` and `sigma`,
-    √((σx² + σy²)/2), pixels; NaN where there is no image.
+    **Fields:** `frame`, `distance`: the frame in which the point is fixed, see
+    `jaxbundle.statistics.projection`; `uv` pixels of the grid; `covariance` and `sigma`, √((σx² +
+    σy²)/2), pixels; NaN where there is no image.
     """
 
     frame: str
@@ -74,7 +74,7 @@ class UncertaintyMap:
 
 
 def grid_of(image_size, columns: int = GRID[0], rows: int = GRID[1]):
-    """Places from corner to corner of an image, pixels [rows, columns, 2]."""
+    """A grid from corner to corner of an image, pixels [rows, columns, 2]."""
     w, h = image_size
     return np.stack(np.meshgrid(np.linspace(0, w - 1, columns), np.linspace(0, h - 1, rows)), -1)
 
@@ -88,10 +88,10 @@ def uncertainty_map(
 ) -> UncertaintyMap:
     """The uncertainty of a projected point over the image of an adjusted camera.
 
-    **Arguments:** `frame`: "scene", "rotation" or "camera"; `distance` (object unit) matters for
-    "scene" only; `grid`: columns and rows of the map.
+    **Arguments:** `frame`: "scene", "rotation" or "camera"; `distance` (object unit) matters only
+    for "scene"; `grid`: columns and rows of the map.
 
-    **Raises:** `InputError` where the image size is not known or the distance impossible.
+    **Raises:** `InputError` if the image size is unknown or the distance impossible.
     """
     if frame not in FRAMES:
         raise InputError(f"frame {frame!r}: {', '.join(FRAMES)}")
@@ -126,9 +126,9 @@ def over_distance(
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """σ of a projected point in the middle and in the corners, pixels, [n] each.
 
-    The image of a point held in the scene changes with the projection centre in proportion to 1/d,
-    so that its variance is a polynomial of the second degree in 1/d: that of Lagrange through
-    `maps` of three distances is exact.
+    The image of a point fixed in the scene changes with the projection centre in proportion to 1/d,
+    so its variance is a quadratic polynomial in 1/d, found exactly by Lagrange interpolation of
+    `maps` at three distances.
     """
     near = np.array([1 / m.distance for m in maps])
     variance = np.array([m.sigma**2 for m in maps])[:, [0, 0, -1, -1], [0, -1, 0, -1]]
@@ -145,11 +145,11 @@ def over_distance(
 @shows_itself
 @dataclasses.dataclass(frozen=True)
 class Coverage:
-    """Where in the image points were measured.
+    """Coverage of the image by measured points.
 
-    **Fields:** `counts` of points in cells of the image; `part` of the cells that hold any;
-    `corners`: by name, whether the cells there hold any; `reach`: largest distance of a measured
-    point from the middle of the image, in half diagonals.
+    **Fields:** `counts` of points in cells of the image; `part` of the cells with points;
+    `corners`: by name, whether the corner cells have points; `reach`: largest distance of a
+    measured point from the image centre, in half diagonals.
     """
 
     counts: Int[np.ndarray, "rows columns"]
@@ -187,12 +187,11 @@ class CrossValidation:
     **Fields:**
 
     - `rms_own`: RMS of the residuals (pixels, |v| of a point) of the two halves adjusted freely;
-    - `rms_other`: the same with the camera held as the other half has it;
+    - `rms_other`: the same with the camera of the other half held;
     - `difference`: of the parameters, first half − second half, in units of its σ;
     - `test`: dᵀ·C⁻¹·d/k of all k free parameters, near 1 if the halves differ by chance;
-    - `halves`: the parameters of both; `comparison`: how far their images are apart over the
-      image, the implied rotation removed (`jaxbundle.cameras.compare`), in the model's unit; None
-      where nothing can be compared.
+    - `halves`: the parameters of both; `comparison`: their image differences, without the best
+      rotation (`jaxbundle.cameras.compare`), in the model's unit; None if nothing can be compared.
     """
 
     rms_own: float
@@ -210,12 +209,12 @@ def kept_rays(adjustment):
 
 
 def cross_validation(result) -> CrossValidation | None:
-    """Calibrate from every other photograph, and hold that camera against the rest.
+    """Calibrate from every other photograph, and test that camera on the rest.
 
-    **Arguments:** the adjustment of one camera: start values are taken from it, and what it has
-    removed stays away.
+    **Arguments:** the adjustment of one camera: its start values are used, and its removed
+    observations stay removed.
 
-    **Returns:** None where there are too few photographs, or a half determines no camera.
+    **Returns:** None if there are too few photographs, or a half does not determine the camera.
     """
     network = result.problem.network
     if len(network.images) < 2 * HELD_OUT_FEWEST:
@@ -258,8 +257,8 @@ def _compared(camera: Camera, halves) -> Comparison | None:
 
 
 def at_result(network: Network, result, keep=None) -> Network:
-    """The network with the adjusted values for its start values; parameters with a prior keep
-    theirs, which the prior is about. `keep`: rays that stay, those not removed if not given."""
+    """The network with adjusted values as start values; parameters with a prior keep theirs, to
+    which the prior refers. `keep`: remaining rays, by default those not removed."""
     camera, exterior = network.cameras[0], result.image_values
     parameters = result.camera_parameters(camera.id)
     parameters |= {name: camera.parameters.get(name, 0.0) for name in camera.sigma}

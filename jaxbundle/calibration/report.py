@@ -1,4 +1,4 @@
-"""The protocol of a calibration and its JSON: photographs, camera, quality, the adjustment."""
+"""The report of a calibration and its JSON: photographs, camera, quality, adjustment."""
 
 import numpy as np
 
@@ -24,7 +24,7 @@ LIMIT = 3.0
 
 
 def text(calibration) -> str:
-    """Photographs, camera, quality and advice; after it the protocol of the adjustment."""
+    """Photographs, camera, quality and advice, followed by the report of the adjustment."""
     lines = [*_photographs(calibration)]
     if calibration.converged:
         lines += [*_camera(calibration), *_quality(calibration), *_advice(calibration)]
@@ -44,7 +44,7 @@ def _photographs(calibration):
 
 
 def photograph_facts(views) -> list[tuple[str, str]]:
-    """The board, how many photographs, how many points of it were found."""
+    """The board, the number of photographs and of detected points."""
     size = " × ".join(map(str, views.image_size))
     return [
         ("Board", str(views.board)),
@@ -93,7 +93,7 @@ def mapping_error_in_words(error) -> str:
 
 
 def bias_in_words(bias) -> str:
-    """σ of a corner beside that of the residuals, and what the tests say."""
+    """σ of a corner compared with that of the residuals, and the conclusion of the tests."""
     tests = "; ".join(f"{name} {test}" for name, test in bias.tests.items())
     return (
         f"Bias: σ of a corner {bias.corner_sigma:.4f} px from {bias.cells} cells of four, of "
@@ -102,7 +102,7 @@ def bias_in_words(bias) -> str:
 
 
 def coverage_in_words(covered) -> str:
-    """How much of the image holds measured points."""
+    """The part of the image with measured points."""
     return (
         f"points in {100 * covered.part:.0f} % of the image's cells, out to "
         f"{100 * covered.reach:.0f} % of the half diagonal"
@@ -110,12 +110,13 @@ def coverage_in_words(covered) -> str:
 
 
 def map_rows(maps, unit: str) -> list[tuple[str, str, str]]:
-    """What a point is held in, its σ in the middle and in the corners, pixels (`MAPS_HEADER`)."""
+    """The frame in which a point is fixed, its σ in the middle and in the corners, pixels
+    (`MAPS_HEADER`)."""
     return [(_held_in(m, unit), fixed(m.middle, 3), fixed(m.corners, 3)) for m in maps]
 
 
 def cross_validation_in_words(calibration) -> list[str]:
-    """What either half of the photographs says of the other, in sentences."""
+    """The cross-validation of the halves, in sentences."""
     checked = calibration.cross_validation
     if checked is None:
         return ["too few photographs for two halves" if calibration.validated else "not made"]
@@ -195,7 +196,7 @@ def _quality_dict(calibration) -> dict:
 
 
 def choice_text(found) -> str:
-    """The models side by side (`choice.ModelComparison`)."""
+    """The comparison of models (`choice.ModelComparison`)."""
     lines = ["Camera models compared", "=" * 100]
     lines += facts([
         ("Photographs", f"{len(found.views)}, in {found.folds} folds; "
@@ -213,7 +214,7 @@ MODELS_HEADER = (
 
 
 def model_rows(found) -> list[tuple[str, ...]]:
-    """A row a model (`MODELS_HEADER`)."""
+    """One row per model (`MODELS_HEADER`)."""
     low = {name: min(getattr(one, name) for one in found.candidates) for name in ("aic", "bic")}
     rows = []
     for one in found.candidates:
@@ -229,7 +230,7 @@ def model_rows(found) -> list[tuple[str, ...]]:
 
 
 def models_legend(found) -> str:
-    """What the columns of `model_rows` are."""
+    """The columns of `model_rows`."""
     return (
         f"RMS: residuals of all photographs; left out: of those not used for the camera; Δ: images "
         f"apart from those of {found.best.model}, over the whole image, rotation removed, and RMS "
@@ -238,7 +239,7 @@ def models_legend(found) -> str:
 
 
 def choice_dict(found) -> dict:
-    """The models side by side as a section of JSON."""
+    """The comparison of models as a section of JSON."""
     candidates = {}
     for one in found.candidates:
         apart = found.differences.get(one.model)
@@ -299,7 +300,7 @@ def rig_text(rig) -> str:
 
 
 def rig_facts(rig, unit: str) -> list[tuple[str, str]]:
-    """Epochs, σ0, RMS, the board, and the epochs that are out or contradict."""
+    """Epochs, σ0, RMS, the board, and excluded or contradicting epochs."""
     odd = (*rig.left_out, *rig.contradicting)
     return [
         ("Epochs", f"{len(rig.epochs)} used, {len(rig.left_out)} left out"),

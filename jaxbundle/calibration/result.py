@@ -1,4 +1,4 @@
-"""The result of a calibration: the camera, its adjustment, and how good it is."""
+"""The result of a calibration: the camera, its adjustment, and its accuracy."""
 
 import dataclasses
 import functools
@@ -21,21 +21,21 @@ from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.tables import Camera
 
 DISTANCES = 400
-"""Distances of a curve of uncertainty, so many that no dip is missed."""
+"""Number of distances of an uncertainty curve, dense enough to show every dip."""
 
 
 class Calibration:
-    """A calibrated camera. Print it; `report()` is the whole protocol.
+    """A calibrated camera. It prints as a summary; `report()` is the full report.
 
     **Attributes:**
 
-    - `views`: what was measured, and which photographs failed and why;
-    - `adjustment`: the `Adjustment` of the network, with everything it can be asked;
+    - `views`: the measurements, and the failed photographs with reasons;
+    - `adjustment`: the `Adjustment` of the network;
     - `camera`: the camera with its adjusted parameters, held; `parameters` and `sigma` by name
       (in the unit of the model, a posteriori);
     - `rms`: √(Σ(vx² + vy²)/points) in pixels, as OpenCV defines it;
-    - `bias`, `mapping_error`, `coverage`, `advice`, `cross_validation`: how good it is, and what
-      to photograph next; `validated`: whether the last is wanted.
+    - `bias`, `mapping_error`, `coverage`, `advice`, `cross_validation`: accuracy, and advice on
+      further photographs; `validated`: whether the last is requested.
     """
 
     def __init__(self, views: BoardViews, adjustment: Adjustment, validated: bool = True):
@@ -65,7 +65,7 @@ class Calibration:
 
     @property
     def camera(self) -> Camera:
-        """The calibrated camera, nothing of it free."""
+        """The calibrated camera with no free parameters."""
         given = self.adjustment.network.cameras[0]
         return dataclasses.replace(given, parameters=self.parameters, free=(), sigma={})
 
@@ -95,7 +95,7 @@ class Calibration:
 
     @property
     def distances(self) -> Float[np.ndarray, " views"]:
-        """Of every view from the middle of the board, object unit."""
+        """Distance of every view from the centre of the board, object unit."""
         return np.linalg.norm(self.position - self.views.board.points.mean(0), axis=1)
 
     @functools.cached_property
@@ -105,26 +105,25 @@ class Calibration:
 
     @functools.cached_property
     def cross_validation(self) -> CrossValidation | None:
-        """The camera calibrated from either half of the photographs; None where there are too few,
-        or where it is not wanted (`validated`).
+        """The camera calibrated from either half of the photographs; None if there are too few,
+        or if not requested (`validated`).
 
-        Four more adjustments, made when first asked for."""
+        Four more adjustments, made on first access."""
         return quality.cross_validation(self.adjustment) if self.validated else None
 
     @functools.cached_property
     def bias(self) -> Bias | None:
-        """Whether the residuals hold more than noise: of camera model or board; None where too few
-        cells of four corners were seen."""
+        """The bias test of camera model and board; None with too few cells of four corners."""
         return find_bias(self.adjustment, self.views.board.grid)
 
     @functools.cached_property
     def mapping_error(self) -> MappingError:
-        """How far images are off over the whole image, whatever the camera model."""
+        """The expected mapping error over the whole image, comparable between camera models."""
         return mapping_error(self.adjustment, self.name)
 
     @functools.cached_property
     def advice(self) -> list[str]:
-        """Warnings in words, and what to photograph next (cross-validation not asked)."""
+        """Warnings in words, and advice on further photographs (without cross-validation)."""
         t = {name: abs(self.parameters[name]) / s for name, s in self.sigma.items() if s > 0}
         found = advice(
             self.position, self.rotation, self.views.board.points.mean(0),
@@ -193,7 +192,7 @@ class Calibration:
         return plotting.uncertainty_image(found, self.views.image_size, self._unit, self.name, ax)
 
     def plot_uncertainty_over_distance(self, ax=None):
-        """The curves of `uncertainty_curves`, with the figures of the report marked; matplotlib
+        """The curves of `uncertainty_curves`, with the values of the report marked; matplotlib
         axes."""
         span = float(self.distances.min()), float(self.distances.max())
         distances, middle, corners, reported = self.uncertainty_curves()
@@ -202,7 +201,7 @@ class Calibration:
         )
 
     def plot_halves(self, ax=None):
-        """How far the images of the two halves' cameras are apart (`cross_validation`); matplotlib
+        """The image differences of the cameras of the two halves (`cross_validation`); matplotlib
         axes."""
         halves = self.cross_validation
         if halves is None or halves.comparison is None:
@@ -211,7 +210,7 @@ class Calibration:
         return plotting.difference_map(halves.comparison, ax, title)
 
     def report(self) -> str:
-        """The whole protocol as text."""
+        """The full report as text."""
         from jaxbundle.calibration.report import text
 
         return text(self)

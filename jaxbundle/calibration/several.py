@@ -1,4 +1,4 @@
-"""Several cameras calibrated from one board: each by itself, and as a rig if they are mounted."""
+"""Several cameras calibrated from one board: separately, and as a rig if they are mounted."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +16,7 @@ from jaxbundle.measure.views import BoardViews
 
 @dataclasses.dataclass(frozen=True)
 class Calibrations:
-    """Calibrations by the name of the camera, and the rig, where there is one."""
+    """Calibrations by the name of the camera, and the rig, if any."""
 
     cameras: dict[str, Calibration]
     rig: RigCalibration | None = None
@@ -26,7 +26,7 @@ class Calibrations:
         return all(one.converged for one in self.cameras.values())
 
     def report(self) -> str:
-        """The protocols of all cameras, that of the rig before them."""
+        """The reports of all cameras, preceded by that of the rig."""
         from jaxbundle.calibration.report import rig_text
 
         parts = [one.report() for one in self.cameras.values()]
@@ -45,13 +45,13 @@ def calibrate_cameras(
 ) -> Calibrations:
     """Calibrate several cameras from photographs of one board.
 
-    **Arguments:** `photographs` by the name of the camera; `rig`: the cameras are mounted rigidly
-    and photographed in step (`calibration.rig`), the first is the reference; epochs that
-    contradict the mounting are left out, and then single points (`snooping`, also where the cameras
-    were estimated robustly), but with `snooping=None` neither, and such epochs are only named;
-    `progress()`: after every photograph; `options`: those of `calibrate`.
+    **Arguments:** `photographs` by the name of the camera; `rig`: rigidly mounted cameras with
+    simultaneous photographs (`calibration.rig`), the first is the reference; epochs that contradict
+    the mounting are excluded, then single points (`snooping`, also if the cameras were estimated
+    robustly); with `snooping=None` such epochs are only listed; `progress()`: after every
+    photograph; `options`: those of `calibrate`.
 
-    **Raises:** `InputError`, `NotSolvedError`, naming the camera where there are several.
+    **Raises:** `InputError`, `NotSolvedError`, naming the camera if there are several.
     """
     if not isinstance(photographs, Mapping) or not photographs:
         raise InputError(
@@ -59,7 +59,7 @@ def calibrate_cameras(
             f"is {shown(photographs)}"
         )
     if rig and len(photographs) < 2:
-        raise InputError("a rig has two cameras or more: give --camera NAME=PATTERN for each")
+        raise InputError("a rig has at least two cameras: give --camera NAME=PATTERN for each")
     found = {}
     for name, given in photographs.items():
         tell = None if progress is None else lambda *_: progress()
@@ -74,6 +74,7 @@ def calibrate_cameras(
         names = ("board_sigma", "board_free", "snooping", "significance")
         given = {name: options[name] for name in names if name in options}
         if options.get("robust") and not given.get("snooping"):
-            given["snooping"] = "pope"  # What counts less in a camera counts fully in the rig.
+            # Points downweighted in a camera have full weight in the rig.
+            given["snooping"] = "pope"
         together = calibrate_rig(found, **given)
     return Calibrations(found, together)

@@ -1,19 +1,20 @@
-r"""How stable is a camera? Calibrations of it at n epochs or temperatures, and what differs by more
-than their σ.
+r"""Stability of a camera: calibrations at n epochs or temperatures, and their significant
+differences.
 
 With interior orientations pᵢ and covariances Cᵢ, independent of each other:
 
-**Homogeneity.** p̄ = (ΣCᵢ⁻¹)⁻¹·ΣCᵢ⁻¹pᵢ, and if nothing has changed
+**Homogeneity.** p̄ = (ΣCᵢ⁻¹)⁻¹·ΣCᵢ⁻¹pᵢ, and without changes
 
     Σ (pᵢ − p̄)ᵀ·Cᵢ⁻¹·(pᵢ − p̄)   ~   χ²((n − 1)·k)
 
-A second test leaves out what every exterior orientation takes up. With A the slopes of images by
-the parameters, A' those after the best rotation, G and H the means of AᵀA and A'ᵀA' over the image,
+A second test ignores changes that an exterior orientation absorbs. With A the derivatives of images
+by the parameters, A' those after the best rotation, G and H the means of AᵀA and A'ᵀA' over the
+image,
 
     H·s = μ·G·s,        0 ≤ μ ≤ 1
 
-says which part μ of the image motion by a change s no rotation removes. Changes with μ below a
-tenth (a shift of the principal point is nearly a rotation) are taken out: χ² of the others.
+gives the fraction μ of the image motion by a change s that no rotation removes. Changes with μ
+below a tenth (a shift of the principal point is nearly a rotation) are excluded from this χ².
 
 **Between epochs.** For each parameter τ², a variance on top of its σᵢ², by Paule and Mandel:
 Σ (pᵢ − m)²/(σᵢ² + τ²) = n − 1, m the mean with these weights. Against a temperature or a date the
@@ -44,7 +45,7 @@ from jaxbundle.statistics.difference import Covariance
 ROTATION = 0.1
 """μ below this: nearly a rotation."""
 SEEN = 1e-12
-"""Of the largest: changes of the parameters that move no image are left out below it."""
+"""Relative limit below which parameter changes that move no image are dropped."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,13 +120,13 @@ class Stability:
 def stability(
     calibrations: Sequence[tuple[Camera, Covariance]], at: Sequence[float] | None = None
 ) -> Stability:
-    """Compare two calibrations of a camera or more.
+    """Compare two or more calibrations of a camera.
 
     **Arguments:** camera, and names and covariance of its free parameters, of every epoch
     (`Calibration.camera`, `Calibration.adjustment.camera_covariance`; of files
     `read_calibrated`); `at`: a number for each epoch, such as its temperature, for the slopes.
 
-    **Raises:** `InputError` where they are not of one camera.
+    **Raises:** `InputError` if they are not of one camera.
     """
     cameras = [camera for camera, _ in calibrations]
     names = _check(calibrations, at)
@@ -193,7 +194,7 @@ def _homogeneity(p, C) -> Homogeneity:
 
 
 def _without_rotation(G, H, scale) -> Float[np.ndarray, "m k"]:
-    """Functions F·p of the parameters that a change like a rotation leaves as they are."""
+    """Functions F·p of the parameters that are invariant to rotation-like changes."""
     unit = np.outer(scale, scale)
     size, U = np.linalg.eigh(G * unit)
     seen = size > SEEN * size[-1]

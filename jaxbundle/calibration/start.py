@@ -1,17 +1,16 @@
-"""Start values of a camera and its photographs of a board, and views that cannot be right.
+"""Start values of a camera and its photographs of a board, and exclusion of impossible views.
 
 `calibrate_batch` gives focal lengths and poses in closed form and adjusts them, in a model in
 pixels. For a model in millimetres that is `opencv` with k1 and k2; to first order
 
     c = (fx·p_x + fy·p_y)/2,   K1 = ∓k1/c²  (− for a correction, + for a distortion)
 
-The parameters of every other model, and of a user's own, are those with the same images as
-`opencv` (or `kannala-brandt`, where rays may be 90° and more from the axis), by a fit over the
-image.
+The parameters of every other model, including user-defined ones, are fitted over the image to
+`opencv` (or `kannala-brandt`, if rays may be 90° and more from the axis).
 
-A view whose points do not fit the others (a wrong board, a wrong order of corners) is left out:
-more than a third of its residuals are gross, measured by the median of all; or it looks at the
-board from behind, as a mirror image does.
+A view whose points do not fit the others (a wrong board, a wrong order of corners) is excluded:
+more than a third of its residuals are gross compared with the median of all, or it looks at the
+board from behind, like a mirror image.
 """
 
 import dataclasses
@@ -28,20 +27,20 @@ from jaxbundle.measure.views import BoardViews
 from jaxbundle.network.columns import count
 
 GROSS = 12.0
-"""Residuals above so many times their typical size (1.4826·median) are gross."""
+"""Residuals above this multiple of their typical size (1.4826·median) are gross."""
 LEAST_GROSS = 3.0
-"""And above so many pixels."""
+"""And above this many pixels."""
 PART = 1 / 3
 SOLVED = ("opencv", "kannala-brandt", "snavely")
-"""Models in pixels that `calibrate_batch` solves without a start."""
+"""Models in pixels that `calibrate_batch` solves without start values."""
 SIMPLE = ("fx", "fy", "cx", "cy", "k1", "k2")
 WIDE = tuple(np.radians([60.0, 100.0, 140.0, 180.0]))
-"""Fields of view tried where the views alone give no start for a fisheye."""
+"""Fields of view tried if the views give no start values for a fisheye."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Start:
-    """Views that can be used, parameters of the camera, X0 and ω, φ, κ (radians) of every view."""
+    """Usable views, camera parameters, X0 and ω, φ, κ (radians) of every view."""
 
     views: BoardViews
     parameters: dict[str, float]
@@ -54,7 +53,8 @@ def start_values(
 ) -> Start:
     """Start values for the adjustment of one camera; `given`: parameters known beforehand.
 
-    **Raises:** `InputError` for too few views; `NotSolvedError` where they determine no camera.
+    **Raises:** `InputError` for too few views; `NotSolvedError` if they do not determine the
+    camera.
     """
     fisheye, by_fit = get_model("kannala-brandt"), _by_fit(model)
     known, wanted = (fisheye, fisheye.free) if by_fit and model.wide else (model, free)
@@ -92,7 +92,7 @@ def start_values(
 
 
 def _by_fit(model: CameraModel) -> bool:
-    """Whether its start values come from those of another model."""
+    """Whether its start values are derived from another model."""
     return is_own(model) or (model.unit == "px" and model.name not in SOLVED)
 
 
@@ -101,7 +101,7 @@ def _why(views):
 
 
 def _solve(views: BoardViews, model: CameraModel, free) -> BatchCalibration:
-    """The first attempt with a solution, a weak one as well."""
+    """The first attempt with a solution, possibly weak."""
     size, direct = views.image_size, model.unit == "px" and not _by_fit(model)
     if direct:
         attempts = [(model.name, free, None)]
@@ -126,7 +126,7 @@ def _solve(views: BoardViews, model: CameraModel, free) -> BatchCalibration:
         if solved.solved[0]:
             return solved
     raise NotSolvedError(
-        f"not solved: {len(views)} photographs of the board determine no camera "
+        f"not solved: {len(views)} photographs of the board do not determine the camera "
         f"({solved.status[0]}); take it from different directions, tilted by 20° to 45°, some with "
         "the camera turned by 90°, or free fewer parameters",
         free,
@@ -134,7 +134,7 @@ def _solve(views: BoardViews, model: CameraModel, free) -> BatchCalibration:
 
 
 def _gross_views(views, solved):
-    """Views of which more than a third of the residuals are gross."""
+    """Views with more than a third of gross residuals."""
     v = _residuals(views, solved)
     typical = 1.4826 * np.nanmedian(v)
     gross = v > max(GROSS * typical, LEAST_GROSS)
@@ -142,7 +142,7 @@ def _gross_views(views, solved):
 
 
 def _residuals(views, solved):
-    """Lengths of the residuals, pixels; NaN where there is no point."""
+    """Lengths of the residuals, pixels; NaN for missing points."""
     model = get_model(solved.model)
     computed = images_of_board(
         model, solved.interior[0], solved.position[0], solved.rotation[0], views.board.points
@@ -151,7 +151,7 @@ def _residuals(views, solved):
 
 
 def _parameters(views, solved, model, free, pixel_size) -> dict[str, float]:
-    """Parameters of the camera as found; those in mm that are not free keep their default."""
+    """The computed parameters of the camera; those in mm that are not free keep their default."""
     found = dict(zip(get_model(solved.model).parameters, solved.interior[0].tolist()))
     if model.unit == "px":
         return found
@@ -173,8 +173,8 @@ def _parameters(views, solved, model, free, pixel_size) -> dict[str, float]:
 
 
 def _fitted(views, solved, model, free, pixel_size, given) -> dict[str, float]:
-    """Parameters of a model with the images of the camera as found, where points are; of one
-    whose parameters have a prior, these alone, all of them, over the whole image if it can be."""
+    """Parameters of a model fitted to the images of the computed camera, over the measured area;
+    for a model with priors, all parameters with a prior, over the whole image if possible."""
     source, xy = get_model(solved.model), views.xy[views.visible]
     found = dict(zip(source.parameters, solved.interior[0].tolist()))
     if {*given} - {*model.principal_distance}:

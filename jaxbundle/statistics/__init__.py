@@ -1,1 +1,1 @@
-"""What is said of an adjusted network: precision, blunders, misfit, weakness, check points."""
+"""Statistics of an adjusted network: precision, blunders, misfit, weakness, check points."""

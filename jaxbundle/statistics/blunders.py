@@ -1,4 +1,4 @@
-"""Blunders and suspects in the words of a network."""
+"""Blunders and suspects in network terms."""
 
 import dataclasses
 import math
@@ -11,8 +11,8 @@ from jaxbundle.types import present
 
 @dataclasses.dataclass(frozen=True)
 class Removed:
-    """A removed observation: its kind, row in the arrays of its kind, a name for people, its test
-    value. `others`: rows of observations that may be the wrong ones instead, removed with it."""
+    """A removed observation: kind, row in the arrays of its kind, a name for reports, test value.
+    `others`: rows of inseparable observations, removed with it."""
 
     kind: str
     row: int
@@ -28,8 +28,8 @@ class Removed:
 
 @dataclasses.dataclass(frozen=True)
 class Suspect:
-    """An observation whose residual is too long for a good one: its kind, row in the arrays, a name
-    for people, the length of its residual t in units of σ and scale, the factor of its weight."""
+    """An observation whose residual exceeds the critical length: kind, row in the arrays, a name
+    for reports, the length t of its residual in units of σ and scale, its weight factor."""
 
     kind: str
     row: int
@@ -39,7 +39,7 @@ class Suspect:
 
 
 def name_removed(problem: Problem, found: snooping.Removed) -> Removed:
-    """What data snooping has removed, with its name."""
+    """Observations removed by data snooping, with names."""
     kind, rows = _place(problem, found.set, found.rows)
     names = [_name(problem, found.set, row, found.residual) for row in found.rows]
     if kind == "control":
@@ -50,7 +50,7 @@ def name_removed(problem: Problem, found: snooping.Removed) -> Removed:
 def image_points_removed(
     problem: Problem, named: Iterable[tuple[str, str]]
 ) -> list[snooping.Removed]:
-    """Image points, by the ids of image and point, as data snooping removes them."""
+    """Image points, by image and point id, as removals for data snooping."""
     named = set(named)
     if not named:
         return []
@@ -67,12 +67,12 @@ def image_points_removed(
 
 
 def either_of(names: Sequence[str]) -> str:
-    """What was removed together because nothing says which of it is wrong."""
+    """Inseparable observations that were removed together."""
     return names[0] if len(names) == 1 else f"either of {', '.join(names[:-1])} or {names[-1]}"
 
 
 def name_suspect(problem: Problem, found: robust.Suspect) -> Suspect:
-    """What robust estimation suspects, with its name."""
+    """Suspects of the robust estimation, with names."""
     kind, rows = _place(problem, found.set, (found.row,))
     name = _name(problem, found.set, found.row, None)
     return Suspect(kind, rows[0], name, found.test, found.weight)

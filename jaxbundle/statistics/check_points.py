@@ -1,6 +1,6 @@
 """Check points: intersected with the adjusted orientations, compared with their given coordinates.
 
-They take no part in the adjustment. Their σ contains the rays and the uncertainty of the
+They are excluded from the adjustment. Their σ includes that of the rays and the uncertainty of
 orientations and cameras (`leastsquares/checks.py`).
 """
 

@@ -9,8 +9,8 @@ from jaxbundle.network.units import ANGLE_UNITS
 
 
 def groups(problem: Problem) -> list[Group]:
-    """Image coordinates (by camera, where several have several images), control points by axis,
-    priors, distances; further kinds by their name."""
+    """Image coordinates (by camera, if several have several images), control points by axis,
+    priors, distances; further kinds by name."""
     network, layout, found = problem.network, problem.layout, []
     of = {f: [o for o, s in enumerate(layout.sets) if s.field == f]
           for f in ("image", "control", "exterior", "interior", "distance")}  # fmt: skip

@@ -5,7 +5,7 @@ from jaxtyping import Float
 
 
 def correlation_matrix(cofactor: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """ρᵢⱼ = qᵢⱼ/√(qᵢᵢqⱼⱼ); 1 on the diagonal, 0 beside an unknown without variance."""
+    """ρᵢⱼ = qᵢⱼ/√(qᵢᵢqⱼⱼ); 1 on the diagonal, 0 with an unknown without variance."""
     sigma = np.sqrt(np.clip(np.diagonal(cofactor), 0, None))
     scale = np.where(sigma > 0, 1 / np.where(sigma > 0, sigma, 1), 0.0)
     C = cofactor * scale[:, None] * scale[None, :]
@@ -14,7 +14,8 @@ def correlation_matrix(cofactor: Float[np.ndarray, "n n"]) -> Float[np.ndarray, 
 
 
 def total_correlation(cofactor: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " n"]:
-    """1 − 1/(C⁻¹)ᵢᵢ: how much of an unknown the others of the group explain (C: correlations).
+    """1 − 1/(C⁻¹)ᵢᵢ: the fraction of an unknown explained by the others of the group (C:
+    correlations).
 
     The squared multiple correlation; BINGO lists it for the parameters of a camera.
     """

@@ -1,12 +1,12 @@
-r"""How large the difference of two calibrations may be by chance.
+r"""The expected difference of two calibrations.
 
-The images of one ray by two calibrations that know nothing of each other differ, to first order, by
+The images of one ray by two independent calibrations differ, to first order, by
 
     C(d) = C_a + C_b,       C = A·Cp·Aᵀ
 
-at every place, each with the rotation that every exterior orientation takes up removed
+at every image position, each without the rotation that an exterior orientation absorbs
 (`projection`, frames "rotation" and "camera"). A difference (`cameras.compare`) well above its σ
-says that the camera has changed, or that a model does not fit.
+means that the camera has changed, or that a model does not fit.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,7 +37,7 @@ def expected_difference(
     **Arguments:** the comparison of a and b, and what it was made from; `covariances` of their
     free parameters.
 
-    **Returns:** NaN where there is no difference.
+    **Returns:** NaN where the difference is undefined.
     """
     xy = np.stack(np.meshgrid(comparison.x, comparison.y), -1).reshape(-1, 2)
     there = xy + comparison.difference.reshape(-1, 2)

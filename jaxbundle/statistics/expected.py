@@ -1,7 +1,7 @@
-"""The precision a network will have, before anything is measured.
+"""The expected precision of a network before measurement.
 
-Cofactors at the start values, with the a priori σ and σ0 = 1: what `adjust` reports of a network
-that fits as well as its σ say.
+Cofactors at the start values, with the a priori σ and σ0 = 1: the report of `adjust` for a network
+whose residuals agree with its σ.
 """
 
 import dataclasses
@@ -48,7 +48,7 @@ def expected_precision(network: Network) -> ExpectedPrecision:
         raise InputError("the planned network is too large for its covariance; plan a part of it")
     found = Inspection(problem, problem.data.start)
     if not found.determined:
-        raise InputError("the planned network leaves something undetermined; plan more overlap")
+        raise InputError("the planned network is not fully determined; plan more overlap")
     sigma = lambda Q: np.sqrt(np.clip(np.diagonal(np.asarray(Q), axis1=1, axis2=2), 0, None))
     points = problem.network.points
     return ExpectedPrecision(

@@ -1,4 +1,4 @@
-"""Points at any distance in a result: direction and distance from the middle of the network."""
+"""Points at any distance in a result: direction and distance from the centre of the network."""
 
 import dataclasses
 
@@ -14,12 +14,12 @@ from jaxbundle.types import present
 @shows_itself
 @dataclasses.dataclass(frozen=True)
 class FarPoints:
-    """Points of which the rays tell the direction well, and the distance badly or not at all.
+    """Points with a well-determined direction and a poorly determined distance.
 
-    **Attributes:** `id`; `origin` [3], the place they are seen from; `direction` [n, 3], unit
+    **Attributes:** `id`; `origin` [3] of the directions; `direction` [n, 3], unit
     vectors; `sigma_direction` [n, 2], the semi-axes of its ellipse across the ray, the larger one
-    first (radians); `inverse_distance` and its σ (1/object unit), 0 and NaN where a point is held
-    at infinity; `at_infinity`. σ are those of the inspection, times `sigma0`.
+    first (radians); `inverse_distance` and its σ (1/object unit), 0 and NaN for a point held at
+    infinity; `at_infinity`. σ are those of the inspection, times `sigma0`.
     """
 
     id: tuple[str, ...]
@@ -37,14 +37,14 @@ class FarPoints:
 
     @property
     def reach(self) -> Float[np.ndarray, "n 2"]:
-        """The distances one σ nearer and farther, on the scale of the inverse distance; NaN where a
-        point is held at infinity."""
+        """The distances one σ nearer and farther, on the scale of the inverse distance; NaN for a
+        point held at infinity."""
         w, s = self.inverse_distance, self.sigma_inverse_distance
         return np.stack([_inverse(w + s), _inverse(np.maximum(w - s, 0.0))], 1)
 
 
 def find_far_points(inspection: Inspection, sigma0: float) -> FarPoints | None:
-    """The points at any distance of a solution; None where there are none."""
+    """The points at any distance of a solution; None if there are none."""
     problem = inspection.problem
     if not problem.at_any_distance.any():
         return None

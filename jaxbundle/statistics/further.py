@@ -1,4 +1,4 @@
-"""The unknowns that came with further kinds of observations, row by row, with their σ."""
+"""The unknowns of further kinds of observations, by row, with σ."""
 
 from functools import partial
 from typing import NamedTuple
@@ -16,7 +16,7 @@ ANGLES = ("omega", "phi", "kappa")
 
 
 class Estimate(NamedTuple):
-    """An unknown of a row: table, row, name, value, σ a posteriori (0 where it is held); `angle`:
+    """An unknown of a row: table, row, name, value, a posteriori σ (0 if held); `angle`:
     radians."""
 
     table: str
@@ -28,8 +28,8 @@ class Estimate(NamedTuple):
 
 
 def estimates(found: Solution, names, sigma0: float, origin) -> list[Estimate]:
-    """All unknowns of some tables. Of frames and poses X0, Y0, Z0 in object space (of mountings in
-    the reference camera), ω, φ, κ."""
+    """All unknowns of some tables. Frames and poses are given as X0, Y0, Z0 in object space
+    (mountings in the reference camera), ω, φ, κ."""
     every = []
     for table in (t for t in found.problem.tables if t.name in names):
         values, Q = found.values[table.name], np.asarray(found.cofactor(table.name))
@@ -49,7 +49,7 @@ def estimates(found: Solution, names, sigma0: float, origin) -> list[Estimate]:
 
 @partial(jax.jit, static_argnums=0)
 def _read_rows(space, values):
-    """Every row as numbers people read [rows, n], and their derivatives by its changes [rows, n,
+    """Every row as reported numbers [rows, n], and their derivatives by its changes [rows, n,
     width]."""
 
     def of_row(value):
@@ -61,7 +61,7 @@ def _read_rows(space, values):
 
 
 def _read(space, value, near):
-    """A row as numbers people read; `near`: of all angles the nearest to these."""
+    """A row as reported numbers; `near`: choose the angles nearest to these."""
     if isinstance(value, PoseValue):
         return jnp.concatenate([value.position, _angles(value.rotation, near)])
     if isinstance(space, Rotation):

@@ -1,4 +1,4 @@
-"""Quantities that an adjustment holds fixed, by name, and errors of a stated σ in them."""
+"""Held quantities of an adjustment by name, and errors of given σ in them."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -25,15 +25,14 @@ from jaxbundle.network.further.base import ANGLES
 from jaxbundle.network.tables import EXTERIOR
 
 EVERY = "*"
-"""Stands for all ids, or all names, of what is held."""
+"""Wildcard for all ids, or all names, of held quantities."""
 ANGLES_OF_POSES = EXTERIOR[3:]
 
 
 @dataclasses.dataclass(frozen=True)
 class Cause:
-    """Something held, with an error: the `name` it was given by, in words; σ of the error (None
-    where the errors were given as a whole), radians of an `angle`; the independent errors, each a
-    change of held values by one σ."""
+    """A held quantity with an error: its `name`, in words; σ of the error (None for common errors),
+    radians for an `angle`; the independent errors, each a change of held values by one σ."""
 
     name: str
     words: str
@@ -43,10 +42,10 @@ class Cause:
 
 
 def find_causes(problem: Problem, values: Values, held: Mapping[Any, Any]) -> list[Cause]:
-    """What is held, by names KIND:ID:NAME, texts or tuples; `values`: the engine's tables.
+    """Held quantities by names KIND:ID:NAME, texts or tuples; `values`: the engine's tables.
 
-    **Raises:** `InputError` for a name that is not there or is estimated, and for a σ that is no
-    positive number."""
+    **Raises:** `InputError` for an unknown or estimated quantity, and for a σ that is not
+    positive."""
     if not isinstance(held, Mapping) or not held:
         raise InputError(
             'held: σ of what is held, by name, are expected, such as {"camera:cam:K3": 1e-6}; '
@@ -75,7 +74,7 @@ def _cause(problem: Problem, values: Values, name, given) -> Cause:
 
 
 def _common(problem: Problem, values: Values, name: str, given: Mapping) -> Cause:
-    """One error that many held quantities have together: by name, by how much each changes."""
+    """One error common to many held quantities: by name, the change of each."""
     change = []
     for one, amount in given.items():
         kind, id, parameter = split_name(one)
@@ -85,7 +84,7 @@ def _common(problem: Problem, values: Values, name: str, given: Mapping) -> Caus
             for table, row, column, _ in _held_places(problem, kind, id, parameter)
         ]
     if not change:
-        raise InputError(f"held: {name!r} names nothing that changes")
+        raise InputError(f"held: {name!r} changes nothing")
     return Cause(name, name, None, False, (tuple(change),))
 
 
@@ -133,7 +132,7 @@ def _held_places(problem: Problem, kind: str, id: str, parameter: str):
         )
     if not found:
         raise InputError(
-            f"{text}: is estimated, and its σ is in the result; a budget is of what is held"
+            f"{text}: is estimated, and its σ is in the result; a budget is for held quantities"
         )
     return found
 
@@ -146,13 +145,13 @@ def _tables_of(problem: Problem, kind: str) -> list[Table]:
     if not found:
         known = dict.fromkeys(["camera", "image", "point", *(t.name for t in tables)])
         raise InputError(
-            f"held: there is nothing called {kind!r}; known: {some(known, 12, str)}"
+            f"held: unknown kind {kind!r}; known: {some(known, 12, str)}"
         )
     return found
 
 
 def _names(problem: Problem, table: Table) -> tuple[str, ...]:
-    """What the numbers of a row are called."""
+    """The names of the numbers of a row."""
     for camera in problem.layout.cameras:
         if camera.name == table.name:
             return camera.parameters
@@ -177,7 +176,7 @@ def _is_free(table: Table, row: int, column: int) -> bool:
 
 
 def _direction(table: Table, values: Values, row: int, column: int):
-    """How the value of a row changes with one of its numbers: that number, or by an angle the unit
+    """The change of a row's value with one of its numbers: that number, or for an angle the unit
     quaternion."""
     value = jax.tree.map(lambda x: np.asarray(x)[row], values[table.name])
     if isinstance(value, PoseValue):
@@ -192,8 +191,8 @@ def _direction(table: Table, values: Values, row: int, column: int):
 
 @jax.jit
 def _turns(rotation):
-    """∂q/∂(ω, φ, κ) of a unit quaternion, a row an angle: by way of a small turn δθ, of which the
-    angles have an invertible derivative."""
+    """∂q/∂(ω, φ, κ) of a unit quaternion, one row per angle: via a small rotation δθ, whose
+    derivative of the angles is invertible."""
 
     def both(d):
         q = retract_quaternion(rotation, d)

@@ -1,4 +1,4 @@
-"""The solution of a network, looked at in the words and order of the network."""
+"""Inspection of a network solution, in terms and order of the network."""
 
 import functools
 from collections.abc import Callable
@@ -34,7 +34,8 @@ class _OfTables(eqx.Module):
 
 
 class Inspection:
-    """What statistics need of a problem at its `adjusted` values; `solution` is the engine's."""
+    """Quantities for the statistics of a problem at its `adjusted` values; `solution`: the
+    engine's."""
 
     def __init__(self, problem: Problem, values: Values):
         self.problem, self.adjusted = problem, values
@@ -62,18 +63,18 @@ class Inspection:
 
     @functools.cached_property
     def image_cofactors(self) -> Float[np.ndarray, "images 6 6"]:
-        """Of X0, Y0, Z0 and the small turn δθ of every image; zero where it is held."""
+        """Cofactors of X0, Y0, Z0 and the small rotation δθ of every image; zero if held."""
         return self.solution.cofactor("image")
 
     @functools.cached_property
     def point_cofactors(self) -> Float[np.ndarray, "points 3 3"]:
-        """Of X, Y, Z of every point; zero where it is held."""
+        """Cofactors of X, Y, Z of every point; zero if held."""
         Q = self.solution.cofactor("point")
         return np.asarray(self.problem.layout.coordinate_cofactors(self.adjusted.point, Q))
 
     @functools.cached_property
     def camera_cofactors(self) -> list[Float[np.ndarray, "k k"]]:
-        """Of the parameters of every camera that are free in any camera of its model."""
+        """Cofactors of the parameters of every camera that are free in any camera of its model."""
         found = [np.zeros((0, 0))] * len(self.problem.network.cameras)
         for table in self.problem.layout.cameras:
             for c, Q in zip(table.cameras, self.solution.cofactor(table.name)):

@@ -1,7 +1,7 @@
-"""What σ0 and the median residual say against the a priori σ.
+"""Comparison of σ0 and the median residual with the a priori σ.
 
-A few blunders do not move the robust scale of the residuals (`leastsquares/robust.py`), σ that are
-too small do; σ0 is moved by both, which tells them apart.
+A few blunders do not change the robust scale of the residuals (`leastsquares/robust.py`), too small
+σ do; σ0 is changed by both, which separates the two causes.
 """
 
 import math
@@ -9,16 +9,16 @@ import math
 from jaxbundle.leastsquares.distributions import chi2_quantile
 
 CONTRADICTED = 1.2
-"""A scale beyond this factor contradicts the a priori σ, if it is beyond chance too."""
+"""A scale beyond this factor contradicts the a priori σ, if it is also significant."""
 BEYOND_CHANCE = 0.001
 MANY = 0.05
-"""More than this part of the image points, beyond those removed by chance, is worth a word."""
+"""A larger fraction of removed image points, beyond chance, is reported."""
 UNRECOGNISABLE = 20.0
-"""Residuals so many times their σ are most likely of coordinates in other axes or units."""
+"""Residuals this many times their σ are most likely due to wrong axes or units."""
 
 
 def contradicts(scale: float, redundancy: int) -> bool:
-    """Whether a scale of 1 is out of the question."""
+    """Whether a scale of 1 can be excluded."""
     low, high = (
         math.sqrt(chi2_quantile(p, redundancy) / redundancy)
         for p in (BEYOND_CHANCE / 2, 1 - BEYOND_CHANCE / 2)
@@ -29,15 +29,15 @@ def contradicts(scale: float, redundancy: int) -> bool:
 def doubt_of_baarda(
     scale: float, removed: int, rays: int, redundancy: int, significance: float
 ) -> str | None:
-    """What Baarda's test has done with σ that the data contradict, or that it has removed many more
-    image points than chance makes it, and the remedy.
+    """A message about Baarda's test with a priori σ that the data contradict, or with many more
+    removed image points than chance explains, and the remedy.
 
-    **Arguments:** `scale` of the good image points, without their selection by this test; how many
-    of so many were removed; the level of the test, of one coordinate.
+    **Arguments:** `scale` of the good image points, without selection by this test; the number of
+    removed points and of all; the level of the test, for one coordinate.
     """
     by_chance = 1 - (1 - significance) ** 2
     took = (
-        f"{removed} of {rays} image points removed, {100 * removed / rays:.2g} %; of good ones the "
+        f"{removed} of {rays} image points removed, {100 * removed / rays:.2g} %; of good ones "
         f"significance {significance:g} removes {100 * by_chance:.2g} %"
     )
     pope = "test with the a posteriori σ (--snooping pope)"
@@ -57,7 +57,7 @@ def doubt_of_baarda(
 
 
 def doubt_of_robust(scale: float, redundancy: int) -> str | None:
-    """That the scale of a robust estimate is not that of the σ given, and the remedy."""
+    """A message that the scale of a robust estimate contradicts the given σ, and the remedy."""
     if not contradicts(scale, redundancy):
         return None
     return (
@@ -70,14 +70,14 @@ def doubt_of_robust(scale: float, redundancy: int) -> str | None:
 def doubt_of_fit(
     sigma0: float, scale: float, redundancy: int, in_pixels: bool = False
 ) -> str | None:
-    """That the global test is far from passed, with the ratio, and the likely causes first.
+    """A message that the global test clearly fails, with the ratio and the likely causes first.
 
     **Arguments:** `sigma0` of all observations; `scale` of the image points by their median;
     whether a principal distance in mm may be `in_pixels`.
     """
     if not (redundancy > 0 and contradicts(sigma0, redundancy)):
         return None
-    told = f"χ² test far from passed: vᵀPv/redundancy is {sigma0**2:.3g} (σ0 {sigma0:.3g}), not 1"
+    told = f"χ² test clearly failed: vᵀPv/redundancy is {sigma0**2:.3g} (σ0 {sigma0:.3g}), not 1"
     if sigma0 < 1:
         return f"{told}; likely cause: a priori σ that are too large. {_remedy(sigma0)}"
     sigma, blunders = "a priori σ that are too small", "blunders (--snooping pope)"
@@ -91,7 +91,7 @@ def doubt_of_fit(
         sigma += f" (multiply them by {scale:.3g}, or --components)"
         causes = [sigma, blunders, missing, mirrored]
     if in_pixels:
-        causes.insert(0, "a principal distance in pixels for mm")
+        causes.insert(0, "a principal distance in pixels instead of mm")
     return f"{told}; likely causes, the likeliest first: {', '.join(causes)}"
 
 

@@ -1,12 +1,12 @@
-"""The precision of a design: σ of everything as a differentiable function of the design.
+"""The precision of a design: all σ as a differentiable function of the design.
 
     C = σ0²·S·(JᵀPJ)⁻¹·Sᵀ,        S the S-transformation into the datum (`leastsquares/datum.py`)
 
-Nothing is adjusted, and no measurement enters. J is taken at the given values (`Data.start`:
-stations, targets, cameras), with image coordinates that are predicted from them, so that it is a
-function of the design alone; P are the weights of the data. So a network needs no measurements to
-be planned, only who sees whom (the rows of the problem). The precision of a network that was
-measured is that of its adjusted values: `precision(problem, replace(data, start=solve(…)))`.
+Nothing is adjusted, and no measurements are used. J is evaluated at the given values (`Data.start`:
+stations, targets, cameras) with predicted image coordinates, so that it is a function of the design
+only; P are the weights of the data. Planning a network requires only its visibility (the rows of
+the problem). For the precision of a measured network use its adjusted values: `precision(problem,
+replace(data, start=solve(…)))`.
 
 Source: Grafarend (1974), Bollettino di Geodesia 33: design of first order (configuration, A) and of
 second order (weights, P).
@@ -33,11 +33,11 @@ from jaxbundle.network.declare import Rows
 from jaxbundle.types import AnyArray
 
 ROUNDING = 1e-14
-"""A variance below this fraction of the largest of its kind is that of what the datum holds: 0."""
+"""A variance below this fraction of the largest of its kind belongs to a datum coordinate: 0."""
 
 
 class Precision(eqx.Module):
-    """σ of all unknowns, 0 where something is held, and the covariance of the named ones.
+    """σ of all unknowns, 0 if held, and the covariance of the named ones.
 
     `images`: of X0, Y0, Z0 (object unit) and ω, φ, κ (radians); `cameras`: in the order of the
     parameters of the model, in their units; `points`: of X, Y, Z (object unit).
@@ -59,25 +59,25 @@ def precision(
     names: tuple[tuple[str, str, str], ...] = (),
     sigma0: float | Float[AnyArray, ""] = 1.0,
 ) -> Precision:
-    """The precision of a design, differentiable to every order in all of it.
+    """The precision of a design, differentiable to any order.
 
     Use it under `jax.jit`, `jax.vmap`, `jax.grad`, `jax.jacfwd` and `jax.jacrev`: `data.start`
     holds the design (stations, targets, cameras), the other fields its weights (1/σ).
 
     **Arguments:**
 
-    - `problem`: from `make_problem`; it says who sees whom, what is free, and the datum.
+    - `problem`: from `make_problem`; it defines visibility, free unknowns, and the datum.
     - `data`: numbers that replace `problem.data` (same shapes); object coordinates relative to
       `problem.origin`. Image coordinates in it are not used.
-    - `names`: unknowns whose covariance is wanted, as in `Adjustment.covariance`:
+    - `names`: unknowns for the covariance, as in `Adjustment.covariance`:
       `("camera", "cam", "c")`, `("image", "12", "kappa")`, `("point", "7", "Z")`.
     - `sigma0`: of the unit weight; 1: a priori.
 
-    **Returns:** a `Precision`; NaN throughout where the design does not determine everything, or a
+    **Returns:** a `Precision`; all NaN if the design leaves unknowns undetermined, or a
     camera has no image of one of its targets.
 
-    **Raises:** `InputError` where no factor of the network fits into memory; `KeyError` for a name
-    that is not there.
+    **Raises:** `InputError` if no factor of the network fits into memory; `KeyError` for an unknown
+    name.
     """
     check_given(problem, data)
     problem, wanted = problem.with_factor(), [] if names == () else named(problem, names)
@@ -126,7 +126,7 @@ def redundancy(problem: Problem, data: Data | None = None) -> Rows:
 
 
 def predicted(problem: Problem, data: Data) -> Data:
-    """The data with the image coordinates that the given values have."""
+    """The data with image coordinates predicted from the given values."""
     space, values, xy = Pose(), data.start, data.image_xy
     poses = PoseValue(values.position, values.rotation)
     for table in problem.layout.cameras:
@@ -144,7 +144,7 @@ def predicted(problem: Problem, data: Data) -> Data:
 
 
 def _root(variance):
-    """σ; where it is 0 its derivative is 0 too. What is not known stays NaN."""
+    """σ, with derivative 0 where it is 0; NaN stays NaN."""
     none = variance <= ROUNDING * jax.lax.stop_gradient(jnp.max(variance, initial=0.0))
     return jnp.where(none, 0.0, jnp.sqrt(jnp.where(none, 1.0, variance)))
 

@@ -1,11 +1,13 @@
-"""How well a calibrated camera projects: the covariance of an image point, over image and distance.
+"""Projection uncertainty of a calibrated camera: the covariance of an image point, by position and
+distance.
 
-The image of a ray depends on the parameters p of the camera, ∂x/∂p by automatic differentiation of
-the projection, exact. What is asked is, of what does the ray stay fixed while p is uncertain?
+The image of a ray depends on the parameters p of the camera, with ∂x/∂p by automatic
+differentiation of the projection. The result depends on the frame in which the ray is fixed while p
+is uncertain:
 
     "camera"   of the camera frame:      Cx = A·Cp·Aᵀ,  A = ∂x/∂p. The least useful one: a shift of
-               the principal point is nearly a rotation, which every later orientation takes up.
-    "rotation" of the scene, after the rotation θ that moves the images of all rays least:
+    the principal point is nearly a rotation, which later orientations absorb. "rotation" of the
+    scene, after the rotation θ that moves the images of all rays least:
                A' = A − B·(BᵀB)⁻¹·BᵀA over the image, B = ∂x/∂θ.
     "scene"    of the object points the camera was calibrated from: a point at a distance d along
                the ray is held in the object frame of every view, and projected through the view's
@@ -52,11 +54,11 @@ def slopes_of_images(
     xy: Float[np.ndarray, "n 2"],
     frame: str = "rotation",
 ) -> Float[np.ndarray, "n 2 k"]:
-    """A, or A' of the frame "rotation": the change of images whose rays are held in that frame, by
-    the parameters in the columns `free`. NaN, where a point has no ray, takes no part.
+    """A, or A' of the frame "rotation": the derivatives of images whose rays are fixed in that
+    frame, by the parameters in the columns `free`. Points without a ray are NaN and ignored.
 
-    **Arguments:** `xy`: image points, in the unit of the model; for "rotation" they stand for the
-    image, in which the rotation is sought.
+    **Arguments:** `xy`: image points, in the unit of the model; for "rotation" they represent the
+    image over which the rotation is fitted.
     """
     if frame not in ("camera", "rotation"):
         raise ValueError(f"frame must be \"camera\" or \"rotation\", not {frame!r}")

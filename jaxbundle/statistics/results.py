@@ -1,4 +1,4 @@
-"""Results that are asked about, by name or as a whole: how they follow, and their σ."""
+"""Requested results, by name or as a whole: their response, and their σ."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -25,14 +25,14 @@ from jaxbundle.statistics.inspection import Inspection
 from jaxbundle.statistics.precision import image_variances
 
 CAMERAS, IMAGES, POINTS = WORDS = ("cameras", "images", "points")
-"""All free parameters of cameras; the root mean square of X0, Y0, Z0, ω, φ, κ of all images, and of
-X, Y, Z of all points, that are not held."""
+"""All free camera parameters; the root mean square of X0, Y0, Z0, ω, φ, κ of all images, and of X,
+Y, Z of all points, without held ones."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Asked:
-    """A result: its `name`, in `words`; radians of an `angle`; the numbers of `function` whose root
-    mean square it is (a slice of one: that number itself)."""
+    """A result: its `name`, in `words`; radians for an `angle`; the numbers of `function` whose
+    root mean square it is (for a slice of one: that number)."""
 
     name: str
     words: str
@@ -40,14 +40,14 @@ class Asked:
     numbers: slice
 
     def of(self, effects: Float[np.ndarray, "k numbers"]) -> Float[np.ndarray, " k"]:
-        """The effect on it, of those on all numbers."""
+        """The effect on the result, from the effects on all numbers."""
         own = effects[:, self.numbers]
         return own[:, 0] if own.shape[1] == 1 else np.sqrt(np.mean(own**2, 1))
 
 
 @dataclasses.dataclass(frozen=True)
 class Results:
-    """What is asked, `function(values) -> [numbers]`, and the σ of each result for σ0 = 1."""
+    """The requested `function(values) -> [numbers]`, and the σ of each result for σ0 = 1."""
 
     asked: tuple[Asked, ...]
     function: Callable[[Values], jax.Array]
@@ -55,9 +55,9 @@ class Results:
 
 
 def ask(inspection: Inspection, of: Any = WORDS) -> Results:
-    """The results named: words, KIND:ID:NAME (a text or a tuple), or a function of `Values`.
+    """The named results: words, KIND:ID:NAME (a text or a tuple), or a function of `Values`.
 
-    **Raises:** `InputError` for a name that is not there, and where nothing is left."""
+    **Raises:** `InputError` for an unknown name, or if nothing is left."""
     if callable(of):
         return _of_function(inspection, of)
     given = (of,) if isinstance(of, str) or _is_name(of) else of
@@ -79,7 +79,7 @@ def ask(inspection: Inspection, of: Any = WORDS) -> Results:
         sigmas.append(sigma)
         first += size
     if not parts:
-        raise InputError("of: no result is asked for, or the network has no unknowns")
+        raise InputError("of: no result is requested, or the network has no unknowns")
     function = lambda values: jnp.concatenate([part(values) for part in parts])
     return Results(tuple(asked), function, np.concatenate(sigmas))
 
@@ -165,7 +165,7 @@ def _of_function(inspection: Inspection, of: Callable[..., Any]) -> Results:
 def effects_on(
     problem: Problem, results: Results, values: Tables, tangents: Tables
 ) -> Float[np.ndarray, "k numbers"]:
-    """The change of every number asked for, along tangents of the engine's tables [k, rows, …]."""
+    """The change of every requested number along tangents of the engine's tables [k, rows, …]."""
     return np.asarray(_along(results.function, problem.layout.values, values, tangents))
 
 

@@ -1,4 +1,4 @@
-"""Whether the distortion of the adjusted cameras is one-to-one over what they measured."""
+"""Check that the distortion of the adjusted cameras is one-to-one over their measurements."""
 
 import dataclasses
 from functools import partial
@@ -16,10 +16,10 @@ from jaxbundle.types import AnyArray
 
 @dataclasses.dataclass(frozen=True)
 class Reach:
-    """How far from its principal point a camera is looked at, in the unit of its model.
+    """The radius to which the distortion of a camera is checked, in the unit of its model.
 
-    `radius`: half the diagonal of the image (`of_image`), or the farthest measurement where the
-    size of the image is not known. `message`: None, or that the distortion turns back inside.
+    `radius`: half the diagonal of the image (`of_image`), or the farthest measurement if the
+    image size is unknown. `message`: None, or that the distortion turns back inside.
     """
 
     radius: float
@@ -28,7 +28,7 @@ class Reach:
 
 
 def distortion_reach(problem: Problem, values: Values) -> dict[str, Reach]:
-    """The reach of every camera, by id."""
+    """The checked radius of every camera, by id."""
     found = {}
     farthest = farthest_measurements(problem, values)
     for given, p, far in zip(problem.network.cameras, np.asarray(values.camera), farthest):
@@ -64,5 +64,5 @@ def farthest_measurements(problem: Problem, values: Values) -> Float[np.ndarray,
 
 @partial(jax.jit, static_argnums=0)
 def measured_centre(model: CameraModel, p: Float[AnyArray, " parameters"]) -> Float[Array, "2"]:
-    """The measured image of a camera's axis, where its distortion is centred."""
+    """The image of a camera's axis, the centre of its distortion."""
     return jnp.stack(model.from_ideal(tuple(p), 0.0, 0.0))

@@ -1,9 +1,9 @@
-"""What a network determines in name only, in its words and with the remedy.
+"""Poorly determined unknowns of a network, with the remedy.
 
-The extent that a σ is compared with (`leastsquares/weakness.py`): of a projection centre the
+The reference that a σ is compared with (`leastsquares/weakness.py`): of a projection centre the
 distance of the points in its image, of an angle a radian, of principal distance and point the
-principal distance, of a point its distance. Coefficients of distortion have none: a σ as large as
-themselves says only that they are not needed.
+principal distance, of a point its distance. Distortion coefficients have none: a σ as large as the
+coefficient only means that it is not needed.
 """
 
 import dataclasses
@@ -21,21 +21,21 @@ from jaxbundle.statistics.inspection import Inspection
 
 ADVICE_FOR = {
     "camera": "Free fewer camera parameters, or give them a prior σ; c needs depth or convergent "
-    "images, x0 and y0 need images turned about their axis.",
+    "images, x0 and y0 need images rolled about their axis.",
     "image": "An image needs three or more well spread points whose coordinates are determined.",
     "point": "A point needs rays from two directions or more.",
 }
 FURTHER = (
-    "Hold what cannot be told apart, or give it a prior σ: a lever arm from the shifts of strips, "
+    "Hold inseparable unknowns, or give them a prior σ: a lever arm and the shifts of strips, "
     "a tilt that its points do not show."
 )
 
 
 @dataclasses.dataclass(frozen=True)
 class Weakness:
-    """`unknowns`: names of those of images and cameras with a σ above 1/`VAGUE` of their extent,
-    the weakest first; `worst`: the largest of these ratios. `points`: ids of those with a σ above
-    1/`FAR` of their distance; `of`: how many there are."""
+    """`unknowns`: names of image and camera unknowns with a σ above 1/`VAGUE` of their reference,
+    the weakest first; `worst`: the largest ratio. `points`: ids of points with a σ above 1/`FAR` of
+    their distance; `of`: the number of points."""
 
     unknowns: tuple[str, ...] = ()
     worst: float = 0.0
@@ -52,7 +52,7 @@ class Weakness:
             found.append(
                 f"poorly determined: {some(self.unknowns, 8, str)}; a σ {worst} the "
                 f"principal distance, the distance to the object, or a radian, and above "
-                f"{1 / VAGUE:g} of it the solution is one in name only. "
+                f"{1 / VAGUE:g} of it the unknown is practically undetermined. "
                 f"{ADVICE_FOR[kinds[0]] if kinds else FURTHER}"
             )
         if self.points:
@@ -67,13 +67,13 @@ class Weakness:
 
 
 def weakness(inspection: Inspection, sigma0: float) -> Weakness:
-    """The weak directions of a solution; none are looked for where there is no factor."""
+    """The weak directions of a solution; none without a factor."""
     found = find_weak(inspection.solution, _extents(inspection), sigma0)
     return _in_words(inspection.problem, found)
 
 
 def weakness_of_unsolved(problem: Problem, values: Values) -> Weakness:
-    """The weak directions where an adjustment ended without a solution, by σ a priori."""
+    """The weak directions where an adjustment ended without a solution, by a priori σ."""
     there = Inspection(problem, values)
     return _in_words(problem, find_weak_unsolved(there.solution, _extents(there)))
 
@@ -110,7 +110,7 @@ def _extents(inspection: Inspection) -> Extents:
 
 
 def _ray_lengths(inspection: Inspection):
-    """Mean length of the rays of every image and of every point; 0 where there is none."""
+    """Mean length of the rays of every image and of every point; 0 without rays."""
     problem, values = inspection.problem, inspection.adjusted
     rays = np.flatnonzero((np.asarray(problem.data.image_weight) > 0).any(1))
     image, point = problem.image[rays], problem.point[rays]

@@ -127,7 +127,7 @@ def test_which_model_suffices(fisheye):
 
 
 def test_what_cannot_be_compared(fisheye):
-    with pytest.raises(InputError, match="give two different ones or more"):
+    with pytest.raises(InputError, match="give at least two different ones"):
         compare_models(fisheye, models=["opencv"])
     with pytest.raises(InputError, match="Unknown camera model 'fish'"):
         compare_models(fisheye, models=["opencv", "fish"])

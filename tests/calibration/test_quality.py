@@ -186,8 +186,8 @@ def test_what_is_missing_is_said():
         render.pose(30 * np.cos(i), 30 * np.sin(i), 180 * (i % 2), middle, 0.3 + 0.1 * (i % 3))
         for i in range(8)
     ]
-    assert ["turned by 90°" in text for text in poses_in_words(unturned)] == [True]
-    assert poses_in_words(good, t={"fx": 2.0})[0].startswith("fx is known to 50 % only")
+    assert ["rolled by 90°" in text for text in poses_in_words(unturned)] == [True]
+    assert poses_in_words(good, t={"fx": 2.0})[0].startswith("fx is known only to 50 %")
     near = [render.pose(*angles, middle, 0.5) for angles in (
         (30, 0, 0), (-30, 0, 0), (0, 30, 90), (0, -30, 90), (20, 20, 0), (0, 0, 0))]  # fmt: skip
     said = poses_in_words(near)

@@ -334,11 +334,11 @@ def test_photographs_are_paired_by_name():
 
 def test_what_is_no_rig_is_refused(rig):
     views = pair()["left"]
-    with pytest.raises(InputError, match="a rig has two cameras or more"):
+    with pytest.raises(InputError, match="a rig has at least two cameras"):
         calibrate_cameras({"left": views}, rig=True)
     with pytest.raises(InputError, match="camera right: only 1 photograph"):
         calibrate_cameras({"right": views.take([0]), "left": views}, rig=True)
-    with pytest.raises(InputError, match="a rig has two cameras or more"):
+    with pytest.raises(InputError, match="a rig has at least two cameras"):
         calibrate_rig({"left": rig.cameras["left"]})
     with pytest.raises(InputError, match="'left' is BoardViews.*expected the Calibration"):
         calibrate_rig(pair())

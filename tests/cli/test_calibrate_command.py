@@ -93,7 +93,7 @@ def test_two_cameras_and_brief_json_alone(calibrate, folder, tmp_path, monkeypat
      "--camera a is given twice: a=x, a=y"),
     (["FOLDER", "--board", "9x6", "--square", "1", "--snooping", "x"],
      "--snooping 'x': one of pope, baarda, none"),
-    (["FOLDER", "--board", "9x6", "--square", "1", "--rig"], "a rig has two cameras or more"),
+    (["FOLDER", "--board", "9x6", "--square", "1", "--rig"], "a rig has at least two cameras"),
     (["FOLDER", "--board", "9x6", "--square", "1", "--json", "FOLDER"], "is a folder"),
     (["FOLDER", "--board", "9x6", "--square", "1", "--json", "FOLDER/text.jpg"], "overwritten"),
 ])  # fmt: skip

@@ -208,7 +208,7 @@ def test_a_global_test_far_from_passed_is_the_last_line(command, project):
     done = command("adjust", project / "project.toml")
     assert done.status == 0 and "Warnings" in done.out
     last = done.out.splitlines()[-1]
-    assert last.startswith("warning: χ² test far from passed: vᵀPv/redundancy is 39.9 (σ0 6.31)")
+    assert last.startswith("warning: χ² test clearly failed: vᵀPv/redundancy is 39.9 (σ0 6.31)")
 
 
 def test_not_converged_says_so(command, tmp_path):

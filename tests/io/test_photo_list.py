@@ -109,8 +109,8 @@ def test_overrides(write):
     ("b 4 5 6", "b 4 five 6", "line 11: Y of object point 'b' is 'five'; a number is expected"),
     ("b 4 5 6 0.5", "b 4 5 6", "line 11: 6 values where an object point"),
     ("b 4 5 6", "c 4 5 6", "line 6: point 'b' is unknown: no such point"),
-    ("b 4 5 6", "a 4 5 6", "line 11: point 'a' stands already in"),
-    ("second", "first photo", "line 7: image 'first photo' stands already in"),
+    ("b 4 5 6", "a 4 5 6", "line 11: point 'a' is already in"),
+    ("second", "first photo", "line 7: image 'first photo' is already in"),
 ])  # fmt: skip
 def test_a_fault_is_refused_with_its_line(write, old, new, said):
     assert old in SMALL

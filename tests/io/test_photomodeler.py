@@ -153,7 +153,7 @@ def test_smart_points_whose_ids_are_taken_are_renumbered(tmp_path):
 
 def test_a_repeated_id_that_is_no_smart_point_is_refused(tmp_path):
     text = smart(export()).replace("0.00000 0.00000\n", "0.10000 0.10000\n")
-    with pytest.raises(InputError, match="point '2' stands already in"):
+    with pytest.raises(InputError, match="point '2' is already in"):
         read(tmp_path, text)
 
 

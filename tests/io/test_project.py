@@ -213,7 +213,7 @@ def test_a_bad_override_is_refused(folder, override, said):
     ("images.csv", ",sX0", ",X0", "images.csv, line 2: the column 'X0' stands there twice"),
     ("images.csv", "10,0,50", "10,abc,50", "images.csv, line 5: Y0 is 'abc'; a number is expected"),
     ("images.csv", "right,cam.1", "right,cam", "images.csv, line 5: camera 'cam' is unknown"),
-    ("images.csv", "right,cam.1", "left,cam.1", "line 5: image 'left' stands already in"),
+    ("images.csv", "right,cam.1", "left,cam.1", "line 5: image 'left' is already in"),
     ("images.csv", ",fixed", "", "images.csv, line 5: 8 cells where the header has 9"),
     ("points.csv", "role,", "", "points.csv, line 2: 8 cells where the header has 7"),
     ("points.csv", "b,fixed,10,", "b,fixed,nan,", "points.csv, line 3: X is 'nan'; a number"),

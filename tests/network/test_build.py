@@ -111,11 +111,11 @@ def test_the_missing_sigma_is_told_when_none_is_given():
 @pytest.mark.parametrize("table, change, said", [
     ("images", {"camera": "b"}, "images, row 2: camera 'b' is unknown: no such camera"),
     ("images", {"id": ""}, "images, row 2: id is missing"),
-    ("images", {"id": 1}, "images, row 2: image '1' stands already in images, row 1"),
+    ("images", {"id": 1}, "images, row 2: image '1' is already in images, row 1"),
     ("images", {"omega": "x"}, "images, row 2: omega is 'x'; a number is expected"),
     ("images", {"sphi": "free"}, "sphi is 'free'; a number or 'fixed' is expected"),
     ("images", {"omeag": 1}, "images: unknown column 'omeag'; did you mean 'omega'"),
-    ("points", {"id": "p"}, "points, row 2: point 'p' stands already in points, row 1"),
+    ("points", {"id": "p"}, "points, row 2: point 'p' is already in points, row 1"),
     ("points", {"X": "nan"}, "points, row 2: X is 'nan'; a number is expected"),
     ("points", {"sX": "inf"}, "sX is 'inf'; a number or 'free' is expected"),
     ("points", {"X": [1]}, r"points, row 2: X is \[1\]; a number is expected"),

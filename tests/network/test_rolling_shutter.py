@@ -237,7 +237,7 @@ def test_the_line_is_needed(flown):
     made, _ = flown
     network = moving(made.network, made.network.observations.xy)
     camera = dataclasses.replace(network.cameras[0], image_size=None)
-    with pytest.raises(InputError, match="camera 'cam': image_size is needed to know when a line"):
+    with pytest.raises(InputError, match="camera 'cam': image_size is needed for the exp"):
         jaxbundle.make_problem(network.replace(cameras=(camera,)))
     with pytest.raises(InputError, match=r"\[rolling_shutter\]: line_time is missing"):
         make_further({"velocities": {"image": ["IMG 1"]}}, 1.0)

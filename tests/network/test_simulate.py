@@ -382,7 +382,7 @@ def test_impossible_stations_are_refused():
         Stations([0.0, 0.0, 0.0], [[0.0, 0.0, 0.0]])
     with pytest.raises(InputError, match="2 positions but 1 rows of angles"):
         Stations(np.zeros((2, 3)), np.zeros((1, 3)))
-    with pytest.raises(InputError, match="station 1 stands on the point it looks at"):
+    with pytest.raises(InputError, match="station 1 is at the point it looks at"):
         stations_looking_at([[0.0, 0.0, 0.0]], [0.0, 0.0, 0.0])
     with pytest.raises(InputError, match="targets, row 2: nan is not a finite number"):
         simulate(RING, [[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0]], BROWN, noise=0.01)

@@ -75,7 +75,7 @@ def test_a_project_keeps_the_tie(tmp_path):
 @pytest.mark.parametrize("tie, message", [
     ([["fx", "fz"]], "tie names the unknown parameter 'fz'"),
     ([["fx", "fy"], ["fy", "cx"]], "tie names fy twice"),
-    ([["fx", "cx"]], "start with different values: fx 900, cx 500"),
+    ([["fx", "cx"]], "have different values: fx 900, cx 500"),
     (["fx", "fy"], "expected groups of names"),
     ([["fx"]], "expected groups of names"),
 ])  # fmt: skip

@@ -77,7 +77,7 @@ def test_a_field_no_lens_has_is_refused_with_the_likely_unit(mistake, said):
             lambda n: n.replace(
                 distances=dataclasses.replace(n.distances, value=1000 * n.distances.value)
             ),
-            "'1 to 5'; are they in m, as the control points",
+            "'1 to 5'; are they in m, like the control points",
         ),
     ],
     ids=["pixel size in metres", "control in mm", "start values in mm", "distance in mm"],

@@ -1,14 +1,14 @@
-"""Cameras on one mounting: calibrated by themselves first, then together with the mounting.
+"""Rig calibration: cameras are calibrated separately first, then together with the mounting.
 
     ray of camera k = R_k·(Y − b_k)      Y: point in the frame of the reference camera
 
-Photographs taken at the same moment are an epoch; they are found by name: equal file names, or
-else equal last numbers in them (left_017.jpg, right_017.jpg). Start values of the mounting come
-from the epochs two cameras share: M_k·Mᵣᵀ and Mᵣ·(X0_k − X0_r) should be the same in all of them,
-and the one nearest to all others is taken. Epochs that contradict the mounting (the board moved in
-between) are left out, or named where nothing is to be left out. The board is known, weighted or
-free, as in the calibration of one camera. Gross errors were removed camera by camera; what only the
-mounting shows is removed then.
+Simultaneous photographs are an epoch; they are matched by equal file names, or else equal last
+numbers in them (left_017.jpg, right_017.jpg). Start values of the mounting come from the epochs two
+cameras share: M_k·Mᵣᵀ and Mᵣ·(X0_k − X0_r) should be the same in all of them, and the one nearest
+to all others is used. Epochs that contradict the mounting (the board moved in between) are
+excluded, or only listed without snooping. The board is known, weighted or free, as in the
+calibration of one camera. Gross errors are removed camera by camera, then those that only the
+mounting reveals.
 """
 
 import dataclasses
@@ -33,11 +33,13 @@ from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.columns import some
 
 FEWEST = 3
-"""Epochs that two cameras must share."""
+"""Minimum number of epochs shared by two cameras."""
 CONTRADICTS, LEAST_CONTRADICTION = 3.0, 1.0
-"""An epoch is left out whose RMS is above so many times the median of all, and so many pixels."""
+"""An epoch is excluded if its RMS exceeds this multiple of the median of all, and this many
+pixels."""
 WORST = 0.5
-"""In one round those go whose RMS is above this part of the largest: the worst spoil the others."""
+"""One round excludes epochs with an RMS above this fraction of the largest: the worst affect
+others."""
 
 
 def calibrate_rig(
@@ -49,22 +51,22 @@ def calibrate_rig(
     significance: float = 0.001,
     max_iterations: int = 50,
 ) -> RigCalibration:
-    """The common calibration of cameras that were calibrated by themselves, from photographs of one
-    board taken in step; the first is the reference.
+    """The common calibration of separately calibrated cameras, from simultaneous photographs of one
+    board; the first is the reference.
 
     **Arguments:** `board_sigma` (object unit), `board_free`, `snooping`, `significance`: as in
-    `calibrate`; without snooping, epochs that contradict the mounting stay as well, and are named
+    `calibrate`; without snooping, epochs that contradict the mounting are kept and listed
     in `contradicting`.
 
-    **Raises:** `InputError` where the photographs of two cameras cannot be paired;
-    `NotSolvedError` where an adjustment does not settle.
+    **Raises:** `InputError` if the photographs of two cameras cannot be paired;
+    `NotSolvedError` if an adjustment does not converge.
     """
     check_test(snooping, significance)
     if not isinstance(calibrations, Mapping):
         raise InputError(f"calibrations are {shown(calibrations)}; expected a mapping from the "
                          "name of each camera to its Calibration")  # fmt: skip
     if len(calibrations) < 2:
-        raise InputError("a rig has two cameras or more: give --camera NAME=PATTERN for each")
+        raise InputError("a rig has at least two cameras: give --camera NAME=PATTERN for each")
     for name, one in calibrations.items():
         if not isinstance(one, Calibration):
             raise InputError(f"calibrations: {name!r} is {shown(one)}; expected the Calibration "
@@ -102,7 +104,7 @@ def require_solved(found: Result) -> Result:
         names = found.undetermined
         what = f"; not determined: {some(names, 8, str)}" if names else ""
         raise NotSolvedError(
-            f"not solved: the rig did not settle ({found.termination}){what}; look for cameras "
+            f"not solved: the rig did not converge ({found.termination}){what}; look for cameras "
             "that share too few epochs, or photographs that are not of the same moment",
             list(names),
         )  # fmt: skip
@@ -112,7 +114,7 @@ def require_solved(found: Result) -> Result:
 def epoch_keys(names: Mapping[str, tuple[str, ...]]) -> dict[str, list[str]]:
     """The epoch of every photograph of every camera: equal file names, or equal last numbers.
 
-    **Raises:** `InputError` where neither pairs them.
+    **Raises:** `InputError` if neither pairs them.
     """
     whole = lambda name: re.sub(r"\.\w+$", "", name.rsplit("/", 1)[-1])
 
@@ -130,7 +132,7 @@ def epoch_keys(names: Mapping[str, tuple[str, ...]]) -> dict[str, list[str]]:
             return keys
     shown = "; ".join(f"{camera}: {some(given, 2)}" for camera, given in names.items())
     raise InputError(
-        f"the photographs of the cameras cannot be paired by their names ({shown}): call those of "
+        f"the photographs of the cameras cannot be paired by their names ({shown}): name those of "
         "one moment alike, or give them the same last number"
     )
 
@@ -163,8 +165,8 @@ def _start_of_mountings(names, poses):
         shared = [key for key in poses[best[0]] if key in common(best)]
         if len(shared) < min(FEWEST, len(poses[best[1]])) or not shared:
             raise InputError(
-                f"camera {best[1]!r} shares {len(shared)} epochs with the others; {FEWEST} or more "
-                "photographs must be of the same moments"
+                f"camera {best[1]!r} shares {len(shared)} epochs with the others; {FEWEST} "
+                "photographs must be simultaneous"
             )
         placed, name = best
         both = [(poses[placed][key], poses[name][key]) for key in shared]
@@ -221,8 +223,8 @@ def _rays(calibration: Calibration, keys, epochs):
 
 
 def _contradictions(rig: Rig, found, size):
-    """Epochs, of those several cameras saw, that do not fit, with their RMS in pixels; `size` of a
-    pixel, [cameras, 2]."""
+    """Epochs seen by several cameras that do not fit, with their RMS in pixels; `size` of a pixel,
+    [cameras, 2]."""
     v = rig.in_order(found.solution.residuals) * rig.sigma / size[rig.camera]
     number = np.zeros((len(rig.epochs), len(size)))
     np.add.at(number, (rig.epoch, rig.camera), used_rays(rig, found.problem))

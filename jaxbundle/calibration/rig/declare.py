@@ -4,11 +4,11 @@
     ray = R_k·(Y − b_k)              camera k, its projection centre at b_k there
     v = image of the ray − measured  (by the camera's own model)
 
-Unknown are the pose of the reference camera before the object at every epoch, the mounting b_k, R_k
-of every camera but the reference, the free parameters of every camera, and the points X, unless
-they are known: with a σ they are weighted, free ones hold the datum by inner constraints (7, scale
-included). The mounting is the same at all epochs. The poses of the epochs are eliminated; what is
-left has a few tens of unknowns, and three more for every unknown point.
+The unknowns are the pose of the reference camera at every epoch, the mounting b_k, R_k of every
+other camera, the free parameters of every camera, and the points X unless known: with a σ they are
+weighted; free ones carry the datum by inner constraints (7, including scale). The mounting is the
+same at all epochs. The poses of the epochs are eliminated; the reduced system has a few tens of
+unknowns, plus three per unknown point.
 
 Source: Luhmann, Robson, Kyle and Boehm (2014), Close-Range Photogrammetry and 3D Imaging, section
 4.4; King (1994), Bundle adjustment of constrained stereo pairs, Geomatics Research Australasia.
@@ -35,7 +35,7 @@ POSES = ("epoch", "mounting")
 
 
 def _scaled(motion, mounting: PoseValue) -> PoseValue:
-    """The bases grow with the object."""
+    """The bases scale with the object."""
     return mounting._replace(position=jnp.exp(motion[6]) * mounting.position)
 
 
@@ -43,18 +43,17 @@ _OF_OBJECT = similarity(("point",), ("epoch",))
 FLOATING = Motions(
     _OF_OBJECT.names, (*_OF_OBJECT.actions, ("mounting", _scaled)), _OF_OBJECT.curved
 )
-"""A similarity of the object, with which the poses and the bases go."""
+"""A similarity of the object that also transforms poses and bases."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Rig:
-    """What is adjusted, with start values.
+    """The input of the rig adjustment, with start values.
 
     **Fields:** `cameras`, the first is the reference; `mounting`: b_k and R_k, 0 and 1 of the
-    first; `epochs`: their names; `pose`: X0_e and M_e; `ids` and `points` of the object about their
-    middle (exact, unless `point_sigma` says how well they are known, or `points_free`); for every
-    image point the rows `epoch`, `camera`, `point` it belongs to, `xy` in the unit of the camera's
-    model and σ.
+    first; `epochs`: their names; `pose`: X0_e and M_e; `ids` and `points` of the object relative to
+    their centroid (exact, unless they have `point_sigma`, or `points_free`); for every image point
+    the rows `epoch`, `camera`, `point` it belongs to, `xy` in the unit of the camera's model and σ.
     """
 
     cameras: tuple[Camera, ...]
@@ -83,7 +82,7 @@ class Rig:
         return table.name, int(np.flatnonzero(table.cameras == k)[0])
 
     def in_order(self, by_set) -> Float[np.ndarray, "n 2"]:
-        """What the engine has found for every set of image points, in the order of the rig's."""
+        """The engine's results by set of image points, in the order of the rig."""
         found = np.zeros(self.xy.shape)
         for o, (_, rows) in enumerate(self.sets):
             found[rows] = by_set[o]
@@ -92,7 +91,7 @@ class Rig:
 
 def declare_rig(rig: Rig) -> tuple[list[Table], list[Observations]]:
     """The tables of unknowns and the observations of a rig."""
-    # Free points that no camera sees keep their place.
+    # Free points that no camera sees keep their coordinates.
     seen = np.isin(np.arange(len(rig.points)), rig.point)
     free = seen if rig.points_free else np.full(len(rig.points), rig.point_sigma is not None)
     names = [camera.id for camera in rig.cameras]
@@ -118,7 +117,7 @@ def declare_rig(rig: Rig) -> tuple[list[Table], list[Observations]]:
 def adjust_rig(rig: Rig, max_iterations: int = 50, **options) -> Result:
     """Adjust a rig from its start values; `options` are those of the solver.
 
-    **Returns:** the result; what is not determined, or did not settle, is not `converged`.
+    **Returns:** the result; not `converged` if undetermined.
     """
     free = {"datum": {"point": np.unique(rig.point)}, "motions": FLOATING}
     return adjust(
@@ -133,8 +132,8 @@ def used_rays(rig: Rig, problem: Problem) -> Bool[np.ndarray, " n"]:
 
 
 def leave_out(rig: Rig, found: Result, rays, max_iterations: int = 50) -> Result:
-    """The rig adjusted again, from its start values, without some of its image points; epochs that
-    are left with too few are set aside."""
+    """The rig adjusted again from its start values without some of its image points; epochs left
+    with too few are excluded."""
     removed = [
         Removed(o, row, None, 0.0)
         for o, (_, of_set) in enumerate(rig.sets) for row in np.flatnonzero(rays[of_set]).tolist()
@@ -144,9 +143,9 @@ def leave_out(rig: Rig, found: Result, rays, max_iterations: int = 50) -> Result
 
 
 def snoop_rig(found: Result, test: str, significance: float, max_iterations: int = 50) -> Result:
-    """The result without what a test calls blunders.
+    """The result without blunders found by a test.
 
-    **Raises:** `NotSolvedError` where what is left determines no answer."""
+    **Raises:** `NotSolvedError` if the remaining observations do not determine a solution."""
     minimum = found.minimum
 
     def again(problem, values) -> Solution:

@@ -1,6 +1,6 @@
-r"""How good are the cameras of a rig: the uncertainty of a projected point, and coverage.
+r"""Accuracy of the cameras of a rig: the uncertainty of a projected point, and coverage.
 
-A point Y at the distance d from camera k is held in the frame
+A point Y at the distance d from camera k is fixed in the frame
 
     "rig"       of the reference camera: mounting and interior orientation of camera k vary,
                 ray = R_k·(Y − b_k). This is what the rig is used for: points intersected from its
@@ -34,7 +34,7 @@ def _slopes(model, p, mounting: PoseValue, xy, nearness):
     """∂x/∂(δb, δθ, p) [n, 2, 6 + parameters] of points at the distance 1/nearness, whose images
     are `xy`."""
     space = Pose()
-    # Seen from where the camera is, in units of the distance.
+    # Relative to the camera, in units of the distance.
     block = space.prepare(mounting._replace(position=jnp.zeros(3)))
 
     def one(xy):
@@ -54,10 +54,10 @@ def rig_uncertainty(
 ) -> UncertaintyMap:
     """The uncertainty of a projected point over the image of a camera of a rig, pixels.
 
-    **Arguments:** `rig`: a `RigCalibration`; `distance` (object unit) matters for "rig" only;
+    **Arguments:** `rig`: a `RigCalibration`; `distance` (object unit) matters only for "rig";
     `grid`: columns and rows of the map.
 
-    **Raises:** `InputError` for a camera, frame or distance that is none.
+    **Raises:** `InputError` for an invalid camera, frame or distance.
     """
     if frame not in FRAMES:
         raise InputError(f"frame {frame!r}: {', '.join(FRAMES)}")
@@ -84,14 +84,14 @@ def rig_uncertainty(
 
 
 def rig_points(rig, name: str):
-    """The image points of a camera that the rig was adjusted from, pixels [n, 2]."""
+    """The image points of a camera used in the rig adjustment, pixels [n, 2]."""
     own, given = rig.used & (rig.rig.camera == _index(rig, name)), rig.camera(name)
     model = get_model(given.model)
     return in_pixels(rig.rig.xy[own], model, given.image_size, given.pixel_size)
 
 
 def rig_coverage(rig, name: str) -> Coverage:
-    """Where in the image of a camera the rig has points."""
+    """Coverage of the image of a camera by points of the rig."""
     return coverage(rig_points(rig, name), rig.camera(name).image_size)
 
 

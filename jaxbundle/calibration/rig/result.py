@@ -1,4 +1,4 @@
-"""The result of a rig: the mountings of its cameras, and the cameras as they are in it."""
+"""The result of a rig: the mountings of its cameras, and the jointly adjusted cameras."""
 
 import dataclasses
 import functools
@@ -32,7 +32,7 @@ DEGREES = np.array([1, 1, 1, *[180 / np.pi] * 3])
 @shows_itself
 @dataclasses.dataclass(frozen=True)
 class Mounting:
-    """Where a camera sits in the frame of the reference camera.
+    """The mounting of a camera in the frame of the reference camera.
 
     **Fields:** `base`: its projection centre, object unit; `rotation`: R, from the reference's
     frame to its own; `angles`: ω, φ, κ of R, degrees; `covariance` [6, 6] of base and angles, a
@@ -53,13 +53,13 @@ class Mounting:
 
 
 class RigCalibration:
-    """Cameras of one mounting, calibrated together.
+    """Cameras of a rig, calibrated together.
 
-    **Attributes:** `cameras`: the calibrations of each by itself; `mountings`, `parameters`,
+    **Attributes:** `cameras`: their separate calibrations; `mountings`, `parameters`,
     `sigma` of the common adjustment, by camera; `board`: its points [points, 3]; `epochs`; `rig`:
-    what was adjusted, `result`: the engine's (`jaxbundle.leastsquares.Result`); `left_out`, and
-    `contradicting` that were kept all the same: epoch and reason; `removed` by data snooping;
-    `residuals`: a table as of an `Adjustment`; `rms` (pixels) by camera; `sigma0`, `redundancy`,
+    the input, `result`: that of the engine (`jaxbundle.leastsquares.Result`); `left_out`, and
+    `contradicting` ones that were kept: epoch and reason; `removed` by data snooping; `residuals`:
+    a table like that of an `Adjustment`; `rms` (pixels) by camera; `sigma0`, `redundancy`,
     `converged`.
     """
 
@@ -98,7 +98,7 @@ class RigCalibration:
 
     @property
     def image_unit(self) -> str:
-        """The unit of image coordinates inside the adjustment: that of the cameras' models."""
+        """The unit of image coordinates in the adjustment: that of the camera models."""
         return units_of(self.rig.cameras)
 
     @functools.cached_property
@@ -119,8 +119,8 @@ class RigCalibration:
 
     @functools.cached_property
     def residuals(self) -> dict[str, np.ndarray]:
-        """One row an observation: kind, image (camera and epoch), point, axis, v, sigma (a priori),
-        r, w (Baarda), tau (Pope), mdb, external."""
+        """One row per observation: kind, image (camera and epoch), point, axis, v, sigma (a
+        priori), r, w (Baarda), tau (Pope), mdb, external."""
         rig, found, weight = self.rig, self.result.solution.reliability, self.result.problem.weights
         ids = np.array(rig.ids, dtype=object)
         photographs = [self._photograph(*row) for row in zip(rig.camera, rig.epoch)]
@@ -147,11 +147,11 @@ class RigCalibration:
 
     @property
     def removed(self) -> list[Removed]:
-        """What data snooping has removed."""
+        """Observations removed by data snooping."""
         rig, found = self.rig, []
         for item in self.result.removed:
             if item.set == len(rig.sets):
-                axis = present(item.residual)  # coordinates are tested one by one
+                axis = present(item.residual)  # coordinates are tested individually
                 name = f"{'XYZ'[axis]} of point {rig.ids[item.row]}"
                 found.append(Removed("control", 3 * item.row + axis, name, item.test))
                 continue
@@ -194,8 +194,8 @@ class RigCalibration:
         return found
 
     def covariance(self, *names: str) -> Float[np.ndarray, "k k"]:
-        """The joint covariance of cameras: of each the mounting (δb, δθ) and its parameters that
-        are free in some camera of its model; zero where something is held."""
+        """The joint covariance of cameras: for each the mounting (δb, δθ) and the parameters that
+        are free in some camera of its model; zero for held ones."""
         if names not in self._covariances:
             problem = self.result.problem
             places = [(self.names.index(name), *self.rig.place(self.names.index(name)))
@@ -250,7 +250,7 @@ class RigCalibration:
         return [self.uncertainty(name, distance, frame) for frame, distance in chosen]
 
     def plot_coverage(self, name: str, ax=None):
-        """Where in the image of a camera the rig has points; matplotlib axes."""
+        """Coverage of the image of a camera by points of the rig; matplotlib axes."""
         size = self.cameras[name].views.image_size
         return plotting.coverage_map(self.coverage(name), rig_points(self, name), size, name, ax)
 

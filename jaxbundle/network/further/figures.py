@@ -221,7 +221,7 @@ class Shapes(Further):
         for k, name in enumerate(names):
             own = np.flatnonzero(shape == k)
             if len(own) < 3:
-                raise InputError(f"{self.source(own[0])}: shape {name!r}: {len(own)} usable points; "
+                raise InputError(f"{self.source(own[0])}: shape {name!r}: {len(own)} points, "
                     "at least 3 are needed")  # fmt: skip
             X0, M = _placed(self.place[own], places[point[own]])
             centre.append(X0)
