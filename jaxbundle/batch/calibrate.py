@@ -1,14 +1,14 @@
-"""`calibrate_batch`: many cameras, each calibrated by itself from views of known points.
+"""`calibrate_batch`: many cameras, each calibrated independently from views of known points.
 
 Cameras are solved in portions of one compiled shape: views and points are padded to the next size
-of a short list (`bucket`), padding being points that are not seen. Where many cameras have far
-fewer views than others, they have a shape of their own.
+of a short list (`bucket`) with invisible points. If many cameras have far fewer views than others,
+they get a separate shape.
 
 On a CPU a portion is a loop over its cameras (`lax.map`), and as many portions as there are cores
 run at the same time, each in a thread. Milliseconds of one core for a camera of 20 views × 88
-points: the loop 1.6, four cameras at a time 2.0, eight 2.4, `vmap` over 32 3.0, for all of them
-wait for the slowest and their arrays leave the cache. On an accelerator a portion is a `vmap` over
-many cameras.
+points: the loop 1.6, four cameras at a time 2.0, eight 2.4, `vmap` over 32 3.0, because all wait
+for the slowest and their arrays exceed the cache. On an accelerator a portion is a `vmap` over many
+cameras.
 """
 
 import dataclasses
@@ -51,13 +51,13 @@ from jaxbundle.leastsquares.snooping import check_test
 from jaxbundle.system.configuration import available_cores
 
 OF_A_START = ("quaternion", "shift")
-"""Poses as the solver has them, for data snooping alone."""
+"""Poses in the form of the solver, only for data snooping."""
 OF_A_VIEW = ("position", "angles", "sigma_position", "sigma_angles", "rotation")
 
 TESTED = (CONVERGED, LIMIT, SINGULAR)
 """Statuses of cameras with residuals that data snooping can test."""
 MOST_FAILED = 60
-"""So many rounds without a solution, and data snooping of a camera ends."""
+"""Data snooping of a camera ends after this number of rounds without a solution."""
 
 
 def calibrate_batch(
@@ -75,34 +75,34 @@ def calibrate_batch(
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> BatchCalibration:
-    """Calibrate many cameras, each by itself, from views of points with known coordinates.
+    """Calibrate many cameras independently from views of points with known coordinates.
 
     **Arguments:**
 
-    - `object_points`: [points, 3] for all cameras, or [cameras, points, 3]; flat or solid. They may
-      be repeated for every view ([views, points, 3] or [cameras, views, points, 3]).
+    - `object_points`: [points, 3] for all cameras, or [cameras, points, 3]; planar or spatial. They
+      may be repeated for every view ([views, points, 3] or [cameras, views, points, 3]).
     - `image_points`: pixels in the axes of the model.
-    - `image_size`: width and height in pixels: the principal point starts in the middle.
+    - `image_size`: width and height in pixels: the principal point starts at the image centre.
     - `model`: a camera model in pixels: "opencv", "kannala-brandt", "snavely", or a `CameraModel`.
-    - `visible`: which points were measured where; all, if not given. What is not visible may have
-      any coordinates. A point that is NaN or masked is not visible: in an image, where it was not
-      measured, or in the object (`make_network` refuses such a row).
+    - `visible`: mask of measured points; default: all. Invisible points may have any coordinates. A
+      point that is NaN or masked, in an image or in the object, is not visible (`make_network`
+      refuses such a row).
     - `free`: the parameters to estimate; if not given, for "opencv" those of OpenCV's model of 5
       coefficients, otherwise all.
-    - `start`: start values of parameters, for all cameras or [cameras]; without focal lengths these
-      are found by themselves. What is neither free nor given is 0, or the middle of the image. A
-      view is left out if the given camera turns too few of its points into rays.
-    - `snooping`: `"pope"`: image points that are blunders at the level `significance`, the
-      probability to lose anything of a camera without blunders, are removed, camera by camera;
-      before that those more than one image size outside the image.
-    - `threads`: portions solved at the same time on a CPU; the number of cores if not given.
+    - `start`: start values of parameters, for all cameras or [cameras]; missing focal lengths are
+      computed. Parameters neither free nor given are 0, or the image centre. A view is excluded if
+      the given camera has rays for too few of its points.
+    - `snooping`: `"pope"`: remove, camera by camera, blunders at the level `significance`, the
+      probability of removing anything from a camera without blunders; before that, points more than
+      one image size outside the image.
+    - `threads`: portions solved at the same time on a CPU; default: the number of cores.
     - `progress(done, total)`: called after every portion.
 
-    **Returns:** a `BatchCalibration`; look at `status` before anything else.
+    **Returns:** a `BatchCalibration`; check `status` first.
 
-    **Raises:** `InputError` for shapes and names that do not fit, and under `jax.jit`, `jax.vmap`
-    or `jax.grad`; `RuntimeError` without 64-bit floats. What is wrong with the numbers of one
-    camera stands in its status.
+    **Raises:** `InputError` for inconsistent shapes and names, and under `jax.jit`, `jax.vmap`
+    or `jax.grad`; `RuntimeError` without 64-bit floats. Bad numbers of one camera are reported
+    in its status.
     """
     require_x64()
     max_iterations = whole("max_iterations", max_iterations)
@@ -138,7 +138,7 @@ def calibrate_batch(
 
 
 def _without_padding(portion: Portion, shape: tuple[int, int], solved: dict) -> dict:
-    """The rows of the cameras of a portion, views at their places among all."""
+    """The rows of the cameras of a portion, views at their original positions."""
     views, points = shape
     rows = {name: values[: len(portion.cameras)] for name, values in solved.items()
             if name not in OF_A_START}  # fmt: skip
@@ -170,7 +170,7 @@ def _result(model: CameraModel, batch: Batch, rows: dict) -> BatchCalibration:
 
 
 def _undetermined(model: CameraModel, batch: Batch, ended, rows) -> Bool[np.ndarray, "cameras k"]:
-    """What the views do not determine, of cameras for which that can be said."""
+    """Undetermined parameters, of cameras for which they can be found."""
     sigma = rows["sigma"]
     null = vanishing(rows["reduced"]) & np.isin(ended, (SINGULAR, LIMIT))[:, None]
     # At the limit the last σ say why, if the equations can be solved.
@@ -181,10 +181,10 @@ def _undetermined(model: CameraModel, batch: Batch, ended, rows) -> Bool[np.ndar
 def _snooped(
     model, free, known, max_steps, size, on_cpu, portion: Portion, rows, test, significance
 ) -> dict:
-    """The rows of a portion without blunders; only cameras that lose any are solved again.
+    """The rows of a portion without blunders; only cameras with removed points are solved again.
 
-    One without a solution is tested where its iterations ended, for blunders may be why. Where it
-    has none without them either, everything stays as it was.
+    A camera without a solution is tested where its iterations ended, since blunders may be the
+    cause. If it has no solution without them either, it is unchanged.
     """
     weight = np.asarray(portion.seen.weight)
     found = [Snooping(seen > 0, test, significance) for seen in weight]

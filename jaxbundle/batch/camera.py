@@ -1,6 +1,6 @@
 """Levenberg–Marquardt for one camera calibrated from many views of known points.
 
-The layout of the normal equations is its own (`normal.py`), the iterations are the engine's
+It has its own layout of the normal equations (`normal.py`) and the iterations of the engine
 (`leastsquares/loop.py`).
 """
 
@@ -32,19 +32,19 @@ MEANING = {
     stopping.LIMIT: LIMIT, stopping.SETTLED: CONVERGED, stopping.RELATIVE_COST: CONVERGED,
     stopping.SINGULAR: SINGULAR, stopping.STUCK: LIMIT, stopping.NOT_FINITE: NOT_FINITE,
 }  # fmt: skip
-"""The status of a camera by why its iterations ended."""
+"""The status of a camera by termination."""
 
 TOLERANCE = 1e-5
 INDETERMINATE = 1e-13
-"""A parameter of which so little is left beside all others is determined by rounding: singular.
+"""Smallest part of a parameter that is independent of the others; below it rounding: singular.
 
 (5 coefficients: 1e-8 to 1e-4; 8, where 5 are enough: 1e-13 to 1e-11; one view repeated: 1e-15.)
 """
 
 
 class Solved(eqx.Module):
-    """The end of the iterations: unknowns, ½vᵀv, cofactors, the scaled reduced normal matrix, why
-    it ended, steps, views used."""
+    """The end of the iterations: unknowns, ½vᵀv, cofactors, the scaled reduced normal matrix,
+    termination, steps, views used."""
 
     at: Calibration
     cost: Float[Array, ""]

@@ -13,16 +13,16 @@ from jaxbundle.cameras import CameraModel, check_own, default_parameters, get_mo
 from jaxbundle.errors import InputError
 
 FLAT = 0.02
-"""A smaller extent across than this fraction of the second largest: the object starts as flat."""
+"""Objects with a smaller thickness, relative to the second extent, start as flat."""
 
 LARGEST = 1e100
-"""Larger numbers are as good as infinite: their products soon are."""
+"""Larger numbers count as infinite, because their products overflow."""
 
 ON_CPU, ON_ACCELERATOR = 32, 512
 """Cameras of a portion."""
 
 WORTH_COMPILING = 4_000_000
-"""So many points of views take as long as compiling for another number of views: 2 to 3 s."""
+"""Padded points that cost as much as compiling for another number of views: 2 to 3 s."""
 
 
 def bucket(n: int) -> int:
@@ -48,7 +48,7 @@ class Portion:
 
 
 def once(X: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """Object points listed for every view, as OpenCV takes them, but the same in all: once."""
+    """Object points listed for every view, as for OpenCV, reduced to one list if all are equal."""
     if xy.ndim != 4 or X.shape in (xy.shape[2:3] + (3,), xy.shape[::2] + (3,)):
         return X
     cameras, views, points, _ = xy.shape
@@ -96,7 +96,7 @@ def check_shapes(X, xy, size: np.ndarray, visible) -> None:
 class Batch:
     """The checked input: object points about their mean and along their principal axes.
 
-    `finite`: all numbers of the camera can be used; the others are not looked at.
+    `finite`: all numbers of the camera are usable; other cameras are skipped.
     """
 
     finite: np.ndarray
@@ -152,7 +152,7 @@ class Batch:
         )  # fmt: skip
 
     def portions(self, on_cpu: bool) -> Iterator[Portion]:
-        """Cameras in portions; flat and solid objects apart, and few views from many."""
+        """Cameras in portions, separated by planar and spatial objects, and by number of views."""
         points = self.xy.shape[2]
         points = bucket(points) if points > 128 else -(-points // 8) * 8
         shown = self.visible.any(2) & self.finite[:, None]
@@ -169,8 +169,8 @@ class Batch:
                     yield self._portion(some, np.sort(views), flat, size, (width, points))
 
     def _widths(self, views: np.ndarray, points: int) -> np.ndarray:
-        """To how many views each camera is filled up: cameras with fewer go by themselves where
-        they save more than the compilation of another program costs."""
+        """The padded number of views of each camera: cameras with fewer views are separated if this
+        saves more than the compilation of another program costs."""
         need = np.array([bucket(number) for number in views])
         width = bucket(self.xy.shape[1])
         widths = np.full(len(need), width)
@@ -205,7 +205,7 @@ def _usable(numbers: np.ndarray) -> np.ndarray:
 
 
 def pixel_model(name: str | CameraModel) -> CameraModel:
-    """The camera model of this name, or an own one, if its unit is the pixel."""
+    """The camera model with this name, or a user-defined one, if its unit is the pixel."""
     if not isinstance(name, str | CameraModel):
         raise InputError(
             f"model must be a name, such as 'opencv', or a CameraModel, but is {name!r}"
@@ -222,7 +222,7 @@ def pixel_model(name: str | CameraModel) -> CameraModel:
         )
     if model.prior:
         raise InputError(
-            f"model {model.name!r} needs priors of its parameters, which a batch has not; "
+            f"model {model.name!r} needs priors of its parameters, which a batch does not support; "
             "calibrate it by itself"
         )
     return model
@@ -248,7 +248,7 @@ def free_parameters(model: CameraModel, free: Any) -> tuple[str, ...]:
 
 
 def _middle_of(model: CameraModel) -> tuple[str, ...]:
-    """The principal point, where it is in the middle of the image and not at zero."""
+    """The principal point, if it is at the image centre and not at zero."""
     return model.principal_point if model.axes == "down" else ()
 
 

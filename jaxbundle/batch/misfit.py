@@ -1,13 +1,13 @@
-"""Cameras of a batch that have a solution which does not fit, and what may be the reason.
+"""Cameras of a batch with a bad fit, and the likely cause.
 
-A camera is a misfit by itself where few points make most of its vᵀv. The lengths of normal
+A camera is a misfit on its own if few points contribute most of vᵀv. The lengths of normal
 residuals have √(mean of squares)/mean = 2/√π = 1.128; beyond `TAIL` times that they are not normal.
-It is one beside the others where its RMS is above `FARTHER` times their median, and above it, in
-the logarithm, by more than `DEVIATIONS` times their spread (1.4826 times the median deviation).
-Fewer than `FEWEST` cameras have no spread: there its RMS is above `FARTHER_OF_FEW` times the
-smallest of the others.
+It is a misfit compared with others if its RMS is above `FARTHER` times their median, and above it,
+in the logarithm, by more than `DEVIATIONS` times their spread (1.4826 times the median deviation).
+With fewer than `FEWEST` cameras there is no spread: then its RMS is above `FARTHER_OF_FEW` times
+the smallest of the others.
 
-What escapes: errors spread so evenly over the residuals that these look normal, in a camera alone,
+Not detected are errors spread so evenly that the residuals look normal, in a single camera,
 in all cameras alike, or below these factors.
 """
 
@@ -18,7 +18,7 @@ from jaxbundle.batch.input import Batch
 from jaxbundle.cameras import CameraModel
 
 TAIL = 1.5
-"""1 for normal residuals, 1.2 for half the views five times as noisy as the others."""
+"""1 for normal residuals, 1.2 if half the views are five times as noisy as the others."""
 NORMAL = 2 / np.sqrt(np.pi)
 OF_DEVIATION = 1.4826
 """The standard deviation of a normal distribution over its median absolute deviation."""
@@ -26,13 +26,13 @@ FARTHER, DEVIATIONS = 3.0, 5.0
 FARTHER_OF_FEW = 10.0
 """Lenses, boards and focus of two good cameras may differ by less than this."""
 FEWEST = 5
-"""So many solved cameras are a population."""
+"""Minimum number of solved cameras for a population."""
 NEGLIGIBLE = 0.01
-"""An RMS below this is no misfit, pixels."""
+"""A smaller RMS is never a misfit, pixels."""
 FAR = 1.0
-"""Points outside the image by more than this times its size are no measurements."""
+"""Points farther outside the image, in image sizes, are not measurements."""
 OUTSIDE = 0.5
-"""More than this part of the image points is outside the image: their axes are not those meant."""
+"""If a larger fraction of image points is outside the image, their axes are probably wrong."""
 
 
 def misfits(
@@ -55,8 +55,8 @@ def misfits(
 def rms_beside(
     rms: Float[np.ndarray, " cameras"], solved: Bool[np.ndarray, " cameras"]
 ) -> Float[np.ndarray, " cameras"]:
-    """What the RMS of each solved camera is compared with: the median of all, of few cameras the
-    smallest of the others; NaN for one alone, and one without a solution."""
+    """The reference of the RMS of each solved camera: the median of all, for few cameras the
+    smallest of the others; NaN for a single camera, and one without a solution."""
     beside = np.full(len(rms), np.nan)
     some = np.maximum(rms[solved], NEGLIGIBLE)
     if len(some) >= FEWEST:
@@ -68,11 +68,11 @@ def rms_beside(
 
 
 def rms_remark(rms: float, beside: float) -> str:
-    """Says so where the RMS is far above that of the other cameras."""
+    """A remark if the RMS is far above that of the other cameras."""
     if not rms > FARTHER * beside:
         return ""
     return (
-        f"RMS {rms:.2g} px beside {beside:.2g} px of the others: wrong points may be why "
+        f"RMS {rms:.2g} px against {beside:.2g} px of the others: wrong points may be why "
         "parameters are not determined"
     )
 
@@ -83,15 +83,15 @@ def far_outside(
     size: Float[np.ndarray, "2"],
     down: bool,
 ) -> Bool[np.ndarray, "cameras views points"]:
-    """Which visible points lie so far outside the image that they cannot be measurements; none of
-    a camera where most do, for there the axes or the size are not those meant."""
+    """Which visible points are so far outside the image that they cannot be measurements; none for
+    a camera with most points outside, since then the axes or the size are wrong."""
     far = visible & _beyond(xy, size, down, FAR)
     most = far.sum((1, 2)) > OUTSIDE * visible.sum((1, 2))
     return far & ~most[:, None, None]
 
 
 def _corner(size, down: bool):
-    """The least coordinates in an image."""
+    """The smallest coordinates in an image."""
     return np.full(2, -0.5) if down else -size / 2
 
 
@@ -104,8 +104,8 @@ def _beyond(xy, size, down: bool, margin: float):
 def axes_remark(
     xy: Float[np.ndarray, "points 2"], size: Float[np.ndarray, "2"], down: bool
 ) -> str:
-    """What is odd about the axes of image points; where most of them are in the image, how many
-    are far outside, if any.
+    """A remark about suspicious axes of image points; if most of them are in the image, the number
+    of points far outside, if any.
 
     **Arguments:** `down`: y is counted downwards from the upper left pixel, else upwards from the
     middle.
@@ -115,7 +115,7 @@ def axes_remark(
     if part <= OUTSIDE:
         far = int(_beyond(xy, size, down, FAR).sum())
         points = "image point is" if far == 1 else "image points are"
-        return f"{far} {points} far outside the image: data snooping leaves such out" * (far > 0)
+        return f"{far} {points} far outside the image: data snooping removes them" * (far > 0)
     if not down and ((xy > -0.5) & (xy < size)).all(1).mean() > 0.9:
         return (
             "the image points seem to be counted from a corner of the image: in this model (0, 0) "
@@ -138,8 +138,8 @@ def axes_remark(
 def remarks(
     model: CameraModel, batch: Batch, rows: dict, good: Bool[np.ndarray, " cameras"]
 ) -> np.ndarray:
-    """What is odd about the image points: looked for where the principal point is outside the
-    image, or there is no good result. Of a camera that is not determined, an RMS that is odd."""
+    """A remark about suspicious image points, if the principal point is outside the image or there
+    is no good result; for an undetermined camera, about its RMS."""
     frame = batch.image_size
     if model.principal_point and model.axes == "down":
         columns = [model.parameters.index(name) for name in model.principal_point]

@@ -2,24 +2,24 @@
 
     ray = M·X + t,        v = computed − observed image point      (pixels, weight 1 or 0)
 
-Unknown are the free parameters of the interior orientation, shared by all views, and 6 of every
-view: a shift δt and a turn δθ about the middle of the object, which is the origin of X:
+The unknowns are the free parameters of the interior orientation, shared by all views, and 6 per
+view: a shift δt and a rotation δθ about the centre of the object, which is the origin of X:
 
     ray(δ) = M·X + δθ × (M·X) + t + δt
 
-A board in front of a camera hardly correlates the two, whereas a turn about the projection centre
-shifts the image as a displacement does. For each view the *augmented* normal matrix is kept,
+These two are hardly correlated, whereas a rotation about the projection centre shifts the image
+like a displacement. For each view the *augmented* normal matrix is stored,
 
     N = [Jₑ Jᵢ v]ᵀ·[Jₑ Jᵢ v],        Jₑ ∂v/∂(δt, δθ),  Jᵢ ∂v/∂(interior),
 
-all that a step, its predicted effect and the covariances need. The views are eliminated first
-(Schur), then a small dense system of the interior orientation remains:
+which contains everything for a step, its predicted effect and the covariances. The views are
+eliminated first (Schur), then a small dense system of the interior orientation remains:
 
     S = Σ Nᵢᵢ − Nᵢₑ·Nₑₑ⁻¹·Nₑᵢ
 
-Arrays are [views, points] for every quantity of a point, and one product of matrices a view builds
-N: a camera of 20 views × 88 points takes 0.12 ms a core, with the derivatives as the last axis
-0.18 ms.
+Arrays are [views, points] for every quantity of a point, and one matrix product per view builds N:
+a camera of 20 views × 88 points takes 0.12 ms on a core, with the derivatives as the last axis 0.18
+ms.
 """
 
 import equinox as eqx
@@ -37,7 +37,7 @@ POSE = 6
 
 
 class Sightings(eqx.Module):
-    """What one camera saw: object points about their middle, image points, weights 1 or 0."""
+    """The data of one camera: object points about their centroid, image points, weights 1 or 0."""
 
     point: Float[AnyArray, "*cameras points 3"]
     xy: Float[AnyArray, "*cameras views points 2"]
@@ -45,7 +45,7 @@ class Sightings(eqx.Module):
 
     @property
     def views(self) -> Bool[Array, " views"]:
-        """Views that take part."""
+        """Used views."""
         return jnp.any(self.weight > 0, 1)
 
 
@@ -69,7 +69,7 @@ def design(model, free, seen: Sightings, at: Calibration) -> tuple[list, list]:
     """The columns of [Jₑ Jᵢ v], each [views, points]: the rows of x, and those of y."""
     M = jax.vmap(matrix_from_quaternion)(at.rotation)
     of_view = lambda column: column[:, None]
-    # What is not seen stands at the middle of the object, whose image always exists.
+    # Invisible points are put at the centre of the object, whose image always exists.
     X = [jnp.where(seen.weight > 0, seen.point[:, i], 0.0) for i in range(3)]
     Y = [sum(of_view(M[:, i, j]) * X[j] for j in range(3)) for i in range(3)]
     t = [of_view(at.shift[:, i]) for i in range(3)]
@@ -94,7 +94,7 @@ def design(model, free, seen: Sightings, at: Calibration) -> tuple[list, list]:
 
 
 def residual_lengths(model, seen: Sightings, at: Calibration) -> Float[Array, "views points"]:
-    """√(vx² + vy²) of all points, 0 where none is seen."""
+    """√(vx² + vy²) of all points, 0 if invisible."""
     M = jax.vmap(matrix_from_quaternion)(at.rotation)
     X = [jnp.where(seen.weight > 0, seen.point[:, i], 0.0) for i in range(3)]
     r, s, q = (
@@ -106,7 +106,7 @@ def residual_lengths(model, seen: Sightings, at: Calibration) -> Float[Array, "v
 
 
 def gram(x: list, y: list) -> Float[Array, "views n n"]:
-    """AᵀA by view, of the n columns of A, of which every point has a row in x and one in y."""
+    """AᵀA by view, of the n columns of A, with a row in x and one in y per point."""
     square = lambda A: jnp.einsum("vip,vjp->vij", A, A)
     return square(jnp.stack(x, 1)) + square(jnp.stack(y, 1))
 
@@ -162,8 +162,9 @@ def step(factor: Factor):
 
 
 def cofactors(factor: Factor):
-    """Q of the interior orientation [k, k], and of every view [views, 6, 6], marginal; and how well
-    the weakest interior parameter is determined, 1/(Qᵢᵢ·Nᵢᵢ): 1 by itself, 0 not at all."""
+    """Q of the interior orientation [k, k], and of every view [views, 6, 6], marginal; and the
+    determinability of the weakest interior parameter, 1/(Qᵢᵢ·Nᵢᵢ): 1 independent, 0
+    undetermined."""
     k = len(factor.right)
     inverse = jax.scipy.linalg.cho_solve((factor.interior, True), jnp.eye(k))
     interior = factor.interior_scale[:, None] * inverse * factor.interior_scale
@@ -177,7 +178,7 @@ def cofactors(factor: Factor):
 
 
 def retract(free, at: Calibration, d_pose, d_interior) -> Calibration:
-    """The unknowns after a change; every view turns about the middle of the object."""
+    """The unknowns after a change; every view rotates about the centre of the object."""
     return Calibration(
         interior=at.interior.at[jnp.array(free)].add(d_interior),
         rotation=jax.vmap(retract_quaternion)(at.rotation, d_pose[:, 3:]),

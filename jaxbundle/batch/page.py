@@ -27,7 +27,7 @@ from jaxbundle.report.page.markup import figure, grid, paragraph
 from jaxbundle.report.page.verdict import BAD, DOUBTFUL, GOOD
 
 MOST_OUTLYING = 30
-"""Cameras listed as outlying; the table has all."""
+"""Number of cameras listed as outlying; the table has all."""
 
 
 def compose_batch(
@@ -35,7 +35,7 @@ def compose_batch(
     against: Mapping[str, np.ndarray] = NOTHING,
 ) -> Iterator[str]:  # fmt: skip
     """The page of the results of `run_batch`, as their lines are read (`result_rows`): HTML, in
-    pieces. `against`: columns that parameters may go with (`Population.correlations`)."""
+    pieces. `against`: columns to correlate with (`Population.correlations`)."""
     found = rows if isinstance(rows, Population) else Population(rows)
     return write(_describe(found, origin, against))
 
@@ -70,7 +70,7 @@ def _states(found: Population) -> str:
 
 
 def _rms(found: Population) -> list[Section]:
-    """The histogram of the RMS of cameras, of σ0 where there are networks alone."""
+    """The histogram of the RMS of cameras, or of σ0 for networks only."""
     name, label = ("rms", "RMS of an image point [px]")
     if not np.isfinite(found.numbers["rms"]).any():
         name, label = "sigma0", "σ0"
@@ -120,7 +120,7 @@ def _histograms(found: Population) -> Iterator[str]:
 
 
 def _correlations(found: Population, against: Mapping[str, np.ndarray]) -> list[Section]:
-    """What parameters go with."""
+    """Correlations of parameters."""
     told = found.correlations(against)
     if not told:
         return []
@@ -142,7 +142,7 @@ def _correlations(found: Population, against: Mapping[str, np.ndarray]) -> list[
 
 
 def _outlying(found: Population) -> list[Section]:
-    """What needs attention: no result first, then misfit, then the farthest."""
+    """Inputs that need attention: those without a result first, then misfits, then the farthest."""
     said = found.outlying()
     if not said:
         return []

@@ -1,10 +1,9 @@
-"""The population of a batch: how its cameras are distributed, which are outlying, what their
-parameters go with.
+"""The population of a batch: distribution of its cameras, outliers, correlations of parameters.
 
-A parameter of a camera is outlying where it is more than `APART` robust standard deviations
-(1.4826 times the median absolute deviation) from the median of the converged cameras; so is an RMS
-above theirs. What parameters go with, a serial number or a date, is the rank correlation of
-Spearman (1904), with the probability of as large a one by chance from
+A parameter of a camera is outlying if it is more than `APART` robust standard deviations
+(1.4826 times the median absolute deviation) from the median of the converged cameras; likewise a
+high RMS. Correlation with a serial number or a date is Spearman's rank correlation (1904), with the
+p-value from
 
     t = r·√((n − 2)/(1 − r²))   ~   Student's t with n − 2 degrees of freedom.
 """
@@ -26,21 +25,21 @@ from jaxbundle.report.layout import significant
 from jaxbundle.report.page.columns import numbers
 
 FEWEST = 8
-"""Cameras that make a population."""
+"""Minimum number of cameras of a population."""
 APART = 5.0
-"""So many robust standard deviations from the median is outlying."""
+"""Outliers are more than this number of robust standard deviations from the median."""
 LEVEL = 0.01
-"""Of all correlations of a batch together."""
+"""Joint level of all correlations of a batch."""
 CLASSES, WIDE = 24, 4.0
-"""Classes of a histogram, and how many robust standard deviations it reaches to each side."""
+"""Number of classes of a histogram, and its half width in robust standard deviations."""
 NUMBERS = ("rms", "sigma0", "redundancy", "iterations", "views", "removed")
 ID = "id"
 
 
 @dataclasses.dataclass(frozen=True)
 class Correlation:
-    """Rank correlation of a parameter with a column over `cameras`; the `probability` of as large a
-    one by chance; `change`: the median of the upper half of the column less that of the lower."""
+    """Rank correlation of a parameter with a column over `cameras`; its p-value `probability`;
+    `change`: the median for the upper half of the column minus that for the lower."""
 
     column: str
     parameter: str
@@ -52,8 +51,8 @@ class Correlation:
 
 class Population:
     """Columns over all rows of a batch (`batch.run.result_rows`): `keys`, `status`, `remark`,
-    `numbers` by name; the parameters of cameras, `values`, with their `sigma`, and how far each is
-    `apart` from the median, in robust standard deviations; `rms_apart`, with its sign."""
+    `numbers` by name; the parameters of cameras, `values`, with their `sigma`, and their deviations
+    `apart` from the median, in robust standard deviations; `rms_apart`, signed."""
 
     def __init__(self, rows: Iterable[Mapping]):
         kept = [_row(row) for row in rows]
@@ -77,7 +76,7 @@ class Population:
 
     @property
     def fit(self) -> np.ndarray:
-        """Which have values that fit and are determined: the population."""
+        """Which have values that fit and are determined, i.e. the population."""
         return self.status == STATUS[CONVERGED]
 
     def spread(self, values: np.ndarray) -> tuple[float, float]:
@@ -95,7 +94,7 @@ class Population:
 
     @property
     def farthest(self) -> np.ndarray:
-        """Of every row the largest deviation of a parameter from the median; NaN without any."""
+        """The largest deviation of a parameter from the median, by row; NaN without any."""
         if not self.apart:
             return np.full(len(self), np.nan)
         found = np.array(list(self.apart.values()))
@@ -103,7 +102,7 @@ class Population:
         return np.where(largest < 0, np.nan, largest)
 
     def why_outlying(self, i: int) -> str:
-        """Status, remark and what is far from the median, in words; empty: not outlying."""
+        """Status, remark and outlying parameters, in words; empty: not outlying."""
         said = [] if self.fit[i] else [self.status[i]]
         said += [self.remark[i]] if self.remark[i] else []
         said += [f"{name} {significant(far[i], 2)} robust σ from the median"
@@ -113,7 +112,8 @@ class Population:
         return "; ".join(said)
 
     def outlying(self) -> list[tuple[int, str]]:
-        """Rows that need attention and why: no result first, then misfit, then the farthest."""
+        """Rows that need attention, with the reason: without a result first, then misfits, then the
+        farthest."""
         said = [(i, self.why_outlying(i)) for i in range(len(self))]
         far, rms = np.nan_to_num(self.farthest), np.nan_to_num(self.numbers["rms"])
         said = [(i, words) for i, words in said if words]
@@ -121,7 +121,7 @@ class Population:
                                               -far[item[0]], -rms[item[0]]))  # fmt: skip
 
     def histogram(self, values: np.ndarray) -> tuple[Float[np.ndarray, " edges"], np.ndarray]:
-        """Edges and numbers of classes over the population, the outer ones open where values lie
+        """Edges and counts of classes over the population, the outer ones open if values lie
         beyond."""
         found = values[self.fit & np.isfinite(values)]
         if not len(found):
@@ -139,8 +139,8 @@ class Population:
         return edges, np.histogram(found, edges)[0]
 
     def correlations(self, against: Mapping[str, np.ndarray]) -> list[Correlation]:
-        """Of every parameter and the RMS with every column of `against` (a number for each row, NaN
-        where there is none), the most certain first."""
+        """Correlations of every parameter and the RMS with every column of `against` (a number per
+        row, NaN if missing), the most significant first."""
         found = []
         for column, with_it in against.items():
             for name, values in {**self.values, "rms": self.numbers["rms"]}.items():
@@ -150,7 +150,7 @@ class Population:
         return sorted(found, key=lambda one: (one.probability, -abs(one.rank_correlation)))
 
     def summary(self, against: Mapping[str, np.ndarray] | None = None) -> dict[str, Any]:
-        """All of it as plain dicts and numbers."""
+        """The population as plain dicts and numbers."""
         names, counts = np.unique(self.status.astype(str), return_counts=True)
         of = {**self.values, "rms": self.numbers["rms"]}
         parameters = {}
@@ -178,8 +178,8 @@ class Population:
         }  # fmt: skip
 
     def table(self, against: Mapping[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
-        """A row an input: key, status, remark, the numbers, every parameter with its σ, the largest
-        deviation from a median, and the columns of `against`."""
+        """One row per input: key, status, remark, the numbers, every parameter with its σ, the
+        largest deviation from a median, and the columns of `against`."""
         columns = {"key": self.keys, "status": self.status, "remark": self.remark}
         columns |= {n: values for n, values in self.numbers.items() if np.isfinite(values).any()}
         for name, values in self.values.items():
@@ -189,7 +189,7 @@ class Population:
 
 
 def _row(row: Mapping) -> dict:
-    """What the population has of a line, without poses and covariances."""
+    """The data of a line used by the population, without poses and covariances."""
     names = ("key", "status", "remark", "rms", "sigma0", "redundancy", "iterations", "views")
     found = {name: row[name] for name in names if name in row}
     removed = row.get("removed")

@@ -24,28 +24,28 @@ MOST_REMARKS = 10
 @shows_itself
 @dataclasses.dataclass(frozen=True)
 class BatchCalibration:
-    """The cameras of a batch; everything of a camera that has no solution is NaN.
+    """The cameras of a batch; all values of a camera without a solution are NaN.
 
     **Fields:**
 
     - `model`, `parameters`: the camera model and its k free parameters.
-    - `status`: "converged"; "weak", as that, but the views do not determine the principal distance
+    - `status`: "converged"; "weak", the same, but the views do not determine the principal distance
       or point, whose σ is above a fiftieth of the principal distance; "misfit": it has values, but
-      the residuals do not fit, by themselves (gross errors) or beside those of the other cameras of
-      the batch (see `jaxbundle.batch.misfit`). Without a solution "iteration limit",
-      "singular", "not finite" (an infinite number among the measurements, or the start) or
-      "too few points" (no view of use, or no redundancy).
-    - `remark`: what seems not to be meant about its image points, and of a camera that is not
-      determined an RMS far above that of the others; mostly empty.
-    - `undetermined`: the free parameters that the views do not determine, where that is why the
-      camera is weak, is singular or came to no end.
-    - `values`, `sigma`, `covariance`: of the free parameters; pixels, coefficients without unit.
+      the residuals are too large, on their own (gross errors) or compared with the other cameras of
+      the batch (see `jaxbundle.batch.misfit`). Without a solution "iteration limit", "singular",
+      "not finite" (an infinite number among the measurements, or the start) or
+      "too few points" (no usable view, or no redundancy).
+    - `remark`: suspicious image points, or for an undetermined camera an RMS far above that of the
+      others; mostly empty.
+    - `undetermined`: the free parameters that the views do not determine, if that is why the
+      camera is weak, singular or at the iteration limit.
+    - `values`, `sigma`, `covariance`: of the free parameters; pixels, dimensionless coefficients.
     - `interior`: all parameters of the model, in its order.
     - `sigma0`: √(vᵀv/redundancy), pixels; all σ and covariances are a posteriori.
     - `rms`: √(Σ(vx² + vy²)/points), pixels, as OpenCV defines it.
     - `redundancy`, `iterations` (evaluations of the normal equations).
-    - `views`: the views that took part. One with fewer than 4 points of a flat object (6 of a solid
-      one), or with all of them on a line (in a plane), is left out.
+    - `views`: the used views. A view with fewer than 4 points of a planar object (6 of a spatial
+      one), or with all of them on a line (in a plane), is excluded.
     - `removed`: the image points removed by data snooping; None without it.
     - `position`, `angles`: X0, Y0, Z0 in the unit of the object; ω, φ, κ in radians, with
       `sigma_position`, `sigma_angles`; `rotation`: the matrices M.
@@ -74,12 +74,12 @@ class BatchCalibration:
 
     @property
     def converged(self) -> Bool[np.ndarray, " cameras"]:
-        """Which have a solution that fits, and everything in it is determined."""
+        """Which have a determined solution that fits."""
         return self.status == STATUS[CONVERGED]
 
     @property
     def solved(self) -> Bool[np.ndarray, " cameras"]:
-        """Which have values: the weak ones and the misfits as well."""
+        """Which have values, including weak ones and misfits."""
         return np.isin(self.status, SOLVED)
 
     def __len__(self) -> int:
@@ -149,8 +149,8 @@ class BatchCalibration:
         return Population({"key": str(id)} | self.row(i, True) for i, id in enumerate(ids))
 
     def table(self) -> dict[str, np.ndarray]:
-        """A row a camera: status, remark, rms and sigma0 (pixels), redundancy, iterations, views,
-        points removed where there was data snooping, every parameter and its σ."""
+        """One row per camera: status, remark, rms and sigma0 (pixels), redundancy, iterations,
+        views, points removed where there was data snooping, every parameter and its σ."""
         columns = {
             "status": self.status, "remark": self.remark, "rms": self.rms, "sigma0": self.sigma0,
             "redundancy": self.redundancy, "iterations": self.iterations,
@@ -167,7 +167,7 @@ class BatchCalibration:
         return data_frame(self.table())
 
     def _repr_html_(self) -> str:
-        """The cameras as a table, those that did not converge first."""
+        """The cameras as a table, unconverged ones first."""
         table = self.table()
         if not (self.remark != "").any():
             del table["remark"]

@@ -1,10 +1,10 @@
-"""What `jaxbundle batch` does: many independent calibrations and networks into one file.
+"""The computation of `jaxbundle batch`: many independent calibrations and networks into one file.
 
-Every camera and every network has a key, the path of its input seen from the folder of the file of
-results: from wherever the command is run, and however the path is written, it is the same. Results
-are written as JSON lines, portion by portion, and what is already in the file is not computed
-again: a run can be interrupted at any moment. Each line says what it was made of, its `settings`
-and the fingerprint of its `data`; where those are others, nothing is taken for a result of these.
+Every camera and every network has a key, the path of its input relative to the folder of the result
+file, independent of the working directory. Results
+are written as JSON lines, portion by portion, and inputs already in the file are skipped,
+so that a run can be interrupted at any time. Each line contains its `settings`
+and the fingerprint of its `data`; lines with other ones are not accepted as results.
 """
 
 import dataclasses
@@ -47,10 +47,10 @@ from jaxbundle.system.configuration import available_cores
 from jaxbundle.system.workers import Workers
 
 SNOOPING = ("snooping", "significance")
-"""Settings that only a line has whose measurements were searched for blunders."""
+"""Settings present only in lines computed with data snooping."""
 CAMERAS_A_WRITE = 256
 NETWORKS_A_CACHE = 50
-"""After so many networks compiled programs are dropped: each holds memory."""
+"""Compiled programs are dropped after this number of networks, to free memory."""
 
 
 def run_batch(
@@ -75,8 +75,8 @@ def run_batch(
 
     **Arguments:**
 
-    - `file`: JSON lines; what it already has is skipped.
-    - `model`, `free`: as of `calibrate_batch`, for the cameras.
+    - `file`: JSON lines; inputs already in it are skipped.
+    - `model`, `free`: as in `calibrate_batch`, for the cameras.
     - `max_iterations`: for each camera and each network.
     - `snooping`, `significance`: data snooping, `"pope"`, of every camera and every network.
     - `board`: what is in the photographs; every folder that holds no network is then one of
@@ -89,12 +89,13 @@ def run_batch(
     - `progress(done, total)`: called after every write, and while photographs are searched; what
       was skipped counts as done.
 
-    **Returns:** how many of the inputs have which status in the file, and how many of them were
-    `"skipped"`, for they were there.
+    **Returns:** the number of inputs by status in the file, and of those `"skipped"` because they
+    were already there.
 
     **Raises:** `InputError` before anything is computed, for a missing input or a bad `.npz`, for
-    results of other settings or data in the file without `renew`, and for a file another run is
-    writing; a network that cannot be read or solved gets a line that says so, and the others go on.
+    results of other settings or data in the file without `renew`, and for a file that another run
+    is writing. A network that cannot be read or solved gets a line with the reason; the run
+    continues.
     """
     portion = whole("portion", portion)
     max_iterations = whole("max_iterations", max_iterations)
@@ -149,7 +150,7 @@ def result_rows(inputs: Sequence[str | Path], file: str | Path) -> Iterator[dict
 
 
 def key_of(path: str | Path, file: str | Path) -> str:
-    """The path of an input seen from the folder of the file of results, with / between folders."""
+    """The path of an input relative to the folder of the result file, with / between folders."""
     folder, name = os.path.split(os.path.abspath(path))
     path = os.path.join(os.path.realpath(folder), name)
     try:
@@ -266,7 +267,7 @@ def _tell(progress, done: int, number: int, total: int, part: float) -> None:
 
 
 def _rows(work: _Work, chosen: Sequence[int], tell: Tell) -> list[dict]:
-    # Before the work: what is changed meanwhile is seen to be changed.
+    # Before the computation, so that later changes are detected.
     data = [work.data(i) for i in chosen]
     return [
         {"key": work.keys[i], "status": row["status"], "settings": work.settings, "data": of} | row
@@ -277,9 +278,9 @@ def _rows(work: _Work, chosen: Sequence[int], tell: Tell) -> list[dict]:
 def _again(
     work: _Work, share: Sequence[int], lines: JsonLines, retry: bool, renew: bool
 ) -> list[str]:
-    """The keys of an input that are in the file, and are to be computed again.
+    """The keys of an input that are in the file and must be recomputed.
 
-    **Raises:** `InputError` for a line that was made of something else, without `renew`."""
+    **Raises:** `InputError` for a line with other settings or data, without `renew`."""
     again, other = [], {}
     for i in share:
         key = work.keys[i]
@@ -294,20 +295,20 @@ def _again(
         key, difference = next(iter(other.items()))
         raise InputError(
             f"{lines.path}: has {len(other)} of these inputs from other settings or other data, "
-            f"{key}: {difference}; give another file to --json-lines, or compute them again with "
+            f"{key}: {difference}; give another file to --json-lines, or recompute them with "
             "--renew"
         )
     return [*again, *other]
 
 
 def _difference(head: dict, work: _Work, i: int) -> str:
-    """What a line was made of otherwise, in words; empty if nothing."""
+    """Differences in settings or data of a line, in words; empty if none."""
     old = head.get("settings")
     if not isinstance(old, dict) or "data" not in head:
         return "its line does not say what it was made of (an earlier version wrote it)"
     for name in {**work.settings, **dict.fromkeys(SNOOPING)}:
         value = work.settings.get(name)
-        # A minimum is the same after however many iterations were allowed.
+        # A minimum does not depend on the iteration limit.
         matters = name != "max_iterations" or head.get("status") == STATUS[LIMIT]
         if matters and old.get(name) != value:
             return f"{name} was {_shown(old.get(name))}, is {_shown(value)}"
@@ -319,7 +320,8 @@ def _shown(value) -> str:
 
 
 def network_row(path: str, **options) -> dict:
-    """The status and brief result of one network (`options` of `adjust`), or why there is none."""
+    """The status and brief result of one network (`options` of `adjust`), or the reason for a
+    failure."""
     try:
         result = adjust(read_network(path), **options)
         status = "converged" if result.converged else result.termination

@@ -1,11 +1,12 @@
-"""Data snooping camera by camera, for batches: blunders go, each camera is calibrated again.
+"""Data snooping for batches, camera by camera: blunders are removed and the camera calibrated
+again.
 
-Of every view only the worst point goes at a time, and only points at least half as bad as the worst
-of all, for a blunder spoils the residuals of its view. In the end whatever was removed is held
-against the calibration it took no part in: what passes comes back. A camera without blunders keeps
-its first solution. The test is Pope's (`leastsquares.distributions`), for a batch knows no σ a
-priori. Its σ0 is that of the residuals, or that of their median where this is smaller: many
-blunders make σ0 so large that each of them hides behind the others.
+Only the worst point of a view is removed at a time, and only points at least half as bad as the
+worst of all, because a blunder affects the residuals of its view. Finally removed points are tested
+against the calibration without them and restored if they pass. A camera without blunders keeps its
+first solution. The test is Pope's (`leastsquares.distributions`), because a batch has no a priori
+σ. Its σ0 is that of the residuals, or from their median if this is smaller: many blunders make σ0
+so large that they mask each other.
 """
 
 import numpy as np
@@ -18,12 +19,12 @@ TESTS = ("pope",)
 MEDIAN = 1.0518
 """Median of the larger of two normal |w|: (2Φ(m) − 1)² = ½."""
 ROUNDING = 1e-6
-"""A smaller σ0 is noise of the arithmetic, pixels."""
+"""A smaller σ0 is arithmetic noise, pixels."""
 ROUNDS = 200
 
 
 class Snooping:
-    """The points of one camera that are in use; `next` says which are after a solution."""
+    """The used points of one camera; `next` updates them after a solution."""
 
     def __init__(self, seen: Bool[np.ndarray, "views points"], test: str, significance: float):
         self.used, self.seen = seen.copy(), seen
@@ -33,9 +34,9 @@ class Snooping:
     def next(
         self, tests: Float[np.ndarray, "views points"], sigma0: float, redundancy: int
     ) -> bool:
-        """Remove what the test calls blunders, or, where there are none, bring back what passes.
+        """Remove blunders found by the test, or, if there are none, restore points that pass.
 
-        **Arguments:** `tests`: |v|/√(redundancy number), NaN where there is none.
+        **Arguments:** `tests`: |v|/√(redundancy number), NaN if undefined.
 
         **Returns:** whether anything has changed.
         """

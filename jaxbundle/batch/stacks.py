@@ -5,7 +5,7 @@
 | `object_points` | [points, 3] or [cameras, points, 3] | known coordinates |
 | `image_points` | [cameras, views, points, 2] | pixels |
 | `image_size` | [2] | width, height |
-| `visible` | [cameras, views, points] | optional: what was measured; NaN is not visible either |
+| `visible` | [cameras, views, points] | optional: measured points; NaN is not visible either |
 | `ids` | [cameras] | optional: names; otherwise 0, 1, 2, … |
 """
 
@@ -29,17 +29,17 @@ UNREADABLE = (
     OSError, EOFError, ValueError, KeyError, NotImplementedError, RuntimeError, MemoryError,
     zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
-"""What numpy and zipfile raise for an archive that is cut, garbled, or claims too much."""
+"""Errors of numpy and zipfile for truncated, damaged or oversized archives."""
 
 NEEDED = ("object_points", "image_points", "image_size")
 KNOWN = (*NEEDED, "visible", "ids")
 BY_CAMERA = {"object_points": 3, "image_points": 4, "visible": 3}
-"""Axes of arrays with a row a camera."""
+"""Number of axes of arrays with one row per camera."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CameraStack:
-    """The cameras of a file; big arrays stay there."""
+    """The cameras of a file; large arrays are read in place."""
 
     ids: tuple[str, ...]
     object_points: np.ndarray | StoredRows
@@ -58,8 +58,8 @@ class CameraStack:
         )
 
     def fingerprint(self, camera: int) -> str:
-        """Of what was measured of a camera; what is not visible does not count, nor how much room
-        there is for it."""
+        """The fingerprint of the measurements of a camera, independent of invisible points and
+        padding."""
         X = self.object_points
         X = X[camera] if isinstance(X, StoredRows) or X.ndim == 3 else X
         xy = self.image_points[camera]
@@ -127,7 +127,7 @@ def read_camera_stack(path: str | Path) -> CameraStack:
 
 
 def _rows(path: str | Path, name: str, file) -> Any:
-    """An array, or the rows of one that is big, has a row a camera, and lies there as it is."""
+    """An array, or on demand the rows of a large uncompressed one with one row per camera."""
     found = find_stored_rows(path, name) if name in BY_CAMERA else None
     cameras = found is not None and found.ndim == BY_CAMERA[name]
     truths = name == "visible"
@@ -137,7 +137,7 @@ def _rows(path: str | Path, name: str, file) -> Any:
 
 
 def _check_size(stream: BinaryIO) -> None:
-    """Refuse an archive whose arrays unpack to far more than measurements do."""
+    """Refuse an archive whose arrays unpack to implausible sizes."""
     with zipfile.ZipFile(stream) as archive:
         unpacked = sum(
             member.file_size for member in archive.infolist()

@@ -24,9 +24,9 @@ from jaxbundle.geometry import quaternion_from_matrix
 from jaxbundle.leastsquares.spaces import cross
 
 FLAT, SOLID = 4, 6
-"""A view of fewer points is left out."""
+"""A view with fewer points is excluded."""
 LEAST_PIVOT = 1e-10
-"""A view whose points lie on a line (a plane) has a scaled pivot below this: it is left out."""
+"""Views with a smaller scaled pivot, with points on a line (in a plane), are excluded."""
 THIN = 1e-7
 """An extent across below this fraction of that along is rounding: the points lie on the line."""
 ORDINARY = 1.2

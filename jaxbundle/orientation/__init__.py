@@ -1,7 +1,7 @@
-"""Start values without start values: orientation in closed form, refined, and robust.
+"""Orientation without start values: in closed form, refined, and robust.
 
-Pure functions of one image, one pair, one point; batch them with `jax.vmap`. What fails is named
-by a `Status` in the result, never by an exception, so that one bad item does not spoil the others.
+Pure functions of one image, one pair, one point; batch them with `jax.vmap`. Failures are reported
+by a `Status` in the result, not by an exception, so that one bad item does not affect the others.
 Image coordinates are ideal ones divided by the principal distance, unless said otherwise.
 """
 

@@ -24,7 +24,7 @@ from jaxbundle.orientation.status import Status, first_of
 from jaxbundle.types import AnyArray
 
 LINE = 1e-7
-"""Points whose second extent is below this part of the first lie on a line."""
+"""Points with a smaller second extent, relative to the first, are collinear."""
 
 
 class AbsoluteOrientation(eqx.Module):
@@ -42,7 +42,7 @@ def absolute_orientation(
     target: Float[AnyArray, "n 3"],
     weights: Float[AnyArray, " n"] | None = None,
 ) -> AbsoluteOrientation:
-    """The similarity that takes `source` to `target`, differentiable, without start values.
+    """The similarity from `source` to `target`, differentiable, without start values.
 
     **Arguments:** corresponding points, three or more, not on one line (`COLLINEAR_POINTS`);
     weights p = 1/σ² of the target, equal in X, Y, Z; 0: the point is absent.
@@ -74,7 +74,7 @@ def absolute_orientation(
 def rotation_between(
     x: Float[AnyArray, "n 3"], y: Float[AnyArray, "n 3"], weights: Float[AnyArray, " n"]
 ) -> Float[Array, "4"]:
-    """The unit quaternion of the rotation that takes directions x nearest to y (Horn, 1987)."""
+    """The unit quaternion of the rotation that best maps directions x to y (Horn, 1987)."""
     S = jnp.einsum("n,ni,nj->ij", weights, x, y)
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = S
     rows = [

@@ -1,4 +1,4 @@
-"""Models brought into one frame: onto control and given positions, onto each other, or to scale."""
+"""Transformation of models: to control and given positions, to each other, or to scale."""
 
 import numpy as np
 from jaxtyping import Float
@@ -9,16 +9,16 @@ from jaxbundle.orientation.growth import Model, controlled
 from jaxbundle.orientation.sights import Sights
 
 APART = 3.0
-"""Points that miss the similarity by more than so many times the median take no part in it."""
+"""Points with residuals above this multiple of the median are excluded from the similarity."""
 LEAST_RAYS = 5
-"""To control points: four give seven unknowns, and one more."""
+"""Minimum rays to control points: four give seven unknowns and one redundancy."""
 FEW = 6
-"""So few points are all believed: none can be told from the others."""
+"""With at most this many points all are used, since outliers cannot be identified."""
 ROUNDS = 3
 LEAST_TO_TELL = 4
-"""Control points by which an object is told from its mirror image."""
+"""Minimum control points for distinguishing an object from its mirror image."""
 MIRRORED, FITS = 5.0, 30.0
-"""As in a mirror: it fits so many times better, and to this part of the extent."""
+"""Mirror image: required improvement of the fit, and fit relative to the extent."""
 
 
 def onto_the_given(network: Network, sights: Sights, model: Model) -> Model | None:
@@ -40,9 +40,9 @@ def onto_the_given(network: Network, sights: Sights, model: Model) -> Model | No
 
 
 def _by_rays(network: Network, sights: Sights, model: Model):
-    """A and t from the rays to control points, many of which may be seen but once.
+    """A and t from the rays to control points, many of which may be seen only once.
 
-    A point at the usual distance along each ray gives the start."""
+    Start values use a point at the typical distance along each ray."""
     points = network.points
     rows = np.flatnonzero(model.placed[sights.image] & controlled(points)[sights.point])
     if len(rows) < LEAST_RAYS or len(np.unique(sights.point[rows])) < 3 or not model.known.any():
@@ -66,11 +66,11 @@ def _by_rays(network: Network, sights: Sights, model: Model):
 
 
 def to_scale(network: Network, model: Model) -> tuple[Model, str]:
-    """The model with the scale of the distances, if there are any, and what it refers to."""
+    """The model with the scale of the distances, if any, and its reference."""
     scale = scale_of_distances(network, model)
     if scale is None:
-        return model, "in a frame and a scale of its own"
-    return model.moved(scale * np.eye(3), np.zeros(3)), "to scale, in a frame of its own"
+        return model, "in an arbitrary frame and scale"
+    return model.moved(scale * np.eye(3), np.zeros(3)), "to scale, in an arbitrary frame"
 
 
 def scale_of_distances(network: Network, model: Model) -> float | None:
@@ -84,10 +84,10 @@ def scale_of_distances(network: Network, model: Model) -> float | None:
 
 
 def joined(sights: Sights, model: Model, part: Model) -> Model | None:
-    """A model with what a second one knows besides; None where nothing connects them.
+    """A model merged with a second one; None if nothing connects them.
 
-    The similarity is that of the points both know, or, where they have an image in common, the one
-    of its pose and of the distances to the points it sees."""
+    The similarity is found from common points, or from the pose of a common image and the distances
+    to its points."""
     both = model.known & part.known
     if not both.any():
         return None
@@ -115,8 +115,8 @@ def _by_an_image(model, part, image, both):
 
 
 def mirrored(network: Network, model: Model) -> str:
-    """Whether a model in a frame of its own fits the control points only as in a mirror, in words;
-    empty where it does not, or where it cannot be told (fewer than four, or in a plane)."""
+    """Whether a model in an arbitrary frame fits the control points only as a mirror image, in
+    words; empty if not, or if undecidable (fewer than four, or coplanar)."""
     points = network.points
     control = controlled(points) & model.known
     source, target = model.X[control], points.position[control]
@@ -127,7 +127,7 @@ def mirrored(network: Network, model: Model) -> str:
     if not off[1] < min(off[0] / MIRRORED, extent / FITS):
         return ""
     return (
-        f"the {len(source)} control points fit the images only as in a mirror (by "
+        f"the {len(source)} control points fit the images only as a mirror image (by "
         f"{off[1]:.3g} {network.object_unit}, otherwise {off[0]:.3g}): X and Y are exchanged, or "
         "one of X, Y, Z has the wrong sign, or the image coordinates count y downward; turn one "
         "axis round"
@@ -144,7 +144,7 @@ def _misfit(source, target) -> float:
 
 
 def similarity(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]):
-    """A and t of X' = A·X + t with the points that agree; None: fewer than three, or on a line."""
+    """A and t of X' = A·X + t from the consistent points; None: fewer than three, or collinear."""
     good = np.ones(len(source), bool)
     for _ in range(ROUNDS):
         found = many.similarity(source, target, good.astype(float)) if good.sum() >= 3 else None

@@ -1,7 +1,7 @@
-"""Angles of start values in another unit than the one stated: degrees for gon, radians, …
+"""Detection of wrong angle units of start values: degrees for gon, radians, …
 
-Start values of images and points say where every image point should be. Where that is nowhere near
-the measurements, and near them with the same numbers in another unit, that is their unit.
+Start values of images and points predict every image point. If the predictions are far from
+the measurements, but close with the same numbers in another unit, that is their unit.
 """
 
 import numpy as np
@@ -13,12 +13,12 @@ from jaxbundle.orientation.growth import Model, misclosures
 from jaxbundle.orientation.sights import sights
 
 FAR = 3.0
-"""Tolerances of start values by which half of the image points miss."""
+"""Limit for the median misclosure of image points, in tolerances of start values."""
 
 
 def name_angle_unit(network: Network) -> str:
-    """The unit in which the start values of the images fit the measurements, in words; empty where
-    the one given does, or no other."""
+    """The unit in which the start values of the images fit the measurements, in words; empty if the
+    given one fits, or no other does."""
     seen, images = sights(network), network.images
     poses = np.concatenate([images.position, images.angles], axis=1)
     there = np.all(np.isfinite(poses), axis=1)

@@ -1,8 +1,8 @@
-"""Control points that contradict each other, and the exchange of names that would mend it.
+"""Contradictory control points, and the swap of names that resolves it.
 
-The images alone give the control points up to a similarity. Where the coordinates given do not fit
-that, those that most of them agree on are looked for (a similarity from every three of them), and
-of the others two whose coordinates fit exchanged; of few points every exchange is tried.
+The images determine the control points up to a similarity. If the given coordinates do not fit
+it, the largest consistent group is searched for (a similarity from every three points), and among
+the others two whose coordinates fit when swapped; for few points every swap is tried.
 """
 
 import dataclasses
@@ -21,20 +21,20 @@ from jaxbundle.orientation.sights import Sights, sights
 
 CONTRADICTION = "control points contradict each other"
 TRIPLES = 120
-"""Similarities of three points that are tried."""
+"""Largest number of tested similarities of three points."""
 FEW = 12
-"""Of so many points every exchange of two is tried."""
+"""With at most this many points every swap of two is tried."""
 AGREED = 4
-"""Points that agree before the others are the ones in question: three always may."""
+"""Minimum number of consistent points before the others are suspected; three always agree."""
 AS_GOOD = 3.0
-"""Explanations that fit so many times worse than the best are explanations still."""
+"""Explanations with a fit worse than the best by at most this factor are also reported."""
 
 
 def name_contradiction(network: Network, seen: Sights | None = None, model=None) -> str:
-    """Which control points contradict the others and what would mend it, in words; empty where
-    none do, or where no exchange and no single point explains it.
+    """Which control points contradict the others and the correction, in words; empty if
+    none do, or if no swap and no single point explains it.
 
-    `model`: images placed in any frame; those of the start values if not given."""
+    `model`: images oriented in any frame; default: those of the start values."""
     seen = sights(network) if seen is None else seen
     points = network.points
     alone = _without_control(network, seen, model)
@@ -59,7 +59,7 @@ def name_contradiction(network: Network, seen: Sights | None = None, model=None)
 
 
 def name_suspects(network: Network, suspects: Bool[np.ndarray, " points"]) -> str:
-    """Control points that contradict the images, where nothing explains it."""
+    """Control points that contradict the images without an explanation."""
     names = [network.points.id[p] for p in np.flatnonzero(suspects)]
     return (
         f"the control points {some(names)} contradict the images or each other, and no exchange "
@@ -70,8 +70,8 @@ def name_suspects(network: Network, suspects: Bool[np.ndarray, " points"]) -> st
 
 @dataclasses.dataclass(frozen=True)
 class Contradiction:
-    """How far points miss `before`, and `after` two are exchanged (`exchanges`) or one is left out
-    (`wrong`): all of these `together`, or each by itself one of several explanations."""
+    """The misclosure of points `before`, and `after` two are swapped (`exchanges`) or one is
+    removed (`wrong`): all of these `together`, or each as one of several explanations."""
 
     before: float
     after: float
@@ -164,7 +164,7 @@ def _misfits(source, target, use):
 
 
 def _without_control(network: Network, seen: Sights, model: Model | None) -> Model:
-    """The points as the images alone give them."""
+    """The points determined by the images alone."""
     alone = Model.empty(seen)
     if model is None:
         images = network.images

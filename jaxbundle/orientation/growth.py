@@ -2,10 +2,10 @@
 
     known points ──resection──▶ images ──intersection──▶ more points ──▶ …
 
-An image is placed from `LEAST` known points or more of which most agree; those with the most known
-points go first, so that every later one finds more. A point is known from two rays or more that
-meet at more than `NARROW` and agree. All with the tolerance of start values: the adjustment that
-follows does the rest.
+An image is resected from at least `LEAST` known points, most of which must agree; images with the
+most known points come first. A point is intersected from at least two consistent rays with an angle
+above `NARROW`. All tests use the tolerance of start values; the subsequent adjustment refines the
+result.
 """
 
 import dataclasses
@@ -20,17 +20,17 @@ from jaxbundle.orientation.sights import Sights
 from jaxbundle.orientation.status import Status
 
 LEAST = 4
-"""Known points an image needs: three, and one to choose among their solutions."""
+"""Minimum known points of an image: three, and one to choose among their solutions."""
 ENOUGH, WAITING = 12, 0.4
-"""An image waits while it has fewer known points, or less than this part of the most that another
-one has."""
+"""An image waits while it has fewer known points, or less than this fraction of the maximum of all
+images."""
 DRIFTS, LARGER = 30, 2.5
-"""Images of a model that is improved first, and how much larger it becomes before the next time."""
+"""Number of images for the first improvement of a model, and its growth factor until the next."""
 PARALLEL, FAR_AWAY = 2e-3, 2e3
 """Radians between the rays of a point that is far away and their middle; and how far, in radii of
 the places of the images."""
 AGREE = 0.4
-"""Least part of the points of an image, or a pair, that must agree."""
+"""Minimum fraction of consistent points of an image or a pair."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Demands:
 
 
 FOR_OTHERS = Demands(0.02, 1.0)
-"""A point from which images are placed."""
+"""A point known well enough for resection."""
 FOR_ITSELF = Demands(1e-3, 4.0)
 """A point that needs a start value."""
 
@@ -96,9 +96,9 @@ def grow(
     among: Bool[np.ndarray, " images"] | None = None,
     improve: Improve | None = None,
 ) -> None:
-    """Place what can be placed of the images (`among` these), and intersect the points they see.
+    """Orient as many images as possible (`among` these), and intersect their points.
 
-    A model that grows drifts; `improve` is called whenever it has become `LARGER` times as big."""
+    A growing model drifts; `improve` is called whenever it has grown by the factor `LARGER`."""
     among = np.ones(sights.images, bool) if among is None else among
     tried = np.zeros(sights.images, int)
     due = max(DRIFTS, LARGER * model.placed.sum())
@@ -120,7 +120,7 @@ def grow(
 
 
 def finish(sights: Sights, model: Model) -> None:
-    """Everything once more, images from all their points and points from all their rays."""
+    """Repeat everything, images from all their points and points from all their rays."""
     for _ in range(2):
         intersect(sights, model, FOR_ITSELF, again=True)
         _refine(sights, model)
@@ -128,10 +128,10 @@ def finish(sights: Sights, model: Model) -> None:
 
 
 def place_far_points(sights: Sights, model: Model) -> None:
-    """Points that are not known, but of whose rays three or more are all parallel: far away in
-    their direction. Such rays hardly meet, and for noise often behind the cameras.
+    """Unknown points with at least three parallel rays: far away in their direction. Such rays
+        hardly intersect, because of noise often behind the cameras.
 
-    None where they are many: then the images stand at one place."""
+        None if there are many: then the images have one common projection centre."""
     rows = np.flatnonzero(model.placed[sights.image] & ~model.known[sights.point])
     point, image = sights.point[rows], sights.image[rows]
     xy1 = np.pad(sights.xy[rows], ((0, 0), (0, 1)), constant_values=-1.0)
@@ -154,7 +154,7 @@ def place_far_points(sights: Sights, model: Model) -> None:
 
 
 def place_images(sights: Sights, model: Model, images) -> int:
-    """Resect images from the known points they see; returns how many could be placed."""
+    """Resect images from their known points; returns the number of oriented images."""
     rows = [_known_rows(sights, model, image) for image in images]
     X0, M, part = many.resect(
         [sights.xy[r] for r in rows], [model.X[sights.point[r]] for r in rows],
@@ -174,7 +174,7 @@ def _known_rows(sights, model, image):
 
 
 def _refine(sights: Sights, model: Model) -> None:
-    """All placed images improved by the points that agree."""
+    """All oriented images improved by consistent points."""
     images = np.flatnonzero(model.placed)
     error = misclosures(sights, model)
     rows = [_known_rows(sights, model, image) for image in images]
@@ -201,7 +201,7 @@ def misclosures(sights: Sights, model: Model) -> Float[np.ndarray, " n"]:
 def intersect(sights: Sights, model: Model, demands: Demands, again: bool = False) -> None:
     """Intersect the points that are not known yet, or all that are not held `again`.
 
-    Of a point whose rays disagree the worst ray is left aside, as long as two remain.
+    If the rays of a point disagree, the worst ray is dropped, as long as two remain.
     """
     rows = np.flatnonzero(model.placed[sights.image])
     rows = rows[np.argsort(sights.point[rows], kind="stable")]
@@ -229,7 +229,7 @@ def intersect(sights: Sights, model: Model, demands: Demands, again: bool = Fals
         sound = status == int(Status.SOUND)
         agree = sound & (off.max(1) < 1)
         X[todo], good[todo] = found, agree & (angle > demands.angle)
-        # blunders: two rays that contradict each other say nothing about which is wrong
+        # blunders: of two contradicting rays either may be wrong
         more = ~agree & (weights[todo].sum(1) > 2) & np.isfinite(off).all(1)
         weights[todo[more], off[more].argmax(1)] = 0.0
         todo = todo[more]

@@ -1,7 +1,7 @@
-"""Many orientations at once: lists of any length in, one compiled program for all of them.
+"""Many orientations at once: lists of any length with one compiled program.
 
-Every item is filled up with absent observations (weight 0) to `SLOTS`, and items to full lanes; of
-more observations the spread is kept, not the number. On the host, numpy in and out.
+Every item is padded with absent observations (weight 0) to `SLOTS`, and items to full lanes; from
+more observations a well-spread subset is used. On the host, with numpy input and output.
 """
 
 from collections.abc import Sequence
@@ -28,12 +28,12 @@ from jaxbundle.orientation.status import Status
 from jaxbundle.system.compilation import quick_jit
 
 SLOTS = 64
-"""Points of an image, of a pair, of two models."""
+"""Padded numbers of points of an image, of a pair, of two models."""
 RAYS = 8
-"""Rays of a point."""
+"""Padded number of rays of a point."""
 LANES, POINT_LANES = 8, 256
 BY_RAYS = 40
-"""Steps of a similarity by rays, whose start is rough."""
+"""Steps of a similarity by rays, which has a rough start."""
 
 
 def resect(

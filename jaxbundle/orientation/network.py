@@ -1,15 +1,15 @@
-"""The start values of a whole network: what can be placed first, and what follows from it.
+"""The start values of a whole network.
 
-1. Images with a given exterior orientation stand, control points are known: images that see enough
+1. Images with given exterior orientation and control points are known: images that see enough
    of them are resected, points intersected, more images resected, … (`growth`).
-2. Where nothing can begin so, given coordinates of tie points count as known.
-3. Where nothing can begin so either, or images are left, a model begins with two of them: of the
-   pairs with many points in common one whose rays meet at good angles, oriented relatively (five
-   points). It grows; what it does not reach follows by a pair of a placed and a new image, joined
-   to it. In the end a similarity takes it onto control points or given positions (`frames`);
-   without these it keeps its own frame.
+2. If no image can be resected, given coordinates of tie points count as known.
+3. If this fails too, or images are left, a model starts from two of them: among the pairs with many
+   common points one with good intersection angles, oriented relatively (five points). It grows;
+   unreached images are joined by relative orientation to an oriented image. Finally a similarity
+   transforms the model to control points or given positions (`frames`); without these it keeps its
+   own frame.
 
-A plane has two relative orientations, and of two pictures from one place every one is wrong: a pair
+A plane has two relative orientations, and two images from one place have none: a pair
 from which little grows is replaced by the next.
 """
 
@@ -45,20 +45,20 @@ from jaxbundle.orientation.sights import TOLERANCE, Sights, sights
 from jaxbundle.types import Index
 
 IN_COMMON = 6
-"""Points two images must share to begin with."""
+"""Minimum common points of a starting pair."""
 PAIRS = 16
-"""Pairs whose relative orientation is looked at."""
+"""Largest number of pairs for relative orientation."""
 SEEDS = 6
-"""Pairs a model is grown from, at most."""
+"""Largest number of pairs a model is grown from."""
 OUT_OF_THE_QUESTION = 3.0
-"""Image points that miss by more than so many tolerances are left out."""
+"""Image points with larger misclosures, in tolerances, are excluded."""
 CONTRADICTED = 0.1
-"""Part of the rays to control points that miss them, or of the points whose rays do not meet, above
-which a mirror is thought of."""
+"""Fraction of rays that miss their control points, or of points whose rays do not intersect, above
+which a mirror image is tested."""
 LEAST_CONTROL = 3
-"""Control points that must be left to fix the datum."""
+"""Minimum remaining control points for the datum."""
 MOST = 0.8
-"""A model in which this part of the image points finds its place need not compete."""
+"""A model that uses at least this fraction of the image points is accepted without alternatives."""
 WIDE = 0.5
 """Angle of intersection, radians, beyond which wider is no better."""
 
@@ -66,9 +66,9 @@ WIDE = 0.5
 @shows_itself
 @dataclasses.dataclass(frozen=True)
 class Oriented:
-    """A network with start values; `images`, `points`: why those that are not in it were not
-    placed; `left_out`: image points that contradict the start values; `frame`: what the coordinates
-    refer to; `finding`: control points that contradict the others, and what would mend it."""
+    """A network with start values; `images`, `points`: reasons for those that could not be
+    oriented; `left_out`: image points that contradict the start values; `frame`: the reference of
+    the coordinates; `finding`: contradictory control points, and the correction."""
 
     network: Network
     frame: str
@@ -106,10 +106,11 @@ def lacks_start_values(network: Network) -> bool:
 def find_start_values(
     network: Network, improve: Callable | None = None, tolerance: float = TOLERANCE
 ) -> Oriented:
-    """The start values a network lacks; those it has stay.
+    """Missing start values of a network; given ones are kept.
 
-    `improve(network, sights, model)`: adjusts a part of a large network on the way, in place.
-    Returns and raises what `jaxbundle.orient` does, which is this with an adjustment on the way.
+    `improve(network, sights, model)`: adjusts a part of a large network in place.
+
+    Returns and raises like `jaxbundle.orient`, which adds intermediate adjustments.
     """
     network = check_tables(network)
     for one in network.further:
@@ -141,19 +142,19 @@ def _no_start_values(network: Network, why: str) -> NotSolvedError:
 
 
 def _missed(network: Network, seen: Sights, model: Model) -> Bool[np.ndarray, " points"]:
-    """Control points that most of their rays miss altogether."""
+    """Control points that most of their rays miss grossly."""
     wrong = np.bincount(seen.point, _out_of_the_question(seen, model), seen.points)
     return controlled(network.points) & (2 * wrong > _rays_of(seen, model))
 
 
 def _rays_of(seen: Sights, model: Model):
-    """Rays of every point from the images placed."""
+    """Rays of every point from oriented images."""
     return np.bincount(seen.point[model.placed[seen.image]], minlength=seen.points)
 
 
 def _control_contradicts(network: Network, seen: Sights, model: Model) -> bool:
-    """Whether many rays to control points miss them altogether, or many points have rays that do
-    not meet."""
+    """Whether many rays miss their control points grossly, or many points have rays that do not
+    intersect."""
     control = controlled(network.points)
     placed = model.placed[seen.image]
     rays = control[seen.point] & placed
@@ -167,7 +168,7 @@ def _control_contradicts(network: Network, seen: Sights, model: Model) -> bool:
 
 
 def _mirrored(network: Network, seen: Sights) -> str:
-    """Whether a model without control fits it as in a mirror only, in words."""
+    """Whether a model without control fits it only as a mirror image, in words."""
     model = _from_a_pair(seen, Model.empty(seen), None)
     return "" if model is None else mirrored(network, model)
 
@@ -221,8 +222,8 @@ def _with_approximate_points(network: Network, model: Model) -> Model:
 
 
 def _from_a_pair(seen: Sights, model: Model, improve) -> Model | None:
-    """The best of the models that grow from a few good pairs of the images not placed; if some are
-    placed, from pairs with one of them, to a model that can be joined to theirs."""
+    """The best of the models grown from a few good pairs of unoriented images; if some are
+    oriented, from pairs with one of them, to a model that can be joined to theirs."""
     new, linked = ~model.placed, bool(model.placed.any())
     old = _neighbours(seen, new) & model.placed
     best, most = None, 0
@@ -264,7 +265,7 @@ def _good_pairs(seen: Sights, among: Bool[np.ndarray, " images"], old, linked: b
 
 def _pairs_in_common(seen: Sights, among, old, linked):
     """Up to `PAIRS` pairs of images, and the number of their points: those with the most, and
-    others with enough, which lie wider apart."""
+    others with enough points and wider bases."""
     pairs, number = _all_pairs(seen, among)
     use = (number >= IN_COMMON) & ((old[pairs[:, 0]] != old[pairs[:, 1]]) | (not linked))
     pairs, number = pairs[use], number[use]
@@ -336,12 +337,12 @@ def _in_contradiction(names: Sequence[str]) -> str:
 
 
 def _out_of_the_question(seen: Sights, model: Model) -> Bool[np.ndarray, " sights"]:
-    """Which rays of known points in placed images miss them altogether."""
+    """Which rays of known points in oriented images miss them grossly."""
     return misclosures(seen, model) > OUT_OF_THE_QUESTION * seen.tolerance[seen.image]
 
 
 def _disagrees(seen: Sights, model: Model) -> Bool[np.ndarray, " images"]:
-    """The images of whose known points too few agree."""
+    """The images with too few consistent known points."""
     of_image = lambda rows: np.bincount(seen.image, rows, minlength=seen.images)
     known = of_image(model.known[seen.point])
     return of_image(_out_of_the_question(seen, model)) > (1 - AGREE) * known
@@ -367,7 +368,7 @@ def _reasons(network: Network, seen: Sights, model: Model, known):
         if by_point[point] < 2:
             why = f"seen in {count(by_point[point], 'placed image')}; 2 are needed"
         else:
-            why = f"its {by_point[point]} rays do not meet, or are parallel"
+            why = f"its {by_point[point]} rays do not intersect, or are parallel"
         points[network.points.id[point]] = why
     return images, points
 
@@ -389,7 +390,7 @@ def _why_nothing(network: Network, seen: Sights) -> str:
         )
     return (
         f"{begin}no two images share {IN_COMMON} points whose rays meet at an angle ({most} points "
-        "in common at most): take images from places that lie apart, look for wrong point numbers, "
+        "in common at most): take images from different positions, look for wrong point numbers, "
         "or give start values"
     )
 

@@ -1,12 +1,12 @@
-"""Images taken from one place: a rotation alone takes the rays of one to those of the other.
+"""Images taken from one place: a rotation maps the rays of one to those of the other.
 
-Seen from one place, points have directions and no depth, whatever their start values say. With the
+From one place only directions of points are determined, no depth. With the
 unit rays u of points that two images share, R·u₁ = u₂ to the precision of the measurements; R by
 Horn (1987), as in `absolute.py`.
 
-A camera that moves sideways before a flat object shifts its image, one that turns by ρ shifts it
-too, and distorts it by ρ³ where ρ = r/c is the field itself. Where that is not seen among the noise
-of the rays, nothing is said.
+A camera that moves sideways before a flat object shifts its image; a rotation by ρ shifts it too,
+and distorts it by ρ³ with ρ = r/c of the field. If this is below the noise of the rays, nothing is
+reported.
 """
 
 import numpy as np
@@ -17,16 +17,16 @@ from jaxbundle.network.tables import Network
 from jaxbundle.orientation.sights import sights
 
 IN_COMMON = 5
-"""Points two images must share: a rotation has 3 parameters, the points 10 coordinates."""
+"""Minimum common points: a rotation has 3 parameters, the points 10 coordinates."""
 MOST = 200
-"""Images that are compared with the one that has the most image points."""
+"""Number of images compared with the one that has the most image points."""
 NOISE = 3.0
-"""A misclosure of so many σ is that of the measurements."""
+"""Misclosures up to this number of σ are explained by the measurements."""
 
 
 def name_one_place(network: Network) -> str:
-    """Which images were taken from one place, in words; empty where they were not, or where images
-    from other places are there too."""
+    """Which images were taken from one place, in words; empty if they were not, or if there are
+    images from other places."""
     seen = sights(network)
     number = np.bincount(seen.image, minlength=seen.images)
     base = int(number.argmax())
@@ -46,7 +46,7 @@ def name_one_place(network: Network) -> str:
 
 
 def _turned_only(seen, sigma, one: int, other: int) -> bool:
-    """Whether a rotation takes the rays of an image to those of another."""
+    """Whether a rotation maps the rays of an image to those of another."""
     a, b = seen.of(one), seen.of(other)
     _, k, l = np.intersect1d(seen.point[a], seen.point[b], return_indices=True)
     if len(k) < IN_COMMON:

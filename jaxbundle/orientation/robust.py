@@ -1,7 +1,7 @@
 """Gross errors: solutions from random minimal samples, RANSAC and least median of squares.
 
-Every sample of the fewest observations gives one or several models; each is held against all
-observations by their absolute errors e. The best one has
+Every minimal sample gives one or several models; each is tested on all observations by their
+absolute errors e. The best one has
 
     RANSAC   least Σ min(e², t²)         Fischler and Bolles (1981); Torr and Zisserman (2000)
     LMedS    least median of e²          Rousseeuw (1984); needs no threshold, up to 50 % errors
@@ -40,13 +40,13 @@ from jaxbundle.orientation.three_points import three_points
 from jaxbundle.types import AnyArray, Scalar
 
 FAR = 1e6
-"""Error of an observation that contradicts a model altogether (a point behind the camera)."""
+"""Error of an observation that is impossible in a model (a point behind the camera)."""
 CUT = 2.5
-"""Observations beyond so many robust standard deviations are gross errors (LMedS)."""
+"""Observations beyond this number of robust standard deviations are gross errors (LMedS)."""
 ROUNDING = 1e-11
-"""Least standard deviation that counts."""
+"""Smallest standard deviation."""
 ROUNDS = 3
-"""A solution of all good observations, then these chosen again."""
+"""Rounds of solving with all good observations and selecting them again."""
 
 
 class Consensus(eqx.Module):
@@ -147,8 +147,8 @@ def robust_relative_orientation(
 ) -> tuple[RelativeOrientation, Bool[Array, " n"]]:
     """Relative orientation of points with up to 40 % gross errors, and which points are good.
 
-    Arguments as in `relative_orientation` and `consensus`. A gross error along the epipolar line
-    is none: it contradicts nothing.
+    Arguments as in `relative_orientation` and `consensus`. A gross error along the epipolar line is
+    not detectable.
     """
     p = ones_unless(weights, xy1)
 

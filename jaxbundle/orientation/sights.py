@@ -1,8 +1,8 @@
-"""What a network sees, as directions: the image points of all cameras free of their distortion.
+"""The image points of a network as directions, free of distortion.
 
-(x, y) = (−r/q, −s/q) of the ray [r, s, q] of an image point, so that pictures of every camera model
-are those of one with c = 1. Points at more than about 80° from the axis have no such coordinates
-and take no part.
+(x, y) = (−r/q, −s/q) of the ray [r, s, q] of an image point, so that images of all camera models
+are those of one with c = 1. Points more than about 80° from the axis have no such coordinates
+and are excluded.
 """
 
 import dataclasses
@@ -26,8 +26,8 @@ PORTION = 4096
 class Sights:
     """Image points, ordered by image: which point in which image, where (c = 1).
 
-    `tolerance`: of an image, the misclosure that start values may have: `TOLERANCE` times the
-    extent of its picture. `row` is the row among the observations of the network.
+    `tolerance`: by image, the allowed misclosure of start values: `TOLERANCE` times the extent of
+    the image. `row` is the row among the observations of the network.
     """
 
     image: Int[np.ndarray, " n"]
@@ -48,7 +48,7 @@ class Sights:
 
 
 TOLERANCE = 0.03
-"""Lens distortion that is not known yet may be as large, in parts of the picture."""
+"""Largest unknown lens distortion, relative to the image extent."""
 
 
 def sights(network: Network, tolerance: float = TOLERANCE) -> Sights:

@@ -1,4 +1,4 @@
-"""What a configuration of points and rays determines, by name: numbers under jit and vmap."""
+"""Status of a configuration of points and rays: an enumeration that works under jit and vmap."""
 
 from enum import IntEnum
 
@@ -8,7 +8,7 @@ from jaxtyping import Bool, Int
 
 
 class Status(IntEnum):
-    """The name of a configuration; `advice` says to a person what is wrong and what to do."""
+    """The status of a configuration; `advice` is the explanation and remedy."""
 
     SOUND = 0
     NO_SOLUTION = 1

@@ -4,7 +4,7 @@
     X = locate_lines(image, Ground(), lines, pixels)      # [3, lines, pixels], metres
     found = project_points(image, make_search(image), X.reshape(3, -1))
 
-    fit, check = fit_image(image, WGS84, (0.0, 3000.0))   # rational polynomials in its place:
+    fit, check = fit_image(image, WGS84, (0.0, 3000.0))   # rational polynomials instead:
     line, sample, status = rpc.project_points(fit.rpc, longitude, latitude, height)
 
 Every array of a `PushbroomImage` is a parameter: `equinox.tree_at` replaces it, `jax.jacfwd`

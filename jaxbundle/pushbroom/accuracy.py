@@ -1,17 +1,17 @@
-"""What errors of the ancillary data do on the ground: in closed form, and by drawing them.
+"""Ground errors due to errors of the ancillary data: by propagation and by Monte Carlo.
 
-Closed form: with J the derivative of the horizontal ground coordinates by every single error (bias,
+Propagation: with J the derivative of the horizontal ground coordinates by every single error (bias,
 drift, each row), by automatic differentiation through the whole chain, the covariance is
 
     Σ = J·diag(σ²)·Jᵀ,     RMS = √(tr Σ),
 
 and CE90, the radius with 90 % of the errors inside, follows from its eigenvalues λ₁, λ₂: with s, c
-normally distributed, P(λ₁·s² + λ₂·c² ≤ CE90²) = 0.9. For a level camera h above a plane, with
-V = tan(FOV/2), an error of attitude gives over the line
+normally distributed, P(λ₁·s² + λ₂·c² ≤ CE90²) = 0.9. For a nadir-looking camera h above a plane,
+with V = tan(FOV/2), an error of attitude gives over the line
 
     RMS = h·√[(1 + 2V²/3 + V⁴/5)·σ_roll² + σ_pitch² + V²/3·σ_yaw²].
 
-By drawing: the same errors drawn, the ground coordinates computed anew, quantiles counted.
+Monte Carlo: the same errors are drawn, the ground coordinates recomputed, quantiles counted.
 """
 
 import equinox as eqx
@@ -30,14 +30,14 @@ from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.types import AnyArray
 
 TINY = 1e-300
-"""Instead of zero under a fraction."""
+"""Replaces zero in a denominator."""
 
 
 class GroundAccuracy(eqx.Module):
-    """Errors east and north (X and Y in a local frame) at places in an image, metres.
+    """Errors east and north (X and Y in a local frame) at image positions, metres.
 
-    `covariance` [n, 2, 2]; `rms` [n] of the length; `ce90` [n]; `overall_ce90` of the errors of
-    all places together.
+    `covariance` [n, 2, 2]; `rms` [n] of the length; `ce90` [n]; `overall_ce90` of the errors at
+    all positions together.
     """
 
     covariance: Float[np.ndarray, "n 2 2"]
@@ -47,7 +47,7 @@ class GroundAccuracy(eqx.Module):
 
     @property
     def overall(self) -> float:
-        """The RMS over all places."""
+        """The RMS over all positions."""
         return float(np.sqrt(np.mean(self.rms**2)))
 
 
@@ -92,23 +92,24 @@ def ground_errors(
     lines: Float[np.ndarray, " n"],
     pixels: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, "n 2"]:
-    """East and north at which places of an image are located wrongly, metres."""
+    """East and north location errors of image positions, metres."""
     return np.asarray(_differences(image, truth, surface, lines, pixels))
 
 
 def closed_form(
     height: float, field_of_view: float, roll: float, pitch: float, yaw: float
 ) -> float:
-    """The RMS over a line of a level camera above a plane, of σ of its angles in radians."""
+    """The RMS over a line of a nadir-looking camera above a plane, for σ of its angles in
+    radians."""
     V = np.tan(field_of_view / 2)
     across = (1 + 2 * V**2 / 3 + V**4 / 5) * roll**2
     return float(height * np.sqrt(across + pitch**2 + V**2 / 3 * yaw**2))
 
 
 def circular_error(covariance: Float[np.ndarray, "*n 2 2"], part: float = 0.9) -> float:
-    """The radius of a circle that holds this part of normally distributed errors.
+    """The radius of a circle that contains this fraction of normally distributed errors.
 
-    Of several covariances, of errors that are distributed after each of them equally often.
+    For several covariances: of a mixture with equal weights.
     """
     variances = np.maximum(np.linalg.eigvalsh(covariance).reshape(-1, 2, 1), 0)
     large = variances.max()

@@ -1,4 +1,4 @@
-"""Ancillary data made into tables; what is wrong is said with its row before it is used."""
+"""Tables of ancillary data, checked before use; errors are reported with the row."""
 
 from typing import Literal
 
@@ -16,7 +16,7 @@ from jaxbundle.types import Numbers
 POSITIONS, ATTITUDE = Source("positions"), Source("attitude")
 
 UNIT = 1e-4
-"""A quaternion's length may differ by this from 1: files with four decimals are taken."""
+"""Tolerance of the length of a quaternion: files with four decimals are accepted."""
 
 GAP = 5.0
 """A step longer than this many median steps is a gap."""
@@ -24,9 +24,9 @@ GAP = 5.0
 FEWEST = {"linear": 2, "hermite": 2, "slerp": 2, "spline": 4, "usgscsm": 2}
 
 STEPS, SHORTEST, LONGEST = 2.0, 0.05, 0.5
-"""Tables of products may end this many steps before the image does, no less than the shortest and
-no more than the longest of these times, in seconds: turns and falls of a satellite that linear
-extrapolation ignores come to centimetres or decimetres on the ground in this time."""
+"""Product tables may end this many steps before the image, bounded by the shortest and longest of
+these times, in seconds: the rotation and fall of a satellite ignored by linear extrapolation cause
+centimetres to decimetres on the ground in this time."""
 
 ROUNDING = 1e-6
 """Times of products are rounded: seconds since J2000 to 6e-8 s, dates to microseconds."""
@@ -47,10 +47,10 @@ def position_table(
 
     **Arguments:** `velocities` in metres a second, needed by `"hermite"`; `order` of Lagrange's
     polynomial; `gap` the longest step that is interpolated, in seconds (five median steps);
-    `extrapolate` the seconds beyond the ends that are extrapolated (none); `source` names the rows
+    `extrapolate` the seconds of allowed extrapolation (none); `source` names the rows
     in messages.
 
-    **Raises:** `InputError` naming the row: times that do not increase, what is not a number, too
+    **Raises:** `InputError` naming the row: times that do not increase, invalid numbers, too
     few rows; a gap that is not positive.
     """
     _check_method(method, METHODS, source)
@@ -76,7 +76,7 @@ def attitude_table(
 ) -> Attitude:
     """Attitudes against time (seconds): quaternions (w, x, y, z), or pitch, roll, yaw in radians.
 
-    Jumps of the sign of quaternions are mended. Angles that jump by a turn are made continuous.
+    Sign changes of quaternions are corrected. Angles that jump by a full turn are made continuous.
 
     **Arguments:** as in `position_table`; `method` also `"slerp"`, for quaternions only.
 
@@ -107,13 +107,13 @@ def attitude_table(
 
 
 def continuous(quaternions: Float[np.ndarray, "rows 4"]) -> Float[np.ndarray, "rows 4"]:
-    """The same rotations with signs such that neighbours are near each other."""
+    """The same rotations with signs such that neighbours are close."""
     same = np.sum(quaternions[1:] * quaternions[:-1], 1) >= 0
     return quaternions * np.cumprod(np.r_[1, np.where(same, 1, -1)])[:, None]
 
 
 def check_times(times: Float[np.ndarray, " rows"], source: Source) -> None:
-    """Refuse times that are not numbers, not sorted, or there twice."""
+    """Refuse times that are not finite, unsorted, or duplicate."""
     if (bad := ~np.isfinite(times)).any():
         raise InputError(f"{source(int(bad.argmax()))}: the time is not a finite number")
     if (bad := np.diff(times) <= 0).any():
@@ -127,8 +127,8 @@ def check_times(times: Float[np.ndarray, " rows"], source: Source) -> None:
 
 
 def extrapolation_limit(rows: Float[np.ndarray, " rows"]) -> float:
-    """The seconds that the table of a product, with rows at these times, is extrapolated at most:
-    two of its steps, but 0.05 s at least and 0.5 s at most."""
+    """The maximum extrapolation, in seconds, of a product table with rows at these times: two of
+    its steps, but at least 0.05 s and at most 0.5 s."""
     step = float(np.median(np.diff(rows))) if len(rows) > 1 else 0.0
     return min(max(STEPS * step, SHORTEST), LONGEST)
 
@@ -157,7 +157,7 @@ def told_extrapolation(
 
 
 def check_span(rows, extrapolate, times, source, thing="image line") -> None:
-    """Refuse times outside the rows of a table by more than is extrapolated."""
+    """Refuse times outside a table by more than the allowed extrapolation."""
     outside = (times < rows[0] - extrapolate) | (times > rows[-1] + extrapolate)
     if outside.any():
         k = int(outside.argmax())
@@ -172,7 +172,7 @@ def check_span(rows, extrapolate, times, source, thing="image line") -> None:
 def check_covered(
     table: Table, times: Numbers, source: Source, thing: str = "image line"
 ) -> None:
-    """Refuse a table that does not reach over the times, or has a gap among them.
+    """Refuse a table that does not cover the times, or has a gap among them.
 
     `source` names the table and its rows, `thing` what the times belong to.
     """
@@ -209,7 +209,7 @@ def _table(times, values, rates, method, order, gap, extrapolate, what, source):
         if array is not None and (bad := ~np.isfinite(array).all(1)).any():
             raise InputError(f"{source(int(bad.argmax()))}: the {name} is not a finite number")
     if method in ("lagrange", "usgscsm") and order < 1:
-        raise InputError(f"{source.name}: the order of {method!r} is {order}; at least 1, please")
+        raise InputError(f"{source.name}: the order of {method!r} is {order}; at least 1 is needed")
     fewest = FEWEST[method] if method in FEWEST else order + 1
     if len(times) < fewest:
         advice = " or a lower order" if method == "lagrange" else ""

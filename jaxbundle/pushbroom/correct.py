@@ -1,14 +1,14 @@
-"""Geometric correction: the image as a map, block by block.
+"""Geometric correction of an image to a map, block by block.
 
-For a block of the map, its ground points at a grid of nodes give, linear in between, the point of
-every pixel on the ellipsoid and its vertical; the height, constant or of a terrain model, lifts it
-off. Every single point is then projected into the image, from a place between those of the nodes
-or, where that does not lead there, searched for, and the image resampled there. Between
+For a block of the map, ground points at a grid of nodes give, by linear interpolation, the point of
+every pixel on the ellipsoid and its vertical; the height, constant or from a terrain model, is then
+added. Every point is projected into the image, starting from the interpolated image position, or
+by a search if that does not converge, and the image is resampled there. Between
 nodes 16 pixels apart a map's curvature is below a millimetre for pixels of 10 m: (16·10 m)²/8R.
 
-Terrain hides other terrain where the ray of the place in the image ends before it comes to the
-point: on request the first hit of every pixel's ray is sought, and what is farther from it than
-half a pixel of the map is not shown.
+A point is hidden by other terrain if the ray of its image position ends before it:
+optionally the first intersection of every pixel's ray is computed, and points farther from it than
+half a map pixel are not shown.
 """
 
 from typing import NamedTuple
@@ -32,7 +32,7 @@ from jaxbundle.types import AnyArray
 BLOCK, STEP = 256, 16
 """Pixels of a block of the map along each side, and between its nodes."""
 BESIDE = 2.0 * BLOCK
-"""Nodes are sought so many lines and pixels beside the image, so that its edges are surrounded."""
+"""Nodes are searched this many lines and pixels beyond the image, to enclose its edges."""
 
 
 class Nodes(NamedTuple):
@@ -43,7 +43,7 @@ class Nodes(NamedTuple):
 
 
 class Places(NamedTuple):
-    """Where in the image the pixels of a block are; NaN outside."""
+    """Image positions of the pixels of a block; NaN outside."""
 
     line: Float[AnyArray, "rows columns"]
     pixel: Float[AnyArray, "rows columns"]
@@ -73,9 +73,9 @@ def block_places(
     nodes: Nodes,
     occlusion: bool = False,
 ) -> Places | None:
-    """Where the pixels of a block are in the image; None if none of them is near it.
+    """Image positions of the pixels of a block; None if none of them is near the image.
 
-    With `occlusion` pixels that other terrain hides are nowhere.
+    With `occlusion` pixels hidden by other terrain have none.
     """
     level = np.asarray(_level(surface))
     raised = nodes.X + level * nodes.up
@@ -89,7 +89,7 @@ def block_places(
     line, pixel, ground = map(np.asarray, _places(scanner, search, surface, nodes, starts))
     lost = np.isnan(line)
     if lost.any():
-        # on a rough trajectory the way from between the nodes may not lead there
+        # on a rough trajectory the interpolated start may not converge
         line, pixel = line.copy(), pixel.copy()
         line[lost], pixel[lost] = _searched(image, search, ground[:, lost], starts[0].size)
     inside = (line >= -0.5) & (line < image.lines - 0.5)
@@ -100,7 +100,7 @@ def block_places(
 
 
 def _searched(image, search, X, portion):
-    """Lines and pixels of points [3, n] by a search of the image, so many points at a time."""
+    """Lines and pixels of points [3, n] by a search of the image, in batches of points."""
     places = np.empty((2, X.shape[1]))
     for k in range(0, X.shape[1], portion):
         few = X[:, k : k + portion]
@@ -114,11 +114,11 @@ def _searched(image, search, X, portion):
 def block_errors(
     truth: PushbroomImage, search: Search, surface: Surface, nodes: Nodes, places: Places
 ) -> Float[np.ndarray, "2 rows columns"]:
-    """East and north at which the pixels of a block stand wrongly on the map, metres.
+    """East and north map errors of the pixels of a block, metres.
 
-    A pixel shows what the image has at its place; the truth knows where on the surface that is.
+    A pixel shows the image at its position; the truth locates that position on the surface.
 
-    **Arguments:** `truth` with the `search` made of it; `places` of the image to be judged.
+    **Arguments:** `truth` with its `search`; `places` in the tested image.
     """
     return np.asarray(_errors(scanner_of(truth), search, surface, nodes, places))
 
@@ -136,7 +136,7 @@ def _errors(truth, search, surface, nodes, places):
 
 
 def _located(image, search, surface, line, pixel):
-    """The point that a place shows, by the pieces of the search."""
+    """The point seen at an image position, by the pieces of the search."""
     numbers, _, (P, V) = sample(search.pieces, image.times.time(line))
     pose = Pose(jnp.stack(P), numbers[:9].reshape(3, 3).T, jnp.stack(V))
     return ground_point(pose, image.optics.slopes(pixel), surface, image.corrections)
@@ -144,9 +144,9 @@ def _located(image, search, surface, line, pixel):
 
 @jax.jit
 def _occluded(image, search, surface, line, pixel, ground):
-    """Whether the rays of places end before they come to their points [3, rows, columns].
+    """Whether the rays of image positions end before their points [3, rows, columns].
 
-    A ray that finds no height on its way to the point hides nothing.
+    A ray without heights on its way to the point hides nothing.
     """
     half = length(ground[:, 0, 1] - ground[:, 0, 0]) / 2
 
@@ -160,7 +160,7 @@ def _occluded(image, search, surface, line, pixel, ground):
 
 
 def _filled(starts):
-    """Nodes that are not seen, from a plane through those that are: good enough to begin with."""
+    """Positions of unseen nodes, from a plane through the others: sufficient as start values."""
     seen = np.isfinite(starts[0])
     if seen.all():
         return starts
@@ -171,7 +171,7 @@ def _filled(starts):
 
 
 def _level(surface):
-    """A height that stands for all of the surface."""
+    """A representative height of the surface."""
     if isinstance(surface, Terrain):
         return (surface.lowest + surface.highest) / 2
     return 0.0 if isinstance(surface, Ground) else surface.level

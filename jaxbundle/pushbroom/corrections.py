@@ -1,4 +1,4 @@
-"""Small effects between the detector and the ground, each a switch, off unless asked for.
+"""Small corrections between detector and ground, each a switch, off by default.
 
 | switch | what | size from 500 to 800 km |
 |---|---|---|
@@ -8,8 +8,8 @@
 
 5° off the nadir; at 50° 1.3 to 2.1 m, 21 to 34 m, 12 to 18 m.
 
-They belong to a product and cannot be guessed: the quaternions of one provider contain the
-aberration, those of another do not. All three mean Earth-fixed positions.
+They depend on the product and cannot be guessed: the quaternions of some providers contain
+aberration, those of others do not. All three assume Earth-fixed positions.
 
 The velocity of the aberration is the inertial one, V + Ω × P (classical addition; relativity
 changes 20 m by a micrometre). The layers of air are those of Orekit Rugged (MultiLayerModel): the
@@ -50,17 +50,17 @@ LIGHT = 299792458.0
 BORDERS = np.array([
     50e3, 40e3, 30e3, 23e3, 18e3, 14e3, 11e3, 9e3, 7e3, 5e3, 3e3, 1e3, 0.0,
 ])  # fmt: skip
-"""Heights of the borders between layers of air, metres."""
+"""Heights of the boundaries between air layers, metres."""
 INDICES = 1 + 1e-6 * np.array([
     0, 1, 4, 12, 28, 52, 83, 106, 134, 167, 206, 252, 278, 306,
 ])  # fmt: skip
-"""Refractive index above the first border, and below each."""
+"""Refractive index above the first boundary, and below each."""
 RATIOS = INDICES[:-1] / INDICES[1:]
 ZETAS = np.diff(INDICES) * -(INDICES[:-1] + INDICES[1:]) / INDICES[1:] ** 2
 """(n₁/n₂)² − 1, without cancellation."""
 
 NEAR = 1e-3
-"""A border of layers this close above the ground, in metres, does not count."""
+"""A layer boundary this close above the ground, in metres, is ignored."""
 
 
 class Corrections(NamedTuple):
@@ -72,12 +72,12 @@ class Corrections(NamedTuple):
 
     @property
     def any(self) -> bool:
-        """Whether there is one at all."""
+        """Whether any is applied."""
         return self.light_time or self.aberration or self.refraction
 
 
 def true_direction(seen: Vector, velocity: Vector) -> Triple:
-    """The unit vector l of the light that is seen along `seen`: c·l = k·seen − v, k > 0."""
+    """The unit vector l of light seen along `seen`: c·l = k·seen − v, k > 0."""
     a, b = dot(seen, seen), dot(seen, velocity)
     c = dot(velocity, velocity) - LIGHT**2
     k = (b + jnp.sqrt(b * b - a * c)) / a
@@ -95,9 +95,9 @@ def inertial_velocity(P: Vector, V: Vector) -> Triple:
 
 
 def earlier_earth(v: Vector, distance: Scalar) -> Triple:
-    """v in the Earth-fixed frame of the moment when light left the ground, `distance` metres ago.
+    """v in the Earth-fixed frame at the time when light left the ground, `distance` metres ago.
 
-    A negative distance leads back.
+    A negative distance inverts it.
     """
     sine = EARTH_RATE * distance / LIGHT
     cosine = 1 - sine * sine / 2  # the next terms are below rounding
@@ -107,7 +107,7 @@ def earlier_earth(v: Vector, distance: Scalar) -> Triple:
 def refracted(
     earth: Ellipsoid | None, height: Scalar, o: Vector, d: Vector
 ) -> tuple[Triple, Triple]:
-    """The last straight part of a ray that goes down to a `height`: where it starts, where to.
+    """The last straight part of a ray down to a `height`: its origin and direction.
 
     **Raises:** `ValueError` without an ellipsoid."""
     earth = require_ellipsoid(earth)
@@ -123,7 +123,7 @@ def refracted(
         choose = lambda new, old: tuple(jnp.where(passed, a, b) for a, b in zip(new, old))
         return (choose(X, o), choose(bent, d)), None
 
-    # a loop: the layers written out one by one would take minutes to compile
+    # a loop: unrolled layers would take minutes to compile
     *ray, _ = jnp.broadcast_arrays(*o, *unit(d), height)
     ends = tuple(ray[:3]), tuple(ray[3:])
     (start, bent), _ = jax.lax.scan(through, ends, (BORDERS, RATIOS, ZETAS))
@@ -142,9 +142,9 @@ def require_ellipsoid(earth: Ellipsoid | None) -> Ellipsoid:
 def seen_point(
     corrections: Corrections, earth: Ellipsoid | None, P: Vector, V: Vector, X: Vector
 ) -> Triple:
-    """The point in whose direction a camera at P, with the velocity V, sees the point X.
+    """The apparent position of the point X for a camera at P with the velocity V.
 
-    The inverse of what `locate` does to a ray: without corrections X itself.
+    The inverse of the ray corrections of `locate`; without corrections X.
     """
     if not corrections.any:
         x, y, z = X

@@ -1,12 +1,12 @@
-"""Inertial frames turned to Earth-fixed ones at the epochs of a table; all else is Earth-fixed.
+"""Transformation of inertial frames to Earth-fixed ones at the epochs of a table.
 
     GCRF    the celestial system of the IERS, x_ITRF = W·R3(ERA)·Q·x_GCRF        (IAU 2006/2000A)
     J2000   mean equator and equinox of J2000.0: GCRF less the frame bias (23 mas, 0.8 m)
     TEME    true equator, mean equinox, of two-line elements: x_ITRF = W·R3(GMST82)·x_TEME
 
 (IERS Conventions 2010, chapter 5; Vallado et al., 2006, AIAA 2006-6753). W is the polar motion.
-Rates lose the turn of the Earth, V = R·v − Ω × P. Left at zero, UT1 − UTC (below 0.9 s) moves the
-ground by up to 400 m, the pole (below 0.6″) by up to 19 m.
+Velocities are reduced by the Earth's rotation, V = R·v − Ω × P. Neglecting UT1 − UTC (below 0.9 s)
+moves the ground by up to 400 m, neglecting the pole (below 0.6″) by up to 19 m.
 
 Needs pyerfa; two-line elements need sgp4 (both in the extra `geo`).
 """
@@ -36,8 +36,8 @@ Rows = Float[np.ndarray, "rows 3"]
 
 
 class EarthOrientation(NamedTuple):
-    """UT1 − UTC in seconds, pole coordinates in arcseconds (IERS Bulletin A or C04); zero if not
-    given."""
+    """UT1 − UTC in seconds, pole coordinates in arcseconds (IERS Bulletin A or C04); default
+    zero."""
 
     ut1_utc: float = 0.0
     x_pole: float = 0.0
@@ -54,7 +54,7 @@ def to_earth(
 
     **Arguments:** `frame` of `FRAMES`; `epoch` in UTC, ISO 8601; `times` in seconds since it.
 
-    **Raises:** `InputError` for an unknown frame, a date that is none, and without pyerfa.
+    **Raises:** `InputError` for an unknown frame, an invalid date, and without pyerfa.
     """
     if frame not in FRAMES:
         raise InputError(f"unknown frame {frame!r}{did_you_mean(frame, FRAMES)}")
@@ -124,7 +124,7 @@ def two_line_orbit(
 ) -> tuple[Rows, Rows]:
     """Earth-fixed positions (m) and velocities (m/s) of two-line elements by SGP4.
 
-    Good to about 1 km at the elements' own epoch, and 1 to 3 km worse a day.
+    Accurate to about 1 km at the epoch of the elements, degrading by 1 to 3 km per day.
     """
     try:
         from sgp4.api import SGP4_ERRORS, Satrec
@@ -158,7 +158,7 @@ def circular_orbit(
     argument: float = 0.0,
     radius: float = 6378137.0,
 ) -> tuple[Rows, Rows]:
-    """Earth-fixed positions (m) and velocities (m/s) on a circle about the turning Earth.
+    """Earth-fixed positions (m) and velocities (m/s) on a circular orbit about the rotating Earth.
 
     **Arguments:** `height` above a sphere of this `radius`, metres; `inclination`; longitude of the
     ascending `node` and `argument` of latitude at t = 0, radians. Kepler's rate, no perturbations.
@@ -179,7 +179,7 @@ def julian_date(epoch: str) -> tuple[float, float]:
         moment = datetime.datetime.fromisoformat(str(epoch))
     except ValueError:
         raise InputError(
-            f"epoch {epoch!r} is no date; ISO 8601 in UTC is expected, such as "
+            f"epoch {epoch!r} is not a date; ISO 8601 in UTC is expected, such as "
             "2024-03-01T10:20:30.5"
         ) from None
     if moment.tzinfo is not None:

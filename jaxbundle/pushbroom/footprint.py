@@ -1,17 +1,18 @@
-"""The footprint of an image, where each point is seen once, and about where: start values.
+"""The footprint of an image in which each point is seen once, with approximate positions as start
+values.
 
-The footprint is what the pixels see between two heights. Time and pixel over it are fitted by
-cubic polynomials of normalised coordinates. Newton's method goes on from there, and if it ends in
-the image, at a point between the heights, that is the only place, because `make_footprint` has
-made sure that the line of detectors passes over every point of the footprint in the same sense: F
+The footprint is the area seen between two heights. Time and pixel over it are fitted by
+cubic polynomials of normalised coordinates. Newton's method starts from there; if it converges in
+the image, at a point between the heights, that position is unique, because `make_footprint` has
+verified that the detector line passes over every point of the footprint in the same sense: F
 of `passages` is continuous in time, since no point is ever beside or behind the camera, and
 
     ∂F/∂t ≠ 0 wherever F = 0,    so that a second zero would need one of the other sign between.
 
-∂F/∂t of what a detector sees at the heights is the speed of its footprint over the ground. It is
-looked at four times in each piece, for all slopes ξ that a point of the footprint has in the whole
-image. An image that turns back, or spins, or is too rough for the polynomials, has no footprint:
-all its points are searched for.
+∂F/∂t of points seen by a detector is the speed of its footprint over the ground. It is tested four
+times in each piece, for all slopes ξ of points of the footprint in the whole image. An image that
+turns back, rotates, or is too rough for the polynomials has no footprint: all its points are
+searched for.
 """
 
 import equinox as eqx
@@ -34,13 +35,13 @@ HEIGHTS = -1000.0, 10_000.0
 TIMES, ACROSS, LEVELS = 17, 9, 4
 """Times, pixels and heights of the lattice through which the polynomials are fitted."""
 WITHIN = np.array([-1.0, -1 / 3, 1 / 3, 1.0])
-"""Where in each piece the speed is looked at."""
+"""Positions in each piece where the speed is tested."""
 STEEP = 0.1
-"""The least speed in parts of the greatest; the least cosine between a sight and the axis."""
+"""Smallest speed relative to the largest; smallest cosine between a sight and the axis."""
 WIDER = 1.2
-"""Slopes are looked at so many times as far out as the points of the lattice have them."""
+"""Slopes are tested this factor beyond those of the lattice points."""
 FAR = 50.0
-"""Lines and pixels by which the polynomials may err."""
+"""Allowed error of the polynomials, in lines and pixels."""
 POWERS = np.array([
     (i, j, k) for i in range(4) for j in range(4 - i) for k in range(4 - i - j)
 ])  # fmt: skip
@@ -75,7 +76,7 @@ def make_footprint(
     image, pieces: Pieces, samples: Float[AnyArray, " k"], line: Float[AnyArray, " 6"],
     earth: Ellipsoid | None,
 ) -> Footprint | None:  # fmt: skip
-    """The footprint, or None if it is not sure that every point is seen once."""
+    """The footprint, or None if it is not certain that every point is seen once."""
     heights = _heights(image, earth)
     if heights is None:
         return None
@@ -104,7 +105,7 @@ def make_footprint(
 
 
 def _heights(image, earth):
-    """Between which heights points are looked at; None if the camera is not above the ground."""
+    """The height range of points; None if the camera is not above the ground."""
     P = np.asarray(image.trajectory.position.values)
     if earth is None:
         above = P[:, 2].min()
@@ -169,7 +170,7 @@ def _fitted(D, times, u, heights):
 
 
 def _reach(pieces, samples, D):
-    """Least and greatest ξ that the points have in the image, and more; None if out of sight."""
+    """Smallest and largest ξ of the points in the image, with a margin; None if out of sight."""
     k, tau = _places(pieces, samples)
     c = np.asarray(pieces.coefficients)[k]
     numbers = np.einsum("kpn,pk->kn", c, tau ** np.arange(c.shape[1])[:, None])

@@ -1,10 +1,10 @@
-"""A pushbroom image: every line a photograph of one row, with its own exterior orientation.
+"""A pushbroom image: every line is a one-row photograph with its own exterior orientation.
 
     X = P(t) + s·R(t)·[ξ, η, −1],      t = t(l),   (ξ, η) = optics(u)
     R(t) = R_attitude(t)·exp([a + ȧ·(t − t₀)]×)·R_mounting,      P(t) = P_table(t) + p + ṗ·(t − t₀)
 
-`Offsets` a, ȧ, p, ṗ (about the time t₀ of the middle line) are zero unless something is to be
-estimated or propagated; a turns about right, forward and up: pitch, roll and yaw.
+`Offsets` a, ȧ, p, ṗ (about the time t₀ of the middle line) are zero unless they are estimated or
+propagated; a rotates about right, forward and up: pitch, roll and yaw.
 """
 
 from typing import NamedTuple
@@ -31,11 +31,11 @@ from jaxbundle.pushbroom.trajectory import (
 from jaxbundle.types import AnyArray, Numbers, Scalar
 
 LONGEST = 10_000_000
-"""More lines or pixels than any image has."""
+"""Upper bound for lines or pixels."""
 
 
 class Offsets(eqx.Module):
-    """Small changes of the trajectory: radians, metres, and the same a second."""
+    """Small changes of the trajectory: radians, metres, and their rates per second."""
 
     attitude: Float[AnyArray, "3"]
     attitude_rate: Float[AnyArray, "3"]
@@ -44,7 +44,7 @@ class Offsets(eqx.Module):
 
 
 def no_offsets() -> Offsets:
-    """The trajectory as its tables give it."""
+    """The trajectory from its tables."""
     return Offsets(*(jnp.zeros(3) for _ in range(4)))
 
 
@@ -89,12 +89,12 @@ def make_image(
     corrections: Corrections = Corrections(),  # noqa: B008
     sources: tuple[Source, Source] = (POSITIONS, ATTITUDE),
 ) -> PushbroomImage:
-    """An image whose tables reach over all its lines.
+    """An image whose tables cover all its lines.
 
     **Arguments:** `sources` name the tables of positions and attitude in messages.
 
-    **Raises:** `InputError` that names the line at a time outside a table or in a gap; for a size
-    that no image has.
+    **Raises:** `InputError` that names the line at a time outside a table or in a gap; for an
+    impossible size.
     """
     require_x64()
     check_size(lines, pixels, "image")
@@ -109,8 +109,8 @@ def make_image(
 
 
 def check_size(lines: float, pixels: float, where: str) -> None:
-    """Refuse a size of an image that is not whole, of no line, of less than 2 pixels, or more than
-    any has."""
+    """Refuse an image size that is not integer, without lines, with fewer than 2 pixels, or
+    impossibly large."""
     for size, name, least in ((lines, "lines", 1), (pixels, "pixels", 2)):
         if not least <= size <= LONGEST or size != int(size):
             raise InputError(
@@ -119,12 +119,12 @@ def check_size(lines: float, pixels: float, where: str) -> None:
 
 
 def pose_at(image: PushbroomImage, t: Scalar) -> Pose:
-    """The pose at the time t, in seconds; NaN where the tables do not reach."""
+    """The pose at the time t, in seconds; NaN outside the tables."""
     return moved_pose(given_pose(image, t), t - image.middle_time, image.offsets, image.mounting)
 
 
 def given_pose(image: PushbroomImage, t: Scalar) -> Pose:
-    """The pose of the platform as its tables have it, without offsets and mounting."""
+    """The pose of the platform from its tables, without offsets and mounting."""
     of = image.trajectory
     return Pose(position_at(of, t), rotation_at(of, t), velocity_at(of, t))
 

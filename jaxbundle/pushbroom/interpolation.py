@@ -1,10 +1,10 @@
-"""A table against time and what stands between its rows.
+"""Tables against time and their interpolation.
 
 Between the rows i and i + 1, with τ = (t − tᵢ)/(tᵢ₊₁ − tᵢ) and Δ = tᵢ₊₁ − tᵢ:
 
     linear      y = (1 − τ)·yᵢ + τ·yᵢ₊₁
     lagrange    y = Σ Lⱼ(t)·yⱼ,  Lⱼ = Π (t − tₖ)/(tⱼ − tₖ),  the order + 1 rows about t
-    usgscsm     the same with as many rows before t as after it, so fewer near the ends of the
+    usgscsm     the same with as many rows before t as after it, hence fewer near the ends of the
                 table: order + 1 at most, 6, 4, 2 in the last intervals (usgscsm, lagrangeInterp)
     hermite     y = h₀₀·yᵢ + h₀₁·yᵢ₊₁ + Δ·(h₁₀·ẏᵢ + h₁₁·ẏᵢ₊₁)      with the rates ẏ of the table
     spline      the same with the rates that make ÿ continuous, not-a-knot at both ends
@@ -12,8 +12,8 @@ Between the rows i and i + 1, with τ = (t − tᵢ)/(tᵢ₊₁ − tᵢ) and �
 
 with h₀₁ = τ²(3 − 2τ), h₀₀ = 1 − h₀₁, h₁₀ = τ(1 − τ)², h₁₁ = −τ²(1 − τ). Times need not be evenly
 spaced. In a step longer than `gap`, and outside the table by more than `extrapolate` seconds (none
-unless it is given), the value is NaN; splines end there. Up to there the first and last interval
-continue, which is a straight line for `usgscsm`.
+unless it is given), the value is NaN; splines end there. Within `extrapolate` the first and last
+interval continue, which is a straight line for `usgscsm`.
 """
 
 from typing import Literal, get_args
@@ -34,7 +34,7 @@ METHODS: tuple[str, ...] = get_args(Method)
 class Table(eqx.Module):
     """Values against time, differentiable in all of them.
 
-    `times` in seconds; `gap` the longest step between two rows that is interpolated, in seconds;
+    `times` in seconds; `gap` the longest interpolated step between two rows, in seconds;
     `order` the degree of Lagrange's polynomial, the highest one of `usgscsm`; `extrapolate` the
     seconds beyond its ends that the table still covers.
     """
@@ -49,7 +49,7 @@ class Table(eqx.Module):
 
 
 def interpolate(table: Table, t: Scalar) -> Float[Array, " k"]:
-    """The values at the time t, in seconds; NaN where the table says nothing."""
+    """The values at the time t, in seconds; NaN outside the table and in gaps."""
     i = interval(table, t)
     match table.method:
         case "linear":
@@ -79,7 +79,7 @@ def interval(table: Table, t: Scalar) -> Int[Array, "..."]:
 
 
 def fraction(table: Table, i: Int[AnyArray, "..."], t: Scalar) -> Scalar:
-    """τ, the part of the interval i that has passed at t; beyond 0 and 1 outside the table."""
+    """τ, the elapsed fraction of interval i at t; beyond 0 and 1 outside the table."""
     start, end = table.times[i], table.times[i + 1]
     return (t - start) / (end - start)
 
@@ -105,10 +105,10 @@ def breaks(table: Table) -> Float[np.ndarray, " rows"]:
 def spline_rates(
     times: Float[AnyArray, " rows"], values: Float[AnyArray, "rows k"], gap: float = np.inf
 ) -> Float[Array, "rows k"]:
-    """The rates at the rows of the cubic spline that is not-a-knot at both ends.
+    """The rates at the rows of the cubic spline with not-a-knot conditions at both ends.
 
-    On each side of a step longer than `gap` a spline of its own ends, so that nothing beyond it has
-    a part; of three rows it is a parabola, of two a straight line.
+    Splines on both sides of a step longer than `gap` are independent; with three rows it is a
+    parabola, with two a straight line.
     """
     step = jnp.diff(times)
     slope = jnp.diff(values, axis=0) / step[:, None]
@@ -135,7 +135,7 @@ def spline_rates(
 
 
 def _end_rows(step, slope, first, last):
-    """Diagonal, coefficient of the next rate and right side of each row, were it the first one.
+    """Diagonal, coefficient of the next rate and right-hand side of each row as the first one.
 
     `first` and `last` tell where a spline begins and ends: not-a-knot needs four rows.
     """

@@ -2,9 +2,9 @@
 
     [X, Y, Z] = P + s·R·[ξ, η, −1]
 
-One pose a line, the directions of the pixels once for all lines: a whole line costs little more
-than its intersections with the surface. `locate_point` is the textbook's formula of one
-pixel, `locate_lines` the same for lines × pixels, `locate_points` for scattered places.
+One pose per line, pixel directions once for all lines: a whole line costs little more than its
+intersections with the surface. `locate_point` is the textbook's formula of one pixel,
+`locate_lines` the same for lines × pixels, `locate_points` for scattered places.
 """
 
 import jax
@@ -20,13 +20,13 @@ from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.types import AnyArray, Scalar
 
 TOGETHER = 1000
-"""Pixels that are refracted together, layer by layer: 8000 take half as long again."""
+"""Pixels refracted together, layer by layer: with 8000 it takes 1.5 times as long."""
 
 
 def locate_point(
     image: PushbroomImage, surface: Surface, line: Scalar, pixel: Scalar
 ) -> Triple:
-    """The point (X, Y, Z), in metres, that a place in the image shows; NaN if the ray misses."""
+    """The point (X, Y, Z), in metres, of an image position; NaN if the ray misses."""
     pose = pose_at(image, image.times.time(line))
     return ground_point(pose, image.optics.slopes(pixel), surface, image.corrections)
 
@@ -82,5 +82,5 @@ def locate_points(
     lines: Float[AnyArray, " n"],
     pixels: Float[AnyArray, " n"],
 ) -> Float[Array, "3 n"]:
-    """The points of scattered places in the image, a pose for each."""
+    """The points of scattered image positions, with one pose each."""
     return jnp.stack(jax.vmap(lambda l, u: locate_point(image, surface, l, u))(lines, pixels))

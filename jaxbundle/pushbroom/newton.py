@@ -2,11 +2,11 @@
 
     f = r + ξ(u)·q = 0,    g = s + η(u)·q = 0,        [r, s, q] = M(τ)·D + m(τ).
 
-D is the sight from the origin of the pieces. A round begins with the piece in which t is, goes
-`STEPS` steps with the derivatives at its beginning, the slopes of the pixel by their chord over
-one pixel, and ends settled if the steps shrink as fast as they should. A root beyond the end of the
-piece is sought again in the next one. Few points need more than one round from a good start; they
-are collected, so that all others do not go with them.
+D is the sight from the origin of the pieces. A round starts with the piece that contains t and
+makes `STEPS` steps with the derivatives at its start, the slopes of the pixel by their chord over
+one pixel; it has settled if the steps decrease fast enough. A root beyond the end of the piece is
+searched again in the next one. Few points need more than one round from a good start; they are
+gathered, so that the others need no further round.
 """
 
 from functools import partial
@@ -21,19 +21,19 @@ from jaxbundle.pushbroom.polynomial import value, value_and_rate
 STEPS = 2
 """Steps of a round."""
 LEFT = 1e-7
-"""Lines and pixels by which a place may be wrong when its steps have settled."""
+"""Position tolerance of settled steps, in lines and pixels."""
 STILL = 1e-3
-"""A sight with corrections may move by so many lines in its last round."""
+"""Largest change of a corrected sight in its last round, in lines."""
 ROUNDS = 8
 """Rounds after which a point is given up."""
 FEW = 64
-"""Points that are collected for another round, at a time."""
+"""Batch size of points gathered for another round."""
 MANY = 8
-"""If more than this part of all points needs another round, all go through it."""
+"""If a larger fraction of points needs another round, all points take it."""
 EDGE = 1e-5
-"""A root so many lines beyond the end of its piece stays with it."""
+"""A root at most this many lines beyond the end of its piece stays with it."""
 STRAY = 1000
-"""A point that is sought so many lines off the image is given up."""
+"""A point this many lines outside the image is given up."""
 
 
 def refine(image, pieces, earth, X, t, u):
@@ -90,7 +90,7 @@ def line_period(image):
 
 
 def seen_from(image, earth, motion, X):
-    """Where X seems to be to a camera at P with the velocity V; `motion` is (P, V)."""
+    """The apparent position of X for a camera at P with the velocity V; `motion` is (P, V)."""
     P, V = motion
     return seen_point(image.corrections, earth, P, V, X) if image.corrections.any else X
 
@@ -116,7 +116,7 @@ def _round(image, pieces, earth, X, t, u):
     if image.corrections.any:
         numbers, rates = zip(*(value_and_rate(p, tau) for p in zip(*c)))
         X = seen_from(image, earth, motion(numbers, [r / half for r in rates], pieces.origin), X)
-        # else XLA computes it anew for each of the twelve sums below
+        # otherwise XLA recomputes it for each of the twelve sums below
         X = jax.lax.optimization_barrier(X)
     D = difference(X, pieces.origin)
     rsq = [[_component(n, D, i) for n in c] for i in range(3)]
@@ -137,9 +137,9 @@ def _round(image, pieces, earth, X, t, u):
     # steps that shrink by step/before each leave about step²/before
     settled = (step * step <= LEFT * (before + LEFT)) & (q < 0)
     if image.corrections.any:
-        # the sight belongs to the time at which the round began
+        # the sight refers to the time at the start of the round
         settled &= jnp.abs(tau - first) < STILL * line
-    # a root at the very end of a piece would go to and fro
+    # a root exactly at the end of a piece would alternate
     reach = 1 + EDGE * line
     settled &= ((tau >= -reach) | (own == 0)) & ((tau <= reach) | (own == last))
     return middle + tau * half, v, settled

@@ -1,12 +1,12 @@
 """Errors of ancillary data: bias, drift, and white noise of every row, in attitude and position.
 
-An attitude in error is R·exp([ε]×), ε in radians about right, forward and up (pitch, roll, yaw); a
-position in error is P + ε in metres. In time,
+An erroneous attitude is R·exp([ε]×), ε in radians about right, forward and up (pitch, roll, yaw);
+an erroneous position is P + ε in metres. Over time,
 
-    ε(t) = bias + drift·(t − t₀) + what is interpolated of the noise of the rows,
+    ε(t) = bias + drift·(t − t₀) + interpolated noise of the rows,
 
 t₀ the time of the middle line. `Errors` are values (drawn, or zero to be differentiated by),
-`Noise` their standard deviations, each axis alike or one by one.
+`Noise` their standard deviations, common or per axis.
 """
 
 from typing import NamedTuple
@@ -31,7 +31,7 @@ Sigma = float | Float[np.ndarray, "3"]
 
 
 class Noise(NamedTuple):
-    """Standard deviations: radians and metres, drifts a second, rows independent of each other."""
+    """Standard deviations: radians and metres, drifts per second, independent rows."""
 
     attitude_bias: Sigma = 0.0
     attitude_drift: Sigma = 0.0
@@ -96,6 +96,6 @@ def _turned_quaternion(q, error):
 
 
 def _turned_angles(angles, error):
-    """Of R·exp([ε]×), the angles next to the given ones."""
+    """The angles of R·exp([ε]×), nearest to the given ones."""
     M = matrix_from_rotation_vector(error).T @ matrix_from_omega_phi_kappa(angles)
     return omega_phi_kappa_near(M, angles)

@@ -1,11 +1,11 @@
-"""An orbit from one state vector: two bodies, and the flattening of the Earth (J2) if asked for.
+"""An orbit from one state vector: Kepler motion, optionally with J2.
 
     r̈ = −GM·r/r³ + a₂,      a₂ = −(3/2)·J2·GM·R²/r⁵·[(1 − 5z²/r²)·(x, y) ; (3 − 5z²/r²)·z]
 
-(Vallado, 2013, Fundamentals of Astrodynamics, section 8.7.1), integrated by DOP853 of scipy in the
-axes that the Earth has at the moment of the state, and turned back by its uniform rotation: so the
-pole of J2 is that of the Earth, and no frame but the Earth-fixed one is needed. What is left out,
-higher terms and drag, grows to some 10 m in a minute, to kilometres in a revolution.
+(Vallado, 2013, Fundamentals of Astrodynamics, section 8.7.1), integrated by scipy's DOP853 in the
+Earth axes at the time of the state, and rotated back uniformly: the pole of J2 is that of the
+Earth, and only the Earth-fixed frame is needed. The neglected higher terms and drag grow to about
+10 m in a minute, to kilometres in a revolution.
 """
 
 import numpy as np
@@ -18,9 +18,9 @@ from jaxbundle.pushbroom.earth_frames import EARTH_RATE, GM, Rows
 
 J2 = 1.08262668e-3
 RADIUS = 6378137.0
-"""The radius that belongs to J2, metres (WGS 84)."""
+"""The reference radius of J2, metres (WGS 84)."""
 TOLERANCE = 1e-12
-"""Of the integration, relative; 1e-5 m in a revolution."""
+"""Relative tolerance of the integration; 1e-5 m in a revolution."""
 
 
 def state_orbit(
@@ -30,12 +30,12 @@ def state_orbit(
     at: float = 0.0,
     j2: bool = True,
 ) -> tuple[Rows, Rows]:
-    """Earth-fixed positions (m) and velocities (m/s) of a satellite whose state is known once.
+    """Earth-fixed positions (m) and velocities (m/s) of a satellite from one state.
 
-    **Arguments:** `times` in seconds; `position`, `velocity` Earth-fixed, relative to the turning
-    Earth, at the time `at`; `j2`: with the flattening of the Earth.
+    **Arguments:** `times` in seconds; `position`, `velocity` Earth-fixed, relative to the rotating
+    Earth, at the time `at`; `j2`: include J2.
 
-    **Raises:** `InputError` for a state below the ground, or an orbit that comes there.
+    **Raises:** `InputError` for a state below the ground, or an orbit that reaches it.
     """
     times, position = np.asarray(times, float), np.asarray(position, float)
     spin = np.array([0.0, 0.0, EARTH_RATE])
@@ -43,7 +43,7 @@ def state_orbit(
     if not np.linalg.norm(position) > RADIUS / 2:
         raise InputError(
             f"state: the position is {np.linalg.norm(position):.6g} m from the centre of the Earth;"
-            " metres, Earth-fixed or in the frame that is told, are expected"
+            " metres, Earth-fixed or in the stated frame, are expected"
         )
     states = np.empty((len(times), 6))
     for part, order in ((times >= at, 1), (times < at, -1)):
@@ -57,7 +57,7 @@ def state_orbit(
         )  # fmt: skip
         if found.status:
             raise InputError(
-                f"state: the orbit is at the ground at {found.t_events[0][0]:.6g} s; look at the "
+                f"state: the orbit reaches the ground at {found.t_events[0][0]:.6g} s; check the "
                 "velocity, its unit and frame"
             )
         states[part] = found.y.T[np.searchsorted(order * when, order * times[part])]

@@ -1,11 +1,11 @@
-"""When the line of detectors passes over a point: searched for over the whole image.
+"""Passages of the detector line over a point, searched over the whole image.
 
     F(t) = −s/q − η(ξ),    ξ = −r/q,    [r, s, q] = M(t)·D + m(t),
 
-the slope at which the point is ahead of the line of detectors, η a polynomial of ξ, changes its
-sign at every passage. Between two times of the search (ends of pieces) F is taken
-as the cubic with its values and rates at both: one that goes to zero and turns back within the step
-passes twice. While the Earth is between point and camera nothing is seen.
+the slope of the point ahead of the detector line, η a polynomial of ξ, changes its sign at every
+passage. Between two times of the search (ends of pieces) F is approximated by the cubic with its
+values and rates at both: one that crosses zero and back within the step passes twice. Points behind
+the Earth are not seen.
 """
 
 from functools import partial
@@ -20,9 +20,9 @@ from jaxbundle.pushbroom.newton import line_period, motion, seen_from
 from jaxbundle.pushbroom.polynomial import value, value_and_rate
 
 SEARCH, FINE_SEARCH = 128, 512
-"""The search has so many steps at most; where the camera may turn back, the finer one."""
+"""Largest number of search steps; the finer one if the camera may turn back."""
 DETECTORS = 257
-"""Places along the line through which η of ξ is fitted."""
+"""Number of points along the line for fitting η of ξ."""
 
 
 def sample_times(pieces, most: int = SEARCH):
@@ -63,10 +63,10 @@ def sample(pieces, t):
 
 
 def passages(image, search, X, most, margin):
-    """When the line of detectors passes over the points, about, and how often; whether they are
-    ahead of the last line, behind the first, and never above the horizon.
+    """Approximate times of passages over the points, and their number; whether points are
+    ahead of the last line, behind the first, or never above the horizon.
 
-    The search begins and ends a line outside the image, so that its edges are within.
+    The search begins and ends one line outside the image, to include its edges.
     """
     step = (1 + margin) * line_period(image)
     samples = search.samples.at[0].add(-step).at[-1].add(step)
@@ -106,8 +106,8 @@ def passages(image, search, X, most, margin):
 
 
 def _zeros(a, b, da, db):
-    """Whether a function passes zero once or twice from 0 to 1, and where, about; from its values
-    and rates at both ends (cubic), false where one is NaN."""
+    """Whether a function crosses zero once or twice from 0 to 1, and approximately where; from its
+    values and rates at both ends (cubic), false if one is NaN."""
     known = ~(jnp.isnan(a) | jnp.isnan(b))
     once = known & ((a >= 0) != (b >= 0))
     straight = a / jnp.where(once, a - b, 1.0)

@@ -1,11 +1,11 @@
-"""The trajectory of an image as polynomials in time, for the way from the ground to the image.
+"""The trajectory of an image as piecewise polynomials in time, for ground → image.
 
 A point X is at [r, s, q] = Rᵀ·(X − P) = M·(X − O) + m in the camera frame, O a fixed origin. The
 twelve numbers M, m are interpolated by polynomials of degree 3 through Chebyshev points of short
-pieces of time. A piece ends where the interpolation of a table does, and is halved until the
-polynomials keep the image coordinates of the ground within `TOLERANCE` pixels. That costs a few
-multiplications for each point where interpolation and rotation cost hundreds. Degree 3 takes more
-pieces than 5, and half as long.
+pieces of time. A piece ends at interpolation nodes of a table and is halved until the polynomials
+reproduce image coordinates within `TOLERANCE` pixels. This costs a few multiplications per point,
+while interpolation and rotation cost hundreds. Degree 3 needs more pieces than 5, but half the
+time.
 """
 
 from math import comb
@@ -27,18 +27,18 @@ from jaxbundle.types import AnyArray
 DEGREE = 3
 TOLERANCE = 1e-7
 SHORTEST = 1e-3
-"""No piece becomes shorter than this part of a line."""
+"""Shortest piece, as a fraction of a line."""
 CHUNK = 1024
-"""Times for which the pose is computed together, always so many: one shape to compile."""
+"""Fixed batch size of times for the pose: one shape to compile."""
 SHARED = 128
-"""Images of so many pieces at most share their compiled programs with those of nearly as many: of
-more, not all ends are times of the search (`passages`), and halves would make it uneven."""
+"""Images with at most this many pieces share compiled programs with those of similar number; with
+more, not all ends are search times (`passages`), and halves would make them uneven."""
 SAME = 1e-6
-"""Rows of two tables nearer in time than this part of a line are taken as one."""
+"""Rows of two tables closer in time than this fraction of a line count as one."""
 
 NODES = np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))
 CHECKS = np.cos(np.pi * np.arange(DEGREE + 2) / (DEGREE + 1))
-"""Between the nodes and at the ends, where the polynomial errs most."""
+"""Check times between the nodes and at the ends, where the polynomial error is largest."""
 TO_COEFFICIENTS = np.linalg.inv(np.vander(NODES, increasing=True))
 TO_CHECKS = np.vander(CHECKS, DEGREE + 1, increasing=True) @ TO_COEFFICIENTS
 TO_HALVES = np.array([
@@ -57,11 +57,11 @@ class Pieces(eqx.Module):
 
 
 def make_pieces(image: PushbroomImage, earth: Ellipsoid | None) -> Pieces:
-    """The pieces from the edge of the first line to that of the last, as far as the tables reach.
+    """The pieces from the edge of the first line to that of the last, within the tables.
 
     `earth` as in `make_search`.
 
-    **Raises:** `InputError` if no pieces follow the trajectory.
+    **Raises:** `InputError` if no pieces represent the trajectory.
     """
     first, last = (float(image.times.time(line)) for line in (-0.5, image.lines - 0.5))
     line = (last - first) / image.lines
@@ -97,7 +97,7 @@ def make_pieces(image: PushbroomImage, earth: Ellipsoid | None) -> Pieces:
 
 
 def _halve_some(pieces, number: int):
-    """Pieces (start, end, coefficients) in order of time, so many of the longest in halves."""
+    """Pieces (start, end, coefficients) in order of time, some of the longest halved."""
     pieces = sorted(pieces, key=lambda piece: piece[1] - piece[0])
     whole, long = pieces[: len(pieces) - number], pieces[len(pieces) - number :]
     for start, end, c in long:

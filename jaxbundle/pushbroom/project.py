@@ -1,17 +1,17 @@
-"""Ground → image: the lines and pixels that see a point; all of them, or none, said by a status.
+"""Ground → image: all lines and pixels that see a point, or a status if there are none.
 
 The point X is seen at the time t by the pixel u where
 
     r + ξ(u)·q = 0,    s + η(u)·q = 0,        [r, s, q] = Rᵀ(t)·(X − P(t)),    q < 0.
 
-`project_points` begins, in the footprint of the image, where polynomials say that the point is
-(`footprint`), and elsewhere with a search of the whole image (`passages`). From there Newton's
-method goes on with the polynomials of `pieces` (`newton`).
+In the footprint of the image `project_points` starts from polynomials
+(`footprint`), elsewhere from a search of the whole image (`passages`). Newton's
+method continues with the polynomials of `pieces` (`newton`).
 
-`project_near` is the textbook's way for one point that is near a known place in the image, with the
-trajectory itself. By the implicit function theorem its derivatives are exact in everything.
+`project_near` is the textbook method for one point near a known image position, with the
+trajectory itself. Its derivatives are exact by the implicit function theorem.
 
-With corrections, X gives way to the point where it seems to be (`seen_point`).
+With corrections, X is replaced by its apparent position (`seen_point`).
 """
 
 from enum import IntEnum
@@ -43,14 +43,14 @@ from jaxbundle.pushbroom.scanner import LineTimes, Optics, Pair
 from jaxbundle.types import AnyArray, Scalar
 
 CHUNK = 2048
-"""Points that go through all steps together, so that they stay in the cache."""
+"""Batch size of points, which stay in the cache."""
 SEARCHED = 256
-"""Points that are searched for together, of those that the footprint does not tell."""
+"""Batch size of searched points outside the footprint."""
 NEAR_STEPS = 6
 
 
 class Status(IntEnum):
-    """Whether a point is in the image, and if not, where it is."""
+    """Whether a point is in the image, and if not, why."""
 
     SEEN = 0
     BEFORE = 1
@@ -61,7 +61,7 @@ class Status(IntEnum):
 
     @property
     def meaning(self) -> str:
-        """In words, for a person."""
+        """The status in words."""
         return _MEANING[self]
 
 
@@ -76,9 +76,9 @@ _MEANING = {
 
 
 class Projected(eqx.Module):
-    """Lines and pixels that see the points, in order of time; NaN where there are fewer.
+    """Lines and pixels that see the points, in order of time; NaN for unused places.
 
-    `count`: how many there are. `status`: that of the point, a `Status`.
+    `count`: their number. `status`: the `Status` of the point.
     """
 
     line: Float[AnyArray, "most n"]
@@ -88,7 +88,7 @@ class Projected(eqx.Module):
 
 
 class Search(eqx.Module):
-    """What the search needs of an image: pieces, footprint, times to begin with, η of ξ about."""
+    """Search data of an image: pieces, footprint, start times, approximate η of ξ."""
 
     pieces: Pieces
     footprint: Footprint | None
@@ -98,8 +98,8 @@ class Search(eqx.Module):
 
 
 class Scanner(eqx.Module):
-    """An image without its trajectory, for which pieces stand: images of one scanner share their
-    compiled programs."""
+    """An image with pieces in place of its trajectory: images of one scanner share compiled
+    programs."""
 
     times: LineTimes
     optics: Optics
@@ -134,18 +134,18 @@ def project_points(
     most: int = 1,
     margin: float = 0.0,
 ) -> Projected:
-    """The places of points in the whole image, the first `most` of each.
+    """The positions of points in the whole image, the first `most` of each.
 
     **Arguments:** `search` of the same image, by `make_search`; X in metres, coordinates first;
-    what is beside the image by up to `margin` lines and pixels is taken as in it. Points inside
-    the image are found some ten times as fast as those outside, which must be searched for.
+    positions outside the image by up to `margin` lines and pixels count as inside. Points inside
+    the image are about ten times as fast as those outside, which must be searched for.
     """
     return _project_points(scanner_of(image), search, X, most, margin)
 
 
 @partial(jax.jit, static_argnames="most")
 def _project_points(image, search, X, most, margin):
-    """One program for every margin: a default left out would be a constant of it."""
+    """One program for all margins: an omitted default would be compiled in."""
     find = lambda X: _found(image, search, X, most, margin)
     return _in_chunks(find, tuple(X))
 
@@ -153,9 +153,9 @@ def _project_points(image, search, X, most, margin):
 def project_from(
     image: PushbroomImage | Scanner, search: Search, X: Vector, line: Scalar, pixel: Scalar
 ) -> tuple[Array, Array]:
-    """Line and pixel of points near the given places; arrays of any one shape, not searched for.
+    """Line and pixel of points near the given positions, without search; arrays of one shape.
 
-    NaN where Newton's method does not settle.
+    NaN if Newton's method does not converge.
     """
     return _project_from(scanner_of(image), search, X, line, pixel)
 
@@ -177,7 +177,7 @@ def project_near(
     pixel: Scalar,
     earth: Ellipsoid | None = WGS84,
 ) -> tuple[Scalar, Scalar]:
-    """Line and pixel of one point seen near a place; differentiable in image and point, to every
+    """Line and pixel of one point near an image position; differentiable in image and point, to any
     order."""
     fixed = stop_gradient((image, X))
 
@@ -203,7 +203,7 @@ def misclosure(
     u: Scalar,
     earth: Ellipsoid | None,
 ) -> Float[Array, "2"]:
-    """Slopes at which X is seen at the time t less those of the pixel u."""
+    """Slopes of the ray to X at the time t minus those of the pixel u."""
     slopes = image.optics.slopes(u)
     return misclosure_of(pose_at(image, t), slopes, X, image.corrections, earth)
 
@@ -215,7 +215,7 @@ def misclosure_of(
     corrections: Corrections,
     earth: Ellipsoid | None,
 ) -> Float[Array, "2"]:
-    """Slopes at which X is seen from a pose less others."""
+    """Slopes of the ray to X from a pose minus given ones."""
     P, R, V = pose
     r, s, q = turned_back(R, difference(seen_point(corrections, earth, P, V, X), P))
     xi, eta = slopes
@@ -235,7 +235,7 @@ def _in_chunks(function, arrays):
 
 
 def _found(image, search, X, most, margin):
-    """The places of a chunk of points, a triple of arrays."""
+    """The positions of a chunk of points, a triple of arrays."""
     if search.footprint is None:
         return _searched(image, search, X, most, margin)
     start = search.footprint.start(difference(X, search.pieces.origin))
@@ -256,7 +256,7 @@ def _found(image, search, X, most, margin):
 
 
 def _searched(image, search, X, most, margin):
-    """The places of points that may be anywhere."""
+    """The positions of arbitrary points."""
     starts, count, ahead, behind, hidden = passages(image, search, X, most, margin)
     there = count > jnp.arange(most)[:, None]
 
@@ -268,13 +268,13 @@ def _searched(image, search, X, most, margin):
             lambda: (start, start, start != start),
         )  # fmt: skip
 
-    # one after the other, not written out: all passages share one compiled Newton's method
+    # a loop: all passages share one compiled Newton's method
     t, u, settled = jax.lax.map(place, (starts, there))
     seen = there & settled & _inside(image, t, u, margin)
     lost = jnp.any(there & ~settled, axis=0)
     order = jnp.argsort(~seen, axis=0, stable=True)
     sorted_ = lambda v: jnp.take_along_axis(jnp.where(seen, v, jnp.nan), order, 0)
-    # passages beyond the first `most` were not followed: they may be beside the image
+    # passages beyond the first `most` were not refined: they may be outside the image
     number = seen.sum(0) + jnp.maximum(count - most, 0)
     status = jnp.select(
         [number > 0, hidden, lost, count > 0, ahead, behind],
@@ -287,7 +287,7 @@ def _searched(image, search, X, most, margin):
 
 
 def _inside(image, t, u, margin):
-    """Whether places are in the image, or beside it by up to `margin` lines and pixels."""
+    """Whether positions are in the image, or outside by up to `margin` lines and pixels."""
     edge = 0.5 + margin
     first, last = image.times.time(-edge), image.times.time(image.lines - 1 + edge)
     return (t >= first) & (t < last) & (u >= -edge) & (u < image.pixels - 1 + edge)

@@ -1,8 +1,8 @@
 """Values of a raster between its pixels: nearest, bilinear, cubic.
 
-Cubic is Keys' convolution with a = −½ (Keys, 1981, IEEE Trans. ASSP 29), exact for parabolas. Whole
-numbers are the centres of pixels; up to half a pixel beyond the outer centres their values go on,
-farther out there is none: NaN. So is it where a pixel that takes part has none.
+Cubic is Keys' convolution with a = −½ (Keys, 1981, IEEE Trans. ASSP 29), exact for parabolas.
+Integers are pixel centres; up to half a pixel beyond the outer centres the values are extended;
+farther out they are NaN, and also if a contributing pixel is NaN.
 """
 
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ def resample(
     column: Float[AnyArray, "*shape"],
     kind: Resampling = "bilinear",
 ) -> Float[Array, "bands *shape"]:
-    """The values of all bands at places in the raster."""
+    """The values of all bands at raster positions."""
     rows, columns = bands.shape[1:]
     inside = (row >= -0.5) & (row <= rows - 0.5) & (column >= -0.5) & (column <= columns - 0.5)
     match kind:
@@ -35,7 +35,7 @@ def resample(
 
 
 def _convolve(bands, row, column, weights, before):
-    """Products of one-dimensional weights of the pixels from `before` the place on."""
+    """Products of one-dimensional weights of the pixels starting `before` the position."""
     rows, columns = bands.shape[1:]
     i, j = jnp.floor(row), jnp.floor(column)
     down, right = weights(row - i), weights(column - j)
@@ -47,7 +47,7 @@ def _convolve(bands, row, column, weights, before):
 
 
 def _keys(x):
-    """Weights of the pixels at −1, 0, 1, 2 for a place x in [0, 1]."""
+    """Weights of the pixels at −1, 0, 1, 2 for a position x in [0, 1]."""
     near = lambda d: 1 + d * d * (1.5 * d - 2.5)
     far = lambda d: 2 + d * (-4 + d * (2.5 - 0.5 * d))
     return far(1 + x), near(x), near(1 - x), far(2 - x)

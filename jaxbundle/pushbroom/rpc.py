@@ -1,6 +1,6 @@
 """Rational polynomial coefficients (RPC): an image as polynomials of longitude, latitude, height.
 
-With L, P, H the longitude, latitude and height less their offsets, divided by their scales,
+With L, P, H the longitude, latitude and height minus their offsets, divided by their scales,
 
     line   = line_offset   + line_scale·a(L, P, H)/b(L, P, H),
     sample = sample_offset + sample_scale·c(L, P, H)/d(L, P, H),
@@ -9,13 +9,13 @@ each polynomial of 20 coefficients in the order of RPC00B (STDI-0002, appendix E
 
     1, L, P, H, LP, LH, PH, L², P², H², PLH, L³, LP², LH², L²P, P³, PH², L²H, P²H, H³.
 
-RPC00A, which orders them otherwise, is not meant. Offsets and scales keep the units of the files,
-degrees and metres; longitudes and latitudes given to functions are in radians, as everywhere here.
+RPC00A has another order and is not supported. Offsets and scales have the units of the files,
+degrees and metres; longitudes and latitudes of functions are in radians.
 Heights are above the ellipsoid. In RPC00B line 0, sample 0 is the centre of the first pixel, as
-everywhere here; `sample` is the pixel of a line scanner.
+in this package; `sample` is the pixel of a line scanner.
 
-The way back solves two equations by Newton's method in (L, P). Its last step is taken from a place
-held fixed, so that its derivatives are those of the solution (implicit function theorem), by
+The inverse solves two equations by Newton's method in (L, P). Its last step is taken from a
+constant position, so that its derivatives are those of the solution (implicit function theorem), by
 line, sample, height and every coefficient.
 """
 
@@ -36,18 +36,18 @@ from jaxbundle.types import AnyArray, Scalar
 
 TERMS = 20
 STEPS = 6
-"""Newton's steps of the way back; it doubles its digits with each."""
+"""Newton steps of the inverse; the number of digits doubles with each."""
 SETTLED = 1e-9
 """A last step below this, in units of the scales, ends Newton's method."""
 MARGIN = 0.1
-"""So much beyond the scales (of 1) still counts as inside."""
+"""Tolerance beyond the scales (of 1) that counts as inside."""
 AHEAD = 20e3
-"""A line of sight begins so far above the highest height of the domain, metres."""
+"""A line of sight begins this far above the highest height of the domain, metres."""
 ROUNDS = 3
 
 
 class RpcStatus(IntEnum):
-    """Whether the polynomials may be trusted at a place."""
+    """Validity of the polynomials at a position."""
 
     INSIDE = 0
     OUTSIDE = 1
@@ -55,7 +55,7 @@ class RpcStatus(IntEnum):
 
     @property
     def meaning(self) -> str:
-        """In words, for a person."""
+        """The status in words."""
         return _MEANING[self]
 
 
@@ -93,9 +93,9 @@ def project(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> tu
 def locate(
     rpc: Rpc, line: Scalar, sample: Scalar, height: Scalar
 ) -> tuple[Array, Array, Array]:
-    """Longitude and latitude, radians, of a place in the image at a height; and its `RpcStatus`.
+    """Longitude and latitude, radians, of an image position at a height; and its `RpcStatus`.
 
-    NaN where Newton's method does not settle.
+    NaN if Newton's method does not converge.
     """
     H = (height - rpc.height_offset) / rpc.height_scale
     target = jnp.stack([
@@ -134,7 +134,8 @@ def _twice_misclosure(place, data):
 
 
 def domain(rpc: Rpc, longitude: Scalar, latitude: Scalar, height: Scalar) -> Array:
-    """The `RpcStatus` of a point: whether it and its image are where the coefficients were made."""
+    """The `RpcStatus` of a point: whether it and its image are in the domain of the
+    coefficients."""
     place = normalised(rpc, longitude, latitude, height)
     ratios = jnp.stack(_ratios(rpc, *place))
     inside = _inside(jnp.stack([*place, *ratios]))
@@ -146,8 +147,9 @@ def locate_on(
 ) -> tuple[Array, Array, Scalar, Array]:
     """(longitude, latitude, height, status) of the first point of the line of sight on a surface.
 
-    The points at the lowest and the highest height of the domain span a straight line; where it
-    meets the surface it is shifted onto the polynomials' own line of sight, and again.
+    The points at the lowest and the highest height of the domain span a straight line; at its
+    intersection with the surface it is shifted onto the line of sight of the polynomials,
+    repeatedly.
 
     **Arguments:** `surface` above an ellipsoid of revolution.
     """
@@ -204,7 +206,7 @@ def locate_points(
     sample: Float[AnyArray, " n"],
     height: Float[AnyArray, " n"],
 ) -> tuple[Array, Array, Array]:
-    """Longitudes, latitudes (radians) and statuses of many places at given heights."""
+    """Longitudes, latitudes (radians) and statuses of many positions at given heights."""
     return jax.vmap(lambda l, s, h: locate(rpc, l, s, h))(line, sample, height)
 
 
@@ -212,7 +214,7 @@ def locate_points(
 def locate_points_on(
     rpc: Rpc, surface: Surface, line: Float[AnyArray, " n"], sample: Float[AnyArray, " n"]
 ) -> tuple[Array, Array, Scalar, Array]:
-    """Longitudes, latitudes, heights and statuses of many places on a surface."""
+    """Longitudes, latitudes, heights and statuses of many positions on a surface."""
     return jax.vmap(lambda l, s: locate_on(rpc, surface, l, s))(line, sample)
 
 

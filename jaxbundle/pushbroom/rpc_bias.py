@@ -2,13 +2,13 @@
 
     line   + v = l + a₀ + a₁·l̂ + a₂·ŝ,        sample + v = s + b₀ + b₁·l̂ + b₂·ŝ
 
-(l, s) the image of a control point by the coefficients, (l̂, ŝ) the same less offset, by scale.
-`"shift"` estimates a₀, b₀ alone. With the σ of the measurement and of the control point,
-G = ∂(l, s)/∂(east, north, up), the weights of a point are
+(l, s) the image of a control point by the coefficients, (l̂, ŝ) the same minus offset, divided by
+scale. `"shift"` estimates only a₀, b₀. With the σ of the measurement and of the control point, G =
+∂(l, s)/∂(east, north, up), the weights of a point are
 
     P = (diag(σ²) + G·Σ·Gᵀ)⁻¹.
 
-Of correlated observations (Baarda, 1968), with Q the cofactors of the unknowns:
+For correlated observations (Baarda, 1968), with Q the cofactors of the unknowns:
 
     Qv = P⁻¹ − A·Q·Aᵀ,      r = diag(Qv·P),      w = (P·v)ᵢ/√(P·Qv·P)ᵢᵢ.
 """
@@ -34,7 +34,7 @@ MODELS = dict(zip(RPC_BIASES, (1, 3), strict=True))
 """Unknowns of each axis."""
 CONTROL = Source("control points")
 DETERMINED = 1e-6
-"""Least singular value of the equations, of the largest: below, points are on one line."""
+"""Smallest relative singular value of the equations; below it points are collinear."""
 GRID = 12
 """Points along each side of the grid to which an affine bias is fitted."""
 
@@ -84,13 +84,13 @@ def fit_bias(
     earth: Ellipsoid = WGS84,
     source: Source = CONTROL,
 ) -> BiasFit:
-    """The bias that control points tell of.
+    """The bias estimated from control points.
 
-    **Arguments:** `control` as given and as measured; `sigma` of what is measured, in pixels;
+    **Arguments:** `control` as given and as measured; `sigma` of the measurements, in pixels;
     `ground_sigma` of the points east, north, up, metres (none if None); `source` names rows.
 
-    **Raises:** `InputError` for an unknown model, too few points, points on one line, what is not a
-    number, and points or measurements outside the domain of the coefficients.
+    **Raises:** `InputError` for an unknown model, too few points, collinear points, invalid
+    numbers, and points or measurements outside the domain of the coefficients.
     """
     require_x64()
     if model not in MODELS:
@@ -108,7 +108,7 @@ def fit_bias(
     computed, G = (np.asarray(a) for a in _images(rpc, earth, *control[:3]))
     if (bad := ~np.isfinite(computed).all(1)).any():
         raise InputError(
-            f"{source(int(bad.argmax()))}: the coefficients have no image of this point; look at "
+            f"{source(int(bad.argmax()))}: the coefficients have no image of this point; check "
             "longitude, latitude, height and their order"
         )
     _check_domain(rpc, control, source)
@@ -145,10 +145,11 @@ def fit_bias(
 
 
 def compensated(rpc: Rpc, bias: Bias) -> tuple[Rpc, RpcCheck | None]:
-    """Coefficients with the bias in them, and what a fit leaves (None for a shift: exact).
+    """Coefficients including the bias, and the residuals of a fit (None for a shift, which is
+    exact).
 
-    A shift moves the offsets. An affine bias mixes two fractions of different denominators: the
-    coefficients are fitted anew to the domain of the old ones.
+    A shift changes the offsets. An affine bias mixes two fractions of different denominators: the
+    coefficients are refitted over the domain of the old ones.
     """
     if not np.any(np.r_[bias.line[1:], bias.sample[1:]]):
         moved = (rpc.line_offset + bias.line[0], rpc.sample_offset + bias.sample[0])
@@ -171,7 +172,8 @@ def compensated(rpc: Rpc, bias: Bias) -> tuple[Rpc, RpcCheck | None]:
 
 
 def _check_domain(rpc, control, source):
-    """Refuse what the coefficients were not made for: another place, another image, swapped."""
+    """Refuse points outside the domain of the coefficients: another area, another image,
+    swapped."""
     longitude, latitude, height, line, sample = control
     axes = (
         ("longitude", np.degrees(longitude), "°", "look at coordinates and their order"),

@@ -1,4 +1,4 @@
-"""Rational polynomial coefficients from a table: of a rigorous model, or given.
+"""Rational polynomial coefficients fitted to a table, given or computed by a rigorous model.
 
 For the lines, and likewise for the samples, with T the 20 terms of a point, y its normalised line
 and c = (a, b) the 20 coefficients of the numerator and the 19 free ones of the denominator,
@@ -6,20 +6,21 @@ and c = (a, b) the 20 coefficients of the numerator and the 19 free ones of the 
     v = a·T/(1 + b·T') − y,        Σv² + τ²·|D·c|² → min.
 
 The start is linear, a·T − y·b·T' = y (Tao and Hu, 2001, PE&RS 67(12)); Gauss-Newton steps follow,
-halved until the sum falls and no denominator vanishes at a point.
+halved until the sum decreases and no denominator vanishes at a point.
 
-The unknowns are nearly dependent on each other, so τ holds them small (Tikhonov): all but the four
-linear terms of the numerator, for which D is a thousand times less. τ is the largest that predicts
-each point from all others as well as any τ does, or within `ENOUGH` pixels (PRESS, Allen, 1974):
+The unknowns are nearly dependent, so τ keeps them small (Tikhonov), except the four
+linear terms of the numerator, for which D is a thousand times smaller. τ is the largest that
+predicts each point from all others as well as the best τ, or within `ENOUGH` pixels (PRESS, Allen,
+1974):
 
     PRESS(τ) = mean (vᵢ/(1 − hᵢ))²,        h = diag J·(N + τ²D²)⁻¹·Jᵀ,    N = Jᵀ·J.
 
-The covariance is that of what noise of the table does to the coefficients,
+The covariance is that of the effect of table noise on the coefficients,
 
     Σ = σ²·(N + τ²D²)⁻¹·N·(N + τ²D²)⁻¹,
 
-σ a posteriori from n − Σhᵢ redundancies if it is not given. What the ridge withholds is no noise:
-it shows in the residuals, as does what no rational polynomial of degree 3 can follow.
+σ by default a posteriori with redundancy n − Σhᵢ. The bias of the ridge is not noise: it appears in
+the residuals, like everything that rational polynomials of degree 3 cannot represent.
 """
 
 from typing import NamedTuple
@@ -41,26 +42,26 @@ from jaxbundle.pushbroom.surfaces import Height
 
 UNKNOWNS = 2 * TERMS - 1
 FEWEST = UNKNOWNS + 1
-"""Fewer points than that do not check anything."""
+"""Minimum number of points."""
 LINEAR = 1e-3
 """D of the constant and linear terms of the numerator."""
 LADDER = 10.0 ** np.arange(-1.0, -15.25, -0.5)
-"""Ridges that are tried, in units of the largest singular value."""
+"""Candidate ridges, in units of the largest singular value."""
 AS_GOOD = 1.05
 ENOUGH = 1e-5
 """Pixels."""
 START = 1e-2
 """The ridge of the linear start, in units of the largest singular value."""
 STEPS, CHOOSING = 30, (0, 1, 2)
-"""Steps of Gauss-Newton, and those in which the ridge is chosen."""
+"""Gauss–Newton steps, and those in which the ridge is chosen."""
 HALVINGS = 30
 SETTLED, EXACT = 1e-3, 1e-8
-"""A last whole step moves no point by more than this part of the RMS and so many pixels."""
+"""The last full step moves no point by more than this fraction of the RMS and this many pixels."""
 TABLE = Source("table")
 
 
 class RpcTable(NamedTuple):
-    """Points of the ground and where the image shows them: radians, metres, lines, samples."""
+    """Ground points and their image positions: radians, metres, lines, samples."""
 
     longitude: Float[np.ndarray, " n"]
     latitude: Float[np.ndarray, " n"]
@@ -70,7 +71,8 @@ class RpcTable(NamedTuple):
 
 
 class RpcCheck(NamedTuple):
-    """Computed less given lines and samples of a table, their RMS and largest amount, in pixels."""
+    """Computed minus given lines and samples of a table, their RMS and largest amount, in
+    pixels."""
 
     residuals: Float[np.ndarray, "n 2"]
     rms: Float[np.ndarray, "2"]
@@ -104,12 +106,12 @@ def fit_rpc(
     sigma: float | None = None,
     source: Source = TABLE,
 ) -> RpcFit:
-    """The coefficients that follow a table best.
+    """The coefficients that fit a table best.
 
-    **Arguments:** `ridge` τ in units of the normalised equations, chosen if None; `sigma` of the
+    **Arguments:** `ridge` τ in units of the normalised equations, automatic if None; `sigma` of the
     table's lines and samples in pixels, a posteriori if None; `source` names rows in messages.
 
-    **Raises:** `InputError` for fewer than 40 points, what is not a number, points of one height.
+    **Raises:** `InputError` for fewer than 40 points, invalid numbers, points at one height.
     """
     require_x64()
     table = RpcTable(*(np.asarray(column, float) for column in table))
@@ -138,7 +140,7 @@ def fit_image(
     size: tuple[int, int, int] = (15, 15, 7),
     ridge: float | None = None,
 ) -> tuple[RpcFit, RpcCheck]:
-    """The coefficients of an image between two heights, and a check at other places and heights.
+    """The coefficients of an image between two heights, and a check at other positions and heights.
 
     **Arguments:** `size` of the grid: lines, pixels, heights; the check has twice as many lines and
     pixels, and heights half way between those of the grid.
@@ -171,14 +173,14 @@ def image_table(
             row = int(bad.argmax())
             raise InputError(
                 f"the ray of line {lines[row]:g}, pixel {pixels[row]:g} misses the height "
-                f"{height:g} m; look at attitude, mounting and heights"
+            f"{height:g} m; check attitude, mounting and heights"
             )
         layers.append(np.stack([*place, lines, pixels]))
     return RpcTable(*np.concatenate(layers, axis=1))
 
 
 def check_rpc(rpc: Rpc, table: RpcTable) -> RpcCheck:
-    """How well coefficients follow a table."""
+    """The residuals of coefficients with respect to a table."""
     line, sample, _ = project_points(rpc, table.longitude, table.latitude, table.height)
     v = np.stack([np.asarray(line) - table.line, np.asarray(sample) - table.sample], 1)
     return RpcCheck(v, np.sqrt(np.mean(v**2, 0)), np.abs(v).max(0), table)
@@ -281,7 +283,7 @@ def _shortened(c, step, T, y, ridge):
         step = step / 2
     if now == np.inf:
         raise InputError(
-            "the denominator vanishes within the table: no rational polynomials follow it; "
+            "the denominator vanishes within the table: no rational polynomials fit it; "
             "look for wrong rows, or give a larger ridge"
         )
     return 0 * step
@@ -293,7 +295,7 @@ def _ridged(U, s, Vt, D, y, tau):
 
 
 def _ridge(U, s, y, scale):
-    """The largest ridge of the ladder that predicts as well as any."""
+    """The largest candidate ridge that predicts as well as the best."""
     part = U.T @ y
     press = []
     for tau in s[0] * LADDER:

@@ -1,7 +1,7 @@
-"""A line of detectors: when a line is taken, and where a pixel looks.
+"""A detector line: exposure times of lines, and viewing directions of pixels.
 
-Line l and pixel u are counted from 0, whole numbers at the centres: pixel 0 of line 0 is the first
-pixel taken, its area from −½ to ½. A pixel looks along [ξ, η, −1] in the camera frame: ξ to the
+Line l and pixel u are counted from 0, integers at the centres: pixel 0 of line 0 is the first
+pixel, its area from −½ to ½. A pixel looks along [ξ, η, −1] in the camera frame: ξ to the
 right, η forward, both tangents of angles. Three kinds of optics:
 
 - `FocalLine`: detectors at (x, y) = (pitch·(u − middle), row) in the focal plane of a frame camera,
@@ -25,7 +25,8 @@ Pair = tuple[Scalar, Scalar]
 
 
 class LineTimes(eqx.Module):
-    """Line l is taken at first + period·l, or at times of a table, linear in between; seconds."""
+    """Line l is exposed at first + period·l, or at times of a table, interpolated linearly;
+    seconds."""
 
     first: Float[AnyArray, ""]
     period: Float[AnyArray, ""]
@@ -48,7 +49,7 @@ class LineTimes(eqx.Module):
 
 
 class Optics(eqx.Module):
-    """Where the pixels of the line look."""
+    """The viewing directions of the pixels of the line."""
 
     @abc.abstractmethod
     def slopes(self, u: Scalar) -> Pair:
@@ -105,7 +106,7 @@ def slopes_of(optics: Optics, pixels: Float[AnyArray, " n"]) -> Pair:
 
 
 def _at(values, place):
-    """Linear in between; the first and last step go on beyond the ends."""
+    """Linear interpolation; the first and last step continue beyond the ends."""
     i = jnp.clip(jnp.floor(place).astype(int), 0, len(values) - 2)
     part = place - i
     return (1 - part) * values[i] + part * values[i + 1]

@@ -22,7 +22,7 @@ from jaxbundle.network.columns import did_you_mean
 Times = Float[np.ndarray, " n"]
 
 LEAD = 60.0
-"""A random walk begins so many seconds before the start, where it is 0."""
+"""A random walk begins this many seconds before the start, with value 0."""
 
 KEYS = {
     "constant": ("value",),
@@ -39,8 +39,8 @@ def signal(
 ) -> Times:
     """The values of a signal at the times t.
 
-    **Arguments:** `description` a number, or `{"kind": …}` with the keys of the kind; what is left
-    out is 0 (a period or step 1 s). A walk draws from `rng`.
+    **Arguments:** `description` a number, or `{"kind": …}` with the keys of the kind; missing ones
+    are 0 (period or step 1 s). A walk draws from `rng`.
 
     **Raises:** `InputError` for unknown kinds and keys.
     """
@@ -68,7 +68,7 @@ def signal(
 
 
 def _walk(passed, sigma, step, rng):
-    # from a fixed time on, so that one seed gives one walk at whatever times it is asked for
+    # from a fixed time on, so that one seed gives one walk for any requested times
     nodes = np.arange(-LEAD, passed[-1] + 3 * step, step)
     steps = sigma * np.sqrt(step) * rng.normal(size=len(nodes))
     spline = CubicSpline(nodes, np.cumsum(steps))

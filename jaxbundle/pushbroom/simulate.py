@@ -1,9 +1,9 @@
-"""Simulation: a true trajectory, what instruments make of it, and the image that is taken.
+"""Simulation: a true trajectory, its records by instruments, and the image.
 
-The true angles are sums of signals (`signals`) on a circular orbit about the turning Earth, or on a
-straight line above a plane. Instruments sample position and attitude at their rates, and err
-(`noise`). The image processing knows those samples only: its trajectory is interpolated from them.
-What remains without any error is the interpolation.
+The true angles are sums of signals (`signals`) on a circular orbit about the rotating Earth, or on
+a straight line above a plane. Instruments sample position and attitude at their rates, with errors
+(`noise`). The image processing uses only these samples: its trajectory is interpolated from them.
+Without errors only the interpolation error remains.
 """
 
 import dataclasses
@@ -33,12 +33,12 @@ from jaxbundle.types import AnyArray
 MARGIN = 6
 """Rows of ancillary data before the first line and after the last."""
 TRUE_RATE = 20.0
-"""Rows a second of the true attitude, splined; at least five times the rate of the instrument."""
+"""Rows per second of the true attitude spline; at least five times the rate of the instrument."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Flight:
-    """What is simulated; angles in radians, lengths in metres, times in seconds.
+    """A simulated flight; angles in radians, lengths in metres, times in seconds.
 
     - `lines`, `pixels`, `period`, `optics`, `mounting`: the scanner.
     - `track`: `{"height", "inclination", "node", "argument"}` of a circular orbit, or
@@ -47,7 +47,7 @@ class Flight:
     - `angles`: signals of pitch, roll, yaw, in the orbital frame or the local one.
     - `position_rate`, `attitude_rate`: of the instruments, in Hz; `noise`: their errors.
     - `position_interpolation`, `attitude_interpolation`: of the samples.
-    - `seed`: of all that is drawn.
+    - `seed`: of all random numbers.
     """
 
     lines: int
@@ -72,7 +72,7 @@ def true_image(flight: Flight) -> PushbroomImage:
 
 
 def measured_image(flight: Flight) -> PushbroomImage:
-    """The image with the trajectory as its instruments tell it: sampled, with noise."""
+    """The image with the trajectory recorded by its instruments: sampled, with noise."""
     image = _image(
         flight,
         _position(flight, flight.position_rate, flight.position_interpolation),
@@ -89,7 +89,8 @@ def _measured(image, sigma, key):
 
 
 def with_errors_in_rows(image: PushbroomImage, errors) -> PushbroomImage:
-    """As `disturbed`, with bias and drift in the rows of the tables, as instruments write them."""
+    """Like `disturbed`, with bias and drift in the rows of the tables, as written by
+    instruments."""
     t0 = image.middle_time
 
     def rows(table, bias, drift, white):
@@ -115,7 +116,7 @@ def taken_image(
     lines: Float[np.ndarray, " lines"],
     resampling: Resampling = "bilinear",
 ) -> Float[np.ndarray, "bands lines pixels"]:
-    """Lines of the image of a scene; NaN where the scene does not reach.
+    """Lines of the image of a scene; NaN outside the scene.
 
     **Arguments:** `to_scene(X)` gives row and column in the scene of points X [3, lines, pixels].
     """

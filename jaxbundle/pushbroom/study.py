@@ -1,12 +1,12 @@
-"""Tables of the accuracy on the ground: attitude trajectories against attitude accuracies.
+"""Tables of ground accuracy: attitude trajectories by attitude accuracies.
 
 The columns are trajectories: of the angles of a flight only roll, only pitch, only yaw, or all
-three vary. The rows are standard deviations of the attitude, about all three axes alike, each in
-three ways beside one another: drawn (Monte Carlo), propagated through the exact Jacobian of the
-image with this trajectory, and in the closed form of a level camera above a plane (`accuracy`).
-The row without error is what the interpolation of the instruments' samples leaves, against the
-truth. Tables 4-1 to 4-3 of Hakim et al. (LAPAN-A3) have this form, without altitude, field of view
-and rate of the samples; here they are stated.
+three vary. The rows are standard deviations of the attitude, equal for all three axes, each
+computed in three ways: by Monte Carlo, by propagation through the exact Jacobian of the
+image with this trajectory, and in the closed form of a nadir-looking camera above a plane
+(`accuracy`). The row without error shows the interpolation error of the instruments' samples.
+Tables 4-1 to 4-3 of Hakim et al. (LAPAN-A3) have this form, without altitude, field of view and
+rate of the samples; here they are stated.
 """
 
 import dataclasses
@@ -37,11 +37,11 @@ TRAJECTORIES = {
 }  # fmt: skip
 FLOORS = ("linear", "spline")
 SIGMAS = (math.radians(0.01), math.radians(0.1))
-"""Accuracies of attitudes, radians, if none are given."""
+"""Default accuracies of attitudes, radians."""
 
 
 class ErrorFree(NamedTuple):
-    """RMS and CE90, metres, that an interpolation of samples without error leaves."""
+    """RMS and CE90, metres, of the interpolation of error-free samples."""
 
     trajectory: str
     interpolation: str
@@ -83,13 +83,12 @@ def accuracy_table(
     lines: int = 13,
     pixels: int = 6,
 ) -> AccuracyTable:
-    """The table of a flight, whose angles are taken one by one and together.
+    """The table of a flight, with its angles one by one and together.
 
     **Arguments:** `sigmas` in radians; `kind` of the error: `"bias"`, one for the whole image, or
-    `"white"`, another in every row of the attitude table, which interpolation averages and the
-    closed form does not know; `lines` × `pixels` places, the middles of equal parts of the image
-    (a prime number of lines: its places do not keep step with the samples of the attitude). The
-    surface is any but a terrain.
+    `"white"`, another in every row of the attitude table, which interpolation averages (the closed
+    form does not); `lines` × `pixels` positions, the centres of equal parts of the image (a prime
+    number of lines avoids synchrony with the attitude samples). The surface must not be a terrain.
     """
     middles = lambda n, size: (np.arange(n) + 0.5) * size / n - 0.5
     of_line, of_pixel = middles(lines, flight.lines), middles(pixels, flight.pixels)

@@ -1,7 +1,7 @@
-"""What a ray meets: a plane, an ellipsoid (or sphere), a constant height above it.
+"""Surfaces for intersection: a plane, an ellipsoid (or sphere), a constant height above it.
 
-A terrain model is a surface too (`terrain`). A surface tells the distance s, in lengths of d, of
-the first point o + s·d in front, NaN where there is none, and the height of a point near it.
+A terrain model is a surface too (`terrain`). A surface gives the distance s, in lengths of d, of
+the first point o + s·d in front, NaN if there is none, and the height of a point near it.
 """
 
 import abc
@@ -23,12 +23,12 @@ from jaxbundle.geometry.vectors import Scalar, Vector
 
 
 class Surface(eqx.Module):
-    """Where rays end."""
+    """A surface."""
 
     earth: eqx.AbstractVar[Ellipsoid | None]
     """The ellipsoid that heights refer to; None in a local frame, Z up."""
     iterative: ClassVar[bool] = False
-    """Whether the distance is found by steps, whose number differs from ray to ray."""
+    """Whether the distance is found iteratively, with a varying number of steps."""
 
     @abc.abstractmethod
     def distance(self, o: Vector, d: Vector) -> Scalar:
@@ -71,5 +71,5 @@ class Height(Surface):
 
 
 def _from_outside(ellipsoid, o, s):
-    """A ray from within would end on the other side of the Earth."""
+    """A ray from below the surface would end on the other side of the Earth."""
     return jnp.where(residual(ellipsoid, o) > 0, s, jnp.nan)

@@ -1,4 +1,4 @@
-"""A terrain model: the first hit of a ray with a bilinear surface over a grid, nothing missed.
+"""A terrain model: the first intersection of a ray with a bilinear surface over a grid.
 
 Between the highest and the lowest height of the model a ray is, in the coordinates of the grid
 (column x, row y, height h), a curve near a straight line. Through three exact points it is a
@@ -7,15 +7,15 @@ and Woo, 1987). In a cell
 
     f(τ) = h(τ) − [(1−v)·((1−u)·z₀₀ + u·z₀₁) + v·((1−u)·z₁₀ + u·z₁₁)]
 
-is a parabola too, and its first root, where there is one, is the first hit: neither the back of a
-ridge nor a peak between two samples is ever taken or passed. One Newton step on the exact
-coordinates puts the point on ray and surface, and carries the derivatives.
+is a parabola too, and its first root, if any, is the first intersection: neither the back of a
+ridge is hit nor a peak between two samples missed. One Newton step on the exact
+coordinates puts the point on ray and surface and provides the derivatives.
 
-Where the model has no height, beyond its edges too, a ray goes on: the sea, or what was cut away,
-is seldom higher than what is behind it. A ray that comes out of such a place below the terrain has
-met the ground in it, and has no point. One that comes out above is taken to its hit, which unknown
-terrain could hide all the same: `over_voids=False` lets no ray pass, and the difference tells which
-points stand on that.
+Where the model has no height, also beyond its edges, a ray continues: the sea, or a clipped area,
+is seldom higher than the terrain behind it. A ray that leaves such an area below the terrain has
+met the ground inside it and has no point. One that leaves above continues to its intersection,
+which unknown terrain could hide: `over_voids=False` stops these rays, and the difference shows the
+affected points.
 
 The grid is regular in longitude and latitude (`earth` an ellipsoid of revolution, heights above
 it), or in X and Y of a local frame (`earth` None).
@@ -46,8 +46,8 @@ more than the 6e-6·h by which an ellipsoid with longer axes leaves the surface 
 class Terrain(Surface):
     """Heights at (x, y) = (x₀ + column·dx, y₀ + row·dy): radians, or metres in a local frame.
 
-    NaN: no height there. A ray that would hit in such a cell, or beyond the grid, has no point;
-    with `over_voids` false neither has one that passes over such a cell before it hits.
+    NaN: no height. A ray that would hit in such a cell, or beyond the grid, has no point; with
+    `over_voids` false neither has a ray that passes over such a cell before.
     """
 
     iterative: ClassVar[bool] = True
@@ -80,7 +80,7 @@ class Terrain(Surface):
         return dx / self.step[0], (y - self.origin[1]) / self.step[1], h
 
     def _slab(self, o, d):
-        """Where the ray enters the slab of all heights, and where it leaves it."""
+        """Where the ray enters and leaves the slab of all heights."""
         if self.earth is None:
             top = (self.highest + MARGIN - o[2]) / d[2]
             bottom = (self.lowest - MARGIN - o[2]) / d[2]
@@ -108,13 +108,13 @@ def make_terrain(
     **Arguments:** `over_voids`: rays pass over cells without a height, and come from beyond the
     edges.
 
-    **Raises:** `InputError` for fewer than 2 × 2 heights, or none that is a number.
+    **Raises:** `InputError` for fewer than 2 × 2 heights, or without any valid height.
     """
     heights = np.asarray(heights, float)
     if heights.ndim != 2 or min(heights.shape) < 2:
         raise InputError(f"terrain: heights of shape {heights.shape}; a grid of 2 × 2 at least")
     if not np.isfinite(heights).any():
-        raise InputError("terrain: no height is a number; give a model that covers the image")
+        raise InputError("terrain: no valid height; give a model that covers the image")
     low, high = float(np.nanmin(heights)), float(np.nanmax(heights))
     heights = np.where(np.isfinite(heights), heights, np.nan)
     (x, y), (dx, dy) = origin, step
@@ -164,11 +164,11 @@ def _rate(path, tau, heights):
 
 
 def _first_hit(path, heights, over_voids):
-    """τ in [0, 1] of the first hit, cell by cell; NaN where there is none."""
+    """τ in [0, 1] of the first intersection, cell by cell; NaN if there is none."""
     rows, columns = heights.shape
     px, py, ph = path
     speed = jnp.abs(px[1]) + jnp.abs(py[1])
-    least = 1e-9 / jnp.maximum(speed, 1.0)  # a billionth of a cell: the traverse never stands still
+    least = 1e-9 / jnp.maximum(speed, 1.0)  # a billionth of a cell: the traversal always advances
 
     def border(p, tau):
         """Where the coordinate reaches the next line of the grid."""
@@ -187,7 +187,7 @@ def _first_hit(path, heights, over_voids):
             value(ph, t) - _in_cell(cell, value(px, t), value(py, t)) for t in (tau, middle, out)
         ]
         part = _first_root(*f)
-        # below the terrain where heights begin again: it was met where there are none
+        # below the terrain where heights begin again: it was met in the void
         under = void & (f[0] < 0)
         void = jnp.isnan(f[1])
         found = (part <= 1) & ~under

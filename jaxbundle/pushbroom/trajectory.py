@@ -1,21 +1,21 @@
 """Position and attitude against time.
 
 The camera frame is that of frame cameras: x to the right along the line of detectors, y forward,
-the camera looks along −z. R = Mᵀ turns it into the object frame, of the quaternion (w, x, y, z) or
-of the angles (pitch θ₂, roll θ₁, yaw θ₃) in radians,
+the camera looks along −z. R = Mᵀ rotates it to the object frame, from the quaternion (w, x, y, z)
+or the angles (pitch θ₂, roll θ₁, yaw θ₃) in radians,
 
     R = Rx(θ₂)·Ry(θ₁)·Rz(θ₃) = (R3(θ₃)·R2(θ₁)·R1(θ₂))ᵀ,
 
 so that pitch, roll, yaw are the ω, φ, κ of a photograph: nose up, right side down, nose left are
-positive. The object frame is Earth-fixed (or local), or the orbital frame, itself turned into the
+positive. The object frame is Earth-fixed (or local), or the orbital frame, which is rotated to the
 former by the columns
 
     x = y × z,   y = z × (V × z)/|…|,   z = P/|P|          right, forward, up
 
 of the position P and its rate V.
 
-Quaternions are interpolated by `slerp`, qᵢ∘exp(τ·log(qᵢ*∘qᵢ₊₁)), which turns about a fixed axis at
-a constant rate (Shoemake, 1985), or as four numbers by a method of `interpolation`, normalised.
+Quaternions are interpolated by `slerp`, qᵢ∘exp(τ·log(qᵢ*∘qᵢ₊₁)), a rotation about a fixed axis at a
+constant rate (Shoemake, 1985), or as four numbers by a method of `interpolation`, normalised.
 """
 
 from typing import Literal
@@ -60,7 +60,7 @@ def position_at(trajectory: Trajectory, t: Scalar) -> Float[Array, "3"]:
 
 
 def velocity_at(trajectory: Trajectory, t: Scalar) -> Float[Array, "3"]:
-    """The rate V of the interpolated position in the (turning) object frame, metres a second."""
+    """The rate V of the interpolated position in the (rotating) object frame, metres per second."""
     return rate(trajectory.position, t)
 
 

@@ -1,4 +1,4 @@
-"""What a refinement makes of points and photographs: tables and networks at the solution."""
+"""Points and photographs of a refinement at the solution: tables and networks."""
 
 import dataclasses
 
@@ -28,9 +28,9 @@ def point_rows(result) -> list[dict]:
 def adjusted_photographs(result) -> Network | None:
     """The network of the photographs of a `Refinement` at its solution; None without any.
 
-    Cameras, orientations and points have their adjusted values, measurements that snooping has
-    removed are gone. What was controlled is a tie point, and priors are dropped: adjusted again
-    they would say twice what they said. Orientations that were held stay so.
+    Cameras, orientations and points have their adjusted values, without measurements removed by
+    snooping. Control points become tie points, and priors are dropped, since they would count twice
+    in a new adjustment. Held orientations stay held.
     """
     network = result.frames
     if network is None:

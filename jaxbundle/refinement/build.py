@@ -1,4 +1,4 @@
-"""What takes part in a refinement, and where it starts; what cannot be used is said before."""
+"""The observations and start values of a refinement; unusable input is reported before."""
 
 import equinox as eqx
 import jax
@@ -25,13 +25,13 @@ from jaxbundle.refinement.tables import (
 )
 
 KNOTS = 10
-"""Knots of jitter with a prior, for each measured point: what is between points only costs."""
+"""Largest number of jitter knots with a prior per measured point: more only cost time."""
 
 
 def choose_rays(
     points: GroundPoints, observations: Observations, frames: Network | None
 ) -> tuple[Rays, Rays, list[str]]:
-    """The rays of the adjustment and those of check points; warnings about what is left out."""
+    """The rays of the adjustment and those of check points; warnings about exclusions."""
     at = {id: k for k, id in enumerate(points.id)}
     row = np.array([] if frames is None else [at[id] for id in frames.points.id], int)
     frame_point = row[frames.observations.point] if frames is not None else row
@@ -53,7 +53,7 @@ def choose_rays(
         )
     if frames is not None and (lost := ~used[row[frames.distances.points]].all(1)).any():
         warnings.append(
-            f"left out {count(lost.sum(), 'distance')} to a point that takes no part"
+            f"left out {count(lost.sum(), 'distance')} to an excluded point"
         )
 
     def rays(mask):
@@ -64,7 +64,7 @@ def choose_rays(
 
 
 def start_points(given: Given, rays: Rays) -> Float[np.ndarray, "points 3"]:
-    """Coordinates as given, or where the rays of a tie point meet."""
+    """Given coordinates, or the intersection of the rays of a tie point."""
     points, chosen = given.points, rays.points
     X = points.X[chosen].copy()
     wanted = np.any(np.isnan(X), axis=1)
@@ -93,7 +93,7 @@ def start_points(given: Given, rays: Rays) -> Float[np.ndarray, "points 3"]:
 
 
 def _sights(given: Given, rays: Rays):
-    """Where the rays start, their directions, their points; image by image."""
+    """Origins, directions and points of the rays; image by image."""
     observations, frames = given.observations, given.frames
     for i, one in enumerate(given.images):
         rows = rays.scanner[observations.image[rays.scanner] == i]
@@ -129,7 +129,7 @@ def check_input(
     observations: Observations,
     frames: Network | None,
 ) -> None:
-    """All that can be refused before anything is computed."""
+    """Checks before any computation."""
     if not images:
         raise InputError("refine: no scanner image; photographs alone are adjusted by `adjust`")
     if len({one.id for one in images}) < len(images):
@@ -153,7 +153,7 @@ def check_input(
 
 
 def _check_knots(one: ScannerImage, measured: int) -> None:
-    """Refuse a jitter with more knots than its points could tell of."""
+    """Refuse a jitter with more knots than its points can determine."""
     free = np.isinf(one.freedom.jitter).any()
     if not any(one.freedom.jitter):
         return

@@ -1,4 +1,4 @@
-"""Check points: what took no part, against the refined images.
+"""Check points: excluded points compared with the refined images.
 
 At the given coordinates, a check point is projected: its residuals in lines and pixels, with
 
@@ -26,8 +26,8 @@ from jaxbundle.refinement.inspection import Inspection, Shared
 @shows_itself
 @dataclasses.dataclass(frozen=True)
 class CheckPoints:
-    """Differences computed − given along the axes of the points, metres, NaN where the height is
-    the given one; their σ; the number of rays. `residual` of every ray, not divided by σ, with
+    """Differences computed − given along the axes of the points, metres, NaN if the height is the
+    given one; their σ; the number of rays. `residual` of every ray, not divided by σ, with
     `residual_sigma`, in the order of the rays of the images.
     """
 

@@ -1,7 +1,7 @@
 """A refinement as tables of unknowns and sets of observations for the engine.
 
-Corrections of scanner images are a table, those of what belongs to their sensors another; the
-photographs with their cameras, priors and distances are declared as in a network.
+Corrections of scanner images are one table, those of their sensors another; the photographs with
+their cameras, priors and distances are declared as in a network.
 """
 
 import dataclasses
@@ -26,7 +26,7 @@ from jaxbundle.types import Index, present
 ARCSEC = math.degrees(1) * 3600
 IMAGE, SENSOR = "scanner image", "sensor"
 FAR = 2.0
-"""A point farther from its measurement than this many images is in another place."""
+"""A point farther from its measurement than this many images is an error."""
 
 
 class Rays(NamedTuple):
@@ -39,9 +39,9 @@ class Rays(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Given:
-    """What is refined: scanner images with the forms of their unknowns and the row of each one's
-    sensor; points, measurements, photographs, and the row of each point of theirs; the `origin`
-    [3] of all coordinates of the engine."""
+    """The input of a refinement: scanner images with the forms of their unknowns and the rows of
+    their sensors; points, measurements, photographs, and the rows of their points; the `origin` [3]
+    of all coordinates of the engine."""
 
     images: list[ScannerImage]
     points: GroundPoints
@@ -78,7 +78,7 @@ def gather(images, points: GroundPoints, observations, frames: Network | None) -
     sensor = np.array([sensors.index(sensor_of(one)) for one in images])
     at = {id: k for k, id in enumerate(points.id)}
     of_frames = [] if frames is None else [at[id] for id in frames.points.id]
-    # Corrections are of Earth-fixed places.
+    # Corrections need Earth-fixed positions.
     absolute = any(one.image.corrections.any for one in images)
     known = points.X[np.isfinite(points.X).all(1)]
     origin = np.zeros(3) if absolute or not len(known) else np.round(known.mean(0))
@@ -142,7 +142,7 @@ class Declared:
         return np.bincount(points, minlength=len(self.rays.points))
 
     def rescaled(self, problem: Problem, values: Values) -> tuple[Problem, float]:
-        """The problem with the S of these values, and the largest relative change of one."""
+        """The problem with S at these values, and the largest relative change of S."""
         measured, X, change = list(problem.data.measured), np.asarray(values["point"].position), 0.0
         for part in self.parts:
             if part.of_scanner:
@@ -165,11 +165,11 @@ def _lines(given: Given, values: Values, X, rows, image, point):
 def declare(given: Given, rays: Rays, X, values: Values | None = None) -> Declared:
     """The tables and observations of a refinement.
 
-    **Arguments:** `X`: start values of the points of the rays; `values`: of all other tables, where
-    these are adjusted already and points are to be compared with them: then there is no control and
-    no distance, and what has one ray keeps its height.
+    **Arguments:** `X`: start values of the points of the rays; `values`: of all other tables, if
+    already adjusted and points are to be compared with them: then there is no control and
+    no distance, and points with one ray keep their height.
 
-    **Raises:** `InputError` for points far from where they are measured."""
+    **Raises:** `InputError` for points far from their measurement."""
     points, chosen, n = given.points, rays.points, len(rays.points)
     checking = values is not None
     index = np.full(len(points), -1)
@@ -292,7 +292,7 @@ def _network_of(given: Given, rays: Rays, index, X, checking: bool) -> Network:
 
 
 def _columns_of_photographs(network: Network, tables, of_cameras) -> list[Column]:
-    """Their unknowns: of every image, and of its camera where it is the first."""
+    """Their unknowns: of every image, and of its camera for the first image."""
     columns, called = [], {t.name: t for t in tables}
     for i, id in enumerate(network.images.id):
         for k in np.flatnonzero(called["image"].free[i]).tolist():
@@ -312,7 +312,7 @@ def _columns_of_photographs(network: Network, tables, of_cameras) -> list[Column
 
 
 def _check_near(given: Given, rows, v) -> None:
-    """Refuse points that lie far from where they are measured: swapped or in error."""
+    """Refuse points far from their measurement: swapped or wrong."""
     points, observations = given.points, given.observations
     size = np.array([(one.image.lines, one.image.pixels) for one in given.images])
     far = (~(np.abs(v) <= FAR * size[observations.image[rows]])).any(1)
@@ -326,6 +326,6 @@ def _check_near(given: Given, rows, v) -> None:
     )
     raise InputError(
         f"{observations.source(row)}: {points.role[p]} point {points.id[p]!r} of "
-        f"{points.source(p)} is off image {id!r}: its coordinates are {said}; look at "
+        f"{points.source(p)} is off image {id!r}: its coordinates are {said}; check "
         "their order, frame and units, and at the id"
     )

@@ -1,4 +1,4 @@
-"""Which unknowns a scanner image has, what they are called, and the image they lead to.
+"""The unknowns of a scanner image, their names, and the resulting image.
 
 | unknown | number | unit | about |
 |---|---|---|---|
@@ -65,7 +65,7 @@ class Freedom:
 
 
 class Change(NamedTuple):
-    """The unknowns of an image, zero where the trajectory and the optics are as given."""
+    """The unknowns of an image, zero for the given trajectory and optics."""
 
     attitude: Float[AnyArray, "3"]
     attitude_rate: Float[AnyArray, "3"]
@@ -79,7 +79,7 @@ class Change(NamedTuple):
 
 
 class Sizes(NamedTuple):
-    """How many numbers each unknown of a `Change` has."""
+    """The size of each unknown of a `Change`."""
 
     attitude: int
     attitude_rate: int
@@ -113,9 +113,8 @@ def changed_slopes(slopes, relative, added):
 
 
 class Name(NamedTuple):
-    """One unknown for people: `owner`, e.g. "image A"; what it is; its unit in reports, and how
-    many of these are one of the adjustment's unit. `group` names the unknowns that weak directions
-    put together."""
+    """One unknown for reports: `owner`, e.g. "image A"; its name; its unit in reports, and the
+    factor from the adjustment's unit. `group`: name for grouping in weak directions."""
 
     owner: str
     parameter: str
@@ -128,8 +127,8 @@ class Name(NamedTuple):
 
 
 class Form(eqx.Module):
-    """What is fixed about the unknowns of an image: axes F, spline, and how many numbers each
-    unknown has in its vector, which may be more than it uses."""
+    """The constants of the unknowns of an image: axes F, spline, and the size of each unknown in
+    its vector, possibly padded."""
 
     axes: Float[AnyArray, "3 3"]
     spline: JitterSpline = eqx.field(static=True)
@@ -137,7 +136,7 @@ class Form(eqx.Module):
 
     @property
     def own(self) -> int:
-        """How many numbers are the image's own; those of its sensor follow."""
+        """The number of the image's own unknowns; those of its sensor follow."""
         return sum(self.sizes) - sum(getattr(self.sizes, name) for name in OF_SENSOR)
 
 
@@ -161,7 +160,7 @@ def _axes(image: PushbroomImage, local: bool) -> Float[Array, "3 3"]:
 
 
 def of_one_size(forms: list[Form]) -> list[Form]:
-    """The forms with room for the most numbers that any of them has, and for one of each."""
+    """The forms padded to the largest size of each unknown, at least one."""
     sizes = Sizes(*map(max, zip(LEAST, *(form.sizes for form in forms))))
     return [dataclasses.replace(form, sizes=sizes) for form in forms]
 
@@ -177,7 +176,7 @@ def change_of(sizes: Sizes, p: Float[AnyArray, " n"]) -> Change:
 def changed(
     image: PushbroomImage, form: Form, change: Change, t: Scalar
 ) -> PushbroomImage:
-    """The image as it is at the time t with its unknowns changed."""
+    """The image at the time t with its unknowns changed."""
     jitter = form.spline.at(change.jitter, t)
     return dataclasses.replace(
         image, offsets=changed_offsets(image.offsets, form.axes, change, jitter),
@@ -206,7 +205,7 @@ def changed_optics(image: PushbroomImage, change: Change) -> ChangedOptics:
 
 
 def middle_and_half(image: PushbroomImage) -> tuple[float, float]:
-    """Of the line of detectors, in pixels."""
+    """Of the detector line, in pixels."""
     return (image.pixels - 1) / 2, image.pixels / 2
 
 

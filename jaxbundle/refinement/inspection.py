@@ -21,11 +21,11 @@ from jaxbundle.statistics.blunders import Removed
 from jaxbundle.types import AnyArray
 
 ROUNDS, SAME = 10, 1e-9
-"""Solutions, each with the S of the one before, at most; an S that changes by less is the same."""
+"""Largest number of solutions, each with the S of the previous one; tolerance of S."""
 
 
 class Shared(eqx.Module):
-    """The changes of the unknowns that points share, as a function of the tables. `at`: by table,
+    """The changes of the shared unknowns, as a function of the tables. `at`: by table,
     their numbers, rows and directions; `start`: of these tables."""
 
     at: dict[str, tuple[np.ndarray, ...]]
@@ -111,7 +111,7 @@ class Inspection:
 
     @functools.cached_property
     def residuals(self) -> dict[int, Float[np.ndarray, "n r"]]:
-        """v of every set of observations in its unit, of those that were removed, too."""
+        """v of every set of observations in its unit, including removed ones."""
         problem, weight = self.solution.problem, self.declared.problem.data.weight
         data = type(problem.data)(problem.data.start, problem.data.measured, weight)
         found = Solution(with_data(problem, data), self.solution.values).residuals
@@ -124,16 +124,16 @@ class Inspection:
         return [np.asarray(w) > 0 for w in self.solution.problem.data.weight]
 
     def rows(self, o: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """v, r, w of a set of observations, NaN where there is none, and what is removed."""
+        """v, r, w of a set of observations, NaN if missing, and the removed ones."""
         used, found = self.used[o], self.solution.reliability
         tell = lambda x: np.where(used, x[o], np.nan)
         return self.residuals[o], tell(found.redundancy), tell(found.w), ~np.any(used, axis=1)
 
 
 def adjust(declared: Declared, snooping: str, significance: float) -> Inspection:
-    """Solve, remove blunders if asked for, and look at the solution.
+    """Solve, optionally remove blunders, and inspect the solution.
 
-    **Raises:** `NotSolvedError` that says what is not determined."""
+    **Raises:** `NotSolvedError` with the undetermined unknowns."""
     steps = 0
 
     def again(problem: Problem, values: Values) -> Solution:
@@ -169,13 +169,13 @@ def _require_solved(declared, found: Solution, minimum, steps: int) -> None:
             reasons,
         )
     raise NotSolvedError(
-        f"the adjustment did not settle in {steps} steps; look at start values and blunders"
+        f"the adjustment did not converge in {steps} steps; check start values and blunders"
     )
 
 
 def _named(declared: Declared, one) -> Removed:
-    """What snooping has removed, in words; rows of image points as `Refinement.image_points`,
-    others as in their sets (of control three for a point)."""
+    """Observations removed by snooping, in words; rows of image points as in
+    `Refinement.image_points`, others as in their sets (three per control point)."""
     given, chosen = declared.given, declared.rays.points
     part = next((p for p in declared.parts if p.set == one.set), None)
     points, set = given.points, declared.problem.observations[one.set]

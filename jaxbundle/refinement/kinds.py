@@ -1,4 +1,5 @@
-"""The kinds of observations of a refinement, beside those of photographs (`network/kinds.py`).
+"""The kinds of observations of a refinement, in addition to those of photographs
+(`network/kinds.py`).
 
 | kind | residuals | touches |
 |---|---|---|
@@ -7,19 +8,19 @@
 | priors of corrections | every correction | scanner image, or sensor |
 
 **Scanner.** The pose at the time t(l) of the measured line is known, so the condition is explicit
-(`jaxbundle.pushbroom.project.misclosure`): the slopes at which the point is seen, less those at
-which the measured pixel looks,
+(`jaxbundle.pushbroom.project.misclosure`): the slopes of the ray to the point, minus those of the
+measured pixel,
 
     g = [−r/q − ξ(u), −s/q − η(u)],        [r, s, q] = Rᵀ(t)·(X̃ − P(t)),
 
-with X̃ the point where corrections let X appear. In lines and pixels,
+with X̃ the apparent position of X with corrections. In lines and pixels,
 
     v = S·g,        S = −(∂g/∂(l, u))⁻¹,
 
-the first of Newton's steps from the measured place to where the point is projected: computed −
-observed but for terms of v². S is taken at the start values and again at the solution, and held
-while the equations are solved. All that they need of trajectory and optics belongs to the measured
-line and pixel: it is computed once and goes with the measurement (`Line`).
+the first Newton step from the measured position to the projected point: computed − observed up to
+terms of v². S is evaluated at the start values and again at the solution, and held while the
+equations are solved. The required trajectory and optics refer to the measured line and pixel: they
+are computed once and stored with the measurement (`Line`).
 
 **Points.** X = X₀ + Aᵀ·δ with the axes A of the point (rows: east, north, up; or X, Y, Z), along
 each of which it may be held, controlled with σ, or free.
@@ -53,7 +54,7 @@ from jaxbundle.types import AnyArray, Scalar
 
 
 class Placed(NamedTuple):
-    """Points, and the axes (rows) along which each of them moves."""
+    """Points, and the axes (rows) of their changes."""
 
     position: Float[AnyArray, "*rows 3"]
     axes: Float[AnyArray, "*rows 3 3"]
@@ -88,7 +89,7 @@ class AlongAxes:
 
 @dataclasses.dataclass(frozen=True)
 class Row(Vector):
-    """Many numbers that add, seen as an array: one operation where scalars are as many."""
+    """Many numbers that add, as one array: one operation instead of many scalars."""
 
     def prepare(self, value):
         return value
@@ -116,7 +117,7 @@ class Line(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class ScannerPoint:
-    """v of a measured line and pixel; `sizes`: of the unknowns of an image and its sensor."""
+    """v for a measured line and pixel; `sizes`: of the unknowns of an image and its sensor."""
 
     corrections: Corrections
     earth: Ellipsoid | None
@@ -126,7 +127,7 @@ class ScannerPoint:
         return line.scale @ self.misclosure(own, sensor, X, line)
 
     def misclosure(self, own, sensor, X, line: Line) -> Float[Array, "2"]:
-        """g: the slopes of the point less those of the pixel."""
+        """g: the slopes of the point minus those of the pixel."""
         change = change_of(self.sizes, jnp.concatenate([own, sensor]))
         jitter = change.jitter @ line.jitter
         offsets = changed_offsets(line.offsets, line.axes, change, jitter)
@@ -197,5 +198,5 @@ def control(axes: tuple[str, str, str]) -> Kind:
 
 
 def priors(table: str) -> Kind:
-    """Corrections of a table that are known to be small."""
+    """Priors of a table of corrections."""
     return Kind(f"corrections of every {table}", _itself, (table,), snooped="")

@@ -1,6 +1,6 @@
-"""The refined image: its changes put into trajectory, mounting and optics.
+"""The refined image: changes applied to trajectory, mounting and optics.
 
-Positions get theirs at the rows of their table, which is exact for what is linear in time. The
+Positions are changed at the rows of their table, which is exact for changes linear in time. The
 attitude, R(t)·exp([a + ȧ·(t − t₀) + s(t)]×), becomes a table of quaternions for slerp: the rows of
 the old table and the knots of the spline, halved until slerp follows within `TOLERANCE`.
 """
@@ -32,13 +32,13 @@ MARGIN = 2
 FEWEST = 2048
 """Rows that are computed at a time, at least."""
 LONGEST = 200_000
-"""No table becomes longer."""
+"""Largest length of a table."""
 SAME = 1e-12
-"""Slopes nearer than this are the same optics."""
+"""Tolerance of slopes for equal optics."""
 
 
 def refined_image(image: PushbroomImage, form: Form, change: Change) -> PushbroomImage:
-    """An image without offsets that is as `image` is with its changes."""
+    """An image without offsets that equals `image` with its changes."""
     moved = changed(image, form, change._replace(jitter=0 * change.jitter), image.middle_time)
     return PushbroomImage(
         Trajectory(_position(moved), _attitude(image, form, change)), image.times,
@@ -130,14 +130,14 @@ def _quaternions(R):
 
 
 def _padded(function, rows):
-    """The function of rows brought to few shapes, so that little is compiled."""
+    """The function of rows padded to few shapes, to compile little."""
     n = len(rows)
     size = FEWEST << max(int(np.ceil(np.log2(n / FEWEST))), 0)
     return np.asarray(function(np.asarray(rows)[np.minimum(np.arange(size), n - 1)]))[:n]
 
 
 def _optics(image, change) -> Optics:
-    """Optics of the same kind where there are such, else a table of angles."""
+    """Optics of the same kind if possible, else a table of angles."""
     wanted = changed_optics(image, change)
     base, e = image.optics, change.focal_length
     if isinstance(base, FocalLine):

@@ -1,6 +1,6 @@
-"""Refinement of scanner images by control and tie points, with photographs in the same equations.
+"""Refinement of scanner images with control and tie points, jointly with photographs.
 
-`refine` puts tables in and a `Refinement` out: least squares with the unknowns of `freedom`, the
+`refine` turns tables into a `Refinement`: least squares with the unknowns of `freedom`, the
 equations of `kinds`, statistics, blunders, check points, warnings, and the refined images.
 """
 
@@ -39,22 +39,22 @@ class Refinement:
 
     @property
     def images(self) -> list[ScannerImage]:
-        """The scanner images as they were given."""
+        """The given scanner images."""
         return self.inspection.declared.given.images
 
     @property
     def frames(self) -> Network | None:
-        """The photographs as they were given."""
+        """The given photographs."""
         return self.inspection.declared.given.frames
 
     @property
     def points(self) -> GroundPoints:
-        """All points as they were given, those of the photographs with them."""
+        """All given points, including those of the photographs."""
         return self.inspection.declared.given.points
 
     @property
     def point_ids(self) -> list[str]:
-        """The points that took part."""
+        """The points used."""
         return [self.points.id[k] for k in self.inspection.declared.rays.points]
 
     @property
@@ -69,7 +69,7 @@ class Refinement:
 
     @property
     def removed(self) -> tuple[Removed, ...]:
-        """What data snooping has removed, in the order of removal."""
+        """Observations removed by data snooping, in the order of removal."""
         return self.inspection.removed
 
     @property
@@ -79,7 +79,7 @@ class Refinement:
 
     @property
     def redundancy(self) -> int:
-        """Observations and priors less unknowns."""
+        """Observations and priors minus unknowns."""
         return self.inspection.redundancy
 
     @property
@@ -99,7 +99,7 @@ class Refinement:
 
     @property
     def positions(self) -> Float[np.ndarray, "points 3"]:
-        """Adjusted coordinates of the points that took part."""
+        """Adjusted coordinates of the points used."""
         return self.inspection.positions
 
     def image(self, id: str) -> PushbroomImage:
@@ -113,7 +113,7 @@ class Refinement:
         return refined_image(self.images[k].image, form, change_of(form.sizes, p))
 
     def image_points(self) -> list[dict]:
-        """A row for every image point that took part, image by image: ids, v, r and w of both
+        """One row per image point used, image by image: ids, v, r and w of both
         coordinates, whether it was removed."""
         declared, points = self.inspection.declared, self.point_ids
         images = declared.given.ids
@@ -127,7 +127,7 @@ class Refinement:
         return [rows[k] for k in np.argsort(declared.image, kind="stable")]
 
     def distances(self) -> list[dict]:
-        """A row for every distance that took part: ids of both points, v, r, w, whether it was
+        """One row per distance used: ids of both points, v, r, w, whether it was
         removed."""
         found, rows = self.inspection, []
         for o, given in enumerate(found.declared.problem.observations):
@@ -156,11 +156,11 @@ def refine(
     - `observations` of the scanner images: `xy` are line and pixel, `sigma` theirs.
     - `frames`: a network in the same object frame; its points are joined by their ids to `points`,
       its exterior orientations have priors, are held (σ 0) or free (NaN).
-    - `snooping`: `"none"`, `"baarda"` (σ a priori, every observation by itself) or `"pope"` (σ a
+    - `snooping`: `"none"`, `"baarda"` (σ a priori, every observation separately) or `"pope"` (σ a
       posteriori, the largest of all), with the `significance` α, two-sided.
 
-    **Raises:** `InputError` for what cannot be used, with its row; `NotSolvedError` where the
-    unknowns are not determined, with their names.
+    **Raises:** `InputError` for unusable input, with its row; `NotSolvedError` if unknowns are not
+    determined, with their names.
     """
     require_x64()
     if snooping not in TESTS:
@@ -173,13 +173,13 @@ def refine(
     given = gather(images, points, observations, frames)
     found = adjust(declare(given, rays, start_points(given, rays)), snooping, significance)
     for weak in weaknesses(found.declared, found.solution):
-        warnings.append(f"{weak.sentence}; what keeps them apart are priors, if any")
+        warnings.append(f"{weak.sentence}; only priors, if any, separate them")
     check = intersect(found, check_rays) if len(check_rays.points) else None
     return Refinement(found, check, tuple(warnings))
 
 
 def _checks_upright(points: GroundPoints, earth: Ellipsoid | None) -> GroundPoints:
-    """The axes of check points made east, north, up, for what is at a given height."""
+    """The axes of check points as east, north, up, for points at a given height."""
     if earth is None or earth.a != earth.b:
         return points
     axes = points.axes.copy()

@@ -8,7 +8,7 @@ from jaxbundle.refinement.refining import Refinement
 STRONG = 0.9
 """Correlations above this are listed."""
 MOST = 12
-"""No more correlations, nor worst image points, are listed."""
+"""Largest number of listed correlations and worst image points."""
 
 
 def to_json(result: Refinement) -> dict:
@@ -59,7 +59,7 @@ def _points(result):
 
 
 def report(result: Refinement) -> str:
-    """The report: what was adjusted, warnings, unknowns, correlations, blunders, checks."""
+    """The report: input, warnings, unknowns, correlations, blunders, checks."""
     found = result.inspection
     rows = result.image_points()
     used = [row for row in rows if not row["removed"]]

@@ -1,12 +1,12 @@
-"""Jitter: a uniform cubic B-spline of the attitude, without constant and linear part.
+"""Jitter: a uniform cubic B-spline of the attitude without constant and linear part.
 
     s(t) = Σ c_k·b((t − t_first)/h − (k − 1)),      b(x) = ⅔ − x² + |x|³/2          |x| < 1
                                                     b(x) = (2 − |x|)³/6         1 ≤ |x| < 2
 
-(de Boor, 1978, chapter IX). The coefficients 1, 1, 1, … make a constant and 0, 1, 2, … a straight
-line, which are the unknowns bias and drift already. So c = Z·z, the columns of Z an orthonormal
-basis of all that is orthogonal to both: two unknowns less an axis, and none twice. An independent
-σ of every c is the same σ of every z.
+(de Boor, 1978, chapter IX). The coefficients 1, 1, 1, … give a constant and 0, 1, 2, … a straight
+line, which are already the unknowns bias and drift. So c = Z·z, the columns of Z an orthonormal
+basis of the orthogonal complement: two unknowns fewer per axis, without duplicates. Independent c
+of equal σ give independent z with the same σ.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from jaxbundle.types import AnyArray, Scalar
 
 FEWEST = 3
-"""Intervals between knots: with fewer, nothing is left beside constant and line."""
+"""Minimum number of intervals between knots: with fewer only constant and line remain."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +56,7 @@ class JitterSpline:
         return jnp.asarray(z)[:, : self.unknowns] @ self.weights(t)
 
     def weights(self, t: Scalar) -> Float[Array, " unknowns"]:
-        """How much of every z is in s(t)."""
+        """The coefficient of every z in s(t)."""
         if not self.intervals:
             return jnp.zeros(0)
         x = jnp.abs((t - self.centres) / self.spacing)

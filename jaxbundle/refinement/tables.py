@@ -1,4 +1,4 @@
-"""What a refinement is given: scanner images, points of the ground, measurements."""
+"""The input of a refinement: scanner images, ground points, measurements."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ ROLES = ("control", "tie", "check")
 
 @dataclasses.dataclass(frozen=True)
 class ScannerImage:
-    """A scanner image and what is unknown about it.
+    """A scanner image and its unknowns.
 
     Images of one `sensor` share focal length, mounting and look angles, and the σ of these are
     those of the first. `earth` is None in a local frame.
@@ -33,10 +33,10 @@ class ScannerImage:
 
 @dataclasses.dataclass(frozen=True)
 class GroundPoints:
-    """Points in the frame of the images, metres; NaN where coordinates are not known.
+    """Points in the frame of the images, metres; NaN for unknown coordinates.
 
     `sigma` of the coordinates along the `axes` (rows; named by `axis_names`): 0 or NaN held, inf
-    not controlled. It means something for control points only.
+    not controlled. It applies only to control points.
     """
 
     id: tuple[str, ...]
@@ -62,7 +62,7 @@ def local_points(
 
 
 def with_frames(points: GroundPoints, frames: Network | None) -> GroundPoints:
-    """The points with those of a frame network added; what is in both keeps what is given here."""
+    """The points with those of a frame network added; duplicates keep the values given here."""
     if frames is None:
         return points
     theirs, known = frames.points, {id: k for k, id in enumerate(points.id)}
@@ -83,7 +83,7 @@ def with_frames(points: GroundPoints, frames: Network | None) -> GroundPoints:
 
 
 def check_points_table(points: GroundPoints) -> None:
-    """Refuse roles that are none, ids twice, control points without coordinates, negative σ."""
+    """Refuse unknown roles, duplicate ids, control points without coordinates, negative σ."""
     seen = {}
     for row, (id, role) in enumerate(zip(points.id, points.role)):
         if role not in ROLES:
@@ -92,7 +92,7 @@ def check_points_table(points: GroundPoints) -> None:
             )
         if id in seen:
             raise InputError(
-                f"{points.source(row)}: point {id!r} is there twice, also at "
+                f"{points.source(row)}: point {id!r} occurs twice, also at "
                 f"{points.source(seen[id])}; leave it once"
             )
         seen[id] = row
@@ -105,7 +105,7 @@ def check_points_table(points: GroundPoints) -> None:
 def check_observations(
     images: list[ScannerImage], points: GroundPoints, observations: Observations
 ) -> None:
-    """Refuse measurements off the image or at times outside the tables, twice, or without σ."""
+    """Refuse measurements outside the image or the tables, duplicates, and invalid σ."""
     seen = {}
     for row, (i, p) in enumerate(zip(observations.image, observations.point)):
         one = images[i]

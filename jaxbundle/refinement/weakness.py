@@ -1,9 +1,9 @@
-"""What the points cannot determine, in words.
+"""Unknowns that the points do not determine, in words.
 
-The normal matrix of all observations but the priors of the shared unknowns, reduced to these and
+The normal matrix of all observations except the priors of the shared unknowns, reduced to these and
 scaled by its diagonal before the elimination of points, has the eigenvalue 1/k for a direction
-in which k times more is unknown than if every unknown were alone. Eigenvectors of small eigenvalues
-are named by the unknowns that have part in them: pitch bias against position along track.
+whose variance is k times that of single unknowns. Eigenvectors of small eigenvalues
+are described by their dominant unknowns: pitch bias against position along track.
 """
 
 import dataclasses
@@ -17,17 +17,17 @@ from jaxbundle.leastsquares.solution import Solution
 from jaxbundle.refinement.declare import Declared
 
 WEAK = 1e-2
-"""Eigenvalues below this: a σ more than ten times greater than of the unknown alone."""
+"""Smaller eigenvalues mean a σ more than ten times that of the unknown alone."""
 NULL = 1e-10
 """Eigenvalues below this are rounding."""
 PART = 0.15
-"""An unknown with this part of the largest belongs to the direction."""
+"""An unknown with at least this fraction of the largest component belongs to the direction."""
 MOST = 4
-"""No more unknowns are named in one direction."""
+"""Largest number of unknowns listed in one direction."""
 
 
 class Weakness(NamedTuple):
-    """A direction: its eigenvalue, unknowns named with their parts, the sentence for people."""
+    """A direction: its eigenvalue, unknowns with their components, a sentence for the report."""
 
     eigenvalue: float
     unknowns: tuple[str, ...]
@@ -35,7 +35,7 @@ class Weakness(NamedTuple):
 
 
 def weaknesses(declared: Declared, found: Solution) -> list[Weakness]:
-    """All weak directions, the weakest first; jitter is one for its axis."""
+    """All weak directions, the weakest first; jitter is one per axis."""
     S, names = _observed(declared, found)
     if not np.isfinite(S).all():
         vague = undetermined(found.problem, found.values)
@@ -57,8 +57,8 @@ def weaknesses(declared: Declared, found: Solution) -> list[Weakness]:
         none = (name, True) in jitter
         value = 0.0 if none else float(values[0])
         sentence = (
-            f"the points leave parts of the {name} undetermined; knots farther apart or more "
-            "points would, its prior holds it meanwhile"
+            f"the points leave parts of the {name} undetermined, so that only its prior holds it; "
+            "use wider knot spacing or more points"
         )
         weak.append(Weakness(value, (name,), sentence))
     return weak

@@ -94,7 +94,7 @@ def test_a_weak_camera_is_judged_by_its_residuals_too(clean):
         found = jaxbundle.calibrate_batch(BOARD, xy, SIZE, visible=visible)
         assert list(found.status) == ["converged", status, "converged"]
         assert found.undetermined[1].any() and list(found.remark[::2]) == ["", ""]
-        said = f"RMS {found.rms[1]:.2g} px beside {found.rms[::2].min():.2g} px of the others"
+        said = f"RMS {found.rms[1]:.2g} px against {found.rms[::2].min():.2g} px of the others"
         assert said in found.remark[1] and said in str(found)
 
 
