@@ -13,7 +13,7 @@ behind it is projected all the same, through the projection centre: the caller l
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 
@@ -36,6 +36,16 @@ PRINCIPAL_POINTS = ("x0", "y0"), ("cx", "cy")
 """The names that are known without saying."""
 TAKEN = ("id", "model", "image_size", "pixel_size", "free", "sigma")
 """What a camera has beside its parameters; none of these can be the name of one."""
+
+
+class LocalFormula(NamedTuple):
+    """A `distort` that depends on few of many parameters: how many; `columns`, `(p, xi, yi) ->`
+    which, as whole numbers; `distort`, `(p, columns, values, xi, yi) -> (x, y)`, with these values
+    in their places."""
+
+    number: int
+    columns: Callable
+    distort: Callable
 
 
 @dataclasses.dataclass(frozen=True, repr=False, kw_only=True)
@@ -76,6 +86,8 @@ class CameraModel:
     - `principal_distance`: one parameter, or two, along and across, that must be given and
       positive; c, fx and fy, or f if not named. `principal_point`: two parameters, the measured
       image of the axis; x0 and y0, or cx and cy if not named, and none where it has none of these.
+    - `local`: beside `distort`, of a model of so many parameters that each image point depends on
+      few of them.
 
     **Fields made of them:** `own_formula`, which of `to_ideal` and `from_ideal` the formula is;
     `ideal`, `(p, r, s, q) -> (xi, yi)`; `ray`, `(p, xi, yi) -> (r, s, q)`, of length 1; `to_ideal`,
@@ -104,6 +116,7 @@ class CameraModel:
     prior: Mapping[str, float] | tuple = ()
     principal_distance: tuple[str, ...] = ()
     principal_point: tuple[str, ...] = ()
+    local: LocalFormula | None = None
     own_formula: Literal["to_ideal", "from_ideal"] = dataclasses.field(init=False, compare=False)
     ideal: OfRay = dataclasses.field(init=False, compare=False)
     ray: ToRay = dataclasses.field(init=False, compare=False)

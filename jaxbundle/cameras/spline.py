@@ -31,7 +31,7 @@ import numpy as np
 from jaxbundle.cameras import opencv
 from jaxbundle.cameras.cubic_splines import basis
 from jaxbundle.cameras.inverse import limited
-from jaxbundle.cameras.model import CameraModel
+from jaxbundle.cameras.model import CameraModel, LocalFormula
 from jaxbundle.cameras.scalars import Pair, Parameters, Scalar
 
 CORE = ("fx", "fy", "cx", "cy")
@@ -63,15 +63,37 @@ def spline(columns: int, rows: int, degrees: float) -> CameraModel:
         return (s >= 1) & (s <= columns - 2) & (t >= 1) & (t <= rows - 2)
 
     def grid_of_splines(p: Parameters, xi: Scalar, yi: Scalar) -> Pair:
-        fx, fy, cx, cy, *knots = p
-        s, t = in_knots(p, xi, yi)
-        along, across = basis(s, 0, columns), basis(t, 0, rows)
-        grid = jnp.stack(jnp.broadcast_arrays(*knots), -1)
+        grid = jnp.stack(jnp.broadcast_arrays(*p[4:]), -1)
         grid = grid.reshape(*grid.shape[:-1], rows, columns, 2)
+        return bent(p, grid, in_knots(p, xi, yi), xi, yi)
+
+    def bent(p: Parameters, grid, at: Pair, xi: Scalar, yi: Scalar) -> Pair:
+        """By a grid of knots [..., rows, columns, 2] of which the first is at (0, 0)."""
+        along, across = basis(at[0], 0, grid.shape[-2]), basis(at[1], 0, grid.shape[-3])
         da, db = jnp.moveaxis(
             jnp.einsum("...i,...ijk,...j->...k", across, grid, along), -1, 0
         )
-        return cx + xi + fx * da, cy + yi + fy * db
+        return p[2] + xi + p[0] * da, p[3] + yi + p[1] * db
+
+    def corner(p: Parameters, xi: Scalar, yi: Scalar):
+        """The first column and row of the 4 × 4 knots that are seen."""
+        s, t = in_knots(p, xi, yi)
+        first = lambda x, n: jnp.clip(jnp.floor(x), 1, n - 3).astype(int) - 1
+        return first(s, columns), first(t, rows)
+
+    def seen(p: Parameters, xi: Scalar, yi: Scalar):
+        j, i = corner(p, xi, yi)
+        return tuple(
+            len(CORE) + 2 * ((i + row) * columns + j + column) + k
+            for row in range(4) for column in range(4) for k in range(2)
+        )  # fmt: skip
+
+    def by_seen(p: Parameters, which, knots, xi: Scalar, yi: Scalar) -> Pair:
+        first = (which[0] - len(CORE)) // 2
+        s, t = in_knots(p, xi, yi)
+        grid = jnp.stack(knots, -1)
+        grid = grid.reshape(*grid.shape[:-1], 4, 4, 2)
+        return bent(p, grid, (s - first % columns, t - first // columns), xi, yi)
 
     distort, inverse = limited(grid_of_splines, inside, opencv.reduce, 12)
     knots = tuple(f"d{k}_{i}_{j}" for i in range(rows) for j in range(columns) for k in "xy")
@@ -79,4 +101,5 @@ def spline(columns: int, rows: int, degrees: float) -> CameraModel:
         f"spline-{columns}x{rows}-{degrees:g}", (*CORE, *knots), distort=distort,
         inverse=inverse, unit="px", image="stereographic", free=knots,
         never_free=CORE, prior=dict.fromkeys(knots, PRIOR),
+        local=LocalFormula(32, seen, by_seen),
     )  # fmt: skip

@@ -106,6 +106,22 @@ class Table:
 
 
 @dataclasses.dataclass(frozen=True)
+class Local:
+    """Few of many columns that an observation depends on (`leastsquares.local`).
+
+    `slot`: of the kind's `of`, a table of vectors; `number` of columns; `columns`:
+    `(blocks…, measured) -> tuple of whole numbers`, which elements of the vector they are;
+    `residual`: `(blocks…, columns, values, measured) -> residuals`, the kind's own with `values` in
+    these columns. Scalars throughout.
+    """
+
+    slot: int
+    number: int
+    columns: Callable
+    residual: Callable
+
+
+@dataclasses.dataclass(frozen=True)
 class Kind:
     """A kind of observation: one pure function of ONE observation.
 
@@ -122,6 +138,7 @@ class Kind:
       `"single"` each residual separately, `""` never, like priors.
     - `invariant`: unchanged by motions of the whole problem (see `Motions`), like image
       points: such kinds do not affect the datum defect.
+    - `local`: of a kind with `scalars` whose observations depend on few columns of a wide table.
     """
 
     name: str
@@ -131,6 +148,7 @@ class Kind:
     scalars: bool = False
     snooped: str = "whole"
     invariant: bool = False
+    local: Local | None = None
 
     def __call__(
         self, rows: Sequence[Int[np.ndarray, " n"]], measured: PyTree = (), *,

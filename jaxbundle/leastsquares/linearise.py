@@ -7,13 +7,21 @@ forward mode along all directions at once for few (a tenth of the loops to compi
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.leastsquares.plan import Part, Plan
-from jaxbundle.leastsquares.rows import Declared, Laid, Residual, diagonal_of, over, residual_of
+from jaxbundle.leastsquares.rows import (
+    Declared,
+    Laid,
+    diagonal_of,
+    over,
+    over_rows,
+    residual_of,
+)
 
 
 def widths_of(declared: Declared, plan: Plan, part: Part) -> tuple[int, ...]:
@@ -63,11 +71,21 @@ def differentiate(declared: Declared, plan: Plan, number: int, prepared, laid: L
     return jnp.stack(r, -1), tuple(touches), E
 
 
+def differentiate_rows(function, widths, part: Part, blocks, measured, weight):
+    """Residuals [chunks, length, r] of `function(blocks, measured, weight, changes)` of every
+    observation, and their derivatives by the changes of every slot [chunks, length, r, width]."""
+    rows = _Rows(function, widths, True)
+    r, found = over_rows(rows, part.by_row, blocks, measured, weight)
+    starts = np.cumsum((0, *widths))
+    of = lambda a, b: jnp.stack([jnp.stack(row[a:b], -1) for row in found], -2) if b > a else None
+    return jnp.stack(r, -1), [of(a, b) for a, b in zip(starts, starts[1:])]
+
+
 @dataclasses.dataclass(frozen=True)
 class _Rows:
     """The residuals of one observation and their derivatives by the changes of its slots."""
 
-    residual: Residual
+    residual: Callable
     widths: tuple[int, ...]
     large: bool
 

@@ -7,6 +7,7 @@ They are filled either from the Jacobian (N = JᵀPJ, Gauss–Newton) or from se
 every observation (the exact Hessian, `hessian.py`); everything after that is the same.
 """
 
+import dataclasses
 from collections.abc import Mapping
 from functools import partial, reduce
 
@@ -19,6 +20,13 @@ from jaxtyping import Array, Float
 
 from jaxbundle.leastsquares.damping import measure
 from jaxbundle.leastsquares.linearise import differentiate
+from jaxbundle.leastsquares.local import (
+    LocalJacobian,
+    differentiate_locally,
+    local_touch,
+    products_of,
+    spread,
+)
 from jaxbundle.leastsquares.plan import Key, Part, Plan
 from jaxbundle.leastsquares.rows import Declared, Laid, Values, prepare
 from jaxbundle.types import AnyArray, present
@@ -152,6 +160,12 @@ def normal_equations(
     Traced once per plan: the solver needs the shapes of its results before the values."""
     prepared, sums = prepare(declared, values), Sums(plan)
     for number, part in enumerate(plan.parts):
+        local = local_touch(declared, part)
+        if local is not None:
+            sums.add_local(part, differentiate_locally(
+                declared, plan, number, local, prepared, laid
+            ))  # fmt: skip
+            continue
         r, touches, E = differentiate(declared, plan, number, prepared, laid)
         sums.add_part(part, 0.5 * jnp.vdot(r, r), *_products_of(part, r, touches, E))
     return sums.finished(declared, values)
@@ -202,6 +216,46 @@ class Sums:
             self.gradient[e] += both[..., -1]
         for touch, N in zip(part.touches, W):
             self._add_incidences(touch, N)
+
+    def add_local(self, part: Part, found: LocalJacobian):
+        """What a part with local columns adds (`local.py`)."""
+        t, J, at = found.touch, found.touches[found.touch], found.columns
+        touch, width = part.touches[t], self.plan.groups[part.touches[t].group].width
+        others = [k for k in range(len(part.touches)) if k != t]
+        couples = [c for c in part.couples if t not in (c.first, c.second)]
+        rest = dataclasses.replace(
+            part, touches=tuple(part.touches[k] for k in others),
+            couples=tuple(dataclasses.replace(
+                c, first=others.index(c.first), second=others.index(c.second)
+            ) for c in couples),
+        )  # fmt: skip
+        r, E = found.r, found.eliminated
+        kept = tuple(found.touches[k] for k in others)
+        self.add_part(rest, 0.5 * jnp.vdot(r, r), *_products_of(rest, r, kept, E))
+        self.own[touch.group] += products_of(self.own[touch.group], touch.row, J, at)
+        g = spread(jnp.einsum("clri,clr->cli", J, r), at, width)
+        self.gradient[touch.group] = self.gradient[touch.group].at[touch.row].add(g)
+        whole = dataclasses.replace(touch, start=0, stop=width)
+        for couple in part.couples:
+            if t in (couple.first, couple.second):
+                k = couple.second if couple.first == t else couple.first
+                B = spread(jnp.einsum("clri,clrj->clij", J, found.touches[k]), at, width)
+                touches = tuple(whole if i == t else one for i, one in enumerate(part.touches))
+                self._add_couple(
+                    dataclasses.replace(part, touches=touches), couple,
+                    B if couple.first == t else B.mT,
+                )  # fmt: skip
+        if E is not None:
+            self._add_local_incidences(touch, jnp.einsum("clri,clrj->clij", J, E), at, width)
+
+    def _add_local_incidences(self, touch, W, columns, width):
+        plan = self.plan.incidences[touch.group]
+        n, shape = plan.eliminated.size, W.shape[:2]
+        at = jnp.arange(n).reshape(shape) if touch.incidence is None else touch.incidence
+        found = jnp.zeros((n, width, W.shape[-1])).at[at[..., None], columns].add(W, mode="drop")
+        self.W[touch.group] = self.W.get(touch.group, 0.0) + found.mT.reshape(
+            *plan.eliminated.shape, W.shape[-1], width
+        )
 
     def _add_couple(self, part, couple, N):
         """An off-diagonal block, or a diagonal one if the two rows are the same."""

@@ -91,7 +91,7 @@ class Residual:
     def __call__(self, blocks, measured, weight, changes=None):
         changes = ((),) * len(self.spaces) if changes is None else changes
         moved = [s.moved(b, d) for s, b, d in zip(self.spaces, blocks, changes)]
-        return _weighted(evaluate(self.kind, moved, measured), weight)
+        return weighted(evaluate(self.kind, moved, measured), weight)
 
 
 def residual_of(declared: Declared, part: Part) -> Residual:
@@ -118,7 +118,7 @@ def _stacked(block) -> Any:
     return block
 
 
-def _weighted(v, weight):
+def weighted(v, weight):
     """L⁻¹·v, or v/σ; 0 if the weight is 0, whatever v is."""
     if isinstance(weight[0], tuple):
         rows = [sum(w * x for w, x in zip(row, v)) for row in weight]
@@ -154,11 +154,12 @@ def over(part: Part, kind: Kind, prepared, laid: Laid, number: int, function) ->
     """`function(blocks, measured, weight)` of every observation of a part; its scalars get the
     axes [chunks, length]. Functions that are equal are traced once for columns of one size."""
     blocks = tuple(look_up(prepared[name], at) for name, at in zip(kind.of, part.lookup))
-    return _over_rows(function, part.by_row, blocks, laid.measured[number], laid.weight[number])
+    return over_rows(function, part.by_row, blocks, laid.measured[number], laid.weight[number])
 
 
 @partial(jax.jit, static_argnums=(0, 1), inline=True)
-def _over_rows(function, by_row, blocks, measured, weight):
+def over_rows(function, by_row, blocks, measured, weight):
+    """`over` of blocks that are looked up."""
     axes = tuple(0 if one else None for one in by_row)
     return jax.vmap(jax.vmap(function, (axes, 0, 0)))(blocks, measured, weight)
 

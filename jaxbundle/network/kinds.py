@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jaxbundle import cameras
 from jaxbundle.geometry import omega_phi_kappa_near
 from jaxbundle.leastsquares.any_distance import move_at_any_distance
-from jaxbundle.leastsquares.declarations import Kind
+from jaxbundle.leastsquares.declarations import Kind, Local
 from jaxbundle.leastsquares.motions import similarity
 from jaxbundle.leastsquares.spaces import Posed, turn_by
 from jaxbundle.network.further.rolling_shutter import READ_OUT, VELOCITIES
@@ -40,6 +40,38 @@ class ImagePoint:
         for pose in poses:
             ray = pose.ray(ray)
         return cameras.residual(cameras.get_model(self.model), self.domain, interior, ray, xy)
+
+
+@dataclasses.dataclass(frozen=True)
+class ColumnsOfImagePoint:
+    """Which parameters of the camera an image point depends on (`CameraModel.local`)."""
+
+    model: str | cameras.CameraModel
+
+    def __call__(self, *touched):
+        *poses, p, ray, _ = touched
+        model = cameras.get_model(self.model)
+        return model.local.columns(p, *model.ideal(p, *_seen(poses, ray)))
+
+
+@dataclasses.dataclass(frozen=True)
+class LocalImagePoint:
+    """The residuals of an image point as a function of these."""
+
+    model: str | cameras.CameraModel
+
+    def __call__(self, *touched):
+        *poses, p, ray, columns, values, xy = touched
+        model = cameras.get_model(self.model)
+        at = model.ideal(p, *_seen(poses, ray))
+        x, y = model.local.distort(p, columns, values, *at)
+        return x - xy[0], y - xy[1]
+
+
+def _seen(poses, ray):
+    for pose in poses:
+        ray = pose.ray(ray)
+    return ray
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +99,12 @@ def image_points(
     only = camera == "camera"
     name = "image coordinates" if only else f"image coordinates of {cameras.get_model(model).name}"
     residual = (MovingImagePoint if moving else ImagePoint)(model, domain)
-    return Kind(name, residual, of, ("x", "y"), scalars=True, invariant=True)
+    formula, local = cameras.get_model(model).local, None
+    if formula is not None and domain == "measured" and not moving:
+        local = Local(
+            of.index(camera), formula.number, ColumnsOfImagePoint(model), LocalImagePoint(model)
+        )
+    return Kind(name, residual, of, ("x", "y"), scalars=True, invariant=True, local=local)
 
 
 def _difference(value, given):
