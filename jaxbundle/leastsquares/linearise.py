@@ -77,8 +77,10 @@ def differentiate_rows(function, widths, part: Part, blocks, measured, weight):
     rows = _Rows(function, widths, True)
     r, found = over_rows(rows, part.by_row, blocks, measured, weight)
     starts = np.cumsum((0, *widths))
-    of = lambda a, b: jnp.stack([jnp.stack(row[a:b], -1) for row in found], -2) if b > a else None
-    return jnp.stack(r, -1), [of(a, b) for a, b in zip(starts, starts[1:])]
+    none = jnp.zeros((*r[0].shape, 0))
+    of = lambda row, a, b: jnp.stack(row[a:b], -1) if b > a else none
+    blocks = [jnp.stack([of(row, a, b) for row in found], -2) for a, b in zip(starts, starts[1:])]
+    return jnp.stack(r, -1), blocks
 
 
 @dataclasses.dataclass(frozen=True)

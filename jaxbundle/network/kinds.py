@@ -24,6 +24,7 @@ from jaxbundle.leastsquares.declarations import Kind, Local
 from jaxbundle.leastsquares.motions import similarity
 from jaxbundle.leastsquares.spaces import Posed, turn_by
 from jaxbundle.network.further.rolling_shutter import READ_OUT, VELOCITIES
+from jaxbundle.types import present
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +52,7 @@ class ColumnsOfImagePoint:
     def __call__(self, *touched):
         *poses, p, ray, _ = touched
         model = cameras.get_model(self.model)
-        return model.local.columns(p, *model.ideal(p, *_seen(poses, ray)))
+        return present(model.local).columns(p, *model.ideal(p, *_seen(poses, ray)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +65,7 @@ class LocalImagePoint:
         *poses, p, ray, columns, values, xy = touched
         model = cameras.get_model(self.model)
         at = model.ideal(p, *_seen(poses, ray))
-        x, y = model.local.distort(p, columns, values, *at)
+        x, y = present(model.local).distort(p, columns, values, *at)
         return x - xy[0], y - xy[1]
 
 
