@@ -13,7 +13,7 @@ ENOUGH = 5
 """Tie points of an image from which its depths are taken."""
 ROOM = 0.35
 """By this part of their range the depths may go beyond those of the tie points."""
-NEAREST_ANGLE, FARTHEST_ANGLE = 1.2, 0.02
+NEAREST_ANGLE, FARTHEST_ANGLE = 1.2, 0.003
 """Angles, radians, at which lines of sight of two images meet where nothing is known."""
 
 

@@ -9,6 +9,9 @@ is solved for a correction δ of the disparity, a shift ε across the rows, brig
 Rows are aligned, so that ε ought to be 0: what it is, in units of its σ, gives a variance factor
 (the median of ε²/σ² over that of χ²). Third differences of disparities farther apart than a window
 give another, with what the shape of the windows does to them; the greater of both is taken.
+Where noise leaves little, larger windows do the same again, as long as they hold one surface.
+A large range of disparities is narrowed before, at a coarser resolution. Semi-global matching has
+grey values less their means over large windows, of one contrast: exposures differ.
 
 Sources: Hirschmüller (2008); Lucas and Kanade (1981); Ackermann (1984).
 """
@@ -27,6 +30,10 @@ from jaxbundle.system.configuration import available_cores
 
 BLOCK = 3
 """Side of the blocks of semi-global matching."""
+EVEN = 40
+"""Half the side of the windows whose means are taken off the grey values."""
+LEAST_SPREAD = 25.0
+"""Standard deviation of the grey values that are compared, of 256, at least."""
 MOST_COSTS = 4e8
 """Pixels times disparities up to which all costs are held in memory, of 2 bytes and more, and
 paths from below are followed as well."""
@@ -34,8 +41,13 @@ UNIQUE = 5
 """Percent by which the best cost must be below the second."""
 SPECKLE = 80
 """Pixels of the smallest region of like disparities that is kept."""
-HALF = 4
-"""Half the side of the windows of least squares."""
+HALF, WIDE = 4, 7
+"""Half the side of the windows of least squares; of those where the texture is weak."""
+WEAK, FEW = 0.05, 0.02
+"""σ of a disparity, pixels, from which the texture is weak; the part of an image up to which no
+larger windows are tried."""
+MOST_RATIO = 5.0
+"""Of the contrasts of two windows that may be alike."""
 ROUNDS = 2
 BAND, MARGIN = 128, 32
 """Rows that are refined together, and those above and below that their windows reach over."""
@@ -44,6 +56,11 @@ HOLES, STEP, JUMP = 0.5, 0.3, 2.5
 which is a change of disparities by more than `JUMP`. Found on rendered roofs."""
 BLOCK_SIDE, SMOOTHEST = 48, 0.25
 """Pixels of a block whose scatter is looked at; the quantile of the blocks that is taken."""
+WIDE_RANGE = 128
+"""Disparities from which on the range is narrowed."""
+RARE, COARSE_ROOM, COARSE_SPECKLE = 0.05, 16, 20
+"""Percent of the coarse disparities at either end that are left out; pixels searched beyond the
+others, and a twentieth of their range; pixels of the smallest region of coarse ones."""
 COARSER, REPEATED, REPETITION, SMALL = 4, 4, 0.8, 0.02
 """At a resolution so much coarser, windows of half this side are compared with others of the image
 itself; their correlation from which a texture repeats itself; the part of the image which a surface
@@ -54,11 +71,12 @@ MOST_CHANGE = 1.0
 """Pixels that least squares may move a disparity."""
 LEAST_CORRELATION, SURE = 0.5, 0.9
 """ρ of a window at least; and of one beside a step in the surface."""
-MOST_SIGMA = 0.5
-"""σ of a disparity, pixels, above which the texture does not determine it."""
-INNER, OVER_NOISE = 2, 1.9
-"""Half the side of the middle of a window, which must have texture of its own: three σ more than
-the variance of noise; else a window tells of what is beside its pixel."""
+LEAST_SIGMA, MOST_SIGMA = 0.008, 0.5
+"""σ of a disparity, pixels: what interpolation and sampling add, and above which the texture does
+not determine it."""
+INNER, SIGNIFICANT = 2, 3.0
+"""By how much the window is larger than its middle, which must have texture of its own: more than
+the variance of noise by so many σ of it; else a window tells of what is beside its pixel."""
 LEAST_CONTRAST = 1.0
 """Standard deviation of a window, grey values of 256."""
 
@@ -85,30 +103,71 @@ class Disparities:
 
 def match_dense(pair: RowPair, span: int) -> Disparities:
     """Disparities from 0 to `span` of a rectified pair, at the pixels of its left image."""
-    left, right, inside = _prepared(pair)
-    start = semi_global(left, right, span)
+    left, right = _prepared(pair)
+    inside = np.isfinite(pair.left)
+    even = alike(left, right, inside, np.isfinite(pair.right))
+    low, high = narrow_range(*even, span)
+    start = semi_global(*even, low, high)
     start[~inside] = np.nan
-    start[ambiguous(left, start, span)] = np.nan
+    start[ambiguous(left, start, high - low)] = np.nan
     return refine_disparities(left, right, start)
 
 
-def semi_global(left, right, span: int) -> Float[np.ndarray, "rows columns"]:
-    """Disparities by OpenCV, pixels; NaN where the check of left and right, the uniqueness or the
-    speckle filter took them out."""
+def alike(left, right, inside, right_inside) -> list[Float[np.ndarray, "rows columns"]]:
+    """Grey values about 128 without what differs by exposure and light."""
     cv2 = need_opencv()
-    number = max(16, -(-(span + 1) // 16) * 16)
+    mean = lambda a: cv2.blur(a.astype(np.float32), (2 * EVEN + 1,) * 2)
+    found, spread = [], 0.0
+    for a, there in ((left, inside), (right, right_inside)):
+        away = np.where(there, a - mean(a * there) / np.maximum(mean(there), 1e-6), 0)
+        own = float(np.std(away[there])) if there.any() else 0.0
+        spread = spread or max(own, LEAST_SPREAD)
+        found.append(np.clip(128 + away * (spread / max(own, 1.0)), 0, 255).astype(np.float32))
+    return found
+
+
+def narrow_range(left, right, span: int) -> tuple[int, int]:
+    """Whole disparities within 0 to `span` between which there are any, by a coarser resolution."""
+    if span < WIDE_RANGE:
+        return 0, span
+    coarse = [_coarser(a) for a in (left, right)]
+    found = semi_global(*coarse, 0, -(-span // COARSER), COARSE_SPECKLE)
+    known = COARSER * found[np.isfinite(found)]
+    if len(known) * RARE < 100:
+        return 0, span
+    low, high = np.percentile(known, [RARE, 100 - RARE])
+    room = COARSE_ROOM + 0.05 * (high - low)
+    return max(int(low - room), 0), min(int(np.ceil(high + room)), span)
+
+
+def _coarser(a):
+    cv2 = need_opencv()
+    rows, columns = (n // COARSER for n in a.shape)
+    # whole pixels: disparities are those of the full resolution, divided
+    return cv2.resize(a[: rows * COARSER, : columns * COARSER], (columns, rows),
+                      interpolation=cv2.INTER_AREA)  # fmt: skip
+
+
+def semi_global(
+    left, right, low: int, high: int, speckle: int = SPECKLE
+) -> Float[np.ndarray, "rows columns"]:
+    """Disparities from `low` to `high` by OpenCV, pixels; NaN where the check of left and right,
+    the uniqueness or the speckle filter took them out."""
+    cv2 = need_opencv()
+    number = max(16, -(-(high - low + 1) // 16) * 16)
     matcher = cv2.StereoSGBM.create(
-        minDisparity=0, numDisparities=number, blockSize=BLOCK, P1=8 * BLOCK**2,
+        minDisparity=low, numDisparities=number, blockSize=BLOCK, P1=8 * BLOCK**2,
         P2=48 * BLOCK**2, disp12MaxDiff=1, preFilterCap=31, uniquenessRatio=UNIQUE,
-        speckleWindowSize=SPECKLE, speckleRange=2,
+        speckleWindowSize=speckle, speckleRange=2,
         mode=cv2.STEREO_SGBM_MODE_HH4 if left.size * number < MOST_COSTS
         else cv2.STEREO_SGBM_MODE_SGBM,
     )  # fmt: skip
     eight = [np.clip(np.rint(a), 0, 255).astype(np.uint8) for a in (left, right)]
     # columns of the left image without a full range of disparities are matched with a margin
-    wide = [cv2.copyMakeBorder(a, 0, 0, number, 0, cv2.BORDER_REPLICATE) for a in eight]
-    found = matcher.compute(*wide)[:, number:].astype(np.float32) / 16
-    return np.where((found >= 0) & (found <= span), found, np.nan)
+    margin = low + number
+    wide = [cv2.copyMakeBorder(a, 0, 0, margin, 0, cv2.BORDER_REPLICATE) for a in eight]
+    found = matcher.compute(*wide)[:, margin:].astype(np.float32) / 16
+    return np.where((found >= low) & (found <= high), found, np.nan)
 
 
 def ambiguous(
@@ -117,9 +176,7 @@ def ambiguous(
     """Pixels whose texture repeats itself along the row within the range of disparities, on a small
     surface of its own: what one image sees alone matches the repetition in the other."""
     cv2 = need_opencv()
-    rows, columns = (n // COARSER for n in left.shape)
-    coarse = cv2.resize(left, (columns, rows), interpolation=cv2.INTER_AREA)
-    repeated = _likeness(coarse, span // COARSER) > REPETITION
+    repeated = _likeness(_coarser(left), span // COARSER) > REPETITION
     if not repeated.any():
         return np.zeros(left.shape, bool)
     repeated = cv2.resize(repeated.astype(np.uint8), left.shape[::-1],
@@ -150,45 +207,63 @@ def _likeness(a, farthest):
 def refine_disparities(left, right, start) -> Disparities:
     """Least squares at every pixel that has a disparity."""
     coefficients = ndimage.spline_filter(right, 3, np.float32)
+    known = np.isfinite(start)
+    found, stepped = _with_windows(left, coefficients, start, HALF, known)
+    with np.errstate(invalid="ignore"):
+        weak = known & ~(found.sigma < WEAK) & ~stepped
+    if weak.sum() > FEW * known.sum():
+        wide, over_step = _with_windows(left, coefficients, start, WIDE, weak)
+        with np.errstate(invalid="ignore"):
+            better = weak & ~over_step & (wide.sigma < np.nan_to_num(found.sigma, nan=MOST_SIGMA))
+        mixed = [np.where(better, getattr(wide, name), getattr(found, name))
+                 for name in ("disparity", "sigma", "rho")]  # fmt: skip
+        found = Disparities(*mixed, found.factor)
+    return found
+
+
+def _with_windows(left, coefficients, start, half, wanted):
+    """Disparities by windows of 2·`half` + 1 pixels, with the factor of those wanted in σ; which
+    windows have a step of the surface in them."""
     rows = len(left)
 
     def of_rows(first):
         low, high = max(first - MARGIN, 0), min(first + BAND + MARGIN, rows)
-        found = _refined(left[low:high], coefficients[low:high], start[low:high])
+        found = _refined(left[low:high], coefficients[low:high], start[low:high], half)
         return [a[first - low : first - low + BAND] for a in found]
 
     with ThreadPoolExecutor(available_cores()) as pool:
         bands = list(pool.map(of_rows, range(0, rows, BAND)))
     d, sigma, rho, across = (np.concatenate(parts) for parts in zip(*bands))
     good = np.isfinite(d)
-    smooth = scatter_factor(d, sigma, 2 * HALF + 1, BLOCK_SIDE, SMOOTHEST)
-    factor = max(robust_factor(across[good]), min(smooth, default=1.0))
-    edges = _at_edges(np.where(good, d, 0), good)
-    sigma = np.sqrt(factor * sigma**2 + edges)
+    smooth = scatter_factor(np.where(wanted, d, np.nan), sigma, 2 * half + 1, BLOCK_SIDE, SMOOTHEST)
+    factor = max(robust_factor(across[good & wanted]), min(smooth, default=1.0))
+    edges = _at_edges(np.where(good, d, 0), good, half)
+    sigma = np.sqrt(factor * sigma**2 + LEAST_SIGMA**2 + edges)
+    stepped = edges >= STEP**2
     with np.errstate(invalid="ignore"):
         # beside a step the disparities of one side reach over to the other
-        good &= ~(edges >= STEP**2) | (rho >= SURE)
+        good &= ~stepped | (rho >= SURE)
         good &= sigma < MOST_SIGMA
     keep = lambda a: np.where(good, a, np.nan)
-    return Disparities(keep(d), keep(sigma), keep(rho), factor)
+    return Disparities(keep(d), keep(sigma), keep(rho), factor), stepped
 
 
-def _refined(left, coefficients, start):
+def _refined(left, coefficients, start, half):
     """Disparities (NaN: none), their σ, ρ, and shifts across the rows over their σ, of some rows;
     `coefficients`: of the spline through the right image."""
     known = np.isfinite(start)
-    shape = _smooth(_without_noise(start, known), known)
+    shape = _smooth(_without_noise(start, known), known, half)
     y, x = np.indices(left.shape, dtype=np.float32)
     found, moved = None, np.zeros(left.shape, np.float32)
     for last in range(ROUNDS):
         if last:
             # a smooth shape and the windows' mean of what is left of it: no bias from curvature
-            shape = _smooth(np.where(known, shape + moved, np.nan), known)
+            shape = _smooth(np.where(known, shape + moved, np.nan), known, half)
         warped = ndimage.map_coordinates(
             coefficients, [y, x - np.where(known, shape, 0)], order=3, prefilter=False,
             mode="nearest",
         )  # fmt: skip
-        found = _solve(left, warped)
+        found = _solve(left, warped, half)
         moved = np.clip(np.nan_to_num(found.x), -MOST_CHANGE, MOST_CHANGE).astype(np.float32)
     assert found is not None
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -212,18 +287,21 @@ class _Solved:
     textured: Bool[np.ndarray, "rows columns"]
 
 
-def _solve(left, warped) -> _Solved:
+def _solve(left, warped, half) -> _Solved:
     """δ, ε, h₁ and their σ from sums over windows."""
     cv2 = need_opencv()
-    side = 2 * HALF + 1
+    side = 2 * half + 1
     n = side * side
     mean = lambda a: cv2.boxFilter(a, cv2.CV_64F, (side, side), borderType=cv2.BORDER_REFLECT_101)
-    both = (left + warped) / 2
-    # the disparity moves the right image against its columns: −∂R/∂x
-    gx = -_gradient(both, 1)
-    gy = _gradient(both, 0)
-    m = {name: mean(a) for name, a in (("L", left), ("R", warped), ("x", gx), ("y", gy))}
+    m = {"L": mean(left), "R": mean(warped)}
     product = lambda a, b, i, j: n * (mean(a * b) - m[i] * m[j])
+    LL, RR = product(left, left, "L", "L"), product(warped, warped, "R", "R")
+    # gradients in grey values of the left image, whatever the exposure of the right one
+    ratio = np.sqrt(np.maximum(LL, n) / np.maximum(RR, n)).clip(1 / MOST_RATIO, MOST_RATIO)
+    gradient = lambda axis: (_gradient(left, axis) + ratio * _gradient(warped, axis)) / 2
+    # the disparity moves the right image against its columns: −∂R/∂x
+    gx, gy = -gradient(1), gradient(0)
+    m |= {"x": mean(gx), "y": mean(gy)}
     table = {"R": warped, "x": gx, "y": gy}
     names = ("x", "y", "R")
     N = np.empty((*left.shape, 3, 3))
@@ -232,15 +310,15 @@ def _solve(left, warped) -> _Solved:
         for j, b in enumerate(names[: i + 1]):
             N[..., i, j] = N[..., j, i] = product(table[a], table[b], a, b)
         g[..., i] = product(table[a], left, a, "L")
-    LL = product(left, left, "L", "L")
-    RR, LR = N[..., 2, 2], g[..., 2]
+    LR = g[..., 2]
     textured = (LL > n * LEAST_CONTRAST**2) & (RR > n * LEAST_CONTRAST**2)
-    inner = _variance(left, INNER)
+    inner = _variance(left, half // INNER)
     Q, p = _solved(N, g, textured)
     rest = np.maximum(LL - np.einsum("...i,...i->...", p, g), 0)
     s2 = rest / (n - 4)
     # half of s² is the noise of the left image
-    textured &= inner > LEAST_CONTRAST**2 + OVER_NOISE * s2 / 2
+    beyond = 1 + SIGNIFICANT * np.sqrt(2 / ((2 * (half // INNER) + 1) ** 2 - 1))
+    textured &= inner > LEAST_CONTRAST**2 + beyond * s2 / 2
     with np.errstate(invalid="ignore", divide="ignore"):
         rho = LR / np.sqrt(LL * RR)
         h1 = p[..., 2]
@@ -276,11 +354,11 @@ def _gradient(a, axis):
     return ndimage.correlate1d(a, kernel, axis=axis, mode="nearest")
 
 
-def _at_edges(d, known):
+def _at_edges(d, known, half):
     """The variance that a window gains which the surface leaves: where it has pixels without
     disparity, or of another surface."""
     cv2 = need_opencv()
-    window = (2 * HALF + 1, 2 * HALF + 1)
+    window = (2 * half + 1, 2 * half + 1)
     holes = cv2.boxFilter((~known).astype(np.float32), -1, window)
     high = cv2.dilate(np.where(known, d, -1e4).astype(np.float32), np.ones(window, np.uint8))
     low = cv2.erode(np.where(known, d, 1e4).astype(np.float32), np.ones(window, np.uint8))
@@ -295,26 +373,24 @@ def _without_noise(disparity, known):
         return np.where(np.abs(median - disparity) < 1.5, median, disparity)
 
 
-def _smooth(disparity, known):
+def _smooth(disparity, known, half):
     """Means over a window of those disparities that are near."""
     cv2 = need_opencv()
     far = np.where(known, disparity, -1e3).astype(np.float32)
-    smooth = cv2.bilateralFilter(far, 2 * HALF + 1, NEAR, float(HALF))
+    smooth = cv2.bilateralFilter(far, 2 * half + 1, NEAR, float(half))
     return np.where(known, smooth, np.nan).astype(np.float32)
 
 
 def _prepared(pair: RowPair):
-    """Both images between 0 and 255, without gaps, and where both are."""
-    inside = np.isfinite(pair.left)
+    """Both images between 0 and 255, without gaps."""
     grey = [a[np.isfinite(a)] for a in (pair.left, pair.right)]
     if not all(len(g) for g in grey):
-        nothing = np.zeros_like(pair.left)
-        return nothing, nothing, np.zeros(pair.left.shape, bool)
+        return np.zeros_like(pair.left), np.zeros_like(pair.left)
     values = np.concatenate([g[:: max(1, len(g) // 200_000)] for g in grey])
     low, high = (0.0, 255.0) if values.max() <= 260 and values.min() >= -5 else (
         np.percentile(values, [0.2, 99.8])
     )
     scale = 255 / max(high - low, 1e-9)
-    filled = [np.where(np.isfinite(a), (a - low) * scale, 0).astype(np.float32)
-              for a in (pair.left, pair.right)]  # fmt: skip
-    return *filled, inside
+    left, right = (np.where(np.isfinite(a), (a - low) * scale, 0).astype(np.float32)
+                   for a in (pair.left, pair.right))  # fmt: skip
+    return left, right

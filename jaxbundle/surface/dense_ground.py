@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxbundle.surface.bounds import Bounds
 from jaxbundle.surface.cloud import Cloud, merge
 from jaxbundle.surface.dense import match_dense
 from jaxbundle.surface.generic_rectification import straighten
@@ -18,12 +19,18 @@ PIECE = 1500
 """Side of a piece of the base image, pixels."""
 TOGETHER = 1 << 17
 """Points that are intersected together."""
+MOST_DISPARITIES = 400
 
 
 def dense_ground_cloud(
-    base: OrientedImage, others: Sequence[OrientedImage], guide: Guide, step: int = 1
+    base: OrientedImage, others: Sequence[OrientedImage], guide: Guide, bounds: Bounds,
+    step: int = 1,
 ) -> tuple[Cloud, list[tuple[str, float]], list[str]]:
-    """The cloud; name and variance factor of each image used; those that could not be used."""
+    """The cloud; name and variance factor of each image used; those that could not be used.
+
+    All disparities between the bounds are searched, since houses stand between the nodes of a
+    guide; if these are very many, those about what the guide has found.
+    """
     clouds, used, left_out = [], [], []
     columns, rows = base.size
     for other in others:
@@ -31,7 +38,7 @@ def dense_ground_cloud(
         for u0 in range(0, columns, PIECE):
             for v0 in range(0, rows, PIECE):
                 window = u0, v0, min(u0 + PIECE, columns) - 1, min(v0 + PIECE, rows) - 1
-                found = _piece(base, other, guide, window, step)
+                found = _piece(base, other, guide, bounds, window, step)
                 if found is not None:
                     clouds.append(found[0])
                     factors.append(found[1])
@@ -45,14 +52,19 @@ def dense_ground_cloud(
     return merge([*clouds, empty]), used, left_out
 
 
-def _piece(base, other, guide, window, step):
+def _piece(base, other, guide, bounds, window, step):
     u0, v0, u1, v1 = window
     row, column = np.nonzero(guide.good)
     uv = np.stack([column, row], 1) * guide.step + guide.first
     inside = (uv >= [u0, v0]).all(1) & (uv <= [u1, v1]).all(1)
     if inside.sum() < 5:
         return None
-    X = base.points(uv[inside], guide.q[row, column][inside])
+    uv = uv[inside]
+    ends = [base.points(uv, q) for q in bounds(uv).T]
+    reach = np.linalg.norm(other.project(ends[1]) - other.project(ends[0]), axis=1)
+    X = base.points(uv, guide.q[row, column][inside])
+    if np.nanmedian(reach) < MOST_DISPARITIES:
+        X = np.concatenate(ends)
     straightened = straighten(base, other, window, X)
     if straightened is None:
         return None

@@ -34,16 +34,18 @@ from jaxbundle.surface.views import OrientedImage, is_inside, line_of_sight
 SEARCH = 2.0
 """Pixels of the full image that are searched beyond the guide's range."""
 LEAST_CORRELATION = 0.6
-MOST_SIGMA = 0.5
-"""Pixels: σ of a match above which the texture does not determine it."""
+LEAST_SIGMA, MOST_SIGMA = 0.012, 0.5
+"""Pixels: σ of a match, what interpolation and sampling add, and above which the texture does not
+determine it."""
 UNIQUE = 0.95
 """ρ of the second best position over that of the best, at most, where both are apart."""
 CONSISTENT = 1.5
 """Pixels between a point and what the guide of the other image has there."""
 STRAYED = 2.5
 """Pixels from the position of the correlation to that of least squares matching, at most."""
-BLOCK_SIDE = 16
-"""Points a side of a block whose scatter is looked at."""
+BLOCK_SIDE, SMOOTH = 16, 0.45
+"""Points a side of a block whose scatter is looked at; the quantile of the blocks that is taken, of
+the smoother direction."""
 SIGNIFICANCE = 1e-3
 """Of the test of a point's residuals."""
 
@@ -117,6 +119,7 @@ def match_points(
         start = positions(base, other, uv, q[:, None])[:, 0]
         match = refine(base, other, uv, start, shape.A, settings.fine)
         place, uncertain = corrected((base, other), sharp, uv, q, match, settings.fine)
+        uncertain = uncertain + LEAST_SIGMA**2 * np.eye(2)
         places[:, k], covariance[:, k], rhos[:, k] = place, uncertain, match.rho
         good = shape.usable & (match.status == int(MatchingStatus.CONVERGED))
         good &= match.rho >= settings.least_correlation
@@ -214,7 +217,7 @@ def _scatter(base, uv, found, settings) -> float:
     values, sigma = np.full((2, row.max() + 1, column.max() + 1), np.nan)
     values[row, column], sigma[row, column] = q, rate
     apart = -(-(2 * settings.fine + 1) // step)
-    return max(scatter_factor(values, sigma, apart, BLOCK_SIDE, 0.5), default=1.0)
+    return min(scatter_factor(values, sigma, apart, BLOCK_SIDE, SMOOTH), default=1.0)
 
 
 def _misfits(found: Intersected, factor: float) -> Bool[np.ndarray, " n"]:

@@ -192,7 +192,7 @@ def _dense(views, i, others, guide, bounds, step):
     if isinstance(base, FrameView):
         cloud, used, left_out = dense_cloud(base, partners, guide, bounds, step)
     else:
-        cloud, used, left_out = dense_ground_cloud(base, partners, guide, step)
+        cloud, used, left_out = dense_ground_cloud(base, partners, guide, bounds, step)
     cloud = dataclasses.replace(cloud, colour=_colour(base, cloud.uv))
     columns, rows = base.size
     number = -(-columns // step) * -(-rows // step)
