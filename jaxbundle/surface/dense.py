@@ -10,8 +10,8 @@ Rows are aligned, so that ε ought to be 0: what it is, in units of its σ, give
 (the median of ε²/σ² over that of χ²). Third differences of disparities farther apart than a window
 give another, with what the shape of the windows does to them; the greater of both is taken.
 Where noise leaves little, larger windows do the same again, as long as they hold one surface.
-A large range of disparities is narrowed before, at a coarser resolution. Semi-global matching has
-grey values less their means over large windows, of one contrast: exposures differ.
+Semi-global matching has grey values less their means over large windows, of one contrast: exposures
+differ.
 
 Sources: Hirschmüller (2008); Lucas and Kanade (1981); Ackermann (1984).
 """
@@ -56,11 +56,6 @@ HOLES, STEP, JUMP = 0.5, 0.3, 2.5
 which is a change of disparities by more than `JUMP`. Found on rendered roofs."""
 BLOCK_SIDE, SMOOTHEST = 48, 0.25
 """Pixels of a block whose scatter is looked at; the quantile of the blocks that is taken."""
-WIDE_RANGE = 128
-"""Disparities from which on the range is narrowed."""
-RARE, COARSE_ROOM, COARSE_SPECKLE = 0.05, 16, 20
-"""Percent of the coarse disparities at either end that are left out; pixels searched beyond the
-others, and a twentieth of their range; pixels of the smallest region of coarse ones."""
 COARSER, REPEATED, REPETITION, SMALL = 4, 4, 0.8, 0.02
 """At a resolution so much coarser, windows of half this side are compared with others of the image
 itself; their correlation from which a texture repeats itself; the part of the image which a surface
@@ -106,10 +101,9 @@ def match_dense(pair: RowPair, span: int) -> Disparities:
     left, right = _prepared(pair)
     inside = np.isfinite(pair.left)
     even = alike(left, right, inside, np.isfinite(pair.right))
-    low, high = narrow_range(*even, span)
-    start = semi_global(*even, low, high)
+    start = semi_global(*even, span)
     start[~inside] = np.nan
-    start[ambiguous(left, start, high - low)] = np.nan
+    start[ambiguous(left, start, span)] = np.nan
     return refine_disparities(left, right, start)
 
 
@@ -126,48 +120,23 @@ def alike(left, right, inside, right_inside) -> list[Float[np.ndarray, "rows col
     return found
 
 
-def narrow_range(left, right, span: int) -> tuple[int, int]:
-    """Whole disparities within 0 to `span` between which there are any, by a coarser resolution."""
-    if span < WIDE_RANGE:
-        return 0, span
-    coarse = [_coarser(a) for a in (left, right)]
-    found = semi_global(*coarse, 0, -(-span // COARSER), COARSE_SPECKLE)
-    known = COARSER * found[np.isfinite(found)]
-    if len(known) * RARE < 100:
-        return 0, span
-    low, high = np.percentile(known, [RARE, 100 - RARE])
-    room = COARSE_ROOM + 0.05 * (high - low)
-    return max(int(low - room), 0), min(int(np.ceil(high + room)), span)
-
-
-def _coarser(a):
+def semi_global(left, right, span: int) -> Float[np.ndarray, "rows columns"]:
+    """Disparities by OpenCV, pixels; NaN where the check of left and right, the uniqueness or the
+    speckle filter took them out."""
     cv2 = need_opencv()
-    rows, columns = (n // COARSER for n in a.shape)
-    # whole pixels: disparities are those of the full resolution, divided
-    return cv2.resize(a[: rows * COARSER, : columns * COARSER], (columns, rows),
-                      interpolation=cv2.INTER_AREA)  # fmt: skip
-
-
-def semi_global(
-    left, right, low: int, high: int, speckle: int = SPECKLE
-) -> Float[np.ndarray, "rows columns"]:
-    """Disparities from `low` to `high` by OpenCV, pixels; NaN where the check of left and right,
-    the uniqueness or the speckle filter took them out."""
-    cv2 = need_opencv()
-    number = max(16, -(-(high - low + 1) // 16) * 16)
+    number = max(16, -(-(span + 1) // 16) * 16)
     matcher = cv2.StereoSGBM.create(
-        minDisparity=low, numDisparities=number, blockSize=BLOCK, P1=8 * BLOCK**2,
+        minDisparity=0, numDisparities=number, blockSize=BLOCK, P1=8 * BLOCK**2,
         P2=48 * BLOCK**2, disp12MaxDiff=1, preFilterCap=31, uniquenessRatio=UNIQUE,
-        speckleWindowSize=speckle, speckleRange=2,
+        speckleWindowSize=SPECKLE, speckleRange=2,
         mode=cv2.STEREO_SGBM_MODE_HH4 if left.size * number < MOST_COSTS
         else cv2.STEREO_SGBM_MODE_SGBM,
     )  # fmt: skip
     eight = [np.clip(np.rint(a), 0, 255).astype(np.uint8) for a in (left, right)]
     # columns of the left image without a full range of disparities are matched with a margin
-    margin = low + number
-    wide = [cv2.copyMakeBorder(a, 0, 0, margin, 0, cv2.BORDER_REPLICATE) for a in eight]
-    found = matcher.compute(*wide)[:, margin:].astype(np.float32) / 16
-    return np.where((found >= low) & (found <= high), found, np.nan)
+    wide = [cv2.copyMakeBorder(a, 0, 0, number, 0, cv2.BORDER_REPLICATE) for a in eight]
+    found = matcher.compute(*wide)[:, number:].astype(np.float32) / 16
+    return np.where((found >= 0) & (found <= span), found, np.nan)
 
 
 def ambiguous(
@@ -176,7 +145,9 @@ def ambiguous(
     """Pixels whose texture repeats itself along the row within the range of disparities, on a small
     surface of its own: what one image sees alone matches the repetition in the other."""
     cv2 = need_opencv()
-    repeated = _likeness(_coarser(left), span // COARSER) > REPETITION
+    rows, columns = (n // COARSER for n in left.shape)
+    coarse = cv2.resize(left, (columns, rows), interpolation=cv2.INTER_AREA)
+    repeated = _likeness(coarse, span // COARSER) > REPETITION
     if not repeated.any():
         return np.zeros(left.shape, bool)
     repeated = cv2.resize(repeated.astype(np.uint8), left.shape[::-1],

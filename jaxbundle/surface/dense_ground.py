@@ -19,7 +19,7 @@ PIECE = 1500
 """Side of a piece of the base image, pixels."""
 TOGETHER = 1 << 17
 """Points that are intersected together."""
-MOST_DISPARITIES = 400
+MOST_DISPARITIES = 200
 
 
 def dense_ground_cloud(

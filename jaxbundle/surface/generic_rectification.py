@@ -17,8 +17,9 @@ from scipy import ndimage
 from jaxbundle.surface.segments import windows
 from jaxbundle.surface.views import OrientedImage
 
-ROOM, LEAST_ROOM = 0.15, 8.0
-"""Disparities beyond those of the points: a part of their range, and pixels."""
+ROOM, LEAST_ROOM = 0.3, 12.0
+"""Disparities beyond those of the points, for houses between them: a part of their range, and
+pixels."""
 NODES = 33
 """Places a side at which the rows are projected; in between cubic."""
 
