@@ -100,8 +100,8 @@ def match_dense(pair: RowPair, span: int) -> Disparities:
     """Disparities from 0 to `span` of a rectified pair, at the pixels of its left image."""
     left, right = _prepared(pair)
     inside = np.isfinite(pair.left)
-    even = alike(left, right, inside, np.isfinite(pair.right))
-    start = semi_global(*even, span)
+    even, right_even = alike(left, right, inside, np.isfinite(pair.right))
+    start = semi_global(even, right_even, span)
     start[~inside] = np.nan
     start[ambiguous(left, start, span)] = np.nan
     return refine_disparities(left, right, start)
@@ -186,9 +186,9 @@ def refine_disparities(left, right, start) -> Disparities:
         wide, over_step = _with_windows(left, coefficients, start, WIDE, weak)
         with np.errstate(invalid="ignore"):
             better = weak & ~over_step & (wide.sigma < np.nan_to_num(found.sigma, nan=MOST_SIGMA))
-        mixed = [np.where(better, getattr(wide, name), getattr(found, name))
-                 for name in ("disparity", "sigma", "rho")]  # fmt: skip
-        found = Disparities(*mixed, found.factor)
+        mixed = {name: np.where(better, getattr(wide, name), getattr(found, name))
+                 for name in ("disparity", "sigma", "rho")}  # fmt: skip
+        found = dataclasses.replace(found, **mixed)
     return found
 
 
