@@ -73,7 +73,7 @@ def test_the_same_result_gives_the_same_page(convergent4):
 def test_words_and_numbers_are_those_of_the_protocol(convergent4, page):
     said = set(page.texts["td"])
     assert {str(convergent4.redundancy), "80", "64"} <= said
-    assert any(words.startswith("says nothing: unit weights") for words in said)
+    assert any(words.startswith("not meaningful: unit weights") for words in said)
     assert set(convergent4.warnings) <= set(page.texts.get("li", []))
     assert hashlib.sha256(EXAMPLE.read_bytes()).hexdigest() in said
     assert jaxbundle.__version__ in said and np.__version__ in said

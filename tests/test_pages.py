@@ -68,7 +68,7 @@ def test_the_table_of_a_batch_has_every_row(rows):
 
 @pytest.mark.parametrize("rows, verdict", [
     ([camera_row(i) for i in range(12)], "The result meets its tests."),
-    ([camera_row(0), camera_row(1, status="weak")], "The result is to be used with care: Fit."),
+    ([camera_row(0), camera_row(1, status="weak")], "Use the result with care: Fit."),
     ([{"key": "a", "status": "bad input", "error": "no such file"}],
      "The result does not meet its tests: Results."),
 ])  # fmt: skip

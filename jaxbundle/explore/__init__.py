@@ -1,8 +1,8 @@
-"""The explorer: one page on the loopback address over the real code (`jaxbundle explore`).
+"""The explorer: an interactive page on the loopback address (`jaxbundle explore`).
 
-A `View` says what its page shows, answers the values of its controls, and gives files to take away
-(`view`); `server` brings it to a browser and nothing else does. What the page draws is what the
-server answers: no formula of the library is written a second time in a script.
+A `View` defines what its page shows, answers changes of its controls, and provides files to
+download (`view`); `server` connects it to a browser. The page draws the answers of the
+server: no formula of the library is repeated in a script.
 
     from jaxbundle.explore.network import NetworkView
     from jaxbundle.explore.server import Server

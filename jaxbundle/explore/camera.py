@@ -1,10 +1,10 @@
-"""A camera to explore: what its parameters do to the image, by its own projection function.
+"""The camera explorer: the effect of its parameters on the image, by its projection function.
 
-The grid: rays that the camera as given would image at even distances if it had no distortion (grey,
-straight lines), and where the parameters on the sliders image the same rays. The curve: radial
-distortion, measured − ideal, beside that of the camera as given. A photograph is freed of the
-distortion by looking up, for every pixel of a perspective image of the same principal distance,
-where its ray is imaged.
+The grid: rays with a regular image by the original camera without distortion (grey,
+straight lines), and their images with the current parameters. The curve: radial
+distortion, measured − ideal, with that of the original camera. A photograph is undistorted
+by looking up the image of the ray of every pixel of a perspective image with the same principal
+distance.
 """
 
 import base64
@@ -43,7 +43,8 @@ RADII = 61
 STEPS = 6
 """Rows of the table of distortion."""
 SLIDER = 0.04
-"""A slider moves the image point near a corner by this part of the half diagonal at most."""
+"""Range of a slider: largest motion of an image point near a corner, relative to the half
+diagonal."""
 WIDEST = 1000
 """Pixels across of a photograph on the page."""
 JPEG_QUALITY = 85
@@ -86,7 +87,7 @@ class CameraView:
     # --- values -----------------------------------------------------------------------------
 
     def parameters(self, given: Given) -> dict[str, float]:
-        """All parameters by name, those of the camera where the page sends none.
+        """All parameters by name, by default those of the camera.
 
         **Raises:** `InputError`."""
         check_keys(given, self.values)
@@ -215,7 +216,7 @@ class CameraView:
         drawing = draw_plan(lines, f"x [{unit_of_axes}]", f"y [{unit_of_axes}]",
                             down=self.model.axes == "down")  # fmt: skip
         return figure(
-            drawing, f"Against the camera as given the image moves by RMS "
+            drawing, f"Image displacement relative to the original camera: RMS "
             f"{significant(scale * rms)} {unit}, at most {significant(scale * largest)} {unit}",
         )  # fmt: skip
 
@@ -252,7 +253,7 @@ class CameraView:
         data = base64.b64encode(coded.tobytes()).decode("ascii")
         return (f'<img alt="undistorted photograph" src="data:image/jpeg;base64,{data}">\n'
                 + paragraph("In perspective, with the principal distance and point on the "
-                            "sliders; white where the photograph does not reach.", "hint"))
+                            "sliders; white outside the photograph.", "hint"))
 
     def _lookup(self, shape: tuple[int, int], values):
         """Columns and rows in a photograph of the pixels of its undistorted picture."""

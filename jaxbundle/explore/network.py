@@ -1,10 +1,10 @@
-"""A network to explore: what was adjusted, and what σ to expect where its stations are moved.
+"""The network explorer: the adjusted network, and the expected σ after moving stations.
 
 The σ after a move are those of a design (`jaxbundle.precision`): J at the adjusted values with the
-stations at their new places, image coordinates predicted from them, the weights of the adjustment;
-no measurement enters. σ before the move come by the same way from the adjusted values, so that the
-two differ by the geometry alone. Both are times the σ0 of the adjustment. Who sees whom stays as it
-is; the answer counts image points that would lie outside the image, or behind the camera.
+stations at their new positions, predicted image coordinates, the weights of the adjustment. σ
+before the move are computed in the same way from the adjusted values, so that the two differ only
+by the geometry. Both are multiplied by σ0 of the adjustment. Visibility is not changed; the answer
+counts image points outside the image, or behind the camera.
 """
 
 import dataclasses
@@ -94,9 +94,9 @@ class NetworkView:
         return jax.jit(lambda data: precision(problem, data, sigma0=scale))
 
     def sigma(self, start: Values) -> Precision:
-        """σ of everything with the network at these values.
+        """All σ of the network at these values.
 
-        **Raises:** `InputError` where it does not determine everything."""
+        **Raises:** `InputError` if it leaves unknowns undetermined."""
         data: Data = dataclasses.replace(self.problem.data, start=start)
         found = jax.tree.map(np.asarray, self._sigma(data))
         if not np.isfinite(found.images).all():
@@ -112,7 +112,7 @@ class NetworkView:
     # --- moves ------------------------------------------------------------------------------
 
     def moves(self, given: Given) -> list[Moved]:
-        """The stations that are moved; with `aim` turned so that they look at their points.
+        """The moved stations; with `aim` rotated to look at their points.
 
         **Raises:** `InputError`."""
         check_keys(given, ("moves", "aim"))
@@ -138,7 +138,8 @@ class NetworkView:
         return Moved(row, pose[:3], self._turn_to_points(row, pose[:3]))
 
     def _turn_to_points(self, row: int, centre) -> np.ndarray:
-        """M that images the middle of the station's points where it was, by the smallest turn."""
+        """M that keeps the image of the centre of the station's points, by the smallest
+        rotation."""
         problem = self.problem
         seen = problem.point[(problem.image == row) & ~problem.at_any_distance[problem.point]]
         given = self.adjustment.image_values[row]
@@ -225,7 +226,7 @@ class NetworkView:
         return at + self._corners[moved.row] @ moved.M
 
     def _say_visibility(self, moves: list[Moved]) -> str:
-        """How many image points of the moved stations would not be there."""
+        """Messages about image points of moved stations outside the image or behind the camera."""
         problem, lines = self.problem, []
         for moved in moves:
             rays = np.flatnonzero(problem.image == moved.row)
@@ -241,8 +242,8 @@ class NetworkView:
             lost = int((behind | outside).sum())
             if lost:
                 lines.append(f"{lost} of {count(len(rays), 'image point')} of image "
-                             f"{clean(self.ids[moved.row])} would lie outside the image or behind "
-                             "the camera; the σ below count them all the same")  # fmt: skip
+                             f"{clean(self.ids[moved.row])} would be outside the image or behind "
+                             "the camera; the σ below still include them")  # fmt: skip
             elif not known:
                 lines.append(f"the size of the images of camera {clean(camera.id)} is not known: "
                              "whether all image points lie in them is not checked")  # fmt: skip

@@ -1,8 +1,8 @@
-"""A line scanner to explore: interpolation, errors of attitude, corrections, and the ground.
+"""The line scanner explorer: interpolation, attitude errors, corrections, and ground height.
 
-Two kinds of files. Of a *scanner file* the image as it was read is what changes are measured
-against, or a known truth. A *flight file* is simulated: what its instruments tell, sampled, noisy
-and interpolated by the chosen methods, is measured against the true trajectory; its rates and σ are
+Two kinds of files. Changes of a *scanner file* are compared with the unchanged image, or with a
+known truth. A *flight file* is simulated: the records of its instruments, sampled, noisy
+and interpolated by the chosen methods, are compared with the true trajectory; its rates and σ are
 controls too.
 
 Attitude errors are given as roll, pitch, yaw of the camera (R·exp([ε]×)) and put into the rows of
@@ -115,7 +115,7 @@ class ScannerView:
 
     @cached_property
     def controls(self) -> list[Control]:
-        """What can be chosen, as the file has it."""
+        """The controls with the values of the file."""
         position, attitude = self.image.trajectory.position, self.image.trajectory.attitude
         quaternions = attitude.table.values.shape[1] == 4
         ways = [m for m in METHODS if m != "hermite" or position.rates is not None]
@@ -147,7 +147,7 @@ class ScannerView:
         return [*found, Number("ground", "height of the ground", 0.0, "m")]
 
     def values(self, given: Given) -> dict[str, Any]:
-        """All values by key, those of the file where the page sends none.
+        """All values by key, by default those of the file.
 
         **Raises:** `InputError`."""
         check_keys(given, [control.key for control in self.controls])
@@ -222,7 +222,7 @@ class ScannerView:
         errors = self._errors(chosen)
         length = np.hypot(*errors.T)
         if not np.isfinite(length).all():
-            raise InputError("not every place of the image has a point on the ground: look at "
+            raise InputError("not every image position has a point on the ground: check "
                              "attitude, mounting and height")  # fmt: skip
         expected = self._expected(chosen)
         rms, ce90 = np.sqrt(np.mean(length**2)), np.quantile(length, 0.9)
@@ -334,7 +334,7 @@ class ScannerView:
             east, north = self._map(truth, P)
             curves.append(Curve("track, from above", east, north, None, "given"))
         return figure(draw_plan(curves, "east [km]", "north [km]"),
-                      "From the middle of the image; both axes at one scale")  # fmt: skip
+                      "Relative to the image centre; both axes at one scale")  # fmt: skip
 
     def _draw_errors(self, field, told) -> str:
         return figure(
@@ -357,7 +357,7 @@ class ScannerView:
             (f"{row['sigma']:g}°", *(significant(row[name], 4) for name in names))
             for row in expected
         ]
-        return first + "<h3>Accuracy to expect of an error for the whole image</h3>\n" + grid(
+        return first + "<h3>Expected accuracy for a constant error over the image</h3>\n" + grid(
             header, table
         )
 
@@ -475,7 +475,7 @@ def _one(sigma) -> float:
 
 
 def _degrees(sigma) -> float:
-    """As people write it: 0.01, not 0.010000000000000002."""
+    """The shortest form: 0.01, not 0.010000000000000002."""
     return float(f"{np.degrees(_one(sigma)):.12g}")
 
 

@@ -1,9 +1,9 @@
 """One page for one browser, from the loopback address.
 
-The address has a random token, without which nothing is answered: another user of the machine, or a
-page of another site that guesses the port, gets status 403. Bodies are JSON of limited size. What
-the view refuses comes back as `{"error": …}`, one line, with status 400; a fault of the program
-with status 500, and its line on the terminal.
+The address contains a random token: without it another user of the machine, or a page of another
+site that guesses the port, gets status 403. Bodies are JSON of limited size. Errors of the view are
+returned as `{"error": …}`, one line, with status 400; program faults with status 500 and a line on
+the terminal.
 
 | request | answer |
 |---|---|
@@ -31,7 +31,7 @@ MOST_BYTES = 256 * 1024
 """Of the body of a request."""
 MOST_READ = 16 * MOST_BYTES
 PATIENCE = 30.0
-"""Seconds a browser has to send what it has announced."""
+"""Timeout for the announced body of a request, seconds."""
 HTML, JSON = "text/html; charset=utf-8", "application/json"
 
 
@@ -69,7 +69,7 @@ class Server(ThreadingHTTPServer):
         return f"http://{HOST}:{self.server_port}/{self.token}/"
 
     def handle_error(self, request, client_address) -> None:
-        """A browser that has gone is no matter for the terminal."""
+        """Ignore closed connections of the browser."""
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -140,7 +140,7 @@ class Handler(BaseHTTPRequestHandler):
 
     def _get(self, action: str, _: bytes) -> File:
         if action or not self.path.endswith("/"):
-            raise Refused(HTTPStatus.NOT_FOUND, "there is one page, at /TOKEN/")
+            raise Refused(HTTPStatus.NOT_FOUND, "the only page is at /TOKEN/")
         return page_file(self.server.view, {}, live=True)
 
     def _post(self, action: str, body: bytes) -> File:

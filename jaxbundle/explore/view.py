@@ -1,4 +1,4 @@
-"""What the server asks of a thing that can be explored, and how its answers are checked."""
+"""The interface of explorer views, and the checks of their input."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -21,20 +21,20 @@ class File(NamedTuple):
 
 
 class View(Protocol):
-    """A thing that can be explored.
+    """An explorer view.
 
-    `given` are the values of the controls as the page sends them; every method refuses what it
-    cannot compute by `InputError` or `NotSolvedError`.
+    `given` are the values of the controls sent by the page; methods raise `InputError` or
+    `NotSolvedError` for values that they cannot compute.
     """
 
     def page(self, given: Given, live: bool) -> Page:
-        """The page with these values; `live`: its controls ask the server, otherwise it is a copy
-        to keep."""
+        """The page with these values; `live`: its controls call the server, otherwise it is a
+        standalone copy."""
         ...
 
     def answer(self, given: Given) -> dict[str, Any]:
-        """What follows from these values: `parts`, HTML by the id of its place, and whatever else
-        the scripts of the view take."""
+        """The answer to these values: `parts`, HTML by element id, and further data for the scripts
+        of the view."""
         ...
 
     def export(self, name: str, given: Given) -> File:

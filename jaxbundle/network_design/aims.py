@@ -1,13 +1,13 @@
-r"""Aims of a design: one number that is to be small.
+r"""Aims of a design: one number to minimise.
 
 With the covariances C of n coordinates of points or of other functions, σ² their diagonals:
 
     mean          √(Σσ²/n)                  A-optimality; of points Fraser's mean σ
-    worst         (Σ(tr C_k/3)^q)^(1/2q)    the worst point, a few percent above its σ
+    worst         (Σ(tr C_k/3)^q)^(1/2q)    the worst point, a few per cent above its σ
     determinant   (Π det C_k)^(1/2n)        D-optimality: mean radius of the error ellipsoids
     reliability   (Σ r^(−q))^(1/2q)         1/√r of the smallest redundancy number: of the MDB
 
-of what is not a point all of C, as one block.
+For quantities other than points C is one block.
 
 Sources: Grafarend (1974); Fraser (1984), Photogrammetric Engineering and Remote Sensing 50(8);
 Baarda (1968) for r.
@@ -46,22 +46,22 @@ Functions = Callable[[Values], Float[Array, " functions"]]
 POWER = 12
 """The q of smooth maxima."""
 COUNTS = 1e-3
-"""Of the largest weight 1/σ: what has less is next to nothing, and its control does not count."""
+"""Smallest weight 1/σ, relative to the largest, whose redundancy number counts."""
 INVARIANT = 1e-7
-"""A change by an open motion, relative to the sizes of its terms, below which there is none."""
+"""A smaller change by an open motion, relative to the sizes of its terms, counts as zero."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Aim:
-    """What is to be small.
+    """The quantity to minimise.
 
     **Arguments:**
 
     - `measure`: "mean", "worst", "determinant" of the σ, or "reliability": of the image coordinate
-      with the smallest redundancy number, which is the one with the largest MDB.
-    - `of`: the σ of what: "points" (the tie points), "cameras" (all free parameters of cameras),
+      with the smallest redundancy number and hence the largest MDB.
+    - `of`: the quantities: "points" (the tie points), "cameras" (all free parameters of cameras),
       names such as `(("camera", "cam", "c"),)`, or any function of the unknowns, `Values ->
-      [functions]`. Object coordinates in `Values` are relative to the middle of the points.
+      [functions]`. Object coordinates in `Values` are relative to the centroid of the points.
 
     **Raises:** `InputError` for another measure.
     """
@@ -91,9 +91,9 @@ class Aim:
 
 
 def functions_of(problem: Problem, aim: Aim) -> Functions | None:
-    """What the aim is about, as a function of the unknowns; None for points and reliability.
+    """The quantities of the aim as a function of the unknowns; None for points and reliability.
 
-    **Raises:** `InputError` where no camera has a free parameter, `KeyError` for unknown names."""
+    **Raises:** `InputError` if no camera has a free parameter, `KeyError` for unknown names."""
     of = aim.of
     if aim.measure != "reliability" and of == "points" and not of_interest(problem).any():
         raise InputError("aim: all points are held, and their σ is 0; aim at the cameras")
@@ -116,7 +116,7 @@ def functions_of(problem: Problem, aim: Aim) -> Functions | None:
 
 
 def of_interest(problem: Problem) -> Bool[np.ndarray, " points"]:
-    """The points whose σ is aimed at: tie points, without any all that are not held."""
+    """The points of the aim: tie points, or if there are none all that are not held."""
     points = problem.network.points
     tie = points.has_role("tie")
     return tie if tie.any() else ~points.has_role("fixed")
@@ -139,7 +139,7 @@ class Task(NamedTuple):
 def task_of(problem: Problem, aim: Aim) -> Task:
     """The aim for the engine.
 
-    **Raises:** `InputError` where no factor of the network fits into memory."""
+    **Raises:** `InputError` if no factor of the network fits into memory."""
     problem = problem.with_factor()
     system, functions = problem.system, functions_of(problem, aim)
     if problem.reduction not in FACTORS:
@@ -157,9 +157,9 @@ def task_of(problem: Problem, aim: Aim) -> Task:
 
 @eqx.filter_jit
 def log_aim(task: Task, data: EngineData) -> tuple[Float[Array, ""], EngineData]:
-    """The logarithm of the aim and its gradient by all numbers of a design, which are filled to the
-    sizes of the plan; NaN where the design does not determine everything. Designs of one shape
-    share the program."""
+    """The logarithm of the aim and its gradient by all numbers of a design, which are padded to the
+    sizes of the plan; NaN if the design leaves unknowns undetermined. Designs of one shape share
+    the program."""
     declared, plan = task.declared, task.plan
 
     def value(data):
@@ -182,8 +182,7 @@ def log_aim(task: Task, data: EngineData) -> tuple[Float[Array, ""], EngineData]
 
 
 def aim_of(problem: Problem, aim: Aim) -> float:
-    """The aim of a network at its start values, by its own weights; NaN where it is not
-    determined."""
+    """The aim of a network at its start values with its weights; NaN if it is not determined."""
     data = pad_data(problem.system, problem.layout.data(problem.data))
     return float(jnp.exp(log_aim(task_of(problem, aim), data)[0]))
 
@@ -242,7 +241,7 @@ def _norm(x, power: int):
 
 
 def refuse_arbitrary(aim: Aim, problem: Problem) -> None:
-    """Refuse an aim that the datum decides.
+    """Refuse an aim that depends on the datum.
 
     **Raises:** `InputError`."""
     datum = problem.system.plan.datum
@@ -252,8 +251,8 @@ def refuse_arbitrary(aim: Aim, problem: Problem) -> None:
     if functions is None:
         if problem.network.datum == "minimal":
             raise InputError(
-                "aim: the datum is minimal, so that the σ of points depend on which coordinates "
-                'hold it; choose inner constraints (datum = "inner"), the datum of smallest mean σ '
+                "aim: the datum is minimal, so that the σ of points depend on the held "
+            'coordinates; choose inner constraints (datum = "inner"), the datum of smallest mean σ '
                 "(design of order zero), or control points"
             )
         return
@@ -264,9 +263,9 @@ def refuse_arbitrary(aim: Aim, problem: Problem) -> None:
     size = np.abs(slope) @ np.abs(np.asarray(datum.gauge)) + np.abs(functions(start))[:, None]
     if (change > INVARIANT * size).any():
         raise InputError(
-            f"aim: {defect} of 7 datum parameters are open, and the datum decides the {aim}: a "
-            "coordinate is known only relative to the points that hold the datum. Aim at what no "
-            "datum changes (a parameter of a camera; a ratio of distances, or a distance where "
+            f"aim: {defect} of 7 datum parameters are open, and the {aim} depends on the datum: a "
+            "coordinate is known only relative to the datum points. Aim at a datum-invariant "
+            "quantity (a parameter of a camera; a ratio of distances, or a distance if "
             "there is a scale), at the σ of all points under inner constraints, or give control "
             "points"
         )

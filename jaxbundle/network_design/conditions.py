@@ -1,8 +1,8 @@
-"""What a design must keep to: where cameras can stand, and when they image a target.
+"""Conditions of a design: allowed camera positions, and visibility of targets.
 
-A condition of a *ray* says whether a station measures a target: field of view, length of the ray,
-depth in focus, angle of incidence, nothing in between. A condition of a *station* says where it can
-stand: in the room, outside of obstacles, apart from the others.
+A condition of a *ray* decides whether a station measures a target: field of view, length of the
+ray, depth of focus, angle of incidence, no obstacle. A condition of a *station* restricts its
+position: in the room, outside of obstacles, apart from the others.
 """
 
 import dataclasses
@@ -25,19 +25,19 @@ class Conditions:
 
     **Arguments:**
 
-    - `room`: lowest and highest X, Y, Z of projection centres. Without one they stay within three
-      times the largest distance of a start station from the middle of the targets.
+    - `room`: lowest and highest X, Y, Z of projection centres. Default: within three times the
+      largest distance of a start station from the centroid of the targets.
     - `distance`: shortest and longest ray, from the projection centre to a target.
     - `focus`: smallest and largest depth along the optical axis that is in focus.
-    - `edge`: part of the format, on each side, that is not used.
+    - `edge`: unused fraction of the format on each side.
     - `incidence`: largest angle between the normal of a target and the ray; needs `normals`, [P, 3]
       in the order of the points or one [3] for all.
-    - `apart`: smallest distance of two stations.
-    - `obstacles`: boxes with edges along X, Y, Z, (lowest corner, highest corner), that hide what
-      is behind them and in which no camera stands; a wall or table is a thin box.
-    - `targets`: box in which targets may be moved, where they are free.
+    - `apart`: smallest distance between stations.
+    - `obstacles`: opaque boxes with edges along X, Y, Z, (lowest corner, highest corner), without
+      cameras inside; a wall or table is a thin box.
+    - `targets`: box for free targets.
 
-    **Raises:** `InputError` for what is empty or no number.
+    **Raises:** `InputError` for empty boxes and invalid numbers.
     """
 
     room: Box | None = None
@@ -71,9 +71,9 @@ class Conditions:
             put("normals", unit_vectors(self.normals))
 
     def of_points(self, points: int) -> Float[np.ndarray, "points 3"] | None:
-        """The normal of every target, None where none are given.
+        """The normal of every target, None if none are given.
 
-        **Raises:** `InputError` where there are others than the network has points."""
+        **Raises:** `InputError` if their number differs from that of the points."""
         if self.normals is None:
             return None
         normals = np.asarray(self.normals)

@@ -1,4 +1,4 @@
-"""`design`: the network with the smallest σ that conditions allow.
+"""`design`: the network with the smallest σ under given conditions.
 
     network = jaxbundle.simulate(stations, targets, camera, noise=0.002)
     room = jaxbundle.Conditions(room=((-4, -4, 0), (4, 4, 3)), distance=(1, 6), apart=0.5)
@@ -7,7 +7,7 @@
 
 The orders are those of Grafarend (1974), in the words of Fraser (1984): zero, the datum; first, the
 configuration; second, the weights of observations, here of whole photographs; third, the
-densification of a network that exists.
+densification of an existing network.
 """
 
 from collections.abc import Sequence
@@ -40,11 +40,11 @@ from jaxbundle.network_design.variables import Start, bounds, choose_variables
 from jaxbundle.network_design.weights import select
 
 ROLLED = 0.1
-"""Radians, at random: by which a search begins rolled, for without it no roll is often a saddle."""
+"""Random initial roll, radians, since zero roll is often a saddle point."""
 CANDIDATES, REFINED = 48, 2
-"""Places tried for a further photograph, and how many of the best are followed."""
+"""Number of positions tried for a further photograph, and of the best ones refined."""
 ROUGH = 0.1
-"""Softness of the conditions with which they are compared."""
+"""Softness of the conditions in this comparison."""
 
 
 def design(
@@ -61,27 +61,27 @@ def design(
     max_iterations: int = 60,
     seed: int = 0,
 ) -> Design:
-    """Design a network: make an aim as small as conditions allow.
+    """Design a network: minimise an aim under conditions.
 
     **Arguments:**
 
     - `network`: cameras with their `image_size`, targets, and stations to start from; image points
-      are needed where a network that exists is to get a further photograph, others do not count.
+      are needed only to add a photograph to an existing network.
     - `aim`: "mean", "worst", "determinant" of the σ of points, "reliability", or an `Aim`.
-    - `order`: "zero": the datum of smallest mean σ. "first": where stations stand and look, their
-      roll, where targets are (`free`: some of "position", "direction", "roll", "targets"), of all
+    - `order`: "zero": the datum of smallest mean σ. "first": positions, directions and roll of
+      stations, and targets (`free`: some of "position", "direction", "roll", "targets"), of all
       stations or those in `stations`; for a calibration these are the poses of the board
-      (`Design.board_poses`). "second": which `photographs` of the candidates given are taken.
-      "third": where so many further `photographs` are taken, 1 if not given, with the last camera.
-    - `sigma_image`: σ of image coordinates to come, in the unit of the cameras' models; the median
-      of those of the network if not given.
-    - `starts`: searches of first order, the further ones from stations at random in the room.
-    - `max_iterations`: of a round of the search; `seed`: of all that is random.
+      (`Design.board_poses`). "second": select this number of `photographs` from the given
+      candidates. "third": add this number of `photographs`, default 1, with the last camera.
+    - `sigma_image`: σ of future image coordinates, in the unit of the camera models; default: the
+      median of the network.
+    - `starts`: number of searches of first order, all but one from random stations in the room.
+    - `max_iterations`: per round of the search; `seed`: random seed.
 
-    **Returns:** a `Design`. Both states in it are as stations see targets, without softness.
+    **Returns:** a `Design`. Both of its states are without softness of the visibility.
 
-    **Raises:** `InputError` for conditions that no station keeps, targets that none sees, an aim
-    that the datum decides; `NotSolvedError` where no network that determines the aim was found.
+    **Raises:** `InputError` for conditions that no station satisfies, targets that none sees, an
+    aim that depends on the datum; `NotSolvedError` if no network that determines the aim was found.
     """
     require_x64()
     one_of("order", order, tuple(ORDERS))
@@ -196,7 +196,7 @@ def _add_photographs(network, aim, conditions, sigma, more, max_iterations, seed
 
 
 def _best_place(pairs: Pairs, new, max_iterations: int, seed: int):
-    """Places at random compared, the best of them followed."""
+    """Compare random positions and refine the best."""
     moving = np.flatnonzero(new)
     start = start_at(pairs)
     variables = choose_variables(start.values, DESIGNED[:3], moving, np.zeros(0, int))
@@ -221,7 +221,7 @@ def _best_place(pairs: Pairs, new, max_iterations: int, seed: int):
 
 def _design_datum(network, aim, conditions, sigma, seed) -> Design:
     """Inner constraints on all object points, the datum of the smallest mean σ of them (Meissl
-    1969), against the datum that the network has."""
+    1969), compared with the datum of the network."""
     if aim.measure == "reliability" or aim.of != "points":
         raise InputError("order \"zero\": the datum is designed for the σ of points")
     if network.datum == "control":
@@ -242,14 +242,14 @@ def _design_datum(network, aim, conditions, sigma, seed) -> Design:
 
 
 def _state(pairs: Pairs, network: Network, values: Values, seed: int, measured=None) -> State:
-    """What the stations see at these values."""
+    """The visibility of targets at these values."""
     measured = pairs.measured(values) if measured is None else measured
     exact = realise(pairs, values, measured, None, network.residuals)
     lost, aim = lost_targets(pairs, measured), float("nan")
     if not lost:
         aim = pairs.aim_at(measured, values)
     if not np.isfinite(aim) and (problem := problem_of(exact)) is not None:
-        aim = aim_of(problem, pairs.aim)  # Of what is left.
+        aim = aim_of(problem, pairs.aim)  # Of the remaining targets.
     noisy = realise(pairs, values, measured, seed, network.residuals)
     return State(noisy, exact, aim, lost)
 
@@ -261,7 +261,7 @@ def _better(a: State, b: State) -> bool:
 
 
 def _keeps(conditions, pairs, variables, start) -> bool:
-    """Whether the start keeps the conditions of stations."""
+    """Whether the start satisfies the conditions of stations."""
     low, high = room_of(conditions, pairs)
     inside = ((start.values.position >= low) & (start.values.position <= high)).all()
     return bool(inside) and kept(conditions, variables, pairs.problem.origin, start)
@@ -276,7 +276,7 @@ def _require_determined(state: State) -> None:
 
 
 def _rolled(start: Start, variables, seed: int) -> Start:
-    """A little roll, so that the search leaves a symmetrical start."""
+    """A small roll, so that the search leaves a symmetrical start."""
     x = variables.vector(start)
     if "roll" not in variables.sizes:
         return start
@@ -295,7 +295,7 @@ def _elsewhere(pairs: Pairs, start: Start, moving, seed: int) -> Start:
 
 
 def _placed(pairs: Pairs, start: Start, rows, position, rotation, target: int) -> Start:
-    """Some stations elsewhere."""
+    """Some stations at other positions."""
     values = start.values
     positions, rotations, look = (
         np.array(x) for x in (values.position, values.rotation, start.look)

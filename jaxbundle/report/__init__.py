@@ -1,11 +1,11 @@
-"""The result of an adjustment for people: the protocol to file, and shorter forms of it.
+"""The report of an adjustment, and shorter forms of it.
 
     print(jaxbundle.report.text(adjustment, date="2024-05-02"))
 
-The protocol is plain text of at most 100 characters a line: the settings and the datum, the course
-of the iterations, σ0 and the global test, cameras, images, points, residuals, reliability, variance
+The report is plain text of at most 100 characters per line: settings and datum, course of the
+iterations, σ0 and the global test, cameras, images, points, residuals, reliability, variance
 components, check points, distances. σ are a posteriori. A network that was not solved gets a short
-report that says why and what to do, without any number of a solution.
+report with reason and remedy, without numbers of a solution.
 """
 
 from jaxbundle.report import head, observations, unknowns
@@ -26,15 +26,15 @@ def text(
     accuracy_unit: float | None = None,
     budget=None,
 ) -> str:
-    """The whole protocol of an adjustment.
+    """The full report of an adjustment.
 
     **Arguments:**
 
     - `residual_limit`: residuals whose test value is larger are listed one by one.
-    - `date`: printed in the head as it is given; nothing is printed without it, so that the same
+    - `date`: printed in the head as given; omitted by default, so that the same
       adjustment always gives the same report.
-    - `test`: what the limit is for, `"pope"` (τ, σ a posteriori) or `"baarda"` (w, σ a priori).
-    - `max_rows`: at most so many images, points, check points and distances are listed.
+    - `test`: the test of the limit, `"pope"` (τ, σ a posteriori) or `"baarda"` (w, σ a priori).
+    - `max_rows`: largest number of listed images, points, check points and distances.
     - `accuracy_unit`: points are counted by σ in classes of 0.1, 0.5, 1, 2 and 4 times this length
       (object unit); None: times the RMS of all σ of the points.
     - `budget`: the error budget of the adjustment (`jaxbundle.sensitivity`), a section at the end.

@@ -1,5 +1,5 @@
-"""The equations of the camera models, as a protocol prints them; of an own model the docstring of
-its formula."""
+"""The equations of the camera models for reports; for a user-defined model the docstring of its
+formula."""
 
 import inspect
 import re
@@ -141,4 +141,4 @@ def equations(model: CameraModel) -> tuple[str, ...]:
     if name in EQUATIONS:
         return EQUATIONS[name]
     said = (inspect.getdoc(model.formula) or "").splitlines()
-    return tuple(line for line in said if line.strip()) or ("of the user's own",)
+    return tuple(line for line in said if line.strip()) or ("user-defined",)

@@ -1,4 +1,4 @@
-"""The opening of a protocol: what was adjusted and how, how it ended, what σ0 says.
+"""The head of a report: input, method, termination, σ0.
 
 σ0 has no unit: it is the factor between the a priori and the a posteriori standard deviations. The
 precision of an image coordinate is σ0 times its a priori σ, in the unit of the image.
@@ -41,13 +41,13 @@ ADVICE = {
     LIMIT: "Allow more iterations (--max-iterations), or give better start values.",
     SINGULAR: "Measure what determines them, give them a prior σ, or hold them.",
     STUCK: "Give better start values, and look for gross errors in observations and point names.",
-    NOT_FINITE: "Give better start values: some points lie behind their cameras or in their "
+    NOT_FINITE: "Give better start values: some points are behind their cameras or in their "
     "plane, or outside the range of the distortion.",
 }
 
 
 def title(adjustment, date: str | None) -> list[str]:
-    """Name of the program, its version, the date, and what was adjusted."""
+    """Name of the program, its version, the date, and the network."""
     from jaxbundle import __version__
 
     left = f"jaxbundle {__version__}: bundle adjustment"
@@ -78,7 +78,7 @@ def setting_facts(adjustment) -> list[tuple[str, str]]:
 
 
 def reduced_system(adjustment) -> str:
-    """How large the system of images and cameras is, and how it was solved."""
+    """The size of the reduced system of images and cameras, and its solver."""
     plan = adjustment.problem.system.plan
     how = REDUCTIONS[adjustment.reduction]
     if adjustment.reduction == "banded":
@@ -87,7 +87,7 @@ def reduced_system(adjustment) -> str:
 
 
 def datum(adjustment) -> str:
-    """What the coordinates refer to, and what the observations leave open."""
+    """The datum of the coordinates, and the freedoms left open by the observations."""
     network, data = adjustment.problem.network, adjustment.problem.data
     system = adjustment.problem.system
     defect = adjustment.counts.datum
@@ -118,7 +118,7 @@ def datum(adjustment) -> str:
     else:
         how = (
             f"inner constraints on {count(int(weight.any(1).sum()), 'datum point')}, whose start "
-            "values fix it on the whole (sum of their variances smallest)"
+            "values fix it (smallest sum of their variances)"
         )
     return (
         f"{network.datum}; {open_ones}; {how}. Coordinates, exterior orientation and their σ "
@@ -127,12 +127,12 @@ def datum(adjustment) -> str:
 
 
 def counts(adjustment) -> list[str]:
-    """How many of what, and the redundancy they leave."""
+    """Counts of observations and unknowns, and the redundancy."""
     return [*heading("Counts"), *table(("", "", ""), count_rows(adjustment), "lrl")[1:]]
 
 
 def count_rows(adjustment) -> list[tuple[str, str, str]]:
-    """What is counted, its number, and the parts of it."""
+    """Label, count, and its parts."""
     network, n = adjustment.problem.network, adjustment.counts
     roles = [(role, int(network.points.has_role(role).sum())) for role in ROLES]
     kinds = [
@@ -163,12 +163,12 @@ def count_rows(adjustment) -> list[tuple[str, str, str]]:
 
 
 def _listed(groups) -> str:
-    """Names with their counts, the empty ones left out."""
+    """Names with their non-zero counts."""
     return ", ".join(f"{name} {n}" for name, n in groups if n)
 
 
 def convergence(adjustment) -> list[str]:
-    """One row an evaluation; a rejected step is one that would have increased vᵀPv."""
+    """One row per evaluation; a rejected step would have increased vᵀPv."""
     vtpv, damping, accepted = evaluations(adjustment)
     tried = len(vtpv)
     rows = [
@@ -206,13 +206,13 @@ def evaluations(adjustment) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def image_sigmas(adjustment) -> np.ndarray:
-    """The a priori σ of the image coordinates, each once, ascending."""
+    """The distinct a priori σ of the image coordinates, ascending."""
     weight = np.asarray(adjustment.problem.data.image_weight)
     return np.unique(np.round(1 / weight[weight > 0], 12))
 
 
 def unit_weights(adjustment) -> bool:
-    """Whether every image coordinate has σ 1 mm: no statement about its precision at all."""
+    """Whether every image coordinate has σ 1 mm, which says nothing about its precision."""
     sigma = image_sigmas(adjustment)
     return len(sigma) == 1 and sigma[0] == 1.0 and adjustment.image_unit == "mm"
 
@@ -235,7 +235,7 @@ def image_precision(adjustment) -> str:
 
 
 def span(values, digits: int = 5) -> str:
-    """From the smallest to the largest; one number where they are the same to these digits."""
+    """From the smallest to the largest; one number if they are equal to these digits."""
     return " to ".join(dict.fromkeys(significant(value, digits) for value in values))
 
 
@@ -247,14 +247,14 @@ def chi_squared(adjustment, level: float = 0.05) -> str:
         return "not made: the σ of the groups were estimated from these residuals, so that σ0 is 1"
     found = adjustment.global_test(level)
     if unit_weights(adjustment):
-        return f"says nothing: unit weights (σ a priori 1 mm); {_interval(found, level)}"
+        return f"not meaningful: unit weights (a priori σ 1 mm);  {_interval(found, level)}"
     return test_in_words(found, level) + (
         ", see Warnings" if adjustment.doubts and found["vtpv"] > found["high"] else ""
     )
 
 
 def test_in_words(found, level: float = 0.05) -> str:
-    """What a χ² test of vᵀPv says (`statistics.global_test`)."""
+    """The conclusion of a χ² test of vᵀPv (`statistics.global_test`)."""
     said = f"{'' if found['passed'] else 'not '}passed: {_interval(found, level)}; "
     if found["passed"]:
         return f"{said}the a priori σ are confirmed"
@@ -273,12 +273,12 @@ def _interval(found, level: float) -> str:
 def variance_factor(adjustment) -> list[str]:
     """σ0, what it means in the image, and the global test."""
     text = (
-        "All standard deviations below are a posteriori, σ0 × those of the a priori weights, "
-        "unless they are said to be a priori."
+        "All standard deviations below are a posteriori, σ0 × those from the a priori weights, "
+        "unless called a priori."
     )
     if adjustment.sigma_factors:
         text += (
-            " The a priori σ of the groups of observations are those estimated, not those given: "
+            "  The a priori σ of the groups of observations are the estimated ones:  "
             "see Variance components."
         )
     return [*heading("Variance factor"), *facts(variance_facts(adjustment)), "", *paragraph(text)]
@@ -289,27 +289,27 @@ def variance_facts(adjustment) -> list[tuple[str, str]]:
     return [
         ("vᵀPv", significant(adjustment.vtpv, 7)),
         ("Redundancy", str(adjustment.redundancy)),
-        ("σ0", f"{significant(adjustment.sigma0, 6)}  √(vᵀPv/redundancy), without unit"),
+        ("σ0", f"{significant(adjustment.sigma0, 6)}  √(vᵀPv/redundancy), dimensionless"),
         ("Image coordinate", image_precision(adjustment)),
         ("χ² test", chi_squared(adjustment)),
     ]
 
 
 def warnings(adjustment) -> list[str]:
-    """What was left out or looked strange."""
+    """Excluded or suspicious data."""
     lines = [line for text in adjustment.warnings for line in paragraph(f"- {clean(text)}", 0, 2)]
     return [*heading("Warnings"), *shortened(lines, 60, "…")] if lines else []
 
 
 def why_not_solved(adjustment) -> list[str]:
-    """Why there is no result, what is not determined, what to do."""
+    """The reason why there is no result, undetermined unknowns, remedy."""
     return [
         *heading("Not solved"), *paragraph(NO_RESULT), "", *facts(failure_facts(adjustment))
     ]
 
 
 def failure_facts(adjustment) -> list[tuple[str, str]]:
-    """Why there is no result, what is not determined, what to do, by name."""
+    """The same as a mapping: reason, undetermined unknowns, remedy."""
     names = adjustment.undetermined
     reason = SINGULAR if names else int(adjustment.minimum.termination)
     tried = int(adjustment.minimum.iterations)

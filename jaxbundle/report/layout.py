@@ -1,6 +1,6 @@
-"""Plain text for protocols: headings, aligned tables, numbers with as many digits as they deserve.
+"""Plain text for reports: headings, aligned tables, numbers with significant digits.
 
-Lines are at most `WIDTH` characters wide; a table that would be wider closes its gaps and then
+Lines are at most `WIDTH` characters wide; a wider table reduces its gaps and then
 shortens its names.
 """
 
@@ -52,7 +52,7 @@ def to_place_of(value: float, sigma: float, digits: int = 3) -> str:
 
 
 def significant(value: float | None, digits: int = 3) -> str:
-    """A number with so many significant digits, without an exponent where it is readable so."""
+    """A number with this many significant digits, without an exponent if readable."""
     if value is None or not math.isfinite(value):
         return MISSING
     if value == 0:
@@ -65,7 +65,7 @@ def significant(value: float | None, digits: int = 3) -> str:
 
 
 def fixed(value: float | None, places: int) -> str:
-    """A number with fixed decimal places; a dash where there is none."""
+    """A number with fixed decimal places; a dash if missing."""
     if value is None or not math.isfinite(value):
         return MISSING
     # + 0.0: no minus before a zero
@@ -88,12 +88,12 @@ def column_decimals(sigma, digits: int = 3, most: int = 9) -> int:
 
 
 def clean(name: object) -> str:
-    """A name from a file without anything that would break a line of text."""
+    """A name from a file without characters that would break a line of text."""
     return "".join(c if c.isprintable() else "?" for c in str(name))
 
 
 def shorten(text: str, width: int) -> str:
-    """Text of at most this width; what is taken from its middle leaves an ellipsis."""
+    """Text of at most this width, shortened in the middle by an ellipsis."""
     if len(text) <= width:
         return text
     head = (width - 1) // 2
@@ -117,7 +117,7 @@ def heading(text: str) -> list[str]:
 
 
 def facts(rows: Iterable[tuple[str, str]], indent: int = 0) -> list[str]:
-    """Names and what is to be said of them, in two columns."""
+    """Names and their descriptions in two columns."""
     rows = list(rows)
     width = max((len(name) for name, _ in rows), default=0)
     lines = []
@@ -167,13 +167,13 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]], align: str) -> l
 
 
 def shortened(lines: Sequence[str], most: int, note: str) -> list[str]:
-    """A list cut after `most` lines, with a note where something was cut."""
+    """A list cut after `most` lines, with a note if it was cut."""
     lines = list(lines)
     return lines if len(lines) <= most else [*lines[:most], note]
 
 
 def bar(count: float, largest: float, width: int = 40) -> str:
-    """A bar of a histogram in text; never empty where there is something to count."""
+    """A bar of a histogram in text; never empty for a positive count."""
     if count <= 0 or largest <= 0:
         return ""
     return "#" * max(1, round(width * count / largest))

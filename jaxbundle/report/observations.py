@@ -1,8 +1,8 @@
-"""The observations in a protocol: residuals, reliability, groups, blunders, comparisons.
+"""The observations in a report: residuals, reliability, groups, blunders, comparisons.
 
 w = (v/σ)/√r uses the a priori σ (Baarda), τ = w/σ0 the a posteriori one (Pope). Only τ is
-comparable between projects whose a priori σ are a guess, so τ is what the report sorts by unless
-it is asked for Baarda's test.
+comparable between projects with guessed a priori σ, so the report sorts by τ unless Baarda's test
+is requested.
 """
 
 import math
@@ -36,7 +36,7 @@ WEAKEST = 8
 
 
 def residuals(adjustment, limit: float, test: str) -> list[str]:
-    """Residuals over the limit, the largest first, then how all of them are distributed."""
+    """Residuals over the limit, the largest first, then the distribution of all."""
     found, symbol = adjustment.residuals, SYMBOLS[test]
     size = np.abs(np.nan_to_num(found[TESTS[test]]))
     order = np.argsort(-size, kind="stable")
@@ -64,7 +64,7 @@ def residuals(adjustment, limit: float, test: str) -> list[str]:
 
 
 def critical_value(adjustment, test: str = "pope", level: float = 0.001) -> float:
-    """Of the test of one observation at a level."""
+    """The critical value of the test of one observation at a level."""
     if test == "baarda":
         return normal_quantile(1 - level / 2)
     return tau_quantile(1 - level / 2, adjustment.redundancy)
@@ -92,7 +92,7 @@ def _rows(adjustment, chosen) -> list[str]:
 
 
 def _histogram(tau) -> list[str]:
-    """Counts of τ in classes of ½, beside what a normal distribution would give."""
+    """Counts of τ in classes of ½, compared with a normal distribution."""
     tau = tau[np.isfinite(tau)]
     if not len(tau):
         return []
@@ -147,12 +147,13 @@ def redundancy(adjustment) -> list[str]:
 
 
 def count_weak(r) -> tuple[int, int]:
-    """How many observations are weakly controlled, r < 0.1, and how many of them not at all."""
+    """The number of weakly controlled observations, r < 0.1, and of uncontrolled ones."""
     return int((r < 0.1).sum()), int((r < 1e-8).sum())
 
 
 def components(adjustment) -> list[str]:
-    """Variance components: the observed σ of every group, over those given and as they are."""
+    """Variance components: the estimated σ of every group, relative to the given ones and
+    absolute."""
     rows = [
         (name, str(c.observations), f"{c.redundancy:.2f}", significant(c.vtpv, 5),
          significant(c.sigma, 4), span(c.estimated, 3))
@@ -166,14 +167,15 @@ def components(adjustment) -> list[str]:
             for name, factor in adjustment.sigma_factors.items()
         )
         lines += ["", *paragraph(
-            f"Estimated: the σ given were multiplied, {names}. What is called a priori elsewhere "
-            "in this report are these estimated σ."
+            f"Estimated: the given σ were multiplied, {names}. A priori elsewhere "
+            "in this report means these estimated σ."
         )]  # fmt: skip
     return lines
 
 
 def removals(adjustment) -> list[str]:
-    """What data snooping took away, in that order, and the parameters fixed for lack of t."""
+    """Observations removed by data snooping, in order, and insignificant parameters that were
+    fixed."""
     lines = []
     if adjustment.removed:
         rows = [
@@ -182,7 +184,7 @@ def removals(adjustment) -> list[str]:
         ]
         lines += heading("Data snooping: removed observations")
         lines += table(("", "kind", "observation", "test"), rows, "rllr")
-        lines += ["", "They take no part in what is reported here."]
+        lines += ["", "They are excluded from all results in this report."]
         if any(item.others for item in adjustment.removed):
             lines += paragraph(
                 "Either of: one of these rays is wrong and the point does not tell which, so that "
@@ -213,8 +215,8 @@ def downweighted(adjustment, most: int) -> list[str]:
     lines += paragraph(
         f"Scale: {significant(adjustment.robust_scale, 4)} times the a priori σ, a posteriori from "
         "the median of the residuals (MAD). "
-        f"{len(suspects)} of {count(len(adjustment.weights), 'image point')} have residuals too "
-        f"long for good ones{', in σ times the scale (test):' if rows else '.'}"
+        f"{len(suspects)} of {count(len(adjustment.weights), 'image point')} have residuals above "
+            f"the critical length{', in σ times the scale (test):' if rows else '.'}"
     )
     if rows:
         header = ("", "kind", "observation", "test", "weight")

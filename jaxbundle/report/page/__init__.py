@@ -4,7 +4,7 @@
     Path("report.html").write_text("".join(pieces))
 
 An adjustment has its page here, and so has a refinement of scanner images (`refinement`);
-calibrations, reconstructions and batches declare theirs in their rooms.
+calibrations, reconstructions and batches declare theirs in their subpackages.
 """
 
 from jaxbundle.report.page.adjustment import Addition as Addition

@@ -1,4 +1,4 @@
-"""The page of an adjustment, and of what another command has found with one."""
+"""The page of an adjustment, and of a command based on one."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
@@ -23,12 +23,11 @@ A_POSTERIORI = (
 
 
 class Addition(NamedTuple):
-    """What a command that adjusts says beside its adjustment.
+    """Additions of a command to the page of its adjustment.
 
-    **Fields:** `kind`, for the title, empty where the name of the network says it; `findings`
-    before those of the adjustment, of which `without` names some that say nothing here; `warnings`
-    before its own; `overview`: HTML below the tests; `sections` after the verdict; `tables` before
-    the others.
+    **Fields:** `kind`, for the title, empty if the name of the network is enough; `findings` before
+    those of the adjustment; `without`: findings of the adjustment to omit; `warnings` before its
+    own; `overview`: HTML below the tests; `sections` after the verdict; `tables` before the others.
     """
 
     kind: str = "bundle adjustment"
@@ -46,15 +45,15 @@ ALONE = Addition()
 def compose(
     adjustment, origin: Origin = UNKNOWN, *, date: str | None = None, also: Addition = ALONE
 ) -> Iterator[str]:
-    """The page of an adjustment as HTML, in pieces; of one that was not solved, why it was not.
+    """The page of an adjustment as HTML, in pieces; for an unsolved one, the reason.
 
     **Arguments:**
 
     - `origin`: the files that were read, with their fingerprints (`fingerprint_files`), and
-      settings that are to be shown.
-    - `date`: printed in the head as it is given; nothing is printed without it, so that the same
+      settings to show.
+    - `date`: printed in the head as given; omitted by default, so that the same
       adjustment always gives the same page.
-    - `also`: what is to be said beside the adjustment.
+    - `also`: additions to the page.
     """
     yield from write(describe(adjustment, origin, also), date)
 
@@ -69,7 +68,7 @@ def compose_failure(
 
 
 def describe(adjustment, origin: Origin = UNKNOWN, also: Addition = ALONE) -> Page:
-    """The page of an adjustment, to be written."""
+    """The page of an adjustment, as a `Page`."""
     title = ": ".join(filter(None, (clean(adjustment.network.name) or "network", also.kind)))
     last = describe_origin(head.setting_facts(adjustment), origin)
     warnings = (*also.warnings, *adjustment.warnings)
@@ -90,7 +89,7 @@ def find(adjustment, also: Addition = ALONE) -> list[Finding]:
 
 
 def _whole(adjustment) -> list[str]:
-    """The numbers of the whole."""
+    """Summary numbers."""
     return [
         "<h3>Result</h3>\n", facts(row for row in summary(adjustment) if row[0] != "Note"),
         "<h3>Variance factor</h3>\n", facts(head.variance_facts(adjustment)),

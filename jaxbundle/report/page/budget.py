@@ -7,7 +7,7 @@ from jaxbundle.report.page.markup import grid, paragraph
 
 
 def describe_budget(budget) -> Addition:
-    """What the page of an adjustment says of its error budget, if there is one."""
+    """The error budget on the page of an adjustment, if there is one."""
     if budget is None:
         return ALONE
     content = grid(HEADER, budget.rows()[:MOST_ROWS], "words") + paragraph(LEGEND)

@@ -1,5 +1,5 @@
-"""Charts as SVG, drawn here so that they print and need no script: line styles and hatching tell
-curves apart without colours."""
+"""Charts as SVG, which print and need no script: line styles and hatching distinguish curves
+without colours."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -24,7 +24,7 @@ class Curve(NamedTuple):
 
 
 class Scale(NamedTuple):
-    """From numbers to places in the drawing."""
+    """From numbers to positions in the drawing."""
 
     low: float
     high: float
@@ -72,7 +72,7 @@ def draw_plan(
     ends = [_scale(v, 0, 1, 0.03) for v in (xs, ys)]
     room = WIDE - RIGHT - LEFT, HIGH - BOTTOM - TOP
     unit = max((end.high - end.low) / size for end, size in zip(ends, room))
-    # What is left of the room is shared by both sides.
+    # The remaining space is shared by both sides.
     low = [(end.low + end.high - unit * size) / 2 for end, size in zip(ends, room)]
     top, bottom = (HIGH - BOTTOM, TOP) if not down else (TOP, HIGH - BOTTOM)
     x = Scale(low[0], low[0] + unit * room[0], LEFT, WIDE - RIGHT)
@@ -87,7 +87,7 @@ def draw_histogram(
     edges: np.ndarray, counted: np.ndarray, x_label: str, things: str,
     expected: np.ndarray | None = None,
 ) -> str:  # fmt: skip
-    """Counts by class as bars, beside the numbers expected of a normal distribution as steps; an
+    """Counts by class as bars, with the expectation of a normal distribution as steps; an
     outer class whose edge is infinite is open, and drawn as wide as its neighbour."""
     ends = np.array(edges, float)
     if np.isinf(ends[0]):

@@ -2,7 +2,7 @@
 
 Numbers are base64 of little-endian arrays, of the smallest type of integers that holds them, of
 32-bit floats where these are enough; a column of equal values is one value. Names that repeat are
-listed once. Nothing in the text can end a script element or begin a comment.
+listed once. The text cannot end a script element or begin a comment.
 """
 
 import base64
@@ -67,7 +67,7 @@ def _holds(kind: str, low: int, high: int) -> bool:
 
 
 def script_text(value) -> str:
-    """JSON that can stand in a script element: ASCII, and no `<` in it."""
+    """JSON that is safe in a script element: ASCII without `<`."""
     return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 

@@ -1,10 +1,9 @@
-"""One page of HTML that holds a whole result: words, charts, tables, drawings to be turned.
+"""A self-contained HTML page of a result: text, charts, tables, rotatable drawings.
 
-A command declares its page: the sections, the verdict first, the tables, and what scripts draw.
-
-The page needs nothing from outside: its script and its style stand in it once, and its policy
-allows neither another script nor any request. What a browser without scripts cannot show, the
-tables, is said to be in the CSV files.
+A command declares its page: the sections, the verdict first, the tables, and script drawings.
+The page needs no other file: it contains its script and style, and its policy
+forbids other scripts and requests. Without scripts, a note refers to the CSV files for the
+tables.
 """
 
 import base64
@@ -47,10 +46,9 @@ class Listing(NamedTuple):
 
 
 class Page(NamedTuple):
-    """A page: its title; its sections, the verdict first; its tables by name, the empty ones are
-    left out; what the scripts draw, by id; the section on where it comes from. `scripts` run after
-    those of every page, `style` adds to its style; `asks`: the scripts may send requests to the
-    server that the page came from."""
+    """A page: its title; its sections, the verdict first; its non-empty tables by name; data of
+    script drawings, by id; the section on its origin. `scripts` run after those of every page,
+    `style` adds to its style; `asks`: the scripts may send requests to the page's server."""
 
     title: str
     sections: Iterable[Section]
@@ -79,7 +77,7 @@ def write(page: Page, date: str | None = None) -> Iterator[str]:
     yield from map(_section, sections)
     if listed:
         yield markup.paragraph(
-            "Click a header to sort, again to turn the order; type to search.", "hint"
+            "Click a header to sort, again to reverse the order; type to search.", "hint"
         )
         yield NO_SCRIPT
         yield from map(_section, listed)
@@ -92,7 +90,7 @@ def write(page: Page, date: str | None = None) -> Iterator[str]:
 
 
 def _listing(id: str, table: Listing) -> Section:
-    """The place of a table, which the script fills."""
+    """The placeholder of a table, filled by the script."""
     place = f'<div class="table" data-table="{id}" data-file="{markup.text(table.file)}"></div>\n'
     note = markup.paragraph(table.note) if table.note else ""
     return Section(f"table-{id}", table.title, note + place)
@@ -116,7 +114,7 @@ def _beginning(page: Page, date: str | None) -> str:
         f"default-src 'none'; img-src data:; style-src '{_digest(style)}'; "
         f"script-src '{_digest(script)}'; base-uri 'none'; form-action 'none'"
     )
-    # A server is asked for an icon, unless the page says that it has none.
+    # Browsers request an icon unless the page declares that it has none.
     icon = '<link rel="icon" href="data:,">\n' if page.asks else ""
     policy += "; connect-src 'self'" if page.asks else ""
     title = markup.text(page.title)
@@ -145,5 +143,5 @@ def _read(name: str) -> str:
 
 
 def _digest(text: str) -> str:
-    """As a content security policy names what it allows."""
+    """The digest in the form of a content security policy."""
     return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")

@@ -1,4 +1,4 @@
-"""Pieces of HTML; whatever comes from outside is escaped here."""
+"""Pieces of HTML; external text is escaped here."""
 
 from collections.abc import Iterable, Sequence
 from html import escape
@@ -28,7 +28,7 @@ def items(lines: Iterable[object]) -> str:
 
 
 def facts(rows: Iterable[tuple[object, object]]) -> str:
-    """Names and what is to be said of them."""
+    """Names and their descriptions."""
     cells = "".join(
         f'<tr><th scope="row">{text(name)}</th><td>{text(value)}</td></tr>\n'
         for name, value in rows

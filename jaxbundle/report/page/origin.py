@@ -1,4 +1,4 @@
-"""Where a result comes from: fingerprints of the files read, versions of the software."""
+"""Origin of a result: fingerprints of the input files, versions of the software."""
 
 import hashlib
 import os
@@ -23,7 +23,7 @@ class InputFile(NamedTuple):
 
 
 class Origin(NamedTuple):
-    """What a result was made of: the files read, and further settings by name as they are shown."""
+    """The origin of a result: the input files, and further settings by displayed name."""
 
     inputs: tuple[InputFile, ...] = ()
     settings: Mapping[str, object] = MappingProxyType({})
@@ -33,7 +33,7 @@ UNKNOWN = Origin()
 
 
 def fingerprint_files(paths: Iterable[str | Path]) -> tuple[InputFile, ...]:
-    """The plain files among these, each once; what cannot be read is left out."""
+    """The distinct readable regular files among these."""
     found: dict[str, InputFile] = {}
     for path in map(Path, paths):
         real = os.path.realpath(path)
@@ -49,7 +49,7 @@ def fingerprint_files(paths: Iterable[str | Path]) -> tuple[InputFile, ...]:
 
 
 def software_versions() -> list[tuple[str, str]]:
-    """The versions of what computed: jaxbundle, its packages, Python, the system."""
+    """Versions: jaxbundle, its packages, Python, the system."""
     from jaxbundle import __version__
 
     return [

@@ -1,4 +1,4 @@
-"""The first and the last section of every page: the verdict, and where the result comes from."""
+"""The first and the last section of every page: the verdict, and the origin of the result."""
 
 from collections.abc import Iterable, Sequence
 
@@ -10,7 +10,7 @@ from jaxbundle.report.page.verdict import Finding, in_words
 
 
 def give_verdict(findings: Sequence[Finding], warnings: Sequence[str], *parts: str) -> Section:
-    """The verdict, the warnings, the findings, and then what else the whole has to say."""
+    """The verdict, the warnings, the findings, and further summary content."""
     state, words = in_words(list(findings), len(warnings))
     rows = [(f.about, f.state, f.words) for f in findings]
     content = [
@@ -23,7 +23,7 @@ def give_verdict(findings: Sequence[Finding], warnings: Sequence[str], *parts: s
 def explain_failure(
     rows: Iterable[tuple[str, str]], warnings: Sequence[str], *parts: str
 ) -> Section:
-    """The verdict where there is no result, and what to do."""
+    """The verdict without a result, and the remedy."""
     content = [paragraph(head.NO_RESULT, "verdict not-met"), _warnings(warnings), facts(rows)]
     return Section("overview", "Verdict", "".join([*content, *parts]))
 

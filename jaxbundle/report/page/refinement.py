@@ -24,7 +24,7 @@ KIND = "refinement of scanner images"
 LARGE = 3.29
 """Critical value of |w| at 0.1 %."""
 MOST_CORRELATED = 40
-"""Of more unknowns the matrix is not shown, but is in result.json."""
+"""With more unknowns the matrix is only in result.json."""
 SCANNER_AXES = ("line", "pixel")
 
 
@@ -81,7 +81,7 @@ def _judge(result, used, w) -> list[Finding]:
         _fit(result),
         Finding("Reliability", DOUBTFUL if weak > 0.05 * len(r) else GOOD,
                 f"mean redundancy number {r.mean():.3f}; {weak} of {count(len(r), 'coordinate')} "
-                f"weakly controlled (r < 0.1), {loose} not at all"),
+                f"weakly controlled (r < 0.1), {loose} uncontrolled"),
         Finding("Blunders", DOUBTFUL if over else GOOD,
                 f"{large} of {count(len(w), 'coordinate')} with |w| over {LARGE} (by chance about "
                 f"{expected:.2g}); {len(result.removed)} removed by data snooping"),
@@ -171,7 +171,7 @@ def _checks(result) -> Columns:
 
 
 def _observations(used) -> Columns:
-    """A row a coordinate, as of an adjustment; `tau`, the test that is drawn, is w."""
+    """One row per coordinate, as for an adjustment; `tau`, the drawn test, is w."""
     both = lambda name: np.concatenate([row[name] for row in used])
     twice = lambda name: _words(row[name] for row in used for _ in range(2))
     return {

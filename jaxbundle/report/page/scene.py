@@ -1,4 +1,4 @@
-"""What the page draws beside its tables: the stations of the network, and the frames of images."""
+"""Drawings of the page: the stations of the network, and the frames of images."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""The sections of an adjustment, in their order; words and numbers are those of the protocol."""
+"""The sections of an adjustment, in order; words and numbers are those of the report."""
 
 from collections.abc import Iterator, Sequence
 
@@ -18,7 +18,7 @@ from jaxbundle.report.page.markup import figure, grid, items, paragraph
 from jaxbundle.report.unknowns import validity
 
 MOST_CAMERAS = 20
-"""Distortion and correlations are drawn of so many cameras."""
+"""Largest number of cameras with drawn distortion and correlations."""
 
 
 def collect(adjustment) -> Iterator[Section]:
@@ -31,9 +31,9 @@ def collect(adjustment) -> Iterator[Section]:
 
 
 def network() -> Section:
-    """The place of the network to be turned."""
+    """The placeholder of the rotatable network."""
     parts = [
-        paragraph("Parallel projection. Drag to turn, with Shift to move, wheel to zoom; click a "
+        paragraph("Parallel projection. Drag to rotate, with Shift to move, wheel to zoom; click a "
                   "point or a station for its standard deviations, a station also for its rays.",
                   "hint"),
         '<div class="tools" id="network-tools"></div>\n',
@@ -45,13 +45,13 @@ def network() -> Section:
 
 
 def photographs(test: str = "τ") -> Section:
-    """The place of the residuals of an image; `test`: the symbol of their test values."""
+    """The placeholder of the residuals of an image; `test`: the symbol of their test values."""
     parts = [
         '<div class="tools" id="photograph-tools"></div>\n',
         '<canvas id="photograph-canvas" width="1200" height="900"></canvas>\n',
-        paragraph("Residuals v = computed − observed, lines from the measured places; thick where "
+        paragraph("Residuals v = computed − observed, lines from the measured positions; thick if "
                   f"|{test}| > 3. The area of a mark is the redundancy number r, mean of both "
-                  "coordinates; a cross where r < 0.1: hardly controlled."),
+                  "coordinates; a cross means r < 0.1: hardly controlled."),
         '<p id="photograph-said" aria-live="polite"></p>\n',
     ]  # fmt: skip
     title = "Photographs: residuals and redundancy"
@@ -98,7 +98,7 @@ def _distortion(adjustment, camera: str) -> str:
 def show_correlations(
     names: Sequence[str], correlations: np.ndarray, columns: Sequence[object] = ()
 ) -> str:
-    """The lower triangle of a correlation matrix in %, and in words what is over 90 %; `columns`:
+    """The lower triangle of a correlation matrix in %, and a list of those over 90 %; `columns`:
     shorter names, for the header."""
     C = 100 * np.asarray(correlations)
     rows = [
@@ -127,7 +127,7 @@ def residuals(adjustment) -> Section:
 
 
 def show_residuals(test: np.ndarray, symbol: str = "τ = w/σ0", more: str = "") -> Section:
-    """The histogram of test values, which the normal distribution is drawn into."""
+    """The histogram of test values, with the normal distribution."""
     edges, counted, expected = count_by_class(test)
     drawing = figure(
         draw_histogram(edges, counted, f"normalised residual {symbol}", "observations", expected),

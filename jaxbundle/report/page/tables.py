@@ -1,4 +1,4 @@
-"""The tables of a result as the page embeds them: what can be sorted, searched and drawn."""
+"""The embedded tables of a result, for sorting, searching and drawing."""
 
 from collections.abc import Mapping
 
@@ -10,11 +10,11 @@ from jaxbundle.report.page.columns import Column, numbers
 from jaxbundle.report.page.document import Listing
 
 MOST_ROWS = 500_000
-"""More observations than this are not embedded: a page with a million takes too long to open."""
+"""Largest number of embedded observations: a page with a million takes too long to open."""
 
 Columns = dict[str, Column]
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-"""The elements of a symmetric matrix that are embedded, in this order."""
+"""The embedded elements of a symmetric matrix, in this order."""
 ANGLES = {"omega": "ω", "phi": "φ", "kappa": "κ"}
 
 
@@ -37,7 +37,7 @@ def collect_tables(adjustment) -> dict[str, Listing]:
 
 
 def cameras(adjustment) -> Columns:
-    """One row a parameter."""
+    """One row per parameter."""
     found = adjustment.table("cameras")
     return {
         "camera": Column(found["camera"], "camera"),
@@ -156,14 +156,14 @@ def measured_coordinates(adjustment) -> np.ndarray:
 
 
 def choose_largest(tau: np.ndarray, most: int) -> np.ndarray:
-    """The rows with the largest |τ|, at most so many, in their order."""
+    """The rows with the largest |τ|, limited in number, in their order."""
     if len(tau) <= most:
         return np.arange(len(tau))
     return np.sort(np.argpartition(-np.abs(np.nan_to_num(tau)), most)[:most])
 
 
 def blunders(adjustment) -> Columns:
-    """What data snooping removed, in this order, and what a robust estimate suspects."""
+    """Observations removed by data snooping, in order, and suspects of a robust estimate."""
     rows = [("removed", r.kind, r.name, r.test, 0.0) for r in adjustment.removed]
     rows += [("suspect", s.kind, s.name, s.test, s.weight) for s in adjustment.suspects]
     if not rows:

@@ -1,4 +1,4 @@
-"""The verdict of the page: what the tests say of a result, in words."""
+"""The verdict of the page: the conclusion of the tests, in words."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ GOOD, DOUBTFUL, BAD = "met", "doubtful", "not met"
 
 
 class Finding(NamedTuple):
-    """What one test is about, whether it is met, and its numbers in words."""
+    """The subject of one test, whether it is met, and its numbers in words."""
 
     about: str
     state: str
@@ -29,14 +29,14 @@ def judge(adjustment) -> list[Finding]:
 
 
 def in_words(findings: list[Finding], warnings: int) -> tuple[str, str]:
-    """The state of the whole, and a sentence that says it."""
+    """The overall state, and a sentence for it."""
     failed = [f.about for f in findings if f.state == BAD]
     doubtful = [f.about for f in findings if f.state == DOUBTFUL]
     if failed:
         return BAD, f"The result does not meet its tests: {', '.join(failed)}."
     if doubtful or warnings:
         reasons = [*doubtful, *([count(warnings, "warning")] if warnings else [])]
-        return DOUBTFUL, f"The result is to be used with care: {', '.join(reasons)}."
+        return DOUBTFUL, f"Use the result with care: {', '.join(reasons)}."
     return GOOD, "The result meets its tests."
 
 
@@ -48,8 +48,8 @@ def _fit(adjustment) -> Finding:
 
 
 def judge_fit(found, words: str) -> Finding:
-    """The finding of a χ² test: better than the a priori σ is a matter of these σ, and harms no
-    result."""
+    """The finding of a χ² test: a result better than the a priori σ only concerns these σ and is
+    harmless."""
     state = GOOD if found["passed"] else DOUBTFUL if found["vtpv"] < found["low"] else BAD
     return Finding("χ² test", state, words)
 
@@ -93,7 +93,7 @@ def _reliability(adjustment) -> Finding:
     weak, loose = count_weak(r)
     words = (
         f"mean redundancy number {r.mean():.3f}; {weak} of {count(len(r), 'observation')} weakly "
-        f"controlled (r < 0.1), {loose} not at all"
+        f"controlled (r < 0.1), {loose} uncontrolled"
     )
     return Finding("Reliability", DOUBTFUL if weak > 0.05 * len(r) else GOOD, words)
 
