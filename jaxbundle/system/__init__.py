@@ -1,1 +1,1 @@
-"""The machine: files, temporary files, interrupts, and how JAX is to work."""
+"""The machine: files, temporary files, interrupts, and JAX settings."""

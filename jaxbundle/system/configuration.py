@@ -1,4 +1,4 @@
-"""How JAX is to work: cores, kept programs, processes; only when it is asked for."""
+"""JAX settings, only on request: cores, kept programs, processes."""
 
 import os
 import re
@@ -11,12 +11,13 @@ from jaxbundle.errors import InputError
 from jaxbundle.system.temporaries import watch_cache
 
 WORTH_KEEPING = 0.02
-"""Programs that took so many seconds to compile are kept; a small network has a dozen of them."""
+"""Programs with at least this compile time, in seconds, are kept; a small network has a dozen of
+them."""
 
 
 def use_cores(number: int | None = None) -> None:
-    """Let the cores of the processor (all, or so many) share the work on big networks, as devices
-    of JAX; call it before the first JAX computation."""
+    """Use all cores of the processor, or this number, for large networks, as JAX devices; call it
+    before the first JAX computation."""
     import jax
 
     from jaxbundle.arguments import whole
@@ -29,10 +30,10 @@ def keep_programs(folder: str | os.PathLike | None = None) -> bool:
     """Keep compiled programs in a folder, so that later processes start without compiling; call it
     before the first JAX computation.
 
-    `folder`: if not given, that of the environment variable JAX_COMPILATION_CACHE_DIR, else
-    `jaxbundle` among the user's caches.
+    `folder`: default that of the environment variable JAX_COMPILATION_CACHE_DIR, else
+    `jaxbundle` in the user's cache folder.
 
-    **Returns:** whether the folder takes files; if not, nothing is kept.
+    **Returns:** whether the folder is writable; if not, nothing is kept.
     """
     import jax
 
@@ -49,7 +50,7 @@ def keep_programs(folder: str | os.PathLike | None = None) -> bool:
         usable = os.access(folder, os.W_OK | os.X_OK)
     except OSError:
         usable = False
-    # JAX has read the variable by itself, and would complain of a bad folder at every program.
+    # JAX has already read the variable, and would warn of a bad folder for every program.
     jax.config.update("jax_compilation_cache_dir", os.fspath(folder) if usable else None)
     if not usable:
         return False
@@ -67,22 +68,22 @@ def join_processes(
     lost_after_seconds: int = 30,
     wait_seconds: int = 60,
 ) -> bool:
-    """Adjust together with other processes, on this machine or others, which all run the same
-    program on the same files; call it before the first JAX computation.
+    """Join other processes, on this machine or others, that run the same program on the same files;
+    call it before the first JAX computation.
 
     **Arguments:**
 
-    - `address`: `host:port` of process 0, the same for all; `processes`: how many there are;
-      `process`: which one this is, from 0. Under SLURM or on TPUs JAX finds all three by itself:
+    - `address`: `host:port` of process 0, the same for all; `processes`: their number;
+      `process`: the index of this one, from 0. Under SLURM or on TPUs JAX finds all three:
       give none of them.
-    - `lost_after_seconds`: a process not heard of for so long has ended, and the others end too.
-    - `wait_seconds`: so long the processes wait for one another to come.
+    - `lost_after_seconds`: a process silent for this time is lost, and the others end too.
+    - `wait_seconds`: how long the processes wait for each other to start.
 
     **Returns:** whether this is process 0, the one that should write the results. All of them have
     the result.
 
-    **Raises:** `InputError` if the processes cannot be told, or process 0 is not found. Process 0
-    that waits in vain for the others is aborted by JAX.
+    **Raises:** `InputError` if the processes are not specified, or process 0 is not found. JAX
+    aborts process 0 if the others do not join.
     """
     import jax
 
@@ -105,7 +106,7 @@ def join_processes(
             raise InputError(f"process {process} of {processes} cannot be joined; {expected}")
         _check_address(parts[1].strip("[]"), int(parts[2]), process, wait_seconds)
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
-    # The service would keep SIGTERM to itself, and the process would run on.
+    # The service would intercept SIGTERM, and the process would continue.
     jax.config.update("jax_enable_preemption_service", False)
     try:
         jax.distributed.initialize(
@@ -121,7 +122,8 @@ def join_processes(
 
 
 def _check_address(host: str, port: int, process: int | None, wait_seconds: int) -> None:
-    """Process 0 needs its port, the others process 0; JAX would abort where they are missing."""
+    """Check that process 0 has its port and the others reach process 0; JAX would abort
+    otherwise."""
     try:
         socket.getaddrinfo(host, port)
     except (OSError, UnicodeError):
@@ -146,7 +148,7 @@ def _check_address(host: str, port: int, process: int | None, wait_seconds: int)
 
 
 def leave(status: int) -> NoReturn:
-    """End this process; one of several joined at once, for an orderly exit waits for the others."""
+    """End this process; immediately if joined with others, since an orderly exit waits for them."""
     jax = sys.modules.get("jax")
     if jax and jax.distributed.is_initialized():
         sys.stdout.flush()

@@ -1,7 +1,7 @@
-"""The examples that come with the package, to be written into a folder of one's own.
+"""The packaged examples, which can be written to a folder.
 
 Their files are those of `examples/` in the repository: the wheel has copies of them in
-`jaxbundle/examples` (pyproject.toml), the source tree itself has them beside the package.
+`jaxbundle/examples` (pyproject.toml), the source tree has them next to the package.
 """
 
 import os
@@ -15,7 +15,7 @@ from jaxbundle.system.temporaries import temporary
 
 
 class Example(NamedTuple):
-    """What an example is of, and a command to begin with, with FOLDER for where it was written."""
+    """Description of an example, and a first command, with FOLDER for its folder."""
 
     about: str
     command: str
@@ -39,9 +39,9 @@ EXAMPLES = {
 
 
 def write_example(name: str, folder: str | Path) -> None:
-    """Copy the files of an example into a folder that is new or empty.
+    """Copy the files of an example into a new or empty folder.
 
-    **Raises:** `InputError` for another name, or a folder that cannot or may not be written.
+    **Raises:** `InputError` for an unknown name, or a folder that cannot or may not be written.
     """
     if name not in EXAMPLES:
         raise InputError(f"no example {name!r}: one of {', '.join(EXAMPLES)} is expected")
@@ -60,7 +60,7 @@ def write_example(name: str, folder: str | Path) -> None:
 
 
 def _source(name: str):
-    """The files of an example: in the package, or beside it in the source tree."""
+    """The files of an example, in the package or the source tree."""
     for place in (files("jaxbundle") / "examples", Path(__file__).parents[2] / "examples"):
         if (place / name).is_dir():
             return place / name

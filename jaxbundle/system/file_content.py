@@ -1,5 +1,5 @@
-"""The content of files: of plain files alone, of text up to its first zero byte, and of documents
-(TOML, JSON) whose nesting and numbers stay within what the program can hold."""
+"""The content of files: only regular files, text without zero bytes, and documents (TOML, JSON)
+with limited nesting and numbers."""
 
 import json
 import os
@@ -13,14 +13,14 @@ from typing import Any
 from jaxbundle.errors import InputError
 
 SYSTEM = ("/proc/", "/sys/")
-"""Where the system shows itself as files: without size or end, or waiting for what never comes."""
+"""System folders with pseudo-files, which may be endless or block."""
 DESCRIPTORS = (Path("/dev"), Path("/dev/fd"), Path("/proc/self/fd"))
-"""Where open files of the process have names."""
+"""Folders of the open files of the process."""
 CHUNK = 2**20
 DEEPEST = 64
-"""Levels of a document."""
+"""Maximum nesting of a document."""
 LARGEST = 2**1023
-"""Whole numbers up to here are floats as well."""
+"""Largest integer that is exactly a float."""
 TOO_LARGE = "too large a number; finite numbers are expected"
 QUOTED = re.compile(r'"(?:\\.|[^"\\])*"|\'[^\']*\'')
 DIGITS = re.compile(r"(?<![\w.])[-+]?\d[\d_]{307,}(?![\w.])")
@@ -28,16 +28,16 @@ DOTTED = re.compile(rf"(?:[\w-]+\s*\.\s*){{{DEEPEST - 1}}}")
 
 
 def check_plain(path: str | Path) -> None:
-    """Refuse a device, a socket, a pipe, and what the system shows of itself.
+    """Refuse devices, sockets, pipes, and system pseudo-files.
 
-    A pipe that the process was given open (`/dev/stdin`, `<(…)` of a shell) is read.
+    An already open pipe (`/dev/stdin`, `<(…)` of a shell) is accepted.
     """
     path = Path(path)
     try:
         mode = os.stat(path).st_mode
         real = os.path.realpath(path)
     except (OSError, ValueError):
-        return  # said by whoever opens it
+        return  # reported when it is opened
     given = path.parent in DESCRIPTORS and stat.S_ISFIFO(mode)
     system = stat.S_ISREG(mode) and real.startswith(SYSTEM)
     if system or not (stat.S_ISREG(mode) or stat.S_ISDIR(mode) or given):
@@ -54,7 +54,7 @@ def is_plain(path: str | Path) -> bool:
 
 
 def beginning(path: str | Path, length: int) -> bytes:
-    """The first bytes of a plain file; none of what is no such file, or cannot be read."""
+    """The first bytes of a regular file; empty for other or unreadable files."""
     if not is_plain(path):
         return b""
     try:
@@ -65,9 +65,9 @@ def beginning(path: str | Path, length: int) -> bytes:
 
 
 def read_content(path: str | Path, text: bool = True) -> bytes:
-    """The bytes of a file; with `text` a zero byte ends the reading with an error.
+    """The bytes of a file; with `text` a zero byte is an error.
 
-    **Raises:** `InputError` if there is none, it cannot be read, or it is no plain file.
+    **Raises:** `InputError` if it is missing, unreadable, or not a regular file.
     """
     check_plain(path)
     chunks, lines = [], 1
@@ -96,7 +96,7 @@ def read_content(path: str | Path, text: bool = True) -> bytes:
 def parse_toml(path: str | Path, text: str) -> dict[str, Any]:
     """The document of a text in TOML.
 
-    **Raises:** `InputError` naming the line of what is nested too deeply or too large a number.
+    **Raises:** `InputError` naming the line of too deep nesting or too large a number.
     """
     return _parsed(path, text, tomllib.loads, "TOML")
 
@@ -124,7 +124,7 @@ def _parsed(path: str | Path, text: str, parse: Callable[[str], Any], kind: str)
 
 
 def _beyond(document: Any) -> str:
-    """What in a document is beyond the limits, in words; empty if nothing is."""
+    """Violations of the limits in a document, in words; empty if there are none."""
     level = [document]
     for _ in range(DEEPEST):
         if any(isinstance(v, int) and abs(v) > LARGEST for v in level):

@@ -1,15 +1,15 @@
-"""Ctrl-C and SIGTERM on the command line: one line, status 130 or 143, nothing half-written.
+"""Ctrl-C and SIGTERM on the command line: one line, status 130 or 143, no partial files.
 
-Python's own handler raises an exception in the main thread. That is not enough. In a destructor, a
-callback of the garbage collector or of C++ the exception is swallowed, and the run goes on; in the
-middle of an import it turns into another error; and while the main thread compiles or computes in
+Python's default handler raises an exception in the main thread. That is not enough. In a destructor
+or a callback of the garbage collector or of C++ the exception is swallowed and the run continues;
+during an import it becomes another error; and while the main thread compiles or computes in
 C++, which takes minutes for a large network, it is not raised at all.
 
-So nothing is raised. The handler removes what is temporary and ends the process. Python calls it
-between two steps of the main thread, wherever that is. Where it is not called within `GRACE`, for
-the main thread is in C++ or in a block `unbroken`, a thread that the signal wakes does the same.
+So nothing is raised. The handler removes temporary files and ends the process. Python calls it
+between two steps of the main thread. If it is not called within `GRACE`, because
+the main thread is in C++ or in an `unbroken` block, a thread woken by the signal does the same.
 
-Nothing of this is set up by importing jaxbundle: only the command line calls `handle_interrupts`.
+Importing jaxbundle installs nothing: only the command line calls `handle_interrupts`.
 """
 
 import os
@@ -17,15 +17,15 @@ import signal
 import sys
 import time
 
-TYPE_CHECKING = False  # typing would be imported for nothing else
+TYPE_CHECKING = False  # avoids importing typing
 if TYPE_CHECKING:
     from typing import NoReturn
 
 GRACE = 0.3
-"""Seconds the main thread has to take notice of a signal."""
+"""Seconds for the main thread to handle a signal."""
 
 PATIENCE = 10.0
-"""Seconds for what must not be cut in two; a disk that does not answer holds nobody longer."""
+"""Seconds to finish unbroken blocks; a hanging disk delays the exit no longer."""
 
 WORDS: dict[int, str] = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 if os.name == "posix":
@@ -34,17 +34,17 @@ if os.name == "posix":
 _advice = ""
 _status = 1
 _screen = 2
-"""Standard error: from `handle_interrupts` on a second way to it, for a writer of rasters silences
-the first."""
+"""Standard error: after `handle_interrupts` a duplicate, because a raster writer silences the
+first."""
 _ending = _temporaries = None
-"""A lock, and the module that knows what is temporary: once they are imported."""
+"""A lock, and the module of temporary files, once imported."""
 
 
 def handle_interrupts() -> None:
-    """End this process by the rules above, from now on; what is ignored stays ignored (nohup).
+    """End this process by the rules above from now on; ignored signals stay ignored (nohup).
 
-    At its end the process leaves without taking the interpreter apart, which takes JAX up to a
-    second in which a signal would end it in other ways.
+    The process exits without finalising the interpreter, which takes up to a second with JAX,
+    during which a signal would end it differently.
     """
     global _ending, _screen, _temporaries
     for number in WORDS:
@@ -53,7 +53,7 @@ def handle_interrupts() -> None:
                 signal.signal(number, _handle)
             except ValueError:  # Only the main thread may.
                 return
-    # After that and not before: these imports take as long as the start of Python.
+    # Only now: these imports take as long as the start of Python.
     import atexit
     import threading
 
@@ -72,7 +72,7 @@ def handle_interrupts() -> None:
 
 
 def advise(words: str) -> None:
-    """Say at an interrupt what to do to go on."""
+    """Set the message shown at an interrupt, on how to resume."""
     global _advice
     _advice = words
 
@@ -91,7 +91,7 @@ def _handle(number: int, frame: object) -> None:
 
 
 def _watch(reader: int) -> None:
-    """Wait for the byte that Python writes for a signal, whatever the main thread does."""
+    """Wait for the byte that Python writes on a signal, independently of the main thread."""
     import threading
 
     number = 0
@@ -105,7 +105,7 @@ def _watch(reader: int) -> None:
 
 
 def _end(number: int) -> None:
-    """Tidy up, say so, and end; a thread that comes second waits here for the end."""
+    """Clean up, print the line, and end; a second thread waits here for the end."""
     if _ending is None or _temporaries is None:
         _say_and_exit(number)
     _ending.acquire()
@@ -117,7 +117,7 @@ def _end(number: int) -> None:
 def _become_deaf() -> None:
     """In the main thread, which runs the handlers: a second signal changes nothing.
 
-    Not "ignore": Python tells of a signal that it had taken note of, and that is now ignored.
+    Not "ignore": Python reports pending signals that are then ignored.
     """
     try:
         for number in WORDS:
@@ -130,7 +130,7 @@ def _become_deaf() -> None:
 def _say_and_exit(number: int) -> "NoReturn":
     line = f"jaxbundle: {WORDS[number]}" + (_advice and f"; {_advice}") + "\n"
     try:
-        if os.isatty(_screen):  # There may be a bar of progress, which hides the cursor.
+        if os.isatty(_screen):  # A progress bar may have hidden the cursor.
             line = "\r\x1b[2K\x1b[?25h" + line
         os.write(_screen, line.encode())
     except OSError:
@@ -148,8 +148,8 @@ def _leave() -> None:
 
 
 def _open_standard_streams() -> None:
-    """Give a closed standard stream (`>&-`) the null device: the next file that is opened would
-    have its number, and get what is said to the user."""
+    """Open the null device for closed standard streams (`>&-`): otherwise the next opened file
+    would get their number and receive messages for the user."""
     for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
         try:
             os.fstat(number)

@@ -1,6 +1,6 @@
-"""Files and folders that no interrupted run leaves behind, and steps that are not cut in two.
+"""Temporary files and folders that an interrupted run removes, and uninterruptible steps.
 
-In a notebook or a program an interrupt is an exception, and the blocks below tidy up as after any
+In a notebook or a program an interrupt is an exception, and the blocks below clean up as after any
 other. The command line ends without one (`system.interrupts`): it calls `remove_temporaries`.
 """
 
@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 _temporaries: dict[str, bool] = {}
-"""By name, whether its content goes with it."""
+"""By name, whether its content is removed too."""
 _caches: set[str] = set()
 _lock = threading.RLock()
 _inside: list[int] = []
@@ -21,9 +21,9 @@ _put_off: list[Callable[[], None]] = []
 
 @contextmanager
 def temporary(path: str | os.PathLike, content: bool = True) -> Iterator[Path]:
-    """A file or folder, not made yet, that is removed at the end of the block if it is there.
+    """A future file or folder that is removed at the end of the block if it exists.
 
-    `content`: a folder goes with what is in it; else it goes if it is empty.
+    `content`: remove a folder with its content; otherwise only if empty.
     """
     name = os.path.abspath(path)
     with _lock:
@@ -37,8 +37,8 @@ def temporary(path: str | os.PathLike, content: bool = True) -> Iterator[Path]:
 
 @contextmanager
 def unbroken() -> Iterator[None]:
-    """An interrupt of the command line waits for the end of this block: for a few calls of the
-    system that belong together, such as two renames, never for work."""
+    """An interrupt of the command line waits for the end of this block: for a few system calls that
+    belong together, such as two renames, never for long work."""
     _lock.acquire()
     _inside.append(threading.get_ident())
     try:
@@ -59,14 +59,14 @@ def put_off(action: Callable[[], None]) -> bool:
 
 
 def watch_cache(folder: str | os.PathLike) -> None:
-    """Name a folder into which a library writes files under their own names: one that is open at an
-    interrupt is removed, for its beginning would be taken for the whole."""
+    """Register a folder into which a library writes directly: files open at an interrupt are
+    removed, since they are incomplete."""
     _caches.add(os.path.realpath(folder))
 
 
 def remove_temporaries(patience: float) -> None:
-    """Remove what is temporary; the process must end at once, for no block `unbroken` begins after
-    this. A thread in such a block may finish it, for so many seconds."""
+    """Remove temporary files; the process must end at once, since no `unbroken` block can begin
+    after this. A thread in such a block may finish it, within the given seconds."""
     _lock.acquire(timeout=patience)
     for name, content in reversed(list(_temporaries.items())):
         _remove(name, content)
