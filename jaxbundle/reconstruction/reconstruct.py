@@ -56,9 +56,11 @@ from jaxbundle.tiepoints.verification import Pair
 DEFAULT = Settings()
 NAMED = 99
 """Kind of the measurements of named points."""
-REPEATS, FOLDED, MANY = 0.3, 0.4, 20
-"""Part of the pairs that contradict others from which on the whole is doubtful; from which on, of
-so many pairs, no answer is trustworthy."""
+REPEATS = 0.3
+"""Part of the pairs that contradict others from which on the whole is doubtful."""
+FOLDED = 1 / 3
+"""Part of the measurements that must agree with a result: of a long facade whose windows are laid
+upon one another it is a fifth, otherwise more than a half."""
 TEXTURE = 16
 """Features a photograph needs."""
 
@@ -227,19 +229,12 @@ class _Making:
             named = (" and ".join(self.names[k] for k in p.images) for p in wrong)
             self.notes.append(f"{count(len(wrong), 'pair')} of photographs not used, which others "
                               f"contradict around three: {some(named, 3, str)}")  # fmt: skip
-        every = len(wrong) + len(pairs)
-        if len(wrong) > REPEATS * every:
-            said = (
-                f"{len(wrong)} of {every} pairs contradict others: the object repeats itself, and "
-                "parts of it may have been laid upon one another"
+        if len(wrong) > REPEATS * (len(wrong) + len(pairs)):
+            self.notes.append(
+                f"{len(wrong)} of {len(wrong) + len(pairs)} pairs contradict others: the object "
+                "repeats itself, and parts of it may have been laid upon one another; compare the "
+                "result with the object, or take photographs nearer to one another"
             )
-            if every >= MANY and len(wrong) > FOLDED * every:
-                raise NotSolvedError(
-                    f"not solved: {said}; take photographs nearer to one another, or leave out "
-                    "those that show repeated parts alone", self.names,
-                )  # fmt: skip
-            self.notes.append(f"{said}; compare the result with the object, or take photographs "
-                              "nearer to one another")  # fmt: skip
         return pairs
 
     def _parts(self, features, matches, pairs: Sequence[Pair]) -> list[Part]:
@@ -313,6 +308,7 @@ class _Making:
         self._begin("start values")
         oriented, weighted, note = self._adjusted(network, measured)
         self._begin("")
+        _refuse_folded(weighted.adjustment, measured, self.names)
         self.notes += [note] if note else []
         part = Part(name, weighted.adjustment, _colours(measured), weighted.factors)
         return part, dict(oriented.images)
@@ -375,6 +371,22 @@ def _not_solved(result: Adjustment) -> NotSolvedError:
         f"not solved: principal distance {found}, which no camera has; take photographs from "
         "places that lie farther apart, or give --camera"
     )
+
+
+def _refuse_folded(result: Adjustment, measured: Measurements, names: Sequence[str]) -> None:
+    """Refuse a result with which most measurements in its photographs do not agree."""
+    placed = set(result.network.images.id)
+    rows = np.isin(measured.image, [k for k, name in enumerate(names) if name in placed])
+    rays = np.bincount(measured.track[rows])
+    found = int(rays[rays > 1].sum())
+    agree = len(result.network.observations) - len(result.removed)
+    if agree < FOLDED * found:
+        raise NotSolvedError(
+            f"not solved: of {found} measurements in {count(len(placed), 'photograph')} {agree} "
+            "agree with one object: it repeats itself, and parts of it would be laid upon one "
+            "another; take photographs nearer to one another, or leave out those that show "
+            "repeated parts alone", names,
+        )  # fmt: skip
 
 
 def _kinds(network: Network, measured: Measurements, names: Sequence[str]):

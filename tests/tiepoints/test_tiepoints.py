@@ -1,5 +1,7 @@
 """Matches of known geometry: principal distance, verification, tracks, what is kept."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -137,6 +139,10 @@ def test_a_pair_that_does_not_close_around_three_photographs_is_found(cloud, win
     kept, wrong = split_contradicted(pairs, ideal)
     assert [p.images for p in wrong] == [shifted] and len(kept) == 9
     assert split_contradicted(pairs[3:4], ideal) == ([pairs[3]], [])
+    chain = [pair(0, 1, 0), pair(1, 3, 0), pair(3, 4, 0)]
+    far = dataclasses.replace(pair(0, 4, 0), sure=False)
+    assert split_contradicted([*chain, far], ideal) == (chain, [far])
+    assert split_contradicted([*chain[:2], far], ideal) == ([*chain[:2], far], [])
 
 
 def features_at(xy):
