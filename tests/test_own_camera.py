@@ -81,7 +81,7 @@ def test_a_file_names_it_and_the_reader_is_given_it(page, tmp_path):
     assert "\n" not in str(said.value)
     with pytest.raises(InputError, match="models must be a list of CameraModels, but is"):
         jaxbundle.read_network(path, models=["division-mm"])
-    with pytest.raises(InputError, match="model 'division-mm' stands already"):
+    with pytest.raises(InputError, match="model 'division-mm' is already"):
         jaxbundle.read_network(path, models=[DIVISION, DIVISION])
     with pytest.raises(InputError, match="camera 'cam': .*unknown key 'L3'"):
         path.write_text(path.read_text().replace("L1 =", "L3 ="))

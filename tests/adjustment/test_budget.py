@@ -177,7 +177,7 @@ def test_the_influence_of_a_measurement_is_what_shifting_it_does():
         ({"camera:cam:c": 1}, "cameras", "is estimated"),
         ({"camera:cam:K33": 1}, "cameras", "there is no 'K33'"),
         ({"camera:cem:K3": 1}, "cameras", "there is no camera 'cem'"),
-        ({"lens:cam:K3": 1}, "cameras", "nothing called 'lens'"),
+        ({"lens:cam:K3": 1}, "cameras", "unknown kind 'lens'"),
         ({"camera:cam:K3": -1}, "cameras", "σ of camera:cam:K3"),
         ({"K3": 1}, "cameras", "KIND:ID:NAME"),
         ({}, "cameras", "by name"),

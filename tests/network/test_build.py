@@ -159,7 +159,7 @@ def test_a_bad_camera_is_refused(camera, said):
     ({"points": [1, 2]}, "points: expected a data frame of pandas, a dict of columns, or a list"),
     ({"points": {"id": "p"}}, "points: column 'id' must be a sequence"),
     ({"cameras": []}, "no camera is given"),
-    ({"cameras": [CAMERAS[0]] * 2}, "camera 'a' stands already"),
+    ({"cameras": [CAMERAS[0]] * 2}, "camera 'a' is already"),
     ({"image_unit": "px"}, "camera 'a': pixel_size is needed to convert between pixels and mm"),
 ])  # fmt: skip
 def test_bad_arguments_are_refused(change, said):
