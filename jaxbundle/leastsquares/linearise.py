@@ -23,6 +23,9 @@ from jaxbundle.leastsquares.rows import (
     residual_of,
 )
 
+ROWS_AT_ONCE = 1 << 16
+"""Observations whose derivatives are looked at together where they are many."""
+
 
 def widths_of(declared: Declared, plan: Plan, part: Part) -> tuple[int, ...]:
     """The directions in which every slot of a part is differentiated."""
@@ -81,6 +84,32 @@ def differentiate_rows(function, widths, part: Part, blocks, measured, weight):
     of = lambda row, a, b: jnp.stack(row[a:b], -1) if b > a else none
     blocks = [jnp.stack([of(row, a, b) for row in found], -2) for a, b in zip(starts, starts[1:])]
     return jnp.stack(r, -1), blocks
+
+
+def differentiate_chunks(
+    declared: Declared, plan: Plan, number: int, prepared, laid: Laid, of_chunk
+):
+    """`of_chunk(part, r, touches, E)` of every chunk of a part, [length, …] each, some chunks at a
+    time, so that derivatives of all of it (2 000 000 rows) are never there at once. The incidences
+    of the touches are always numbered."""
+    part = plan.parts[number]
+    chunks, length = part.source.shape
+    in_order = jnp.arange(chunks * length).reshape(chunks, length)
+    counted = lambda t: t if t.incidence is not None else dataclasses.replace(t, incidence=in_order)
+    touches = tuple(map(counted, part.touches))
+    part = dataclasses.replace(part, touches=touches, place=in_order)
+
+    def of(given):
+        part, measured, weight = jax.tree.map(lambda x: x[None], given)
+        one = dataclasses.replace(plan, parts=(part,))
+        found = differentiate(declared, one, 0, prepared, Laid((measured,), (weight,)))
+        return of_chunk(given[0], *jax.tree.map(lambda x: x[0], found))
+
+    given = part, laid.measured[number], laid.weight[number]
+    at_once = max(ROWS_AT_ONCE // max(length, 1), 1)
+    if chunks > at_once:
+        return jax.lax.map(of, given, batch_size=at_once)
+    return jax.vmap(of)(given)
 
 
 @dataclasses.dataclass(frozen=True)

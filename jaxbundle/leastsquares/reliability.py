@@ -13,16 +13,16 @@ For observations with a covariance, v/σ means L⁻¹·v.
 """
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jaxbundle.leastsquares.cofactors import Cofactors
-from jaxbundle.leastsquares.linearise import differentiate
+from jaxbundle.leastsquares.linearise import differentiate_chunks
 from jaxbundle.leastsquares.plan import Part, Plan
 from jaxbundle.leastsquares.rows import (
     Data,
@@ -38,7 +38,6 @@ from jaxbundle.types import AnyArray, present
 
 UNCONTROLLED = 1e-8
 """Redundancy numbers below this are rounding: the observation is uncontrolled."""
-ROWS_AT_ONCE = 1 << 16
 
 
 class Reliability(eqx.Module):
@@ -68,79 +67,50 @@ def reliability(
 def hat_diagonal(declared: Declared, plan: Plan, values: Values, laid: Laid, Q: Cofactors):
     """v/σ, h = diag(J·Q·Jᵀ) and its part E·V⁻¹·Eᵀ of the eliminated row alone, of every part,
     [chunks, length, r], from the blocks of Q that each observation touches."""
-    prepared = prepare(declared, values)
-    residual, hat, own = [], [], []
-    for number, part in enumerate(plan.parts):
-        r, touches, E = differentiate(declared, plan, number, prepared, laid)
-        residual.append(r)
-        hat.append(_of_part(plan, part, touches, E, Q))
-        own.append(jnp.zeros_like(r) if E is None else _of_eliminated(part, E, Q))
-    return tuple(residual), tuple(hat), tuple(own)
+    prepared, of_chunk = prepare(declared, values), partial(_of_chunk, Q)
+    found = [
+        differentiate_chunks(declared, plan, number, prepared, laid, of_chunk)
+        for number in range(len(plan.parts))
+    ]
+    return zip(*found) if found else ((), (), ())
 
 
-def _of_eliminated(part: Part, E, Q: Cofactors):
-    lower_inverse = present(Q.lower_inverse)[part.eliminated]
-    return jnp.sum(jnp.einsum("clri,clji->clrj", E, lower_inverse) ** 2, -1)
-
-
-def _of_part(plan: Plan, part: Part, touches, E, Q: Cofactors):
-    """h of one part, some chunks at a time: what belongs to all of it (2 000 000 rows) is large."""
-    chunks, length = part.source.shape
+def _of_chunk(Q: Cofactors, part: Part, r, touches, E):
+    """The same of one chunk, [length, r]."""
     form = lambda a, B, b: jnp.sum((a @ B) * b, -1)
-
-    def of_chunk(given):
-        at, touches, E = given
-        h = 0.0
-        if touches:
-            J = jnp.concatenate(touches, -1)
-            h = form(J, _of_kept(part, at, Q), J)
-        if E is None:
-            return h
-        h = h + form(E, present(Q.eliminated)[at["eliminated"]], E)
-        for touch, incidence, J in zip(part.touches, at["incidences"], touches):
+    hat = own = jnp.zeros_like(r)
+    if touches:
+        J = jnp.concatenate(touches, -1)
+        hat = form(J, _of_kept(part, Q), J)
+    if E is not None:
+        own = jnp.einsum("lri,lji->lrj", E, present(Q.lower_inverse)[part.eliminated])
+        own = jnp.sum(own**2, -1)
+        hat = hat + form(E, present(Q.eliminated)[part.eliminated], E)
+        for touch, J in zip(part.touches, touches):
             coupled = Q.coupled[touch.group]
-            rows = coupled.reshape(-1, *coupled.shape[2:])[incidence]
-            h = h + 2 * form(E, rows[..., touch.start : touch.stop], J)
-        return h
-
-    given = (_rows_of_chunks(plan, part), touches, E)
-    at_once = max(ROWS_AT_ONCE // max(length, 1), 1)
-    if chunks > at_once:
-        return jax.lax.map(of_chunk, given, batch_size=at_once)
-    return jax.vmap(of_chunk)(given)
+            rows = coupled.reshape(-1, *coupled.shape[2:])[touch.incidence]
+            hat = hat + 2 * form(E, rows[..., touch.start : touch.stop], J)
+    return r, hat, own
 
 
-def _rows_of_chunks(plan: Plan, part: Part):
-    """Which blocks of Q every chunk of a part touches."""
-    in_order = jnp.arange(part.source.size).reshape(part.source.shape)
-    return {
-        "rows": tuple(t.row for t in part.touches),
-        "blocks": tuple((c.block, c.turned, c.same) for c in part.couples),
-        "eliminated": part.eliminated,
-        "incidences": tuple(
-            in_order if t.incidence is None else t.incidence for t in part.touches
-        ) if part.slot is not None else (),
-    }  # fmt: skip
-
-
-def _of_kept(part: Part, at, Q: Cofactors):
+def _of_kept(part: Part, Q: Cofactors):
     """The block of Q of all kept rows that a chunk touches, in the order of its touches."""
     touches = part.touches
     cut = lambda B, rows, columns: B[rows.start : rows.stop, columns.start : columns.stop]
     blocks: list[list[Any]] = [[None] * len(touches) for _ in touches]
-    for t, row in enumerate(at["rows"]):
-        blocks[t][t] = cut(Q.kept.own[touches[t].group][row], touches[t], touches[t])
-    for couple, (block, turned, same) in zip(part.couples, at["blocks"]):
+    for t, touch in enumerate(touches):
+        blocks[t][t] = cut(Q.kept.own[touch.group][touch.row], touch, touch)
+    for couple in part.couples:
         first, second = touches[couple.first], touches[couple.second]
         found: Any = 0.0
-        if block is not None:
-            B = Q.kept.off[first.group, second.group][block]
+        if couple.block is not None:
+            B = Q.kept.off[first.group, second.group][couple.block]
             found = cut(B, first, second)
-            if turned is not None:
-                found = jnp.where(turned > 0, cut(B, second, first).T, found)
-        if same is not None:
-            on = cut(Q.kept.own[first.group][at["rows"][couple.first]], first, second)
-            found = jnp.where(same > 0, on, found)
+            if couple.turned is not None:
+                found = jnp.where(couple.turned > 0, cut(B, second, first).T, found)
+        if couple.same is not None:
+            on = cut(Q.kept.own[first.group][first.row], first, second)
+            found = jnp.where(couple.same > 0, on, found)
         blocks[couple.first][couple.second] = found
         blocks[couple.second][couple.first] = found.T
     return jnp.block(blocks)
