@@ -78,7 +78,7 @@ def start_points(given: Given, rays: Rays) -> Float[np.ndarray, "points 3"]:
     place = np.minimum(np.arange(number.max()), number[:, None] - 1)
     weight = (np.arange(number.max()) < number[:, None]).astype(float)
     mine = order[first[:, None] + place]
-    met = jax.jit(jax.vmap(intersection))(centre[mine], direction[mine], weight)
+    met = _meet(centre[mine], direction[mine], weight)
     X[rows] = met.X
     lost = (np.asarray(met.status) != Status.SOUND) | ~np.isfinite(X[rows]).all(1)
     if lost.any():
@@ -90,6 +90,9 @@ def start_points(given: Given, rays: Rays) -> Float[np.ndarray, "points 3"]:
             "it in an image from elsewhere"
         )
     return X
+
+
+_meet = jax.jit(jax.vmap(intersection))
 
 
 def _sights(given: Given, rays: Rays):

@@ -148,11 +148,15 @@ def _optics(image, change) -> Optics:
     else:
         candidate = base
     u = jnp.arange(image.pixels, dtype=float)
-    slopes = eqx.filter_jit(lambda optics, u: jnp.stack(jax.vmap(optics.slopes)(u)))
-    target = slopes(wanted, u)
-    if float(jnp.abs(slopes(candidate, u) - target).max()) <= SAME:
+    target = _slopes(wanted, u)
+    if float(jnp.abs(_slopes(candidate, u) - target).max()) <= SAME:
         return candidate
     return AngleTable(jnp.arctan(target[0]), jnp.arctan(target[1]))
+
+
+@eqx.filter_jit
+def _slopes(optics, u):
+    return jnp.stack(jax.vmap(optics.slopes)(u))
 
 
 def _sum(base, e, added):

@@ -94,7 +94,9 @@ def precision(
     )
     of_points = problem.layout.coordinate_cofactors(data.start.point, found.own["point"])
     return Precision(
-        images=_root(image_variances(problem, data.start, found.own["image"])) * sigma0,
+        images=_root(
+            image_variances(problem.network.images.angles, data.start.rotation, found.own["image"])
+        ) * sigma0,
         cameras=_camera_sigma(problem, data.start, found.own) * sigma0,
         points=_root(jnp.diagonal(of_points, axis1=1, axis2=2)) * sigma0,
         covariance=found.covariance * jnp.square(sigma0),
@@ -149,10 +151,11 @@ def _root(variance):
     return jnp.where(none, 0.0, jnp.sqrt(jnp.where(none, 1.0, variance)))
 
 
-def image_variances(problem: Problem, values: Values, Q):
-    """Variances of X0, Y0, Z0 and of ω, φ, κ, by the Jacobian of the angles."""
+def image_variances(angles, rotation, Q):
+    """Variances [images, 6] of X0, Y0, Z0 and of ω, φ, κ near `angles`, by the Jacobian of the
+    angles; `Q`: cofactors of the poses, `rotation`: their quaternions."""
     turn = jax.vmap(jax.jacfwd(angles_near, 1), (0, None, 0))
-    A = turn(values.rotation, jnp.zeros(3), jnp.asarray(problem.network.images.angles))
+    A = turn(rotation, jnp.zeros(3), jnp.asarray(angles))
     of_position = jnp.diagonal(Q[:, :3, :3], axis1=1, axis2=2)
     of_angles = jnp.einsum("nij,njk,nik->ni", A, Q[:, 3:, 3:], A)
     return jnp.concatenate([of_position, of_angles], 1)

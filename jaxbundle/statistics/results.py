@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -137,10 +136,14 @@ def _of_images(inspection: Inspection):
         angles = jax.vmap(angles_near, (0, None, 0))(values.rotation[rows], jnp.zeros(3), given)
         return jnp.concatenate([values.position[rows], angles], 1).ravel()
 
-    variances = jax.jit(partial(image_variances, problem))
-    variance = np.asarray(variances(inspection.adjusted, inspection.image_cofactors))[rows]
+    angles, values = problem.network.images.angles, inspection.adjusted
+    variance = _variances(angles, values.rotation, inspection.image_cofactors)
+    variance = np.asarray(variance)[rows]
     names = [(f"images:{p}", f"{p} of images, RMS", p in EXTERIOR[3:]) for p in EXTERIOR]
     return poses, names, 6 * len(rows), np.sqrt(np.clip(variance.mean(0), 0, None))
+
+
+_variances = jax.jit(image_variances)
 
 
 def _of_points(inspection: Inspection):
