@@ -39,12 +39,12 @@ class CannotHold(InputError):
 class Survey(NamedTuple):
     """The effect of the motions at the start values, including padded rows.
 
-    `products`: J·G of all observations that are not invariant; `terms`: the magnitude of cancelling
-    terms; `held`: G on held unknowns; `moves`, `free`: G and free directions by table, [rows,
-    width, …]; `of_groups`: G by group, 0 for held unknowns."""
+    `products`: J·G of all observations that are not invariant, part by part; `squares`: the sums of
+    squares of the cancelling terms; `held`: G on held unknowns; `moves`, `free`: G and free
+    directions by table, [rows, width, …]; `of_groups`: G by group, 0 for held unknowns."""
 
-    products: Float[Array, "rows motions"]
-    terms: Float[Array, "rows motions"]
+    products: tuple[Float[Array, "rows motions"], ...]
+    squares: Float[Array, " motions"]
     held: Float[Array, "rows motions"]
     moves: Tangent
     free: Tangent
@@ -69,7 +69,7 @@ def _survey(declared, plan, data, real, moves) -> Survey:
         ], 1)
         for name, group in plan.groups.items()
     }  # fmt: skip
-    products, terms = [], []
+    products, squares = [], jnp.zeros(motions)
     for number, part in enumerate(plan.parts):
         if declared.kinds[part.observations].invariant:
             continue
@@ -79,16 +79,18 @@ def _survey(declared, plan, data, real, moves) -> Survey:
         if E is not None:
             blocks.append((E, everywhere[present(plan.eliminated)][part.eliminated]))
         total = lambda rows: reduce(jnp.add, rows).reshape(-1, motions)
-        products.append(total([J @ G for J, G in blocks]))
-        terms.append(total([abs(J) @ abs(G) for J, G in blocks]))
+        product, terms = (total([f(J) @ f(G) for J, G in blocks]) for f in (jnp.asarray, abs))
+        # Non-finite values at the start are ignored here; the solver will report them.
+        there = jnp.isfinite(terms).all(1, keepdims=True)
+        products.append(jnp.where(there, product, 0.0))
+        squares += jnp.where(there, terms**2, 0.0).sum(0)
     free = free_of_tables(plan, declared, data.start)
     held = [
         jnp.where((free[name] > 0)[..., None] | ~real[name][:, None, None], 0.0, rows)
         for name, rows in moves.items()
     ]
-    flat = lambda rows: jnp.concatenate([jnp.zeros((0, motions)), *rows])
-    held = flat([rows.reshape(-1, motions) for rows in held])
-    return Survey(flat(products), flat(terms), held, moves, free, of_groups(plan, moves))
+    held = jnp.concatenate([rows.reshape(-1, motions) for rows in held])
+    return Survey(tuple(products), squares, held, moves, free, of_groups(plan, moves))
 
 
 def find_open_motions(survey: Survey) -> Float[np.ndarray, "motions defect"]:
@@ -96,18 +98,18 @@ def find_open_motions(survey: Survey) -> Float[np.ndarray, "motions defect"]:
 
     Computed from the singular values of J·G, its columns scaled by the size of their terms, so that
     neither units nor the number of observations matter."""
-    products, terms, held = (np.asarray(x) for x in survey[:3])
-    # Non-finite values at the start are ignored here; the solver will report them.
-    products, terms, held = (x[np.isfinite(x).all(1)] for x in (products, terms, held))
-    scale = np.sqrt((np.concatenate([terms, held]) ** 2).sum(0))
+    held = np.asarray(survey.held)
+    held = held[np.isfinite(held).all(1)]
+    scale = np.sqrt(np.asarray(survey.squares) + (held**2).sum(0))
     scale = np.where(scale > 0, scale, 1.0)
     held = held / scale
     size = np.linalg.norm(held, axis=1, keepdims=True)
-    held = held / np.where(size > 0, size, 1.0)
-    motions = products.shape[1]
     # Singular values of a QR, not of the Gram matrix, which would lose half of the digits.
-    rows = np.concatenate([products / scale, held, np.zeros((motions, motions))])
-    _, singular, directions = np.linalg.svd(np.linalg.qr(rows, mode="r"))
+    R = np.zeros((len(scale), len(scale)))
+    products = (np.asarray(rows) / scale for rows in survey.products)
+    for rows in (held / np.where(size > 0, size, 1.0), *products):
+        R = np.linalg.qr(np.concatenate([R, rows]), mode="r")
+    _, singular, directions = np.linalg.svd(R)
     return directions[singular < OPEN].T / scale[:, None]
 
 
