@@ -84,8 +84,12 @@ def shell(only_shell):
     only_shell.reset()
 
 
-FURTHER = ("lapan_a3", "next_photograph", "two_strips_to_a_dsm", "two_video_cameras")
-"""Whose functions another notebook calls."""
+FURTHER = (
+    "calibrate_through_pixels", "lapan_a3", "next_photograph", "rolling_shutter_on_a_drone",
+    "ten_thousand_cameras", "two_strips_to_a_dsm", "two_video_cameras", "weights_learned_from_data",
+    "which_camera_model",
+)  # fmt: skip
+"""Whose functions another notebook, or another test, calls."""
 
 
 @pytest.mark.slow
