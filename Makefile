@@ -1,4 +1,4 @@
-# `make demo`, `make test` (`make test-all`: with the further cases of its dear tests), `make docs` and
+# `make demo`, `make test` (`make test-all`: with the further cases of its dear tests), `make test-oldest`, `make docs` and
 # `make bench` (or a part of it, below). All make .venv first (uv where installed, else venv and pip)
 # and install the package with what the tests need; `docs` also Sphinx, `bench` also what it compares
 # with. More problems: make bench-bal BAL="problem-16-22106-pre.txt.bz2 …" PEERS="--ceres …"
@@ -16,7 +16,7 @@ MORE_BENCHES = large pushbroom orientation measuring blunders
 BAL ?=
 PEERS ?=
 
-.PHONY: demo test test-all bench docs install clean $(BENCHES:%=bench-%) $(MORE_BENCHES:%=bench-%)
+.PHONY: demo test test-all test-oldest bench docs install clean $(BENCHES:%=bench-%) $(MORE_BENCHES:%=bench-%)
 
 install: $(VENV)/installed
 
@@ -37,6 +37,16 @@ test test-all: install
 	$(BIN)/python -m ruff check jaxbundle tests benchmarks docs
 	$(BIN)/basedpyright --pythonpath $(BIN)/python
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(CASES)
+
+# The oldest versions that pyproject.toml allows, in an environment of their own, on some tests.
+OLDEST = out/oldest
+test-oldest:
+	$(PYTHON) -m venv $(OLDEST)
+	$(OLDEST)/bin/python tests/oldest_versions.py > $(OLDEST)/versions.txt
+	$(OLDEST)/bin/python -m pip install --quiet --disable-pip-version-check -c $(OLDEST)/versions.txt \
+	  ".[tables]" pytest beartype hypothesis
+	$(OLDEST)/bin/python -m pytest -q -p no:cacheprovider tests/test_saved.py tests/cli/test_first_touch.py \
+	  tests/adjustment/test_solve.py -W ignore::DeprecationWarning
 
 $(VENV)/documented: $(VENV)/installed
 	@if command -v uv >/dev/null 2>&1; then \

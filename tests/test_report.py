@@ -237,7 +237,8 @@ def test_check_points(convergent4):
         difference=np.array([[1e-3, 2e-3, -2e-3], [-1e-3, 0, 0]]),
         cofactor=np.stack([np.eye(3), 4 * np.eye(3)]), rays=np.array([3, 4]),
     )  # fmt: skip
-    changed = again(convergent4, check=lambda adjustment: found)
+    changed = again(convergent4)
+    changed.check_points = found
     table = rows(section(changed.report(), "Check points: intersected − given, in model"), "point")
     assert [float(x) for x in table[0][1:4]] == [0.001, 0.002, -0.002]
     assert float(table[1][4]) == pytest.approx(2 * convergent4.sigma0, rel=6e-3)

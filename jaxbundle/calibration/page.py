@@ -63,7 +63,10 @@ def compose_calibration(calibration, origin: Origin = UNKNOWN, choice=None) -> I
 
 def _describe_one(calibration, choice=None) -> Addition:
     views, sections = calibration.views, []
-    overview = f"<h3>Photographs</h3>\n{facts(photograph_facts(views))}"
+    rows = list(photograph_facts(views))
+    if calibration.converged:
+        rows.append(("RMS of an image point", f"{calibration.rms:.4f} px"))
+    overview = f"<h3>Photographs</h3>\n{facts(rows)}"
     if choice is not None:
         sections.append(_models(choice))
     if not calibration.converged:
@@ -73,9 +76,8 @@ def _describe_one(calibration, choice=None) -> Addition:
         _validation(calibration), *_failed(views),
     ]  # fmt: skip
     findings = (_coverage(calibration.coverage), *_halves(calibration))
-    rows = [("RMS of an image point", f"{calibration.rms:.4f} px")]
     return Addition(
-        "", findings, BOARD, tuple(calibration.advice), overview + facts(rows), tuple(sections)
+        "", findings, BOARD, tuple(calibration.advice), overview, tuple(sections)
     )
 
 
@@ -103,9 +105,11 @@ def _quality(covered, maps, unit: str, name: str = "", number: int = 0) -> Secti
     parts = [figure(draw_field(counts, 0), caption)]
     parts += ["<h3>Uncertainty of a projected point (σ, pixels)</h3>\n",
               grid(MAPS_HEADER, map_rows(maps, unit))]  # fmt: skip
+    parts.append('<div class="maps">\n')
     for one, (held, *_) in zip(maps, map_rows(maps, unit)):
         caption = f"σ over the image from corner to corner, pixels; point held in {held}"
         parts.append(figure(draw_field(one.sigma), caption))
+    parts.append("</div>\n")
     title = f"Quality of camera {name}" if name else "Quality"
     link = "Quality" if number == 0 else ""
     return Section(f"quality-{number}" if number else "quality", title, "".join(parts), link, True)

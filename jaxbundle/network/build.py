@@ -314,12 +314,13 @@ def _make_images(table: Columns, cameras: Sequence[Camera], radians: float) -> I
 
 
 def _make_points(table: Columns) -> Points:
-    table.check_names(POINT_COLUMNS, (*POINT_SIGMAS, *POINT_ERRORS))
+    needed = AXES if {*AXES} & {*table.values} else ()
+    table.check_names(("id", *needed), ("role", *AXES, *POINT_SIGMAS, *POINT_ERRORS))
     ids = table.ids("id")
     check_unique(ids, table.source, "point")
     return Points(
         id=ids,
-        role=table.ids("role"),
+        role=table.ids("role") if "role" in table.values else ("tie",) * len(ids),
         position=_matrix(table, AXES),
         sigma=_matrix(table, POINT_SIGMAS, words={"free": math.inf}),
         source=table.source,

@@ -132,17 +132,17 @@ def read(kind: str, folder: Path):
         case "result":
             return [camera for camera, _ in read_calibrated(folder / "result.json")]
         case "colmap-text":
-            return read_network(folder, "colmap")
+            return read_network(folder, format="colmap")
         case "colmap" | "project" | "bingo" | "opensfm" | "micmac":
-            return read_network(folder, kind)
+            return read_network(folder, format=kind)
         case "column-map":
-            return read_network(folder / "map.toml", kind)
+            return read_network(folder / "map.toml", format=kind)
         case "jaicov":
-            return read_network(folder / "project.phc", kind)
+            return read_network(folder / "project.phc", format=kind)
         case _:
             (file,) = (p for p in folder.iterdir() if p.name != "list.txt")
             settings = ["sigma_image=1"] if kind == "photo-list" else []
-            return read_network(file, kind, settings)
+            return read_network(file, format=kind, overrides=settings)
 
 
 

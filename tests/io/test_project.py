@@ -243,7 +243,7 @@ def test_a_fault_in_a_file_is_refused_with_its_place(folder, name, old, new, sai
     ("points.csv", "b,fixed", "b,fxed", "points.csv, line 3: point 'b': role must be one of"),
     ("points.csv", "0.1,0.1,free", "0.1,,free", "line 2: control point 'a': σ of Y is missing"),
     ("observations.csv", "0.02,0.02", "0.02,-3", "line 4: σ of y of point 'c' in image 'left' is"),
-    ("observations.csv", "left,b,10", "left,a,10", "line 3: point 'a' in image 'left' stands alre"),
+    ("observations.csv", "left,b,10", "left,a,10", "line 3: point 'a' in image 'left' is alre"),
     ("distances.csv", "7.07", "0", "distances.csv, line 2: distance 'a' to 'e, far': value is 0"),
 ])  # fmt: skip
 def test_a_fault_in_a_value_is_refused_with_its_place(folder, name, old, new, said):
@@ -396,11 +396,11 @@ def test_the_kind_of_input_is_recognised(folder):
         read_network(camera)
     for name, what in (("opencv", "holds a camera alone"), ("ply", "is written only")):
         with pytest.raises(InputError, match=f"--format {name}: {what}"):
-            read_network(camera, name)
+            read_network(camera, format=name)
     with pytest.raises(InputError, match="not recognised; known formats: project: a .toml file"):
         read_network(folder / "points.csv")
     with pytest.raises(InputError, match="unknown format 'toml'; known: project, photo-list"):
-        read_network(folder, "toml")
+        read_network(folder, format="toml")
     assert list(FORMATS)[:2] == ["project", "photo-list"]
 
 

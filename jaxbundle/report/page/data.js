@@ -83,5 +83,6 @@ function formatNumber(value, places) {
   if (Number.isNaN(value)) return "–";
   if (!Number.isFinite(value)) return value > 0 ? "∞" : "−∞";
   if (Number.isInteger(value) && places < 0) return String(value);
-  return places < 0 ? value.toPrecision(-places) : value.toFixed(places);
+  const text = places < 0 ? value.toPrecision(-places) : value.toFixed(places);
+  return /^-[0.]+$/.test(text) ? text.slice(1) : text;
 }

@@ -17,7 +17,10 @@ class NetworkView {
     this.canvas = document.getElementById("network-canvas");
     this.said = document.getElementById("network-said");
     this.placed = [[images, STATION], [points, POINT], [checks, POINT]].filter(([table]) => table);
-    this.show = { ellipsoids: true, rays: observations.length / 2 < MOST_RAYS };
+    this.show = {
+      ellipsoids: true, "ellipsoids of stations": !scene.wide,
+      rays: observations.length / 2 < MOST_RAYS,
+    };
     this.corners = unpack(scene.pyramids, images.length * 15);
     this.station = null;
     this.chosen = () => {};
@@ -96,7 +99,7 @@ class NetworkView {
     if (this.show.rays || this.station !== null) this.drawRays(context);
     this.drawStations(context);
     for (const [table] of this.placed) if (table !== this.images) this.drawPoints(context, table);
-    if (this.show.ellipsoids) this.drawEllipsoids(context);
+    this.drawEllipsoids(context);
     drawBar(context, 20, high - 20, scale, this.unit);
     this.drawAxes(context, wide - 70, high - 60);
   }
@@ -132,7 +135,9 @@ class NetworkView {
     let left = MOST_ELLIPSOIDS;
     context.strokeStyle = COLOURS.ink;
     context.lineWidth = 0.7;
-    for (const [table, names] of this.placed.filter(([table]) => table.has("c00"))) {
+    const wanted = table => table.has("c00")
+      && (table === this.images ? this.show["ellipsoids of stations"] : this.show.ellipsoids);
+    for (const [table, names] of this.placed.filter(([table]) => wanted(table))) {
       for (let row = 0; row < table.length && left > 0; row++) {
         const at = this.findInside(table, row, names);
         if (at === null) continue;

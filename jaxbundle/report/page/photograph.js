@@ -78,7 +78,7 @@ class PhotographView {
     const large = points.filter(one => one.tau > LARGE).length;
     const rms = this.images.cell("rms", image);
     this.said.textContent = `Image ${this.images.cell("id", image)}: ${points.length} image points, `
-      + `RMS v ${rms}, vectors drawn ${factor} times as large, ${large} with |${this.observations.columns.tau.label}| > ${LARGE}.`;
+      + `${this.images.columns.rms.label} ${rms}, vectors drawn ${factor} times as large, ${large} with |${this.observations.columns.tau.label}| > ${LARGE}.`;
   }
 
   // `chosen(image, point)` gets the ids of the image point that is clicked.

@@ -5,24 +5,35 @@ import numpy as np
 from jaxbundle.cameras import get_model
 from jaxbundle.plotting.distortion import principal_point
 from jaxbundle.plotting.frame import image_frame
-from jaxbundle.plotting.style import extent, micrometres
+from jaxbundle.plotting.style import extent, micrometres, round_number
 from jaxbundle.plotting.views import camera_pyramids, ellipse_factor, pyramid_size
 from jaxbundle.report.layout import clean
 from jaxbundle.report.page.columns import encode_values
 
+OF_STATIONS = 0.05
+"""The largest ellipsoid of a station, as a part of the network, where no point has one."""
+MOST_OF_SIZE = 0.15
+"""Wider ones hide the network: they are drawn on request."""
+
 
 def describe_network(adjustment) -> dict:
-    """Centre, size and unit of the network, the factor of its error ellipsoids, and the pyramid of
-    every image (projection centre and four corners, relative to the centre)."""
+    """Centre, size and unit of the network, the factor of its error ellipsoids, whether those of
+    stations are too wide to be drawn with it, and the pyramid of every image (projection centre and
+    four corners, relative to the centre)."""
     centres = adjustment.image_values[:, :3]
     near = adjustment.point_values[~adjustment.problem.at_any_distance]
     centre, size = extent(np.concatenate([near, centres]))
     pyramids = camera_pyramids(adjustment, pyramid_size(centres, size)) - centre
+    number, factor = ellipse_factor(adjustment, size)
+    largest = np.sqrt(np.trace(adjustment.image_covariance[:, :3, :3], axis1=1, axis2=2))
+    if not number and largest.max(initial=0.0) > 0:
+        factor = round_number(OF_STATIONS * size / largest.max())
     return {
         "centre": centre.tolist(),
         "size": size,
         "unit": clean(adjustment.network.object_unit),
-        "factor": ellipse_factor(adjustment, size)[1],
+        "factor": factor,
+        "wide": bool(factor * largest.max(initial=0.0) > MOST_OF_SIZE * size),
         "pyramids": encode_values(pyramids.ravel()),
     }
 
