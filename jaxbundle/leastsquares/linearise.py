@@ -17,6 +17,7 @@ from jaxbundle.leastsquares.plan import Part, Plan
 from jaxbundle.leastsquares.rows import (
     Declared,
     Laid,
+    Residual,
     diagonal_of,
     over,
     over_rows,
@@ -137,15 +138,22 @@ def _reverse(residual, widths, row):
 
 def _forward(residual, widths, row):
     """Residuals, a tuple of scalars, and their derivatives [r, directions]."""
+    blocks, given, weight = row
     ends = np.cumsum((0, *widths))
     split = lambda x: tuple(tuple(x[a:b]) for a, b in zip(ends, ends[1:]))
 
+    if isinstance(residual, Residual) and residual.is_wide(weight):
+        parts = lambda x: [x[a:b] for a, b in zip(ends, ends[1:])]
+        one = lambda x: residual.array(blocks, given, weight, parts(x))
+        w, nothing = jnp.stack(weight), jnp.zeros(ends[-1])
+        return tuple(one(nothing)), jnp.where(w[:, None] > 0, jax.jacfwd(one)(nothing), 0.0)
+
     def stacked(x):
-        r = residual(*row, split(x))
+        r = residual(blocks, given, weight, split(x))
         return jnp.stack(r), r
 
     J, r = jax.jacfwd(stacked, has_aux=True)(jnp.zeros(ends[-1]))
-    return r, jnp.stack([_where_weighted(row[2], i, J[i]) for i in range(len(r))])
+    return r, jnp.stack([_where_weighted(weight, i, J[i]) for i in range(len(r))])
 
 
 def _where_weighted(weight, i, columns):

@@ -16,8 +16,11 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from jaxbundle.leastsquares.declarations import Kind, Motions
 from jaxbundle.leastsquares.plan import Part, Plan
-from jaxbundle.leastsquares.spaces import Space
+from jaxbundle.leastsquares.spaces import Space, Vector
 from jaxbundle.types import AnyArray
+
+WIDE = 64
+"""Residuals of one observation, as of the priors of a spline camera."""
 
 Values = dict[str, PyTree[Float[AnyArray, "rows ..."]]]
 """The rows of every table."""
@@ -92,6 +95,29 @@ class Residual:
         changes = ((),) * len(self.spaces) if changes is None else changes
         moved = [s.moved(b, d) for s, b, d in zip(self.spaces, blocks, changes)]
         return weighted(evaluate(self.kind, moved, measured), weight)
+
+
+    def array(self, blocks, measured, weight, changes) -> Float[Array, " r"]:
+        """The same as an array, of changes [width] of every slot: for kinds of arrays with hundreds
+        of columns, as scalars of which XLA compiles for minutes."""
+        moved = []
+        for space, block, change in zip(self.spaces, blocks, changes, strict=True):
+            if isinstance(space, Vector) and space.size:
+                block = _stacked(block)
+                if change.shape[0]:
+                    columns, of = (jnp.array(x, int) for x in space.moves)
+                    block = block.at[columns].add(change[of])
+            else:
+                block = _stacked(space.moved(block, tuple(change)))
+            moved.append(block)
+        given = jax.tree.map(_stacked, measured, is_leaf=lambda x: type(x) is tuple)
+        found, w = self.kind.residual(*moved, given), jnp.stack(weight)
+        v = jnp.stack(found) if isinstance(found, tuple) else jnp.atleast_1d(found)
+        return jnp.where(w > 0, w * v, 0.0)
+
+    def is_wide(self, weight) -> bool:
+        """Whether `array` is the way: the kind is one of arrays, with a weight for each."""
+        return not self.kind.scalars and len(weight) > WIDE and not isinstance(weight[0], tuple)
 
 
 def residual_of(declared: Declared, part: Part) -> Residual:

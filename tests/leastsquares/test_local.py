@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from jaxbundle.cameras.cubic_splines import basis
+from jaxbundle.leastsquares import rows
 from jaxbundle.leastsquares.declarations import Kind, Local, Table
 from jaxbundle.leastsquares.layout import SMALL
 from jaxbundle.leastsquares.normal import normal_equations
 from jaxbundle.leastsquares.problem import make_problem, pad_data
-from jaxbundle.leastsquares.rows import lay_out_data
 
 KNOTS, CURVES, SHIFTS, POINTS = 12, 2, 3, 40
 
@@ -55,9 +55,9 @@ def problem(request):
         Table("shift", random.normal(0, 0.2, (SHIFTS, 1))),
         Table("point", random.normal(size=(POINTS, 1)), free=np.arange(POINTS) > 4),
     ]
-    rows = tuple(random.integers(0, n, number) for n in (CURVES, SHIFTS, POINTS))
+    touched = tuple(random.integers(0, n, number) for n in (CURVES, SHIFTS, POINTS))
     measured = np.c_[random.uniform(1, KNOTS - 2, number), random.normal(size=(number, 2))]
-    seen = LOCAL(rows, measured, sigma=random.uniform(0.1, 0.3, (number, 2)))
+    seen = LOCAL(touched, measured, sigma=random.uniform(0.1, 0.3, (number, 2)))
     return make_problem(tables, [seen], eliminate=request.param)
 
 
@@ -68,7 +68,25 @@ def test_the_normal_equations_are_those_of_all_columns(problem):
         declared = dataclasses.replace(problem.declared, kinds=(kind,))
         assert problem.plan.parts[0].large
         found.append(normal_equations(
-            declared, problem.plan, data.start, lay_out_data(problem.plan, data)
+            declared, problem.plan, data.start, rows.lay_out_data(problem.plan, data)
         ))  # fmt: skip
     for one, other in zip(*map(jax.tree.leaves, found), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-11 * np.abs(other).max())
+
+
+def test_wide_observations_are_computed_as_arrays(monkeypatch):
+    """Many priors of one camera: the same as scalar by scalar, one of them without weight."""
+    random, found = np.random.default_rng(3), []
+    start, sigma = random.normal(size=(2, 70)), random.uniform(0.1, 0.3, (2, 70))
+    sigma[1, 5] = np.inf
+    for name, wide in (("array", rows.WIDE), ("scalars", 1000)):
+        monkeypatch.setattr(rows, "WIDE", wide)
+        kind = Kind(name, lambda v, given: v * v[::-1] - given, ("wide",))
+        table = Table("wide", start, free=np.arange(70)[None] != 8)
+        problem = make_problem([table], [kind((np.arange(2),), 0 * start, sigma=sigma)])
+        data = pad_data(problem, problem.data)
+        found.append(normal_equations(
+            problem.declared, problem.plan, data.start, rows.lay_out_data(problem.plan, data)
+        ))  # fmt: skip
+    for one, other in zip(*map(jax.tree.leaves, found), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12 * np.abs(other).max())
