@@ -1,5 +1,6 @@
 """Pages of the documentation whose code runs, from the folder of the repository."""
 
+import dataclasses
 import re
 from pathlib import Path
 
@@ -58,3 +59,9 @@ def test_derivatives():
     )
     reported = page["result"].cameras["cam"]["parameters"]["c"]["sigma"]
     assert by_hand == pytest.approx(reported, rel=1e-6)
+    assert page["reported"] == pytest.approx(reported, rel=1e-6)
+    data, slopes, h = page["data"], page["slopes"], 1e-6
+    moved = lambda t: dataclasses.replace(data, image_xy=data.image_xy.at[page["ray"], 0].add(t))
+    ends = [page["sigma_of_sigma"](moved(t))[0] for t in (-h, h)]
+    difference = (ends[1] - ends[0]) / (2 * h)
+    assert slopes.image_xy[page["ray"], 0] == pytest.approx(float(difference), rel=1e-4)
