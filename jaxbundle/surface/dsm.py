@@ -3,7 +3,8 @@
 A cell has the weighted mean of the heights of its points, p = 1/σ_Z², after those that differ from
 their median by more than three times its spread. Its σ is that of the mean, but not less than what
 the points scatter for: σ² = max(1, χ²/(n − 1))/Σp. Small gaps are filled linearly, with σ of the
-points around and the distance to them.
+points around and the distance to them; beside a wall from the lower surface, because what the
+photographs do not see there lies low (Hirschmüller 2008).
 """
 
 import dataclasses
@@ -26,6 +27,9 @@ LEAST_SPREAD = 0.3
 """Of that spread, as a part of the cell size."""
 SLOPE = 0.3
 """σ of a filled cell per cell of distance, as a part of the cell size."""
+STEP = 1.0
+"""Scatter of the heights around a gap, as a part of the cell size, beyond which they are of two
+surfaces."""
 NO_DATA = -9999.0
 
 
@@ -151,6 +155,24 @@ def _filled(dsm: Dsm, reach: int) -> Dsm:
     around = ndimage.binary_closing(np.pad(known, 2 * reach), iterations=reach)
     gap &= around[2 * reach : -2 * reach, 2 * reach : -2 * reach]
     safe = np.where(weight > 0, weight, 1.0)
-    height = np.where(gap, weigh(dsm.height) / safe, dsm.height)
+    level = np.nanmean(dsm.height)
+    mean, square = weigh(dsm.height - level) / safe, weigh((dsm.height - level) ** 2) / safe
+    height = np.where(gap, level + mean, dsm.height)
+    at_wall = gap & (square - mean**2 > (STEP * dsm.size) ** 2)
+    height[at_wall] = _lower_means(dsm.height, kernel, at_wall, height[at_wall])
     sigma = np.hypot(weigh(dsm.sigma) / safe, SLOPE * dsm.size * distance)
     return dataclasses.replace(dsm, height=height, sigma=np.where(gap, sigma, dsm.sigma))
+
+
+def _lower_means(height, kernel, at, bound):
+    """The weighted means of the heights around some cells that are not above a bound each."""
+    reach = len(kernel) // 2
+    wide = np.pad(height, reach, constant_values=np.nan)
+    rows, columns = np.nonzero(at)
+    total, weight = np.zeros((2, len(rows)))
+    for (i, j), w in np.ndenumerate(kernel):
+        found = wide[rows + i, columns + j]
+        low = found <= bound
+        total += np.where(low, w * found, 0.0)
+        weight += w * low
+    return total / weight

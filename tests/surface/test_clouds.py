@@ -121,6 +121,18 @@ def test_gaps_of_a_dsm_are_filled_inside_only(plane):
     assert (filled.sigma[gap] > np.nanmedian(plain.sigma)).all()
 
 
+def test_a_gap_beside_a_wall_is_filled_from_below(plane):
+    X = plane.X.copy()
+    east = X[:, 0] - X[:, 0].min()
+    X[:, 2] = np.where(east > 20, 9.0, 0.0) + 0.01 * X[:, 1] % 0.05
+    walled = dataclasses.replace(plane, X=X).take((east < 19.0) | (east > 22.5))
+    plain, filled = make_dsm(walled, 1.0, fill=0), make_dsm(walled, 1.0)
+    gap = np.isnan(plain.height) & np.isfinite(filled.height)
+    inside = np.abs(filled.x + np.arange(gap.shape[1]) + 0.5 - X[:, 0].min() - 20.7) < 1.5
+    assert (gap & inside).sum() > 20
+    assert (filled.height[gap] < 1e-3 + 0.05)[inside[None].repeat(len(gap), 0)[gap]].all()
+
+
 def test_the_report_counts_by_classes(plane):
     found = accuracy_of(plane)
     assert [c["points"] for c in found["classes"]] == [2000, 2000, 0, 0, 0, 0] or (
