@@ -112,7 +112,7 @@ def path(name: str, value: Any) -> str:
 def numeric_array(name: str, values: Any, expected: str, truths: bool = False) -> np.ndarray:
     """Values as an array of real numbers, or of Booleans; a masked number becomes NaN, a masked
     Boolean False.
-    
+
 
     **Raises:** `InputError` that says what is expected."""
     refuse_traced(name, values)

@@ -45,7 +45,7 @@ def named(problem: Problem, names: Sequence[tuple[str, str, str]]) -> list[Name]
 
 def value_of(problem: Problem, name: Name, values: Values):
     """The unknown with this name; exterior orientation as X0, Y0, Z0, ω, φ, κ (radians).
-    
+
     **Raises:** `KeyError` for an unknown name."""
     network = problem.network
     if name.kind == "camera":
@@ -72,7 +72,7 @@ def angles_near(rotation, d_theta, given):
 
 def place_of(name: str, names: Sequence[str], thing: str) -> int:
     """The index of a name.
-    
+
     **Raises:** `KeyError` if it is missing, with the closest existing name."""
     if name not in names:
         known = did_you_mean(name, names, listing=len(names) <= 20)

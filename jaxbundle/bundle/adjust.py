@@ -14,6 +14,7 @@ from jaxbundle.bundle.far_points import minimise_at_any_distance, minimise_with_
 from jaxbundle.bundle.minimum import (
     adjusted_cameras,
     misjudged,
+    name_inseparable,
     names_of_defects,
     solved,
     start_with,
@@ -271,6 +272,7 @@ def _likely_causes(
         name_pixels(network), name_angle_unit(network),
         "" if told else name_contradiction(network),
         "" if inspection else name_one_place(network),
+        "" if inspection else name_inseparable(problem, minimum),
     )  # fmt: skip
     return tuple(filter(None, causes))
 

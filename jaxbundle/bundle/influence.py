@@ -47,7 +47,7 @@ class Influence:
     def table(self, result: str | None = None) -> dict[str, np.ndarray]:
         """The measurements with their influence on one result (default: the first), largest first:
         kind, image, point, axis, effect, derivative.
-        
+
         **Raises:** `KeyError` for a result that was not requested."""
         names = [one.name for one in self.results]
         if result is not None and result not in names:

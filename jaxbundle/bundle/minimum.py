@@ -13,7 +13,7 @@ from jaxbundle.errors import NotSolvedError
 from jaxbundle.leastsquares.names import undetermined
 from jaxbundle.leastsquares.solution import find_minimum
 from jaxbundle.leastsquares.solver import Minimum
-from jaxbundle.leastsquares.stopping import SINGULAR, TERMINATIONS, converged
+from jaxbundle.leastsquares.stopping import LIMIT, SINGULAR, TERMINATIONS, converged
 from jaxbundle.network.arrays import Values
 from jaxbundle.network.columns import some
 from jaxbundle.network.tables import Camera
@@ -23,6 +23,9 @@ from jaxbundle.statistics.weakness import Weakness, weakness_of_unsolved
 MISJUDGED = 1.03
 """If a principal distance changed by more than this factor, start values are computed again."""
 
+INSEPARABLE = 1e-7
+"""Scaled eigenvalues of the normal matrix below this: a change of the unknowns by many σ hardly
+changes an observation, and iterations go on for long."""
 EIGENVECTORS = 3000
 """Reduced systems with more unknowns are not searched for null vectors: that takes minutes."""
 
@@ -59,6 +62,24 @@ def names_of_defects(problem: Problem, minimum: Minimum[Values]) -> list[str]:
     return list(weakness_without_solution(problem, minimum).unknowns) if singular else []
 
 
+def name_inseparable(problem: Problem, minimum: Minimum[Values]) -> str:
+    """Why the iterations may have reached their limit: unknowns that the observations hardly
+    separate, in words; empty if there are none, or in a large network."""
+    system = problem.system
+    if int(minimum.termination) != LIMIT or system.plan.reduction != "dense":
+        return ""
+    if system.reduced_size > EIGENVECTORS:
+        return ""
+    tables = problem.layout.tables(_last(problem, minimum))
+    names = undetermined(system, tables, INSEPARABLE)
+    if not names:
+        return ""
+    return (
+        f"hardly separated where the iterations ended: {some(names, 8, str)}; hold some of them, "
+        "give them a prior σ, or raise the limit of iterations"
+    )
+
+
 def weakness_without_solution(problem: Problem, minimum: Minimum[Values]) -> Weakness:
     """The poorly determined unknowns where the iterations ended."""
     return weakness_of_unsolved(problem, _last(problem, minimum))
@@ -88,7 +109,7 @@ def require_solved(problem: Problem, minimum: Minimum[Values], when: str) -> Ins
 
 def _collapsed(problem: Problem, values: Values) -> list[str]:
     """Principal distances that diverged from their start values by a factor of `RUNAWAY`.
-    
+
     If c and an image scale are both free, c = 0 makes all corrected residuals zero.
     """
     return [

@@ -34,7 +34,7 @@ def orient(network: Network, *, tolerance: float = TOLERANCE) -> Oriented:
 
     **Returns:** the network with start values. Images and points that could not be oriented, and
     image points that contradict all others, are excluded and listed with the reason.
-    
+
     **Raises:** `InputError` for bad tables; `NotSolvedError` if no image could be oriented.
     """
     require_x64()

@@ -29,7 +29,7 @@ def snooped(
 ):
     """The problem and its minimum without blunders, the removed observations, and warnings about a
     priori σ that the test relies on although the data contradict them.
-    
+
     `doubtful`: image and point, by id, of initially removed image points."""
     problem, whole, doubt = found.problem, found.solution, None
     repeat = _Repeat(problem, again, "after data snooping", minimum)

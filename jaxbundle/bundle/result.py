@@ -156,7 +156,7 @@ class Adjustment:
     def weakness(self) -> Weakness:
         """Poorly determined unknowns: σ above a fiftieth of their reference length; without a
         solution the a priori σ where the iterations ended.
-        
+
         The σ are a posteriori with a robust scale, so that neither blunders nor a reported
         contradiction make good geometry look weak."""
         if self._weakness is not None or not self.converged:

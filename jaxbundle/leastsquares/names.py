@@ -57,8 +57,11 @@ def kept_unknowns(problem: Problem) -> list[tuple[str, int, int]]:
     ]  # fmt: skip
 
 
-def undetermined(problem: Problem, values: Values) -> list[str]:
-    """The unknowns that the observations do not determine, most affected first."""
+def undetermined(
+    problem: Problem, values: Values, threshold: float = INDETERMINATE
+) -> list[str]:
+    """The unknowns that the observations do not determine, most affected first. `threshold`: of the
+    scaled eigenvalues; a larger one also finds unknowns that are hardly separated."""
     S, V, G = scaled_system(problem, values)
     rows = [] if V is None else _undetermined_rows(problem, V)
     if not np.isfinite(S).all():
@@ -67,7 +70,7 @@ def undetermined(problem: Problem, values: Values) -> list[str]:
         q, _ = np.linalg.qr(G)
         S = S + q @ q.T
     eigenvalues, vectors = np.linalg.eigh(S) if S.size else (np.zeros(0), S)
-    null = vectors[:, eigenvalues < INDETERMINATE * max(1.0, eigenvalues[-1:].sum())]
+    null = vectors[:, eigenvalues < threshold * max(1.0, eigenvalues[-1:].sum())]
     share, names = (null**2).sum(1), kept_unknowns(problem)
     order = np.argsort(-share, kind="stable")
     return [str(name_of(problem, *names[i])) for i in order if share[i] > SHARE] + rows
