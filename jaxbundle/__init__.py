@@ -12,7 +12,6 @@ uses all cores for large networks, `keep_programs` keeps compiled programs.
 """
 
 import importlib
-from difflib import get_close_matches
 
 TYPE_CHECKING = False  # avoids importing typing
 
@@ -116,6 +115,8 @@ def __getattr__(name: str):
     """Import public names on first use (PEP 562), so that the command line can configure JAX and
     the linear algebra library before they start."""
     if name not in _MODULE:
+        from difflib import get_close_matches  # here: interrupts are handled before other imports
+
         close = [] if name.startswith("_") else get_close_matches(name, __all__, 1)
         mean = f"; did you mean {close[0]!r}?" if close else ""
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}{mean}")

@@ -94,7 +94,7 @@ def test_what_does_not_fit_is_told(network, alone):
         jaxbundle.adjust(network, also=[table, wrong])
     with pytest.raises(jaxbundle.InputError, match="no table 'level'"):
         jaxbundle.adjust(network, also=[differences])
-    with pytest.raises(jaxbundle.InputError, match="has a table 'point' itself"):
+    with pytest.raises(jaxbundle.InputError, match="already has a table 'point'"):
         jaxbundle.adjust(network, also=[ls.Table("point", np.zeros((2, 3)))])
     with pytest.raises(jaxbundle.InputError, match="also: tables .* are expected"):
         jaxbundle.adjust(network, also=[3.0])

@@ -366,7 +366,7 @@ def test_a_fisheye_from_given_start_values():
     start = {"fx": 380.0, "fy": 380.0, "k1": 0.0}
     free = ("fx", "fy", "cx", "cy", "k1", "k2")
     found = jaxbundle.calibrate_batch(
-        BOARD, xy, SIZE, "kannala-brandt", free=free, start=start | {"k3": 0.001}
+        BOARD, xy, SIZE, model="kannala-brandt", free=free, start=start | {"k3": 0.001}
     )
     assert list(found.status) == ["converged"]
     assert np.abs((found.values[0] - p[:6]) / found.sigma[0]).max() < 4.5

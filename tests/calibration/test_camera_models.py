@@ -230,7 +230,7 @@ def test_the_command_compares_models(fisheye, command, tmp_path, monkeypatch):
     assert "stereographic" in (out / "models.txt").read_text() and (out / "cam.toml").exists()
     said = command("calibrate", folder, "--board", "9x6", "--square", "0.03", "--models",
                    "opencv,brown", "--rig")  # fmt: skip
-    assert said.status == 2 and "leave --rig out" in said.err
+    assert said.status == 2 and "omit --rig" in said.err
 
 
 def test_simulated_views_are_what_cv2_projects():

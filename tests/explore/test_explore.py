@@ -153,7 +153,7 @@ def test_without_the_token_nothing_is_answered(doubling, path):
 
 
 @pytest.mark.parametrize("path, body, status, words", [
-    ("other", None, 404, "one page"), ("other", {}, 404, "there is no other"),
+    ("other", None, 404, "only page"), ("other", {}, 404, "there is no other"),
     ("export/", {}, 404, "there is no export"), ("export/y", {}, 400, "no file 'y'"),
     ("answer", "{", 400, "not JSON"), ("answer", "[1]", 400, "object of values"),
     ("answer", '{"x": NaN}', 400, "NaN is no number"), ("answer", "[" * 5000, 400, "not JSON"),

@@ -146,7 +146,7 @@ def test_what_is_refused(tmp_path, flight, run):
     scanner = tmp_path / "out" / "scanner.toml"
     for arguments, words in [
         (["accuracy", scanner], ["no σ", "--attitude-white"]),
-        (["accuracy", flight, "--table", "bias", "--draws", 1], ["--draws 1", "20 at least"]),
+        (["accuracy", flight, "--table", "bias", "--draws", 1], ["--draws 1", "at least 20"]),
         (["accuracy", scanner, "--map", "a.jpg"], ["a.jpg", ".tif or .png"]),
         (["correct", scanner, tmp_path / "no.tif", "--out", tmp_path / "m.tif", "--truth",
           scanner], ["--truth", "--error-map", "both"]),

@@ -156,5 +156,5 @@ def test_point_is_on_terrain_and_ray_and_moves_with_both():
 def test_terrain_without_heights_is_refused():
     with pytest.raises(InputError, match="2 × 2"):
         make_terrain(np.zeros((1, 5)), (0, 0), (1, 1))
-    with pytest.raises(InputError, match="no height"):
+    with pytest.raises(InputError, match="no valid height"):
         make_terrain(np.full((3, 5), np.nan), (0, 0), (1, 1))

@@ -156,7 +156,7 @@ WRONG = [
     ("observations", 7, "point", "P6", r"line 9: point 'P6' in image 'A' is measured twice"),
     ("observations", 7, "line", "x", r"line 9: line is 'x'"),
     ("points", 2, "role", "gcp", r"line 4: role 'gcp'; one of control, tie, check"),
-    ("points", 2, "id", "P1", r"line 4: point 'P1' is there twice"),
+    ("points", 2, "id", "P1", r"line 4: point 'P1' occurs twice"),
     ("points", 2, "height", "", r"line 4: control point 'P2' needs all coordinates"),
     ("points", 2, "latitude", 95.0, r"line 4: latitude 95 is beyond the pole"),
     ("points", 2, "longitude", 3.0, r"line 4: .*control point 'P2' of .*points.csv, line 4 is off"),

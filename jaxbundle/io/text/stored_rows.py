@@ -9,6 +9,7 @@ import dataclasses
 import shutil
 import struct
 import tempfile
+import weakref
 import zipfile
 from contextlib import nullcontext
 from pathlib import Path
@@ -86,10 +87,10 @@ def find_stored_rows(path: str | Path, name: str) -> StoredRows | None:
             if by_columns or dtype.kind not in "biuf" or not shape or member.file_size != whole:
                 return None
             if member.compress_type != zipfile.ZIP_STORED:
-                unpacked = tempfile.TemporaryFile()
-                shutil.copyfileobj(stream, unpacked, AT_ONCE)
-                unpacked.flush()
-                return StoredRows(Path(path), 0, tuple(shape), dtype, unpacked)
+                unpacked = _unpacked(stream)
+                rows = StoredRows(Path(path), 0, tuple(shape), dtype, unpacked)
+                weakref.finalize(rows, unpacked.close)
+                return rows
             while stream.read(AT_ONCE):
                 pass
     with open(path, "rb") as stream:
@@ -99,3 +100,15 @@ def find_stored_rows(path: str | Path, name: str) -> StoredRows | None:
         return None
     offset = member.header_offset + LOCAL_HEADER.size + sum(lengths) + head
     return StoredRows(Path(path), offset, tuple(shape), dtype)
+
+
+def _unpacked(stream) -> BinaryIO:
+    """The rest of a stream in a temporary file."""
+    unpacked = tempfile.TemporaryFile()
+    try:
+        shutil.copyfileobj(stream, unpacked, AT_ONCE)
+        unpacked.flush()
+    except BaseException:
+        unpacked.close()
+        raise
+    return unpacked
