@@ -153,6 +153,20 @@ def test_a_narrow_field_cannot_tell_a_turn_from_a_shift():
     assert name_one_place(of(4000.0)) == ""
 
 
+@pytest.mark.further
+def test_parameters_that_are_hardly_separated_are_named_at_the_limit():
+    """Views of a narrow field that are not rolled: fy, cy and the pitch of the images are alike."""
+    start = {"fx": 3e3, "fy": 3e3, "cx": 960.0, "cy": 540.0, "alpha": 0.05, "beta": 1.1}
+    lens = Camera("cam", "eucm", start, free=("fx", "fy", "cx", "cy", "alpha", "beta"))
+    ring = ring_of_stations(8, 3.0, 0.5)
+    narrow = simulate(ring, TARGETS, lens, noise=0.3, seed=2, image_format=(1920, 1080))
+    result = jaxbundle.adjust(narrow, max_iterations=2)
+    said = why_not(result)
+    assert not result.converged and "hardly separated" in said
+    named = said.split("hardly separated")[1].split("; hold")[0]
+    assert "fy of camera cam" in named and "omega" not in named and "fx" not in named
+
+
 @pytest.mark.parametrize("size", [None, (0.006, 0.006)])
 def test_c_in_pixels_is_named_where_the_adjustment_fails(size):
     """c begins at 4000 of 0.006 mm, and is free."""

@@ -72,6 +72,8 @@ def name_inseparable(problem: Problem, minimum: Minimum[Values]) -> str:
         return ""
     tables = problem.layout.tables(_last(problem, minimum))
     names = undetermined(system, tables, INSEPARABLE)
+    # Orientations follow the cameras.
+    names = [name for name in names if " of camera " in name] or names
     if not names:
         return ""
     return (
