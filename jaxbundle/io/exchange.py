@@ -1,7 +1,7 @@
-"""From any input to any output: reading, the camera model, writing, and what that costs.
+"""Conversion of any input to any output: reading, camera models, writing, and the differences.
 
 A network becomes a network, or points and cameras in a drawing or table, or one of its cameras a
-camera file; a camera file becomes a camera file. Nothing is written before everything is known.
+camera file; a camera file becomes a camera file. Nothing is written before all checks.
 """
 
 import dataclasses
@@ -35,12 +35,12 @@ from jaxbundle.network.rules import check_camera
 from jaxbundle.network.tables import Camera, Network
 
 MOST_SHOWN = 8
-"""Conversions told one by one, the worst first."""
+"""Conversions reported individually, the worst first."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Converted:
-    """What was written: its kind and place, what the cameras cost, what is not kept, warnings."""
+    """The written output: kind and path, camera differences, what is not kept, warnings."""
 
     kind: str
     path: Path
@@ -81,13 +81,13 @@ def convert(
     - `to`: kind of output, a name of `TARGETS` or `CAMERA_KINDS`; recognised from the name of
       the output if not given.
     - `model`: camera model to convert to, by name or a `CameraModel`. Without it cameras are
-      converted only where the output has not their model and the conversion is exact.
-    - `camera`: which camera, where the output holds one.
+      converted only if the output does not have their model and the conversion is exact.
+    - `camera`: which camera, if the output holds one.
     - `format`, `overrides`, `control`, `models`: of the input, as in `read_network`.
-    - `measured`: what is fitted is fitted over the area of the measurements, not the whole image.
+    - `measured`: fit over the area of the measurements, not the whole image.
     - `image_size` (pixels), `pixel_size` (mm): of all cameras that have none.
-    - `force`: files that are there, the output and those written beside it, are replaced. Without
-      it a folder is replaced that `convert` has written, no file.
+    - `force`: replace existing files, the output and those written beside it. Otherwise only a
+      folder written by `convert` is replaced.
 
     **Raises:** `InputError`; nothing is written then.
     """
@@ -123,7 +123,7 @@ def convert(
             made = _convert_cameras(input, network.cameras, output, kind, model, camera)
         return dataclasses.replace(made, lost=("images and points",), warnings=network.warnings)
     if camera is not None:
-        raise InputError(f"--camera {camera}: {kind} holds all cameras; leave it out")
+        raise InputError(f"--camera {camera}: {kind} holds all cameras; omit it")
     return _convert_network(network, output, kind, model, measured, force)
 
 
@@ -155,7 +155,7 @@ def _kind(output: Path, to: str | None) -> str:
 
 
 def _sized(cameras: Sequence[Camera], image_size, pixel_size) -> tuple[Camera, ...]:
-    """The cameras, with sizes where they had none."""
+    """The cameras, with sizes added if missing."""
     given = {"image_size": image_size, "pixel_size": pixel_size}
     made = tuple(
         dataclasses.replace(camera, **{
@@ -170,7 +170,7 @@ def _sized(cameras: Sequence[Camera], image_size, pixel_size) -> tuple[Camera, .
 
 
 def _check_output(output: Path, kind: str) -> None:
-    """Refuse a place where nothing can be written."""
+    """Refuse a path that cannot be written."""
     folder = _folder(output, kind)
     if folder is not None and folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: is a file; {kind} is written into a folder")
@@ -181,7 +181,7 @@ def _check_output(output: Path, kind: str) -> None:
 
 
 def _keep_input(input: Path, network: Network, output: Path, kind: str, control=None) -> None:
-    """Refuse to replace what is read."""
+    """Refuse to replace the input."""
     tables = (network.images, network.points, network.observations, network.distances,
               *network.further)  # fmt: skip
     read = {os.path.realpath(p) for p in (input, *(table.source.name for table in tables))}
@@ -203,14 +203,14 @@ def _keep_camera_file(input: Path, output: Path) -> None:
 
 
 def _folder(output: Path, kind: str) -> Path | None:
-    """The folder that is written; None where it is a file, with others beside it or not."""
+    """The folder to write; None for a file, with others beside it or not."""
     if kind not in TARGETS or not TARGETS[kind].files:
         return None
     return output.parent if kind == "project" and output.name == FILE_NAME else output
 
 
 def _keep_others(output: Path, kind: str, force: bool) -> None:
-    """Refuse to replace files that are there, and folders that are not of `convert`."""
+    """Refuse to replace existing files, and folders not written by `convert`."""
     folder = _folder(output, kind)
     if folder is not None:
         names = TARGETS[kind].files
@@ -228,7 +228,7 @@ def _keep_others(output: Path, kind: str, force: bool) -> None:
 def _with_model(
     network: Network, kind: str, model: str | CameraModel | None, measured: bool
 ):
-    """The network with cameras the output has, and by camera what that cost."""
+    """The network with camera models of the output, and the difference of each camera."""
     models = TARGETS[kind].models
     if model is not None:
         if not has_model(models, model):
@@ -249,7 +249,7 @@ def _refuse_inexact(cameras: Sequence[Camera], id: str, kind: str, cost: Convers
         raise InputError(
             f"camera {id!r}: {kind} has no model {str(model)!r}, and {cost.model} is not the same: "
             f"{cost.reason}; fitted over the image the largest difference is {cost.largest:.3g} "
-            f"{cost.unit}; give --model {cost.model} to accept that"
+            f"{cost.unit}; give --model {cost.model} to accept this"
         )
 
 

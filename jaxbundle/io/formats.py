@@ -1,4 +1,4 @@
-"""Which format a path is in, who reads it, and who writes it."""
+"""Formats: how they are recognised, and their readers and writers."""
 
 import dataclasses
 import os
@@ -55,14 +55,14 @@ from jaxbundle.network.tables import Camera, Network, Source
 from jaxbundle.system.file_content import is_plain
 
 FIRST_LINES = 100_000
-"""Characters of a file that tell what it is."""
+"""Characters of a file from which its format is recognised."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Format:
-    """A kind of input: how it is recognised, how it is read, and what it looks like in words;
-    `adjusted` where its control points have adjusted coordinates and a posteriori σ; `names_models`
-    where cameras name their models, and `read` takes own ones."""
+    """A kind of input: how it is recognised, how it is read, and a description;
+    `adjusted` if its control points have adjusted coordinates and a posteriori σ; `names_models`
+    if cameras name their models, and `read` takes own ones."""
 
     recognises: Callable[[Path], bool]
     read: Callable[..., Network]
@@ -73,10 +73,10 @@ class Format:
 
 @dataclasses.dataclass(frozen=True)
 class Target:
-    """A kind of output: names it is recognised by, who writes it, and the camera models it has.
+    """A kind of output: how its names are recognised, its writer, and its camera models.
 
-    `write` returns what is not kept, in words; no `models`: all, a name with * is a family.
-    `files`: names of what is written into a folder; none: a file is written. `alone`: cameras
+    `write` returns messages about what is not kept; no `models`: all, a name with * is a family.
+    `files`: names of the files in a folder; none: a file is written. `alone`: cameras
     without images can be written.
     """
 
@@ -90,8 +90,8 @@ class Target:
 
 @dataclasses.dataclass(frozen=True)
 class CameraTarget:
-    """A kind of output that holds cameras alone: as `Target`; `one`: a single camera; `broad`: the
-    name is as that of other kinds, which come first."""
+    """A kind of output that holds cameras only: as `Target`; `one`: a single camera; `broad`: the
+    name also fits other kinds, which come first."""
 
     recognises: Callable[[Path], bool]
     write: Callable[[Sequence[Camera], Path], None]
@@ -163,7 +163,7 @@ def _ends(*suffixes: str) -> Callable[[Path], bool]:
 
 
 def _folder_of(*words: str) -> Callable[[Path], bool]:
-    """A name without suffix that has one of these words, or whose folder has."""
+    """A name without suffix that contains one of these words, or whose folder does."""
     return lambda path: not path.suffix and any(
         word in part.lower() for part in path.parts[-2:] for word in words
     )
@@ -178,7 +178,7 @@ def _is_named(name: str) -> Callable[[Path], bool]:
 
 
 def _first(write: Callable[[Camera, Path], None]) -> Callable[[Sequence[Camera], Path], None]:
-    """Writes the one camera that there is."""
+    """Writes the only camera."""
     return lambda cameras, path: write(cameras[0], path)
 
 
@@ -255,11 +255,11 @@ CAMERA_KINDS: dict[str, CameraTarget] = {
     ),
     "cameras": CameraTarget(_ends(".toml"), write_cameras, "NAME.toml", broad=True),
 }
-"""Outputs that hold cameras alone."""
+"""Outputs that hold cameras only."""
 
 
 def has_model(models: Sequence[str], model: str | CameraModel) -> bool:
-    """Whether a kind of output with these models has one; without any it has all."""
+    """Whether a kind of output has a model; an empty list means all."""
     return not models or any(isinstance(model, str) and fnmatchcase(model, m) for m in models)
 
 
@@ -273,12 +273,12 @@ def recognised_target(path: Path) -> str | None:
 
 
 def recognised_format(path: Path) -> str | None:
-    """The kind of an input, from its name and content; None where none fits."""
+    """The kind of an input, from its name and content; None if none fits."""
     return next((name for name, kind in FORMATS.items() if kind.recognises(path)), None)
 
 
 def read_oriented(path: str | Path) -> Network:
-    """The network of an input in any known format; of a project cameras and images are enough.
+    """The network of an input in any known format; a project needs only cameras and images.
 
     **Raises:** `InputError`."""
     is_project = os.path.exists(path) and recognised_format(Path(path)) == "project"
@@ -301,7 +301,7 @@ def read_network(
     - `format`: a name in `FORMATS`; recognised from the path and its content if not given.
     - `overrides`: settings `KEY=VALUE` that replace those of the input.
     - `control`: a table whose control points replace those of the input (`networks.control`).
-    - `models`: `CameraModel`s of one's own that a project, or a column map, may name.
+    - `models`: own `CameraModel`s that a project, or a column map, may name.
 
     **Raises:** `InputError`.
     """
@@ -350,7 +350,7 @@ def check_own_models(models: Sequence[CameraModel]) -> tuple[CameraModel, ...]:
 
 
 def _of_adjusted_control(network: Network):
-    """What is to be said of control that an adjustment has already moved, and of what is held."""
+    """Messages about already adjusted control points, and about held ones."""
     points = network.points
     held = [id for id, role in zip(points.id, points.role) if role == "fixed"]
     weighted = points.role.count("control")

@@ -109,7 +109,7 @@ BROKEN = {
     "unknown image": (("image.txt", "\n1 1 ", "\n9 1 "), "line 2: image '9' is unknown"),
     "key": (("map.toml", "skip", "skop"), "unknown key 'skop'; did you mean 'skip'"),
     "table": (("map.toml", "[table.points]", "[table.point]"), "unknown table 'point'"),
-    "twice": (("map.toml", '"id", "-", "X"', '"id", "X", "X"'), "stands there twice"),
+    "twice": (("map.toml", '"id", "-", "X"', '"id", "X", "X"'), "occurs twice"),
     "column": (("map.toml", '"Y", "Z"]', '"Y", "H"]'), "scale of 'Z'"),
     "scale": (("map.toml", "y = -1", "y = 0"), "scale of y is 0"),
     "scale of an id": (("map.toml", "y = -1", "image = 2"), "no such column of numbers"),

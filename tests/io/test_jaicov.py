@@ -94,7 +94,7 @@ BROKEN = {
     "end": ("24.0 16.0 4000 2500\n", "", "ior: the file ends after line 4"),
     "sign": ("1 0 -28.8", "1 0 28.8", "ior, line 5: c must be negative"),
     "eor": (" 0 1 3\n", " 0\n", "eor, line 1: 7 values where 9"),
-    "twice": ("101 ", "100 ", "obc, line 2: point 100 stands there twice"),
+    "twice": ("101 ", "100 ", "obc, line 2: point 100 occurs twice"),
     "scale": ("1.25 0.01 1", "1.25 0 1", "scale, line 1: length and σ must be positive"),
 }  # fmt: skip
 

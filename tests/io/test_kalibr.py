@@ -127,7 +127,7 @@ BROKEN = {
     "no size": ("  resolution", "  size", "cam0: resolution is missing"),
     "rows": ("  - [0.0, 0.0, 0.0, 1.0]\n", "", "cam1: T_cn_cnm1 is .* 4 × 4"),
     "mirror": ("  - [0.99", "  - [-0.99", "cam1: T_cn_cnm1 is not a rotation"),
-    "yaml": ("cam1:", "cam0:", "line 9: cam0 stands there twice"),
+    "yaml": ("cam1:", "cam0:", "line 9: cam0 occurs twice"),
 }
 
 

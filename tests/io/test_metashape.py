@@ -268,7 +268,7 @@ BROKEN = {
     ),
     "NaN": (lambda t: t.replace("<k2>0.02", "<k2>nan"), "sensor 'cam', k2 is 'nan'"),
     "digits": (lambda t: t.replace("<f>1000.0", "<f>1_000"), "sensor 'cam', f is '1_000'"),
-    "repeated": (lambda t: t.replace("<k1>", "<f>1</f><k1>"), "sensor 'cam': <f> stands there tw"),
+    "repeated": (lambda t: t.replace("<k1>", "<f>1</f><k1>"), "sensor 'cam': <f> occurs twice"),
     "focal": (lambda t: t.replace("<f>1000.0", "<f>-1000.0"), "must be positive"),
     "size": (lambda t: t.replace('width="1280"', ""), "resolution, width"),
     "sensor": (lambda t: t.replace('id="0" label="cam"', 'id="5" label="cam"'), "sensor '0' is no"),

@@ -151,7 +151,7 @@ def test_a_skew_and_a_tilt_are_fitted_and_the_difference_told(tmp_path, skew, ti
 BROKEN = {
     "no matrix": (_with(camera_matrix=None), "camera_matrix is missing"),
     "skew": (_with(camera_matrix=_matrix(3, 3, [5, 0.1, 3, 0, 5, 2, 0, 0, 1]), image_width=None,
-                   image_height=None), "skew or a tilted sensor .* image size is needed"),
+                   image_height=None), "skew or a tilted sensor; .* image size is needed"),
     "not a camera": (_with(camera_matrix=_matrix(3, 3, [5, 0, 3, 0, 5, 2, 0, 0, 2])), r"\[2\]"),
     "too few": (_with(camera_matrix=_matrix(3, 3, [5, 0, 3])), "3 numbers for 3 rows"),
     "wrong shape": (_with(camera_matrix=_matrix(1, 9, [5, 0, 3, 0, 5, 2, 0, 0, 1])), "3 rows"),

@@ -141,7 +141,7 @@ BROKEN = {
         lambda d: d["structure"][1]["value"]["observations"][2]["value"].update(x=[1, 2, 3]),
         "point 1, view 2: x is",
     ),
-    "twice": (lambda d: d["views"].append(d["views"][0]), "key 0 stands there twice"),
+    "twice": (lambda d: d["views"].append(d["views"][0]), "key 0 occurs twice"),
 }  # fmt: skip
 
 

@@ -181,7 +181,7 @@ def test_which_of_the_points_of_an_id_is_the_smart_one(listed, marked, objects, 
 
 
 @pytest.mark.parametrize("listed, marked, message", [
-    ([1, 2, 2, 2], [1, 2, -2], "line 3: point '2' stands in the object points 3 times"),
+    ([1, 2, 2, 2], [1, 2, -2], "line 3: point '2' is in the object points 3 times"),
     ([1, 5, 6], [1, 5, -5, -6], "line 1: point '5' has image points .* once"),
     ([9, 5, 1], [1, 5, -5, -9], "line 1: point '5' has image points .* once"),
 ])  # fmt: skip

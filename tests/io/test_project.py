@@ -210,7 +210,7 @@ def test_a_bad_override_is_refused(folder, override, said):
     ("project.toml", "c = 50.0", "", "camera 'cam.1':"),
     ("project.toml", "c = 50.0", 'c = "50"', "camera 'cam.1': c is '50'; a number is expected"),
     ("images.csv", "phi", "fhi", "images.csv: unknown column 'fhi'; did you mean 'phi'?"),
-    ("images.csv", ",sX0", ",X0", "images.csv, line 2: the column 'X0' stands there twice"),
+    ("images.csv", ",sX0", ",X0", "images.csv, line 2: the column 'X0' occurs twice"),
     ("images.csv", "10,0,50", "10,abc,50", "images.csv, line 5: Y0 is 'abc'; a number is expected"),
     ("images.csv", "right,cam.1", "right,cam", "images.csv, line 5: camera 'cam' is unknown"),
     ("images.csv", "right,cam.1", "left,cam.1", "line 5: image 'left' is already in"),

@@ -42,9 +42,9 @@ def test_what_is_read():
 
 
 @pytest.mark.parametrize("text, message", [
-    ("a: 1\na: 2", "line 2: a stands there twice"), ("a: {b: 1}", "line 1: .*braces"),
+    ("a: 1\na: 2", "line 2: a occurs twice"), ("a: {b: 1}", "line 1: .*braces"),
     ("a: &b 1", "an anchor"), ("a: |\n  b", "a block of text"), ("a: [1, [2]", "has no end"),
-    ("a: [1]]", "brackets"), ("a: 1\n  b: 2", "line 2: .* indented otherwise"),
+    ("a: [1]]", "brackets"), ("a: 1\n  b: 2", "line 2: .* indented differently"),
     ("a:\n\tb: 1", "line 2: indentation by tabs"), ("a: 1\n---\nb: 2", "a second document"),
     ("", "is empty"), ("- 1", "keys and values"), ("a b", "line 1: 'a b': a key"),
     ("\n".join(" " * k + f"a{k}:" for k in range(99)), "nested too deeply"),

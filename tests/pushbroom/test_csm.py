@@ -213,7 +213,7 @@ BROKEN = {
     "endless": (changed("image_lines", 1e15), ["image_lines", "10000000"]),
     "focal length": (changed("focal_length_model.focal_length", 0), ["focal_length is 0"]),
     "constant": (
-        changed("body_rotation.constant_rotation", [0.0] * 9), ["body_rotation", "no rotation"],
+        changed("body_rotation.constant_rotation", [0.0] * 9), ["body_rotation", "not a rotation"],
     ),
     "text": (changed("image_lines", "many"), ["image_lines", "'many'", "number"]),
     "shape": (changed("focal2pixel_lines", [0.0, 1.0]), ["focal2pixel_lines", "array 3"]),

@@ -6,9 +6,9 @@
 
 A row for each point, those of a photograph together, row after row of the board from the upper
 left, as `Board.ids`; pixels, the centre of the first one is (0, 0). A photograph without a board
-has one row of "-", a point not found one of its own. The column `level` is how often the
-photograph was reduced by 2 to find the point; in its place there may be a `weight`. Points of a
-negative level, or without weight, do not count.
+has one row of "-", and so has a missing point. The column `level` is how often the
+photograph was reduced by 2 to find the point; a `weight` may replace it. Points of a
+negative level, or without weight, are ignored.
 
 Source: mrcal's documentation, "How to run a calibration", "corners.vnl"; vnlog's, "the format".
 """
@@ -31,10 +31,10 @@ NOTHING = "-"
 
 
 def read_corners(path: str | Path, board: Board, image_size: Sequence[int]) -> BoardViews:
-    """What was measured of a board, to be given to `calibrate`.
+    """The measured image points of a board, for `calibrate`.
 
-    **Arguments:** `board`: its grid is that of the points; `image_size`: columns and rows, which
-    the table has not.
+    **Arguments:** `board`: with the grid of the points; `image_size`: columns and rows, which
+    the table does not contain.
 
     **Raises:** `InputError` naming file, line and photograph.
     """
@@ -77,7 +77,7 @@ def _legend(row: Row) -> list[str]:
 
 
 def _point(row: Row, given: dict[str, str]) -> tuple[float, float]:
-    """A point; NaN where it was not found, or does not count."""
+    """A point; NaN if it was not found, or is ignored."""
     if NOTHING in (given["x"], given["y"]):
         return np.nan, np.nan
     own = Row(row.path, row.number, f"{given['x']} {given['y']}")
@@ -91,7 +91,7 @@ def _point(row: Row, given: dict[str, str]) -> tuple[float, float]:
 
 
 def write_corners(views: BoardViews, path: str | Path) -> None:
-    """Write what was measured of a board.
+    """Write the measured image points of a board.
 
     **Raises:** `InputError` for names with blanks.
     """

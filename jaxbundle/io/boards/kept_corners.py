@@ -1,8 +1,8 @@
 """Corners found in photographs, kept for the next run: an SQLite file.
 
-What was found belongs to the content of a photograph, not to its name: one that was changed is
-searched again, one that was moved or copied is not. Whether a file has the content it had is told
-by its size and time of change; where these are others, it is read.
+Corners belong to the content of a photograph, not to its name: a changed one is searched again, a
+moved or copied one is not. Size and time of change show whether the content is the same; if they
+differ, the file is read.
 
 | table | |
 |---|---|
@@ -32,7 +32,7 @@ CREATE TABLE IF NOT EXISTS boards
 
 
 class KeptCorners:
-    """What is in such a file, and what is added to it; a context. Only one process at a time.
+    """The corners in such a file, and new ones; a context. Only one process at a time.
 
     **Raises:** `InputError` if the file cannot be read or written, or is of another kind.
     """
@@ -71,7 +71,7 @@ class KeptCorners:
         return content
 
     def look(self, content: str, board: Board) -> Look | None:
-        """What was found of a board in a photograph of this content; None: it was not sought."""
+        """The search result of a board in a photograph of this content; None: not searched."""
         found = self._first(
             "SELECT columns, rows, xy, why FROM boards WHERE content = ? AND board = ?",
             content, repr(board),
@@ -84,7 +84,7 @@ class KeptCorners:
         return (columns, rows), np.frombuffer(xy, "<f8").reshape(-1, 2)
 
     def keep(self, content: str, board: Board, look: Look) -> None:
-        """Add what was found; it is in the file when this returns."""
+        """Add a search result; it is in the file when this returns."""
         (columns, rows), xy = ((None, None), None) if isinstance(look, str) else look
         points = None if xy is None else np.ascontiguousarray(xy, "<f8").tobytes()
         self._write(

@@ -5,7 +5,7 @@
     target_type: circlegrid      targetCols, targetRows, spacingMeters, asymmetricGrid
     target_type: aprilgrid       tagCols, tagRows, tagSize, tagSpacing: refused, not found here
 
-Of an asymmetric grid the spacing is that of neighbouring rows, as `Board.square`. Metres.
+The spacing of an asymmetric grid is between neighbouring rows, as `Board.square`. Metres.
 
 Source: Kalibr's wiki, "Calibration targets".
 """
@@ -49,9 +49,9 @@ def read_target(path: str | Path) -> Board:
 
 
 def write_target(board: Board, path: str | Path) -> None:
-    """Write a board whose unit is the metre.
+    """Write a board in metres.
 
-    **Raises:** `InputError` for ChArUco, which Kalibr has not.
+    **Raises:** `InputError` for ChArUco, which Kalibr does not have.
     """
     if board.kind == "charuco":
         raise InputError(f"{path}: Kalibr has no board of kind charuco")

@@ -1,1 +1,1 @@
-"""Cameras by themselves."""
+"""Camera files."""

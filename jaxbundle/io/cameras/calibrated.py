@@ -31,7 +31,7 @@ def is_result(path: Path) -> bool:
 def read_calibrated(path: str | Path) -> list[Calibrated]:
     """The cameras of a result.
 
-    **Raises:** `InputError` where it is not solved, or entries are missing or wrong.
+    **Raises:** `InputError` if it is not solved, or entries are missing or wrong.
     """
     if is_kalibr_results(Path(path)):
         return read_kalibr_results(path)
@@ -72,8 +72,8 @@ def _calibrated(path, id, entry, about) -> Calibrated:
 
 
 def _tied_to(name: str, parameters, known) -> str:
-    """The parameter whose correlations are those of this one: itself, or of tied ones, such as
-    fx and fy, the first, which has the same value and σ."""
+    """The parameter with the correlations of this one: itself, or the first of tied ones, such as
+    fx and fy, with the same value and σ."""
     if name in known:
         return name
     same = lambda other: all(

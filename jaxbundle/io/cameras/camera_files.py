@@ -1,4 +1,4 @@
-"""Cameras by themselves: what may hold one, and how cameras are written alone.
+"""Camera files: which files hold cameras, and how cameras are written without a network.
 
 | file | read | written |
 |---|---|---|
@@ -31,11 +31,11 @@ LOOKS = (
     "OpenCV's or ROS's .yaml, .yml or .json; a .toml with [[camera]] entries; cameras.txt or "
     "cameras.bin of COLMAP; camera_models.json of OpenSfM; AutoCal….xml of MicMac"
 )
-"""Camera files in words."""
+"""Description of camera files."""
 
 
 def is_camera_file(path: Path) -> bool:
-    """Whether a file holds cameras and nothing else."""
+    """Whether a file holds only cameras."""
     if path.name.lower() in COLMAP_FILES and path.is_file():
         return True
     if _is_toml(path):

@@ -1,8 +1,8 @@
-"""Cameras of other programs that are none of our models: fitted by the nearest, with what it costs.
+"""Cameras of other programs without an equal model here: the nearest is fitted, with its misfit.
 
-A reader gives the camera's own formula, from rays to pixels. Points of a grid over the image get
+A reader gives the formula of the camera, from rays to pixels. Points of a grid over the image get
 their rays by Newton's method; the parameters of each candidate are those that bring the images of
-these rays nearest to the points (`cameras.convert_fit`). The first candidate that leaves less than
+these rays nearest to the points (`cameras.convert_fit`). The first candidate with differences below
 `GOOD` is taken, else the nearest.
 """
 
@@ -36,7 +36,7 @@ one: a function of JAX whose derivatives are finite on the axis, the same object
 a kind (it is compiled once)."""
 
 GOOD = 0.05
-"""Pixels: a candidate that is as near is taken without a look at the next."""
+"""Pixels: a candidate this near is taken without trying the next."""
 ON_THE_POINT = 1e-7
 """Pixels by which a ray may miss its point."""
 ROUNDS, LONGEST = 60, 0.2
@@ -53,7 +53,7 @@ NARROW = np.cos(np.radians(75))
 
 
 class NoPlaceError(InputError):
-    """A camera that none of our models comes near: its photographs can be left out."""
+    """No model is near this camera: its photographs can be left out."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,8 +74,7 @@ class Foreign:
 
 
 def nearest_camera(camera: Foreign, where: str) -> tuple[dict, str]:
-    """The model and parameters of the nearest of our cameras as an entry of a document, and in
-    words how near it is.
+    """The nearest of our cameras as an entry of a document, and a message with its differences.
 
     **Raises:** `NoPlaceError` beginning with `where` if less than half of the image has rays, or
     nothing could be fitted.
@@ -110,7 +109,7 @@ def nearest_camera(camera: Foreign, where: str) -> tuple[dict, str]:
         if largest <= GOOD:
             break
     if not found or not np.isfinite(min(found, key=lambda one: one[0])[0]):
-        raise NoPlaceError(f"{where}: none of our models comes near it; {problem}")
+        raise NoPlaceError(f"{where}: no camera model fits it; {problem}")
     largest, rms, target, values = min(found, key=lambda one: one[0])
     entry: dict[str, Any] = {"model": target.name, **values}
     told = f"fitted as {target.name}, largest difference {largest:.2g} px, RMS {rms:.2g} px"
@@ -123,13 +122,13 @@ def nearest_camera(camera: Foreign, where: str) -> tuple[dict, str]:
 
 @dataclasses.dataclass(frozen=True)
 class FittedCamera(Camera):
-    """A camera that stands for one of another program, and in words how near it is."""
+    """A camera fitted to one of another program, and a message with its differences."""
 
     told: str = ""
 
 
 def fitted_camera(id: str, camera: Foreign, where: str, why: str) -> FittedCamera:
-    """The nearest of our cameras; `why` its own model has no place here.
+    """The nearest of our cameras; `why` the original model has no equal here.
 
     **Raises:** `NoPlaceError`.
     """
@@ -143,12 +142,12 @@ def fitted_camera(id: str, camera: Foreign, where: str, why: str) -> FittedCamer
 
 
 def fits_told(cameras: Iterable[Camera]) -> tuple[str, ...]:
-    """What is to be told of the cameras that were fitted."""
+    """Messages about the fitted cameras."""
     return tuple(camera.told for camera in cameras if isinstance(camera, FittedCamera))
 
 
 def _rays(camera: Foreign, uv) -> tuple[Float[np.ndarray, "n 3"], np.ndarray]:
-    """Unit vectors (right, down, forward) of image points, and which of them there are: beyond a
+    """Unit vectors (right, down, forward) of image points, and which points have one: beyond a
     radius where the image turns back there are none."""
     p = camera.start
     at = (uv - [p["cx"], p["cy"]]) / [p["fx"], p["fy"]]
@@ -182,7 +181,7 @@ def _newton(formula: Formula, p, uv, m):
 
 
 def _direction(m: Float[Array, "2"]) -> Float[Array, "3"]:
-    """The unit vector that is an angle from the axis: m is this angle times its direction."""
+    """The unit vector at an angle from the axis: m is this angle times its direction."""
     angle = root(m @ m)
     shrink = jnp.where(angle > 0, jnp.sin(angle) / jnp.where(angle > 0, angle, 1.0), 1.0)
     return jnp.append(m * shrink, jnp.cos(angle))

@@ -13,17 +13,17 @@
        …
        data: [ k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 ]      4, 5, 8, 12 or 14 of them
 
-The files of ROS, which look alike, are read as well, and its message CameraInfo as it is printed
+The similar files of ROS are read as well, and its message CameraInfo as printed
 (height, width, K and D, in ROS 2 k and d): with `distortion_model` "equidistant" or "fisheye" the
 four coefficients are those of `kannala-brandt`. Pixels have their origin at the
-centre of the first pixel, as ours. A skew and a tilted sensor (τx, τy),
+centre of the first pixel, as here. A skew and a tilted sensor (τx, τy),
 
     s·[x'', y'', 1] = [R33, 0, −R13; 0, R33, −R23; 0, 0, 1]·R·[x', y', 1]
     R = [cos τy, 0, −sin τy; 0, 1, 0; sin τy, 0, cos τy]
         ·[1, 0, 0; 0, cos τx, sin τx; 0, −sin τx, cos τx]
     u = fx·x'' + skew·y'' + cx
 
-have no place in our models: where they are not 0 the nearest is fitted, which needs the image size.
+are not part of our models: if they are not 0 the nearest is fitted, which needs the image size.
 
 Other entries are skipped.
 
@@ -58,7 +58,7 @@ SUFFIXES = (*YAML, ".json")
 MATRIX = ("camera_matrix", "cameraMatrix", "K", "k")
 COEFFICIENTS = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "D", "d")
 OF_A_MESSAGE = b"distortion_model"
-"""What a file with a `k` alone must have, to be a message of ROS 2."""
+"""Required beside a lone `k` in a message of ROS 2."""
 ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
 LENGTHS = (4, 5, 8, 12)
 FISHEYE = ("equidistant", "fisheye")
@@ -112,7 +112,7 @@ def _fitted(path: Path, camera: Camera, skew: float, tilt: Sequence[float]) -> F
     """The nearest of our cameras to one with a skew or a tilted sensor."""
     if camera.image_size is None:
         raise InputError(
-            f"{path}: a skew or a tilted sensor has no place in our models; to fit the nearest one "
+            f"{path}: no camera model has a skew or a tilted sensor; to fit the nearest one "
             "the image size is needed: give image_width and image_height"
         )
     p = all_parameters(camera)
@@ -170,7 +170,7 @@ def opencv_text(camera: Camera, as_json: bool = False) -> str:
 
 
 def write_opencv(camera: Camera, path: str | Path) -> None:
-    """Write a camera as YAML or, where the name ends so, JSON."""
+    """Write a camera as YAML or, by its suffix, JSON."""
     path = Path(path)
     write_text(path, opencv_text(camera, path.suffix.lower() == ".json"))
 

@@ -1,7 +1,7 @@
-"""Networks from what readers of other programs' files find, and the pieces writers need.
+"""Networks from the contents of other programs' files, and helper functions for writers.
 
-The readers give rotation matrices and numbers; here they become tables, with the settings of the
-command line put in.
+Readers give rotation matrices and numbers; here they become tables, with the settings of the
+command line applied.
 """
 
 from collections import Counter
@@ -29,7 +29,7 @@ from jaxbundle.network.tables import (
 
 
 def foreign_document(name: str, cameras: Iterable[Mapping], **project) -> Document:
-    """What a project file would say of a network of another program: measured in pixels, free."""
+    """The project document of a network of another program: measured in pixels, free."""
     settings = {"name": name, "datum": "inner", "image_unit": "px", "residuals": "measured",
                 "object_unit": "model", "sigma_image": 1.0}  # fmt: skip
     return {"project": settings | project, "camera": [dict(camera) for camera in cameras]}
@@ -46,8 +46,8 @@ def assemble(
 ) -> Network:
     """The network of a document and its tables, angles in radians.
 
-    Without points there is a network of cameras and images alone, which can be written but not
-    adjusted. The image unit is the file's and cannot be set.
+    Without points the network has only cameras and images and can be written but not
+    adjusted. The image unit is that of the file and cannot be set.
 
     **Raises:** `InputError`.
     """
@@ -84,7 +84,7 @@ def _without_points(cameras: Sequence[Camera], images: Columns, project: Mapping
 
 
 def network_of_cameras(cameras: Sequence[Camera], where: str) -> Network:
-    """Cameras with an image each, called as they are, at the origin and not turned."""
+    """Cameras with one image each, with the same names, at the origin and not rotated."""
     names, none = [camera.id for camera in cameras], np.zeros((len(cameras), 3, 3))
     images = image_columns(
         Source(where, None, "camera"), names, names, none + np.eye(3), none[:, 0]
@@ -94,7 +94,7 @@ def network_of_cameras(cameras: Sequence[Camera], where: str) -> Network:
 
 
 def unique_labels(labels: Sequence[str], ids: Sequence) -> list[str]:
-    """The labels, those that stand twice with their id."""
+    """The labels, repeated ones with their id."""
     number = Counter(labels)
     return [f"{label}#{id}" if number[label] > 1 else label for label, id in zip(labels, ids)]
 
@@ -120,6 +120,6 @@ def entry_of(camera: Camera) -> dict:
 
 
 def all_parameters(camera: Camera) -> dict[str, float]:
-    """All parameters of a camera by name, those not given with their defaults."""
+    """All parameters of a camera by name, missing ones with their defaults."""
     values = {**default_parameters(get_model(camera.model)), **camera.parameters}
     return {name: float(values[name]) for name in get_model(camera.model).parameters}

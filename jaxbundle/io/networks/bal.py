@@ -7,7 +7,7 @@
     X Y Z                               three for every point
 
 Cameras and points are counted from 0; these numbers become their ids. Every image has its own
-camera of model `snavely`, all of it free; residuals are formed in the image as measured, σ is
+camera of model `snavely`, all parameters free; residuals are formed in the image as measured, σ is
 1 px, and the datum is given by inner constraints. [r] is a rotation vector and t a shift:
 M = exp([r]×), X0 = −Mᵀt.
 
@@ -65,7 +65,7 @@ def is_bal(path: Path) -> bool:
 def read_bal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     """The network of a BAL problem; `overrides` as for a project file.
 
-    **Raises:** `InputError` where numbers are missing, too many, or not numbers.
+    **Raises:** `InputError` for missing, superfluous or invalid numbers.
     """
     path = Path(path)
     (cameras, points, rows), numbers = _numbers(path)
@@ -117,7 +117,7 @@ def write_bal(network: Network, path: str | Path) -> tuple[str, ...]:
 
     Its cameras must be of model `snavely`. Images that share a camera each get a copy of it.
 
-    **Returns:** what the format has no place for, in words.
+    **Returns:** messages about what the format cannot hold.
     """
     path = Path(path)
     images, points, rays = network.images, network.points, network.observations
@@ -147,7 +147,7 @@ def _are_counts(words: Sequence[bytes]) -> bool:
 
 
 def _counts(path: Path, first: Sequence[bytes]) -> tuple[int, ...]:
-    """Cameras, points and observations, as the words of the first line announce them."""
+    """The numbers of cameras, points and observations in the first line."""
     if not _are_counts(first):
         raise InputError(
             f"{path}, line 1: three whole numbers are expected: cameras, points, observations"
@@ -163,7 +163,7 @@ def _counts(path: Path, first: Sequence[bytes]) -> tuple[int, ...]:
 def _numbers(path: Path):
     """The three counts of the first line, and all numbers after it.
 
-    No more is read than these can be, whatever a compressed file unpacks to.
+    No more is read than these require, however much a compressed file unpacks to.
     """
     suffix = path.suffix.lower()
     try:
@@ -184,7 +184,7 @@ def _numbers(path: Path):
         )
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # Of text that is no number.
+            warnings.simplefilter("error")  # about text that is not a number
             numbers = np.fromstring(text, sep=" ")
     except (ValueError, DeprecationWarning):
         raise _not_a_number(path, text) from None
@@ -222,6 +222,6 @@ def _images(pose) -> dict:
 
 
 def _table(path: Path, word: str, columns: dict) -> Columns:
-    """A table whose rows are known by their number, from 0."""
+    """A table with row numbers as ids, from 0."""
     first = next(iter(columns.values()))
     return Columns(columns, Source(str(path), np.arange(len(first)), word))

@@ -7,21 +7,21 @@
     …
     -99
 
-`geoin.dat`, of which these statements are read:
+`geoin.dat`; these statements are read:
 
     CAPA key CAMERA c xH yH [σc σx σy]      camera; key 3: all three are adjusted, with these σ
     CONT POINT X Y Z                        control point, held
     CHCK POINT X Y Z                        check point
 
-Lines that begin with `*` or the word `C` are comments, so is what begins with `#`. RADI and ADPA
+Lines that begin with `*`, the word `C` or `#` are comments. RADI and ADPA
 (distortion curve, additional parameters) are skipped with a warning: they concern the distortion,
 which starts at 0 here. Every other statement is refused by name: the program's manual is not
-public, and what is said here of the two files is what a thesis and an open reader show of them.
+public, and this description of the two files follows a thesis and an open reader.
 `itera.dat` (orientations and coordinates) is not read for the same reason: photographs have no
 start values.
 
-Image coordinates have y up and the unit of the file, which is also that of c, xH, yH; it is called
-"mm" here. The camera is of model `bingo`.
+Image coordinates have y up and the unit of the file, also used for c, xH, yH; it is called
+"mm" here. The camera has model `bingo`.
 
 Sources: Repanšek (2009), section 7.1.2 and appendices; the BINGO reader of an add-on to GRASS GIS
 for the orientation of images (Turek).
@@ -143,7 +143,7 @@ def _image_coordinates(path: Path):
 
 
 def _geo_input(path: Path):
-    """Cameras by name, rows of points, and the statements that were skipped."""
+    """Cameras by name, rows of points, and the skipped statements."""
     cameras: dict[str, dict] = {}
     points, skipped = [], {}
     for row in Rows(path, "#"):
@@ -155,7 +155,7 @@ def _geo_input(path: Path):
         elif keyword == "CAPA":
             camera = _camera(row)
             if camera["id"] in cameras:
-                raise row.error(f"camera {camera['id']!r} stands there twice")
+                raise row.error(f"camera {camera['id']!r} occurs twice")
             cameras[camera["id"]] = camera
         elif keyword in ROLES:
             if len(row) < 2:

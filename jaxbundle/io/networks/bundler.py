@@ -11,8 +11,8 @@
     rays  camera key x y  camera key x y  …
 
 x_camera = R·X + t, x right, y up, looking along −z; image points count from the image centre, y up:
-model `snavely`. `list.txt` in the same folder names the images, one a line; without it they are
-called by their number, from 0. Keys are not kept.
+model `snavely`. `list.txt` in the same folder names the images, one per line; without it their
+numbers, from 0, are their names. Keys are not kept.
 
 Source: Snavely, Bundler user's manual, section "Output format and scene representation".
 """
@@ -40,12 +40,12 @@ FREE = ["f", "k1", "k2"]
 
 
 def is_bundler(path: Path) -> bool:
-    """Whether a file begins as Bundler's output does."""
+    """Whether a file begins like Bundler's output."""
     return beginning(path, 13) == b"# Bundle file"
 
 
 def read_bundler(path: str | Path, overrides: Sequence[str] = ()) -> Network:
-    """The network of a `bundle.out`: a camera for every image, all of it free, σ 1 px.
+    """The network of a `bundle.out`: one camera per image, all parameters free, σ 1 px.
 
     Images without orientation are left out with a warning.
 
@@ -146,11 +146,11 @@ def _names(path: Path, number: int) -> list[str]:
 
 
 def write_bundler(network: Network, path: str | Path) -> tuple[str, ...]:
-    """Write `bundle.out` and, where the images have names, `list.txt` beside it.
+    """Write `bundle.out` and, if the images have names, `list.txt` beside it.
 
     The cameras must be of model `snavely`; images that share a camera each get a copy of it.
 
-    **Returns:** what the format has no place for, in words.
+    **Returns:** messages about what the format cannot hold.
     """
     path = Path(path)
     images, points, rays = network.images, network.points, network.observations
@@ -173,7 +173,7 @@ def write_bundler(network: Network, path: str | Path) -> tuple[str, ...]:
         if any(character.isspace() for id in images.id for character in id):
             raise InputError(f"{path.parent / LIST}: names of images cannot have blanks")
     content: dict[Path, Sequence[str]] = {path: lines}
-    if not numbered or names.is_file():  # a list that is there would name the images
+    if not numbered or names.is_file():  # an existing list would name the images
         content[names] = images.id
     with replaced_files(*content) as temporary:
         for place, text in zip(temporary, content.values()):

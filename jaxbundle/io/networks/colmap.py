@@ -20,7 +20,7 @@ PARTS = ("cameras", "images", "points3D")
 RIGS = ("rigs", "frames")
 SUFFIXES = (".bin", ".txt")
 FILES = tuple(f"{part}{suffix}" for part in (*PARTS, *RIGS) for suffix in SUFFIXES)
-"""What a model may consist of, in either form."""
+"""Possible files of a model, in either form."""
 
 
 def is_colmap(path: Path) -> bool:
@@ -30,7 +30,7 @@ def is_colmap(path: Path) -> bool:
 
 
 def read_colmap(path: str | Path, overrides: Sequence[str] = ()) -> Network:
-    """The network of a sparse model; binary files come before text files, as in COLMAP.
+    """The network of a sparse model; binary files take precedence, as in COLMAP.
 
     **Raises:** `InputError` naming file and line, or which entry of a binary file.
     """
@@ -46,12 +46,12 @@ def read_colmap(path: str | Path, overrides: Sequence[str] = ()) -> Network:
             raise InputError(f"{path / part}{suffix}: no such file")
     network = to_network(path, read(path), overrides)
     if (path / f"rigs{suffix}").is_file():
-        return network.warn("rigs and frames are not read: every image has a pose of its own")
+        return network.warn("rigs and frames are not read: every image has its own pose")
     return network
 
 
 def read_colmap_cameras(path: str | Path) -> tuple[Camera, ...]:
-    """The cameras of a cameras.bin or cameras.txt, called by number.
+    """The cameras of a cameras.bin or cameras.txt, named by number.
 
     **Raises:** `InputError`.
     """
@@ -61,7 +61,7 @@ def read_colmap_cameras(path: str | Path) -> tuple[Camera, ...]:
 
 
 def write_colmap_cameras(cameras: Sequence[Camera], path: str | Path) -> None:
-    """Write a cameras.txt alone; cameras as in `write_colmap`."""
+    """Write only a cameras.txt; cameras as in `write_colmap`."""
     lines = camera_lines(dict(zip(numbers_of([camera.id for camera in cameras]), cameras)))
     write_bytes(Path(path), ("\n".join(lines) + "\n").encode())
 
@@ -71,11 +71,11 @@ def write_colmap(
 ) -> tuple[str, ...]:
     """Write a sparse model into a folder.
 
-    Cameras must be of one of `COLMAP_MODELS` and have an image size.
+    Cameras must have one of the `COLMAP_MODELS` and an image size.
 
-    **Arguments:** `force`: replace a model that this function has not written, in either form.
+    **Arguments:** `force`: also replace a model not written by this function, in either form.
 
-    **Returns:** what COLMAP has no place for, in words.
+    **Returns:** messages about what COLMAP cannot hold.
 
     **Raises:** `InputError` where the folder may not or cannot be written
     (`jaxbundle.io.writing.folders`).
@@ -85,8 +85,8 @@ def write_colmap(
 
 
 def fill_colmap(network: Network, folder: Path, text: bool | None = None) -> tuple[str, ...]:
-    """Write a sparse model beside what is in a folder, or a new one; as `write_colmap`. `text`, if
-    not given: where it can be, which is not with blanks in the names of images."""
+    """Write a sparse model into an existing folder or a new one; as `write_colmap`. `text`
+    by default if possible, that is without blanks in image names."""
     model, lost = from_network(network)
     if text is None:
         text = not any(character.isspace() for image in model.images for character in image.name)

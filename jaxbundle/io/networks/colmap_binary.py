@@ -5,7 +5,7 @@
                count u64,  x f64, y f64, point u64 (2⁶⁴ − 1: none)
     points3D   count u64;  id u64, X Y Z f64, R G B u8, error f64, count u64,  image u32, index u32
 
-Every count is held against the bytes that are left before anything is made of it.
+Every count is compared with the remaining bytes before memory is allocated.
 
 Source: COLMAP documentation, "Output Format", and src/colmap/scene/reconstruction_io.
 """
@@ -40,7 +40,7 @@ NONE = np.uint64(2**64 - 1)
 
 
 class _Bytes:
-    """The bytes of a file one after the other; complaints name the file and what was being read."""
+    """The bytes of a file in sequence; errors name the file and the item being read."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -62,7 +62,7 @@ class _Bytes:
         return part
 
     def count(self, what: str, least_size: int) -> int:
-        """A number of things of at least so many bytes each."""
+        """A number of items with at least the given bytes each."""
         (count,) = self.take("Q")
         left = len(self.data) - self.position
         if count * least_size > left:
@@ -107,7 +107,7 @@ def read_binary_cameras(path: Path) -> dict[int, Camera]:
         file.what = f"camera {k + 1}"
         id, model, width, height = file.take("IiQQ")
         if id in cameras:
-            raise file.error(f"camera {id} stands there twice")
+            raise file.error(f"camera {id} occurs twice")
         name = NAMES.get(model, f"number {model}")
         values = file.numbers(len(parameter_names(name, file.error)), "parameters")
         if not (0 < width < 10**9 and 0 < height < 10**9):

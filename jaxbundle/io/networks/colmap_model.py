@@ -1,9 +1,9 @@
 """A sparse model of COLMAP as its files have it, and as a network.
 
 A pose is x_camera = R·X + t with x right, y down, z forward (`geometry.pose_conventions`); image
-points count from the corner of the first pixel, ½ more than ours. Image points that belong to no
+points count from the corner of the first pixel, ½ more than here. Image points without an
 object point are left out. Rigs and frames (COLMAP 3.12 and later) are not read: every image has its
-whole pose in `images`; without them COLMAP makes trivial ones.
+full pose in `images`; without them COLMAP creates trivial ones.
 """
 
 import dataclasses
@@ -61,19 +61,19 @@ def rows_of_points(model: ColmapModel) -> Iterator[tuple[int, np.ndarray, float]
 
 
 def check_unique(ids: Sequence[int], place, thing: str) -> None:
-    """Refuse a number that stands twice; `place(k)` tells where the k-th is."""
+    """Refuse repeated numbers; `place(k)` names the position of the k-th."""
     values, first, counts = np.unique(np.asarray(ids), return_index=True, return_counts=True)
     for value in values[counts > 1][:1]:
         again = np.flatnonzero(np.asarray(ids) == value)[1]
-        raise InputError(f"{place(again)}: {thing} {value} stands there twice")
+        raise InputError(f"{place(again)}: {thing} {value} occurs twice")
 
 
 def to_network(path: Path, model: ColmapModel, overrides: Sequence[str]) -> Network:
-    """The network of a sparse model; cameras are called by number, images by name.
+    """The network of a sparse model; cameras are named by number, images by name.
 
-    Nothing of the cameras is free, σ is 1 px, the datum inner.
+    No camera parameter is free, σ is 1 px, the datum inner.
 
-    **Raises:** `InputError` for ids that are not there.
+    **Raises:** `InputError` for missing ids.
     """
     images = model.images
     if not images:
@@ -110,7 +110,7 @@ def to_network(path: Path, model: ColmapModel, overrides: Sequence[str]) -> Netw
 
 
 def _observations(path: Path, model: ColmapModel):
-    """The table of image points; of several in one image on one object point the first."""
+    """The table of image points; the first if an image has several of one object point."""
     index, point, xy = [], [], []
     repeated = []
     known = np.sort(model.point_ids)
@@ -140,9 +140,9 @@ def _observations(path: Path, model: ColmapModel):
 
 
 def from_network(network: Network) -> tuple[ColmapModel, tuple[str, ...]]:
-    """The sparse model of a network, and what it does not keep, in words.
+    """The sparse model of a network, and messages about what it does not keep.
 
-    **Raises:** `InputError` for a camera COLMAP has no model for, and for what has no coordinates.
+    **Raises:** `InputError` for a camera without a model in COLMAP, and for missing coordinates.
     """
     images, points, rays = network.images, network.points, network.observations
     cameras = dict(zip(numbers_of([c.id for c in network.cameras]), network.cameras))
@@ -171,13 +171,13 @@ def from_network(network: Network) -> tuple[ColmapModel, tuple[str, ...]]:
 
 
 def numbers_of(ids: Sequence[str]) -> list[int]:
-    """The ids themselves where all are whole numbers from 1, else 1, 2, 3, …"""
+    """The ids if all are whole numbers from 1, else 1, 2, 3, …"""
     good = all(id.isascii() and id.isdigit() and len(id) < 10 and id[0] != "0" for id in ids)
     return [int(id) for id in ids] if good else list(range(1, len(ids) + 1))
 
 
 def tracks(model: ColmapModel) -> dict[int, list[tuple[int, int]]]:
-    """By object point the (image, index of its image point) of every ray."""
+    """(image, index of its image point) of every ray, by object point."""
     found: dict[int, list[tuple[int, int]]] = {int(id): [] for id in model.point_ids}
     for image in model.images:
         for k, point in enumerate(image.point.tolist()):

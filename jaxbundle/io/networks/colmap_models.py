@@ -26,7 +26,7 @@ from jaxbundle.io.networks.losses import size_of
 from jaxbundle.network.tables import Camera
 
 HALF = 0.5
-"""A pixel's centre seen from its corner."""
+"""Centre of a pixel relative to its corner."""
 
 _RADIAL = ("f", "cx", "cy", "k1", "k2")
 _OPENCV = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -58,13 +58,13 @@ MODELS: dict[str, tuple[int, str, tuple[str, ...]]] = {
 """Number in binary files, our model, parameters in their order."""
 NAMES = {number: name for name, (number, *_) in MODELS.items()}
 COLMAP_MODELS = tuple(dict.fromkeys(ours for _, ours, _ in MODELS.values()))
-"""Ours that have a place there."""
+"""Our models that COLMAP has."""
 
 
 def parameter_names(model: str, error: Callable[[str], InputError]) -> tuple[str, ...]:
     """The names of the parameters of a COLMAP model.
 
-    **Raises:** what `error` makes of the message, for a model that has no counterpart here.
+    **Raises:** `error` with a message, for a model without a counterpart here.
     """
     if model not in MODELS:
         raise error(f"the camera model {model[:40]} is unknown; these are: {', '.join(MODELS)}")
@@ -72,7 +72,7 @@ def parameter_names(model: str, error: Callable[[str], InputError]) -> tuple[str
 
 
 def from_colmap(id: str, model: str, size: Sequence[int], values: Iterable[float]) -> Camera:
-    """A camera of ours from one of COLMAP's."""
+    """Our camera from one of COLMAP."""
     _, ours, names = MODELS[model]
     p = dict(zip(names, map(float, values)))
     size = int(size[0]), int(size[1])
@@ -100,7 +100,7 @@ def to_colmap(camera: Camera) -> tuple[str, list[float]]:
     """The smallest of COLMAP's models that holds a camera exactly, and its parameters.
 
     **Raises:** `InputError` for another model, without image size, for a thin prism of `opencv`,
-    and for a panorama that is not a whole one.
+    and for an incomplete panorama.
     """
     where = f"camera {camera.id!r}"
     candidates = [(name, names) for name, (_, ours, names) in MODELS.items()

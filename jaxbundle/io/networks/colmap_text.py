@@ -48,7 +48,7 @@ def read_text_cameras(path: Path) -> dict[int, Camera]:
     for row in Rows(path, "#"):
         number = row.whole(0, "CAMERA_ID")
         if number in cameras:
-            raise row.error(f"camera {number} stands there twice")
+            raise row.error(f"camera {number} occurs twice")
         model = row.words[1] if len(row) > 1 else ""
         names = parameter_names(model, row.error)
         size = [row.whole(k, what, 1) for k, what in ((2, "WIDTH"), (3, "HEIGHT"))]
@@ -58,7 +58,7 @@ def read_text_cameras(path: Path) -> dict[int, Camera]:
 
 
 def _images(path: Path) -> list[ColmapImage]:
-    # comments are skipped before heads only: the line of image points may be empty
+    # comments are skipped only before heads: the line of image points may be empty
     rows = Rows(path, "#", blank=True)
     images = []
     while rows.more():

@@ -37,7 +37,7 @@ scale = { x = 0.001, y = -0.001 }
 | `constant` | columns that are not in the file and have one value | none |
 | `rotation` | of `images`: `omega-phi-kappa`, M = R3(κ)·R2(φ)·R1(ω); `phi-omega-kappa`, M = R3(κ)·R1(ω)·R2(φ), with the columns phi, omega, kappa; `azimuth-tilt-swing`; `matrix` with m11 … m33, object → camera | `omega-phi-kappa` |
 
-A table `distances` may be there. Where points have no column `role`, they are tie points.
+A table `distances` is optional. Without a column `role` points are tie points.
 """  # noqa: E501
 
 import re
@@ -123,7 +123,7 @@ def read_column_map(
 
 
 def _read(folder: Path, where: str, entry: Mapping) -> Columns:
-    """A table as its map says; numbers scaled."""
+    """A table by its map; numbers scaled."""
     for key in entry:
         if key not in KEYS:
             raise InputError(f"{where}: unknown key {key!r}{did_you_mean(key, KEYS)}")
@@ -136,11 +136,11 @@ def _read(folder: Path, where: str, entry: Mapping) -> Columns:
     names = names[:-1] if more else names
     used = {name: k for k, name in enumerate(names) if name != UNUSED}
     if len(used) + names.count(UNUSED) < len(names):
-        raise InputError(f"{where}: a column stands there twice")
+        raise InputError(f"{where}: a column occurs twice")
     scale, constant = (_table(where, entry, key) for key in ("scale", "constant"))
     for name, factor in scale.items():
         if name not in used or name in IDS:
-            raise InputError(f"{where}: scale of {name!r}: there is no such column of numbers")
+            raise InputError(f"{where}: scale of {name!r}: no such column of numbers")
         if isinstance(factor, bool) or not isinstance(factor, int | float) or factor == 0:
             raise InputError(f"{where}: scale of {name} is {shown(factor)}; a number is expected")
     skip, decimal = entry.get("skip", 0), entry.get("decimal", ".")
@@ -164,7 +164,7 @@ def _read(folder: Path, where: str, entry: Mapping) -> Columns:
     source = Source(str(folder / file), np.array(lines, np.int64), "line")
     columns = Columns({**texts, **{k: [v] * len(lines) for k, v in constant.items()}}, source)
     scaled = {name: columns.numbers(name) * factor for name, factor in scale.items()}
-    # a σ has no sign, also where its axis points the other way
+    # a σ has no sign, even if its axis is reversed
     scaled = {name: abs(x) if name.startswith("s") else x for name, x in scaled.items()}
     return Columns({**columns.values, **scaled}, source)
 

@@ -1,13 +1,13 @@
-"""Control points from a table of their own, for a network in any format.
+"""Control points from a separate table, for a network in any format.
 
 The table has a header with `id`, `X`, `Y`, `Z` and, if wanted, `sX`, `sY`, `sZ`, `role` (a column
 `name` is not used), or no header and 4 or 7 columns in this order. Its columns are separated by
-commas, semicolons, tabs or blanks; decimals may have a comma where commas do not separate. Without
+commas, semicolons, tabs or blanks; decimals may have a comma if commas do not separate. Without
 a role its points are control points, those without σ held.
 
-What a table gives replaces the control of the input: its control and fixed points that the table
-does not name become tie points. Where the input's start values are in another frame (PhotoModeler
-shifts its own), a similarity by the points both know takes images and points into that of the
+The table replaces the control of the input: control and fixed points missing from the table
+become tie points. If the start values of the input are in another frame (PhotoModeler shifts
+them), a similarity through the common points transforms images and points into that of the
 table.
 """
 
@@ -33,7 +33,8 @@ PLAIN = ("id", *AXES, *POINT_SIGMAS)
 """The columns of a table without a header, the last three only together."""
 NAMES = {name.lower(): name for name in (*PLAIN, "role", "name", *POINT_ERRORS)}
 ELSEWHERE = 0.01
-"""Control this far from where the input has it, as a part of its extent, is in another frame."""
+"""Control farther than this from its position in the input, relative to its extent, is in another
+frame."""
 
 
 def read_control(path: str | Path) -> Points:
@@ -79,7 +80,7 @@ def read_control(path: str | Path) -> Points:
 
 
 def _separator(line: str) -> str | None:
-    """What separates the columns: a comma only where it is not that of decimals between blanks."""
+    """The separator of the columns: a comma unless it is a decimal comma between blanks."""
     found = next((s for s in (";", "\t", ",") if s in line), None)
     decimal = found == "," and any(len(cell.split()) > 1 for cell in line.split(","))
     return None if decimal else found
@@ -93,7 +94,7 @@ def _cells(line: str, separator: str | None) -> list[str]:
 
 
 def _header(path: Path, number: int, cells: list[str]) -> list[str] | None:
-    """The names of the columns; None where the first line is none of names."""
+    """The names of the columns; None if the first line is not a header."""
     if not {"x", "y", "z"} <= {cell.lower() for cell in cells}:
         return None
     names = [re.sub("^(σ|sigma_?|std_?)", "s", cell.lower()) for cell in cells]
@@ -104,7 +105,7 @@ def _header(path: Path, number: int, cells: list[str]) -> list[str] | None:
                 f"{did_you_mean(cell, NAMES.values())}"
             )
         if names.count(name) > 1:
-            raise InputError(f"{path}, line {number}: the column {cell!r} stands there twice")
+            raise InputError(f"{path}, line {number}: the column {cell!r} occurs twice")
     if "id" not in names:
         raise InputError(f"{path}, line {number}: the column 'id' is missing")
     return [NAMES[name] for name in names]
@@ -132,11 +133,11 @@ def _points(table: Columns) -> Points:
 
 
 def with_control(network: Network, control: Points, datum: bool = True) -> Network:
-    """A network whose control is that of a table.
+    """A network with the control of a table.
 
     **Arguments:** `datum` whether control becomes the datum.
 
-    **Raises:** `InputError` where no point of the network is in the table.
+    **Raises:** `InputError` if no point of the network is in the table.
     """
     index = {id: k for k, id in enumerate(network.points.id)}
     rows = [k for k, id in enumerate(control.id) if id in index]
@@ -172,7 +173,7 @@ def with_control(network: Network, control: Points, datum: bool = True) -> Netwo
 
 
 def _in_the_frame_of(network: Network, at, target) -> Network:
-    """The network with its start values where control points `at` have the coordinates `target`."""
+    """The network with start values transformed so that control points `at` are at `target`."""
     images, points = network.images, network.points
     if np.isfinite(images.sigma).any() or not np.isfinite(images.position).any():
         return network
@@ -200,7 +201,7 @@ def _in_the_frame_of(network: Network, at, target) -> Network:
 
 
 def _intersected(network: Network, at):
-    """The coordinates of points by the orientations of the input; NaN where there are none."""
+    """The coordinates of points by the orientations of the input; NaN if there are none."""
     points = network.points
     roles = np.array(points.role, dtype=object)
     position, free = points.position.copy(), np.full_like(points.sigma, np.nan)

@@ -1,4 +1,4 @@
-"""Projects of AICON 3D Studio, as JAiCov reads them: tables of numbers beside each other.
+"""Projects of AICON 3D Studio, as JAiCov reads them: several tables of numbers.
 
     NAME.phc    image point x y sx sy vx vy method active parameter      image points, mm
     NAME.ior    five lines for each camera:                              interior orientation
@@ -9,11 +9,11 @@
     NAME.scale  number "name" point point length σ active                distances
 
 Columns are separated by blanks, lines that begin with # are comments. Angles are radians, M as
-ours; the axes of the image are x right, y up, from its centre. The file has −c. The camera is
+here; the axes of the image are x right, y up, from its centre. The file has −c. The camera is
 `brown-projected` (distortion at the projected point) with K_i = A_i, r0 = R0, P_i = B_i, b_i = C_i.
-What is not active is left out; images whose rotation is of another order than 0, or whose state is
+Inactive entries are left out; images with a rotation order other than 0, or with state
 1, have no orientation. `datum` marks the points of the inner datum; all points are tie points, as
-JAiCov takes them. Without .eor and .obc there are no orientations and coordinates.
+in JAiCov. Without .eor and .obc there are no orientations and coordinates.
 
 Source: Loesler, JAiCov (Java Aicon Covariance), the columns its readers name; Luhmann (2023),
 Nahbereichsphotogrammetrie, eq. 2.31, for the rotation.
@@ -46,12 +46,12 @@ INTERIOR = (
 
 
 def is_jaicov(path: Path) -> bool:
-    """Whether a file is called as image points of AICON are."""
+    """Whether a file has the name of AICON's image points."""
     return path.suffix.lower() == SUFFIX and path.is_file()
 
 
 def read_jaicov(path: str | Path, overrides: Sequence[str] = ()) -> Network:
-    """The network of a project; nothing of the cameras is free.
+    """The network of a project; no camera parameter is free.
 
     **Raises:** `InputError` naming file and line.
     """
@@ -100,7 +100,7 @@ def _cameras(file: Path) -> dict[str, dict]:
             raise row.error("c must be negative, the sizes of the sensor positive")
         id = first.words[0]
         if id in cameras:
-            raise first.error(f"camera {id} stands there twice")
+            raise first.error(f"camera {id} occurs twice")
         values = {name: given[name] for name in ("x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1",
                                                  "b2", "r0")}  # fmt: skip
         cameras[id] = {
@@ -114,7 +114,7 @@ def _cameras(file: Path) -> dict[str, dict]:
 
 
 def _images(file: Path):
-    """Row of each image, angles, positions, cameras, and what is to be told."""
+    """Row of each image, angles, positions, cameras, and messages."""
     images: dict[str, int] = {}
     angles, position, camera, other = [], [], [], []
     for row in Rows(file, comment="#") if file.is_file() else ():
@@ -152,12 +152,12 @@ def _points(file: Path):
 
 def _new(row: Row, table: dict[str, int], thing: str) -> None:
     if row.words[0] in table:
-        raise row.error(f"{thing} {row.words[0]} stands there twice")
+        raise row.error(f"{thing} {row.words[0]} occurs twice")
     table[row.words[0]] = len(table)
 
 
 def _rays(file: Path, points: dict | None):
-    """The columns of image points, their lines, and what is to be told."""
+    """The columns of image points, their lines, and messages."""
     columns: dict[str, list] = {name: [] for name in ("image", "point", "x", "y", "sx", "sy")}
     lines, unknown = [], []
     names = ("x", "y", "sx", "sy", "vx", "vy", "method", "active")
@@ -180,7 +180,7 @@ def _rays(file: Path, points: dict | None):
 
 
 def _with_distances(network: Network, file: Path) -> Network:
-    """The network with the active distances of a file, between points it has."""
+    """The network with the active distances of a file between its points."""
     index, lines = {id: k for k, id in enumerate(network.points.id)}, []
     ends, values = [], []
     for row in Rows(file, comment="#") if file.is_file() else ():
@@ -204,10 +204,10 @@ def _with_distances(network: Network, file: Path) -> Network:
 def write_jaicov(network: Network, path: str | Path) -> tuple[str, ...]:
     """Write a project: NAME.phc and NAME.ior, .eor, .obc, .scale beside it.
 
-    Cameras must be of model `brown-projected`, with image and pixel size; images and cameras become
-    numbers where their ids are none.
+    Cameras must have model `brown-projected`, with image and pixel size; images and cameras are
+    numbered if their ids are not numbers.
 
-    **Returns:** what the format has no place for, in words.
+    **Returns:** messages about what the format cannot hold.
     """
     path = Path(path)
     need_values(network, "brown-projected", "AICON")

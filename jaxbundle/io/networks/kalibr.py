@@ -16,10 +16,10 @@
     eucm, ds    none `eucm`, `double-sphere`
 
 Camera frames have x right, y down, z forward; the centre of the first pixel is (0, 0). A chain
-becomes an image of every camera, taken at one moment by a rig: the first at the origin, looking
-along Z with Y down. Where the cameras are not coupled (no T_cn_cnm1) they are in no rig.
-Of a network the mounting is that of the first moment at which all cameras have an image, or of the
-images where each camera has one. T_cam_imu and time shifts are not read.
+becomes one image per camera, taken at one moment by a rig: the first at the origin, looking
+along Z with Y down. Uncoupled cameras (no T_cn_cnm1) form no rig.
+The written mounting is that of the first moment with an image of every camera, or of the
+images if each camera has one. T_cam_imu and time shifts are not read.
 
 Source: Kalibr's wiki, "yaml formats", "Supported models".
 """
@@ -62,7 +62,7 @@ MODELS: dict[tuple[str, str], tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     ("eucm", "none"): ("eucm", ("alpha", "beta", *CORE), ()),
     ("ds", "none"): ("double-sphere", ("xi", "alpha", *CORE), ()),
 }
-"""Our model, what the intrinsics are and the coefficients; of one model the first is written."""
+"""Our model, intrinsics and coefficients; the first of a model is written."""
 OFFERED = tuple(dict.fromkeys(model for model, *_ in MODELS.values()))
 RIG, MOMENT = "rig", "0"
 
@@ -141,11 +141,11 @@ def _camera(id: str, fields: JsonFields) -> Camera:
 
 
 def write_kalibr(network: Network, path: str | Path) -> tuple[str, ...]:
-    """Write the cameras of a network, called cam0, cam1, …, with the mountings of a rig.
+    """Write the cameras of a network, named cam0, cam1, …, with the mountings of a rig.
 
-    **Returns:** what the format has no place for, in words.
+    **Returns:** messages about what the format cannot hold.
 
-    **Raises:** `InputError` for a camera that Kalibr has no model for, and without image size.
+    **Raises:** `InputError` for a camera without a model in Kalibr, or without image size.
     """
     mountings, lost = _mountings(network)
     lines = []
@@ -188,7 +188,7 @@ def _camera_lines(camera: Camera, k: int) -> list[str]:
 
 
 def _mountings(network: Network) -> tuple[np.ndarray | None, list[str]]:
-    """T from each camera to the next [cameras − 1, 4, 4]; None, and what is lost, without."""
+    """T from each camera to the next [cameras − 1, 4, 4]; else None, and what is lost."""
     images, number = network.images, len(network.cameras)
     if number == 1:
         return None, ["orientations"] if len(images) > 1 else []

@@ -1,4 +1,4 @@
-"""What a writer needs of a network, and what its format has no place for."""
+"""What a writer requires of a network, and what its format cannot hold."""
 
 from collections.abc import Sequence
 
@@ -9,12 +9,12 @@ from jaxbundle.io.networks.assemble import all_parameters
 from jaxbundle.network.tables import Camera, Network
 
 PIXEL_MODELS = ("opencv", "kannala-brandt")
-"""What formats of computer vision have in common."""
+"""Camera models common to formats of computer vision."""
 CORE = ("fx", "fy", "cx", "cy")
 
 
 def need_values(network: Network, model: str = "", format: str = "", points: bool = True) -> None:
-    """Refuse a network without orientations, coordinates, or the only model a format has.
+    """Refuse a network without orientations, coordinates, or the only model of a format.
 
     **Raises:** `InputError` naming camera, image or point.
     """
@@ -38,9 +38,9 @@ def need_values(network: Network, model: str = "", format: str = "", points: boo
 def what_is_lost(
     network: Network, shared_cameras: bool = False, names: bool = False, rays: bool = False
 ) -> tuple[str, ...]:
-    """What a network has that formats of computer vision have not, in words.
+    """Messages about parts of a network that formats of computer vision cannot hold.
 
-    **Arguments:** `shared_cameras` whether every image gets a camera of its own; `names` whether
+    **Arguments:** `shared_cameras` whether every image gets its own camera; `names` whether
     ids become numbers; `rays` whether image points are lost.
     """
     images, points = network.images, network.points
@@ -63,10 +63,10 @@ def _numbered(*ids) -> bool:
 
 
 def the_rest_is_0(camera: Camera, format: str, coefficients: Sequence[str]) -> dict[str, float]:
-    """All parameters of a camera of one of the `PIXEL_MODELS`, of which a format has some
+    """All parameters of a camera of one of the `PIXEL_MODELS`, for a format with some of the
     coefficients.
 
-    **Raises:** `InputError` for another model, and for a coefficient that it has not.
+    **Raises:** `InputError` for another model, and for a coefficient the format does not have.
     """
     where = f"camera {camera.id!r}: {format} has no"
     if camera.model not in PIXEL_MODELS:
@@ -80,7 +80,7 @@ def the_rest_is_0(camera: Camera, format: str, coefficients: Sequence[str]) -> d
 
 
 def one_focal_length(camera: Camera, format: str) -> float:
-    """fx, which must be fy.
+    """fx, which must equal fy.
 
     **Raises:** `InputError`.
     """
@@ -94,7 +94,7 @@ def one_focal_length(camera: Camera, format: str) -> float:
 
 
 def size_of(camera: Camera, format: str) -> tuple[int, int]:
-    """The size of its images.
+    """The image size of a camera.
 
     **Raises:** `InputError` without one."""
     if camera.image_size is None:

@@ -8,15 +8,15 @@
       reference                               the coordinate system of the references
       markers/marker id label                 reference x y z [sx sy sz] enabled
       frames/frame/markers/marker             location camera_id x y [valid]
-      settings/property accuracy_markers      σ of references that have none
+      settings/property accuracy_markers      default σ of references
 
 The sensors are in `metashape_camera.py`. Cameras that are disabled or not aligned are left out, and
-those of sensors that no model comes near (spherical, RPC, of size 0, with a distortion that turns
-back inside the image). A chunk with a transform gives world coordinates (geocentric where it is
-georeferenced), one without its own.
+those of sensors that no model fits (spherical, RPC, of size 0, with a distortion that turns
+back inside the image). A chunk with a transform gives world coordinates (geocentric if it is
+georeferenced), otherwise chunk coordinates.
 
-Markers are points. Where their references are in a local coordinate system, three of them or more
-are control points, and those that are not enabled check points; otherwise they are tie points
+Markers are points. If their references are in a local coordinate system, three of them or more
+are control points, and disabled ones check points; otherwise they are tie points
 without coordinates. The tie points of Metashape are not in this file.
 
 Source: Agisoft Metashape user manual, sections on formats; exported files.
@@ -51,7 +51,7 @@ from jaxbundle.system.file_content import beginning
 
 LEAST_CONTROL = 3
 ACCURACY = 0.005
-"""Metashape's own σ of markers, where a file has none."""
+"""Metashape's default σ of markers."""
 LOCAL = "LOCAL_CS"
 
 
@@ -64,7 +64,7 @@ def is_metashape(path: Path) -> bool:
 def read_metashape(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     """The cameras and images of an export, and the image points of markers if there are any.
 
-    Cameras are called by their label, images too; nothing is free, σ is 1 px, the datum inner.
+    Cameras and images are named by their labels; nothing is free, σ is 1 px, the datum inner.
 
     **Raises:** `InputError` naming file and element.
     """
@@ -106,7 +106,7 @@ def read_metashape(path: str | Path, overrides: Sequence[str] = ()) -> Network:
 
 
 def _entries(path: Path, sensors: dict, used: Sequence[ET.Element]):
-    """The entries of the sensors that photographs are of, by id, and what is to be told of them."""
+    """The entries of the sensors of the photographs, by id, and messages about them."""
     entries, told, refused = {}, [], {}
     for camera in used:
         id = camera.get("sensor_id")
@@ -162,7 +162,7 @@ def _pose(where: str, camera: ET.Element, chunk: ET.Element):
 
 
 def _markers(path: Path, chunk: ET.Element, images: dict):
-    """Tables of points and image points of markers, and control points; None: there are none."""
+    """Tables of points and image points of markers, and control points; each may be None."""
     markers = {m.get("id"): m for m in chunk.iterfind("markers//marker")}
     rows, seen = [], {}
     for marker in chunk.iterfind("frames/frame/markers/marker"):
@@ -191,8 +191,8 @@ def _markers(path: Path, chunk: ET.Element, images: dict):
 
 
 def _references(path: Path, chunk: ET.Element, markers: dict) -> Points | None:
-    """Control and check points of the markers that have a reference in a local system; None where
-    they give no datum."""
+    """Control and check points of the markers with a reference in a local system; None if
+    they define no datum."""
     if not _is_local(chunk):
         return None
     ids, roles, position, sigma = [], [], [], []
@@ -213,7 +213,7 @@ def _references(path: Path, chunk: ET.Element, markers: dict) -> Points | None:
 
 
 def _about_references(chunk: ET.Element, control: Points | None):
-    """What is to be told of the references of markers."""
+    """Messages about the references of markers."""
     if control is not None:
         yield (f"{count(len(control), 'marker')} with reference coordinates: control points with "
                f"σ as the file gives it, else {_accuracy(chunk):g} m; those not enabled are check "

@@ -43,11 +43,10 @@ PIXEL = ("pixel_width", "pixel_height")
 
 
 def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict, tuple[str, ...]]:
-    """The entry of a sensor in a document, and warnings: where it is fitted, and of
-    coefficients that are not known.
+    """The entry of a sensor in a document, and warnings about a fit and unknown coefficients.
 
     **Raises:** `InputError` naming file, sensor and element; `NoPlaceError` for a sensor of
-    another kind, of size 0, or that no model comes near.
+    another kind, of size 0, or that no model fits.
     """
     label = label_of(sensor)
     where = f"{path}, sensor {label!r}"
@@ -98,11 +97,11 @@ def sensor_camera(path: Path, sensor: ET.Element) -> tuple[dict, tuple[str, ...]
 
 
 def _coefficients(where: str, calibration: ET.Element, w: float, h: float):
-    """All coefficients in the form of today, and in words those not 0 that are none of them."""
+    """All coefficients in the current form, and the names of unknown ones that are not 0."""
     tags = [element.tag for element in calibration]
     twice = next((tag for tag in (*COEFFICIENTS, *OLD) if tags.count(tag) > 1), None)
     if twice:
-        raise InputError(f"{where}: <{twice}> stands there twice")
+        raise InputError(f"{where}: <{twice}> occurs twice")
     given = {
         element.tag: number_in(element.text or "", f"{where}, {element.tag}")
         for element in calibration
@@ -121,7 +120,7 @@ def _coefficients(where: str, calibration: ET.Element, w: float, h: float):
 
 
 def _is_coefficient(element: ET.Element) -> bool:
-    """Whether an element is called as coefficients are, such as k5."""
+    """Whether an element has a name like a coefficient, such as k5."""
     return re.fullmatch(r"[a-z]\d+", element.tag) is not None and not len(element)
 
 
@@ -156,12 +155,12 @@ FORMULAS = {kind: partial(_published, kind) for kind in TYPES}
 
 
 def label_of(element: ET.Element) -> str:
-    """What an element is called."""
+    """The name of an element."""
     return element.get("label") or element.get("id") or "?"
 
 
 def numbers_of(where: str, text: str | None, n: int) -> np.ndarray:
-    """So many finite numbers."""
+    """The given number of finite numbers."""
     words = (text or "").split()
     if len(words) != n:
         raise InputError(f"{where}: {len(words)} numbers where {n} are expected")

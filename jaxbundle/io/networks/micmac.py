@@ -8,8 +8,8 @@
         ConvOri               KnownConv
 
 L1, L2, L3 are the rows of the rotation from the camera frame (x right, y down, z forward) to the
-world, so that R = [L1; L2; L3]ᵀ, M = D·R; Centre is X0. Calibrations are looked for beside, and
-from the folder above. Angles (CodageAngulaire) and other conventions are refused. Tie points
+world, so that R = [L1; L2; L3]ᵀ, M = D·R; Centre is X0. Calibrations are searched in the folder
+and the one above. Angles (CodageAngulaire) and other conventions are refused. Tie points
 (Homol) and measurements of control are in other files, which are not read.
 
 Source: MicMac's documentation, "Orientation"; its conventions eConvApero_DistM2C, eConvOriLib.
@@ -45,7 +45,7 @@ def is_micmac(path: Path) -> bool:
 
 
 def read_micmac(path: str | Path, overrides: Sequence[str] = ()) -> Network:
-    """The cameras and images of a folder, called as the files; nothing can be adjusted.
+    """The cameras and images of a folder, named after the files; nothing can be adjusted.
 
     **Raises:** `InputError` naming file and element.
     """
@@ -113,9 +113,9 @@ def write_micmac(network: Network, folder: str | Path, force: bool = False) -> t
     Cameras must be of model `opencv` with one focal length, without k4 and beyond, or
     `brown-projected` or `brown` with square pixels, and have an image size.
 
-    **Arguments:** `force`: replace a folder that this function has not written.
+    **Arguments:** `force`: also replace a folder not written by this function.
 
-    **Returns:** what the format has no place for, in words.
+    **Returns:** messages about what the format cannot hold.
 
     **Raises:** `InputError` where the folder may not or cannot be written
     (`jaxbundle.io.writing.folders`).
@@ -125,7 +125,7 @@ def write_micmac(network: Network, folder: str | Path, force: bool = False) -> t
 
 
 def fill_micmac(network: Network, folder: Path) -> tuple[str, ...]:
-    """Write orientations beside what is in a folder, or a new one; as `write_micmac`."""
+    """Write orientations into an existing folder or a new one; as `write_micmac`."""
     need_values(network, points=False)
     images = network.images
     for id in (*images.id, *(camera.id for camera in network.cameras)):

@@ -18,12 +18,12 @@ three coefficients or fewer is exactly `opencv`, with fx and fy tied,
     k1 = R3·F²   k2 = R5·F⁴   k3 = R7·F⁶   p1 = P2·F   p2 = P1·F
 
 With an affinity b1, b2 it is `brown-projected`, and C2M is `brown`, exactly, P2 and b2 with the
-other sign. These are in mm: the pixel size, which the file has not, is taken as `PIXEL`; another
-would scale c and coefficients, and change nothing in pixels. With more coefficients, or C beside
-PP, the nearest of ours is fitted. ModUnif (Ebner, Brown's 14 parameters, fisheyes) is refused by
-name, and so is an affine part of its own (OrIntGlob). Which point of the first pixel is (0, 0) is
-not published; it is taken for its centre. Another choice would shift image points and principal
-point alike, so that no ray changes.
+other sign. These are in mm: the pixel size, missing from the file, is taken as `PIXEL`; another
+would scale c and coefficients, and change nothing in pixels. With more coefficients, or C different
+from PP, the nearest of our models is fitted. ModUnif (Ebner, Brown's 14 parameters, fisheyes) is
+refused by name, and so is a separate affine part (OrIntGlob). Which point of the first pixel is
+(0, 0) is not published; its centre is assumed. Another choice would shift image points and
+principal point alike, so that no ray changes.
 
 Source: MicMac's documentation, "Camera models"; the formula of its `cDistModStdPhpgr`.
 """
@@ -54,7 +54,7 @@ ITERATIONS = 12
 PIXEL = 0.005
 """mm."""
 MODELS = ("opencv", "brown-projected", "brown")
-"""What can be written."""
+"""Models that can be written."""
 LONGEST = 5
 """Coefficients CoeffDist of MicMac's models."""
 AFFINE = ("P1", "P2", "b1", "b2")
@@ -88,7 +88,7 @@ def calibration(path: Path, root: ET.Element, id: str) -> Camera:
         known = ", ".join((*M2C, *C2M))
         raise InputError(f"{path}: KnownConv is {direction}; one of {known} is expected")
     if xml.find("OrIntGlob") is not None:
-        raise InputError(f"{path}: OrIntGlob, an affine part of its own, is not offered here")
+        raise InputError(f"{path}: OrIntGlob, a separate affine part, is not supported")
     f, (cx, cy), (w, h) = xml.number("F"), xml.numbers("PP", 2), xml.numbers("SzIm", 2)
     if not (f > 0 and w > 0 and h > 0 and w.is_integer() and h.is_integer()):
         raise InputError(f"{path}: F and SzIm must be positive, SzIm whole, not {f:g}, {w:g} {h:g}")
@@ -97,7 +97,7 @@ def calibration(path: Path, root: ET.Element, id: str) -> Camera:
     start = core | {f"k{i}": p[f"R{i}"] * f ** (2 * i) for i in (1, 2, 3)}
     start |= {"p1": p["P2"] * f, "p2": p["P1"] * f}
     odd = {"more than three coefficients": p["R4"] or p["R5"],
-           "a centre of distortion of its own": (p["x"], p["y"]) != (p["cx"], p["cy"])}
+           "a separate centre of distortion": (p["x"], p["y"]) != (p["cx"], p["cy"])}
     has = " and ".join(what for what, there in odd.items() if there)
     size = int(w), int(h)
     if has:
@@ -123,9 +123,9 @@ def _in_mm(p: Mapping[str, float], size: tuple[int, int]) -> dict[str, float]:
 
 
 def _distortion(xml: XmlFields, core: Mapping[str, float]) -> dict[str, float]:
-    """R1 … R5, the centre x, y, and P1, P2, b1, b2, of the one distortion that is none but in name.
+    """R1 … R5, the centre x, y, and P1, P2, b1, b2, of the only distortion other than ModNoDist.
 
-    **Raises:** `InputError` for a kind that is not offered, and for several."""
+    **Raises:** `InputError` for an unsupported kind, and for several."""
     none = dict.fromkeys(COEFFICIENTS, 0.0)
     kinds = [kind for part in xml.root.iter("CalibDistortion") for kind in part]
     kinds = [kind for kind in kinds if kind.tag != "ModNoDist"]
@@ -161,7 +161,7 @@ _from_world = implicit_inverse(_distorted, lambda p, x, y: (x, y), ITERATIONS)
 
 
 def _image(direction: Formula, p: Mapping, X, Y, Z):
-    """The image of a ray: `direction` takes the ideal image there."""
+    """The image of a ray: `direction` maps from the ideal image."""
     x, y = p["fx"] * X / Z + p["cx"] - p["x"], p["fy"] * Y / Z + p["cy"] - p["y"]
     x, y = direction(tuple(p[name] for name in COEFFICIENTS), x, y)
     return jnp.stack([x + p["x"], y + p["y"]])

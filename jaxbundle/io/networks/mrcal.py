@@ -77,14 +77,14 @@ OFFERED = (*dict.fromkeys(model for model, _ in MODELS.values()), "spline-*")
 
 
 def is_mrcal(path: Path) -> bool:
-    """Whether a file is called as camera models are, or a folder has such files."""
+    """Whether a file has the name of a camera model, or a folder has such files."""
     if path.is_dir():
         return any(path.glob(FILES[0]))
     return path.suffix.lower() == SUFFIX
 
 
 def read_mrcal(path: str | Path, overrides: Sequence[str] = ()) -> Network:
-    """The cameras of a file or a folder, called as the files, each with an image.
+    """The cameras of a file or a folder, named after the files, each with an image.
 
     **Raises:** `InputError` naming file and entry.
     """
@@ -144,7 +144,7 @@ def _camera(id: str, fields: JsonFields) -> Camera:
     if p["alpha"] == 0 == p["beta"]:
         return Camera(id, "opencv", exact, image_size=(w, h))
     foreign = Foreign(cahvor, p, exact, (w, h))
-    return fitted_camera(id, foreign, str(fields.path), "is of CAHVOR with an axis of its own")
+    return fitted_camera(id, foreign, str(fields.path), "is of CAHVOR with a separate axis")
 
 
 def cahvor(p: Mapping, X, Y, Z):
@@ -162,7 +162,7 @@ def cahvor(p: Mapping, X, Y, Z):
 def model_text(camera: Camera, rt: Sequence[float] = (0.0,) * 6) -> str:
     """The text of a `.cameramodel`, of the smallest lens model that holds the camera.
 
-    **Raises:** `InputError` for a camera mrcal has no model for, and without image size.
+    **Raises:** `InputError` for a camera without a model in mrcal, or without image size.
     """
     p, (w, h) = all_parameters(camera), size_of(camera, "mrcal")
     kinds = {kind: more for kind, (model, more) in MODELS.items() if model == camera.model}
@@ -187,9 +187,9 @@ def model_text(camera: Camera, rt: Sequence[float] = (0.0,) * 6) -> str:
 def write_mrcal(network: Network, folder: str | Path, force: bool = False) -> tuple[str, ...]:
     """Write the cameras of a network into a folder, a `.cameramodel` for every image.
 
-    **Arguments:** `force`: replace a folder that this function has not written.
+    **Arguments:** `force`: also replace a folder not written by this function.
 
-    **Returns:** what the format has no place for, in words.
+    **Returns:** messages about what the format cannot hold.
 
     **Raises:** `InputError` where the folder may not or cannot be written
     (`jaxbundle.io.writing.folders`).
@@ -199,7 +199,7 @@ def write_mrcal(network: Network, folder: str | Path, force: bool = False) -> tu
 
 
 def fill_mrcal(network: Network, folder: Path) -> tuple[str, ...]:
-    """Write camera models beside what is in a folder, or a new one; as `write_mrcal`."""
+    """Write camera models into an existing folder or a new one; as `write_mrcal`."""
     need_values(network, points=False)
     images = network.images
     R, t = cv_pose(matrices_of(images.angles), images.position)
@@ -207,7 +207,7 @@ def fill_mrcal(network: Network, folder: Path) -> tuple[str, ...]:
     names = [id.replace("/", "_") for id in images.id]
     twice = next((name for name in names if names.count(name) > 1 or not name.strip(".")), None)
     if twice is not None:
-        raise InputError(f"{folder}: image {twice!r} gives no name of a file of its own")
+        raise InputError(f"{folder}: image {twice!r} does not give a unique file name")
     texts = [model_text(network.cameras[c], one) for c, one in zip(images.camera, rt)]
     folder.mkdir(exist_ok=True)
     for name, text in zip(names, texts):
@@ -217,5 +217,5 @@ def fill_mrcal(network: Network, folder: Path) -> tuple[str, ...]:
 
 
 def write_cameramodel(camera: Camera, path: str | Path) -> None:
-    """Write one camera, at the origin and not turned."""
+    """Write one camera, at the origin and not rotated."""
     write_text(Path(path), model_text(camera))

@@ -8,8 +8,8 @@
     structure        key, value: X, observations: key (of the view), value: id_feat, x
     control_points   the same
 
-The name of a kind stands at its first intrinsic only; later ones repeat its number. Some versions
-wrap what a kind has of another in "value0". Of kinds
+The name of a kind is given at its first intrinsic only; later ones repeat its number. Some versions
+wrap the fields inherited from another kind in "value0". Of the kinds
 
     pinhole, pinhole_radial_k1, pinhole_radial_k3    disto_k1, disto_k3: k1, k2, k3
     pinhole_brown_t2                                 disto_t2: k1, k2, k3, t1, t2
@@ -17,7 +17,7 @@ wrap what a kind has of another in "value0". Of kinds
 
 the first are `opencv` with p1 = t1, p2 = t2, the last `kannala-brandt`; fx = fy = focal_length.
 Views of a spherical camera are left out. x_camera = R·(X − center), x right, y down, z forward.
-Which point of the first pixel is (0, 0) is not published; it is taken for its centre. Another
+Which point of the first pixel is (0, 0) is not published; its centre is assumed. Another
 choice would shift image points and principal point alike, so that no ray changes.
 
 Source: openMVG documentation, "SfM_Data", "cameras"; the serialisation of its cameras.
@@ -59,14 +59,14 @@ KINDS = {
     "pinhole_brown_t2": ("opencv", "disto_t2", ("k1", "k2", "k3", "p1", "p2")),
     "fisheye": ("kannala-brandt", "fisheye", ("k1", "k2", "k3", "k4")),
 }
-"""Our model, the field of the coefficients, and what they are here."""
+"""Our model, the field of the coefficients, and their names here."""
 SPHERICAL = "spherical"
 NONE = 2**32 - 1
-"""openMVG's index of what is not there."""
+"""openMVG's index of a missing entry."""
 FIRST = 2**31
-"""The bit of a number that is new; what it stands for follows."""
+"""The bit of a new number; its name follows."""
 ALIKE = 2**30
-"""The number of what is of the declared class itself."""
+"""The number of an object of the declared class."""
 
 
 def is_openmvg(path: Path) -> bool:
@@ -75,10 +75,10 @@ def is_openmvg(path: Path) -> bool:
 
 
 def read_openmvg(path: str | Path, overrides: Sequence[str] = ()) -> Network:
-    """The network of a scene; cameras and points are called by number, images by file.
+    """The network of a scene; cameras and points are named by number, images by file.
 
-    Nothing of the cameras is free, σ is 1 px, the datum inner; control points are held. Views
-    without pose have no orientation, or are left out where they have no image point.
+    No camera parameter is free, σ is 1 px, the datum inner; control points are held. Views
+    without pose have no orientation, or are left out if they have no image point.
 
     **Raises:** `InputError` naming file, entry and field.
     """
@@ -132,13 +132,13 @@ def _entries(scene: JsonFields, name: str) -> dict[int, JsonFields]:
     for row in scene.rows(name):
         key = row.whole("key")
         if key in found:
-            raise InputError(f"{row.path}: key {key} stands there twice")
+            raise InputError(f"{row.path}: key {key} occurs twice")
         found[key] = row.of("value")
     return found
 
 
 def _data(value: JsonFields) -> JsonFields:
-    """What a pointer leads to, with what its class has of another."""
+    """The object of a pointer, with inherited fields."""
     data = value.of("ptr_wrapper.data")
     fields, more = {}, data.document
     while isinstance(more, dict):
@@ -177,7 +177,7 @@ def _cameras(scene: JsonFields) -> tuple[dict[int, dict], set[int]]:
 
 
 def _views(scene: JsonFields, cameras: Mapping, spherical: set[int]):
-    """The views that have a camera, by number, and the names of the others."""
+    """The views with a camera, by number, and the names of the others."""
     views, left = {}, []
     for key, value in _entries(scene, "views").items():
         view = _data(value)
@@ -244,7 +244,7 @@ def write_openmvg(network: Network, path: str | Path) -> tuple[str, ...]:
     """Write a scene. Cameras must be of model `opencv` or `kannala-brandt`, with one principal
     distance, and have an image size; control and fixed points become `control_points`.
 
-    **Returns:** what the format has no place for, in words.
+    **Returns:** messages about what the format cannot hold.
     """
     need_values(network)
     images, points, rays = network.images, network.points, network.observations
@@ -287,7 +287,7 @@ def _entry(key: int, value: dict) -> dict:
 
 
 def _numbers(ids: Sequence[str]) -> list[int]:
-    """The ids where all are numbers, else 0, 1, 2, …"""
+    """The ids if all are numbers, else 0, 1, 2, …"""
     plain = all(id.isascii() and id.isdigit() and len(id) < 10 and str(int(id)) == id for id in ids)
     return [int(id) for id in ids] if plain else list(range(len(ids)))
 

@@ -4,9 +4,9 @@
       "shots": {image: {camera, rotation, translation, gps_position, gps_dop}},
       "points": {id: {coordinates, color}}}, …]
 
-The image points are in the tracks, one a line, separated by tabs: image, track, feature, x, y, …;
-the header names the version, of which 0 has none. They and the parameters of cameras are counted
-from the middle of the image, x right, y down, in units of its larger side s,
+The image points are in the tracks, one per line, separated by tabs: image, track, feature, x, y, …;
+the header names the version (version 0 has no header). They and the camera parameters are relative
+to the centre of the image, x right, y down, in units of its larger side s,
 
     u = s·x + (w − 1)/2   v = s·y + (h − 1)/2   fx = s·focal_x   cx = s·c_x + (w − 1)/2
 
@@ -70,7 +70,7 @@ FILES = (RECONSTRUCTION, TRACKS, MODELS)
 HEAD = "OPENSFM_TRACKS_VERSION_v"
 VERSION = 2
 DOP = 15.0
-"""OpenSfM's σ of a position where a shot has none, metres."""
+"""OpenSfM's default σ of a position, metres."""
 LEAST_POSITIONS = 3
 """Fewer do not define a datum."""
 ONE = ("focal",)
@@ -90,14 +90,14 @@ SPHERICAL = ("spherical", "equirectangular")
 
 
 def is_opensfm(path: Path) -> bool:
-    """Whether it is a reconstruction, or a folder that has one."""
+    """Whether a path is a reconstruction, or a folder with one."""
     if path.is_dir():
         return (path / RECONSTRUCTION).is_file()
     return _has_cameras(path, b"[")
 
 
 def is_opensfm_cameras(path: Path) -> bool:
-    """Whether it is a JSON file of cameras alone, such as `camera_models.json`."""
+    """Whether a path is a JSON file with cameras only, such as `camera_models.json`."""
     return _has_cameras(path, b"{")
 
 
@@ -117,10 +117,10 @@ def read_opensfm_cameras(path: str | Path) -> tuple[Camera, ...]:
 
 
 def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
-    """The network of a reconstruction, of several the largest.
+    """The network of the largest reconstruction of a file.
 
-    Nothing of the cameras is free, σ is 1 px; the datum is given by the positions of GPS
-    where three shots have one, else inner.
+    No camera parameter is free, σ is 1 px; the datum is given by GPS positions
+    if three shots have one, else inner.
 
     **Raises:** `InputError` naming file, entry and field.
     """
@@ -165,7 +165,7 @@ def read_opensfm(path: str | Path, overrides: Sequence[str] = ()) -> Network:
 
 
 def _largest(file: Path) -> tuple[JsonFields, list[str]]:
-    """The reconstruction with the most shots, and what is to be told of the others."""
+    """The reconstruction with the most shots, and messages about the others."""
     scenes = JsonFields(file, {"": parse_json(file, read_text(file))}).rows("")
     if not scenes:
         raise InputError(f"{file}: there is no reconstruction in it")
@@ -190,7 +190,7 @@ def _cameras(scene: JsonFields) -> tuple[dict[str, Camera], dict[str, NoPlaceErr
 
 
 def _camera(id: str, fields: JsonFields) -> Camera:
-    """A camera of ours; **Raises:** `NoPlaceError` where no model comes near."""
+    """Our camera; **Raises:** `NoPlaceError` if no model fits."""
     kind = fields.text("projection_type", "perspective")
     size = fields.whole("width", least=1), fields.whole("height", least=1)
     if kind in SPHERICAL:
@@ -264,7 +264,7 @@ def _images(file: Path, shots: Mapping[str, JsonFields]) -> Columns:
 
 
 def _positions(shots: Mapping[str, JsonFields]) -> tuple[Antennas, ...]:
-    """The observed projection centres, where they define a datum."""
+    """The observed projection centres, if they define a datum."""
     given = {id: shot for id, shot in shots.items() if shot.get("gps_position") is not None}
     if len(given) < LEAST_POSITIONS:
         return ()
@@ -277,7 +277,7 @@ def _positions(shots: Mapping[str, JsonFields]) -> tuple[Antennas, ...]:
 
 
 def _tracks(file: Path, cameras: Mapping, shots: Mapping, points: Mapping):
-    """The table of image points, None without tracks; how many there are of no point."""
+    """The table of image points, None without tracks; how many have no point."""
     if not file.is_file():
         return None, 0
     columns: dict[str, list] = {name: [] for name in ("image", "point", "x", "y")}
@@ -317,9 +317,9 @@ def write_opensfm(network: Network, folder: str | Path, force: bool = False) -> 
 
     Cameras must be of model `opencv` or `kannala-brandt` and have an image size.
 
-    **Arguments:** `force`: replace a folder that this function has not written.
+    **Arguments:** `force`: also replace a folder not written by this function.
 
-    **Returns:** what the format has no place for, in words.
+    **Returns:** messages about what the format cannot hold.
 
     **Raises:** `InputError` where the folder may not or cannot be written
     (`jaxbundle.io.writing.folders`).
@@ -329,7 +329,7 @@ def write_opensfm(network: Network, folder: str | Path, force: bool = False) -> 
 
 
 def fill_opensfm(network: Network, folder: Path) -> tuple[str, ...]:
-    """Write a reconstruction beside what is in a folder, or a new one; as `write_opensfm`."""
+    """Write a reconstruction into an existing folder or a new one; as `write_opensfm`."""
     need_values(network)
     images, points = network.images, network.points
     cameras = {camera.id: _camera_fields(camera) for camera in network.cameras}

@@ -1,4 +1,4 @@
-"""`precision.csv` beside a project: how well its orientations and cameras are known, jointly.
+"""`precision.csv` beside a project: the joint covariance of its orientations and cameras.
 
 | column | |
 |---|---|
@@ -6,7 +6,7 @@
 | `sigma` | object unit, angle unit of the project, unit of the parameter |
 | `1`, `2`, … | correlations with the rows above, and with itself |
 
-It is no table of the project: nothing of it becomes an observation. What is not in it is held.
+It is not a table of the project: it adds no observations. Parameters not listed are held.
 """
 
 import dataclasses

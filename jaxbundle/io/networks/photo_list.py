@@ -30,11 +30,11 @@ OBJECT_POINT = ("X", "Y", "Z")
 
 
 def read_photo_list(path: str | Path, overrides: Sequence[str] = ()) -> Network:
-    """The network of a list of photographs: one camera "cam", model brown, nothing of it free.
+    """The network of a list of photographs: one camera "cam", model brown, no free parameters.
 
     `overrides` are settings `KEY=VALUE` (`networks.settings`), such as `free=c,x0,y0,K1`.
-    With `sigma_image=VALUE` (mm) all image coordinates have this σ and those of the file are
-    ignored.
+    With `sigma_image=VALUE` (mm) all image coordinates have this σ instead of that of the
+    file.
 
     **Raises:** `InputError` naming file and line, among others for a σ that is not finite and
     positive.
@@ -79,7 +79,7 @@ def _columns(path, rows, names, id="id", **more) -> Columns:
 
 @dataclasses.dataclass(frozen=True)
 class _Row:
-    """A line of the file: its number, what it is about, its values with their σ behind them."""
+    """A line of the file: its number, its subject, its values followed by their σ."""
 
     line: int
     id: str
@@ -106,7 +106,7 @@ def _check_sigmas(path: Path, rows: Sequence[_Row]) -> None:
 
 
 class _Parser:
-    """Walks through the lines of the file; `parse` is the grammar."""
+    """Reads the lines of the file in sequence; `parse` is the grammar."""
 
     def __init__(self, path: Path):
         self.path = path

@@ -1,7 +1,7 @@
 """The text export of PhotoModeler ("Bundle Soln").
 
     title
-    tolerance  iterations  [width  height]                      image size in pixels, if it is there
+    tolerance  iterations  [width  height]                      image size in pixels, if given
     σ of photo coordinates, control, …                          defaults, not used
     c xp yp  xs ys  K1 K2 K3 P1 P2                              default camera, mm, all digits
     σ of these
@@ -19,20 +19,20 @@
     (empty line)
     N  id  u v  σu σv                                           image points, pixels
 
-What follows (features) is not read. The distortion is a correction at the measured point, y up:
-model `brown`. Pixels and the principal point count from the upper left corner of the image, whose
-format is xs × ys mm:
+The rest (features) is not read. The distortion is a correction at the measured point, y up:
+model `brown`. Pixels and the principal point count from the upper left corner of the image with
+format xs × ys mm:
 
     x0 = xp − xs/2,  y0 = ys/2 − yp,  p_x = xs/w,  p_y = ys/h,  our pixel = u − ½, v − ½
 
 Whether the program's own origin is the corner or the centre of the first pixel is not published;
 another choice moves image points and principal point alike, and changes no ray.
 
-A control point with positive σ is weighted, one without is held. The coordinates of weighted ones
-are adjusted ones with a posteriori σ (`formats` warns of that). An image point with σ 0 (a smart
-point) has the default σ. Decimals may have a comma, as the language of the system has it;
-photographs whose numbers were skipped (not used in the project) stay skipped. Where the orientation
-of several photographs is nothing but zeros, they have none.
+A control point with positive σ is weighted, others are held. Weighted ones have adjusted
+coordinates with a posteriori σ (`formats` warns about it). An image point with σ 0 (a smart point)
+has the default σ. Decimals may have a comma, depending on the language of the system;
+photographs with skipped numbers (not used in the project) stay skipped. Several photographs whose
+orientation is all zeros have none.
 
 Source: the file itself, as read by the Damped Bundle Adjustment Toolbox (Börlin and Grussenmeyer
 2013), and the camera of its published calibrations, which agree with this reading.
@@ -71,16 +71,16 @@ RAY = ("u", "v", "σu", "σv")
 
 
 def is_photomodeler(path: Path) -> bool:
-    """Whether a text file begins as the export does."""
+    """Whether a text file begins like the export."""
     head = beginning(path, 100) if path.suffix.lower() == ".txt" else b""
     return head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(TITLE.encode())
 
 
 def read_photomodeler(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     """The network of an export: cameras `cam` (or `cam1`, `cam2`, …), nothing free; photographs
-    are called by their file name.
+    are named after their files.
 
-    The datum is given by control points, where there are any; otherwise it is inner.
+    The datum is given by control points, if there are any; otherwise it is inner.
 
     **Raises:** `InputError` naming file and line, or that the image size is missing.
     """
@@ -127,8 +127,8 @@ def _warnings(points: Columns, renumbered: str):
 
 
 def _document(path: Path, photos: Sequence["Photo"], size, overrides: Sequence[str]):
-    """Settings and cameras with what the command line says of these; by photograph the camera; the
-    overrides used; and by camera half a unit of the last decimal of its values."""
+    """Settings and cameras with overrides; the camera of each photograph; the
+    overrides used; and half a unit of the last decimal of the values of each camera."""
     distinct, first, camera = np.unique(
         np.array([photo.inner for photo in photos]), axis=0, return_index=True, return_inverse=True
     )
@@ -224,7 +224,7 @@ def _marks(rows: Rows, names: Mapping[int, str]) -> Block:
 
 
 def _block(rows: Rows):
-    """Lines to the next empty one, without which the file is cut off."""
+    """Lines to the next empty one; without it the file is truncated."""
     while True:
         row = _take(rows, "an empty line after the last of a block")
         if not row.words:
@@ -239,7 +239,7 @@ def _take(rows: Rows, what: str) -> Row:
 
 
 def _names(files: Sequence[str]) -> list[str]:
-    """File names without their folders, as long as they differ; a file given twice is numbered."""
+    """File names without their folders, if they differ; a repeated file is numbered."""
     short = [ntpath.basename(name) for name in files]
     names = short if len(set(short)) == len(short) else list(files)
     return [f"{name}#{k}" if names.count(name) > 1 else name for k, name in enumerate(names)]

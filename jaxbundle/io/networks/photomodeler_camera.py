@@ -1,13 +1,13 @@
-"""The cameras of a PhotoModeler export: which of two roundings holds, and what rounding costs.
+"""The cameras of a PhotoModeler export: which of two roundings holds, and the effect of rounding.
 
-The header has the default camera with all digits that were written; the line of a photograph
+The header has the default camera with all digits; the line of a photograph
 repeats its camera with c, xp, yp to 3 decimals and the rest to 5:
 
     7.4693 3.6178 2.6087 7.25320 5.43990 4.981e-3 -9.814e-5 0 -6.587e-5 -2.806e-5       header
     7.469  3.618  2.609  7.25320 5.43990 0.00498 -0.00010 0.00000 -0.00007 -0.00003     photograph
 
-A photograph has the camera of the header where every number agrees with its own to half a unit of
-the last decimal; otherwise it has another camera, and keeps its own, rounded numbers.
+A photograph has the camera of the header if every number agrees to half a unit of
+the last decimal; otherwise it has another camera with the rounded numbers.
 """
 
 from collections.abc import Sequence
@@ -22,9 +22,9 @@ from jaxbundle.network.tables import Camera
 
 INNER = ("c", "xp", "yp", "xs", "ys", "K1", "K2", "K3", "P1", "P2")
 DECIMALS = (3, 3, 3, 5, 5, 5, 5, 5, 5, 5)
-"""Of the numbers of a photograph, where it has no more: a bare 0 stands for no whole unit."""
+"""Minimum decimals of the numbers of a photograph: a bare 0 is not rounded to whole units."""
 LARGEST_ROUNDING = 0.1
-"""Pixels in the corner of the image: a camera with coarser digits is warned of."""
+"""Pixels in the corner of the image: coarser digits of a camera give a warning."""
 
 Inner = Float[np.ndarray, "10"]
 
@@ -66,7 +66,7 @@ def camera_entry(id: str, values: Inner, size: Sequence[float] | None) -> dict:
 def rounding_warnings(
     cameras: Sequence[Camera], half: Float[np.ndarray, "cameras 10"]
 ) -> list[str]:
-    """Of cameras whose digits leave more than `LARGEST_ROUNDING` pixels open in the corner of the
+    """Warnings about cameras whose rounding exceeds `LARGEST_ROUNDING` pixels in the corner of the
     image; parameters that are 0 or free are not counted.
 
     **Arguments:** `half` half a unit of the last decimal of each value.
@@ -86,7 +86,7 @@ def rounding_warnings(
             worst = some((f"{name} to {cost:.2g} px" for name, cost in coarse.items()), as_text=str)
             told.append(
                 f"the file rounds camera {camera.id!r}: in the corner of the image this leaves "
-                f"open {worst}; give the digits (--set camera.{camera.id}.{next(iter(coarse))}=…) "
-                f"or let them be free (--set camera.{camera.id}.free={','.join(coarse)})"
+                f"open {worst}; give more digits (--set camera.{camera.id}.{next(iter(coarse))}=…) "
+                f"or free them (--set camera.{camera.id}.free={','.join(coarse)})"
             )
     return told

@@ -1,11 +1,11 @@
 """Points and image points of a PhotoModeler export, and the ids of its smart points.
 
-Points found by matching ("smart points") have an id sequence of their own. It may run through ids
-of points that were marked by hand: then an id stands in the list of object points twice, first for
-the point marked by hand, and image points of both have it. Those of smart points have σ 0. Where
-both kinds have an id, the smart point gets another. An id of both that is listed once is a smart
-point's if it stands after one of those, as ids do that only smart points have, or, where this
-leaves it open, after the first descent of the ids.
+Points found by matching ("smart points") have a separate id sequence. It may include ids
+of points marked by hand: then an id is in the list of object points twice, first for
+the point marked by hand, and image points of both have it. Those of smart points have σ 0. If
+both kinds have an id, the smart point gets another. An id of both that is listed once belongs to
+the smart point if it comes after another smart point or, if this does not decide, after the first
+descent of the ids.
 
 Source: exported files; the same convention in the Damped Bundle Adjustment Toolbox (Börlin and
 Grussenmeyer 2013).
@@ -35,12 +35,12 @@ class Block:
 
 
 def renumber_smart(path: Path, objects: Block, marks: Block) -> str:
-    """Give smart points that have the id of another point ids of their own, in place.
+    """Give smart points with the id of another point new ids, in place.
 
-    **Returns:** what was renumbered, in words; empty if nothing was.
+    **Returns:** a message about renumbered points; empty if none was.
 
-    **Raises:** `InputError` for an id that stands in the object points three times, or once where
-    it cannot be told for which of its two points.
+    **Raises:** `InputError` for an id that is in the object points three times, or once and
+    cannot be assigned to one of its two points.
     """
     smart = (marks.values[:, 2:] == 0).all(1)
     of_smart = {id for id, s in zip(marks.id, smart) if s}
@@ -65,12 +65,12 @@ def renumber_smart(path: Path, objects: Block, marks: Block) -> str:
 
 def _smart_objects(path, objects, listed, repeated, of) -> list[int]:
     """The rows of smart points among the object points with a repeated id: the second of two; of
-    one, by what is known of the rows around it."""
+    one, by the neighbouring rows."""
     twice = {id: at for id, at in listed.items() if id in repeated and len(at) > 1}
     for id, at in twice.items():
         if len(at) > 2:
             raise InputError(
-                f"{path}, line {objects.line[at[2]]}: point {id!r} stands in the object points "
+                f"{path}, line {objects.line[at[2]]}: point {id!r} is in the object points "
                 f"{len(at)} times; at most a point marked by hand and a smart point have the same "
                 "id"
             )
@@ -89,8 +89,8 @@ def _smart_objects(path, objects, listed, repeated, of) -> list[int]:
         if after == before and (after or descent is None):
             raise InputError(
                 f"{path}, line {objects.line[k]}: point {objects.id[k]!r} has image points of a "
-                "point marked by hand and of a smart point (σ 0), but stands in the object points "
-                "once, and it cannot be told for which; give one of the two another id"
+                "point marked by hand and of a smart point (σ 0), but is in the object points "
+                "only once, and it is unclear for which; give one of the two another id"
             )
         if after or (not before and k >= descent):
             found.append(k)
@@ -98,8 +98,8 @@ def _smart_objects(path, objects, listed, repeated, of) -> list[int]:
 
 
 def point_table(path: Path, control: Block, objects: Block, marked: list[str]) -> Columns:
-    """Control points as given, then the object points that are none, then those marked in
-    photographs that have no coordinates."""
+    """Control points as given, then the other object points, then points marked in
+    photographs without coordinates."""
     taken = set(control.id)
     other = [k for k, id in enumerate(objects.id) if id not in taken]
     known = taken | set(objects.id)

@@ -1,4 +1,4 @@
-"""Rotations of many images at once, in the forms files have them.
+"""Rotations of many images at once, in the forms used by files.
 
 All are computed in batches of one shape, so that any number of images shares one compiled program.
 """
@@ -59,7 +59,7 @@ def are_rotations(R: Float[np.ndarray, "*images 3 3"]) -> Bool[np.ndarray, "*ima
 
 
 def check_rotations(R: Float[np.ndarray, "*images 3 3"], where: str) -> None:
-    """Refuse what is no rotation matrix.
+    """Refuse invalid rotation matrices.
 
     **Raises:** `InputError` beginning with `where`."""
     if not are_rotations(R).all():

@@ -25,8 +25,8 @@ free = ["c", "x0", "y0", "K1"]
 sigma = { c = 0.1 }                 # prior σ of the start value
 ```
 
-Small tables may stand in the file itself, one `[[image]]`, `[[point]]`, `[[observation]]`,
-`[[distance]]` a row.
+Small tables may be part of the file, one `[[image]]`, `[[point]]`, `[[observation]]`,
+`[[distance]]` per row.
 """
 
 import dataclasses
@@ -73,7 +73,7 @@ FILE_NAME = "project.toml"
 ADJUSTED = "network"
 """The folder of the adjusted network beside the tables of a result."""
 FILES = (FILE_NAME, *(f"{table}.csv" for table in TABLES))
-"""What a project consists of."""
+"""The files of a project."""
 INLINE = {
     table: table.removesuffix("s") for table in TABLES
     if table not in KINDS or not KINDS[table].SECTION
@@ -81,18 +81,18 @@ INLINE = {
 """The tables and the name of one of their rows in the TOML file."""
 
 WITHOUT = {"points": ("id", "role", *AXES), "observations": ("image", "point", "x", "y")}
-"""Tables that a network of oriented images can do without, and their columns."""
+"""Tables not required for oriented images, and their columns."""
 
 
 def read_project(
     path: str | Path, overrides: Sequence[str] = (), models: Sequence[CameraModel] = (),
     oriented: bool = False,
 ) -> Network:  # fmt: skip
-    """The network of a project file, or of the one in a folder (`project_file`).
+    """The network of a project file, or of that in a folder (`project_file`).
 
     `overrides` are settings `KEY=VALUE` that replace those of the file, see
     `jaxbundle.io.networks.settings`; `models` own camera models that the file may name;
-    `oriented`: cameras and images are enough, without points and observations.
+    `oriented`: points and observations are not required.
 
     **Raises:** `InputError` naming file, line and column.
     """
@@ -115,7 +115,7 @@ def _is_absent(document: Document, table: str) -> bool:
 
 
 def project_file(path: Path) -> Path:
-    """The project file a path stands for: itself, or the one in a folder.
+    """The project file of a path: the path, or the file in a folder.
 
     In a folder written by `jaxbundle adjust --out` it is that of the adjusted network.
     """
@@ -134,7 +134,7 @@ def _read_document(path: Path) -> Document:
         if key in SECTIONS and not isinstance(value, dict):
             table = next(table for table, kind in KINDS.items() if kind.SECTION == key)
             raise InputError(
-                f"{path}: write [{key}] in single brackets; its rows stand in {table}.csv"
+                f"{path}: write [{key}] in single brackets; its rows are in {table}.csv"
             )
         if key not in ("project", *SECTIONS) and not (
             isinstance(value, list) and all(isinstance(row, dict) for row in value)
@@ -146,7 +146,7 @@ def _read_document(path: Path) -> Document:
 
 
 def _read_table(document: Document, table: str, path: Path) -> Columns | None:
-    """A table from its CSV file or from the document itself; None where it is not needed and not
+    """A table from its CSV file or from the document; None if it is neither required nor
     given."""
     key, file = INLINE.get(table), document["project"].get(table)
     if key is not None and document.get(key) is not None:
@@ -176,9 +176,9 @@ def write_project(
 ) -> Path:
     """Write `project.toml` and its tables into a folder; returns the path of the former.
 
-    Reading it again gives the same network (its warnings stand in the file as comments).
+    Reading it again gives the same network (its warnings are comments in the file).
 
-    **Arguments:** `force`: replace what `by`, the command or function, has not written.
+    **Arguments:** `force`: also replace files not written by `by`, the command or function.
 
     **Raises:** `InputError` where the folder may not or cannot be written
     (`jaxbundle.io.writing.folders`).
@@ -190,7 +190,7 @@ def write_project(
 
 
 def fill_project(network: Network, folder: Path) -> None:
-    """Write `project.toml` and its tables beside what is in a folder, or a new one."""
+    """Write `project.toml` and its tables into an existing folder or a new one."""
     images, points, rays = network.images, network.points, network.observations
     xy, sigma = to_image_unit(
         network.cameras, images.camera[rays.image], rays.xy, rays.sigma, network.image_unit
@@ -224,7 +224,7 @@ def fill_project(network: Network, folder: Path) -> None:
 
 
 def _write_table(path, header, ids, values, sigma_header, sigma, words):
-    """Ids, numbers and, where there are any, σ; `words` stand for special values of σ."""
+    """Ids, numbers and σ if given; `words` replace special values of σ."""
     with_sigma = bool(sigma_header) and not np.isnan(sigma).all()
     rows = (
         (*names, *_cells(row), *(_cells(s, words) if with_sigma else ()))

@@ -1,7 +1,7 @@
-"""The settings of a project: what keys there are, `--set KEY=VALUE`, and the network they make.
+"""The settings of a project: known keys, `--set KEY=VALUE`, and the resulting network.
 
-A *document* is what a project file says: `{"project": {...}, "camera": [{...}, ...]}`. Every
-reader that has settings makes one, so that the same overrides work for all of them.
+A *document* is the content of a project file: `{"project": {...}, "camera": [{...}, ...]}`. Every
+reader with settings makes one, so that the same overrides work for all.
 """
 
 import copy
@@ -24,7 +24,7 @@ CAMERA_KEYS = ("camera.ID.PARAMETER", "camera.ID.sigma.PARAMETER") + tuple(
     f"camera.ID.{field}" for field in CAMERA_FIELDS if field not in ("id", "sigma")
 )
 ALL = "*"
-"""Stands for all cameras, where none has this id."""
+"""Means all cameras, unless one has this id."""
 
 Document = dict[str, Any]
 
@@ -32,7 +32,7 @@ Document = dict[str, Any]
 def apply_overrides(
     document: Document, overrides: Sequence[str], keys: Sequence[str] = SETTINGS
 ) -> Document:
-    """The document with `KEY=VALUE` settings of the command line put in.
+    """The document with `KEY=VALUE` settings of the command line applied.
 
     Keys are those of `[project]` in `keys`, `camera.ID.…` of a camera, `camera.*.…` of all
     cameras, `free`, which is `camera.*.free`, and `SECTION.…` of a further kind of
@@ -64,7 +64,7 @@ def _project_value(key: str, text: str):
 
 
 def _override_cameras(cameras: list[dict], key: str, text: str) -> None:
-    """Put a setting into the camera the key names, or into all of them."""
+    """Apply a setting to the camera named by the key, or to all cameras."""
     rest = key.removeprefix("camera.")
     ids = [str(camera.get("id", "")).strip() for camera in cameras]
     for c in sorted(range(len(ids)), key=lambda c: -len(ids[c])):
@@ -104,7 +104,7 @@ def _override_camera(camera: dict, key: str, field: str, text: str) -> None:
 
 
 def _override_section(document: Document, key: str, text: str) -> None:
-    """Put a setting, words or numbers, into a section: `antenna.free`, `antenna.sigma.ax`."""
+    """Apply a setting, words or numbers, to a section: `antenna.free`, `antenna.sigma.ax`."""
     *sections, name = key.split(".")
     settings = document
     for section in sections:

@@ -5,12 +5,12 @@
                                                 angle of view, in radians, for fl_x
     frames            file_path, transform_matrix
 
-The transform is camera → world, 4 × 4, x right, y up, the camera looks along −z, as ours: M = Rᵀ,
-X0 = its last column. Pixels count from the corner of the first one: cx = cx_file − ½. Without fl_y
-it is fl_x, without cx, cy the middle of the image. Of OPENCV k4 is the coefficient of r⁸, which has
-no place in ours: where it is not 0 the nearest camera is fitted. `is_fisheye` of instant-ngp is
+The transform is camera → world, 4 × 4, x right, y up, the camera looks along −z, as here: M = Rᵀ,
+X0 = its last column. Pixels count from the corner of the first one: cx = cx_file − ½. fl_y is
+fl_x, and cx, cy the image centre if not given. k4 of OPENCV is the coefficient of r⁸, which our
+model does not have: if it is not 0 the nearest camera is fitted. `is_fisheye` of instant-ngp is
 OPENCV_FISHEYE. The point cloud (`ply_file_path`), masks and depths are not read. Coordinates are
-those of the file: what was done to them before (`applied_transform`, `scale`, `offset`) is not
+those of the file: earlier transformations (`applied_transform`, `scale`, `offset`) are not
 undone.
 
 Source: nerfstudio documentation, "Data conventions"; instant-ngp, "Tips for training NeRF models".
@@ -35,7 +35,7 @@ from jaxbundle.network.tables import Camera, Network, Source
 from jaxbundle.system.file_content import beginning
 
 HALF = 0.5
-"""A pixel's centre seen from its corner."""
+"""Centre of a pixel relative to its corner."""
 MODELS = {
     "OPENCV": ("opencv", ("k1", "k2", "k3", "p1", "p2")),
     "PINHOLE": ("opencv", ()),
@@ -54,7 +54,7 @@ def is_transforms(path: Path) -> bool:
 
 
 def read_transforms(path: str | Path, overrides: Sequence[str] = ()) -> Network:
-    """The cameras and images of a file; frames of the same intrinsics share a camera.
+    """The cameras and images of a file; frames with the same intrinsics share a camera.
 
     Nothing can be adjusted: there are no image points.
 
@@ -98,7 +98,7 @@ def read_transforms(path: str | Path, overrides: Sequence[str] = ()) -> Network:
 
 
 def _intrinsics(file: JsonFields, frame: JsonFields) -> JsonFields:
-    """What a frame says of its camera, and of what it does not say the file."""
+    """The camera fields of a frame, missing ones from the file."""
     own = any(name in frame.document for name in INTRINSICS)
     given = {name: value for source in (file, frame) for name in INTRINSICS
              if (value := source.get(name)) is not None}  # fmt: skip
@@ -134,7 +134,7 @@ def _camera(id: str, fields: JsonFields) -> Camera:
 
 
 def _focal_length(fields: JsonFields, axis: str, size: int | None, other: float | None) -> float:
-    """Along an axis: given, from the angle of view, or the other one."""
+    """Focal length along an axis: given, from the angle of view, or that of the other axis."""
     if fields.get(f"fl_{axis}") is None and fields.get(f"camera_angle_{axis}") is not None:
         if size is None:
             raise InputError(f"{fields.path}: w and h are missing, which camera_angle_{axis} needs")
@@ -153,11 +153,11 @@ def polynomial(p: Mapping, X, Y, Z):
 
 
 def write_transforms(network: Network, path: str | Path) -> tuple[str, ...]:
-    """Write the cameras and images of a network; one camera's intrinsics stand for all frames.
+    """Write the cameras and images of a network; intrinsics of a single camera are given once.
 
     Cameras must be of model `opencv` or `kannala-brandt` and have an image size.
 
-    **Returns:** what the format has no place for, in words.
+    **Returns:** messages about what the format cannot hold.
     """
     need_values(network, points=False)
     images, one = network.images, len(network.cameras) == 1

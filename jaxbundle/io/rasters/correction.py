@@ -22,15 +22,15 @@ from jaxbundle.pushbroom.surfaces import Surface
 from jaxbundle.pushbroom.terrain import Terrain
 
 REACH = 3
-"""Pixels beyond the outermost place that resampling may ask for."""
+"""Pixels that resampling may require beyond the outermost position."""
 ROUND = 128
 """Windows of the image are widened to a multiple of this, or an eighth: few shapes to compile."""
 WINDOW = 2**22
-"""Values of the image, of all bands, that are in memory for a part of a block."""
+"""Image values, of all bands, in memory for a part of a block."""
 BORDER = 33
-"""Places along each border of the image that bound the map."""
+"""Points along each border of the image that bound the map."""
 MOST = 10_000
-"""A map with so many times the pixels of the image is a mistake in its spacing."""
+"""Pixels of a map relative to those of the image: more indicate a wrong spacing."""
 
 _resample = jax.jit(resample, static_argnums=3)
 _locate = jax.jit(locate_lines)
@@ -43,7 +43,7 @@ def map_of(
     size: float | None,
     model: str | Path | None = None,
 ) -> MapGrid:
-    """The pixels of a map that hold the whole image, by default of its own size on the ground.
+    """The pixels of a map of the whole image, by default with its size on the ground.
 
     `model` names the file of a terrain in messages.
 
@@ -58,7 +58,7 @@ def map_of(
         raise InputError(
             f"{model or 'terrain'}: no height where the image looks; give a model that covers it"
             if isinstance(surface, Terrain) else
-            "no point of the image is on the ground; look at attitude and mounting"
+            "no point of the image is on the ground; check attitude and mounting"
         )
     x, y = system.from_ground(X)
     if not np.isfinite(x).any():
@@ -69,7 +69,7 @@ def map_of(
         columns = np.hypot(np.diff(x, axis=1), np.diff(y, axis=1)) / np.diff(pixels)
         size = float(f"{min(np.nanmedian(rows), np.nanmedian(columns)):.2g}")
     grid = grid_around(x, y, size, MOST * image.lines * image.pixels)
-    # a line beyond the outermost centres, which the border leaves out
+    # a line beyond the outermost centres, outside the border
     return MapGrid(grid.x - size, grid.y + size, size, grid.columns + 2, grid.rows + 2)
 
 
@@ -87,10 +87,10 @@ def write_corrected(
 ) -> None:
     """Write the raster `source`, taken by the image, as the map `target`.
 
-    All bands, in the type of the source; where the map shows nothing, NaN or 0 (told as no data).
-    With `occlusion` that is also so where terrain hides other terrain.
+    All bands, in the type of the source; NaN or 0 (declared as no data) outside the image and,
+    with `occlusion`, also for hidden terrain.
 
-    **Raises:** `InputError` if the raster has not the size of the image, or cannot be read.
+    **Raises:** `InputError` if the raster does not have the size of the image, or cannot be read.
     """
     package = rasterio()
     try:
@@ -119,7 +119,7 @@ def write_corrected(
 
 
 def _values(bands, reading, image, places, resampling):
-    """All bands at the places of a block."""
+    """All bands at the positions of a block."""
     line, pixel = (np.asarray(p) for p in places)
     values = np.full((bands.count, *line.shape), np.nan)
     for part, window in _parts(line, pixel, image, WINDOW / bands.count):
@@ -133,10 +133,10 @@ def _values(bands, reading, image, places, resampling):
 
 
 def _parts(line, pixel, image, most, part=(slice(0, BLOCK), slice(0, BLOCK))):
-    """Quarters of a block, quartered again until each sees at most so many pixels of the image.
+    """Quarters of a block, quartered again until each covers few enough pixels of the image.
 
-    Each as slices of the block, with the rows and columns of the image that it needs. What sees
-    nothing is left out.
+    Each as slices of the block, with the required rows and columns of the image. Parts outside the
+    image are left out.
     """
     seen = line[part], pixel[part]
     if not np.isfinite(seen[0]).any():

@@ -1,4 +1,4 @@
-"""Errors as rasters: of a map against a known truth, and of places over an image."""
+"""Errors as rasters: of a map relative to a known truth, and over an image."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -29,10 +29,10 @@ def write_error_map(
     grid: MapGrid,
     progress: Callable[[int, int], None] | None = None,
 ) -> float:
-    """Write how far every pixel of a map of the image is off, by the true image: three bands.
+    """Write the position error of every pixel of a map relative to the true image: three bands.
 
-    East and north (X and Y in a local frame) of the map less the truth, and their length, metres;
-    NaN where the map shows nothing. Returns the RMS of the length.
+    East and north (X and Y in a local frame) of map minus truth, and their length, metres;
+    NaN outside the image. Returns the RMS of the length.
     """
     squares = []
 

@@ -1,7 +1,7 @@
-"""Where a terrain model is asked for: longitudes and latitudes that an image can see.
+"""The extent of the required terrain: longitudes and latitudes visible in an image.
 
-A ray is above the ground that it meets from the highest to the lowest height a terrain may have;
-the extent holds both ends of the rays of a lattice over the image.
+A ray meets the ground between the highest and the lowest possible height of the terrain;
+the extent contains both ends of the rays of a lattice over the image.
 """
 
 from typing import NamedTuple
@@ -16,13 +16,13 @@ from jaxbundle.pushbroom.rpc import Rpc
 from jaxbundle.pushbroom.surfaces import Height
 
 HEIGHTS = -12_000.0, 25_000.0
-"""Metres: of the Earth, the Moon and Mars none is outside, the sea's floor included."""
+"""Metres: limits for the Earth with its sea floor, the Moon and Mars."""
 PLACES = 17
 """Lines and pixels of the lattice."""
 WIDER = 0.03
-"""So much of its size is added on each side."""
+"""Margin on each side, relative to the size."""
 POLE = 85.0
-"""Beyond this latitude, in degrees, all longitudes may be seen."""
+"""Beyond this latitude, in degrees, all longitudes may be visible."""
 
 
 class Extent(NamedTuple):
@@ -41,14 +41,14 @@ class Extent(NamedTuple):
 
 
 def image_extent(image: PushbroomImage, earth: Ellipsoid) -> Extent | None:
-    """What an image can see; None if it sees the horizon or the pole."""
+    """The visible extent of an image; None if it shows the horizon or the pole."""
     lines, pixels = (np.linspace(0, n - 1, PLACES) for n in (image.lines, image.pixels))
     low, high = (
         np.asarray(_locate(image, Height(level=h, earth=earth), lines, pixels)) for h in HEIGHTS
     )
     if not np.isfinite(low).all():
         return None
-    # a camera below the highest height sees from where it is
+    # below the highest height rays begin at the camera
     P = np.asarray(_positions(image, image.times.time(lines))).T[:, :, None]
     high = np.where(np.isfinite(high), high, P)
     X = np.stack([low, high], axis=1)
@@ -59,7 +59,7 @@ def image_extent(image: PushbroomImage, earth: Ellipsoid) -> Extent | None:
 
 
 def rpc_extent(rpc: Rpc) -> Extent | None:
-    """The domain of coefficients."""
+    """The validity domain of coefficients."""
     ends = np.array([-1.0, 1.0])
     return _around(
         float(rpc.longitude_offset) + abs(float(rpc.longitude_scale)) * 1.2 * ends,

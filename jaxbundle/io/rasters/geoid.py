@@ -2,7 +2,7 @@
 
     h = H + N(λ, φ),      N bilinear in a grid
 
-The grid is a raster with georeference (GeoTIFF, GTX), or one of PROJ's own by its name, such as
+The grid is a raster with georeference (GeoTIFF, GTX), or a grid of PROJ by its name, such as
 `us_nga_egm96_15.tif`, which `projsync` fetches (through pyproj).
 """
 
@@ -18,17 +18,17 @@ from jaxbundle.io.rasters.reading import read_terrain
 from jaxbundle.pushbroom.terrain import Terrain, make_terrain
 
 EDGE = 1e-6
-"""Places so many cells beyond the last one are on it, but for rounding."""
+"""Tolerance for points beyond the last cell due to rounding, cells."""
 
 
 def add_geoid(terrain: Terrain, geoid: Path) -> Terrain:
-    """The terrain with heights above the ellipsoid, of one with heights above the geoid.
+    """Terrain with heights above the ellipsoid, from heights above the geoid.
 
-    **Raises:** `InputError` if the geoid cannot be read, or has no height at a place that has one
-    in the terrain model.
+    **Raises:** `InputError` if the geoid cannot be read, or has no height at a point of the
+    terrain model.
     """
     if terrain.earth is None:
-        raise InputError("--geoid: a local frame has no geoid; leave it away")
+        raise InputError("--geoid: a local frame has no geoid; omit it")
     heights = np.asarray(terrain.heights)
     longitude, latitude = (
         np.degrees(terrain.origin[k] + terrain.step[k] * np.arange(heights.shape[1 - k]))
@@ -47,7 +47,7 @@ def add_geoid(terrain: Terrain, geoid: Path) -> Terrain:
 def undulations(
     geoid: Path, longitude: Float[np.ndarray, " columns"], latitude: Float[np.ndarray, " rows"]
 ) -> Float[np.ndarray, "rows columns"]:
-    """N in metres at longitudes × latitudes in degrees; NaN where the grid has none."""
+    """N in metres at longitudes × latitudes in degrees; NaN outside the grid."""
     if not Path(geoid).exists():
         return _of_proj(geoid, longitude, latitude)
     extent = Extent(longitude.min(), latitude.min(), longitude.max(), latitude.max())
@@ -59,7 +59,7 @@ def undulations(
 
 
 def _bilinear(values, row, column):
-    """Values at rows × columns; NaN outside, or beside one that is NaN with a weight."""
+    """Values at rows × columns; NaN outside, or if a NaN has a weight."""
     inside = lambda place, n: np.where(
         (place >= -EDGE) & (place <= n - 1 + EDGE), np.clip(place, 0, n - 1), np.nan
     )
@@ -84,7 +84,7 @@ def _of_proj(name, longitude, latitude):
             f"+grids={name} +multiplier=1 +step +proj=unitconvert +xy_in=rad +xy_out=deg"
         )
     except pyproj.exceptions.ProjError:
-        # public by its documentation, though its stub does not say so
+        # public in the documentation, though not in the stub
         folder = pyproj.datadir.get_user_data_dir()  # pyright: ignore[reportPrivateImportUsage]
         raise InputError(
             f"--geoid {name}: there is no such file, and PROJ has no grid of this name (its folder "

@@ -26,8 +26,8 @@ def write_map(
 ) -> None:
     """Write the map of `grid`, `count` bands of the type `dtype`.
 
-    `block` makes the values [count, `BLOCK`, `BLOCK`] of a block from its nodes, NaN where there
-    are none; None if there are none at all. `names` describe the bands.
+    `block` computes the values [count, `BLOCK`, `BLOCK`] of a block from its nodes, NaN if
+    missing; None if all are missing. `names` describe the bands.
 
     **Raises:** `InputError` if the file cannot be written.
     """

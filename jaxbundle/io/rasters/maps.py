@@ -1,7 +1,7 @@
 """Coordinates of maps: pyproj's systems, and grids of pixels in them.
 
-Longitudes of a map have no seam: they go on beyond ±180° where what is mapped does, as 179.9 to
-180.4, which GDAL and its users read. A projected system that has its edge there is refused.
+Longitudes of a map are continuous: they continue beyond ±180° if required, such as 179.9 to
+180.4, which GDAL and its users read. A projected system with an edge there is refused.
 """
 
 from typing import NamedTuple
@@ -16,9 +16,9 @@ from jaxbundle.pushbroom.correct import Nodes, geographic_nodes, local_nodes
 from jaxbundle.pushbroom.surfaces import Surface
 
 JUMP = 0.25
-"""Neighbouring places farther apart than this part of all lie on both sides of an edge."""
+"""Neighbouring points farther apart than this part of the extent are on both sides of an edge."""
 LARGEST = 2**31 - 1
-"""Rows and columns of a GeoTIFF."""
+"""Maximum rows and columns of a GeoTIFF."""
 
 _geodetic = jax.jit(geodetic)
 
@@ -27,10 +27,10 @@ class MapSystem:
     """A coordinate system of maps, for points of an Earth or of a local frame.
 
     `crs` is anything pyproj reads, such as `"EPSG:32633"`; None: longitude and latitude in degrees,
-    or X and Y of the local frame. `turn` is what x gains in a turn around the Earth, None if x is
-    no longitude.
+    or X and Y of the local frame. `turn` is the change of x in a turn around the Earth, None if x
+    is not a longitude.
 
-    **Raises:** `InputError` for what pyproj does not know, and what is no system of maps.
+    **Raises:** `InputError` for systems unknown to pyproj, and other than map systems.
     """
 
     def __init__(self, earth: Ellipsoid | None, crs: str | None):
@@ -38,12 +38,12 @@ class MapSystem:
         self.transformer = None
         self.turn = None if earth is None else 360.0
         if earth is None and crs is not None:
-            raise InputError(f"coordinate system {crs}: a local frame has none; leave it away")
+            raise InputError(f"coordinate system {crs}: a local frame has none; omit it")
         if earth is not None and crs is not None:
             self.transformer, self.turn = _transformer(crs)
 
     def from_ground(self, X: Float[np.ndarray, "3 *shape"]) -> tuple[np.ndarray, np.ndarray]:
-        """x and y of points of the ground; NaN where the system has no place for one."""
+        """x and y of ground points; NaN outside the domain of the system."""
         if self.earth is None:
             return X[0], X[1]
         longitude, latitude, _ = _geodetic(self.earth, tuple(X))
@@ -54,7 +54,7 @@ class MapSystem:
         return np.where(np.isfinite(x), x, np.nan), np.where(np.isfinite(y), y, np.nan)
 
     def around(self, x: np.ndarray, middle: float) -> np.ndarray:
-        """The same longitudes, turns away from their own, within half a turn of the middle."""
+        """The longitudes shifted by full turns to within half a turn of the middle."""
         return x if self.turn is None else x - self.turn * np.round((x - middle) / self.turn)
 
     def nodes(self, surface: Surface, x: np.ndarray, y: np.ndarray) -> Nodes:
@@ -67,12 +67,12 @@ class MapSystem:
 
     @property
     def text(self) -> str | None:
-        """As rasterio writes it."""
+        """The system in the form of rasterio."""
         return self.crs if self.crs or self.earth is None else "EPSG:4326"
 
     @property
     def unit(self) -> str:
-        """What a size of pixels is in, for messages."""
+        """The unit of pixel sizes, for messages."""
         if self.earth is None:
             return "metres"
         return "degrees" if self.transformer is None else f"units of {self.crs}"
@@ -99,9 +99,9 @@ class MapGrid(NamedTuple):
 
 
 def contiguous(system: MapSystem, x: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "r c"]:
-    """x of a lattice of places, longitudes made contiguous about its middle.
+    """x of a lattice of points, longitudes made contiguous about its middle.
 
-    **Raises:** `InputError` if a projected system has its edge among the places.
+    **Raises:** `InputError` if a projected system has its edge among the points.
     """
     seen = np.flatnonzero(np.isfinite(x))
     if not len(seen):
@@ -115,15 +115,15 @@ def contiguous(system: MapSystem, x: Float[np.ndarray, "r c"]) -> Float[np.ndarr
             raise InputError(
                 f"coordinate system {system.crs}: the image lies on both sides of its edge (x "
                 f"jumps by {longest:.6g}); give a system with its middle there, such as EPSG:3832 "
-                "at 180°, the zone of UTM, or leave it away: longitude and latitude"
+                "at 180°, the zone of UTM, or omit it: longitude and latitude"
             )
     return x
 
 
 def grid_around(x: np.ndarray, y: np.ndarray, size: float, most: float = np.inf) -> MapGrid:
-    """The pixels of this size that hold all places, their edges at multiples of it.
+    """The pixels of this size that cover all points, with edges at multiples of it.
 
-    **Raises:** `InputError` for more than `most` pixels, or rows or columns than a GeoTIFF holds.
+    **Raises:** `InputError` for more than `most` pixels, or too many rows or columns for a GeoTIFF.
     """
     left, right = np.floor(np.nanmin(x) / size), np.ceil(np.nanmax(x) / size)
     bottom, top = np.floor(np.nanmin(y) / size), np.ceil(np.nanmax(y) / size)
@@ -137,7 +137,7 @@ def grid_around(x: np.ndarray, y: np.ndarray, size: float, most: float = np.inf)
 
 
 def _transformer(crs):
-    """From degrees to a system, and what x gains in a turn there."""
+    """The transformation from degrees to a system, and the change of x in a turn."""
     try:
         import pyproj.exceptions
     except ImportError:
@@ -146,7 +146,7 @@ def _transformer(crs):
         system = pyproj.CRS.from_user_input(crs)
         if not (system.is_geographic or system.is_projected):
             raise InputError(
-                f"coordinate system {crs!r} ({system.name}): {system.type_name} is none of maps; "
+                f"coordinate system {crs!r} ({system.name}): {system.type_name} is not for maps; "
                 "give a projected one, such as EPSG:32633, or a geographic one, such as EPSG:4326"
             )
         transformer = pyproj.Transformer.from_crs("EPSG:4326", system, always_xy=True)

@@ -1,4 +1,4 @@
-"""Rasters through rasterio: terrain models, and what all readers and writers share."""
+"""Rasters through rasterio: terrain models, and functions common to readers and writers."""
 
 import warnings
 from pathlib import Path
@@ -15,7 +15,7 @@ GEOGRAPHIC = "EPSG:4326"
 
 
 def rasterio():
-    """The package, or an error that names the extra."""
+    """The package, or an error naming the extra."""
     try:
         import rasterio
         import rasterio.enums
@@ -27,12 +27,12 @@ def rasterio():
 
 
 def unreadable(path: str | Path, error: Exception) -> InputError:
-    """What rasterio says about a file, in one line."""
+    """The message of rasterio about a file, in one line."""
     return InputError(f"{path}: {' '.join(str(error).split())}")
 
 
 def open_plain(path: str | Path, *arguments, **options):
-    """As `rasterio.open`; an image without georeference is what is expected, and not warned of."""
+    """As `rasterio.open`, without a warning about missing georeference."""
     package = rasterio()
     check_plain(path)
     with warnings.catch_warnings():
@@ -41,7 +41,7 @@ def open_plain(path: str | Path, *arguments, **options):
 
 
 def as_type(values: np.ndarray, dtype: np.dtype | str) -> np.ndarray:
-    """Values as they are stored: whole numbers are rounded and kept in range, NaN becomes 0."""
+    """Values as stored: whole numbers are rounded and clipped to the range, NaN becomes 0."""
     if np.issubdtype(dtype, np.floating):
         return values.astype(dtype)
     limits = np.iinfo(dtype)
@@ -53,11 +53,11 @@ def read_terrain(
 ) -> Terrain:
     """The terrain model of the first band of a raster; its heights are those above `earth`.
 
-    In a projected system it is brought to longitude and latitude first (bilinear, about the same
-    spacing). With `earth` None its own x and y are those of the local frame. Of a model of an Earth
-    only what is inside the `extent` is read.
+    A projected system is resampled to longitude and latitude first (bilinear, about the same
+    spacing). With `earth` None its x and y are those of the local frame. Otherwise
+    only the `extent` is read.
 
-    **Raises:** `InputError` if it cannot be read, has no georeference, no heights, or none there.
+    **Raises:** `InputError` if it cannot be read, has no georeference, or no heights in the extent.
     """
     package = rasterio()
     check_plain(path)
@@ -69,7 +69,7 @@ def read_terrain(
                 return _terrain(source, earth, path, extent)
             if source.crs is None:
                 raise InputError(
-                    f"{path}: the raster has no coordinate system; give one that has, such as by "
+                    f"{path}: the raster has no coordinate system; add one, such as by "
                     "gdal_translate -a_srs EPSG:4326"
                 )
             with WarpedVRT(
@@ -82,7 +82,7 @@ def read_terrain(
 
 
 def _degrees_around(source):
-    """Longitude and latitude with the seam of longitudes opposite to a raster."""
+    """Longitude and latitude with the jump of longitudes opposite to a raster."""
     import pyproj
 
     left, bottom, right, top = source.bounds
@@ -112,7 +112,7 @@ def _terrain(source, earth, path, extent):
 
 
 def _cut(source, path, extent):
-    """The heights inside the extent and a cell around it, and the row and column of the first."""
+    """The heights of the extent and a cell around it, and the row and column of the first."""
     (dx, dy), (x0, y0) = (source.transform.a, source.transform.e), source.transform[2:6:3]
     rows, columns = source.shape
     bounds = source.bounds

@@ -1,4 +1,4 @@
-"""Scenes for simulation: a raster with map coordinates, and the image that is taken of it."""
+"""Scenes for simulation: a raster with map coordinates, and its simulated image."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +18,7 @@ from jaxbundle.pushbroom.simulate import taken_image
 from jaxbundle.pushbroom.surfaces import Surface
 
 PORTION = 64
-"""Lines that are taken together."""
+"""Lines simulated together."""
 
 
 class Scene(NamedTuple):
@@ -30,7 +30,7 @@ class Scene(NamedTuple):
 
 
 def read_scene(path: str | Path, earth: Ellipsoid | None) -> Scene:
-    """A raster in any coordinate system; for a local frame its own coordinates are X and Y."""
+    """A raster in any coordinate system; for a local frame its coordinates are X and Y."""
     package = rasterio()
     try:
         with open_plain(path) as source:
@@ -39,7 +39,7 @@ def read_scene(path: str | Path, earth: Ellipsoid | None) -> Scene:
     except package.errors.RasterioError as error:
         raise unreadable(path, error) from None
     if earth is not None and crs is None:
-        raise InputError(f"{path}: the raster has no coordinate system; give one that has")
+        raise InputError(f"{path}: the raster has no coordinate system; add one")
     system = MapSystem(earth, None if earth is None else crs.to_wkt())
     back = ~transform
     middle = transform.c + transform.a * bands.shape[2] / 2 + transform.b * bands.shape[1] / 2
@@ -64,9 +64,9 @@ def write_taken(
     resampling: Resampling,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Write the image of a scene, some lines at a time; 0 or NaN where the scene does not reach.
+    """Write the image of a scene, some lines at a time; 0 or NaN outside the scene.
 
-    **Raises:** `InputError` if the scene is nowhere in the image.
+    **Raises:** `InputError` if the scene is not in the image.
     """
     seen = False
     with written_raster(path, image.pixels, image.lines, len(bands), dtype) as target:
@@ -80,4 +80,4 @@ def write_taken(
             if progress:
                 progress(first + values.shape[1], image.lines)
         if not seen:
-            raise InputError("the image shows nothing of the scene: look at track and coordinates")
+            raise InputError("the image shows nothing of the scene: check track and coordinates")

@@ -1,8 +1,8 @@
-"""GeoTIFFs written whole or not at all: on a full disk the file is named, and its disk.
+"""GeoTIFFs written completely or not at all: a full disk is reported with the file.
 
-GDAL keeps blocks in memory and writes some of them when the file is closed; an error there is told
-to nobody, and the file stays short. So every block is read again and compared before the file gets
-its name. What libtiff says of its own accord is silenced: the command line ends in one line.
+GDAL keeps blocks in memory and writes some of them when the file is closed; an error there is not
+reported, and the file is incomplete. So every block is read again and compared before the file gets
+its name. Messages of libtiff are silenced: the command line ends in one line.
 """
 
 import os
@@ -21,7 +21,7 @@ from jaxbundle.io.writing.replacing import disk_of, replaced_file
 
 
 class RasterWriter:
-    """A raster that is being written, block by block, from any thread."""
+    """A raster being written, block by block, from any thread."""
 
     def __init__(self, raster):
         self._raster = raster
@@ -45,7 +45,7 @@ class RasterWriter:
 def written_raster(
     target: str | Path, width: int, height: int, count: int, dtype: np.dtype | str, **profile
 ) -> Iterator[RasterWriter]:
-    """A GeoTIFF to write, which gets its name when all of it is on the disk.
+    """A GeoTIFF to write, which gets its name when it is completely on the disk.
 
     **Arguments:** as of `rasterio.open`.
 
@@ -78,7 +78,7 @@ def written_raster(
             why = error.__cause__ or error
             raise _unwritable(target, " ".join(str(why).split()).rstrip(".")) from None
         if not whole:
-            raise _unwritable(target, "what was written is not on the disk")
+            raise _unwritable(target, "the written data are not on the disk")
 
 
 def _unwritable(target: str | Path, why: str) -> InputError:
@@ -90,9 +90,9 @@ def _checksum(values: np.ndarray) -> int:
 
 
 class _Silence:
-    """Standard error of the process goes nowhere while any thread is in such a block.
+    """Standard error of the process is silenced while any thread is in such a block.
 
-    The line of an interrupt is said all the same: `system.interrupts` keeps a way of its own.
+    The line of an interrupt is still printed: `system.interrupts` keeps a separate stream.
     """
 
     def __init__(self):

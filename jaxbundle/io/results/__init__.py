@@ -1,1 +1,1 @@
-"""What is written of a result: JSON, tables, drawings, the adjusted project."""
+"""Output files of a result: JSON, tables, drawings, the adjusted project."""

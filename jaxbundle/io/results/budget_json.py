@@ -2,7 +2,7 @@
 
 
 def budget_dict(budget) -> dict:
-    """By result its σ, the total, and of every cause effect and share; angles in the unit of the
+    """σ, total, and effect and share of every cause for each result; angles in the unit of the
     network."""
     columns, results = budget.table(), {}
     for name, cause, _, effect, share in zip(*(c.tolist() for c in columns.values())):

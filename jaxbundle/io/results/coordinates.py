@@ -1,7 +1,7 @@
 """Points and orientations as tables of comma-separated values.
 
 `NAME.csv` has the points, `NAME_images.csv` the exterior orientations, angles in the network's
-unit; the columns are those of a project's tables, without σ where there are none, and of points the
+unit; the columns are those of a project's tables, without σ if there are none, and for points the
 mean reprojection error, `error_px` or `error_mm`, which is not read again.
 """
 
@@ -18,14 +18,14 @@ from jaxbundle.network.units import ANGLE_UNITS
 
 
 def images_path(path: Path) -> Path:
-    """Where the orientations are written beside the points."""
+    """Path of the orientations beside the points."""
     return path.with_name(f"{path.stem}_images{path.suffix}")
 
 
 def write_coordinates(network: Network, path: str | Path) -> tuple[str, ...]:
     """Write both tables; a missing value is an empty cell.
 
-    **Returns:** what is lost, in words.
+    **Returns:** messages about what is lost.
     """
     path = Path(path)
     images, points = network.images, network.points

@@ -16,7 +16,7 @@ from jaxbundle.io.text.csv_tables import write_text
 from jaxbundle.network.tables import ROLES, Network
 
 TEXT_SHARE = 0.01
-"""Height of names, of the extent of the drawing."""
+"""Height of names relative to the extent of the drawing."""
 COLOURS = {"tie": 8, "control": 5, "fixed": 4, "check": 3, "camera": 1}
 """Numbers of AutoCAD's colour index."""
 
@@ -24,9 +24,9 @@ COLOURS = {"tie": 8, "control": 5, "fixed": 4, "check": 3, "camera": 1}
 def write_dxf(network: Network, path: str | Path) -> tuple[str, ...]:
     """Write points and cameras; points without coordinates are left out.
 
-    **Returns:** what is lost, in words.
+    **Returns:** messages about what is lost.
 
-    **Raises:** `InputError` where ezdxf is not installed.
+    **Raises:** `InputError` if ezdxf is not installed.
     """
     try:
         import ezdxf

@@ -1,7 +1,7 @@
 """Results as JSON lines: one object a line, each with a `key`, appended as they come.
 
-An interrupted run leaves whole lines and at most one torn one at the end. `JsonLines` takes up
-where it stopped: it knows the keys that are there, and what their lines were made of.
+An interrupted run leaves complete lines and at most one partial line at the end. `JsonLines`
+resumes: it knows the existing keys, and the inputs of their lines.
 """
 
 import json
@@ -16,13 +16,13 @@ from jaxbundle.io.text.csv_tables import write_bytes
 from jaxbundle.system.temporaries import unbroken
 
 HEAD = ("status", "settings", "data")
-"""What is remembered of a line: how it ended, and what it was made of."""
+"""Fields of a line kept in memory: its status and inputs."""
 
 
 class JsonLines:
-    """A file of results, kept whole and never with a key twice; to be used under its lock.
+    """A file of results, always complete and without repeated keys; to be used under its lock.
 
-    `heads`: of every key the fields `HEAD` of its line, as far as it has them.
+    `heads`: for every key the fields `HEAD` of its line, if present.
 
     **Raises:** `InputError` if the file cannot be read or written, or has other content.
     """
@@ -59,7 +59,7 @@ class JsonLines:
     def append(self, rows: Iterable[dict]) -> None:
         """Add rows; they are on the disk when this returns."""
         rows = list(rows)
-        # A name that is no UTF-8 is escaped, as JSON escapes it.
+        # Names that are not UTF-8 are escaped as in JSON.
         text = "".join(_text(row) + "\n" for row in rows).encode(errors="backslashreplace")
         self._write(lambda file: file.write(text))
         self.heads.update((row["key"], self._head(row)) for row in rows)
@@ -76,7 +76,7 @@ class JsonLines:
         self._keep(self.heads)
 
     def _keep(self, keys: Iterable[str]) -> None:
-        """Rewrite the file with the first line of each of these keys alone."""
+        """Rewrite the file with only the first line of each of these keys."""
         left, kept = set(keys), []
         for line in self._lines():
             row = _row(line)
@@ -96,7 +96,7 @@ class JsonLines:
 
     def _write(self, write: Callable) -> None:
         try:
-            # A pipe may take its time: nothing waits for it.
+            # A pipe may be slow: nothing waits for it.
             with unbroken() if self._regular else nullcontext(), self._file.open("ab") as file:
                 write(file)
                 file.flush()
@@ -106,7 +106,7 @@ class JsonLines:
             raise InputError(f"{self.path}: cannot be written: {error.strerror}") from None
 
     def _head(self, row: dict) -> dict:
-        """What is remembered; settings that are alike are one object, for all lines have some."""
+        """The fields kept in memory; equal settings share one object, since all lines have some."""
         found = {name: row[name] for name in HEAD if name in row}
         if "settings" in found:
             key = json.dumps(found["settings"], sort_keys=True, default=str)
@@ -114,7 +114,7 @@ class JsonLines:
         return found
 
     def _mend(self, end: int) -> None:
-        """Cut off a torn line that begins at `end`, or give the last line its line feed."""
+        """Remove a partial line that begins at `end`, or add the line feed of the last line."""
         if end < self._file.stat().st_size:
             os.truncate(self._file, end)
         else:
@@ -129,7 +129,7 @@ def _text(row: dict) -> str:
 
 
 def _is_torn(line: bytes) -> bool:
-    """Whether a line is the beginning of a row, and not the whole of something else."""
+    """Whether a line is the beginning of a row, and not other content."""
     begin = b'{"key": "'
     return begin.startswith(line[: len(begin)]) and _parsed(line) is None
 

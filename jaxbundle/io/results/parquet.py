@@ -11,7 +11,7 @@ from jaxbundle.io.text.csv_tables import write_bytes
 
 
 def is_parquet(path: Path) -> bool:
-    """Whether the name is that of a Parquet file."""
+    """Whether this is the name of a Parquet file."""
     return path.suffix.lower() == ".parquet"
 
 
@@ -26,7 +26,7 @@ def need_pyarrow() -> None:
 
 
 def write_parquet(path: Path, columns: Mapping[str, np.ndarray]) -> None:
-    """Write columns of numbers and words; what is NaN is null."""
+    """Write columns of numbers and words; NaN becomes null."""
     need_pyarrow()
     arrow, parquet = map(importlib.import_module, ("pyarrow", "pyarrow.parquet"))
     arrays = {

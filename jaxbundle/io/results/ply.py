@@ -1,7 +1,7 @@
 """Points and cameras as a PLY file: vertices with colours by role, edges of the cameras' pyramids.
 
 Binary, little endian, coordinates in double precision. `error` is the mean reprojection error of a
-point, NaN where it has none (a comment in the header gives its unit).
+point, NaN if it has none (a comment in the header gives its unit).
 
 Source: Turk (1994), The PLY Polygon File Format.
 """
@@ -28,9 +28,9 @@ def write_ply(
 ) -> tuple[str, ...]:
     """Write points and cameras; points without coordinates are left out.
 
-    **Arguments:** `colours`: red, green, blue of points by id; the others have that of their role.
+    **Arguments:** `colours`: red, green, blue of points by id; the others are coloured by role.
 
-    **Returns:** what is lost, in words.
+    **Returns:** messages about what is lost.
     """
     need_values(network, points=False)
     known = np.all(np.isfinite(network.points.position), axis=1)

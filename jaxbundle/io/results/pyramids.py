@@ -9,9 +9,9 @@ from jaxbundle.io.networks.poses import matrices_of
 from jaxbundle.network.tables import Camera, Network
 
 SHARE = 0.1
-"""Length of a pyramid, of the distance from the cameras to the points."""
+"""Length of a pyramid relative to the distance from the cameras to the points."""
 UNKNOWN = (0.4, 0.3)
-"""Half width and height of an image of unknown size, of the principal distance."""
+"""Half width and height of an image of unknown size relative to the principal distance."""
 CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 
 

@@ -1,8 +1,8 @@
 """The result of an adjustment as JSON (the fields are listed in docs/result.md).
 
-σ are a posteriori, w uses the a priori σ. A number that does not exist (the σ of a camera parameter
-that is held, the MDB of an uncontrolled observation) is null; the σ of a fixed point and of what is
-held of an exterior orientation are 0.
+σ are a posteriori, w uses the a priori σ. A missing number (the σ of a held camera parameter, the
+MDB of an uncontrolled observation) is null; the σ of a fixed point and of held parameters of an
+exterior orientation are 0.
 """
 
 import json
@@ -74,7 +74,7 @@ def result_dict(adjustment, brief: bool = False) -> dict:
 
 
 def unsolved_text(error: NotSolvedError) -> str:
-    """The JSON text of an adjustment that ended before there was an `Adjustment`."""
+    """The JSON text of an adjustment that ended without an `Adjustment`."""
     head = {"converged": False, "termination": str(error), "undetermined": [*error.undetermined]}
     return json.dumps(head, ensure_ascii=False) + "\n"
 
@@ -82,8 +82,8 @@ def unsolved_text(error: NotSolvedError) -> str:
 def result_text(
     adjustment, brief: bool = False, also: Mapping = MappingProxyType({})
 ) -> Iterator[str]:
-    """The result as JSON text, one line that ends with a line feed, in pieces: that of 2 000 000
-    image points is of 1 GB. `also`: further entries."""
+    """The result as JSON text, one line that ends with a line feed, in pieces: 2 000 000
+    image points take 1 GB. `also`: further entries."""
     head = result_dict(adjustment, brief=True) | dict(also)
     if brief or not adjustment.converged:
         yield _text(head) + "\n"

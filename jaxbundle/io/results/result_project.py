@@ -1,4 +1,4 @@
-"""The adjusted network as a project: what other programs are given of a result."""
+"""The adjusted network as a project, for other programs."""
 
 import dataclasses
 
@@ -12,13 +12,13 @@ from jaxbundle.network.tables import Images, Network, Observations, Points
 def adjusted_network(adjustment) -> Network:
     """The network of a solved `Adjustment` at its solution.
 
-    Cameras, orientations and points have their adjusted values; observations that data snooping has
-    removed are gone. Control points with σ are tie points here; priors and observations of further
-    kinds are dropped: what they said has been used, and around the adjusted values they would say
-    it twice. Only the priors that a camera model needs, as a grid of splines, stay: without them it
-    has no solution. So the datum is inner; adjusted again, the network stays as it is. σ of image
-    coordinates are those given, also where variance components were estimated. Check points are
-    not in it, nor are points at infinity, which have no coordinates.
+    Cameras, orientations and points have their adjusted values; observations removed by data
+    snooping are left out. Control points with σ are tie points here; priors and observations of
+    further kinds are dropped: their information is already in the adjusted values and would count
+    twice. Only priors required by a camera model, such as a grid of splines, stay: without them it
+    has no solution. So the datum is inner; a second adjustment changes nothing. σ of image
+    coordinates are the given ones, even if variance components were estimated. Check points are
+    left out, and so are points at infinity, which have no coordinates.
     """
     problem = adjustment.problem
     network = problem.network

@@ -1,6 +1,6 @@
 """Tables and settings as one file: numbers as the arrays of an .npz, the rest as JSON text in it.
 
-Only dataclasses that the reader lists become objects again, and nothing in a file is executed: one
+Only dataclasses listed by the reader become objects again, and nothing in a file is executed: files
 of unknown origin can be read.
 """
 
@@ -27,7 +27,7 @@ HEAD = "head"
 def write_tree(path: str | Path, tree: Any, classes: Sequence[type]) -> None:
     """Write a tree of numbers, texts, arrays, tuples, lists, maps and dataclasses of `classes`.
 
-    **Raises:** `InputError` for anything else, and where the file cannot be written."""
+    **Raises:** `InputError` for anything else, and if the file cannot be written."""
     head, arrays = flatten(tree, classes)
     with replaced_file(path) as temporary, temporary.open("wb") as file:
         content: dict[str, Any] = {HEAD: np.frombuffer(head, np.uint8), **arrays}
@@ -35,9 +35,9 @@ def write_tree(path: str | Path, tree: Any, classes: Sequence[type]) -> None:
 
 
 def read_tree(path: str | Path, classes: Sequence[type], what: str) -> Any:
-    """Read what `write_tree` wrote; `what` the file should be, for the message.
+    """Read a tree of `write_tree`; `what` names the expected content in messages.
 
-    **Raises:** `InputError` for a file that is missing, or is something else."""
+    **Raises:** `InputError` for a missing file, or other content."""
     check_plain(Path(path))
     try:
         with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
@@ -54,7 +54,7 @@ def read_tree(path: str | Path, classes: Sequence[type], what: str) -> Any:
 
 
 def fingerprint(tree: Any, classes: Sequence[type], without: Sequence[type] = ()) -> str:
-    """16 hex digits of a tree; objects `without` which it is the same count as nothing."""
+    """16 hex digits of a tree; objects in `without` are ignored."""
     head, arrays = flatten(tree, classes, without)
     found = hashlib.blake2b(head, digest_size=8)
     for array in arrays.values():

@@ -1,6 +1,6 @@
 """Line scanners of the Community Sensor Model: support data (ISD) as ALE writes them, model states.
 
-What the fields mean is what usgscsm makes of them:
+The fields have the meaning of usgscsm:
 
 - lines and samples: (0.5, 0.5) is the centre of the first pixel, here (0, 0);
 - `line_scan_rate`: rows of line L₀, start t₀ after the centre time, period p: line l here is taken
@@ -9,8 +9,7 @@ What the fields mean is what usgscsm makes of them:
 - focal plane and distortion: `csm_optics`;
 - radii in km, or in their `unit`.
 
-Which way along its line the camera looks is told by the planet: it is in front. No correction is
-set, as usgscsm applies none.
+The camera looks towards the planet. No correction is set, as usgscsm applies none.
 """
 
 from pathlib import Path
@@ -39,8 +38,8 @@ def read_csm(path: str | Path, interpolation: str = "usgscsm") -> Scanner:
     **Arguments:** `interpolation` of positions and attitudes: `"usgscsm"`, as usgscsm does it, or
     `"lagrange"`, through eight rows up to the ends of the tables (`csm_trajectory`).
 
-    **Raises:** `InputError` naming file and field: what is missing, of another kind, not a number,
-    a distortion that is not known here; tables that end too long before the image does.
+    **Raises:** `InputError` naming file and field: missing, of another kind, not a number,
+    an unknown distortion; tables that end too long before the image.
     """
     isd, order = _support_data(Path(path))
     lines, pixels = (isd.number(key) for key in ("image_lines", "image_samples"))
@@ -101,7 +100,7 @@ def _line_times(isd, lines):
 
 
 def _middle(states, middle):
-    """At the middle line, in the camera's frame: the direction down, and that of flight."""
+    """The directions down and of flight at the middle line, in the camera frame."""
     here, after = (
         np.array([np.interp(middle + dt, states.t, p) for p in states.P.T]) for dt in (0, 1e-3)
     )

@@ -50,7 +50,7 @@ def optics_of(
 
 
 def _focal_plane(isd, u):
-    """Where the pixels are in the focal plane, mm, x and y of the ISD."""
+    """Positions of the pixels in the focal plane, mm, x and y of the ISD."""
     to_line, to_sample = (isd.array(f"focal2pixel_{k}", (3,)) for k in ("lines", "samples"))
     summing = isd.number("detector_sample_summing", 1)
     sample = (u + 0.5) * summing + isd.number("starting_detector_sample", 0)
@@ -66,7 +66,7 @@ def _focal_plane(isd, u):
 
 
 def _distortion(isd, x, y):
-    """Its kind, and the coordinates free of it, mm."""
+    """The kind of distortion, and the undistorted coordinates, mm."""
     given = isd.document.setdefault("optical_distortion", {"radial": {"coefficients": [0.0]}})
     kind = next(iter(given), None) if isinstance(given, dict) else None
     if isinstance(given, dict) and len(given) > 1:
@@ -104,7 +104,7 @@ def _distortion(isd, x, y):
 
 
 def _transverse(isd, a, b, x, y):
-    """The place that the cubic polynomials a and b distort to (x, y)."""
+    """The point that the cubic polynomials a and b distort to (x, y)."""
     u, v = x, y
     for _ in range(100):
         terms = np.stack([

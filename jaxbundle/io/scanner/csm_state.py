@@ -5,8 +5,9 @@ The name of the model, then a JSON object of fields `m_…` in metres, seconds a
     USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL
     {"m_nLines": …, "m_positions": […], "m_quaternions": […], …}
 
-Positions and quaternions (scalar last, camera → body) are evenly spaced: it has what the older form
-of an ISD has, and is read as one. Estimated adjustments, `m_currentParameterValue`, must be zero.
+Positions and quaternions (scalar last, camera → body) are evenly spaced: a state has the content of
+the older form of an ISD, and is read as one. Estimated adjustments, `m_currentParameterValue`, must
+be zero.
 """
 
 from typing import Any

@@ -41,13 +41,13 @@ from jaxbundle.pushbroom.trajectory import Trajectory
 INTERPOLATIONS = ("usgscsm", "lagrange")
 UNITS = {"m": 1.0, "km": 1000.0}
 FEWEST, ORDER = 25, 7
-"""Positions are resampled to so many rows at least."""
+"""Minimum rows of resampled positions."""
 ORTHOGONAL = 1e-4
-"""Products of the rows of a rotation may differ by this from those of axes, as quaternions do."""
+"""Tolerance of R·Rᵀ relative to the identity, as of quaternions."""
 
 
 class States(NamedTuple):
-    """Positions (metres) and rotations camera → body at their times, and how far they reach.
+    """Positions (metres) and rotations camera → body at their times, and their extrapolation.
 
     Times are in seconds since the centre time; `extrapolate` are seconds beyond the ends of both.
     """
@@ -180,7 +180,7 @@ def _turns(isd, key):
     fixed = isd.array(f"{key}.constant_rotation", (9,), np.eye(3).ravel()).reshape(3, 3)
     if not np.abs(fixed @ fixed.T - np.eye(3)).max() < ORTHOGONAL or np.linalg.det(fixed) < 0:
         raise InputError(
-            f"{isd.path}: {key}.constant_rotation is no rotation; nine numbers of an orthogonal "
+            f"{isd.path}: {key}.constant_rotation is not a rotation; nine numbers of an orthogonal "
             "matrix are expected, row by row"
         )
     constant = Rotation.from_matrix(fixed)

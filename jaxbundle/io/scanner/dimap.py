@@ -9,8 +9,8 @@ By the SPOT 123-4-5 Geometry Handbook (GAEL-P135-DOC-001), with angles in radian
 
 Its camera frame and its orbital frame are ours; its pitch and roll have the other sign. Lines count
 from 1 there, from 0 here. Positions and velocities by Lagrange's polynomial through eight rows; the
-attitudes, turned into Earth-fixed quaternions at their own times, by slerp. Where they end a little
-before the image does (`ancillary.extrapolation_limit`), the angles go on linearly.
+attitudes, converted to Earth-fixed quaternions at their times, by slerp. If they end a little
+before the image (`ancillary.extrapolation_limit`), the angles are extrapolated linearly.
 """
 
 import jax
@@ -41,8 +41,8 @@ ORDER = 7
 def read_dimap(file: XmlFields) -> Scanner:
     """The pushbroom image of a SPOT 5 scene, `METADATA.DIM`.
 
-    **Raises:** `InputError` naming file, element and its number: what is missing, no number, no
-    time, not as many look angles as pixels, times that do not increase.
+    **Raises:** `InputError` naming file, element and its number: a missing one, an invalid number
+    or time, a different number of look angles and pixels, times that do not increase.
     """
     path = file.path
     lines, pixels = (file.number(f"Raster_Dimensions/{n}") for n in ("NROWS", "NCOLS"))
@@ -92,7 +92,7 @@ def read_dimap(file: XmlFields) -> Scanner:
 
 
 def _continued(t, angles, first, last):
-    """The rows with more before and after them where these are needed, on straight lines."""
+    """The rows, extrapolated linearly before and after if required."""
     if len(t) < 2:
         return t, angles
     end = (t[-1], t[-1] - t[-2], angles[-1], angles[-1] - angles[-2], last)

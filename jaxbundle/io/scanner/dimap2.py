@@ -33,7 +33,7 @@ from jaxbundle.pushbroom.scanner import LineTimes
 MODEL = "Geometric_Data/Refined_Model"
 UNITS = (1.0, 1e-3, 1e-6)
 PROFILES = {"PHR": 1e-3, "PNEO": 1e-6, "S6": 1e-6, "S7": 1e-6}
-"""Units of LINE_PERIOD by METADATA_PROFILE, where START and END do not tell them."""
+"""Units of LINE_PERIOD by METADATA_PROFILE, if START and END do not determine them."""
 FITS = 0.05
 """START to END may differ by this part from the period times the lines."""
 ROWS, MARGIN = 65, 1.0
@@ -44,8 +44,8 @@ DAY = 86400.0
 def read_dimap2(file: XmlFields) -> Scanner:
     """The pushbroom image of a DIMAP 2 file of sensor level.
 
-    **Raises:** `InputError` naming file and element: what is missing, no number, no time, tables
-    that end too long before the image does.
+    **Raises:** `InputError` naming file and element: a missing one, an invalid number or time,
+    tables that end too long before the image.
     """
     path = file.path
     lines, pixels = (file.number(f"Raster_Dimensions/{n}") for n in ("NROWS", "NCOLS"))
@@ -88,7 +88,7 @@ def _period(file, lines, epoch):
     )
     profile = file.text("Metadata_Identification/METADATA_PROFILE", "").partition("_")[0]
     known = (PROFILES[profile],) if profile in PROFILES else ()
-    # Of few lines several units fit: that of the product goes first.
+    # With few lines several units fit: that of the product is tried first.
     for unit in (*known, *UNITS):
         if fits(unit):
             return unit * period
@@ -152,7 +152,7 @@ def _look_angles(file):
         moved = np.polynomial.Polynomial(given)(np.polynomial.Polynomial([shift, 1.0])).coef
         polynomials.append(np.r_[moved, np.zeros(len(row) - len(moved))])
     warnings = () if len(bands) < 2 else (
-        f"{file.path}: {len(bands)} bands have look angles of their own; those of the first, "
+        f"{file.path}: {len(bands)} bands have different look angles; those of the first, "
         f"{bands[0].findtext('BAND_ID', '').strip() or 'without a name'}, are used",
     )  # fmt: skip
     return *polynomials, warnings

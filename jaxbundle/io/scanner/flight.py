@@ -70,7 +70,7 @@ NEEDED = ("scanner", "times", "optics", "track")
 
 
 class FlightFile(NamedTuple):
-    """A flight file, what it means, and the ellipsoid of its Earth."""
+    """A flight file, its content, and the ellipsoid of its Earth."""
 
     file: TomlFile
     flight: Flight

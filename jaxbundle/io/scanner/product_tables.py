@@ -1,4 +1,4 @@
-"""Positions and attitudes of products made into tables that reach over the whole image."""
+"""Positions and attitudes of products as tables that cover the whole image."""
 
 from typing import NamedTuple
 
@@ -30,7 +30,7 @@ class Tables(NamedTuple):
     attitude: Source
 
     def directions(self, at: float) -> tuple[np.ndarray, np.ndarray]:
-        """The directions down and of flight in the frame of the camera, about."""
+        """Approximate directions down and of flight in the camera frame."""
         here, after = (np.array([np.interp(at + dt, self.t, p) for p in self.P.T])
                        for dt in (0, 1e-3))  # fmt: skip
         camera = slerp(self.rows, self.R, np.array([at]))[0].inv()
@@ -42,8 +42,8 @@ def trajectory_of(
 ) -> tuple[Trajectory, tuple[str, ...]]:
     """The trajectory, the camera turned by `turn`, and warnings.
 
-    Lagrange's polynomial through eight rows; a table that ends a little before the lines do is
-    extrapolated on a straight line (`usgscsm` of `pushbroom.interpolation`).
+    Lagrange's polynomial through eight rows; a table that ends a little before the lines is
+    extrapolated linearly (`usgscsm` of `pushbroom.interpolation`).
 
     **Raises:** `InputError` naming the line that is too far outside.
     """

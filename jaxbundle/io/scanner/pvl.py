@@ -5,8 +5,8 @@
         TLCList = ( (0, 0.0), (600, 4.0) );
     END_GROUP = IMAGE_1
 
-They have the names of the XML files in other letters, numbered groups, and lists in brackets; read
-as the tree of elements that the XML file is.
+They have the names of the XML files in another spelling, numbered groups, and lists in brackets;
+they are read as the tree of elements of the XML file.
 """
 
 import re
@@ -24,7 +24,7 @@ ROW = re.compile(r"\(([^()]*)\)")
 def read_support_data(path: Path) -> ET.Element:
     """The tree of an IMD file and those beside it.
 
-    **Raises:** `InputError` if one is missing, or is no PVL, naming file and line.
+    **Raises:** `InputError` if one is missing, or is not PVL, naming file and line.
     """
     root = ET.Element("isd")
     beside = {p.suffix.upper(): p for p in path.parent.glob("*") if p.stem == path.stem}
@@ -56,7 +56,7 @@ def _read(path, root):
                     raise wrong("the name of a group is expected")
                 groups.append(ET.SubElement(groups[-1], tag))
             elif len(groups) == 1 or groups.pop().tag != tag:
-                raise wrong(f"the group {tag} ends, but has not begun")
+                raise wrong(f"the group {tag} ends without a beginning")
             at = line
             continue
         end = text.find(";", match.end())

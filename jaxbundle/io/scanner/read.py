@@ -1,4 +1,4 @@
-"""Any scanner image: our own file, or a product, which its suffix and the root of its XML tell."""
+"""Any scanner image: our file, or a product recognised by its suffix and the root of its XML."""
 
 import dataclasses
 from pathlib import Path
@@ -22,8 +22,8 @@ WORLDVIEW = "support data of DigitalGlobe with IMD, EPH, ATT, GEO"
 def read_scanner(path: str | Path) -> Scanner:
     """The pushbroom image of a scanner file, `.toml`, or of a product.
 
-    **Raises:** `InputError` naming file, section and key, or table and line; for what no reader
-    knows.
+    **Raises:** `InputError` naming file, section and key, or table and line; also for unknown
+    formats.
     """
     path = Path(path)
     if path.suffix.lower() in PRODUCTS:
@@ -54,14 +54,14 @@ def _of_product(file: TomlFile, scanner: Section) -> Scanner:
 
 
 def _read_product(path: Path, interpolation: str | None = None) -> Scanner:
-    """The image of a product; `interpolation` is a choice of CSM files only."""
+    """The image of a product; `interpolation` applies to CSM files only."""
     suffix = path.suffix.lower()
     if suffix not in PRODUCTS:
         raise InputError(f"{path}: the suffix of a scanner file is .toml or {', '.join(PRODUCTS)}")
     if suffix == ".json":
         return read_csm(path) if interpolation is None else read_csm(path, interpolation)
     if interpolation is not None:
-        raise InputError(f"{path}: interpolation can be chosen for CSM files only; leave it away")
+        raise InputError(f"{path}: interpolation can be chosen for CSM files only; omit it")
     if suffix == ".imd":
         return read_worldview(XmlFields(path, read_support_data(path), WORLDVIEW))
     return _read_xml(path)

@@ -122,7 +122,7 @@ def read_refinement(path: str | Path) -> RefineFile:
     if "frames" in section:
         frames = read_network(path.parent / section.text("frames"))
     points = _points(read_csv(path.parent / section.text("points")), earth, radians)
-    # told first: the ids of observations are looked up in it
+    # checked first: the ids of observations are looked up in it
     check_points_table(points)
     ids = {id: k for k, id in enumerate(points.id)}
     if frames is not None:

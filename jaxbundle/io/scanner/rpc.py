@@ -8,8 +8,8 @@ products (`rpc_products`).
     lineNumCoef = ( -1.2E-03, …);
 
 In all of them line 0, sample 0 is the centre of the first pixel, degrees and metres, as in `Rpc`.
-Errors and limits that a file may tell besides (ERR_BIAS, ERR_RAND, MIN_LONG, …) are passed over,
-and none are written. Scales may be negative, as some providers have them.
+Errors and limits in a file (ERR_BIAS, ERR_RAND, MIN_LONG, …) are ignored,
+and none are written. Scales may be negative, as from some providers.
 """
 
 import re
@@ -53,7 +53,7 @@ RPB = re.compile(r"\s*(\w+)\s*=\s*(.*?)\s*;?\s*$")
 def read_rpc(path: str | Path) -> Rpc:
     """The coefficients of a text file, an RPB file, a raster with RPC tags, or of a product.
 
-    **Raises:** `InputError` naming file and line: what is missing, there twice, no number, in
+    **Raises:** `InputError` naming file and line: missing or repeated entries, invalid numbers,
     another unit, not RPC00B.
     """
     path = Path(path)
@@ -77,7 +77,7 @@ def read_rpc(path: str | Path) -> Rpc:
 
 
 def write_rpc(path: str | Path, rpc: Rpc) -> None:
-    """Write coefficients so that `read_rpc` gives them back to the last digit (15 in a GeoTIFF).
+    """Write coefficients for `read_rpc`, exact to the last digit (15 in a GeoTIFF).
 
     `.rpb`: RPB; `.tif`: the tags of a GeoTIFF that exists; anything else: text.
     """
@@ -205,7 +205,7 @@ def _to_raster(path, rpc):
             shutil.copyfile(path, temporary)
             with package.open(temporary, "r+") as target:
                 target.rpcs = RPC(**given)
-            with package.open(temporary) as target:  # what fails at closing is told to nobody
+            with package.open(temporary) as target:  # errors at closing are not reported
                 if target.rpcs is None:
                     raise InputError(f"{path}: cannot be written: no tags arrived{disk_of(path)}")
     except (OSError, package.errors.RasterioError) as error:

@@ -6,9 +6,9 @@
 | DigitalGlobe, `.XML` | `RPB/IMAGE`, of RPC00B | (0, 0) |
 | OSSIM keyword list, `….geom` | `line_num_coeff_00`, …, of `polynomial_format` B | (0, 0) |
 
-The indices of the first pixel stand in the validity domain of a DIMAP file: 1 for Pléiades, 0 or 1
-for SPOT 6 and 7, 0.5 for Pléiades Neo (its coordinates begin at the corner of the pixel). Where
-there are none they are 1 (Pléiades User Guide, appendix C; GDAL takes FIRST_COL for both).
+The validity domain of a DIMAP file has the indices of the first pixel: 1 for Pléiades, 0 or 1
+for SPOT 6 and 7, 0.5 for Pléiades Neo (its coordinates begin at the corner of the pixel). The
+default is 1 (Pléiades User Guide, appendix C; GDAL takes FIRST_COL for both).
 """
 
 from pathlib import Path
@@ -31,15 +31,15 @@ DIMAP, DIGITALGLOBE = "an RPC file of DIMAP", "an RPC file of DigitalGlobe"
 def from_xml(path: Path) -> dict[str, Any]:
     """The fields of `Rpc` in an XML file of DIMAP or DigitalGlobe.
 
-    **Raises:** `InputError` for XML of another kind, naming what it is.
+    **Raises:** `InputError` for XML of another kind, naming the kind.
     """
     root = read_xml(path)
     if root.tag == "Dimap_Document" or root.find(".//Rational_Function_Model") is not None:
         if root.find(".//RFM_Validity") is not None:
             return _from_dimap(XmlFields(path, root, DIMAP))
         raise InputError(
-            f"{path}: DIMAP without RPC (RFM_Validity); its RPC stand in a file of their own, "
-            "RPC_….XML. `pushbroom` commands read the rigorous model from this one"
+            f"{path}: DIMAP without RPC (RFM_Validity); its RPC are in a separate file, "
+            "RPC_….XML. `pushbroom` commands read the rigorous model from this file"
         )
     if root.find(".//RPB") is not None:
         return _from_digitalglobe(XmlFields(path, root, DIGITALGLOBE))

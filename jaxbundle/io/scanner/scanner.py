@@ -1,4 +1,4 @@
-"""A scanner image as every reader returns it."""
+"""A scanner image as returned by every reader."""
 
 import dataclasses
 

@@ -41,7 +41,7 @@ aberration = true                   # light_time, aberration, refraction: false 
 ut1_utc = -0.12                     # seconds; x_pole, y_pole in arcseconds
 ```
 
-Or the file of a product, with what is to be different from it:
+Or the file of a product, with changes:
 
 ```toml
 [scanner]
@@ -231,7 +231,7 @@ def _position(file: TomlFile, earth: Ellipsoid | None) -> tuple[Table, Source]:
 def _orbit(
     file: TomlFile, section: Section, kind: str, earth: Ellipsoid | None
 ) -> tuple[Table, Source]:
-    """Two-line elements, a circle, a state: at the steps of a table from which is interpolated."""
+    """Two-line elements, a circle, a state: as a table for interpolation."""
     start, end = section.numbers("span", 2)
     step = section.number("step", 1.0)
     if not (step > 0 and 0 < (end - start) / step <= MOST_ROWS):
@@ -281,7 +281,7 @@ def _attitude(file: TomlFile, earth: Ellipsoid | None) -> tuple[Attitude, Source
         if not quaternions:
             raise InputError(f"{section.where}frame {frame} needs quaternions; give q0, q1, q2, q3")
         check_times(t, columns.source)
-        # what is not unit is refused below, with its row
+        # other than unit quaternions are refused below, with their row
         R = frames.to_earth(frame, _epoch(file), t, _orientation(file))
         lengths = np.linalg.norm(values, axis=1, keepdims=True)
         values = lengths * frames.turn_quaternions(R, values)

@@ -13,9 +13,9 @@ EPH, ATT, GEO (the camera).
   detectors (DETPITCH) in millimetres; θ (DETROTANGLE) degrees; u the pixel, l the line, here both
   from 0 at the centres of the first.
 
-The attitude is that of the light as it arrives: aberration and light time are switched on, together
-(one without the other is off by a metre). Refraction is left off. Optical distortion, times that go
-backwards, and products resampled to a map are refused.
+The attitude is that of the arriving light: aberration and light time are switched on together
+(one without the other gives an error of a metre). Refraction is off. Optical distortion, decreasing
+times, and products resampled to a map are refused.
 """
 
 import jax.numpy as jnp
@@ -45,8 +45,8 @@ CORRECTIONS = Corrections(light_time=True, aberration=True)
 def read_worldview(file: XmlFields) -> Scanner:
     """The pushbroom image of a DigitalGlobe XML file.
 
-    **Raises:** `InputError` naming file and element: what is missing, no number, a product of
-    another level, tables that end too long before the image does.
+    **Raises:** `InputError` naming file and element: missing, not a number, a product of
+    another level, tables that end too long before the image.
     """
     path = file.path
     level = file.text("IMD/IMAGEDESCRIPTOR", "Basic1B")
@@ -70,7 +70,7 @@ def read_worldview(file: XmlFields) -> Scanner:
     P = P[:, :3] + slerp(rows, R, t).apply(centre)
     lens = [file.number(f"GEO/CAMERA_ATTITUDE/QCS{k}") for k in range(1, 5)]
     if not abs(np.linalg.norm(lens) - 1) < 1e-4:
-        raise InputError(f"{path}: QCS1 to QCS4 are no unit quaternion, scalar last")
+        raise InputError(f"{path}: QCS1 to QCS4 are not a unit quaternion, scalar last")
     x, y, warnings = _detectors(file)
     tables = Tables(
         t, P, rows, R * Rotation.from_quat(lens), Source(f"{path}, EPHEMLIST", None, "row"), source
@@ -128,7 +128,7 @@ def _table(file, group, name, used, epoch):
 
 
 def _numbers(file, element, name, used):
-    """The first numbers of an element, of which there are more."""
+    """The first numbers of an element with more numbers."""
     words = (element.text or "").replace(",", " ").split()
     if len(words) < used:
         raise InputError(f"{file.path}: {name} has {len(words)} numbers; {used} are expected")

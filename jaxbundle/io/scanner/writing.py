@@ -1,4 +1,4 @@
-"""A scanner image written: `NAME.toml` and its tables, which `read_scanner` reads again."""
+"""Writing of a scanner image: `NAME.toml` and its tables, for `read_scanner`."""
 
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ TABLES = ("positions", "attitude", "times", "angles")
 
 
 def names_of(name: str, prefix: str | None = None) -> list[str]:
-    """The files an image may consist of; arguments as of `write_scanner_image`."""
+    """The possible files of an image; arguments as of `write_scanner_image`."""
     prefix = f"{name}_" if prefix is None else prefix
     return [f"{name}.toml", *(f"{prefix}{table}.csv" for table in TABLES)]
 

@@ -1,1 +1,1 @@
-"""Text: tables of comma-separated values, TOML, JSON, XML; what is wrong is said with its place."""
+"""Text: tables of comma-separated values, TOML, JSON, XML; errors name the place."""

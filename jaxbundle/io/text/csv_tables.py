@@ -17,14 +17,14 @@ from jaxbundle.network.tables import Source
 from jaxbundle.system.file_content import DESCRIPTORS, parse_toml, read_content
 
 PORTION = 10_000
-"""Rows that are turned into text at a time."""
+"""Rows converted to text at a time."""
 
 
 def read_text(path: Path, fallback: str = "") -> str:
-    """The text of a file; `fallback` is the encoding of what is not UTF-8.
+    """The text of a file; `fallback` is the encoding if it is not UTF-8.
 
-    **Raises:** `InputError` if there is none, it cannot be read, it is no plain file, it has a zero
-    byte, or it is not UTF-8.
+    **Raises:** `InputError` if it is missing, cannot be read, is not a regular file, has a zero
+    byte, or is not UTF-8.
     """
     content = read_content(path)
     try:
@@ -69,7 +69,7 @@ def read_csv(path: Path) -> Columns:
         raise InputError(f"{path}, line {numbers[0]}: separate the columns by commas")
     for name in header:
         if header.count(name) > 1:
-            raise InputError(f"{path}, line {numbers[0]}: the column {name!r} stands there twice")
+            raise InputError(f"{path}, line {numbers[0]}: the column {name!r} occurs twice")
     width = len(header)
     for number, row in zip(numbers, rows):
         if len(row) != width:
@@ -82,7 +82,7 @@ def read_csv(path: Path) -> Columns:
 
 
 def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Write a table that `read_csv` reads back; floats in full precision."""
+    """Write a table for `read_csv`; floats in full precision."""
     write_text(path, (_csv_text(some) for some in in_portions(itertools.chain((header,), rows))))
 
 
@@ -91,14 +91,14 @@ def _csv_text(rows: Iterable[Sequence[Any]]) -> str:
     plain = csv.writer(text, lineterminator="\n")
     quoted = csv.writer(text, lineterminator="\n", quoting=csv.QUOTE_ALL)
     for row in rows:
-        # Else it would be read as a comment.
+        # Otherwise it would be read as a comment.
         writer = quoted if str(row[0]).startswith("#") else plain
         writer.writerow(row)
     return text.getvalue()
 
 
 def table_rows(table: Mapping[str, np.ndarray]) -> Iterator[tuple]:
-    """The rows of a table of columns as plain values; never all of them at a time."""
+    """The rows of a table of columns as plain values, some at a time."""
     columns = list(table.values())
     for first in range(0, max(map(len, columns), default=0), PORTION):
         yield from zip(*(column[first : first + PORTION].tolist() for column in columns))
@@ -121,8 +121,8 @@ def write_bytes(path: Path, content: bytes | Iterable[bytes]) -> None:
     """Write a file, given whole or in pieces, whole or not at all: under a temporary name, then
     renamed.
 
-    What is there and no file (a device, a pipe) is written to as it is, and so is what an open
-    descriptor leads to (/dev/stdout); a link stays a link.
+    An existing device or pipe is written to directly, and so is an open
+    descriptor (/dev/stdout); a link stays a link.
     """
     pieces = (content,) if isinstance(content, bytes) else content
     if path.exists() and (not path.is_file() or path.parent in DESCRIPTORS):

@@ -1,5 +1,5 @@
-"""Fields of a JSON document, or of another of the same parts (YAML, a Python dictionary), asked for
-by their path; what is wrong is said with file and field."""
+"""Fields of a JSON document, or a similar one (YAML, a Python dictionary), by their path; errors
+name file and field."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,9 +14,9 @@ from jaxbundle.system.file_content import parse_json
 
 
 class JsonFields:
-    """A JSON object whose fields are asked for by their path, "a.b".
+    """A JSON object with access to fields by their path, "a.b".
 
-    **Raises:** `InputError` naming file and field: what is missing, no number, of another shape.
+    **Raises:** `InputError` naming file and field: a missing one, an invalid number or shape.
     """
 
     def __init__(self, path: str | Path, document: dict[str, Any]):
@@ -36,7 +36,7 @@ class JsonFields:
         return float(self.array(key, (), default))
 
     def array(self, key: str, shape: tuple[int | None, ...], default: Any = None) -> np.ndarray:
-        """Numbers of a shape; None in it is any length."""
+        """Numbers of a shape; None means any length."""
         value = self.get(key, default)
         if value is None:
             raise InputError(f"{self.path}: {key} is missing")
@@ -63,7 +63,7 @@ class JsonFields:
         return int(value)
 
     def text(self, key: str, default: str | None = None) -> str:
-        """A text; a number is the text of it."""
+        """A text; a number is converted to text."""
         value = self.get(key, default)
         if isinstance(value, bool) or not isinstance(value, str | int | float) or value == "":
             said = "missing" if value in (None, "") else f"{shown(value)}; a text is expected"
@@ -71,7 +71,7 @@ class JsonFields:
         return str(value)
 
     def of(self, key: str) -> "JsonFields":
-        """The object that is a field."""
+        """The object in a field."""
         value = self.get(key)
         if not isinstance(value, dict):
             said = "missing" if value is None else f"{shown(value)}; an object is expected"
@@ -79,7 +79,7 @@ class JsonFields:
         return JsonFields(f"{self.path}, {key}", value)
 
     def objects(self, key: str) -> dict[str, "JsonFields"]:
-        """The objects in a field that is an object of them; none where it is missing."""
+        """The objects in a field with an object of objects; none if it is missing."""
         fields = self.of(key) if self.get(key) is not None else JsonFields(self.path, {})
         return {
             id: _object(f"{self.path}, {key} {shown(id)}", value)
@@ -87,7 +87,7 @@ class JsonFields:
         }
 
     def rows(self, key: str) -> list["JsonFields"]:
-        """The objects in a list, counted from 0 in messages; none where it is missing."""
+        """The objects in a list, counted from 0 in messages; none if it is missing."""
         value = self.get(key, [])
         if not isinstance(value, list):
             raise InputError(f"{self.path}: {key} is {shown(value)}; a list is expected")
@@ -110,7 +110,7 @@ def stacked(
     """Many lists of numbers as one array [len(values), size]; of the k-th, `place(k)` names file
     and field.
 
-    **Raises:** `InputError` for the first that is none.
+    **Raises:** `InputError` for the first invalid list.
     """
     try:
         array = np.array(values, float).reshape(len(values), size)
@@ -123,7 +123,7 @@ def stacked(
 
 
 def read_object(path: str | Path, text: str, kind: str) -> dict[str, Any]:
-    """The object that a text is; `kind` is what it should be, for messages."""
+    """The JSON object in a text; `kind` names the expected content in messages."""
     document = parse_json(path, text)
     if not isinstance(document, dict):
         raise InputError(f"{path}: an object with the fields of {kind} is expected")

@@ -1,4 +1,4 @@
-"""The lines of a text file as rows of words; a complaint names the file and the line."""
+"""The lines of a text file as rows of words; errors name the file and the line."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from jaxbundle.network.columns import shown
 
 
 class Row:
-    """A line of a file: where it stands, its text, its words."""
+    """A line of a file: its place, text, and words."""
 
     def __init__(self, path: Path, number: int, text: str, separator: str | None = None):
         self.path, self.number, self.text = path, number, text
@@ -28,7 +28,7 @@ class Row:
         return f"{self.path}, line {self.number}"
 
     def error(self, message: str) -> InputError:
-        """A complaint about this line, to be raised."""
+        """An error about this line, to be raised."""
         return InputError(f"{self.place}: {message}")
 
     def numbers(
@@ -43,7 +43,7 @@ class Row:
         return np.array([self._number(word, name) for word, name in zip(words, what)])
 
     def all_numbers(self, what: str) -> Float[np.ndarray, " n"]:
-        """All words as numbers; `what` each of them is."""
+        """All words as numbers; `what` names each in messages."""
         try:
             numbers = np.array(self.words, float) if self.words else np.zeros(0)
         except ValueError:
@@ -53,7 +53,7 @@ class Row:
         return numbers
 
     def whole(self, k: int, what: str, least: int = 0) -> int:
-        """The whole number that is the k-th word."""
+        """The k-th word as a whole number."""
         word = self.words[k] if k < len(self.words) else ""
         sign = word.removeprefix("-")
         if not (sign.isascii() and sign.isdigit() and len(sign) < 19) or int(word) < least:
@@ -71,10 +71,10 @@ class Row:
 
 
 class Rows:
-    """The lines of a file one after the other.
+    """The lines of a file in sequence.
 
-    **Arguments:** `comment` begins lines that do not count; `blank` whether empty lines count;
-    `separator` of the words, blanks if None; `fallback` the encoding of what is not UTF-8.
+    **Arguments:** `comment` begins lines to skip; `blank` whether empty lines count;
+    `separator` of the words, blanks if None; `fallback` the encoding if it is not UTF-8.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class Rows:
         return self.position < len(self.lines)
 
     def take(self, what: str) -> Row:
-        """The next line; `what` it should be.
+        """The next line; `what` names the expected content in messages.
 
         **Raises:** `InputError` if the file has ended.
         """

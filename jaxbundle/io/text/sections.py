@@ -1,4 +1,4 @@
-"""TOML files of named sections: what is there, of what type, in the words of one message."""
+"""TOML files of named sections: checks of keys and types, with common messages."""
 
 import dataclasses
 import os
@@ -23,7 +23,7 @@ class TomlFile:
     document: dict[str, Any]
 
     def section(self, name: str) -> "Section":
-        """A section, empty if it is not there."""
+        """A section, empty if it is missing."""
         return Section(self, f"{self.path}, [{name}]: ", self.document.get(name, {}))
 
     def require(self, names: Sequence[str]) -> None:
@@ -44,9 +44,9 @@ class TomlFile:
 def read_sections(
     path: Path, sections: Mapping[str, Sequence[str]], needed: Sequence[str]
 ) -> TomlFile:
-    """A TOML file whose sections and keys are known (an empty list: any key).
+    """A TOML file with known sections and keys (an empty list: any key).
 
-    **Raises:** `InputError` for what is unknown or missing.
+    **Raises:** `InputError` for unknown or missing entries.
     """
     document = read_toml(path)
     for key, value in document.items():
@@ -63,7 +63,7 @@ def read_sections(
 
 @dataclasses.dataclass(frozen=True)
 class Section:
-    """One section; every getter refuses what is missing or of another type."""
+    """One section; every getter refuses missing entries and other types."""
 
     file: TomlFile | None
     where: str
@@ -105,7 +105,7 @@ class Section:
         return self._given(key, default, "text in quotes", (str,))
 
     def switch(self, key: str) -> bool:
-        """True or false; false if it is not there."""
+        """True or false; false if it is missing."""
         return self._given(key, False, "true or false", (bool,))
 
     def numbers(self, key: str, count: int | None = None) -> np.ndarray:
@@ -129,7 +129,7 @@ class Section:
 
 
 def toml_text(document: Mapping[str, Mapping[str, Any]]) -> str:
-    """Sections as text that `read_sections` reads."""
+    """Sections as text for `read_sections`."""
     parts = []
     for name, section in document.items():
         parts.append("\n".join([f"[{name}]", *assignments(section)]))

@@ -1,8 +1,8 @@
-"""Rows of an array in an `.npz`, read when they are asked for: memory does not grow with the file.
+"""Rows of an array in an `.npz`, read on demand: memory does not grow with the file.
 
-An archive of NumPy stores its members as they are (`numpy.savez`) or compressed
-(`numpy.savez_compressed`). Of the first the rows are read where they lie; the second are unpacked
-into a temporary file without a name, which is gone with the process.
+An archive of NumPy stores its members uncompressed (`numpy.savez`) or compressed
+(`numpy.savez_compressed`). Rows of the former are read in place; the latter are unpacked
+into a temporary file without a name, which disappears with the process.
 """
 
 import dataclasses
@@ -22,7 +22,7 @@ from jaxbundle.errors import InputError
 WORTH = 2**20
 """Smaller arrays are read at once, bytes."""
 LOCAL_HEADER = struct.Struct("<4s22xHH")
-"""Signature, length of the name, of what follows it."""
+"""Signature, length of the name, of the field after it."""
 READERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
@@ -32,8 +32,8 @@ AT_ONCE = 2**20
 
 @dataclasses.dataclass(frozen=True)
 class StoredRows:
-    """Rows of an array of numbers in a file, from `offset` on; `unpacked`: where they are, if not
-    in the file itself."""
+    """Rows of an array of numbers in a file, from `offset` on; `unpacked`: the temporary file, if
+    any."""
 
     path: Path
     offset: int
@@ -66,10 +66,10 @@ class StoredRows:
 
 
 def find_stored_rows(path: str | Path, name: str) -> StoredRows | None:
-    """The rows of an array of an `.npz`, where they can be read one by one and that is worth it;
+    """The rows of an array of an `.npz`, if they can be read singly and the array is large enough;
     its checksum is tested once.
 
-    **Raises:** what `zipfile` and NumPy raise for an archive that is damaged."""
+    **Raises:** as `zipfile` and NumPy for a damaged archive."""
     with zipfile.ZipFile(path) as archive:
         try:
             member = archive.getinfo(f"{name}.npy")

@@ -13,7 +13,7 @@ def assignments(table: Mapping) -> Iterable[str]:
 
 
 def _key(key: str) -> str:
-    """A key, in quotes where it has to be."""
+    """A key, in quotes if required."""
     return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else toml_value(str(key))
 
 

@@ -1,4 +1,4 @@
-"""Elements of an XML document, asked for by their path; what is wrong is said with its place."""
+"""Elements of an XML document by their path; errors name the place."""
 
 import re
 import xml.etree.ElementTree as ET
@@ -16,11 +16,11 @@ TIME = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d(?:\.\d{1,9})?)\d*Z?")
 
 
 class XmlFields:
-    """An XML document whose elements are asked for by their path, anywhere in it.
+    """An XML document with access to elements by their path, anywhere in it.
 
-    `kind` is what the document should be, for messages; names are without namespaces.
+    `kind` names the expected document in messages; names are without namespaces.
 
-    **Raises:** `InputError` naming file and element: what is missing, no number, no time.
+    **Raises:** `InputError` naming file and element: a missing one, an invalid number or time.
     """
 
     def __init__(self, path: str | Path, root: ET.Element, kind: str):
@@ -55,7 +55,7 @@ class XmlFields:
         return time_in(self.text(key), f"{self.path}: {key}")
 
     def elements(self, key: str) -> list[ET.Element]:
-        """Elements that stand there again and again; of the first list of them."""
+        """Repeated elements, from the first list of them."""
         parent, _, last = key.rpartition("/")
         found = self.find(parent)
         elements = [] if found is None else found.findall(last)
@@ -64,7 +64,7 @@ class XmlFields:
         return elements
 
     def columns(self, key: str, names: Sequence[str]) -> np.ndarray:
-        """The numbers of names [elements, names] in elements that stand there again and again."""
+        """Numbers [elements, names] of repeated elements."""
         last = key.rpartition("/")[2]
         return np.array([
             [number_in(e.findtext(name, ""), f"{self.path}: {last} {k}, {name}") for name in names]
@@ -72,7 +72,7 @@ class XmlFields:
         ])
 
     def times(self, key: str, epoch: np.datetime64, name: str = "TIME") -> np.ndarray:
-        """Seconds since the epoch of elements that stand there again and again."""
+        """Seconds since the epoch of repeated elements."""
         last = key.rpartition("/")[2]
         times = [
             time_in(e.findtext(name, ""), f"{self.path}: {last} {k}, {name}")
@@ -81,7 +81,7 @@ class XmlFields:
         return np.array([seconds(t, epoch) for t in times])
 
     def missing(self, key: str) -> InputError:
-        """What to raise where an element is not there."""
+        """The error for a missing element."""
         return InputError(f"{self.path}: {key} is missing; {self.kind} is expected")
 
 
@@ -106,7 +106,7 @@ def read_xml(path: str | Path) -> ET.Element:
 
 
 def number_in(text: str, where: str) -> float:
-    """A finite number of a text."""
+    """The finite number in a text."""
     try:
         value = float(text)
         good = np.isfinite(value) and "_" not in text
@@ -118,7 +118,7 @@ def number_in(text: str, where: str) -> float:
 
 
 def time_in(text: str, where: str) -> np.datetime64:
-    """A time of a text, to the nanosecond."""
+    """The time in a text, to the nanosecond."""
     try:
         if match := TIME.fullmatch(text.strip()):
             return np.datetime64("T".join(match.groups()), "ns")

@@ -3,7 +3,7 @@
 Blocks of keys and of lists by indentation, lists in brackets (over several lines too), texts with
 and without quotes, numbers, true, false, null, comments. Tags (`!!opencv-matrix`), the `%YAML` line
 and `---` are skipped. Dictionaries in braces, anchors, texts over several lines, and a second
-document are refused by name; or, where a file has much that nobody asks for, read as None.
+document are refused by name; or read as None in files with many unused entries.
 
 Source: YAML 1.2, the chapters on block and flow collections.
 """
@@ -29,20 +29,20 @@ NOT_READ = {
 
 
 class Line:
-    """A line that counts: its number, its indentation, and the rest."""
+    """A line with content: its number, its indentation, and the rest."""
 
     def __init__(self, path: str | Path, number: int, text: str, lenient: bool = False):
         self.path, self.number, self.lenient = path, number, lenient
         self.indent, self.text = len(text) - len(text.lstrip()), text.strip()
 
     def error(self, message: str) -> InputError:
-        """A complaint about this line, to be raised."""
+        """An error about this line, to be raised."""
         return InputError(f"{self.path}, line {self.number}: {message}")
 
 
 def parse_yaml(path: str | Path, text: str, *, lenient: bool = False) -> dict[str, Any]:
-    """The document of a text, which must be one of keys; `lenient`: a value of a sort that is not
-    read here is None.
+    """The document of a text, which must consist of keys; `lenient`: values of an unsupported kind
+    are None.
 
     **Raises:** `InputError` naming the line.
     """
@@ -51,14 +51,14 @@ def parse_yaml(path: str | Path, text: str, *, lenient: bool = False) -> dict[st
         raise InputError(f"{path}: the file is empty; keys and values are expected")
     value, rest = _block(lines, lines[0].indent, 0)
     if rest:
-        raise rest[0].error(f"{shown(rest[0].text)} is indented otherwise than what is before")
+        raise rest[0].error(f"{shown(rest[0].text)} is indented differently from the lines before")
     if not isinstance(value, dict):
         raise lines[0].error("keys and values are expected")
     return value
 
 
 def _lines(path: str | Path, text: str, lenient: bool) -> list[Line]:
-    """The lines without comments; a list in brackets, or what is in braces, is one line."""
+    """The lines without comments; content in brackets or braces becomes one line."""
     lines: list[Line] = []
     open_brackets, ended = 0, 0
     for number, raw in enumerate(text.splitlines(), 1):
@@ -120,7 +120,7 @@ def _keys(lines: list[Line], indent: int, depth: int) -> tuple[dict, list[Line]]
             raise line.error(f"{shown(line.text)}: a key and a value, KEY: VALUE, are expected")
         key, text = found[1].strip("\"'"), TAG.sub("", found[2] or "", count=1)
         if key in values:
-            raise line.error(f"{key} stands there twice")
+            raise line.error(f"{key} occurs twice")
         if text:
             values[key] = _value(line, text)
         else:
@@ -129,7 +129,7 @@ def _keys(lines: list[Line], indent: int, depth: int) -> tuple[dict, list[Line]]
 
 
 def _nested(lines: list[Line], indent: int, depth: int) -> tuple[Any, list[Line]]:
-    """What stands below a key or the dash of a list; a list may be no farther in than its key."""
+    """The value below a key or the dash of a list; a list may have the indentation of its key."""
     if not lines or lines[0].indent < indent:
         return None, lines
     if lines[0].indent == indent and not _is_item(lines[0]):

@@ -1,1 +1,1 @@
-"""Files and folders written whole or not at all, and fingerprints of what they were made of."""
+"""Files and folders written completely or not at all, and fingerprints of their inputs."""

@@ -1,4 +1,4 @@
-"""Short fingerprints of what a result was made of: the same content, the same 16 hex digits."""
+"""Short fingerprints of inputs: the same content, the same 16 hex digits."""
 
 import hashlib
 import os
@@ -20,7 +20,7 @@ _hash = partial(hashlib.blake2b, digest_size=8)
 
 
 def of_arrays(*arrays: np.ndarray) -> str:
-    """The fingerprint of numbers in their shapes; their type does not count."""
+    """The fingerprint of numbers in their shapes, regardless of type."""
     found = _hash()
     for array in arrays:
         found.update(repr(array.shape).encode())
@@ -37,9 +37,9 @@ def of_words(words: Iterable[str]) -> str:
 
 
 def of_input(path: str | Path) -> str:
-    """The fingerprint of an input of `read_network`: of its files, not of where they are.
+    """The fingerprint of an input of `read_network`: of its files, not of their paths.
 
-    What cannot be read counts as empty.
+    Unreadable files count as empty.
     """
     found = _hash()
     for file in input_files(path):
@@ -55,13 +55,13 @@ def of_input(path: str | Path) -> str:
 
 
 def input_files(path: str | Path) -> Iterator[Path]:
-    """The files of an input of `read_network`: itself and what it names, or those of its folder."""
+    """The files of an input of `read_network`: itself and named files, or those of its folder."""
     project = project_file(Path(path))
     return _files(project if project.is_file() else Path(path))
 
 
 def files_read(path: str | Path) -> list[Path]:
-    """An input in TOML, the files it names, and those that these name."""
+    """An input in TOML, the files it names, and those named by these."""
     found, left = {}, [Path(path)]
     while left:
         file = left.pop()

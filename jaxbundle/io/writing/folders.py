@@ -1,20 +1,20 @@
-"""Folders of results: written whole or not at all, and only over what the same command wrote.
+"""Folders of results: written completely or not at all, and only over results of the same command.
 
 A folder has a marker, `.jaxbundle`: JSON that names the command and lists its files, each with a
-digest. A folder is written when it is new, or empty, or its marker is of the same command and the
-files it lists are as they were written. Anything else needs `force`, which replaces what the marker
-lists and what the refusal names. Other files are never touched.
+digest. A folder is written if it is new, or empty, or its marker is of the same command and the
+listed files are unchanged. Anything else requires `force`, which replaces the files listed by the
+marker and named by the refusal. Other files are never touched.
 
     .FOLDER.jaxbundle/new    the new result, until it is complete
     .FOLDER.jaxbundle/ready  the same, while its files and those it replaces are exchanged
     .FOLDER.jaxbundle/old    the files it replaces
-    FOLDER/.jaxbundle.work   the same, where nothing can be made beside the folder, or moved there
+    FOLDER/.jaxbundle.work   the same, if nothing can be created or moved beside the folder
 
-A new folder is `ready`, renamed. Else the old files are moved to `old`, the marker first, and then
-the new ones to the folder, the marker last: by renames alone, which no full disk stops. At no
-moment are old and new files mixed. Whatever ends the program in between, the next command that
-writes to the folder first settles it (`recover`): with the new marker in place it removes `old`,
-else it moves everything back.
+A new folder is `ready`, renamed. Otherwise the old files are moved to `old`, the marker first, and
+then the new ones to the folder, the marker last: only by renames, which work on a full disk. Old
+and new files are never mixed. If the program ends in between, the next command that writes to the
+folder first completes or reverts the exchange (`recover`): with the new marker in place it removes
+`old`, else it moves everything back.
 """
 
 import fnmatch
@@ -36,11 +36,11 @@ from jaxbundle.system.temporaries import temporary, unbroken
 MARKER, INSIDE = ".jaxbundle", ".jaxbundle.work"
 NEW, READY, OLD = "new", "ready", "old"
 MOST_NAMED = 40
-"""Files that a refusal names one by one."""
+"""Maximum number of files named by a refusal."""
 
 
 class Marker(NamedTuple):
-    """What the marker of a folder tells: the command, and the digest of every file by name."""
+    """The content of a folder's marker: the command, and the digest of every file by name."""
 
     by: str
     files: Mapping[str, str]
@@ -57,8 +57,8 @@ def check_folder(
     """Refuse a folder that the command `by` cannot or may not write (see the module's docstring),
     before anything is computed.
 
-    **Arguments:** `names`: what may be written, as names or patterns with `*`; `inputs`: files that
-    are read, which nothing may replace; `option`: where the folder comes from, for messages.
+    **Arguments:** `names`: files to write, as names or patterns with `*`; `inputs`: input files,
+    which are never replaced; `option`: the option that gave the folder, for messages.
 
     **Raises:** `InputError`.
     """
@@ -80,12 +80,12 @@ def check_folder(
 def replaced_folder(
     folder: str | Path, by: str, names: Iterable[str], force: bool = False
 ) -> Iterator[Path]:
-    """An empty folder to fill, which then takes the place of `folder` or of its files.
+    """An empty folder to fill, which then replaces `folder` or its files.
 
-    Where anything fails or interrupts, it is removed, and `folder` stays as it was. Arguments as of
-    `check_folder`; of what is there, `force` replaces what is among the names.
+    After a failure or an interrupt it is removed, and `folder` is unchanged. Arguments as of
+    `check_folder`; `force` replaces existing files among the names.
 
-    **Raises:** `InputError` where the folder may not or cannot be written.
+    **Raises:** `InputError` if the folder may not or cannot be written.
     """
     folder = Path(folder)
     real = Path(os.path.realpath(folder))
@@ -114,7 +114,7 @@ def replaced_folder(
 
 
 def recover(folder: str | Path) -> None:
-    """Settle what a command that was ended while it wrote the folder has left."""
+    """Complete or revert the exchange of a command that was ended while writing the folder."""
     real = Path(os.path.realpath(folder))
     for work in _works(real):
         if work.is_dir() and not work.is_symlink():
@@ -128,7 +128,7 @@ def recover(folder: str | Path) -> None:
 
 
 def read_marker(folder: Path) -> Marker | None:
-    """The marker of a folder; None if it has none that can be read."""
+    """The marker of a folder; None if it is missing or unreadable."""
     try:
         document = json.loads((folder / MARKER).read_bytes())
         files = {str(name): str(digest) for name, digest in document["files"].items()}
@@ -147,7 +147,7 @@ def _is_inside(folder: Path, name: str) -> bool:
 
 
 def _check_place(folder: Path, said: str) -> None:
-    """Refuse what is no folder, or where none can be made, or nothing written."""
+    """Refuse paths that are not folders, or cannot be created or written."""
     there = next((p for p in (folder, *folder.absolute().parents) if os.path.lexists(p)), folder)
     dangling = there == folder and os.path.islink(there) and not os.path.exists(there)
     if not os.path.isdir(there) and not dangling:
@@ -159,7 +159,7 @@ def _check_place(folder: Path, said: str) -> None:
 def _refuse_others(
     folder: Path, real: Path, by: str, names: Sequence[str], said: str
 ) -> None:
-    """Refuse a folder that is not this command's, and what is not its own among `names`."""
+    """Refuse folders of other commands, and other files among `names`."""
     marker, entries = read_marker(real), _entries(real)
     if not entries:
         return
@@ -199,7 +199,7 @@ def _entries(real: Path) -> list[str]:
 
 
 def _taken(real: Path, names: Sequence[str], own: Iterable[str]) -> list[str]:
-    """Files among `names` that are there, less those that the marker lists."""
+    """Existing files among `names`, except those listed by the marker."""
     found = {}
     for name in names:
         paths = real.glob(name) if "*" in name else [real / name]
@@ -208,7 +208,7 @@ def _taken(real: Path, names: Sequence[str], own: Iterable[str]) -> list[str]:
 
 
 def _digest(path: Path) -> str | None:
-    """Of the content of a file; None where nothing is, empty for anything else."""
+    """Digest of the content of a file; None if it is missing, empty for anything else."""
     if not os.path.lexists(path):
         return None
     if path.is_symlink() or not path.is_file():
@@ -222,8 +222,8 @@ def _works(real: Path) -> tuple[Path, Path]:
 
 
 def _make_work(real: Path) -> Path:
-    """The folder for the new and the old files: beside, if what is in it can be moved from there
-    to the folder, which may be on another disk than its surroundings; else inside."""
+    """The folder for the new and the old files: beside, if files can be moved from there
+    to the folder, which may be on another disk; else inside."""
     beside, inside = _works(real)
     if not real.is_dir():
         beside.mkdir(exist_ok=True)
@@ -243,7 +243,7 @@ def _held(folder: str | Path, work: Path) -> AbstractContextManager[None]:
 def _replace(
     folder: Path, real: Path, work: Path, by: str, names: Sequence[str], force: bool
 ) -> None:
-    """Let the new files, which are complete, take the place of the old ones."""
+    """Replace the old files by the complete new ones."""
     new = work / NEW
     files = {name: _digest(new / name) for name in _files(new)}
     about = f"Files that jaxbundle {by} has written here, and may replace."
@@ -272,7 +272,7 @@ def _replace(
 
 
 def _exchange(real: Path, work: Path, files: Iterable[str], going: Sequence[str]) -> None:
-    """Let the new files take the place of those that go, all or none."""
+    """Replace old files by the new ones, all or none."""
     new, old = work / READY, work / OLD
     os.rename(work / NEW, new)
     if not real.exists():
@@ -299,9 +299,9 @@ def _check_way(real: Path, name: str) -> None:
     for parent in [*pure.parents][:-1]:
         path = real / parent
         if path.is_symlink() or (path.exists() and not path.is_dir()):
-            raise InputError(f"{path}: a folder is to be written there; move it away")
+            raise InputError(f"{path}: a folder would be written there; move it away")
     if (real / pure).is_dir() and not (real / pure).is_symlink():
-        raise InputError(f"{real / pure}: is a folder; a file is to be written there; move it away")
+        raise InputError(f"{real / pure}: is a folder; a file would be written there; move it away")
 
 
 def _move_back(work: Path, real: Path) -> None:
@@ -316,7 +316,7 @@ def _move_back(work: Path, real: Path) -> None:
 
 
 def _settle(work: Path, real: Path) -> None:
-    """Move the old files back, unless the new ones are all in place; remove what is left."""
+    """Move the old files back, unless the new ones are all in place; remove the rest."""
     _move_back(work, real)
     for name in (NEW, READY, OLD):
         shutil.rmtree(work / name, ignore_errors=True)

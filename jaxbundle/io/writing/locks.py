@@ -1,8 +1,8 @@
 """A file that one process at a time writes.
 
 The lock is an empty file beside it, `.NAME.lock`, that the operating system keeps locked (flock; on
-Windows its first byte) until the process ends, however it ends: one left behind by a killed process
-hinders nobody. The file itself may be renamed over meanwhile.
+Windows its first byte) until the process ends in any way: a lock file left by a killed process
+has no effect. The file may be renamed over meanwhile.
 """
 
 import errno
@@ -16,7 +16,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.system.temporaries import temporary, unbroken
 
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
-"""Errors of a file system that has no locks."""
+"""Errors of file systems without locks."""
 
 
 @contextmanager
@@ -25,10 +25,10 @@ def locked(
 ) -> Iterator[None]:
     """Hold the lock of a file, which need not exist; devices and pipes have none.
 
-    **Arguments:** `named`: what messages say is being written, the file by default; `needed`:
+    **Arguments:** `named`: the name in messages, by default the file; `needed`:
     whether a file system without locks is an error.
 
-    **Raises:** `InputError` if another process holds it, or no lock can be had.
+    **Raises:** `InputError` if another process holds it, or it cannot be locked.
     """
     if os.path.exists(path) and not os.path.isfile(path):
         yield
@@ -38,10 +38,10 @@ def locked(
         raise InputError(f"{told}: there is no folder {real.parent}")
     lock = real.with_name(f".{real.name}.lock")
     with ExitStack() as held:
-        with unbroken():  # A lock is removed by the process that has it, and by no other.
+        with unbroken():  # A lock is removed only by the process that holds it.
             held.enter_context(_taken(lock, told, needed))
-            # Gone before it is let go: nobody else gets a lock on a file that is about to vanish.
-            # Windows removes no open file: there it stays.
+            # Removed before release: no other process locks a file about to vanish.
+            # Windows cannot remove open files: there it stays.
             held.enter_context(temporary(lock))
         yield
 
@@ -59,7 +59,7 @@ def _taken(lock: Path, told: str | Path, needed: bool) -> BinaryIO:
         ) from None
     except OSError as error:
         raise InputError(
-            f"{told}: its lock {lock} cannot be made: {error.strerror}; the folder must take files"
+            f"{told}: its lock {lock} cannot be made: {error.strerror}; the folder must be writable"
         ) from None
     return stream
 
@@ -67,7 +67,7 @@ def _taken(lock: Path, told: str | Path, needed: bool) -> BinaryIO:
 def _opened(lock: Path, needed: bool) -> BinaryIO | None:
     """The file, locked; None if it vanished meanwhile.
 
-    **Raises:** `BlockingIOError` if somebody else has the lock."""
+    **Raises:** `BlockingIOError` if another process has the lock."""
     stream = open(lock, "ab")
     try:
         try:

@@ -1,4 +1,4 @@
-"""Files replaced whole or not at all: written under a temporary name beside, then renamed."""
+"""Files replaced completely or not at all: written under a temporary name beside, then renamed."""
 
 import errno
 import os
@@ -12,7 +12,7 @@ from jaxbundle.system.temporaries import temporary, unbroken
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 LONGEST_STEM = 60
-"""Characters of a name that its temporary name has: the whole of it may be too long."""
+"""Characters of a name in its temporary name, which could otherwise be too long."""
 
 
 @contextmanager
@@ -24,14 +24,14 @@ def replaced_file(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def replaced_files(*paths: str | Path) -> Iterator[tuple[Path, ...]]:
-    """Temporary names, beside some files, to write to; at the end they are renamed to those.
+    """Temporary names, beside some files, to write to; at the end they are renamed to the files.
 
-    Where writing fails, none is renamed and the temporary files are removed; the files that were
-    there stay as they are. Of several, the renames follow each other: where the system refuses a
-    later one (a file that must not be changed), the earlier files are the new ones and the message
-    names that one. A link stays a link: what it leads to is replaced.
+    If writing fails, none is renamed and the temporary files are removed; existing files
+    are unchanged. Several files are renamed in sequence: if the system refuses a
+    later one (a read-only file), the earlier files are new and the message
+    names the refused one. A link stays a link: its target is replaced.
 
-    **Raises:** `InputError` for an error of the disk, and for what is there and no file.
+    **Raises:** `InputError` for disk errors, and if the path exists but is not a file.
     """
     real = [Path(os.path.realpath(path)) for path in paths]
     for path, target in zip(paths, real):
@@ -60,7 +60,7 @@ def replaced_files(*paths: str | Path) -> Iterator[tuple[Path, ...]]:
 
 
 def unwritable(path: str | Path, error: OSError) -> InputError:
-    """Why a file or folder cannot be written, in one line; of a full disk, which it is."""
+    """Why a file or folder cannot be written, in one line; a full disk is named."""
     why = error.strerror or " ".join(str(error).split())
     return InputError(
         f"{path}: cannot be written: {why}{disk_of(path) if error.errno in FULL else ''}"
@@ -68,7 +68,7 @@ def unwritable(path: str | Path, error: OSError) -> InputError:
 
 
 def disk_of(path: str | Path) -> str:
-    """The disk a file is on, and what is free there, as the end of a message."""
+    """The disk of a file and its free space, as the end of a message."""
     place = Path(os.path.realpath(path))
     while not place.exists():
         place = place.parent
