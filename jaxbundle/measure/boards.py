@@ -1,6 +1,6 @@
-"""Boards: flat objects with points that are found and numbered in photographs.
+"""Boards: flat objects whose points are found and numbered in photographs.
 
-The points lie in rows, which are numbered from the top, in each from the left: "1-1", "1-2", ….
+The points form rows, numbered from the top, each from the left: "1-1", "1-2", ….
 X runs along the rows to the right, Y up, Z towards the viewer; the origin is the left point of the
 last row.
 
@@ -11,10 +11,10 @@ last row.
 | `asymmetric-circles` | the same, every other row shifted by half a step | circles of a row, rows |
 | `charuco` | corners of the squares; may be hidden in part | squares |
 
-Which corner is the first: of a chessboard the one whose square beyond, to the upper left, is black,
-or, where a half turn leaves the colours as they are (columns + rows even), of the two that are
-possible the upper one in the photograph. Circles in straight rows cannot tell a half turn either.
-A board that is taken as it is known does not mind; one whose points are estimated does
+The first corner of a chessboard has a black square beyond it, to the upper left; if a half turn
+does not change the colours (columns + rows even), the upper of the two possible corners in the
+photograph is the first. For circles in straight rows a half turn is not recognised either. This
+does not matter for a board with known points, but for one with estimated points
 (`Board.unique`).
 """
 
@@ -39,18 +39,18 @@ def _is_length(x: float) -> bool:
 
 @dataclasses.dataclass(frozen=True)
 class Board:
-    """A board: how many points, how far apart, and what they are.
+    """A board: number, spacing and kind of its points.
 
     **Fields:**
 
     - `columns`, `rows`: as the table above counts them.
-    - `square`: side of a square, or distance of neighbouring circles, in the object unit; of
-      `asymmetric-circles` the distance of neighbouring rows, half of that of circles of a row.
+    - `square`: side of a square, or distance of neighbouring circles, in the object unit; for
+      `asymmetric-circles` the distance of neighbouring rows, half that of circles in a row.
     - `kind`: see the table.
     - `diameter`: of the circles, object unit: their images are then corrected for eccentricity.
     - `marker`, `dictionary`: side and OpenCV dictionary of the markers of `charuco`.
 
-    **Raises:** `InputError` for a board that cannot be.
+    **Raises:** `InputError` for an impossible board.
     """
 
     columns: int
@@ -104,7 +104,7 @@ class Board:
 
     @property
     def unique(self) -> bool:
-        """Whether a photograph tells which point is which, a half turn of the board included."""
+        """Whether points are identified in a photograph even after a half turn of the board."""
         if self.kind == "chessboard":
             return (self.columns + self.rows) % 2 == 1
         if self.kind == "asymmetric-circles":
@@ -116,7 +116,7 @@ class Board:
 
 
 def require_board(board: Board) -> Board:
-    """The board, or a complaint about what was given instead.
+    """The board, or an error about another argument.
 
     **Raises:** `InputError`."""
     if not isinstance(board, Board):

@@ -1,4 +1,4 @@
-"""A cloud of points made regular: cubes that hold enough points, each replaced by its corner."""
+"""A regular point cloud: cubes with enough points, each replaced by its corner."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -9,9 +9,9 @@ from jaxbundle.errors import InputError
 def filter_cloud(
     points: Float[np.ndarray, "n 3"], size: float, least: int = 1
 ) -> tuple[Float[np.ndarray, "cubes 3"], Int[np.ndarray, " cubes"]]:
-    """The lowest corners of the cubes of side `size` that hold at least `least` points.
+    """The lowest corners of the cubes of side `size` with at least `least` points.
 
-    The cubes stand on whole multiples of their side; points on a face belong to the higher one.
+    Cubes begin at whole multiples of their side; points on a face belong to the higher one.
 
     **Returns:** corners in the unit of the points, in ascending order, and numbers of points.
     """

@@ -1,4 +1,4 @@
-"""Coded targets: points that tell their own names.
+"""Coded targets: points identified by a code.
 
 | kind | points | names |
 |---|---|---|
@@ -10,7 +10,7 @@
 
 Corners 1 to 4 go clockwise from the upper left one of the marker. A ring-coded target is a light
 disc of radius r on dark ground, and about it a ring from 2·r to 3·r of as many sectors as bits,
-light for 1; the code is the smallest number that its bits give, whatever sector is the first
+light for 1; the code is the smallest number of its bits for any first sector
 (Schneider and Sinnreich, 1992). Its centre is that of the ellipse of the disc (`targets.py`).
 """
 
@@ -33,13 +33,13 @@ CORNER = 0.1
 WITHIN = 3
 """Half a window in which a corner is refined, pixels."""
 SAMPLES = 20
-"""Places sampled in every sector of a ring."""
+"""Samples in every sector of a ring."""
 GAP, RING, BEYOND = 1.5, 2.5, 3.4
 """Radii in the middle of the dark gap, of the ring, and beyond it, in radii of the disc."""
 FEWEST_PIXELS, ROUND = 20, 0.12
-"""Pixels of a disc, and by which part its area may differ from that of its ellipse."""
+"""Minimum pixels of a disc, and the relative tolerance of its area to that of its ellipse."""
 CLEAR = 0.3
-"""Part of the contrast by which sectors and the gap may differ from light and dark."""
+"""Tolerance of sectors and the gap relative to the contrast."""
 
 
 @shows_itself
@@ -56,7 +56,7 @@ class NamedPoints:
 
 
 def find_coded_targets(grey: UInt8[np.ndarray, "rows columns"], kind: str) -> NamedPoints:
-    """The coded targets of a photograph; of a name that is there twice none.
+    """The coded targets of a photograph, without repeated names.
 
     **Raises:** `InputError` for an unknown kind.
     """
@@ -70,7 +70,7 @@ def find_coded_targets(grey: UInt8[np.ndarray, "rows columns"], kind: str) -> Na
 
 
 def check_kind(kind: str) -> None:
-    """Refuse a kind that is none.
+    """Refuse unknown kinds.
 
     **Raises:** `InputError`."""
     name = kind.partition(":")[0]
@@ -141,7 +141,7 @@ def _rings(grey, bits):
             found.append((*read, target))
     kept = []
     for _, code, target in sorted(found, key=lambda one: one[0]):
-        # a sector of a ring may look like a disc with a ring; the clearer one is right
+        # a sector of a ring may look like a disc with a ring; the more distinct one is right
         reach = 3 * target.axes[0]
         if all(np.linalg.norm(target.xy - t.xy) > max(reach, 3 * t.axes[0]) for _, t in kept):
             kept.append((code, target))
@@ -149,7 +149,7 @@ def _rings(grey, bits):
 
 
 def _discs(grey):
-    """Middles of light blobs that fill the ellipse of their outline."""
+    """Centres of light blobs that fill the ellipse of their outline."""
     cv2 = need_opencv()
     side = max(15, (min(grey.shape) // 20) | 1)
     light = cv2.adaptiveThreshold(
@@ -161,14 +161,14 @@ def _discs(grey):
         if area < FEWEST_PIXELS or len(outline) < 6:
             continue
         middle, axes, _ = cv2.fitEllipse(outline)
-        # the outline goes through the middles of the outermost pixels
+        # the outline passes through the centres of the outermost pixels
         full = np.pi / 4 * axes[0] * axes[1]
         if min(axes) > 0.25 * max(axes) and abs(area / max(full, 1e-9) - 1) < ROUND:
             yield np.array(middle)
 
 
 def _code(grey, target, bits):
-    """How badly the ring about a disc reads, and its code; None where there is none."""
+    """The misfit of the ring around a disc, and its code; None if there is none."""
     from scipy.ndimage import map_coordinates
 
     n = bits * SAMPLES
@@ -185,7 +185,7 @@ def _code(grey, target, bits):
     gap, value, beyond = ((a - dark) / target.contrast for a in (gap, ring, beyond))
     if np.abs(gap).max() > CLEAR or beyond.mean() > 0.5:
         return None
-    # the sectors begin where the changes are
+    # the sectors begin at the changes
     by_start = np.stack([np.roll(value, -k).reshape(bits, SAMPLES) for k in range(SAMPLES)])
     inner = by_start[:, :, SAMPLES // 5 : -(SAMPLES // 5)]
     best = int(inner.var(2).sum(1).argmin())

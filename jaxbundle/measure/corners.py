@@ -1,10 +1,10 @@
-"""Boards found in photographs through OpenCV, their points numbered as `boards` says.
+"""Detection of boards in photographs by OpenCV, with the numbering of `boards`.
 
 Corners of squares are refined by OpenCV's `cornerSubPix`: the point to which all grey-value
 gradients around it are perpendicular (Förstner and Gülch, 1987). Its window is chosen from the
-distance to the next corner. Circles are refined by `targets`. Boards are sought in a smaller copy
+distance to the next corner. Circles are refined by `targets`. Boards are searched in a reduced copy
 of a large photograph (24 million pixels take 25 s, one of 1600 columns 1 s), points are measured in
-the photograph itself.
+the original.
 """
 
 import dataclasses
@@ -20,21 +20,21 @@ from jaxbundle.photographs.opencv import need_opencv
 Grey = UInt8[np.ndarray, "rows columns"]
 
 WINDOW = 0.35
-"""Half a window, in distances to the next corner: no other corner's edges end in it."""
+"""Half a window relative to the distance to the next corner: no other corner is in it."""
 SIDES = (1600, 3200)
-"""Longer sides of the copies in which boards are sought, in pixels, one after the other."""
+"""Longer sides of the reduced copies in which boards are searched in turn, in pixels."""
 MARKERS = 3
-"""More markers than this show that a board has another dictionary: false ones are rare."""
+"""More markers than this prove another dictionary: false ones are rare."""
 QUICK = 800
-"""The same, where boards of other sizes are tried."""
+"""The same for boards of other sizes."""
 SMALLEST, LARGEST = 2, 15
 """Limits of half a window, in pixels."""
 
 
 def find_board(grey: Grey, board: Board) -> Float[np.ndarray, "points 2"]:
-    """The image points of a board in a photograph, pixels; NaN where a point was not found.
+    """The image points of a board in a photograph, pixels; NaN for missing points.
 
-    **Raises:** `InputError` that says why there are none.
+    **Raises:** `InputError` with the reason if there are none.
     """
     cv2 = need_opencv()
     if min(grey.shape) < 16:
@@ -47,10 +47,10 @@ def find_board(grey: Grey, board: Board) -> Float[np.ndarray, "points 2"]:
 
 
 def other_sizes(grey: Grey, board: Board) -> Board | None:
-    """The largest board of another size, of the same kind, that is in the photograph.
+    """The largest board of another size, of the same kind, in the photograph.
 
-    Chessboards of any size; circles with columns and rows changed, and some less or more of either;
-    ChArUco boards of the same size with markers of another dictionary.
+    Chessboards of any size; circles with columns and rows exchanged, or some less or more of
+    either; ChArUco boards of the same size with markers of another dictionary.
     """
     if board.kind == "chessboard":
         other = largest_chessboard(grey, board)
@@ -60,7 +60,7 @@ def other_sizes(grey: Grey, board: Board) -> Board | None:
     m, n = board.columns, board.rows
     near = [(n, m)] + [(m + i, n + j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
     grey, _ = _reduced(need_opencv(), grey, QUICK)
-    # A part of a board is a board as well: the largest is sought first.
+    # A part of a board is a board too: the largest is searched first.
     for columns, rows in sorted(near, key=lambda size: -size[0] * size[1]):
         try:
             other = dataclasses.replace(board, columns=columns, rows=rows)
@@ -72,8 +72,8 @@ def other_sizes(grey: Grey, board: Board) -> Board | None:
 
 
 def _with_other_markers(grey: Grey, board: Board) -> Board | None:
-    """The board with the dictionary of which most markers are in the photograph; of several that
-    have the same markers the smallest."""
+    """The board with the dictionary of most markers in the photograph; of several with
+    the same markers the smallest."""
     aruco = need_opencv().aruco
     names = sorted(name for name in dir(aruco) if name.startswith("DICT_"))
     known = {name: aruco.getPredefinedDictionary(getattr(aruco, name)) for name in names}
@@ -90,8 +90,8 @@ def _with_other_markers(grey: Grey, board: Board) -> Board | None:
 
 
 def largest_chessboard(grey: Grey, board: Board) -> Board | None:
-    """The chessboard in the photograph with all its corners, whatever their number; sought in a
-    small copy. More columns than rows, or as `board` has them."""
+    """The chessboard in the photograph with all its corners, of any number; searched in a
+    reduced copy. More columns than rows, or as in `board`."""
     cv2 = need_opencv()
     grey, _ = _reduced(cv2, grey, QUICK)
     least = LEAST["chessboard"]
@@ -130,7 +130,7 @@ def _chessboard(cv2, grey, board):
 
 
 def _in_copies(cv2, grey, seek):
-    """What `seek` finds in smaller copies of the image, as pixels of the image; None: nothing."""
+    """The result of `seek` in reduced copies, in pixels of the image; None: nothing found."""
     sides = [side for side in SIDES if side < max(grey.shape)]
     for side in (*sides, max(grey.shape))[: len(SIDES)]:
         copy, factor = _reduced(cv2, grey, side)
@@ -141,7 +141,7 @@ def _in_copies(cv2, grey, seek):
 
 
 def _reduced(cv2, grey, side):
-    """The image made smaller by a whole factor, so that no side is longer; and the factor."""
+    """The image reduced by a whole factor to the maximum side; and the factor."""
     factor = -(-max(grey.shape) // side)
     if factor < 2:
         return grey, 1
@@ -151,7 +151,7 @@ def _reduced(cv2, grey, side):
 
 
 def _refined(cv2, grey, xy):
-    """Corners [rows, columns, 2], each in a window that no other corner reaches."""
+    """Refined corners [rows, columns, 2], each in a window without other corners."""
     near = [np.linalg.norm(np.diff(xy, axis=axis), axis=2) for axis in (0, 1)]
     half = int(np.clip(WINDOW * min(d.min() for d in near), SMALLEST, LARGEST))
     return _by_gradients(cv2, grey, xy.reshape(-1, 2), half).reshape(xy.shape)
@@ -165,7 +165,7 @@ def _by_gradients(cv2, grey, xy, half):
 
 
 def _turned_right(xy):
-    """Rows from the top, in each from the left: no mirror image, and the first row above."""
+    """Rows from the top, each from the left: not mirrored, the first row at the top."""
     right, down = xy[:, -1] - xy[:, 0], xy[-1] - xy[0]
     if np.linalg.det([right.sum(0), down.sum(0)]) < 0:
         xy = xy[:, ::-1]
@@ -174,7 +174,7 @@ def _turned_right(xy):
 
 
 def _first_black(grey, xy, board):
-    """The numbering, of the two or four possible ones, whose first square is black."""
+    """The one of two or four possible numberings with a black first square."""
     turns = [xy, xy[::-1, ::-1]]
     if board.columns == board.rows:
         quarter = xy[:, ::-1].swapaxes(0, 1)
@@ -183,7 +183,7 @@ def _first_black(grey, xy, board):
 
 
 def _contrast(grey, xy):
-    """How much darker the squares of the first one's colour are; a tie is 0."""
+    """Grey-value difference between squares of the other and of the first colour; 0: undecided."""
     middle = (xy[:-1, :-1] + xy[1:, 1:] + xy[:-1, 1:] + xy[1:, :-1]) / 4
     column, row = np.rint(middle).astype(int).reshape(-1, 2).T
     shade = grey[row, column].astype(float).reshape(middle.shape[:2])
@@ -217,7 +217,7 @@ def _charuco(cv2, grey, board):
         )
     xy, ids = best
     apart = np.linalg.norm(xy[:, None] - xy[None], axis=2)
-    # the markers beside a corner must not reach into its window
+    # no markers beside a corner in its window
     free = 0.5 * (1 - marker / board.square)
     half = int(np.clip(min(WINDOW, free) * apart[apart > 0].min(), SMALLEST, LARGEST))
     found = np.full((len(board.ids), 2), np.nan)
@@ -253,7 +253,7 @@ def _circles(cv2, grey, board):
 
 
 def _blob_finder(cv2, grey, shade):
-    """Round blobs of any size that fits into the image; OpenCV's own limit is 5000 pixels."""
+    """Round blobs of any size in the image; the limit of OpenCV is 5000 pixels."""
     wanted = cv2.SimpleBlobDetector_Params()
     wanted.blobColor = shade
     wanted.minArea, wanted.maxArea = 15, grey.size / 8
@@ -264,7 +264,7 @@ def _blob_finder(cv2, grey, shade):
 
 
 def _uneven_rows(xy):
-    """The numbering whose second row is shifted to the right, not a mirror image."""
+    """The numbering with the second row shifted to the right, not mirrored."""
 
     def fits(xy):
         right, down = xy[0, -1] - xy[0, 0], xy[-1] - xy[0]

@@ -1,7 +1,7 @@
-"""An ellipse through edge points, and where the centre of a circle lies in it.
+"""An ellipse through edge points, and the image of a circle's centre in it.
 
 The conic A·x² + B·xy + C·y² + D·x + E·y + F = 0 of least Σ F(x, y)² under 4AC − B² = 1 is an
-ellipse whatever the points (Fitzgibbon, Pilu and Fisher, 1999), found in the stable way of Halíř
+ellipse for any points (Fitzgibbon, Pilu and Fisher, 1999), computed by the stable method of Halíř
 and Flusser (1998): D, E, F are eliminated; then, with T the reduced scatter matrix = L·Lᵀ,
 
     C₁·a = μ·T·a,   C₁ = [[0, 0, 2], [0, −1, 0], [2, 0, 0]],   a = L⁻ᵀ·(eigenvector of L⁻¹·C₁·L⁻ᵀ
@@ -17,9 +17,9 @@ is the pole of the line at infinity, the image of the direction
 
     H·diag(−ρ², −ρ², 1)·Hᵀ·z = q·X − ρ²·(z − n_q·n)
 
-since a·aᵀ + b·bᵀ = 1 − n·nᵀ (compare Ahn, Warnecke and Kotowski, 1999; Dold, 1996). Where the
-distortion bends over the circle's image, that image is no ellipse: `rim_centre_shift` fits one to
-it, as it is measured.
+since a·aᵀ + b·bᵀ = 1 − n·nᵀ (compare Ahn, Warnecke and Kotowski, 1999; Dold, 1996). If the
+distortion varies over the circle's image, it is not an ellipse: `rim_centre_shift` fits one to
+it, as in the measurement.
 """
 
 import equinox as eqx
@@ -55,7 +55,7 @@ def fit_ellipse(
 
     **Arguments:** `weights`: 0: the point is absent.
 
-    **Returns:** NaN where the points determine no ellipse.
+    **Returns:** NaN if the points determine no ellipse.
     """
     p = jnp.ones(xy.shape[0]) if weights is None else weights
     xy = jnp.where(p[:, None] > 0, xy, 0.0)
@@ -84,7 +84,7 @@ def fit_ellipse(
     spare = jnp.maximum(jnp.sum(p > 0) - 5, 1)
     sigma0 = jnp.sqrt(jnp.sum(p * distance**2) / spare)
     design = jnp.sqrt(p)[:, None] * rows / slope[:, None]
-    # the length of the conic's coefficients means nothing: it is held
+    # the length of the conic's coefficients has no meaning: it is held
     N = design.T @ design + jnp.trace(design.T @ design) * jnp.outer(conic, conic)
     J = jax.jacfwd(_centre)(conic)
     covariance = sigma0**2 * J @ jnp.linalg.solve(N, J.T)
@@ -108,7 +108,7 @@ def circle_centre_shift(
 ) -> Float[Array, "2"]:
     """Centre of the image of a circle minus image of its centre: the eccentricity of projection.
 
-    Subtract it from the measured centre of the ellipse. Distortion is taken as linear over the
+    Subtract it from the measured centre of the ellipse. Distortion is assumed linear over the
     circle's image.
 
     **Arguments:** `p`: parameters of the camera; `centre`, `radius` of the circle in the object
@@ -131,7 +131,7 @@ def rim_centre_shift(
     radius: Scalar,
 ) -> Float[Array, "2"]:
     """Centre of the ellipse through the image of a circle's rim minus image of its centre: as
-    `circle_centre_shift`, and with the distortion as it is along the rim."""
+    `circle_centre_shift`, with the actual distortion along the rim."""
     aside = jnp.where(jnp.abs(normal[0]) < 0.8, jnp.array([1.0, 0, 0]), jnp.array([0, 1.0, 0]))
     a = jnp.cross(normal, aside)
     a = a / jnp.linalg.norm(a)
@@ -142,7 +142,7 @@ def rim_centre_shift(
 
 
 def _centre(conic):
-    """Where the gradient of the conic vanishes."""
+    """The point with zero gradient of the conic."""
     A, B, C, D, E, _ = conic
     determinant = 4 * A * C - B * B
     return jnp.stack([B * E - 2 * C * D, B * D - 2 * A * E]) / determinant

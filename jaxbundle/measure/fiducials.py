@@ -5,8 +5,8 @@
     projective   X = (a·x + b·y + c)/(g·x + h·y + 1),  Y = (d·x + e·y + f)/(g·x + h·y + 1)
 
 by least squares on v = computed − calibrated image coordinates, σ0² = vᵀPv/(2n − u). The affine one
-takes up two scales and a shear of film or scanner; the similarity nothing but scale and position,
-and shows what the film did in its residuals.
+absorbs two scales and a shear of film or scanner; the similarity only scale and position,
+so that its residuals show film deformation.
 
 Source: Kraus (2007), Photogrammetry, section 3.2; Wolf and Dewitt (2000), appendices B and C.
 """
@@ -32,7 +32,7 @@ UNKNOWNS = {"similarity": 4, "affine": 6, "projective": 8}
 @shows_itself
 @dataclasses.dataclass(frozen=True)
 class Transformation:
-    """A transformation of the plane with what it leaves.
+    """A transformation of the plane with its residuals.
 
     **Fields:** `parameters` in the order of the letters above and their `covariance` (a posteriori;
     NaN without redundancy); `residuals` v of the marks in the unit of the target, `sigma0`, the σ
@@ -47,7 +47,7 @@ class Transformation:
     redundancy: int
 
     def __call__(self, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Points of the source in the target."""
+        """Points of the source in the target system."""
         return np.asarray(_transform_all(self.kind, self.parameters, np.asarray(xy, float)))
 
     def __str__(self) -> str:
@@ -61,7 +61,7 @@ class Transformation:
 def transform(
     kind: str, p: Float[AnyArray, " u"], point: Float[AnyArray, "2"]
 ) -> Float[Array, "2"]:
-    """A point (x, y) of the source in the target."""
+    """A point (x, y) of the source in the target system."""
     if kind == "similarity":
         a, b, c, d = p
         p = jnp.stack([a, -b, c, b, a, d])
@@ -131,7 +131,7 @@ def _fit(kind, unknowns, source, target, p):
     def residuals(q, source, target, root):
         return (root * (_transform_all(kind, q, source) - target)).ravel()
 
-    # linear ones end with the first step; for the projective one theirs is the start
+    # linear ones end with the first step; the projective one starts from it
     if kind == "projective":
         first = affine.fit(source, target, p)
         start = jnp.concatenate([first, jnp.zeros(2)])
@@ -140,7 +140,7 @@ def _fit(kind, unknowns, source, target, p):
 
 @partial(jax.jit, static_argnums=0)
 def _in_source_units(kind, q, middle, size):
-    """Parameters for (x, y) of those for (x − middle)/size, and their derivatives."""
+    """Parameters for (x, y) from those for (x − middle)/size, and their derivatives."""
 
     def same(q):
         (mx, my), k = middle, size

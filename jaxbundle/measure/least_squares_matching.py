@@ -2,37 +2,37 @@
 
     g1(x, y) + v = h0 + h1·g2(u, v),        [u, v] = A·[x, y, 1]
 
-with x, y counted from the centre of the window, A [2, 3] an affine transformation into the other
-image, whose last column is the place of the centre, h0 and h1 for brightness and contrast: eight
-unknowns. g2 between the pixels by the cubic spline through them; the Jacobian is that of automatic
+with x, y from the centre of the window, A [2, 3] an affine transformation into the other
+image, with the position of the centre in its last column, h0 and h1 for brightness and contrast:
+eight unknowns. g2 between the pixels by the cubic spline through them; the Jacobian by automatic
 differentiation. Damped steps (Marquardt).
 
 Interpolated noise of variance σ² has the variance σ²·κ(u)·κ(v), periodic by pixels: 1 at a pixel,
-0.57 in the middle of four. With like noise in both windows
+0.57 in the middle of four. With equal noise in both windows
 
     E vᵀv/(n − 8) = σ²·(1 + h1²·κ̄),    C = σ²·(1 + h1²)·N⁻¹,
 
-since the gradients are smooth and the interpolation does not take their noise away. C is the
-covariance of the one place relative to the other: half of it belongs to either window. And vᵀv is
-least where the noise is, midway between pixels; its expectation ½·σ²·h1²·Σκ(u)·κ(v) draws p by
-−N⁻¹·∂/∂p of it, which is taken off.
+since the gradients are smooth and interpolation does not reduce their noise. C is the
+covariance of one position relative to the other: each window has half of it. Noise makes vᵀv
+smallest midway between pixels; its expectation ½·σ²·h1²·Σκ(u)·κ(v) shifts p by
+−N⁻¹·∂/∂p of it, which is subtracted.
 
-Cubic convolution instead of the spline shifts places by up to 0.03 pixel on sharp photographs.
+Cubic convolution instead of the spline shifts positions by up to 0.03 pixel on sharp photographs.
 
 Both images may have been smoothed by a Gaussian of s pixels before (`blur`). Then noise is not
-interpolated away, but correlated, by R = exp(−d²/4s²) at a distance of d pixels:
+reduced by interpolation, but correlated, with R = exp(−d²/4s²) at a distance of d pixels:
 
     E vᵀv = σ²·(n² − tr(N⁻¹·JᵀRJ)),    C = σ²·N₀⁻¹·JᵀRJ·N₀⁻¹,
 
-with N₀ = N − E JₙᵀJₙ: the gradients of noise, of variance σ²/2s², are in N, but determine nothing.
+with N₀ = N − E JₙᵀJₙ: noise gradients, of variance σ²/2s², are in N, but determine nothing.
 
-Where the surface is no plane within the window, residuals are not noise: they go together, and are
+If the surface is not a plane within the window, residuals are not noise: they are correlated, and
 large in one part of it, such as behind an edge. With g = J'v of every pixel (its row of J times its
-residual) the covariance is that of their own correlations (`reach` pixels far),
+residual) the covariance follows from their correlations (over `reach` pixels),
 
     C = N⁻¹·Σ K(d)·g(x)·g(x + d)ᵀ·N⁻¹,    K = (1 − |dx|/reach)·(1 − |dy|/reach) or 0.
 
-On photographs of objects 3 to 40 m away it takes the errors above 4 σ from 3.4 to 0.9 %.
+On photographs of objects 3 to 40 m away it reduces errors above 4 σ from 3.4 to 0.9 %.
 
 Sources: Conley (1999), GMM estimation with cross sectional dependence, J. of Econometrics 92(1);
 Gruen (1985), Adaptive least squares correlation, South African J. of Photogrammetry 14(3);
@@ -55,13 +55,13 @@ from jaxbundle.types import AnyArray
 STEPS = 12
 """Evaluations of a matching: two of three end after six."""
 STILL = 0.005
-"""Steps below so many pixels, anywhere in the window, end the iterations."""
+"""Steps below this, anywhere in the window, end the iterations, pixels."""
 FAR = 0.5
 """The centre may move from its start by this part of the side of the window."""
 FLAT = 1e-6
-"""Standard deviation of grey values, in parts of the largest, below which there is no contrast."""
+"""Standard deviation of grey values, relative to the largest, below which there is no contrast."""
 DETERMINED = 1e-5
-"""Least square of a pivot of N, scaled to a unit diagonal, below it nothing is determined."""
+"""Smallest square of a pivot of N, scaled to a unit diagonal; below it nothing is determined."""
 TINY = 1e-20
 UNKNOWNS = 8
 
@@ -72,17 +72,17 @@ class MatchingStatus(IntEnum):
     CONVERGED = 0
     NOT_CONVERGED = 1
     OUTSIDE = 2
-    """The window reaches beyond the other image."""
+    """The window extends beyond the other image."""
     NO_TEXTURE = 3
-    """The grey values do not determine the place."""
+    """The grey values do not determine the position."""
     DIVERGED = 4
-    """It went too far from its start, or was turned inside out."""
+    """The match moved too far from its start, or was mirrored."""
 
 
 class LeastSquaresMatch(eqx.Module):
-    """`affine`: A, pixels of the other image; `radiometry`: (h0, h1); `covariance`: of the place
+    """`affine`: A, pixels of the other image; `radiometry`: (h0, h1); `covariance`: of the position
     A[:, 2], pixels², relative to the window; `sigma0`: of a grey value; `correlation`: ρ of the
-    window and what it was matched with; `status`: a `MatchingStatus`."""
+    window and its match; `status`: a `MatchingStatus`."""
 
     affine: Float[Array, "2 3"]
     radiometry: Float[Array, "2"]
@@ -109,11 +109,11 @@ def match_least_squares(
 
     **Arguments:** `template`: grey values of the window, n odd, its centre the point; `image`: the
     other image or a piece of it; `start`: A, from pixels about the centre of the window (x right, y
-    down) to pixels of `image`; `steps`: evaluations at most; `blur`: σ, pixels, of the Gaussian by
-    which the noise of both was smoothed, 0: white noise; `reach`: pixels, less than n/2, over which
-    residuals may go together, 0: they do not.
+    down) to pixels of `image`; `steps`: maximum evaluations; `blur`: σ, pixels, of the Gaussian by
+    which both were smoothed, 0: white noise; `reach`: pixels, less than n/2, over which
+    residuals may be correlated, 0: not at all.
 
-    **Returns:** `status` names what failed; the covariance is infinite where nothing is determined.
+    **Returns:** `status` gives the reason of a failure; the covariance is infinite if undetermined.
     """
     n, dtype = template.shape[0], template.dtype
     start = start.astype(dtype)
@@ -124,12 +124,12 @@ def match_least_squares(
     grey = ((template - mean) / unit).ravel()
     other = spline_coefficients((image.astype(dtype) - mean) / unit)
     x, y = _window(n, dtype)
-    # unknowns of one size: what they do at the edge of the window
+    # unknowns scaled by their effect at the edge of the window
     size = jnp.asarray([n // 2, n // 2, 1, n // 2, n // 2, 1, 1, 1], dtype)
     computed = lambda p: jax.vmap(_computed, (None, None, 0, 0))(p / size, other, x, y)
 
     def normal_equations(p):
-        # forward, kept: in reverse, or within the products, the grey values are looked up again
+        # forward, and stored: in reverse, or within the products, grey values are looked up again
         J, v = jax.lax.optimization_barrier((jax.jacfwd(computed)(p), computed(p) - grey))
         return J.T @ J, J.T @ v, v @ v
 
@@ -167,7 +167,7 @@ def match_least_squares(
 
 
 def _status(affine, start, shape, n, textured, known, moving):
-    """What ended a matching; of several reasons the first."""
+    """The first reason for the end of a matching."""
     middle = (jnp.asarray(shape[::-1]) - 1) / 2
     reach = jnp.max(jnp.abs(affine @ _corners(n, affine.dtype) - middle[:, None]), 1)
     away = jnp.linalg.norm(affine[:, 2] - start[:, 2])
@@ -186,7 +186,7 @@ def _status(affine, start, shape, n, textured, known, moving):
 
 
 def spline_coefficients(image: Float[AnyArray, "rows columns"]) -> Float[Array, "rows columns"]:
-    """Of the cubic spline through the pixels of an image, linear beyond its edge."""
+    """Coefficients of the cubic spline through the pixels of an image, linear beyond its edge."""
     down, along = (jnp.asarray(_prefilter(n), image.dtype) for n in image.shape)
     return down @ image @ along.T
 
@@ -198,7 +198,7 @@ def grey_value(coefficients: Float[AnyArray, "rows columns"], u, v) -> Float[Arr
     row = [jnp.clip(i.astype(int) + k, 0, rows - 1) for k in (-1, 0, 1, 2)]
     column = [jnp.clip(j.astype(int) + k, 0, columns - 1) for k in (-1, 0, 1, 2)]
     down, along = _spline_weights(v - i), _spline_weights(u - j)
-    # sums written out: one loop over the window, where small products are one call each
+    # sums written out: one loop over the window, whereas small products are one call each
     nil = jnp.zeros((), coefficients.dtype)
     line = lambda r: sum((b * coefficients[r, c] for b, c in zip(along, column)), nil)
     return sum((a * line(r) for a, r in zip(down, row)), nil)
@@ -244,7 +244,7 @@ def _correlated(J, n, blur):
 
 
 def _of_noise(contrast2, size, x, y, blur):
-    """E JₙᵀJₙ for residuals of variance 1, of which the other image has its part."""
+    """E JₙᵀJₙ for residuals of variance 1, for the share of the other image."""
     one, nil = jnp.ones_like(x), jnp.zeros_like(x)
     slope = jnp.sqrt(contrast2 / (1 + contrast2) / (2 * blur**2))
     u = jnp.stack([x, y, one, nil, nil, nil, nil, nil], 1) / size * slope
@@ -281,7 +281,7 @@ def _corners(n, dtype):
 
 
 def _with_radiometry(start, image, grey, x, y):
-    """The eight unknowns: A, and h0, h1 by the mean and the variance of what it covers."""
+    """The eight unknowns: A, and h0, h1 from the mean and the variance of the covered pixels."""
     u, v = start @ jnp.stack([x, y, jnp.ones_like(x)])
     covered = jax.vmap(grey_value, (None, 0, 0))(image, u, v)
     spread = jnp.std(covered)
@@ -290,11 +290,11 @@ def _with_radiometry(start, image, grey, x, y):
 
 
 def _minimise(normal_equations, begin, steps):
-    """The unknowns, N, vᵀv, and whether they still move, after damped steps."""
+    """The unknowns, N, vᵀv, and whether they still change, after damped steps."""
 
     def improve(state):
         count, p, N, g, square, damping, moving = state
-        # what is not determined does not move: a unit diagonal, and something beside it
+        # undetermined unknowns do not change: a unit diagonal, and a small addition
         scale = 1 / jnp.sqrt(jnp.diag(N) + TINY)
         scaled = N * scale * scale[:, None] + damping * jnp.eye(UNKNOWNS, dtype=N.dtype)
         step = -scale * cho_solve(cho_factor(scaled), scale * g)

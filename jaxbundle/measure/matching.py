@@ -1,14 +1,14 @@
 """A point of one image found in another: vertical line locus with normalised cross-correlation.
 
-A point (x, y) of the base image that lies between the heights Zmin and Zmax is, in the other image,
-on the segment between the images of its ground points at both. For heights along it, so close that
-the segment is covered in steps of half a pixel, the window around (x, y) is carried to the other
-image by way of the horizontal plane of that height, which takes the differences of scale and
-rotation with it, and compared:
+A point (x, y) of the base image with a height between Zmin and Zmax is, in the other image,
+on the segment between the images of its ground points at both heights. For heights along it, in
+steps of half a pixel on the segment, the window around (x, y) is transformed to the other
+image through the horizontal plane of that height, which includes the differences of scale and
+rotation, and compared:
 
     ρ = Σ(g − ḡ)(h − h̄)/√(Σ(g − ḡ)²·Σ(h − h̄)²)
 
-The largest ρ wins; a parabola through it and its neighbours gives the height between the steps.
+The largest ρ is taken; a parabola through it and its neighbours gives the height between the steps.
 
 Source: Bethel (1986), The DSR11 image correlator; Kraus (2007), section 6.8.
 """
@@ -28,9 +28,9 @@ from jaxbundle.measure.transfer import View, ground_point, image_point
 from jaxbundle.types import AnyArray
 
 STEP = 0.5
-"""Distance of the heights tried, as pixels of the other image."""
+"""Step of the heights, pixels of the other image."""
 FEWEST, MOST = 16, 4096
-"""Heights tried at least and at most."""
+"""Minimum and maximum number of heights."""
 
 
 @shows_itself
@@ -44,7 +44,7 @@ class Match:
 
 
 def correlation(a: Float[AnyArray, " n"], b: Float[AnyArray, " n"]) -> Float[Array, ""]:
-    """Normalised cross-correlation ρ of two windows; −1 where one of them has no contrast."""
+    """Normalised cross-correlation ρ of two windows; −1 if one has no contrast."""
     a, b = a - jnp.mean(a), b - jnp.mean(b)
     square = jnp.sum(a * a) * jnp.sum(b * b)
     there = square > 0
@@ -66,7 +66,7 @@ def find_match(
     **Arguments:** both photographs as grey values; both oriented views, of models in pixels with v
     down; `xy` pixels in `base`; heights in the object unit; `window`: its side in pixels, odd.
 
-    **Raises:** `InputError` where the window or the whole segment is outside the images.
+    **Raises:** `InputError` if the window or the whole segment is outside the images.
     """
     if any(v.model.unit != "px" or v.model.axes != "down" for v in (view, other_view)):
         raise InputError("matching needs cameras in pixels, v down (opencv, kannala-brandt)")
@@ -83,7 +83,7 @@ def find_match(
     ends = np.asarray(_locus(view, other_view, place, jnp.array([Zmin, Zmax])))
     length = np.linalg.norm(ends[1] - ends[0])
     steps = FEWEST if not np.isfinite(length) else math.ceil(length / STEP) + 1
-    # a power of two, lest every point compile a program of its own
+    # a power of two, so that points share compiled programs
     steps = min(2 ** math.ceil(math.log2(max(steps, FEWEST))), MOST)
     Z = jnp.linspace(Zmin, Zmax, steps)
     rho = np.asarray(_correlations(grey, other_grey, view, other_view, place, Z, half))
@@ -97,7 +97,7 @@ def find_match(
 
 
 def _peak(rho, best):
-    """Where a parabola through three neighbours has its top, in steps from the middle one."""
+    """The vertex of a parabola through three neighbours, in steps from the middle one."""
     if not 0 < best < len(rho) - 1 or not np.isfinite(rho[best - 1 : best + 2]).all():
         return 0.0
     left, middle, right = rho[best - 1 : best + 2]

@@ -1,28 +1,28 @@
 """A light or dark spot in a photograph: its window, its threshold, its pixels.
 
-A window about the place given grows until the spot nearest to it ends inside. Threshold within a
-window: the grey value that separates two classes best (Otsu, 1979); what the rim of the window
-shows is background. The noise σg of the grey values is estimated by a mask that cancels what is
-linear in the image (Immerkær, 1996).
+A window around the given position grows until it contains the nearest spot. Threshold within a
+window: the grey value that separates two classes best (Otsu, 1979); the rim of the window
+is background. The noise σg of the grey values is estimated by a mask that cancels
+linear changes of the image (Immerkær, 1996).
 """
 
 import dataclasses
 
 import numpy as np
-import scipy  # whose parts are loaded when they are used
+import scipy  # its parts are loaded on use
 
 from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
 
 FIRST, LARGEST = 8, 256
-"""Half a window, in pixels: where it begins, and the largest."""
+"""Half a window, in pixels: the first, and the largest."""
 CONTRAST = 5.0
-"""A target differs from its background by more than so many σg."""
+"""Minimum difference of a target from its background, in σg."""
 LEAST_CONTRAST = 4.0
-"""And by so many grey values."""
+"""Minimum difference of a target from its background, in grey values."""
 LEAST_PIXELS = 5
 MARGIN = 3
-"""Pixels beyond the spot that its blurred edge may reach."""
+"""Pixels of the blurred edge beyond the spot."""
 
 
 @shows_itself
@@ -47,7 +47,7 @@ class Spot:
 def find_spot(grey, near) -> Spot:
     """The spot nearest to `near` (column, row) in `grey` [rows, columns].
 
-    **Raises:** `InputError` where none stands out, or it is cut by the edge of the image.
+    **Raises:** `InputError` if none stands out, or it is cut by the edge of the image.
     """
     where = f"at ({near[0]:.1f}, {near[1]:.1f})"
     rows, columns = grey.shape
@@ -71,7 +71,7 @@ def find_spot(grey, near) -> Spot:
 
 
 def _nearest_spot(window, near):
-    """Pixels of the spot nearest to a place, and the threshold; None where there is none."""
+    """Pixels of the spot nearest to a position, and the threshold; None if there is none."""
     threshold = otsu(window)
     bright = window > threshold
     contrast = window[bright].mean() - window[~bright].mean() if bright.any() else 0.0
@@ -90,7 +90,7 @@ def _nearest_spot(window, near):
 
 
 def _ends_inside(inside) -> bool:
-    """Whether the spot, with the room its edge needs, ends within the window."""
+    """Whether the spot, including its blurred edge, is within the window."""
     rows, columns = (np.flatnonzero(inside.any(axis)) for axis in (1, 0))
     free = min(rows[0], columns[0], inside.shape[0] - 1 - rows[-1],
                inside.shape[1] - 1 - columns[-1])  # fmt: skip
@@ -98,7 +98,7 @@ def _ends_inside(inside) -> bool:
 
 
 def _levels(grey, low, window, inside, threshold) -> Spot:
-    """The spot in the smallest window that holds it, with the levels of target and background."""
+    """The spot in the smallest window around it, with the levels of target and background."""
     rows, columns = np.nonzero(inside)
     room = 2 * MARGIN
     first = np.maximum([columns.min() - room, rows.min() - room], 0)
@@ -135,8 +135,8 @@ def otsu(grey) -> float:
 
 
 def noise_of(grey) -> float:
-    """σ of the noise of the grey values (Immerkær, 1996, with the median for its mean, since edges
-    are outliers); not below that of rounding to whole grey values, 1/√12."""
+    """σ of the noise of the grey values (Immerkær, 1996, with the median instead of the mean, since
+    edges are outliers); at least that of rounding to whole grey values, 1/√12."""
     if min(grey.shape) < 3:
         return 12**-0.5
     mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]])

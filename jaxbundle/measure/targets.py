@@ -2,14 +2,14 @@
 
 1. The spot, its window and threshold: `spots`.
 2. Centre by weighted grey values: with g the grey value, b that of the background, f that of the
-   target, over the spot and the pixels next to it, where its blurred edge ends,
+   target, over the spot and its blurred edge,
 
        w = (g − b)/(f − b)        x̄ = Σw·x/Σw        σ² = σg²/(f − b)²·Σ(x − x̄)²/(Σw)²
 
 3. Centre by an ellipse: grey-value profiles across the edge, along the normals of the spot's
-   ellipse of inertia; the edge is where a profile, from the target's own level there to the
-   background's, has its middle value; then `fit_ellipse`. (Blur σ makes a disc of radius r smaller
-   by about σ²/2r; its centre stays.)
+   ellipse of inertia; the edge is at the mean of the local levels of target and background;
+   then `fit_ellipse`. (Blur σ makes a disc of radius r smaller
+   by about σ²/2r; its centre is unchanged.)
 
 Both centres are those of the ellipse, not of the circle: `circle_centre_shift`.
 """
@@ -18,7 +18,7 @@ import dataclasses
 
 import jax
 import numpy as np
-import scipy  # whose parts are loaded when they are used
+import scipy  # its parts are loaded on use
 from jaxtyping import Float
 
 from jaxbundle.display import shows_itself
@@ -27,12 +27,12 @@ from jaxbundle.measure.ellipses import fit_ellipse
 from jaxbundle.measure.spots import MARGIN, find_spot
 
 PROFILES = (16, 32, 64)
-"""Numbers of profiles: the largest that is not above the circumference in pixels, lest pixels be
+"""Numbers of profiles: the largest not above the circumference in pixels, so that no pixel is
 measured twice."""
 STEP = 0.25
-"""Distance of the places of a profile, in pixels."""
+"""Step along a profile, in pixels."""
 SAMPLING = 0.045
-"""σ of a point of the edge, in pixels, that pixels alone cause: few profiles hide it in the fit.
+"""σ of an edge point due to the pixel raster, in pixels: with few profiles the fit hides it.
 
 (Rendered discs of 2 to 10 pixels radius, blur 0.7 to 1.2: 0.03 to 0.045.)
 """
@@ -63,7 +63,7 @@ def centre_by_grey_values(grey, near) -> Target:
 
     **Arguments:** `grey` [rows, columns]; `near`: within a few pixels of the target.
 
-    **Raises:** `InputError` where no target stands out, or it is cut by the edge of the image.
+    **Raises:** `InputError` if no target stands out, or it is cut by the edge of the image.
     """
     spot = find_spot(np.asarray(grey, float), np.asarray(near, float))
     xy, spread, total = _moments(spot)
@@ -74,7 +74,7 @@ def centre_by_grey_values(grey, near) -> Target:
 
 
 def centre_by_ellipse(grey, near) -> Target:
-    """The centre of the target nearest to `near` (column, row) as that of an ellipse through its
+    """The centre of the target nearest to `near` (column, row) by an ellipse through its
     edge; arguments and errors as in `centre_by_grey_values`."""
     spot = find_spot(np.asarray(grey, float), np.asarray(near, float))
     xy, spread, _ = _moments(spot)
@@ -82,10 +82,10 @@ def centre_by_ellipse(grey, near) -> Target:
     edge = _edge_points(spot, xy, axes, angle)
     weights = np.isfinite(edge).all(1).astype(float)
     if weights.sum() < 0.6 * len(edge):
-        raise InputError(f"{_place(spot, xy)}: the target's edge is not seen all around")
+        raise InputError(f"{_place(spot, xy)}: the edge of the target is not fully visible")
     centre, covariance, axes, angle = _fitted(np.nan_to_num(edge), weights)
     if not np.isfinite(covariance).all():
-        raise InputError(f"{_place(spot, xy)}: the target's edge is no ellipse")
+        raise InputError(f"{_place(spot, xy)}: the edge of the target is not an ellipse")
     return _target(spot, centre, np.sqrt(np.diagonal(covariance)), axes, angle)
 
 
@@ -128,7 +128,7 @@ def _axes_of(spread):
 
 
 def _edge_points(spot, xy, axes, angle):
-    """Points of the edge [profiles, 2], NaN where a profile has none."""
+    """Points of the edge [profiles, 2], NaN for profiles without one."""
     circumference = np.pi * axes.sum()
     number = max([n for n in PROFILES if n <= circumference] or PROFILES[:1])
     t = 2 * np.pi * (np.arange(number) + 0.5) / number
@@ -144,7 +144,7 @@ def _edge_points(spot, xy, axes, angle):
     inner, outer = profile[:, :3].mean(1), profile[:, -3:].mean(1)
     middle = (inner + outer) / 2
     crosses = (profile[:, :-1] > middle[:, None]) & (profile[:, 1:] <= middle[:, None])
-    # of several crossings, the one nearest to where the edge should be
+    # of several crossings, the one nearest to the expected edge
     away = np.where(crosses, np.abs(s[:-1]), np.inf)
     k, all_of_them = away.argmin(1), np.arange(number)
     upper, lower = profile[all_of_them, k], profile[all_of_them, k + 1]
@@ -160,7 +160,7 @@ def _fit(xy, weights):
 
 
 def _fitted(xy, weights):
-    """Centre, its covariance, axes and angle of the ellipse; the worst points left out once."""
+    """Centre, its covariance, axes and angle of the ellipse; the worst points are left out once."""
     for _ in range(2):
         found = _fit(xy, weights)
         away = _distances(found, xy)

@@ -1,4 +1,4 @@
-"""From image to ground, to image, and from one image to another by way of the ground.
+"""From image to ground, to image, and from one image to another through the ground.
 
     ground point   the ray of (x, y) meets the plane Z:  X = X0 + t·Mᵀ·[r, s, q],  t = (Z − Z0)/d_Z
     image point    (x, y) of X by the collinearity equations with distortion
@@ -32,7 +32,7 @@ def line_of_sight(view: View, xy: Float[AnyArray, "2"]) -> Float[Array, "3"]:
 
 
 def ground_point(view: View, xy: Float[AnyArray, "2"], Z: Scalar) -> Float[Array, "3"]:
-    """Where the ray of an image point meets the plane of this Z; NaN where it does not."""
+    """The intersection of the ray of an image point with the plane of this Z; NaN if none."""
     d = line_of_sight(view, xy)
     t = (Z - view.pose.X0[2]) / d[2]
     point = jnp.asarray(view.pose.X0) + t * d
@@ -50,5 +50,5 @@ def image_point(view: View, X: Float[AnyArray, "3"]) -> Float[Array, "2"]:
 def image_to_image(
     view: View, xy: Float[AnyArray, "2"], Z: Scalar, other: View
 ) -> Float[Array, "2"]:
-    """The image point in another image of what lies at the height Z in this one."""
+    """The image point in another image of a point at the height Z in this one."""
     return image_point(other, ground_point(view, xy, Z))

@@ -1,4 +1,4 @@
-"""A board measured in many photographs; photographs that fail are listed, the others are used."""
+"""A board measured in many photographs; failed photographs are listed, the others are used."""
 
 import dataclasses
 import glob
@@ -23,17 +23,17 @@ from jaxbundle.system.configuration import available_cores
 from jaxbundle.system.file_content import read_content
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".jp2")
-"""Files of a folder that are taken for photographs."""
+"""Suffixes of photographs in a folder."""
 SAME, ALIKE = 0.05, 0.8
-"""Photographs are one if their points agree to so many pixels (RMS), in this part of the board at
-least. JPEG at quality 40 moves corners by 0.05; a second photograph of one pose, whose noise moves
-them by no more, says nothing about the camera either."""
+"""Photographs are the same if their points agree to this (RMS, pixels), in at least this part of
+the board. JPEG at quality 40 moves corners by 0.05; a second photograph of one pose, with no larger
+noise, does not determine the camera better either."""
 SEARCHED = 3
-"""In so many photographs boards of other sizes are looked for: in those without a board, where few
-have it, and in the others, whether the board they have is a part of a larger one."""
+"""Number of photographs searched for boards of other sizes: those without a board, if few
+have it, and the others, whether their board is a part of a larger one."""
 
 Look = tuple[tuple[int, int], Float[np.ndarray, "points 2"]] | str
-"""What was found of a board in a photograph: image size and image points, or why nothing."""
+"""Search result of a board in a photograph: image size and image points, or why none."""
 HINT = "give --board"
 HINTS = (HINT, "give --dictionary")
 
@@ -41,11 +41,11 @@ HINTS = (HINT, "give --dictionary")
 @shows_itself
 @dataclasses.dataclass(frozen=True)
 class BoardViews:
-    """What was measured of a board: image points of every view, and which photographs failed.
+    """The measurements of a board: image points of every view, and failed photographs.
 
-    **Fields:** `names` of the views; `image_size` (columns, rows); `xy` pixels, NaN where a point
-    was not found; `failed`: name and reason of every photograph that is no view; `warnings`: what
-    seems not to be meant.
+    **Fields:** `names` of the views; `image_size` (columns, rows); `xy` pixels, NaN for missing
+    points; `failed`: name and reason of every photograph not used; `warnings`: probable
+    mistakes.
     """
 
     board: Board
@@ -87,7 +87,7 @@ class BoardViews:
         return np.all(np.isfinite(self.xy), axis=2)
 
     def take(self, rows, why: str = "") -> "BoardViews":
-        """Some of the views (a mask or indices); the others count as failed where `why` says so."""
+        """Some of the views (a mask or indices); the others count as failed if `why` is given."""
         keep = np.zeros(len(self), bool)
         keep[rows] = True
         out = [(name, why) for name, kept in zip(self.names, keep) if not kept and why]
@@ -99,7 +99,7 @@ class BoardViews:
 def photographs(given: Sequence[str | Path]) -> list[Path]:
     """Files of paths, patterns (`left/*.jpg`) and folders, each once and in order.
 
-    **Raises:** `InputError` where a pattern or a folder has none.
+    **Raises:** `InputError` if a pattern or a folder has none.
     """
     found: dict[Path, None] = {}
     for item in given:
@@ -127,9 +127,9 @@ def measure_boards(
 
     **Arguments:** `paths`: files, patterns, folders; `progress(done, total)`.
 
-    **Returns:** the views that show it, of the image size most of them have.
+    **Returns:** the views of the board with the most frequent image size.
 
-    **Raises:** `InputError` where no photograph shows the board.
+    **Raises:** `InputError` if no photograph shows the board.
     """
     files = photographs(paths)
     if not files:
@@ -150,12 +150,12 @@ def measure_boards(
 def collect_views(
     file_of: Mapping[str, Path], looks: Mapping[str, Look], board: Board, hints: bool = True
 ) -> BoardViews:
-    """The views of photographs in which the board was sought, of the image size most of them have.
+    """The views of searched photographs, with the most frequent image size.
 
-    **Arguments:** `file_of`: the photographs by name (`name_photographs`); `looks`: of each what
-    `search_board` has found.
+    **Arguments:** `file_of`: the photographs by name (`name_photographs`); `looks`: the result of
+    `search_board` of each.
 
-    **Raises:** `InputError` where no photograph shows the board.
+    **Raises:** `InputError` if no photograph shows the board.
     """
     failed = {name: look for name, look in looks.items() if isinstance(look, str)}
     found = [(name, *look) for name, look in looks.items() if not isinstance(look, str)]
@@ -182,8 +182,8 @@ def collect_views(
 
 
 def search_board(path: str | Path, board: Board) -> Look:
-    """Image size (columns, rows) and image points of a board in one photograph, or why there are
-    none, without the path."""
+    """Image size (columns, rows) and image points of a board in one photograph, or the reason of a
+    failure, without the path."""
     try:
         grey = read_photograph(path)
         return (grey.shape[1], grey.shape[0]), find_board(grey, board)
@@ -192,14 +192,14 @@ def search_board(path: str | Path, board: Board) -> Look:
 
 
 def search_alone(task: tuple[str | Path, Board]) -> Look:
-    """`search_board` in a process of its own, one of several on this machine."""
+    """`search_board` in a separate process, one of several on this machine."""
     enable_x64()
     need_opencv().setNumThreads(1)
     return search_board(*task)
 
 
 def _repeated(paths: Mapping[str, Path]) -> dict[str, str]:
-    """The files that have the content of an earlier one, and which that is."""
+    """The files with the content of an earlier one, and the earlier one."""
     first: dict[bytes, str] = {}
     found = {}
     for name, path in paths.items():
@@ -214,7 +214,7 @@ def _repeated(paths: Mapping[str, Path]) -> dict[str, str]:
 
 
 def _saved_again(used: Sequence[tuple[str, np.ndarray]]) -> dict[str, str]:
-    """Views whose points are where those of an earlier one are: one photograph in another
+    """Views with the same points as an earlier one: one photograph in another
     compression or format."""
     found: dict[str, str] = {}
     for i, (name, xy) in enumerate(used):
@@ -234,14 +234,14 @@ def _saved_again(used: Sequence[tuple[str, np.ndarray]]) -> dict[str, str]:
 
 
 def _nothing_found(paths: Mapping[str, Path], failed: Mapping[str, str]) -> str:
-    """One line about photographs without a board; one that has another board speaks for all."""
+    """One line about photographs without a board, preferably about one with another board."""
     hinted = (name for name in failed if any(hint in failed[name] for hint in HINTS))
     first = next(hinted, next(iter(failed)))
     return f"no photograph of {len(failed)} shows the board: {paths[first]}: {failed[first]}"
 
 
 def _other_boards(paths: Mapping[str, Path], board: Board, failed: Mapping[str, str]):
-    """Reasons of some photographs without the board, with the size of the one they have instead."""
+    """Reasons of some photographs without the board, with the size of another board in them."""
     sizes = {}
     for name in list(failed)[:SEARCHED]:
         try:
@@ -262,7 +262,7 @@ def _other_boards(paths: Mapping[str, Path], board: Board, failed: Mapping[str, 
 
 
 def _part_of_a_larger(paths: Mapping[str, Path], used, board: Board) -> tuple[str, ...]:
-    """A warning where most of some photographs show the same larger board; one alone may err."""
+    """A warning if most of some photographs show the same larger board; one may be wrong."""
     if board.kind != "chessboard":
         return ()
     few = used[:SEARCHED]
@@ -281,7 +281,7 @@ def _part_of_a_larger(paths: Mapping[str, Path], used, board: Board) -> tuple[st
 
 
 def name_photographs(files: Sequence[Path]) -> dict[str, Path]:
-    """Photographs by file name, with as much of the folders as makes each one different."""
+    """Photographs by file name, with as many folders as make the names unique."""
     for parts in range(1, max((len(p.parts) for p in files), default=0) + 1):
         names = ["/".join(p.parts[-parts:]) for p in files]
         if len({*names}) == len(names):

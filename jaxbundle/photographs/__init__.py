@@ -1,4 +1,4 @@
-"""Photographs as files: pixels, and what their files say of camera, place and time."""
+"""Photographs as files: pixels, and metadata on camera, position and time."""
 
 from .exif import Exif as Exif
 from .exif import read_exif as read_exif

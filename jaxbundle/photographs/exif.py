@@ -1,6 +1,6 @@
-"""What the file of a photograph says of its camera, its time, its place (EXIF) and attitude (XMP).
+"""Metadata of a photograph: camera, time, position (EXIF) and attitude (XMP).
 
-Every value may be missing, and those of some cameras are wrong: they are start values and priors.
+Every value may be missing, and some cameras write wrong ones: they are start values and priors.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ FOCAL_LENGTH, FOCAL_LENGTH_35, DATE_TAKEN, FRACTION = 0x920A, 0xA405, 0x9003, 0x
 PLANE_X, PLANE_UNIT = 0xA20E, 0xA210
 TAKEN_X, TAKEN_Y = 0xA002, 0xA003
 FILM_DIAGONAL = math.hypot(36, 24)
-"""mm: what focal lengths equivalent to those of 35 mm film refer to."""
+"""mm: reference of focal lengths equivalent to 35 mm film."""
 MM = {2: 25.4, 3: 10.0, 4: 1.0}
 """Units of the resolution in the focal plane."""
 UPRIGHT = 1
@@ -28,9 +28,9 @@ UPRIGHT = 1
 
 @dataclasses.dataclass(frozen=True)
 class Place:
-    """Latitude and longitude in degrees (WGS 84), height in metres; what the height is above is not
-    known for sure (EXIF: above sea level); `sigma` of the position, and of the height, metres, if
-    they are stated."""
+    """Latitude and longitude in degrees (WGS 84), height in metres with uncertain reference
+    (EXIF: above sea level); `sigma` of the position, and of the height, metres, if
+    stated."""
 
     latitude: float
     longitude: float
@@ -41,8 +41,8 @@ class Place:
 
 @dataclasses.dataclass(frozen=True)
 class Exif:
-    """Size in pixels; the camera; focal length in mm, and that which gives the same picture on
-    35 mm film; pixels for a mm of the focal plane; orientation (1: as the sensor saw it); time."""
+    """Size in pixels; the camera; focal length in mm, and its equivalent for
+    35 mm film; pixels per mm in the focal plane; orientation (1: as on the sensor); time."""
 
     size: tuple[int, int]
     make: str = ""
@@ -57,13 +57,13 @@ class Exif:
 
     @property
     def camera(self) -> str:
-        """Make and model, as one would say them."""
+        """Make and model without repetition."""
         first = self.make.split()[:1]
         repeated = first and self.model.lower().startswith(first[0].lower())
         return (self.model if repeated else f"{self.make} {self.model}").strip()
 
     def principal_distance(self) -> tuple[float, str] | None:
-        """The principal distance in pixels and where it is from; None where nothing tells it."""
+        """The principal distance in pixels and its source; None if unknown."""
         long = max(self.size)
         width = sensor_width(self.make, self.model)
         if self.focal_length and width:
@@ -77,24 +77,24 @@ class Exif:
 
 
 def read_exif(path: str | Path) -> Exif:
-    """What the head of a file says.
+    """The metadata in the header of a file.
 
-    **Raises:** `InputError` if it is no image.
+    **Raises:** `InputError` if it is not an image.
     """
     with open_image(path) as image, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of damaged heads
+        warnings.simplefilter("ignore")  # about damaged headers
         size = image.size
         try:
             head = image.getexif()
             details, gps = head.get_ifd(DETAILS), head.get_ifd(GPS)
             packet = image.info.get("xmp") or image.info.get(PNG_PACKET) or head.get(PACKET) or b""
-        except Exception:  # whatever a damaged head makes of its reader
+        except Exception:  # any error of the reader on a damaged header
             return Exif(size)
     resolution = _positive(details.get(PLANE_X))
     unit = MM.get(details.get(PLANE_UNIT, 2))
     taken = max(_positive(details.get(TAKEN_X)) or 0, _positive(details.get(TAKEN_Y)) or 0)
     if resolution and taken:
-        # of the photograph as it was taken: what made it smaller usually leaves this as it was
+        # of the original photograph: programs that reduce it usually keep this
         resolution *= max(size) / taken
     xmp = parse_xmp(packet) if isinstance(packet, bytes | str) else Xmp()
     return Exif(

@@ -1,10 +1,10 @@
-"""OpenCV and Pillow (extra `images`), where they are needed."""
+"""OpenCV and Pillow (extra `images`), imported on demand."""
 
 from jaxbundle.errors import InputError
 
 
 def need_opencv():
-    """The module cv2, or what to install."""
+    """The module cv2, or an error that says what to install."""
     try:
         import cv2
     except ImportError:
@@ -15,7 +15,7 @@ def need_opencv():
 
 
 def need_pillow():
-    """The module PIL.Image, or what to install."""
+    """The module PIL.Image, or an error that says what to install."""
     try:
         from PIL import Image
     except ImportError:

@@ -1,8 +1,8 @@
-"""Positions in a map system, from what the files of photographs and control say.
+"""Positions in a map system, from photographs and control files.
 
-Latitude and longitude become coordinates of the zone of UTM in which most of them are. Heights stay
-what they are: EXIF means them above sea level, many drones write them above the ellipsoid or above
-the place of take-off, so that the kind of height is said with them, and not known for sure.
+Latitude and longitude become coordinates of the UTM zone with most of them. Heights are
+unchanged: above sea level by EXIF, but many drones write them above the ellipsoid or above
+the take-off point, so the assumed reference is reported with them.
 """
 
 import re
@@ -16,14 +16,14 @@ from jaxbundle.errors import InputError
 from jaxbundle.photographs.exif import Place
 
 SIGMA, SIGMA_HEIGHT = 3.0, 6.0
-"""σ of positions by satellites, metres, where none is given."""
+"""Default σ of satellite positions, metres."""
 WORTH = 8.0
-"""Positions are used if they are spread over so many σ."""
+"""Minimum extent of positions, in σ."""
 
 
 class MapPositions(NamedTuple):
-    """Positions and their σ, metres, NaN: not known; convergence of the meridian there, degrees;
-    the system in words."""
+    """Positions and their σ, metres, NaN: unknown; meridian convergence there, degrees;
+    the name of the system."""
 
     X: Float[np.ndarray, "n 3"]
     sigma: Float[np.ndarray, "n 3"]
@@ -40,7 +40,7 @@ def utm_system(latitude: float, longitude: float) -> str:
 def map_positions(
     places: Sequence[Place | None],
 ) -> MapPositions | None:
-    """Positions in the zone of UTM; None where they are too few, or lie within their own σ."""
+    """Positions in the UTM zone; None if they are too few, or within their σ."""
     there = [(k, p) for k, p in enumerate(places) if p is not None and p.height is not None]
     if len(there) < 3:
         return None
@@ -68,9 +68,9 @@ def map_positions(
 def to_map(
     X: Float[np.ndarray, "n 3"], system: str, where: str
 ) -> tuple[Float[np.ndarray, "n 3"], str]:
-    """Coordinates in a map system; degrees become those of UTM. Returns the system in words.
+    """Coordinates in a map system; degrees are converted to UTM. Returns also the system's name.
 
-    **Raises:** `InputError` for a system that pyproj does not know.
+    **Raises:** `InputError` for a system unknown to pyproj.
     """
     if not system:
         return X, ""

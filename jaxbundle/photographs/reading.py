@@ -1,8 +1,7 @@
 """Photographs as arrays of grey values or colours, 8 bits.
 
-The pixels are taken as the sensor wrote them: a note in the file that the photograph is to be shown
-turned (EXIF orientation) is not obeyed, since turning it would turn the camera's own axes. What has
-more than 8 bits is stretched over them.
+The pixels are used in the orientation of the sensor: EXIF orientation is ignored, since a rotation
+would rotate the camera axes. Images with more than 8 bits are stretched to 8 bits.
 """
 
 import os
@@ -18,11 +17,11 @@ from jaxbundle.photographs.opencv import need_opencv, need_pillow
 from jaxbundle.system.file_content import check_plain, read_content
 
 SUFFIXES = (".jpg", ".jpeg", ".tif", ".tiff", ".png")
-"""Files of a folder that are taken for photographs."""
+"""Suffixes of photographs in a folder."""
 MOST_PIXELS = 2**30
-"""OpenCV decodes no more."""
+"""Limit of OpenCV."""
 BRIGHT = 99.8
-"""Percentile of the grey values of more than 8 bits that becomes white."""
+"""Percentile of grey values with more than 8 bits that becomes white."""
 LIMIT = threading.Lock()
 START, SCAN, END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
 """Marks of JPEG: start of the file, of a scan, end of the image."""
@@ -33,7 +32,7 @@ def read_photograph(
 ) -> UInt8[np.ndarray, "rows columns"] | UInt8[np.ndarray, "rows columns 3"]:
     """The grey values of a photograph in any format OpenCV reads, or its red, green and blue.
 
-    **Raises:** `InputError` if there is no such file, it is empty, not an image, cut short, or too
+    **Raises:** `InputError` if the file is missing, empty, not an image, truncated, or too
     large.
     """
     cv2 = need_opencv()
@@ -60,18 +59,18 @@ def read_photograph(
 
 
 def photograph_size(path: str | Path) -> tuple[int, int]:
-    """(columns, rows) of a photograph, from the head of its file.
+    """(columns, rows) of a photograph, from the header of its file.
 
-    **Raises:** `InputError` if it is no image, or has more than 2³⁰ pixels.
+    **Raises:** `InputError` if it is not an image, or has more than 2³⁰ pixels.
     """
     with open_image(path) as image:
         return image.size
 
 
 def open_image(path: str | Path):
-    """The file opened by Pillow, its head read; the pixels are not decoded. Close it, by `with`.
+    """The file opened by Pillow with its header read, without decoding pixels. Close it, by `with`.
 
-    **Raises:** `InputError` if it cannot be read, is no image, or has more than 2³⁰ pixels.
+    **Raises:** `InputError` if it cannot be read, is not an image, or has more than 2³⁰ pixels.
     """
     check_plain(path)
     try:
@@ -95,21 +94,21 @@ def open_image(path: str | Path):
 
 
 def _open_any_size(path):
-    """The file opened without the limit that Pillow sets for fear of files that unpack to much more
-    than they are: 179 million pixels, which a photograph may have."""
+    """The file opened without Pillow's limit against decompression bombs: 179 million pixels, which
+    a photograph may have."""
     Image = need_pillow()
     with LIMIT:
         given, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of damaged heads: what is missing is not known
+                warnings.simplefilter("ignore")  # about damaged headers: missing fields are unknown
                 return Image.open(path)
         finally:
             Image.MAX_IMAGE_PIXELS = given
 
 
 def _looks_cut(content: bytes) -> bool:
-    """Whether a JPEG file has no end after its last scan, or a PNG file no end."""
+    """Whether a JPEG file has no end mark after its last scan, or a PNG file no end."""
     if content.startswith(START):
         return content.rfind(END) < content.rfind(SCAN)
     return content.startswith(b"\x89PNG") and b"IEND" not in content[-64:]

@@ -1,7 +1,7 @@
-"""Widths of sensors, mm, of cameras that state a focal length but not its equivalent on film.
+"""Widths of sensors, mm, of cameras that state a focal length but not its film equivalent.
 
-From the makers' data sheets; the longer side. A camera that is not here needs the equivalent focal
-length in its files, a calibration, or pictures from which the principal distance can be found.
+From the makers' data sheets; the longer side. Other cameras need the equivalent focal
+length in their files, a calibration, or photographs that determine the principal distance.
 """
 
 WIDTHS = {
@@ -43,6 +43,6 @@ def sensor_width(make: str, model: str) -> float | None:
 
 
 def _begins(name: str, known: str) -> bool:
-    """Whether a name begins with a known one, and no further digit follows: a D80 is no D800."""
+    """Whether a name begins with a known one, not followed by a digit: a D80 is not a D800."""
     rest = name[len(known) :]
     return name.startswith(known) and not (rest[:1].isdigit() and known[-1].isdigit())

@@ -1,4 +1,4 @@
-"""What drones write into the XMP packet of a photograph: attitude, and how good the position is.
+"""The XMP packet of a drone photograph: attitude, and accuracy of the position.
 
     DJI (drone-dji:)            GimbalYawDegree, GimbalPitchDegree, GimbalRollDegree,
                                 RtkStdLon, RtkStdLat, RtkStdHgt
@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 SIGMA_ATTITUDE = 5.0
-"""Degrees, where no σ is given: a gimbal is better about the horizontal axes, a compass worse."""
+"""Default σ, degrees: a gimbal is better about the horizontal axes, a compass worse."""
 MOST_BYTES = 1 << 20
 DJI = ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree")
 PIX4D = ("Yaw", "Pitch", "Roll")
@@ -38,7 +38,8 @@ class Attitude:
 
 @dataclasses.dataclass(frozen=True)
 class Xmp:
-    """What a packet says: attitude; σ of the position east and north, and of its height, metres."""
+    """The content of a packet: attitude; σ of the position east and north, and of its height,
+    metres."""
 
     attitude: Attitude | None = None
     sigma: float | None = None
@@ -46,7 +47,7 @@ class Xmp:
 
 
 def parse_xmp(packet: bytes | str) -> Xmp:
-    """What a packet says; nothing, if it is damaged or another program's."""
+    """The content of a packet; empty if it is damaged or unknown."""
     fields = _fields(packet)
     number = lambda name: _number(fields.get(name))
     attitude = _attitude(number)
@@ -73,7 +74,7 @@ def rotation_of(attitude: Attitude, convergence: float = 0.0) -> Float[np.ndarra
 
 def _attitude(number) -> Attitude | None:
     dji, pix4d = ([number(name) for name in names] for names in (DJI, PIX4D))
-    # A gimbal that is not there, or did not work, is all zeros.
+    # A missing or failed gimbal gives all zeros.
     if None not in dji and any(dji):
         yaw, pitch, roll = dji
     elif None not in pix4d and any(pix4d):

@@ -1,9 +1,9 @@
-"""Features of a photograph: places that look like themselves from elsewhere, with descriptors.
+"""Features of a photograph: points recognisable from other positions, with descriptors.
 
-A photograph is reduced to `Detection.side` pixels first, in which OpenCV's SIFT (Lowe, 2004) begins
-with doubling it, so that the finest features are those of twice that side; least squares matching
-measures in the original afterwards. Of the features found, those that stand out most are kept, as
-many of each cell of a grid: photographs are covered evenly, in their dull parts too.
+A photograph is first reduced to `Detection.side` pixels; OpenCV's SIFT (Lowe, 2004) begins
+by doubling it, so that the finest features are those of twice that side; least squares matching
+measures in the original afterwards. The most distinct features are kept, equally
+many in each cell of a grid: they cover photographs evenly, including parts with little texture.
 """
 
 import dataclasses
@@ -19,16 +19,16 @@ from jaxbundle.photographs.opencv import need_opencv
 CELLS = 16
 """Cells of the grid along the longer side."""
 AMPLE = 1.6
-"""Features looked for, as a multiple of those kept."""
+"""Searched features, as a multiple of those kept."""
 TILE = 2400
-"""Side of the parts in which a large photograph is searched, reduced pixels."""
+"""Side of the tiles in which a large photograph is searched, reduced pixels."""
 OVERLAP = 64
 
 
 @dataclasses.dataclass(frozen=True)
 class Detection:
-    """What features are looked for: `kind`; `number` kept of a photograph; `side`: the longer side
-    to which a photograph is reduced, 0: not at all."""
+    """Settings of the search: `kind`; `number` of features kept per photograph; `side`: the longer
+    side to which a photograph is reduced, 0: not at all."""
 
     kind: str = "sift"
     number: int = 6000
@@ -61,7 +61,7 @@ class Features:
 def find_features(
     grey: UInt8[np.ndarray, "rows columns"], settings: Detection = Detection()
 ) -> Features:
-    """The features of a photograph, evenly spread."""
+    """The features of a photograph, evenly distributed."""
     cv2 = need_opencv()
     rows, columns = grey.shape
     factor = min(1.0, settings.side / max(rows, columns)) if settings.side else 1.0
@@ -92,7 +92,7 @@ def _detector(cv2, settings: Detection):
 
 
 def _tiles(rows: int, columns: int):
-    """(top, left, bottom, right) of parts that overlap, and of what each of them is to give."""
+    """(top, left, bottom, right) of overlapping tiles, and of the part from which each is used."""
     tall, wide = (max(1, -(-n // TILE)) for n in (rows, columns))
     for i in range(tall):
         for j in range(wide):
@@ -102,7 +102,7 @@ def _tiles(rows: int, columns: int):
 
 
 def _in_tile(detector, grey, top, left, bottom, right):
-    """Key points within a part, searched with a margin, and their descriptors."""
+    """Key points within a tile, searched with a margin, and their descriptors."""
     t, l = max(top - OVERLAP, 0), max(left - OVERLAP, 0)
     part = np.ascontiguousarray(grey[t : bottom + OVERLAP, l : right + OVERLAP])
     points, descriptors = detector.detectAndCompute(part, None)
@@ -124,7 +124,7 @@ def _columns(points):
 
 
 def _spread(xy, size, response, shape, number):
-    """The rows to keep, the largest features first: of each cell the most distinct ones."""
+    """The rows to keep, the largest features first: the most distinct ones of each cell."""
     if len(xy) <= number:
         return np.argsort(-size, kind="stable")
     side = max(shape) / CELLS

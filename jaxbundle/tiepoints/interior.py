@@ -1,13 +1,13 @@
-"""The principal distance and K1 of a camera from pairs of its photographs, without anything known.
+"""The principal distance and K1 of a camera from pairs of its photographs, without prior knowledge.
 
-Matches of two photographs fulfil the condition of coplanarity for the right interior orientation
-only. For principal distances over a wide range every pair is oriented relatively, and the distance
-with the least robust sum of Sampson's distances (in pixels) starts an adjustment of
+Matches of two photographs satisfy the coplanarity condition only for the right interior
+orientation. Every pair is oriented relatively with principal distances over a wide range, and the
+distance with the smallest robust sum of Sampson's distances (in pixels) starts an adjustment of
 
     c, K1, and M, b of every pair
 
-in which matches count the less the worse they agree (Cauchy). Pairs of parallel views hardly
-know c, pairs of a plane neither: their sums say so by being flat, and others decide.
+in which matches with larger misclosures have less weight (Cauchy). Pairs of parallel views hardly
+determine c, nor do pairs of a plane: their sums are flat, and other pairs decide.
 """
 
 import dataclasses
@@ -28,27 +28,28 @@ from jaxbundle.orientation.sights import ideal_points
 from jaxbundle.system.compilation import quick_jit
 
 FACTORS = tuple(0.55 * 1.2**k for k in range(10))
-"""Principal distances tried, in parts of the longer side: 85° to 20° of view."""
+"""Principal distances tried, relative to the longer side: 85° to 20° of view."""
 CANDIDATES, PAIRS, SLOTS, PIXELS = 16, 8, 64, 4.0
-"""Pairs that are looked at, those that are used (most matches agree, wide angles), and the matches
-of each; the misclosure at which a match counts half, for a photograph of 3000 pixels: lens
-distortion is not known yet."""
+"""Number of pairs examined, of pairs used (most matches agree, wide angles), and of their matches;
+the misclosure at which a match has half weight, for a photograph of 3000 pixels: lens
+distortion is not yet known."""
 ROUNDS, STEPS = 4, 8
 USUAL, DOUBT = 1.0, 0.06
-"""The usual principal distance, in parts of the longer side, and by which part a sum must be less
-to believe one that differs by a factor of e; for x = |ln| of another factor x·(1 + x)/2 times as
-much."""
+"""The usual principal distance relative to the longer side, and the relative reduction of the sum
+required to accept one that differs by a factor of e; for x = |ln| of another factor x·(1 + x)/2
+times as much."""
 WIDE = 0.12
-"""Angle of intersection, radians, beyond which wider is no better."""
+"""Angle of intersection, radians, above which wider angles are not better."""
 FARTHEST = 0.35
-"""|k1| beyond this is not believed."""
+"""Larger |k1| is rejected."""
 KNOWN = 1.35
-"""A principal distance that is tried, or is from the file, may be wrong by this factor."""
+"""A principal distance tried, or from the file, may be wrong by this factor."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Start:
-    """The camera, how many pairs agree on it, and the misclosure of their matches (median, px)."""
+    """The camera, the number of consistent pairs, and the misclosure of their matches (median,
+    px)."""
 
     camera: Camera
     pairs: int
@@ -60,10 +61,10 @@ def estimate_interior(
     pairs: Sequence[tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]],
     known: bool,
 ) -> Start:
-    """A camera of model `opencv` with the principal distance and K1 that pairs agree on.
+    """A camera of model `opencv` with the principal distance and K1 of consistent pairs.
 
-    **Arguments:** matches of each pair in pixels, the clearest first, the best pairs first;
-    `known`: whether the principal distance of the camera is one to begin with.
+    **Arguments:** matches of each pair in pixels, the most distinct first, the best pairs first;
+    `known`: whether the principal distance of the camera is a usable start value.
     """
     pairs = [(one, other) for one, other in pairs if len(one) >= 24][:CANDIDATES]
     if not pairs or camera.image_size is None:
@@ -95,7 +96,7 @@ def estimate_interior(
 
 
 def prepare() -> None:
-    """Compile what `estimate_interior` runs, ahead of its data."""
+    """Compile the programs of `estimate_interior` ahead of its data."""
     xy = np.random.default_rng(0).uniform(-0.5, 0.5, (PAIRS, SLOTS, 2))
     many.orient_pairs(list(xy), list(xy), np.full(PAIRS, 1e-3))
     camera = Camera("camera", "opencv", {"fx": 1.0, "fy": 1.0})
@@ -110,8 +111,8 @@ def _with(camera, f, k1=0.0):
 
 
 def _oriented(cameras, xy1, xy2, limit):
-    """Relative orientations of all pairs with each camera, the parts that agree, robust sums, and
-    angles of intersection."""
+    """Relative orientations of all pairs with each camera, shares of agreeing matches, robust sums,
+    and angles of intersection."""
     f = np.repeat([camera.parameters["fx"] for camera in cameras], len(xy1))
     one, two = ([ideal_points(c, xy) for c in cameras for xy in side] for side in (xy1, xy2))
     M, b, part, angle = many.orient_pairs(one, two, limit / f)

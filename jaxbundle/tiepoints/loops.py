@@ -1,18 +1,18 @@
-"""Pairs that contradict other pairs: around three photographs, orientations must close.
+"""Contradictory pairs: orientations around three photographs must close.
 
-Of photographs i, j, k, of which each two are a pair with M and a base b of length 1,
+For photographs i, j, k, each two of which are a pair with M and a base b of length 1,
 
     M_jk·M_ij = M_ik,        β_ij·b_ij + β_jk·M_ijᵀ·b_jk = β_ik·b_ik
 
-with the lengths β of the bases, whose ratios the depths tell of features that two pairs have
-in common (a depth s of a pair is s·β). A row of windows that is matched one window further keeps
+with the lengths β of the bases; their ratios follow from the depths of features common to two
+pairs (a depth s of a pair is s·β). A row of windows matched one window further keeps
 the rotation, and moves the camera: only the bases do not close.
 
-Pairs are taken one after another, sure ones first, and of these the ones with many matches and
-loops that close. One that contradicts pairs already taken, in more loops than it agrees with, is
-left out. Where it is alone to connect photographs there is no loop: it stays, unless it is not sure
-and its photographs are connected already: any two photographs of a long row of windows match, the
-far ones as if they stood side by side, and agree with one another in that.
+Pairs are accepted one after another, sure ones first, and among these those with many matches and
+closing loops. A pair that contradicts accepted pairs in more loops than it agrees with is
+left out. A pair that alone connects photographs has no loop: it stays, unless it is not sure
+and its photographs are already connected: any two photographs of a long row of windows match, even
+distant ones as if they were neighbours, and such pairs are consistent.
 
 Zach, Klopschitz and Pollefeys (2010), Disambiguating visual relations using loop constraints.
 """
@@ -25,17 +25,17 @@ from jaxtyping import Float
 from jaxbundle.tiepoints.verification import Pair
 
 TURN, GAP = np.radians(5.0), 0.15
-"""Rotation that remains around a loop, and gap of the bases in parts of the longest, at most."""
+"""Maximum rotation remaining around a loop, and maximum gap of the bases relative to the longest."""
 COMMON = 8
-"""Features that two pairs must have in common for the ratio of their bases."""
+"""Minimum common features of two pairs for the ratio of their bases."""
 MOST = 12
-"""Loops of a pair that are looked at, those with the most matches."""
+"""Maximum loops examined per pair, those with the most matches."""
 
 
 def split_contradicted(
     pairs: Sequence[Pair], ideal: Sequence[Float[np.ndarray, "_ 2"]]
 ) -> tuple[list[Pair], list[Pair]]:
-    """The pairs that agree with one another, and those that contradict them, in the given order.
+    """Consistent pairs, and contradictory ones, in the given order.
 
     **Arguments:** `ideal`: coordinates of the features of every photograph, c = 1.
     """
@@ -65,7 +65,7 @@ def _pair(i: int, j: int) -> tuple[int, int]:
 
 
 class _Loops:
-    """Loops of pairs that have a base."""
+    """Loops of pairs with a base."""
 
     def __init__(self, pairs: Sequence[Pair], ideal):
         self.pairs = {p.images: p for p in pairs if p.kind != "rotation"}
@@ -77,7 +77,7 @@ class _Loops:
         self.known: dict[tuple[int, ...], bool | None] = {}
 
     def thirds(self, of: tuple[int, int]) -> list[int]:
-        """Photographs that are a pair with both, those with the most matches first."""
+        """Photographs that form a pair with both, those with the most matches first."""
         if of not in self.pairs:
             return []
         i, j = of
@@ -85,7 +85,7 @@ class _Loops:
         return sorted(self.next[i] & self.next[j], key=lambda k: (-fewest(k), k))[:MOST]
 
     def closes(self, of: tuple[int, int], k: int) -> bool | None:
-        """Whether a loop closes; None where nothing tells the bases."""
+        """Whether a loop closes; None if the bases are unknown."""
         loop = tuple(sorted((*of, k)))
         if loop not in self.known:
             self.known[loop] = self._closes(*loop)
@@ -108,8 +108,8 @@ class _Loops:
         return bool(gap < GAP * max(1.0, np.exp(of_jk), np.exp(of_ik)))
 
     def _ratio(self, one, other, of_one, of_other) -> float:
-        """ln of the ratio of the base of `other` to that of `one`, by the depths in the photograph
-        that they have in common: the first or second (0, 1) of each; NaN: not known."""
+        """ln of the ratio of the base of `other` to that of `one`, by the depths in their common
+        photograph: the first or second (0, 1) of each; NaN: unknown."""
         a, depth = self.pairs[one].matches[:, of_one], self.depth[one][of_one]
         b, far = self.pairs[other].matches[:, of_other], self.depth[other][of_other]
         _, rows, columns = np.intersect1d(a, b, return_indices=True)
@@ -119,7 +119,7 @@ class _Loops:
 
 
 def _depths(pair: Pair, ideal):
-    """Depths of the matches in both photographs, the base being 1."""
+    """Depths of the matches in both photographs for base 1."""
     a, c = (np.pad(ideal[k][rows], ((0, 0), (0, 1)), constant_values=-1.0)
             for k, rows in zip(pair.images, pair.matches.T))  # fmt: skip
     c = c @ pair.M

@@ -1,15 +1,15 @@
-"""Features of two photographs that look alike: each the nearest of the other, clearly so.
+"""Matching features of two photographs: mutually nearest and distinct.
 
-Descriptors of SIFT count as the roots of their parts of the sum (Arandjelović and Zisserman, 2012):
-of unit length, so that their distance is √(2 − 2·a·b): one matrix product for all pairs.
-A match is kept if it is the best from both sides, and if its distance is below `ratio` times that
-of the second best (Lowe, 2004), of either side, and of what looks most like either of the two in
-its own photograph: of identical windows the wrong one is as good as the right one.
+Descriptors of SIFT are the square roots of their normalised counts (Arandjelović and Zisserman,
+2012), of unit length, so that their distance is √(2 − 2·a·b): one matrix product for all pairs.
+A match is kept if it is mutually the best, and if its distance is below `ratio` times that
+of the second best (Lowe, 2004), from either side, and of the most similar feature in
+the same photograph: of identical windows the wrong one is as good as the right one.
 
-Windows seen at other angles are not quite identical, and one may look more like another window of
-the second photograph, seen at the same angle, than like itself. So a match says as well whether it
-is `single`: whether nothing in either photograph looks like it as much as two photographs of one
-place usually do.
+Windows seen at different angles are not identical, and one may be more similar to another window of
+the second photograph, seen at the same angle, than to itself. So a match also has a flag
+`single`: no feature in either photograph is as similar to it as two photographs of one
+point usually are.
 """
 
 from typing import NamedTuple
@@ -22,21 +22,21 @@ from jaxbundle.tiepoints.features import Features
 
 RATIO = 0.8
 PORTION = 1024
-"""Features whose distances to all others are computed at once."""
+"""Features processed at once for distances to all others."""
 OF_SIFT = 128
 """Numbers of a descriptor of SIFT."""
 SAME = 1e-3
 """Descriptors whose distance is below this are the same."""
 REPEATED = 0.22
-"""Distance below which two features of a photograph may be of one kind of thing: that of most true
+"""Distance below which two features of a photograph may be repetitions: that of most true
 matches of SIFT."""
 FEW = 800
-"""Largest features by which is decided whether two photographs may show the same."""
+"""Number of largest features that decide whether two photographs may overlap."""
 
 
 class Matches(NamedTuple):
-    """Rows of the features of two photographs that match, the clearest first; their clarity; which
-    of them are of something that is in the photographs once."""
+    """Rows of matching features of two photographs, the most distinct first; their clarity; and
+    which are unique in the photographs."""
 
     images: tuple[int, int]
     rows: Int[np.ndarray, "n 2"]
@@ -56,8 +56,8 @@ def match_features(
     ratio: float = RATIO,
     own: tuple[Float[np.ndarray, " a"], Float[np.ndarray, " b"]] | None = None,
 ) -> tuple[Int[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
-    """Rows of features that match, the clearest first, and the ratio of their distances to those of
-    the second best.
+    """Rows of matching features, the most distinct first, and the ratio of their distances to those
+    of the second best.
 
     **Arguments:** `own`: `distances_within` both photographs."""
     if min(len(one), len(other)) < 2 or one.descriptor.shape[1] != other.descriptor.shape[1]:
@@ -83,12 +83,12 @@ def single_matches(
     rows: Int[np.ndarray, "n 2"],
     own: tuple[Float[np.ndarray, " a"], Float[np.ndarray, " b"]],
 ) -> Bool[np.ndarray, " n"]:
-    """Which matches are of something that nothing else in either photograph looks like."""
+    """Which matches have no similar feature in either photograph."""
     return np.minimum(own[0][rows[:, 0]], own[1][rows[:, 1]]) >= REPEATED
 
 
 def number_alike(one: Features, other: Features) -> int:
-    """How many of the largest features match: a quick answer to whether two photographs overlap
+    """The number of matches of the largest features: a quick check whether two photographs overlap
     (Wu, 2013, preemptive matching)."""
     return len(match_features(one.take(slice(FEW)), other.take(slice(FEW)))[0])
 
@@ -99,8 +99,8 @@ def _root(descriptor):
 
 
 def distances_within(features: Features) -> Float[np.ndarray, " n"]:
-    """Of every feature the distance to what looks most like it elsewhere in its photograph; of bits
-    infinite."""
+    """For every feature the distance to the most similar one elsewhere in its photograph; infinite
+    for binary descriptors."""
     n = len(features)
     found = np.full(n, np.inf)
     if n < 2 or features.descriptor.shape[1] != OF_SIFT:
@@ -117,7 +117,7 @@ def distances_within(features: Features) -> Float[np.ndarray, " n"]:
 
 
 def _nearest(a, b):
-    """The nearest of b for each of a, its distance, and that of the second."""
+    """The nearest row of b for each row of a, its distance, and that of the second."""
     best, distance, second = np.empty(len(a), int), np.empty(len(a)), np.empty(len(a))
     for first in range(0, len(a), PORTION):
         s = a[first : first + PORTION] @ b.T

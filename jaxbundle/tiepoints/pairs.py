@@ -1,4 +1,4 @@
-"""Which photographs may show the same: pairs worth matching."""
+"""Selection of pairs of photographs for matching."""
 
 from collections.abc import Callable, Sequence
 from itertools import combinations
@@ -10,13 +10,13 @@ from jaxbundle.tiepoints.features import Features
 from jaxbundle.tiepoints.matching import number_alike
 
 MANY = 60
-"""Photographs beyond which not all pairs are matched."""
+"""Maximum number of photographs with all pairs matched."""
 NEXT = 5
-"""Photographs before and after one in a sequence."""
+"""Neighbours of a photograph on each side in a sequence."""
 NEAREST = 20
-"""Neighbours of a photograph, by place or by likeness."""
+"""Neighbours of a photograph, by position or by similarity."""
 ALIKE = 4
-"""Matches of the largest features that make a pair worth a closer look."""
+"""Minimum matches of the largest features for a candidate pair."""
 
 
 def candidate_pairs(
@@ -25,12 +25,12 @@ def candidate_pairs(
     place: Float[np.ndarray, "photographs 3"] | None = None,
     run: Callable = map,
 ) -> list[tuple[int, int]]:
-    """Pairs of photographs to be matched.
+    """Pairs of photographs to match.
 
     **Arguments:** `way`: `"all"`; `"sequence"`: neighbours in the order given; `"place"`: the
     nearest by the positions in their files; `"alike"`: those whose largest features match;
-    `"auto"`: all of a few; of many the nearest where all positions are known, else those alike.
-    `place`: positions, NaN: not known; `run`: maps a function over many.
+    `"auto"`: all of a few; of many the nearest if all positions are known, else those alike.
+    `place`: positions, NaN: unknown; `run`: maps a function over many.
     """
     n = len(features)
     known = place is not None and np.isfinite(place).all()

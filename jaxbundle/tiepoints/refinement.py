@@ -1,12 +1,12 @@
-"""Every measurement of a track by least squares matching, each with its own covariance.
+"""Every measurement of a track by least squares matching, with individual covariances.
 
 One photograph of a track gives the window, around the pixel nearest to its feature: the point is
-this pixel. In the others it is matched (`measure.least_squares_matching`), starting with the
-similarity of the two features, on the level of the pyramid where the window looks alike. Half of
-the variance of a match belongs to the window, which shifts all of its matches by its own noise: the
-measurement in the first photograph has the mean of these halves, every other one its own.
+this pixel. The window is matched in the others (`measure.least_squares_matching`), starting from
+the similarity of the two features, on the level of the pyramid with equal scale. Half of
+the variance of a match is due to the noise of the window, which shifts all of its matches: the
+measurement in the first photograph has the mean of these halves, every other one its own half.
 
-What is not matched keeps the place of its feature, whose σ is `FEATURE` times its size.
+Unmatched measurements keep the position of their feature, with σ `FEATURE` times its size.
 """
 
 import dataclasses
@@ -23,30 +23,30 @@ from jaxbundle.tiepoints.features import Features
 from jaxbundle.tiepoints.tracks import flatten
 
 WINDOW, PIECE = 17, 41
-"""Sides of the window, and of the piece of another photograph in which it is matched."""
+"""Sides of the window, and of the part of another photograph in which it is matched."""
 FINEST = 7.0
-"""Diameter, pixels, of the features that are matched in the original; of larger ones in a coarser
-level, where they have about this size."""
+"""Diameter, pixels, of features matched in the original; larger ones are matched on a coarser
+level, with about this size."""
 LEVELS = 6
 LANES = 128
 WEAK = 0.75
-"""Correlation below which a match is not believed."""
+"""Minimum correlation of a match."""
 SHIFT = 3.0
-"""Farthest a match may lie from its feature, pixels of its level."""
+"""Maximum distance of a match from its feature, pixels of its level."""
 WORST = 0.4
-"""σ above which a match is not believed, pixels of its level."""
+"""Maximum σ of a match, pixels of its level."""
 REACH = 7
-"""Pixels over which residuals within a window go together."""
+"""Pixels over which residuals within a window are correlated."""
 LEAST_SIGMA = 0.01
-"""σ below this, pixels of its level, is not believed: interpolation and sampling add as much."""
+"""Minimum σ, pixels of its level: interpolation and sampling add as much."""
 FEATURE = 0.12
-"""σ of the place of a feature, in parts of its diameter."""
+"""σ of the position of a feature relative to its diameter."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Measurements:
-    """Measured places: which track and photograph; `xy`, `sigma`: pixels; `level`: of the pyramid,
-    −1: the place of the feature; `first`: whether it gave the window; `colour`: RGB there."""
+    """Measurements: track and photograph; `xy`, `sigma`: pixels; `level`: of the pyramid,
+    −1: the position of the feature; `first`: whether it gave the window; `colour`: RGB there."""
 
     track: Int[np.ndarray, " n"]
     image: Int[np.ndarray, " n"]
@@ -70,7 +70,7 @@ def measure_tracks(
     read: Callable[[int], UInt8[np.ndarray, "rows columns 3"]],
     advance: Callable[[], None] = lambda: None,
 ) -> Measurements:
-    """Measure every place of every track; each photograph is read once.
+    """Measure all points of every track; each photograph is read once.
 
     **Arguments:** `read(k)`: colours of a photograph; `advance`: called after each of them.
     """
@@ -105,7 +105,7 @@ def prepare() -> None:
 
 
 def _roles(track, size):
-    """Which measurement of a track gives the window, that of the middle size; and the levels."""
+    """The measurement of a track that gives the window, of medium size; and the levels."""
     order = np.lexsort((size, track))
     begin = np.searchsorted(track[order], np.arange(track.max(initial=-1) + 1))
     length = np.bincount(track)
@@ -120,7 +120,7 @@ def _roles(track, size):
 
 
 def _starts(xy, size, angle, scale, centre, window_of):
-    """A of every measurement, from the window's pixels to those of its level."""
+    """A of every measurement, from pixels of the window to those of its level."""
     w = window_of
     turn = angle - angle[w]
     grown = size / scale / (size[w] / scale[w])
@@ -133,7 +133,7 @@ def _starts(xy, size, angle, scale, centre, window_of):
 
 
 def _cut_out(photographs, image, first, level, corner, xy, read, advance):
-    """Windows by track, pieces by measurement, which are inside, and the colours at the places."""
+    """Windows by track, parts by measurement, which are inside, and the colours of the points."""
     cv2 = need_opencv()
     n = len(image)
     windows = np.zeros((int(first.sum()), WINDOW, WINDOW), np.uint8)
@@ -162,7 +162,7 @@ def _cut_out(photographs, image, first, level, corner, xy, read, advance):
 
 
 def _pieces(picture, corner, side):
-    """Squares of a photograph, and which of their middles are in it; beyond its edge repeated."""
+    """Squares of a photograph, and which of their centres are in it; edge pixels are repeated."""
     rows, columns = picture.shape
     offset = np.arange(side)
     v = np.clip(corner[:, 1, None] + offset, 0, rows - 1)

@@ -22,23 +22,23 @@ from jaxbundle.tiepoints.verification import ENOUGH, Pair, verify_pairs
 
 Tell = Callable[[str, int, int], None]
 TOLERANCE = 0.0012
-"""Sampson's distance of a match that agrees, in parts of the longer side."""
+"""Maximum Sampson distance of an agreeing match, relative to the longer side."""
 WIDEST = 0.6
-"""Pairs that determine the principal distance: those with at least this part of the most matches,
-and others with fewer, which lie wider apart."""
+"""Pairs that determine the principal distance: those with at least this part of the largest number
+of matches, and others with fewer, which have longer bases."""
 MOST_ALIKE = 5
 """Of the former."""
 OF_THE_LENS = ("fx", "fy", "k1")
 OTHERS, APART = (0.7, 0.9, 1.2, 1.6, 2.2), 1.15
-"""Other principal distances that are tried, in parts of the longer side, unless they differ by less
+"""Other principal distances to try, relative to the longer side, unless they differ by less
 than this factor."""
 MORE, MORE_THAN_TOLD = 1.05, 1.25
-"""How many times as many matches they must explain; also as that from a file, which may be wrong of
-photographs that were cut or made smaller."""
+"""Required ratio of the numbers of explained matches; also to replace that from a file, which may
+be wrong for cropped or reduced photographs."""
 PLENTY = 0.85
-"""Part of the matches that must be explained for others not to be tried."""
+"""Share of explained matches above which others are not tried."""
 TRIED = 24
-"""Pairs by which they are judged."""
+"""Number of pairs for this comparison."""
 
 
 def prepare() -> None:
@@ -55,7 +55,7 @@ def detect(
     workers: int,
     tell: Tell,
 ) -> list[Features]:
-    """The features of every photograph, kept ones where there are some."""
+    """The features of every photograph, stored ones if available."""
 
     def one(k):
         found = store.load_features(fingerprints[k])
@@ -115,13 +115,13 @@ def start_cameras(
     features: Sequence[Features],
     matches: Sequence[Matches],
 ) -> tuple[list[Camera], list[str]]:
-    """Cameras with the principal distance and K1 that pairs of photographs by their lens agree on.
+    """Cameras with the principal distance and K1 of consistent pairs of photographs with their lens.
 
-    Where nothing tells the principal distance, what few pairs agree on is held against other
-    distances: by how many matches of many pairs relative orientations explain.
+    If the principal distance is unknown, the result of few pairs is compared with other
+    distances by the number of matches of many pairs explained by relative orientations.
 
-    **Arguments:** `lens` of every camera; `known`: whether its principal distance is one to begin
-    with.
+    **Arguments:** `lens` of every camera; `known`: whether its principal distance is a usable start
+    value.
     """
     better, notes = list(cameras), []
     for number in dict.fromkeys(lens):
@@ -152,13 +152,13 @@ def start_cameras(
 
 
 def _once(matches: Matches) -> Matches:
-    """Those of what is there once, where they are enough."""
+    """The unique matches, if they are enough."""
     use = matches.single
     return matches.take(use) if use.sum() >= ENOUGH else matches
 
 
 def _centred(cameras, of, features, matches):
-    """Matches of pairs, from the middles of their photographs."""
+    """Matches of pairs, relative to the image centres."""
     centred = lambda k: features[k].xy - _middle(cameras[of[k]])
     return [tuple(centred(k)[rows] for k, rows in zip(m.images, m.rows.T)) for m in matches]
 
@@ -171,14 +171,14 @@ def _with_lens(cameras, own, camera: Camera) -> list[Camera]:
 
 
 def _explained(cameras, of, features, matches) -> int:
-    """How many matches the relative orientations of their pairs explain, of pairs that close around
-    three photographs, as hardly any do by a wrong principal distance."""
+    """The number of matches explained by relative orientations of pairs that close around
+    three photographs, as hardly any do with a wrong principal distance."""
     pairs = verify(cameras, of, features, matches, lambda *_: None)
     return sum(map(len, without_contradicted(cameras, of, features, pairs)[0]))
 
 
 def _most_explained(start: Start, begin: Camera, xy, explained, least: float) -> Start:
-    """The start, or that from another principal distance which explains clearly more matches."""
+    """The start, or that from another principal distance that explains clearly more matches."""
     size = max(present_size(begin))
     f = start.camera.parameters["fx"]
     most, best = least, None
@@ -198,7 +198,7 @@ def _middle(camera: Camera):
 
 
 def _various(own):
-    """The pairs with the most matches, and as many others with enough, each photograph in turn."""
+    """The pairs with the most matches, and as many others with enough, by photograph in turn."""
     own = sorted(own, key=lambda found: -len(found.rows))
     if not own:
         return []
@@ -217,7 +217,7 @@ def verify(
     matches: Sequence[Matches],
     tell: Tell,
 ) -> list[Pair]:
-    """The pairs that one object can explain, with the matches that agree."""
+    """The pairs explained by one object, with the agreeing matches."""
     ideal = [ideal_features(cameras[c], f.xy) for c, f in zip(of, features)]
     size = np.array([max(present_size(cameras[c])) / _scale(cameras[c]) for c in of])
     matches = [m for m in matches if len(m.rows)]
@@ -240,25 +240,25 @@ def without_contradicted(
     cameras: Sequence[Camera], of: Sequence[int], features: Sequence[Features],
     pairs: Sequence[Pair],
 ) -> tuple[list[Pair], list[Pair]]:  # fmt: skip
-    """The pairs that agree with one another in loops of three, and the others."""
+    """The pairs consistent in loops of three, and the others."""
     ideal = [ideal_features(cameras[c], f.xy) for c, f in zip(of, features)]
     return split_contradicted(pairs, ideal)
 
 
 def ideal_features(camera: Camera, uv):
-    """Ideal image coordinates, c = 1, of pixels; NaN to the side of the camera."""
+    """Ideal image coordinates, c = 1, of pixels; NaN for rays sideways."""
     xy, _ = from_image_unit([camera], np.zeros(len(uv), int), uv, np.ones_like(uv), "px")
     return ideal_points(camera, xy) if len(xy) else xy
 
 
 def present_size(camera: Camera) -> tuple[int, int]:
-    """The image size of a camera that has one."""
+    """The image size of a camera."""
     assert camera.image_size is not None
     return camera.image_size
 
 
 def _scale(camera):
-    """The principal distance in pixels, by the picture of two points next to the middle."""
+    """The principal distance in pixels, from the images of two points near the centre."""
     columns, rows = present_size(camera)
     middle = np.array([[columns / 2 - 0.5, rows / 2 - 0.5], [columns / 2 + 0.5, rows / 2 - 0.5]])
     return 1 / np.linalg.norm(np.diff(ideal_features(camera, middle), axis=0))

@@ -1,13 +1,13 @@
-"""What is at the same pixel of photographs although they were taken from other places: a date or a
-name that was written into them, dirt on the sensor, a part of the vehicle.
+"""Features at the same pixel in photographs from different positions: a date or a
+name written into them, dirt on the sensor, a part of the vehicle.
 
-Its features match in any two photographs, and agree that nothing has moved. A match is still if
-both features have one place, size and direction. Where the other matches of a pair have moved, and
-hardly any of them by little, the still ones are of no object; their places in three photographs are
-marks, and still matches at marks are left out of all pairs.
+These features match in any two photographs, without motion. A match is still if
+both features have the same position, size and direction. If the other matches of a pair have moved,
+and hardly any by a small amount, the still ones are not on the object; their positions in three
+photographs are marks, and still matches at marks are left out of all pairs.
 
-Far objects seen by a camera that is not turned are still as well, but those in front of them move
-by all amounts, and photographs from one place are still everywhere: neither makes marks.
+Far objects seen by a camera without rotation are still as well, but those in front of them move
+by all amounts, and photographs from one position are still everywhere: neither gives marks.
 """
 
 from collections.abc import Sequence
@@ -19,22 +19,22 @@ from jaxbundle.tiepoints.features import Features
 from jaxbundle.tiepoints.matching import Matches
 
 STILL = 0.001
-"""Motion, in parts of the longer side, of a feature that has not moved."""
+"""Maximum motion of a still feature, relative to the longer side."""
 LITTLE = 5.0
-"""Motion by little: below so many times as much."""
+"""A small motion: below this multiple of it."""
 ALIKE = 1.25, 0.2
-"""Ratio of the sizes of features that are one, and difference of their directions, radians."""
+"""Ratio of the sizes of equal features, and difference of their directions, radians."""
 LEAST, CLEAR = 16, 0.4
-"""Matches of a pair that must have moved, and at least as many as still ones; and those that have
-moved by little, at most, in parts of the still ones."""
+"""Minimum moved matches of a pair, and at least as many as still ones; and maximum of those with
+small motion, relative to the still ones."""
 PHOTOGRAPHS = 3
-"""Photographs that must show a mark."""
+"""Minimum photographs of a mark."""
 
 
 def without_marks(
     matches: Sequence[Matches], features: Sequence[Features], sizes: Sequence[tuple[int, int]]
 ) -> tuple[list[Matches], int]:
-    """The matches without those of marks, and how many photographs show marks."""
+    """The matches without those of marks, and the number of photographs with marks."""
     still = [_still(m, features, sizes) for m in matches]
     shown: dict[tuple, set[int]] = {}
     for m, (rows, motion) in zip(matches, still):
@@ -62,7 +62,7 @@ def without_marks(
 def _still(
     m: Matches, features, sizes
 ) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Which matches are still, and how far all have moved, in parts of what counts as still."""
+    """Which matches are still, and the motion of all, relative to the limit."""
     i, j = m.images
     if sizes[i] != sizes[j] or not len(m.rows):
         return np.zeros(len(m.rows), bool), np.full(len(m.rows), np.inf)

@@ -1,7 +1,7 @@
 """Features and matches kept in a folder, so that an interrupted reconstruction resumes.
 
-A file is named by the fingerprint of the photograph's content and of the settings: of a photograph
-that has changed nothing is found. Files are written under a temporary name and renamed.
+A file is named by the fingerprint of the photograph's content and of the settings: nothing is found
+for a changed photograph. Files are written under a temporary name and renamed.
 """
 
 import hashlib
@@ -18,13 +18,13 @@ from jaxbundle.tiepoints.features import Detection, Features
 
 LENGTH = 16
 ABANDONED = 600.0
-"""Seconds after which nobody writes a file any more."""
+"""Seconds after which no process writes a file any more."""
 RULES = "4"
-"""Of finding and matching: what was kept by others is not used."""
+"""Version of features and matches: files of others are not used."""
 
 
 class Store:
-    """Files of features and matches in a folder; of none, nothing is kept."""
+    """Files of features and matches in a folder; without a folder nothing is stored."""
 
     def __init__(self, folder: Path | None, settings: Detection):
         self.folder, self.settings = folder, repr(settings)
@@ -40,39 +40,39 @@ class Store:
         return found
 
     def load_features(self, fingerprint: str) -> Features | None:
-        """The features of a photograph, if they are kept."""
+        """The stored features of a photograph, if any."""
         found = self._load(self.name(fingerprint))
         if found is None or set(found) != {"xy", "size", "angle", "descriptor"}:
             return None
         return Features(found["xy"], found["size"], found["angle"], found["descriptor"])
 
     def save_features(self, fingerprint: str, features: Features) -> None:
-        """Keep the features of a photograph."""
+        """Store the features of a photograph."""
         self._save(
             self.name(fingerprint), xy=features.xy, size=features.size, angle=features.angle,
             descriptor=features.descriptor,
         )  # fmt: skip
 
     def load_matches(self, one: str, other: str) -> tuple[np.ndarray, ...] | None:
-        """The rows of features that match of two photographs, their clarity, and which are single,
-        if they are kept."""
+        """The stored rows of matching features of two photographs, their clarity, and which are
+        single, if any."""
         found = self._load(self.name(one, other))
         if found is None or set(found) != {"rows", "clarity", "single"}:
             return None
         return found["rows"], found["clarity"], found["single"]
 
     def save_matches(self, one: str, other: str, rows, clarity, single) -> None:
-        """Keep the matches of two photographs."""
+        """Store the matches of two photographs."""
         self._save(self.name(one, other), rows=rows, clarity=clarity, single=single)
 
     def drop_unused(self) -> None:
-        """Remove the files of photographs that are no longer there."""
+        """Remove the files of photographs that no longer exist."""
         if self.folder is not None:
             for path in self.folder.glob("*.npz"):
                 if path.stem not in self.used:
                     path.unlink(missing_ok=True)
             for path in self.folder.glob("*.part*"):
-                # of a run that was killed, unless it is so new that another one may be writing it
+                # from a killed run, unless so new that another run may be writing it
                 with suppress(OSError):
                     if time.time() - path.stat().st_mtime > ABANDONED:
                         path.unlink()

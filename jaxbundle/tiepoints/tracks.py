@@ -1,7 +1,7 @@
-"""Tracks: one point in all the photographs that show it, from matches of pairs.
+"""Tracks: one point in all its photographs, from matches of pairs.
 
-Matches are joined, the clearest first (union-find); one that would put two places of a photograph
-into a track contradicts the clearer ones and is left out. Of the tracks those are kept that cover
+Matches are joined, the most distinct first (union-find); one that would put two points of a
+photograph into a track contradicts better ones and is left out. The kept tracks cover
 every photograph evenly, long ones first, and none next to another.
 """
 
@@ -39,13 +39,13 @@ def make_tracks(
 
 
 def _first_at_a_place(xy):
-    """For every feature the first one at its place: SIFT has several directions of one."""
+    """For every feature the first one at its position: SIFT may give several directions."""
     _, first, back = np.unique(np.round(xy, 2), axis=0, return_index=True, return_inverse=True)
     return first[back.ravel()]
 
 
 def _joined(edges, image):
-    """The groups of nodes that edges join, none with two nodes of an image."""
+    """The groups of nodes joined by edges, none with two nodes of an image."""
     parent: dict[int, int] = {}
     group: dict[int, dict[int, int]] = {}
 
@@ -75,9 +75,9 @@ def choose_tracks(
     sizes: Sequence[tuple[int, int]],
     number: int,
 ) -> Bool[np.ndarray, " tracks"]:
-    """Which tracks to keep, for about `number` places in every photograph, evenly spread.
+    """Which tracks to keep, for about `number` points in every photograph, evenly distributed.
 
-    **Arguments:** `xy`: places of the features of every photograph; `sizes`: columns, rows.
+    **Arguments:** `xy`: positions of the features of every photograph; `sizes`: columns, rows.
     """
     cell, near, shape = _cells(xy, sizes)
     quota = [max(1, round(number / (nx * ny))) for nx, ny in shape]
@@ -98,7 +98,7 @@ def choose_tracks(
 
 
 def _cells(xy, sizes):
-    """Of every feature its cell of the grid, and that of a fine grid; shape of the grids."""
+    """For every feature its cell of the grid, and that of a fine grid; shape of the grids."""
     cell, near, shape = [], [], []
     for places, (columns, rows) in zip(xy, sizes):
         side = max(columns, rows) / CELLS

@@ -1,18 +1,18 @@
-"""Which matches of two photographs one object can explain.
+"""The matches of two photographs that one object can explain.
 
-From the clearest matches a relative orientation is found that withstands gross errors (five points
-at a time, `orientation.robust`); refined with the matches that agree; then all matches are held
-against it: the distance of coplanarity (Sampson), and both rays in front. A rotation alone, or a
-homography, that explains nearly all of them as well is named: two photographs from one place, or of
-a plane, from which no model begins.
+A robust relative orientation is computed from the most distinct matches (five points
+at a time, `orientation.robust`), refined with the agreeing matches, and then tested with all
+matches: the coplanarity misclosure (Sampson), and both rays in front. A pure rotation, or a
+homography, that explains nearly all of them as well is reported: two photographs from one position,
+or of a plane, which do not start a model.
 
-Matches of what is there once go first (`Matches.single`): of a row of windows, those of one to its
-neighbour agree on an orientation of their own, with a camera that is moved by their distance. Only
-where too few single ones agree are all taken; such a pair is not `sure`. Of a sure pair with
-`ENOUGH` single matches the others are left out: along an epipolar line windows follow one another.
+Unique matches come first (`Matches.single`): in a row of windows, matches of each window to its
+neighbour are consistent with a wrong orientation, shifted by their distance. All matches are
+used only if too few unique ones agree; such a pair is not `sure`. In a sure pair with
+`ENOUGH` unique matches the others are left out: windows follow one another along an epipolar line.
 
-Matches that agree must be spread over both photographs, and not lie in one corner: a sign that two
-places have in common is no reason to believe that they are one.
+Agreeing matches must be distributed over both photographs, not in one corner: a common sign
+in two scenes does not prove that they are the same.
 """
 
 import dataclasses
@@ -37,31 +37,31 @@ from jaxbundle.orientation.relative import retract, sampson_distance
 from jaxbundle.system.compilation import quick_jit
 
 LEAST, PART = 16, 0.2
-"""Matches that must agree, and their least part of all."""
+"""Minimum number of agreeing matches, and their minimum share of all."""
 CLEAR = 0.6
-"""Part of the matches, the clearest ones, from which the orientation is sought."""
+"""Share of the most distinct matches used to find the orientation."""
 ENOUGH = 60
-"""Single matches that suffice."""
+"""Sufficient number of unique matches."""
 EXTENT = 0.05
-"""Least standard deviation of the places of agreeing matches across their longest direction, in
-parts of that of a photograph's features: they are no speck, and on no line."""
+"""Minimum standard deviation of agreeing matches across their longest direction, relative to
+that of a photograph's features: not a spot, and not a line."""
 SLOTS, LANES = 192, 8
 ROUNDS, STEPS = 2, 8
 TURNS = 40
-"""Pairs of matches from which a rotation is tried."""
+"""Number of pairs of matches for trial rotations."""
 LOOSE = 3.0
 """The first choice of matches, in tolerances."""
 EXPLAINED = 0.9
-"""Part of the matches that a simpler relation must explain."""
+"""Share of the matches that a simpler relation must explain."""
 KINDS = ("relative", "plane", "rotation")
 
 
 @dataclasses.dataclass(frozen=True)
 class Pair:
-    """Two photographs that show the same: rows of features that match; M from the first camera to
-    the second and base b; angle of intersection (median, radians); `kind`: `"relative"`, or what
-    explains the pair as well: `"plane"`, `"rotation"` (b is then zero or without meaning); `found`:
-    matches before verification; `sure`: it was oriented by matches of what is there once."""
+    """Two overlapping photographs: rows of matching features; M from the first camera to
+    the second and base b; angle of intersection (median, radians); `kind`: `"relative"`, or a
+    sufficient simpler relation: `"plane"`, `"rotation"` (b is then zero or without meaning);
+    `found`: matches before verification; `sure`: oriented by unique matches."""
 
     images: tuple[int, int]
     matches: Int[np.ndarray, "n 2"]
@@ -78,7 +78,7 @@ class Pair:
 
 
 class Verified(NamedTuple):
-    """What one object can explain of a pair: which matches; M, b, angle and kind as of `Pair`."""
+    """The matches of a pair explained by one object; M, b, angle and kind as of `Pair`."""
 
     good: Bool[np.ndarray, " n"]
     M: Float[np.ndarray, "3 3"]
@@ -94,10 +94,10 @@ def verify_pairs(
     tolerance: Float[np.ndarray, " pairs"],
     single: Sequence[Bool[np.ndarray, " _"]] | None = None,
 ) -> list[Verified | None]:
-    """For each pair what one object can explain; None where too few matches agree.
+    """The part of each pair explained by one object; None if too few matches agree.
 
-    **Arguments:** matches, the clearest first, as ideal image coordinates, c = 1; `tolerance`: of
-    Sampson's distance, c = 1; `single`: which matches are of what is there once; all, if not given.
+    **Arguments:** matches, the most distinct first, as ideal image coordinates, c = 1; `tolerance`:
+    of Sampson's distance, c = 1; `single`: which matches are unique; all, if not given.
     """
     single = [np.ones(len(xy), bool) for xy in xy1] if single is None else single
     usable = [k for k, xy in enumerate(xy1) if len(xy) >= LEAST]
@@ -128,9 +128,9 @@ def verify_pairs(
 
 
 def _agreed(rows: dict[int, np.ndarray], xy1, xy2, tolerance):
-    """Of pairs the matches that agree with the orientation by some of them (`rows`), M and b, where
-    enough of these agree. Where they do not by the clear ones, which are many, the clearest are
-    asked: of photographs far apart most matches may be wrong."""
+    """The agreeing matches of pairs with the orientation from some of them (`rows`), M and b, if
+    enough of these agree. Otherwise only the most distinct ones are tried: for photographs far
+    apart most matches may be wrong."""
     rows = {k: r for k, r in rows.items() if len(r) >= LEAST}
     found = _by_some(rows, _clear_rows, xy1, xy2, tolerance)
     again = {k: r for k, r in rows.items() if k not in found and CLEAR * len(r) > many.SLOTS}
@@ -138,7 +138,7 @@ def _agreed(rows: dict[int, np.ndarray], xy1, xy2, tolerance):
 
 
 def _by_some(rows: dict[int, np.ndarray], clear, xy1, xy2, tolerance):
-    """As `_agreed`, sought by the matches that `clear` gives of their number."""
+    """As `_agreed`, from the number of matches given by `clear`."""
     if not rows:
         return {}
     keys = np.array(list(rows))
@@ -161,12 +161,12 @@ def _by_some(rows: dict[int, np.ndarray], clear, xy1, xy2, tolerance):
 
 
 def _extended(some, every) -> bool:
-    """Whether some places extend over more than a speck or a line among all."""
+    """Whether some points extend over more than a spot or a line among all."""
     return np.linalg.eigvalsh(np.cov(some.T))[0] > (EXTENT * every.std()) ** 2
 
 
 def prepare() -> None:
-    """Compile what `verify_pairs` runs, ahead of its data."""
+    """Compile the programs of `verify_pairs` ahead of its data."""
     xy = np.random.default_rng(0).uniform(-0.5, 0.5, (LANES, SLOTS, 2))
     M, b = np.tile(np.eye(3), (LANES, 1, 1)), np.tile([1.0, 0, 0], (LANES, 1))
     weights = np.ones((LANES, SLOTS))
@@ -175,7 +175,7 @@ def prepare() -> None:
 
 
 def _by_rotation(xy1, xy2, tolerance):
-    """The matches that a rotation about the projection centre explains, and M, if most are."""
+    """The matches explained by a rotation about the projection centre, and M, if they are most."""
     rays = [np.pad(xy, ((0, 0), (0, 1)), constant_values=-1.0) for xy in (xy1, xy2)]
     one, two = (a / np.linalg.norm(a, axis=1, keepdims=True) for a in rays)
     rng, best = np.random.default_rng(0), None
@@ -199,7 +199,7 @@ def _triad(a, b):
 
 
 def _clear_rows(number):
-    """The clearest of the matches, all of a few."""
+    """The most distinct matches, all of a few."""
     return many.spread(max(int(CLEAR * number), min(number, many.SLOTS)))
 
 
@@ -209,7 +209,7 @@ def _agree(M, b, xy1, xy2, tolerance):
 
 
 def _distances(M, b, xy1, xy2):
-    """Sampson's distance of every match, and whether it lies in front (numpy, any number)."""
+    """Sampson's distance of every match, and whether it is in front (numpy, any number)."""
     a1, a2 = (np.pad(xy, ((0, 0), (0, 1)), constant_values=-1.0) for xy in (xy1, xy2))
     back = a2 @ M
     line2, line1 = np.cross(b, a1) @ M.T, np.cross(back, b)
@@ -222,7 +222,7 @@ def _distances(M, b, xy1, xy2):
 
 
 def _improved(poses, of, xy1, xy2, tolerance, limit):
-    """The relative orientations refined by the matches (`of` these rows) that agree to `limit`
+    """The relative orientations refined by the matches (`of` these rows) within `limit`
     tolerances."""
     keys, rows = [], []
     for k, (M, b) in poses.items():
