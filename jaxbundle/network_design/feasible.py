@@ -1,6 +1,6 @@
-"""Whether any station can keep the conditions: places tried all over the room.
+"""Test whether any station can satisfy the conditions, by trial positions all over the room.
 
-What cannot be designed is refused by name before anything is searched.
+Infeasible designs are refused by name before the search.
 """
 
 import jax
@@ -17,9 +17,9 @@ from jaxbundle.network_design.variables import Start, looked_at, turned
 from jaxbundle.network_design.visibility import margins, visible
 
 TRIED = 1024
-"""Places in the room."""
+"""Trial positions in the room."""
 REACH = 3.0
-"""Without a room, stations stay within so many times the largest distance of the start."""
+"""Without a room, the limit of the distance of stations, relative to the largest at the start."""
 
 
 def room_of(conditions: Conditions, pairs: Pairs) -> Float[np.ndarray, "2 3"]:
@@ -33,7 +33,7 @@ def room_of(conditions: Conditions, pairs: Pairs) -> Float[np.ndarray, "2 3"]:
 
 
 def targets_of(conditions: Conditions, pairs: Pairs) -> Float[np.ndarray, "2 3"]:
-    """The box of targets that move: that of the conditions, or of all points."""
+    """The box of movable targets: that of the conditions, or of all points."""
     if conditions.targets is not None:
         return np.array(conditions.targets) - pairs.problem.origin
     points = np.asarray(pairs.problem.data.start.point)
@@ -46,7 +46,7 @@ _turned = jax.jit(jax.vmap(turned))
 def try_stations(
     pairs: Pairs, number: int, seed: int = 0
 ) -> tuple[Float[np.ndarray, "tried 3"], Float[np.ndarray, "tried 4"], np.ndarray]:
-    """Stations at random in the room that look at a target each, outside of obstacles.
+    """Random stations in the room, outside of obstacles, each looking at a target.
 
     **Returns:** positions, rotations, and the targets."""
     random = np.random.default_rng(seed)
@@ -64,9 +64,9 @@ def try_stations(
 
 
 def check_feasible(pairs: Pairs, tried: int = TRIED) -> None:
-    """Refuse conditions that no station keeps, and targets that none sees.
+    """Refuse conditions that no station satisfies, and targets visible from none.
 
-    **Raises:** `InputError` that names the condition, or the targets."""
+    **Raises:** `InputError` naming the condition, or the targets."""
     start = pairs.problem.data.start
     position, rotation, _ = try_stations(pairs, tried)
     position = np.concatenate([position, start.position])
@@ -88,14 +88,14 @@ def check_feasible(pairs: Pairs, tried: int = TRIED) -> None:
     if hidden.any():
         ids = [pairs.problem.network.points.id[interest[k]] for k in np.flatnonzero(hidden)]
         raise InputError(
-            f"conditions: {len(ids)} of {len(interest)} targets can be measured from nowhere in "
+            f"conditions: {len(ids)} of {len(interest)} targets cannot be measured from anywhere in "
             f"the room ({len(position)} places tried): {some(ids)}. Widen the conditions, or leave "
             "these targets out"
         )
 
 
 def _why(found, tried: int) -> str:
-    """Which condition no ray keeps, or that they contradict each other."""
+    """A message on the condition that no ray satisfies, or on contradictory conditions."""
     places = f"({tried} places in the room tried)"
     if "obstacles" in found and not found["obstacles"].any():
         return f"conditions: all targets are hidden by the obstacles from everywhere {places}"
@@ -113,7 +113,7 @@ def _why(found, tried: int) -> str:
 
 
 def _seen(pairs: Pairs, c: int, start: Values, position, rotation):
-    """Which conditions are kept by stations of a camera, [stations, points] each."""
+    """Which conditions the stations of a camera satisfy, [stations, points] each."""
     view = pairs.views[c]
     interior = jnp.asarray(start.camera)[c, : len(view.model.parameters)]
 
@@ -128,13 +128,13 @@ def _seen(pairs: Pairs, c: int, start: Values, position, rotation):
 
 
 def start_at(pairs: Pairs) -> Start:
-    """The configuration to begin with."""
+    """The start configuration."""
     values = jax.tree.map(np.asarray, pairs.problem.data.start)
     return Start(values, looked_at(values))
 
 
 def lost_targets(pairs: Pairs, measured) -> tuple[str, ...]:
-    """The ids of targets of interest with too few rays to be determined."""
+    """The ids of targets of interest undetermined by too few rays."""
     rays = np.bincount(pairs.problem.point[measured], minlength=len(pairs.interest))
     lost = pairs.interest & (rays < FEWEST_RAYS)
     return tuple(pairs.problem.network.points.id[k] for k in np.flatnonzero(lost))

@@ -1,7 +1,7 @@
-"""The network in which every station may see every target: the problem whose precision is designed.
+"""The network of all pairs of stations and targets: the problem whose precision is designed.
 
-Measured image points stay as they are where they are kept (`kept`); every other pair of a station
-and a target is an observation whose weight is 1/σ times its visibility.
+Kept image points (`kept`) are unchanged; every other pair of a station
+and a target is an observation with weight 1/σ times its visibility.
 """
 
 import dataclasses
@@ -42,20 +42,20 @@ from jaxbundle.network_design.visibility import (
 from jaxbundle.types import AnyArray
 
 FEWEST_RAYS = 2
-"""Of a target, to determine it."""
+"""Minimum rays of a determined target."""
 FEWEST_TARGETS = 3
-"""Of a photograph that takes part."""
+"""Minimum rays of an included photograph."""
 IDLE = 3e-4
-"""The factor of the weights 1/σ of a photograph that takes no part: 1e-7 of its information."""
+"""The factor of the weights 1/σ of an excluded photograph: 1e-7 of its information."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Pairs:
     """A problem of all pairs, its aim and its conditions.
 
-    `kept`: the weights of rays that do not depend on what is designed, 1 for those that were
-    measured, 0 for those that were not; NaN for all others. `views`: the image of every camera;
-    `rules`: the conditions of rays; `normals`: of all points; `interest`: the points aimed at.
+    `kept`: the weights of rays independent of the design, 1 for measured and 0 for missing
+    ones; NaN for all others. `views`: the image of every camera;
+    `rules`: the conditions of rays; `normals`: of all points; `interest`: the points of the aim.
     """
 
     problem: Problem
@@ -70,7 +70,7 @@ class Pairs:
 
     @property
     def soft(self) -> Bool[np.ndarray, " rays"]:
-        """Which rays depend on what is designed."""
+        """Which rays depend on the design."""
         return np.isnan(self.kept)
 
     def of_camera(self, c: int) -> Int[np.ndarray, " rows"]:
@@ -102,7 +102,7 @@ class Pairs:
         return jnp.where(self.soft, self.each_ray(one, values), np.nan_to_num(self.kept))
 
     def data(self, values: Values, weight: Float[AnyArray, " rays"]) -> EngineData:
-        """The numbers of the design, filled to the sizes of the plan: weights are 1/σ times
+        """The numbers of the design, padded to the sizes of the plan: weights are 1/σ times
         `weight`, image coordinates those of the values."""
         xy, data = self.predicted(values), self.problem.data
         weight = jnp.asarray(data.image_weight) * jnp.asarray(weight)[:, None]
@@ -111,8 +111,8 @@ class Pairs:
         return fill_data(self.problem.system, self.problem.layout.data(data))
 
     def aim_at(self, measured: Bool[np.ndarray, " rays"], values: Values) -> float:
-        """The aim with these rays; NaN where they do not determine it. Photographs with too few of
-        them take no part: their rays have next to no weight, so that they stay determined."""
+        """The aim with these rays; NaN if they do not determine it. Photographs with too few
+        rays are excluded: their rays have a negligible weight, so that they stay determined."""
         image = self.problem.image
         rays = np.bincount(image[measured], minlength=len(self.problem.network.images))
         weight = np.where(rays[image] < FEWEST_TARGETS, IDLE, np.asarray(measured, float))
@@ -124,7 +124,7 @@ class Pairs:
         return jax.jit(self.data)
 
     def seen(self, values: Values) -> dict[str, Bool[np.ndarray, " rays"]]:
-        """Which rays keep which conditions, as they are."""
+        """Which rays satisfy which conditions, without softness."""
         return {k: np.asarray(v) for k, v in self._seen(values).items()}
 
     @cached_property
@@ -141,7 +141,7 @@ class Pairs:
         return jax.jit(lambda values: self.each_ray(one, values))
 
     def measured(self, values: Values) -> Bool[np.ndarray, " rays"]:
-        """Which rays are measured: those that keep all conditions, and those that were."""
+        """Which rays are measured: those that satisfy all conditions, and already measured ones."""
         seen = np.logical_and.reduce(list(self.seen(values).values()))
         return np.where(self.soft, seen, self.kept > 0)
 
@@ -152,11 +152,12 @@ def make_pairs(
 ) -> Pairs:
     """The problem of all pairs of a network without check points.
 
-    **Arguments:** `sigma`: of image coordinates to come, in the unit of the cameras' models; `new`:
-    images to be designed, whose rays are not measured; all if not given, and then no measured image
-    point counts.
+    **Arguments:** `sigma`: of future image coordinates, in the unit of the cameras' models; `new`:
+    images to design, whose rays are not measured; all if not given, and then measured image
+    points are ignored.
 
-    **Raises:** `InputError` for a network that cannot be designed, an aim that the datum decides.
+    **Raises:** `InputError` for a network that cannot be designed, or an aim that depends on the
+    datum.
     """
     _refuse(require_network(network))
     images, points, rays = network.images, network.points, network.observations
@@ -181,7 +182,7 @@ def make_pairs(
 
 
 def _refuse(network: Network) -> None:
-    """Refuse what a design cannot start from.
+    """Refuse networks from which a design cannot start.
 
     **Raises:** `InputError`."""
     images, points = network.images, network.points
@@ -195,7 +196,7 @@ def _refuse(network: Network) -> None:
                              f"design starts from {words}")  # fmt: skip
     if network.further:
         raise InputError(
-            f"{network.further[0].source.name}: a design knows image points, distances, control "
+            f"{network.further[0].source.name}: a design uses image points, distances, control "
             "points and priors; leave the other observations out"
         )
     if len(network.points) < 3 or len(network.images) < 1:

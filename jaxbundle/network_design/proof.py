@@ -1,9 +1,9 @@
-r"""A design proved: many networks simulated, adjusted, and compared with what was predicted.
+r"""Proof of a design: many simulated networks are adjusted and compared with the prediction.
 
-The draws are adjusted one after the other, by the programs that `adjust` uses: for networks of this
-size that takes less time than one program for all of them takes to be compiled. The deviations from
-the truth, in the datum of the network, give covariances C̃ = Σ d·dᵀ/n, of which the aim is formed as
-of the predicted ones. With n draws the σ of a single unknown is known to 1/√(2n) of itself.
+The draws are adjusted one after the other, by the programs of `adjust`: for networks of this
+size this is faster than compiling one program for all. The deviations from
+the truth, in the datum of the network, give covariances C̃ = Σ d·dᵀ/n, from which the aim is
+computed like the predicted one. With n draws the relative σ of an estimated σ is 1/√(2n).
 """
 
 import dataclasses
@@ -26,7 +26,7 @@ FIELDS = ("image", "control", "exterior", "interior", "distance")
 @shows_itself
 @dataclasses.dataclass(frozen=True)
 class Proof:
-    """The aim as predicted and as found from `draws` adjustments of simulated measurements."""
+    """The predicted aim, and that from `draws` adjustments of simulated measurements."""
 
     predicted: float
     found: float
@@ -35,12 +35,12 @@ class Proof:
 
     @property
     def ratio(self) -> float:
-        """Found over predicted: 1 but for chance."""
+        """Ratio of found to predicted aim: 1 except for chance."""
         return self.found / self.predicted
 
     @property
     def limit(self) -> float:
-        """How far the ratio of one σ may be from 1 by chance: three times its σ."""
+        """Limit of the random deviation of the ratio of one σ from 1: three times its σ."""
         return 3 / np.sqrt(2 * (self.draws - self.failed))
 
     @property
@@ -58,11 +58,11 @@ class Proof:
 
 
 def prove(problem: Problem, aim: Aim, draws: int = 200, seed: int = 0) -> Proof:
-    """Simulate and adjust a network whose image coordinates are exact.
+    """Simulate and adjust a network with exact image coordinates.
 
     **Arguments:** `problem`: its start values are the truth.
 
-    **Raises:** `NotSolvedError` where no draw can be adjusted."""
+    **Raises:** `NotSolvedError` if no draw can be adjusted."""
     draws = whole("draws", draws, least=2, most=100_000)
     truth, exact = problem.data.start, problem.data
     functions = functions_of(problem, aim)
@@ -87,7 +87,7 @@ def _points_of(interest):
 
 
 def _measured(exact: Data, random: np.random.Generator) -> Data:
-    """The data as they would be measured."""
+    """Simulated data."""
     noisy = {
         name: np.asarray(exact.measured(name))
         + random.standard_normal(exact.measured(name).shape) * _sigma(exact.weight(name))
@@ -98,7 +98,7 @@ def _measured(exact: Data, random: np.random.Generator) -> Data:
 
 
 def _adjusted(problem: Problem, data: Data) -> Values | None:
-    """The adjusted values, in the datum of the problem; None where there is no solution."""
+    """The adjusted values, in the datum of the problem; None without solution."""
     system = with_data(problem.system, problem.layout.data(data))
     minimum = find_minimum(system)
     if not bool(converged(minimum.termination)):

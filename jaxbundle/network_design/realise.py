@@ -1,4 +1,4 @@
-"""A design as a network that can be adjusted: what its stations see, measured with noise."""
+"""A design as a network for adjustment: visible targets, measured with noise."""
 
 import dataclasses
 
@@ -24,11 +24,11 @@ def realise(
     pairs: Pairs, values: Values, measured: Bool[np.ndarray, " rays"], seed: int | None = 0,
     residuals: str = "corrected",
 ) -> Network:
-    """The network of a design with simulated measurements; stations that see fewer than three
-    targets are left out.
+    """The network of a design with simulated measurements; stations with fewer than three
+    visible targets are left out.
 
-    **Arguments:** `measured`: which rays; `seed`: of the noise of those that are simulated, those
-    that were measured stay as they are; None: all rays without noise."""
+    **Arguments:** `measured`: which rays; `seed`: of the noise of simulated rays, while
+    already measured ones are unchanged; None: all rays without noise."""
     network, origin = pairs.problem.network, pairs.problem.origin
     images = dataclasses.replace(
         network.images, position=np.asarray(values.position) + origin,
@@ -54,7 +54,7 @@ def realise(
 
 
 def _distances(network: Network, points, seed: int | None):
-    """Distances as they would be measured where a target has moved."""
+    """Distances simulated after targets have moved."""
     given = network.distances
     ends = points[given.points], network.points.position[given.points]
     length, before = (np.linalg.norm(e[:, 0] - e[:, 1], axis=1) for e in ends)
@@ -66,7 +66,7 @@ def _distances(network: Network, points, seed: int | None):
 
 
 def problem_of(network: Network) -> Problem | None:
-    """The problem of a network as designed; None where it cannot be adjusted."""
+    """The problem of a designed network; None if it cannot be adjusted."""
     try:
         return make_problem(check_network(network))
     except (InputError, NotSolvedError):

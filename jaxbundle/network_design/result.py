@@ -1,4 +1,4 @@
-"""A designed network: what it was, what it became, what that gains, and the proof."""
+"""A designed network: before and after, the gain, and the proof."""
 
 import dataclasses
 from functools import cached_property
@@ -21,8 +21,8 @@ from jaxbundle.types import present
 
 @dataclasses.dataclass(frozen=True)
 class State:
-    """A network as its stations see it: `network` with simulated measurements, `exact` without
-    noise; the `aim`, NaN where it is not determined; targets `lost`, with fewer than two rays."""
+    """A network with its visible targets: `network` with simulated measurements, `exact` without
+    noise; the `aim`, NaN if it is not determined; targets `lost`, with fewer than two rays."""
 
     network: Network
     exact: Network
@@ -31,7 +31,7 @@ class State:
 
     @cached_property
     def smallest_redundancy(self) -> float:
-        """Of an image coordinate; NaN where the network cannot be adjusted."""
+        """Mean redundancy number of an image coordinate; NaN if the network cannot be adjusted."""
         problem = problem_of(self.exact)
         return np.nan if problem is None else smallest_redundancy(problem)
 
@@ -42,7 +42,7 @@ class State:
 
     @property
     def photographs(self) -> int:
-        """Stations that see something."""
+        """Stations with visible targets."""
         return len(self.network.images)
 
 
@@ -53,9 +53,9 @@ class Design:
 
     `order`: "zero", "first", "second", "third"; `path`: the aim by iteration, and the projection
     centres; `converged`: whether the last round of the search did; `bound`: no selection of as many
-    photographs has a smaller aim (second order); `dropped`: ids of photographs that are not taken;
-    `weights`: of all candidates; `tried`: places [n, 3] and the aim with a photograph there (third
-    order).
+    photographs has a smaller aim (second order); `dropped`: ids of photographs not selected;
+    `weights`: of all candidates; `tried`: positions [n, 3] and the aim with a photograph there
+    (third order).
     """
 
     order: str
@@ -78,18 +78,18 @@ class Design:
 
     @property
     def gain(self) -> float:
-        """How many times smaller the aim is; NaN where the start determined nothing."""
+        """Ratio of the aims before and after; NaN if the start does not determine the aim."""
         return self.before.aim / self.after.aim
 
     @cached_property
     def proof(self) -> Proof:
-        """200 networks simulated and adjusted (`prove`)."""
+        """Proof with 200 simulated networks (`prove`)."""
         return self.prove()
 
     def prove(self, draws: int = 200, seed: int = 0) -> Proof:
-        """Simulate and adjust the designed network so often, and compare with the prediction.
+        """Simulate and adjust the designed network repeatedly, and compare with the prediction.
 
-        **Raises:** `NotSolvedError` where it cannot be adjusted."""
+        **Raises:** `NotSolvedError` if it cannot be adjusted."""
         problem = problem_of(self.after.exact)
         if problem is None:
             raise NotSolvedError("design: the designed network cannot be adjusted")
@@ -97,8 +97,8 @@ class Design:
 
     @property
     def board_poses(self) -> Float[np.ndarray, "images 4 4"]:
-        """The targets' frame in that of the camera, for every photograph: where a board is to be
-        held before a camera that stands still. In the axes of a camera with z towards the scene and
+        """The frame of the targets in that of the camera, for every photograph: the positions of a
+        board in front of a fixed camera. In the axes of a camera with z towards the scene and
         y down."""
         from jaxbundle.geometry import matrix_from_omega_phi_kappa
 
@@ -134,7 +134,7 @@ class Design:
 
     def _remarks(self):
         if np.isnan(self.before.aim):
-            yield "gain: the start determines nothing that the aim needs"
+            yield "gain: the start does not determine the aim"
         elif self.gain > 1 + 1e-9:
             yield f"gain: the aim is {self.gain:.3g} times smaller"
         else:

@@ -1,8 +1,9 @@
 """The search for a configuration: constrained minimisation with gradients by autodiff.
 
 Sequential quadratic programming (SLSQP, Kraft 1988) of the logarithm of the aim, in rounds: the
-conditions of rays are soft at first, so that a station feels targets that it does not see yet, and
-sharper in every round. What rounding or a singular design makes no number is as bad as can be.
+conditions of rays are soft at first, so that not yet visible targets have a gradient, and
+sharper in every round. Values that are not finite, by rounding or a singular design, count as the
+worst.
 """
 
 from collections.abc import Callable
@@ -25,9 +26,9 @@ from jaxbundle.types import AnyArray
 ROUNDS = (0.3, 0.1, 0.03)
 """Softness of the conditions."""
 WORST = 1e3
-"""The logarithm of the aim where there is none."""
+"""The logarithm of an undetermined aim."""
 SETTLED = 1e-4
-"""A change of the logarithm of the aim at which a round ends."""
+"""A change of the logarithm of the aim that ends a round."""
 ROUNDED = 20.0
 """Edges of obstacles are rounded to 1/20 of their half size for projection centres."""
 
@@ -45,8 +46,8 @@ def make_program(
 ) -> Callable[..., tuple[float, Float[np.ndarray, " variables"]]]:
     """`(x, *given) -> (log aim, gradient)`; `design(x, *given)` gives values and weights of rays.
 
-    In three programs, of which that of the aim is by far the largest: it is shared by all designs
-    of one shape. Where there is no aim it is as bad as can be, without a slope."""
+    In three programs; the largest by far, that of the aim, is shared by all designs
+    of one shape. An undetermined aim has the worst value, with zero gradient."""
 
     def data(x, given):
         return pairs.data(*design(x, *given))
@@ -58,7 +59,7 @@ def make_program(
         return jax.vjp(lambda x: data(x, given), x)[1](slopes)[0]
 
     def program(x, *given):
-        # A softness that were a number of Python would be compiled anew.
+        # A Python number as softness would cause a new compilation.
         x, given = jnp.asarray(x), jax.tree.map(jnp.asarray, given)
         value, slopes = log_aim(pairs.task, forward(x, given))
         slope = np.asarray(back(x, given, slopes))
@@ -82,8 +83,8 @@ def configuration(pairs: Pairs, variables: Variables) -> Callable:
 def station_margins(
     conditions: Conditions, variables: Variables, origin: Float[np.ndarray, "3"]
 ) -> Callable | None:
-    """`(x, start) -> margins` of projection centres, positive where the conditions are kept: of
-    pairs of stations apart, and of stations outside of obstacles. None where there are none."""
+    """`(x, start) -> margins` of projection centres, positive if the conditions are satisfied:
+    distances of stations, and stations outside of obstacles. None without conditions."""
     if not (conditions.apart > 0 or conditions.obstacles):
         return None
     boxes = np.array(conditions.obstacles).reshape(-1, 2, 3) - origin
@@ -161,7 +162,7 @@ def _compiled(margins):
 def kept(
     conditions: Conditions, variables: Variables, origin: np.ndarray, start: Start
 ) -> bool:
-    """Whether the stations keep their conditions, to a thousandth of their lengths."""
+    """Whether the stations satisfy their conditions, to a thousandth of their lengths."""
     margins = station_margins(conditions, variables, origin)
     if margins is None:
         return True

@@ -1,8 +1,8 @@
-r"""The variables of a design of first order: where cameras stand, where they look, how they are
-rolled, where targets are.
+r"""The variables of a design of first order: positions, viewing directions and roll of cameras,
+and positions of targets.
 
 Lengths are in units of the size of the network, angles in radians. A station looks at a point, so
-that it turns as it moves: from the start attitude M by the smallest rotation that brings the axis
+that it rotates as it moves: from the start attitude M by the smallest rotation of the axis
 to the point, then by the roll ρ about it,
 
     M' = R3(ρ)·exp([δ]×)·M,   δ from d × (0, 0, −1), d the direction of the point in the camera.
@@ -25,12 +25,12 @@ from jaxbundle.types import AnyArray
 
 AXIS = np.array([0.0, 0.0, -1.0])
 ROOM_OF_SIGHT = 0.25
-"""By this part of their extent the points looked at may be beyond the targets."""
+"""Margin of the viewed points beyond the targets, relative to their extent."""
 
 
 class Start(eqx.Module):
-    """What the variables change: values of the network, and the points looked at, relative to its
-    origin."""
+    """The quantities changed by the variables: values of the network, and the viewed points,
+    relative to its origin."""
 
     values: Values
     look: Float[AnyArray, "images 3"]
@@ -38,7 +38,7 @@ class Start(eqx.Module):
 
 @dataclasses.dataclass(frozen=True)
 class Variables:
-    """Which rows move and how the vector of variables is cut; `unit`: of lengths."""
+    """The variable rows and the parts of the vector of variables; `unit`: of lengths."""
 
     images: np.ndarray
     points: np.ndarray
@@ -104,7 +104,7 @@ class Variables:
 
 
 def turned(q: Float[AnyArray, "4"], away: Float[AnyArray, "3"]) -> Float[Array, "4"]:
-    """The attitude turned so that the axis has the direction `away` (object space)."""
+    """The attitude rotated so that the axis has the direction `away` (object space)."""
     d = matrix_from_quaternion(q) @ away
     d = d / jnp.sqrt(jnp.sum(d**2))
     axis, cosine = jnp.cross(d, AXIS), d @ AXIS
@@ -124,12 +124,12 @@ def choose_variables(
 ) -> Variables:
     """The variables of these rows.
 
-    **Raises:** `InputError` for what cannot be free."""
+    **Raises:** `InputError` for variables that cannot be free."""
     for name in free:
         if name not in DESIGNED:
             raise InputError(f"free: {name!r} is not one of {', '.join(DESIGNED)}")
     if not free:
-        raise InputError(f"free: nothing is to be designed; give some of {', '.join(DESIGNED)}")
+        raise InputError(f"free: nothing to design; give some of {', '.join(DESIGNED)}")
     reach = np.asarray(values.position) - np.asarray(values.point).mean(0)
     return Variables(images, points, tuple(free), float(np.linalg.norm(reach, axis=1).mean()))
 
@@ -138,7 +138,7 @@ _axes = jax.jit(jax.vmap(lambda q: matrix_from_quaternion(q).T @ AXIS))
 
 
 def looked_at(values: Values) -> Float[np.ndarray, "images 3"]:
-    """The points on the axes of all images at the depth of the middle of the targets."""
+    """The points on the axes of all images at the depth of the centre of the targets."""
     position, middle = np.asarray(values.position), np.asarray(values.point).mean(0)
     axis = np.asarray(_axes(np.asarray(values.rotation)))
     depth = ((middle - position) * axis).sum(1)

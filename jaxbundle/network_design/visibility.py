@@ -1,14 +1,14 @@
-r"""Whether a station measures a target: as a smooth weight, and as yes or no.
+r"""Visibility of a target from a station: as a smooth weight, and as yes or no.
 
-Every condition of a ray is a margin m, 0 at its limit and about 1 well inside: of the format the
-distance from an edge in half formats, of lengths in half their range. The weight is
+Every condition of a ray is a margin m, 0 at its limit and about 1 well inside: for the format the
+distance from an edge in half formats, for lengths in half their range. The weight is
 
     v = Π 1/(1 + exp(−m/s))
 
-with the softness s. It is differentiable, and for s → 0 it is 1 where all margins are positive, 0
-elsewhere. What is hidden is a length: that of the ray within an obstacle, which is widened by 3·s
-so that a thin wall hides as well, and 4·s of which do not count so that targets on its surface are
-seen.
+with the softness s. It is differentiable, and for s → 0 it is 1 if all margins are positive, else
+0. The margin of occlusion is the length of the ray within an obstacle, widened by 3·s
+so that thin walls also hide, and reduced by 4·s so that targets on its surface are
+visible.
 """
 
 from typing import NamedTuple
@@ -29,18 +29,19 @@ from jaxbundle.network_design.conditions import Conditions
 from jaxbundle.types import AnyArray
 
 WIDE = np.radians(70.0)
-"""Off the axis, rays of narrower cameras are compared by their tangents, others by the angle."""
+"""Rays of narrower cameras are compared by tangents of the angle off the axis, others by the
+angle."""
 STEEPEST = np.radians(87.0)
 """Angles off the axis whose tangents are compared; beyond, the angle is added."""
 AT_CORNERS = 1e-6
-"""By which a ray may be beyond the corner of the image: rounding."""
+"""Tolerance of a ray beyond the corner of the image: rounding."""
 WIDENED, SPARED = 3.0, 4.0
 TOUCHED = 1e-9
-"""Margins above this below zero are kept: rounding, and targets on the surface of an obstacle."""
+"""Margins down to this count as satisfied: rounding, and targets on the surface of an obstacle."""
 
 
 class View(NamedTuple):
-    """The image of a camera: its model, the corners of what may be used of its format, and the
+    """The image of a camera: its model, the corners of the usable format, and the
     largest angle off the axis (radians)."""
 
     model: CameraModel
@@ -61,7 +62,7 @@ class Rules(eqx.Module):
 def view_of(camera: Camera, edge: float) -> View:
     """The image of a camera.
 
-    **Raises:** `InputError` where its format is not known."""
+    **Raises:** `InputError` if its format is not known."""
     model = get_model(camera.model)
     try:
         low, high = image_area(model, camera.image_size, camera.pixel_size)
@@ -82,7 +83,7 @@ def view_of(camera: Camera, edge: float) -> View:
 
 
 def present_size(camera: Camera) -> tuple[int, int]:
-    """The image size of a camera that has one.
+    """The image size of a camera.
 
     **Raises:** `ValueError`."""
     if camera.image_size is None:
@@ -105,8 +106,8 @@ def image_of(
     view: View, position: Float[AnyArray, "3"], rotation: Float[AnyArray, "4"],
     interior: Float[AnyArray, " parameters"], point: Float[AnyArray, "3"],
 ) -> Float[Array, "2"]:
-    """The image of a target; of one outside the field of view that of the nearest ray inside, as a
-    distorted camera may have none of its own."""
+    """The image of a target; outside the field of view that of the nearest ray inside, since a
+    distorted camera may have no image there."""
     x, y, z = matrix_from_quaternion(rotation) @ (point - position)
     return _image(view, interior, x, y, -z)[0]
 
@@ -116,7 +117,7 @@ def margins(
     interior: Float[AnyArray, " parameters"], point: Float[AnyArray, "3"],
     normal: Float[AnyArray, "3"] | None, softness: float | Float[AnyArray, ""] = 0.0,
 ) -> dict[str, Float[Array, " margins"]]:
-    """The margins of one ray by condition; of obstacles at this softness, 0: as they are."""
+    """The margins of one ray by condition; obstacles with this softness, 0: exact."""
     away = point - position
     length = jnp.sqrt(jnp.sum(away**2))
     x, y, z = matrix_from_quaternion(rotation) @ away
@@ -135,14 +136,14 @@ def margins(
 
 
 def visibility(found: dict[str, Array], softness) -> Float[Array, ""]:
-    """The smooth weight of a ray, 0 to 1, of its margins at this softness."""
+    """The smooth weight of a ray, 0 to 1, from its margins at this softness."""
     spared = lambda name: SPARED if name == "obstacles" else 0.0
     return jnp.exp(sum(jnp.sum(jax.nn.log_sigmoid(m / softness + spared(name)))
                        for name, m in found.items()))  # fmt: skip
 
 
 def visible(found: dict[str, Array]) -> dict[str, Bool[Array, ""]]:
-    """Which conditions a ray keeps, by its margins."""
+    """Which conditions a ray satisfies, by its margins."""
     return {name: jnp.all(m >= -TOUCHED) for name, m in found.items()}
 
 
@@ -178,8 +179,8 @@ def _within(x, ends):
 
 
 def _outside(box, point, position, softness):
-    """The length of the ray within a box, negative, in its half mean edges; where the ray misses
-    the box, a positive measure of how far."""
+    """The length of the ray within a box, negative, in half mean edges; if the ray misses
+    the box, a positive measure of the distance."""
     scale = jnp.mean(box[1] - box[0]) / 2
     wider = WIDENED * softness * scale
     direction = position - point

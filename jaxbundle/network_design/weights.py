@@ -1,13 +1,14 @@
-r"""Design of second order: which of many photographs are worth taking.
+r"""Design of second order: selection of the best of many photographs.
 
 Every candidate has a weight 0 ≤ w ≤ 1 with Σw = n, which multiplies the weights of its image
 coordinates. The square of the aim is convex in w (Pukelsheim 1993, Optimal Design of Experiments),
-so that the minimum over all weights is one, most of them are 0 or 1 there, and for every selection
+so that the minimum over all weights is unique, most of them are 0 or 1 there, and for every
+selection
 
     aim² ≥ T(w) + min over w' of ∇T·(w' − w)
 
-is a bound that no choice of n photographs can fall below. The largest weights are chosen, and
-photographs exchanged while that makes the aim smaller (Fedorov 1972).
+is a lower bound for any choice of n photographs. The largest weights are chosen, and
+photographs exchanged while this reduces the aim (Fedorov 1972).
 """
 
 from typing import NamedTuple
@@ -21,13 +22,13 @@ from jaxbundle.network_design.pairs import IDLE, Pairs
 from jaxbundle.network_design.search import WORST, make_program
 
 NOTHING = IDLE**2
-"""The weight of a photograph that is not taken, so that its orientation stays determined."""
+"""The weight of an unselected photograph, so that its orientation stays determined."""
 MOST_EXCHANGES = 50
 
 
 class Selection(NamedTuple):
     """`weight` of the relaxed problem; `chosen`; `aims`: by iteration; `bound`: on the aim of any
-    selection (0 where there is none)."""
+    selection (0 if there is none)."""
 
     weight: Float[np.ndarray, " images"]
     chosen: Bool[np.ndarray, " images"]
@@ -37,9 +38,9 @@ class Selection(NamedTuple):
 
 
 def select(pairs: Pairs, photographs: int, max_iterations: int = 100) -> Selection:
-    """The photographs to be taken.
+    """The photographs to take.
 
-    **Raises:** `InputError` for a number that is not possible, `NotSolvedError` where no selection
+    **Raises:** `InputError` for an impossible number, `NotSolvedError` if no selection
     determines the network."""
     from scipy.optimize import minimize
 
@@ -96,7 +97,7 @@ def _exchange(program, chosen):
     for _ in range(MOST_EXCHANGES):
         found = best, chosen
         slope = program(np.maximum(chosen.astype(float), 1e-3))[1]
-        # Those whose weight is worth most come in, those worth least go.
+        # Those with the most valuable weight are added, those with the least are removed.
         coming = np.flatnonzero(~chosen)[np.argsort(slope[~chosen])][:8]
         for new in coming:
             for old in np.flatnonzero(chosen):

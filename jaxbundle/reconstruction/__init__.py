@@ -1,1 +1,1 @@
-"""Photographs to an adjusted network."""
+"""Reconstruction: from photographs to an adjusted network."""

@@ -1,14 +1,14 @@
-"""The adjustment of a reconstruction: weights that are honest, gross errors removed.
+"""The adjustment of a reconstruction: estimated weights, gross errors removed.
 
 1. All measurements with the σ of their matching.
-2. The σ of measurements of a kind (least squares matching by level of the pyramid, places of
+2. The σ of measurements of a kind (least squares matching by level of the pyramid, positions of
    features) are multiplied by the root of the variance component of this kind,
 
        f² = Σ(v/σ)²/Σr,        r = 1 − 3/(2n) for a point with n rays,
 
    over residuals below `GROSS`·f.
-3. Data snooping, and 2. again over all that are left, with their own redundancy numbers, until the
-   factors stay.
+3. Data snooping, and 2. again for the remaining measurements, with their redundancy numbers, until
+   the factors converge.
 """
 
 import dataclasses
@@ -28,18 +28,18 @@ SETTLED = 0.004
 """Change of a factor that ends the rounds."""
 ROUNDS = 4
 FEWEST = 60
-"""Measurements of a kind with a factor of its own."""
+"""Minimum measurements of a kind with a separate factor."""
 SMALLEST, LARGEST = 0.3, 8.0
 LOSSES = 6
-"""How often points are left out that data snooping leaves undetermined."""
+"""Maximum rounds of excluding points left undetermined by data snooping."""
 MOST_ITERATIONS = 400
-"""Of one adjustment. Photographs that all look the same way determine the principal distance of an
-unknown camera only weakly, and the search then needs more than a hundred."""
+"""Of one adjustment. Photographs with the same viewing direction determine the principal distance
+of an unknown camera only weakly, and the search then needs more than a hundred."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Weighted:
-    """The adjustment, and the factor of the σ of each kind of measurement."""
+    """The adjustment, and the factor of σ of each kind of measurement."""
 
     adjustment: Adjustment
     factors: dict[str, float]
@@ -52,8 +52,8 @@ def adjust_weighted(
     significance: float,
     tell: Callable[[str], None],
 ) -> Weighted:
-    """Adjust with variance components of the kinds and data snooping; where that has no solution,
-    without the points of two rays, whose gross errors nothing shows.
+    """Adjust with variance components of the kinds and data snooping; without a solution
+    again without points of two rays, whose gross errors are not detectable.
 
     **Arguments:** `kinds`: of every observation of the network.
 
@@ -72,8 +72,7 @@ def adjust_weighted(
 
 
 def _without_lost(network: Network, kinds, names, significance, tell) -> Weighted:
-    """As `_weighted`, without tie points that what data snooping leaves of their rays does not
-    determine."""
+    """As `_weighted`, without tie points undetermined by the rays left after data snooping."""
     tie = network.points.has_role("tie")
     for _ in range(LOSSES):
         try:
@@ -89,7 +88,7 @@ def _without_lost(network: Network, kinds, names, significance, tell) -> Weighte
 
 
 def _keep(network: Network, kinds, points) -> tuple[Network, Int[np.ndarray, " rays"]]:
-    """The network with these points alone, and the kinds of the observations of it."""
+    """The network with only these points, and the kinds of its observations."""
     return keep_points(network, points), kinds[points[network.observations.point]]
 
 
@@ -123,7 +122,7 @@ def _weighted(network: Network, kinds, names, significance, tell) -> Weighted:
 
 
 def _rows(result: Adjustment, network: Network) -> Int[np.ndarray, " rays"]:
-    """For every image point of a result its row in the network, of which some were left out."""
+    """For every image point of a result its row in the network, without excluded ones."""
     rays = network.observations
     index = {one: k for k, one in enumerate(_ids(network, rays.image, rays.point))}
     return np.array([index[one] for one in _named(result, slice(None))], int)
@@ -145,7 +144,7 @@ def _with_sigma(network: Network, sigma) -> Network:
 
 
 def _of_residuals(result: Adjustment):
-    """v/σ of the rays, and their redundancy numbers by the rays of their points."""
+    """v/σ of the rays, and redundancy numbers from the number of rays of their points."""
     w = np.asarray(result.inspection.residuals.image)
     rays = np.bincount(result.problem.point)[result.problem.point]
     return w, np.repeat(1 - 3 / (2 * rays[:, None]), 2, 1)
@@ -160,7 +159,7 @@ def _of_reliability(result: Adjustment):
 def _factors(
     w: Float[np.ndarray, "rays 2"], r: Float[np.ndarray, "rays 2"], kinds, gross: float = GROSS
 ) -> Float[np.ndarray, " rays"]:
-    """By which the σ of every ray is to be multiplied."""
+    """Factors of the σ of every ray."""
     r = np.maximum(r, 1e-3)
     factor = np.ones(len(w))
     for kind in np.unique(kinds):

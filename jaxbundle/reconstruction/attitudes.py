@@ -1,8 +1,8 @@
-"""Attitudes that drones measured, as observations of the network, where they agree with it.
+"""Attitudes measured by drones as observations of the network, if they agree with it.
 
-What a mounting, a firmware or another convention has turned would spoil a network that needs no
-attitude. So they are compared first with the orientations that the photographs and their positions
-give, and are left out as a whole where they are off by more than `AGREE` of their σ.
+Attitudes rotated by a mounting, a firmware or another convention would spoil a network that does
+not need them. So they are first compared with the orientations from the photographs and their
+positions, and all are left out if they differ by more than `AGREE` of their σ.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ FEWEST = 3
 
 
 class Attitudes(NamedTuple):
-    """M from the map system to the camera, and its σ about every axis, radians; NaN: not known."""
+    """M from the map system to the camera, and its σ about every axis, radians; NaN: unknown."""
 
     M: Float[np.ndarray, "n 3 3"]
     sigma: Float[np.ndarray, " n"]
@@ -31,7 +31,7 @@ class Attitudes(NamedTuple):
 def map_attitudes(
     measured: Sequence[Attitude | None], convergence: Float[np.ndarray, " n"]
 ) -> Attitudes | None:
-    """The attitudes in the map system; None where fewer than three are known."""
+    """The attitudes in the map system; None if fewer than three are known."""
     M, sigma = np.full((len(measured), 3, 3), np.nan), np.full(len(measured), np.nan)
     for k, attitude in enumerate(measured):
         if attitude is not None and np.isfinite(convergence[k]):
@@ -59,7 +59,7 @@ def with_attitudes(
     if np.median(off / sigma) > AGREE:
         return network, (
             f"attitudes in the files are off by {np.degrees(np.median(off)):.0f} degrees (median) "
-            "against what the photographs and their positions give: not used"
+            "from those of the photographs and their positions: not used"
         )
     angles = np.asarray(many.angles(M))
     columns = {"image": [network.images.id[k] for k in np.flatnonzero(known)]}

@@ -6,8 +6,8 @@
 | table with header | `id`, `X`, `Y`, `Z`, `image`, `u`, `v` [, `sX`, `sY`, `sZ`, `role`, `suv`] |
 | table without measurements | as `jaxbundle adjust --control`: of coded targets, by their names |
 
-u, v are pixels, (0, 0) the centre of the upper left one. Coordinates in degrees become those of the
-zone of UTM they are in.
+u, v are pixels, (0, 0) the centre of the upper left one. Coordinates in degrees are converted to
+their UTM zone.
 """
 
 import csv
@@ -25,13 +25,13 @@ from jaxbundle.network.tables import Points, Source
 from jaxbundle.photographs.places import to_map
 
 MANUAL = 1.0
-"""σ of a measurement by hand, pixels, where none is given."""
+"""Default σ of a manual measurement, pixels."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Control:
-    """Control points, and their places in photographs: rows of (photograph, point); `system` in
-    words."""
+    """Control points, and their image points: rows of (photograph, point); `system`: its
+    name."""
 
     points: Points
     seen: tuple[tuple[str, str], ...]
@@ -41,7 +41,7 @@ class Control:
 
 
 def read_control_measurements(path: str | Path) -> Control:
-    """Control points, with their measurements where the file has them.
+    """Control points, with measurements if the file has them.
 
     **Raises:** `InputError` naming file and line.
     """
@@ -106,13 +106,13 @@ def _table(path, head, rows) -> Control:
 
 def _collect(path, records, system, sigmas) -> Control:
     if not records:
-        raise InputError(f"{path}: no control points in it")
+        raise InputError(f"{path}: contains no control points")
     position, numbers = {}, {}
     for name, X, _, place, sigma, number in records:
         if not np.isfinite([*X, *place, sigma]).all() or sigma <= 0:
             raise InputError(f"{path}, line {number}: coordinates and pixels must be finite")
         if name in position and position[name] != X:
-            raise InputError(f"{path}, line {number}: point {name} has other coordinates before")
+            raise InputError(f"{path}, line {number}: point {name} had other coordinates before")
         position[name] = X
         numbers.setdefault(name, number)
     X, said = to_map(np.array(list(position.values())), system, str(path))

@@ -37,7 +37,7 @@ class Named:
 
 
 def no_named_points() -> Named:
-    """None at all."""
+    """No measurements."""
     return Named(np.zeros(0, int), (), np.zeros((0, 2)), np.zeros((0, 2)))
 
 
@@ -49,7 +49,7 @@ def find_named(
 ) -> tuple[Named, list[str]]:
     """The coded targets of all photographs and the measurements of control points; notes.
 
-    **Raises:** `InputError` where control points are measured in unknown photographs only.
+    **Raises:** `InputError` if control points are measured in unknown photographs only.
     """
     image, name, xy, sigma, notes = [], [], [], [], []
     if targets:
@@ -71,7 +71,7 @@ def find_named(
                 f"{some(unknown, 3, str)}"
             )
         if unknown:
-            notes.append(f"control measured in photographs that are not there: {some(unknown)}")
+            notes.append(f"control measured in missing photographs: {some(unknown)}")
         for (file, id), place, s in zip(control.seen, control.xy, control.sigma):
             if file in index:
                 image.append(index[file])
@@ -86,9 +86,9 @@ def find_named(
 def name_unused(
     named: Named, control: Control | None, distances: Sequence[dict], fewest: int
 ) -> list[str]:
-    """Notes of scale bars and control points that are in no photographs.
+    """Notes about scale bars and control points in no photographs.
 
-    **Raises:** `InputError` where no scale bar, or fewer than `fewest` control points, are left.
+    **Raises:** `InputError` if no scale bar, or fewer than `fewest` control points, are left.
     """
     photographs = {name: len(set(named.image[np.array(named.name) == name].tolist()))
                    for name in set(named.name)}  # fmt: skip
@@ -96,7 +96,7 @@ def name_unused(
     lost = [f"{d['from']} to {d['to']}" for d in distances if ends(d) < 2]
     if distances and len(lost) == len(distances):
         raise InputError(
-            f"no scale bar has both ends in two photographs ({some(lost, 3, str)}): look at the "
+            f"no scale bar has both ends in two photographs ({some(lost, 3, str)}): check the "
             "names of the targets"
         )
     notes = [f"scale bars that are not in two photographs: {some(lost, 3, str)}"] * bool(lost)
@@ -113,7 +113,7 @@ def name_unused(
 
 
 def _targets_of(photograph: Photograph, kind: str) -> NamedPoints | None:
-    """The coded targets of a photograph; None where it cannot be read: it is left out later, with
+    """The coded targets of a photograph; None if it cannot be read: it is left out later, with
     the reason."""
     try:
         grey = read_photograph(photograph.path)

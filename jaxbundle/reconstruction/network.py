@@ -1,4 +1,4 @@
-"""The network of a set of photographs: measured tie points, cameras with what is free."""
+"""The network of a set of photographs: measured tie points, cameras with free parameters."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -14,24 +14,24 @@ from jaxbundle.reconstruction.photographs import Cameras, Photograph
 from jaxbundle.tiepoints.refinement import Measurements
 
 PRIORS = {"fx": 0.2, "cx": 0.02, "cy": 0.02}
-"""σ of start values, in parts of the principal distance, of the longer side: so wide that they
-count only where photographs determine nothing."""
+"""σ of start values, relative to the principal distance, or the longer side: large enough to
+matter only if photographs determine nothing."""
 K1_PRIOR = 0.3
 UNTIED = 8
-"""Photographs of a camera from which on its pixels need not be square."""
+"""Minimum photographs of a camera for pixels that need not be square."""
 FEWEST_CONTROL = 3
-"""Control points that a part must show to be put into their frame."""
+"""Minimum control points in a part to transform it into their frame."""
 BY_NUMBER = ((3, ("fx", "k1")), (4, ("cx", "cy")), (5, ("k2",)))
-"""What is free from how many photographs by a lens on."""
+"""Free parameters by the minimum number of photographs of a lens."""
 TANGENTIAL = 5
-"""Photographs of a camera from which on P1 and P2 are free."""
+"""Minimum photographs of a camera for free P1 and P2."""
 OF_THE_LENS = ("fx", "k1", "k2")
-"""What cameras with one lens have in common."""
+"""Common parameters of cameras with one lens."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Extra:
-    """What a network has besides tie points: named points, control among them, distances between
+    """Further data of a network: named points including control, distances between
     them; positions of the photographs with their σ, and attitudes."""
 
     named: Named
@@ -48,7 +48,7 @@ def tie_network(
     extra: Extra,
     name: str,
 ) -> Network:
-    """The network of the photographs that measurements name; image coordinates in pixels."""
+    """The network of the photographs with measurements; image coordinates in pixels."""
     rows = np.unique(measured.image).tolist()
     of = [cameras.of[k] for k in rows]
     used = sorted(set(of))
@@ -91,7 +91,7 @@ def track_name(track: int) -> str:
 
 
 def _with_ties(network: Network, lens: Sequence[int]) -> Network:
-    """The network whose cameras with one lens have its parameters in common."""
+    """The network with common parameters of cameras with one lens."""
     first, columns = {}, {"camera": [], "other": [], "parameter": []}
     for camera, number in zip(network.cameras, lens):
         one = first.setdefault(number, camera)
@@ -105,7 +105,7 @@ def _with_ties(network: Network, lens: Sequence[int]) -> Network:
 
 
 def _freed(camera: Camera, own: int, of_lens: int, given: bool) -> Camera:
-    """A camera with what so many photographs, its own and those by its lens, determine."""
+    """A camera with the parameters determined by the number of its photographs, and of its lens."""
     if given:
         return camera
     free = tuple(n for least, names in BY_NUMBER if of_lens >= least for n in names)

@@ -1,4 +1,4 @@
-"""The page of a reconstruction: that of an adjusted part, and what became of the photographs."""
+"""The page of a reconstruction: that of an adjusted part, and the use of the photographs."""
 
 from collections.abc import Iterator
 
@@ -43,7 +43,7 @@ def _photographs(found, part) -> Finding:
     used, total = len(part.adjustment.network.images), len(found.photographs)
     words = f"{used} of {count(total, 'photograph')} in this part"
     if len(found.parts) > 1:
-        words += f", {len(found.parts)} parts that do not hang together"
+        words += f", {len(found.parts)} unconnected parts"
     if found.left_out:
         words += f", {len(found.left_out)} left out"
     whole = len(found.parts) == 1 and not found.left_out
@@ -64,7 +64,7 @@ def _counts(found, part) -> list[tuple[str, str]]:
 
 
 def _factors(part) -> Section:
-    """How the σ of the kinds of measurements were weighted."""
+    """Factors of σ of the kinds of measurements."""
     rows = [(kind, significant(factor, 4)) for kind, factor in part.factors.items()]
     note = ("kind of measurement", "factor of its a priori σ")
     return Section("factors", "Variance factors", grid(note, rows), "Variance factors")

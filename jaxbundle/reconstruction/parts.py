@@ -1,15 +1,15 @@
-"""Photographs that belong together: parts of a set that nothing connects are made apart."""
+"""Connected photographs: unconnected parts of a set are reconstructed separately."""
 
 from collections.abc import Sequence
 
 from jaxbundle.tiepoints.verification import Pair
 
 SMALLEST = 3
-"""Photographs of a part; two where there are no more altogether."""
+"""Minimum photographs of a part; two if there are only two in all."""
 
 
 def connected(number: int, pairs: Sequence[Pair]) -> list[list[int]]:
-    """Groups of photographs that verified pairs connect, the largest first."""
+    """Groups of photographs connected by verified pairs, the largest first."""
     root = list(range(number))
 
     def of(k):
@@ -28,17 +28,17 @@ def connected(number: int, pairs: Sequence[Pair]) -> list[list[int]]:
 
 
 def why_alone(k: int, names: Sequence[str], matches, pairs: Sequence[Pair]) -> str:
-    """Why a photograph is in no part, in words."""
+    """The reason why a photograph is in no part."""
     mine = [pair for pair in pairs if k in pair.images]
     if mine:
         with_it = sorted({names[j] for pair in mine for j in pair.images if j != k})
-        return f"it shows the same as {', '.join(with_it[:3])} alone, no other photograph does"
+        return f"it overlaps only with {', '.join(with_it[:3])}"
     found = [(len(m.rows), m.images) for m in matches if k in m.images]
     most, best = max(found, default=(0, None))
     if best is None or not most:
-        return "nothing in it is found in any other photograph"
+        return "it has no matches with any other photograph"
     other = names[best[0] if best[1] == k else best[1]]
     return (
-        f"it shares too little with any other photograph: {most} places look alike in {other}, but "
+        f"it has too few matches with any other photograph: {most} with {other}, but "
         "too few of them agree on one object"
     )

@@ -1,4 +1,4 @@
-"""The photographs of a reconstruction: found, looked at, and put together by camera."""
+"""The photographs of a reconstruction: files, metadata, and grouping by camera."""
 
 import dataclasses
 import hashlib
@@ -13,14 +13,14 @@ from jaxbundle.photographs.reading import SUFFIXES, photograph_size
 from jaxbundle.system.file_content import check_plain, read_content
 
 GUESSED = 1.2
-"""A principal distance nothing is known of, in parts of the longer side."""
+"""Default principal distance relative to the longer side."""
 SMALLEST = 64
-"""Pixels of the shorter side."""
+"""Minimum pixels of the shorter side."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Photograph:
-    """A file: `name` is unique among all; `fingerprint` of its content; what its head says."""
+    """A file: unique `name`; `fingerprint` of its content; the metadata of its header."""
 
     path: Path
     name: str
@@ -35,10 +35,10 @@ class Photograph:
 def find_photographs(
     given: Sequence[str | Path],
 ) -> tuple[list[Photograph], dict[str, str]]:
-    """The photographs among files and folders, in the order of their names; and what was left out,
+    """The photographs among files and folders, in the order of their names; and excluded files,
     with the reason.
 
-    **Raises:** `InputError` where fewer than two can be used, or a name is given twice.
+    **Raises:** `InputError` if fewer than two can be used, or a name is given twice.
     """
     paths, left_out = _files(given), {}
     names = _names(paths)
@@ -85,7 +85,7 @@ def _files(given) -> list[Path]:
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """File names; with their folder where two are the same."""
+    """File names; with their folder if two are the same."""
     plain = [path.name for path in paths]
     double = {name for name in plain if plain.count(name) > 1}
     return [f"{p.parent.name}/{p.name}" if p.name in double else p.name for p in paths]
@@ -93,9 +93,9 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 @dataclasses.dataclass(frozen=True)
 class Cameras:
-    """`cameras`, the one of every photograph (`of`), whether its principal distance is `known` to
-    begin with, and whether it was `given` as calibrated; `notes` in words; `lens` of every camera:
-    that of photographs stored upright is the lens of those stored lying, with the same principal
+    """`cameras`, the camera of every photograph (`of`), whether its principal distance is `known`
+    as a start value, and whether it was `given` as calibrated; `notes`; `lens` of every camera:
+    photographs in portrait and landscape format share a lens, with the same principal
     distance and radial distortion."""
 
     cameras: tuple[Camera, ...]
@@ -109,9 +109,9 @@ class Cameras:
 def assign_cameras(photographs: Sequence[Photograph], given: Camera | None = None) -> Cameras:
     """Photographs of one make, model, focal length and size share a camera, of model `opencv`.
 
-    **Arguments:** `given`: a calibrated camera, which then all photographs share.
+    **Arguments:** `given`: a calibrated camera, shared by all photographs.
 
-    **Raises:** `InputError` where the size of the given camera is another.
+    **Raises:** `InputError` if the given camera has another size.
     """
     notes = _turned(photographs)
     if given is not None:
@@ -167,6 +167,6 @@ def _turned(photographs) -> tuple[str, ...]:
     if not turned:
         return ()
     return (
-        f"{len(turned)} photographs are to be shown turned ({some(turned, 3, str)}); their pixels "
-        "are used as the sensor wrote them, columns and rows counted so",
+        f"{len(turned)} photographs have a rotated EXIF orientation ({some(turned, 3, str)}); "
+        "their pixels are used in the orientation of the sensor, columns and rows likewise",
     )

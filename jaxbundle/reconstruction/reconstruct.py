@@ -57,18 +57,18 @@ DEFAULT = Settings()
 NAMED = 99
 """Kind of the measurements of named points."""
 REPEATS = 0.3
-"""Part of the pairs that contradict others from which on the whole is doubtful."""
+"""Share of contradictory pairs above which the result is doubtful."""
 FOLDED = 1 / 3
-"""Part of the measurements that must agree with a result: of a long facade whose windows are laid
-upon one another it is a fifth, otherwise more than a half."""
+"""Minimum share of measurements that agree with a result: for a long facade with superimposed
+windows it is a fifth, otherwise more than a half."""
 TEXTURE = 16
-"""Features a photograph needs."""
+"""Minimum features of a photograph."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """Photographs that hang together, adjusted: `name`; `colours` of the points by id; `factors`:
-    by which the σ of kinds of measurements were multiplied."""
+    """Connected photographs, adjusted: `name`; `colours` of the points by id; `factors` of the σ of
+    kinds of measurements."""
 
     name: str
     adjustment: Adjustment
@@ -79,9 +79,9 @@ class Part:
 @shows_itself
 @dataclasses.dataclass(frozen=True)
 class Reconstruction:
-    """`parts`, the largest first; photographs that are in none of them, with the reason; notes;
-    `pairs` that were verified, by the names of their photographs: matches found, those that agree,
-    kind; `photographs`: the files that were looked at, by name."""
+    """`parts`, the largest first; photographs in none of them, with the reason; notes;
+    verified `pairs`, by the names of their photographs: matches, agreeing matches,
+    kind; `photographs`: the examined files, by name."""
 
     parts: tuple[Part, ...]
     left_out: Mapping[str, str]
@@ -111,14 +111,14 @@ def reconstruct(
     control: Control | None = None,
     distances: Sequence[dict] = (),
 ) -> Reconstruction:
-    """Orient photographs by what they show, with self-calibration.
+    """Orient photographs by their content, with self-calibration.
 
-    **Arguments:** `given`: files, and folders of photographs; `camera`: a calibrated one, which all
-    share; `store`: folder in which features and matches are kept; `tell(stage, done, total)`;
+    **Arguments:** `given`: files, and folders of photographs; `camera`: a calibrated one, shared by
+    all; `store`: folder for features and matches; `tell(stage, done, total)`;
     `control`: points with coordinates, by the names of coded targets or measured in photographs;
     `distances`: rows `from`, `to`, `value`, `sigma` between named points.
 
-    **Raises:** `InputError` where the photographs cannot be used; `NotSolvedError` where no two of
+    **Raises:** `InputError` if the photographs cannot be used; `NotSolvedError` if no two of
     them can be oriented.
     """
     require_x64()
@@ -129,7 +129,7 @@ def reconstruct(
     notes += name_unused(named, control, distances, FEWEST_CONTROL)
     positions = map_positions([p.exif.place for p in photographs]) if control is None else None
     if positions is not None:
-        notes.append(f"positions of the photographs by satellites: {positions.system}")
+        notes.append(f"satellite positions of the photographs: {positions.system}")
     if control is not None and control.system:
         notes.append(f"control in {control.system}")
     attitudes = None
@@ -144,7 +144,7 @@ def reconstruct(
 
 
 class _Making:
-    """One reconstruction on its way."""
+    """The state of a running reconstruction."""
 
     def __init__(self, photographs, left_out, cameras: Cameras, settings, store, tell, extra):
         self.photographs: list[Photograph] = photographs
@@ -157,7 +157,7 @@ class _Making:
 
     def run(self) -> Reconstruction:
         with ThreadPoolExecutor(1) as ahead:
-            # compiled while features are searched and matched, and pairs verified
+            # compiled during the search and matching of features, and the verification of pairs
             prepared = [ahead.submit(one) for one in (prepare, refinement.prepare, many.prepare)]
             features, matches = self._matches()
             prepared[0].result()
@@ -194,7 +194,7 @@ class _Making:
         bad = {k for k, f in enumerate(features) if len(f) < TEXTURE}
         for k in sorted(bad):
             self.left_out.setdefault(
-                self.names[k], f"no texture: {count(len(features[k]), 'feature')} in it"
+                self.names[k], f"no texture: {count(len(features[k]), 'feature')}"
             )
         if len(features) - len(bad) < 2:
             said = some((f"{n} ({w})" for n, w in self.left_out.items()), 3, str)
@@ -227,13 +227,13 @@ class _Making:
         pairs, wrong = without_contradicted(*cameras, verify(*cameras, matches, self.tell))
         if wrong:
             named = (" and ".join(self.names[k] for k in p.images) for p in wrong)
-            self.notes.append(f"{count(len(wrong), 'pair')} of photographs not used, which others "
-                              f"contradict around three: {some(named, 3, str)}")  # fmt: skip
+            self.notes.append(f"{count(len(wrong), 'pair')} of photographs not used, contradicted "
+                              f"by others in triplets: {some(named, 3, str)}")  # fmt: skip
         if len(wrong) > REPEATS * (len(wrong) + len(pairs)):
             self.notes.append(
                 f"{len(wrong)} of {len(wrong) + len(pairs)} pairs contradict others: the object "
-                "repeats itself, and parts of it may have been laid upon one another; compare the "
-                "result with the object, or take photographs nearer to one another"
+                "repeats itself, and parts of it may have been superimposed; compare the "
+                "result with the object, or take photographs with shorter bases"
             )
         return pairs
 
@@ -274,7 +274,7 @@ class _Making:
         return sorted(parts, key=lambda part: -len(part.adjustment.network.images))
 
     def _begin(self, stage: str) -> None:
-        """A stage whose length is not known begins, and the one before has ended."""
+        """Begin a stage of unknown length, after the end of the one before."""
         if self.stage:
             self.tell(self.stage, 1, 1)
         self.stage = stage
@@ -286,12 +286,12 @@ class _Making:
         if kinds == {"rotation"} or kinds == {"rotation", "plane"}:
             return (
                 "not solved: a rotation or a plane explains every pair: the photographs were taken "
-                "from one place, or show a plane only; take them from places that lie apart"
+                "from one position, or show only a plane; take them from different positions"
             )
         if failed:
             return failed[0] if failed[0].startswith("not solved") else f"not solved: {failed[0]}"
         said = some((f"{n} ({w})" for n, w in self.left_out.items()), 3, str)
-        return f"not solved: no photographs show the same object: {said}"
+        return f"not solved: no photographs overlap: {said}"
 
     def _part(self, group, features, pairs, name) -> tuple[Part, dict[str, str]]:
         inside = [p for p in pairs if set(p.images) <= set(group)]
@@ -314,7 +314,8 @@ class _Making:
         return part, dict(oriented.images)
 
     def _adjusted(self, network: Network, measured) -> tuple[Oriented, Weighted, str]:
-        """The first start values that lead to an adjustment, this, and a note of attitudes."""
+        """The first start values that lead to an adjustment, the adjustment, and a note on
+        attitudes."""
         guessed = [camera.id for camera, known in zip(self.cameras.cameras, self.cameras.known)
                    if not known]  # fmt: skip
         failed: NotSolvedError | None = None
@@ -354,7 +355,7 @@ def _principal_distances(result: Adjustment) -> dict[str, dict]:
 
 
 def _distances_found(result: Adjustment) -> str:
-    """The principal distances that were free, with their σ."""
+    """The free principal distances, with their σ."""
     return "".join(f", principal distance {c['value']:.2f} ± {c['sigma']:.2f} px ({id})"
                    for id, c in _principal_distances(result).items()
                    if c["free"] and c["sigma"])  # fmt: skip
@@ -368,13 +369,13 @@ def _not_solved(result: Adjustment) -> NotSolvedError:
         f"{c['value']:.0f} px in {id}" for id, c in _principal_distances(result).items()
     )
     return NotSolvedError(
-        f"not solved: principal distance {found}, which no camera has; take photographs from "
-        "places that lie farther apart, or give --camera"
+        f"not solved: impossible principal distance {found}; take photographs from "
+        "positions farther apart, or give --camera"
     )
 
 
 def _refuse_folded(result: Adjustment, measured: Measurements, names: Sequence[str]) -> None:
-    """Refuse a result with which most measurements in its photographs do not agree."""
+    """Refuse a result that disagrees with most measurements in its photographs."""
     placed = set(result.network.images.id)
     rows = np.isin(measured.image, [k for k, name in enumerate(names) if name in placed])
     rays = np.bincount(measured.track[rows])
@@ -383,14 +384,14 @@ def _refuse_folded(result: Adjustment, measured: Measurements, names: Sequence[s
     if agree < FOLDED * found:
         raise NotSolvedError(
             f"not solved: of {found} measurements in {count(len(placed), 'photograph')} {agree} "
-            "agree with one object: it repeats itself, and parts of it would be laid upon one "
-            "another; take photographs nearer to one another, or leave out those that show "
+            "agree with one object: it repeats itself, and parts of it would be superimposed; "
+            "take photographs with shorter bases, or leave out those that show "
             "repeated parts alone", names,
         )  # fmt: skip
 
 
 def _kinds(network: Network, measured: Measurements, names: Sequence[str]):
-    """The kind of every observation, and what kinds are called."""
+    """The kind of every observation, and the names of kinds."""
     columns = (measured.image, measured.track, measured.level)
     level = {(names[i], track_name(t)): l for i, t, l in zip(*(c.tolist() for c in columns))}
     rays, images, points = network.observations, network.images.id, network.points.id

@@ -1,4 +1,4 @@
-"""How a reconstruction is made."""
+"""Settings of a reconstruction."""
 
 import dataclasses
 
@@ -9,7 +9,7 @@ from jaxbundle.tiepoints.features import Detection
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """`detection`: features; `pairs`: which photographs are matched; `points`: measurements wanted
+    """`detection`: features; `pairs`: which photographs are matched; `points`: desired measurements
     in every photograph; `workers`: threads, all cores if 0; `significance`: of data snooping;
     `targets`: kind of coded targets (`measure.coded_targets`)."""
 

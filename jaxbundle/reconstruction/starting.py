@@ -1,10 +1,10 @@
-"""Start values of a part, in several ways, until one of them leads to an adjustment.
+"""Start values of a part, by several methods, until one of them leads to an adjustment.
 
-1. With the cameras that pairs of photographs agree on: what misses by more than `CLOSE` of the
-   picture contradicts. Where that leaves photographs out, as far as an unknown lens may bend it.
-2. With other principal distances, unless the file tells one, those first that explain the most.
+1. With the cameras from consistent pairs of photographs: misclosures above `CLOSE` of the
+   image are contradictions. If photographs are left out, the limit is that of an unknown lens.
+2. With other principal distances, unless the file gives one; those that explain most come first.
 
-Whichever it is, photographs that are left out then get another chance with the cameras adjusted.
+In both cases, left out photographs are tried again with the adjusted cameras.
 """
 
 import dataclasses
@@ -22,20 +22,20 @@ from jaxbundle.orientation.sights import TOLERANCE
 from jaxbundle.tiepoints.search import APART, OTHERS, present_size
 
 CLOSE = 0.01
-"""Tolerance of start values by cameras that pairs agree on, in parts of the extent of a picture."""
+"""Tolerance of start values by cameras from consistent pairs, relative to the image extent."""
 SHORTEST, LONGEST = 0.35, 12.0
-"""Principal distances between which an adjusted one is believed, in parts of the longer side."""
+"""Limits of an adjusted principal distance, relative to the longer side."""
 FEWEST_RAYS = 12
-"""Image points a photograph needs; of fewer gross errors may be most."""
+"""Minimum image points of a photograph; of fewer most may be gross errors."""
 LEAST_OF_IMAGES, OF_OTHERS = 0.5, 2
-"""Part of the photographs that start values by another principal distance must place; and how many
-of these are adjusted."""
+"""Minimum share of photographs oriented by start values with another principal distance; and
+maximum number of such start values that are adjusted."""
 
 
 def start_values(network: Network, guessed: Sequence[str]) -> Iterator[Oriented]:
-    """The network with start values, in one way after another.
+    """The network with start values, by one method after another.
 
-    **Arguments:** `guessed`: ids of cameras whose principal distance no file tells.
+    **Arguments:** `guessed`: ids of cameras with a principal distance unknown from files.
 
     **Raises:** `NotSolvedError` if there are none.
     """
@@ -63,7 +63,7 @@ def start_values(network: Network, guessed: Sequence[str]) -> Iterator[Oriented]
 
 
 def _oriented(network: Network, tolerance: float) -> Oriented:
-    """Start values, without photographs that are hardly tied to the others."""
+    """Start values, without photographs weakly connected to the others."""
     found = orient(network, tolerance=tolerance)
     network, images = found.network, dict(found.images)
     while True:
@@ -74,7 +74,7 @@ def _oriented(network: Network, tolerance: float) -> Oriented:
         if not few.any() or few.all():
             return dataclasses.replace(found, network=network, images=images)
         for k in np.flatnonzero(few):
-            why = f"only {int(number[k])} places in it agree with the others"
+            why = f"only {int(number[k])} of its points agree with the others"
             images[network.images.id[k]] = why
         network = keep_images(network, ~few)
         rays = np.bincount(network.observations.point, minlength=len(network.points))
@@ -100,7 +100,7 @@ def _with_distance(camera: Camera, f: float) -> Camera:
 
 
 def believable(result: Adjustment) -> bool:
-    """Whether an adjustment converged to principal distances that a camera may have."""
+    """Whether an adjustment converged to plausible principal distances."""
     return bool(result.converged) and all(
         SHORTEST < found["fx"] / max(camera.image_size) < LONGEST
         for camera in result.network.cameras
@@ -109,7 +109,7 @@ def believable(result: Adjustment) -> bool:
 
 
 def start_again(network: Network, oriented: Oriented, result: Adjustment) -> Oriented | None:
-    """Start values with the adjusted cameras, if these place more photographs."""
+    """Start values with the adjusted cameras, if these orient more photographs."""
     if not oriented.images:
         return None
     better: Mapping[str, Camera] = {

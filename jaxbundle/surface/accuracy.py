@@ -1,5 +1,5 @@
-"""The accuracy report of a cloud: mean, greatest and least σX, σY, σZ, and numbers by classes; RMS
-at check points, or to a plane.
+"""The accuracy report of a cloud: mean, largest and smallest σX, σY, σZ, and numbers by classes;
+RMS at check points, or to a plane.
 
 Source: the classes are those of seed 004's system.
 """
@@ -19,7 +19,7 @@ AXES = ("X", "Y", "Z")
 
 
 def accuracy_of(cloud: Cloud) -> dict[str, Any]:
-    """Mean, greatest and least σ of each axis, and numbers of points by class of all three."""
+    """Mean, largest and smallest σ of each axis, and numbers of points by class of all three."""
     sigma = cloud.sigma
     known = np.isfinite(sigma).all(1)
     sigma = sigma[known]
@@ -64,7 +64,7 @@ def at_check_points(
 
 
 def to_plane(X: Float[np.ndarray, "n 3"]) -> dict[str, Any]:
-    """RMS of distances from the plane that fits points best, its normal, a point on it."""
+    """RMS of distances from the best-fitting plane, its normal, a point on it."""
     middle = X.mean(0)
     _, _, axes = np.linalg.svd(X - middle, full_matrices=False)
     distance = (X - middle) @ axes[2]

@@ -1,15 +1,15 @@
-"""What least squares matching loses where the surface is no plane within the window, given back.
+"""Correction of least squares matching if the surface is not a plane within the window.
 
-A place d of the window has its match at
+A point d of the window has its match at
 
     p(d) = p₀ + A·d + ½·Σ p_ij·dᵢ·dⱼ,
 
-by perspective, distortion, and the curvature of the surface, which the guide's nodes show: q about
-each is a polynomial of the second degree. An affine matching of windows finds the p₀ + A·c of
+due to perspective, distortion, and the curvature of the surface, taken from the nodes of the guide:
+q around each is a polynomial of second degree. An affine matching of windows finds the p₀ + A·c of
 
     gᵀ·(B·d + c) + h₀ + h₁·T ≈ gᵀ·A⁻¹·½·Σ p_ij·dᵢ·dⱼ
 
-in the least squares sense, g the gradient of the grey values T. So A·c is taken off the place.
+in the least squares sense, g the gradient of the grey values T. So A·c is subtracted.
 """
 
 import dataclasses
@@ -26,35 +26,36 @@ from jaxbundle.surface.segments import positions, windows
 from jaxbundle.surface.views import OrientedImage
 
 REACHES = 4, 2
-"""Nodes on each side of one through which the polynomial goes. The wide one has the errors of the
-nodes, which are those of the matches about it, an eighth as large; the narrow one is for surfaces
-the wide one does not fit."""
+"""Nodes on each side of the centre for the polynomial. The wide one reduces the errors of the
+nodes, which are those of the matches around it, to an eighth; the narrow one is for surfaces
+that the wide one does not fit."""
 MOST_MISSING = 0.16
-"""Part of these nodes."""
+"""Minimum share of valid nodes."""
 MOST_MISFIT = 0.12
-"""RMS of the nodes beside the polynomial, pixels of their level."""
+"""Maximum RMS of the nodes relative to the polynomial, pixels of their level."""
 STEP = 4.0
-"""Pixels of the base over which second differences of places are taken."""
+"""Pixels of the base for second differences of positions."""
 UNSURE = 0.3
-"""σ of a correction, as a part of it."""
+"""σ of a correction relative to it."""
 UNKNOWN = 2.0
-"""Mean squares of the corrections that are added where none is known."""
+"""Multiple of the mean squares of the corrections added if a correction is unknown."""
 MOST = 0.5
-"""Pixels: a correction beyond is of a surface that the polynomial does not describe."""
+"""Maximum correction, pixels: larger ones mean that the polynomial does not fit the surface."""
 NEAR, SURE = 1.5, 0.7
-"""Pixels that least squares matching may move a node, and its ρ at least."""
+"""Maximum shift of a node by least squares matching, pixels, and its minimum ρ."""
 TOGETHER = 4096
 
 
 class Bend(NamedTuple):
-    """First and second derivatives of q by u and v [n, 5] (u, v, uu, uv, vv); which are known."""
+    """First and second derivatives of q by u and v [n, 5] (u, v, uu, uv, vv); and which are
+    known."""
 
     derivatives: Float[np.ndarray, "n 5"]
     known: Bool[np.ndarray, " n"]
 
 
 def bend_at(guide: Guide, uv: Float[np.ndarray, "n 2"]) -> Bend:
-    """Of the widest polynomial about the nearest node that fits, at places."""
+    """Derivatives of the widest fitting polynomial around the nearest node."""
     wide, narrow = (_polynomials(guide, uv, reach) for reach in REACHES)
     derivatives = np.where(wide.known[:, None], wide.derivatives, narrow.derivatives)
     return Bend(derivatives, wide.known | narrow.known)
@@ -79,7 +80,7 @@ def _polynomials(guide, uv, reach):
     known = (there.sum(1) >= (1 - MOST_MISSING) * len(x)) & (misfit < MOST_MISFIT * level)
     size = guide.step
     found = p[:, 1:] / np.array([size, size, size**2, size**2, size**2])
-    # the slope at the place itself, not at the node
+    # the slope at the point, not at the node
     du, dv = ((place - np.stack([j, i], 1)) * size).T
     found[:, 0] += found[:, 2] * du + found[:, 3] * dv
     found[:, 1] += found[:, 3] * du + found[:, 4] * dv
@@ -87,8 +88,8 @@ def _polynomials(guide, uv, reach):
 
 
 def sharpen(base: OrientedImage, others: Sequence[OrientedImage], guide: Guide, half: int) -> Guide:
-    """The guide with its good nodes where least squares matching has them, in the first of the
-    others that sees them: the polynomials need more than correlation gives."""
+    """The guide with good nodes refined by least squares matching in the first of the other images
+    that shows them: correlation is not accurate enough for the polynomials."""
     row, column = np.nonzero(guide.good)
     q, left = guide.q.copy(), np.ones(len(row), bool)
     uv = np.rint(np.stack([column, row], 1) * guide.step + guide.first)
@@ -97,7 +98,7 @@ def sharpen(base: OrientedImage, others: Sequence[OrientedImage], guide: Guide, 
         if not len(k):
             break
         here, normal = guide.q[row[k], column[k]], guide.normal[row[k], column[k]]
-        # the node's own place is between pixels where the guide ends above the finest level
+        # the node is between pixels if the guide ends above the finest level
         shift = uv[k] - (np.stack([column[k], row[k]], 1) * guide.step + guide.first)
         slope = bend_at(guide, uv[k]).derivatives[:, :2]
         here = here + np.sum(slope * shift, 1)
@@ -123,7 +124,8 @@ def second_differences(
     base: OrientedImage, other: OrientedImage, uv: Float[np.ndarray, "n 2"],
     q: Float[np.ndarray, " n"], bend: Bend,
 ) -> Float[np.ndarray, "n 3 2"]:
-    """p_uu, p_uv, p_vv: of places in the other image by u and v of the base, pixels⁻¹."""
+    """p_uu, p_uv, p_vv: derivatives of the position in the other image by u and v of the base,
+    pixels⁻¹."""
     places = {}
     for a in (-1, 0, 1):
         for b in (-1, 0, 1):
@@ -142,8 +144,8 @@ def response(
     grey: Float[np.ndarray, "rows columns"], uv: Float[np.ndarray, "n 2"],
     A: Float[np.ndarray, "n 2 2"], second: Float[np.ndarray, "n 3 2"], half: int,
 ) -> Float[np.ndarray, "n 2"]:
-    """A·c: by how much the matching of windows of 2·`half` + 1 pixels is beside the place; 0 where
-    that is not determined."""
+    """A·c: the error of matching with windows of 2·`half` + 1 pixels; 0 if it is not
+    determined."""
     out = np.zeros((len(uv), 2))
     k = np.arange(-half, half + 1, dtype=float)
     y, x = (a.ravel() for a in np.meshgrid(k, k, indexing="ij"))
@@ -170,7 +172,7 @@ def corrected(
     pair: tuple[OrientedImage, OrientedImage], guide: Guide, uv: Float[np.ndarray, "n 2"],
     q: Float[np.ndarray, " n"], match, half: int,
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
-    """Places of matches, and their covariances, free of what bending does."""
+    """Matches, and their covariances, corrected for bending."""
     bend = bend_at(guide, uv)
     base, other = pair
     second = second_differences(base, other, uv, q, bend)
@@ -180,7 +182,7 @@ def corrected(
     off = np.zeros((len(uv), 2))
     off[rows] = response(base.grey, uv[rows], match.A[rows], second[rows], half)
     squares = off[:, :, None] * off[:, None]
-    # where no polynomial fits, what bending does elsewhere is not known to be less
+    # without a fitting polynomial the effect of bending may be as large as elsewhere
     unknown = squares[rows].mean(0) if len(rows) else np.zeros((2, 2))
     doubt = np.where(good[:, None, None], UNSURE**2 * squares, UNKNOWN * unknown)
     return match.uv - off, match.covariance + doubt

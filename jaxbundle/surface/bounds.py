@@ -1,4 +1,4 @@
-"""Between which depths the surface is: by given heights, by tie points, or by the geometry alone.
+"""Bounds of the depth of the surface: by given heights, by tie points, or by the geometry alone.
 """
 
 import dataclasses
@@ -10,16 +10,16 @@ from jaxtyping import Float
 from jaxbundle.surface.views import OrientedImage, is_inside, line_of_sight
 
 ENOUGH = 5
-"""Tie points of an image from which its depths are taken."""
+"""Minimum tie points of an image for its depths."""
 ROOM = 0.35
-"""By this part of their range the depths may go beyond those of the tie points."""
+"""Margin of the depths beyond those of the tie points, relative to their range."""
 NEAREST_ANGLE, FARTHEST_ANGLE = 1.2, 0.003
-"""Angles, radians, at which lines of sight of two images meet where nothing is known."""
+"""Default angles of intersection of two images, radians."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Bounds:
-    """q between which the surface is seen by an image; heights `low` to `high`, where given."""
+    """Bounds of q of the surface in an image; heights `low` to `high`, if given."""
 
     view: OrientedImage
     q: tuple[float, float]
@@ -33,12 +33,12 @@ class Bounds:
             return whole.copy()
         q = self.view.bounds(uv, self.low, self.high)
         inside = np.stack([np.fmax(q[:, 0], whole[:, 0]), np.fmin(q[:, 1], whole[:, 1])], 1)
-        # a line of sight that never reaches these heights keeps some range, and finds nothing
+        # a line of sight that never reaches these heights keeps a range without matches
         return np.where((inside[:, :1] < inside[:, 1:]), inside, whole)
 
 
 def by_points(view: OrientedImage, X: Float[np.ndarray, "n 3"]) -> tuple[float, float] | None:
-    """q of the points in an image and some room beyond; None where they are too few."""
+    """Bounds of q of the points in an image with a margin; None if they are too few."""
     X = X[is_inside(view, view.project(X))]
     if len(X) < ENOUGH:
         return None
@@ -50,8 +50,8 @@ def by_points(view: OrientedImage, X: Float[np.ndarray, "n 3"]) -> tuple[float, 
 def by_geometry(
     view, others: Sequence
 ) -> tuple[float, float] | None:
-    """q of photographs at which lines of sight meet under usual angles, about the place where most
-    of their optical axes come nearest to each other; None of images at one place."""
+    """Bounds of q of photographs for usual angles of intersection, around the point where most
+    of their optical axes are nearest to each other; None for images at one position."""
     bases = [np.linalg.norm(o.X0 - view.X0) for o in others]
     base = float(np.median(bases)) if bases else 0.0
     if not base > 0:
@@ -74,7 +74,8 @@ def angle_at(views: Sequence[OrientedImage], X: Float[np.ndarray, "n 3"]) -> np.
 
 
 def _axes_meet(view, other) -> float | None:
-    """Distance along the optical axis to where another comes nearest; None behind, or parallel."""
+    """Distance along the optical axis to the point nearest to another axis; None if behind or
+    parallel."""
     a, b, t = -view.M[2], -other.M[2], other.X0 - view.X0
     sine2 = 1 - (a @ b) ** 2
     if sine2 < np.sin(np.radians(3)) ** 2:

@@ -1,4 +1,4 @@
-"""A cloud of points, each with its covariance, number of rays, and the pixel it was found from."""
+"""A point cloud with the covariance, number of rays, and base pixel of each point."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -14,8 +14,8 @@ from jaxbundle.errors import InputError
 @dataclasses.dataclass(frozen=True)
 class Cloud:
     """Points X [n, 3] with covariance, object unit; `rays`; `image`, index into `images`, and `uv`,
-    the pixel of that base image; `colour` red, green, blue. `system`: coordinate system, where it
-    is one of maps."""
+    the pixel of that base image; `colour` red, green, blue. `system`: coordinate system, if it
+    is a map system."""
 
     X: Float[np.ndarray, "n 3"]
     covariance: Float[np.ndarray, "n 3 3"]
@@ -40,7 +40,7 @@ class Cloud:
 
     @property
     def sigma(self) -> Float[np.ndarray, "n 3"]:
-        """σX, σY, σZ; NaN where they are not known."""
+        """σX, σY, σZ; NaN if unknown."""
         with np.errstate(invalid="ignore"):
             return np.sqrt(np.einsum("nii->ni", self.covariance))
 

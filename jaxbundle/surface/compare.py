@@ -1,7 +1,7 @@
-"""Two clouds compared: distances along the normals of one, and heights above it.
+"""Comparison of two clouds: distances along the normals of one, and heights above it.
 
 At each point of the first cloud a plane through the nearest points of the second; the distance from
-it, and its σ by those of both clouds where they have any.
+it, and its σ from those of both clouds if they have any.
 """
 
 from typing import Any
@@ -14,7 +14,7 @@ from jaxbundle.surface.cloud import Cloud
 
 NEIGHBOURS = 8
 FARTHEST = 3.0
-"""A point has neighbours if they are within so many median spacings of the second cloud."""
+"""Maximum distance of neighbours, in median spacings of the second cloud."""
 TOGETHER = 1 << 16
 
 
@@ -22,9 +22,9 @@ def compare(cloud: Cloud, other: Cloud) -> dict[str, Any]:
     """Numbers of points compared and beyond, distances: mean, median, RMS, robust σ (1.4826 times
     the median absolute deviation), 90 %; `normalised`: RMS of distances over their σ.
 
-    **Raises:** `InputError` where either has fewer than four points."""
+    **Raises:** `InputError` if either has fewer than four points."""
     if min(len(cloud), len(other)) < 4:
-        raise InputError("clouds are compared from four points on")
+        raise InputError("a comparison needs clouds of at least four points")
     tree = cKDTree(other.X)
     k = min(NEIGHBOURS, len(other))
     spacing = float(np.median(tree.query(other.X[:: max(1, len(other) // 20_000)], 2)[0][:, 1]))
@@ -34,7 +34,7 @@ def compare(cloud: Cloud, other: Cloud) -> dict[str, Any]:
         distance[part], sigma[part] = _to_planes(cloud, other, tree, k, part, FARTHEST * spacing)
     v = distance[np.isfinite(distance)]
     if not len(v):
-        raise InputError("the clouds have nothing in common: look at their coordinate systems")
+        raise InputError("the clouds have nothing in common: check their coordinate systems")
     middle = float(np.median(v))
     ratio = (distance / sigma)[np.isfinite(distance) & np.isfinite(sigma) & (sigma > 0)]
     return {

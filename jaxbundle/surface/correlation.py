@@ -1,12 +1,12 @@
 """Normalised cross-correlation along segments, in many images at once.
 
-Both windows are sampled on grids whose first axis is the epipolar line. Then all windows along a
-segment are parts of one strip, of which column k + x of row y is sampled once:
+Both windows are sampled on grids with the epipolar line as first axis. Then all windows along a
+segment are parts of one strip, and column k + x of row y is sampled once:
 
     ρ(k) = Σ t(x, y)·s(k + x, y)/√(Σt²·Σ(s − s̄ₖ)²),    Σt = 0
 
-Positions are one window pixel apart; between them ρ is a parabola. The place to a fraction of a
-pixel is the business of least squares matching.
+Positions are one window pixel apart; between them ρ is a parabola. Subpixel positions are left to
+least squares matching.
 """
 
 import dataclasses
@@ -22,25 +22,25 @@ from jaxbundle.surface.views import OrientedImage
 from jaxbundle.system.configuration import available_cores
 
 TOGETHER = 256
-"""Points whose strips stay in the cache."""
+"""Number of points whose strips fit into the cache."""
 STRIP = 512
-"""Lines of a coarser image that are made together."""
+"""Lines of a coarser image computed together."""
 FLAT = 1e-3
 """Standard deviation of a window, grey values, below which it has no contrast."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Pyramid:
-    """An image, as it is given, and its means over 2 × 2, 4 × 4, … pixels, as float32."""
+    """An image, and its means over 2 × 2, 4 × 4, … pixels, as float32."""
 
     levels: tuple[Shaped[np.ndarray, "rows columns"], ...]
 
     def sample(self, level: int, uv: Float[np.ndarray, "rows columns 2"]):
-        """Grey values at places given in pixels of the full image; NaN outside."""
+        """Grey values at positions in pixels of the full image; NaN outside."""
         cv2 = need_opencv()
         place = (uv + 0.5) / 2**level - 0.5
         grey = self.levels[level]
-        # of large images the part that is looked at: OpenCV has coordinates of 15 bits
+        # only a part of large images: OpenCV has coordinates of 15 bits
         low, high = _extent(place, grey.shape)
         part = grey[low[1] : high[1], low[0] : high[0]].astype(np.float32)
         place = (place - low).astype(np.float32)
@@ -51,7 +51,7 @@ class Pyramid:
 
 
 def make_pyramid(grey: Shaped[np.ndarray, "rows columns"], levels: int) -> Pyramid:
-    """The image and so many coarser ones."""
+    """The image and the coarser ones."""
     found = [np.asarray(grey)]
     for _ in range(levels):
         found.append(_halved(found[-1]))
@@ -72,7 +72,7 @@ def _halved(a):
 
 
 def _extent(place, shape):
-    """The corner (u, v) of the part of an image that has places, and the one after its last."""
+    """The corner (u, v) of the used part of an image, and the one after its last."""
     finite = np.where(np.isfinite(place), place, 0.0).reshape(-1, 2)
     size = np.array(shape[::-1])
     low = np.clip(np.floor(finite.min(0)).astype(int) - 1, 0, size - 1)
@@ -91,11 +91,11 @@ def correlate(
     half: int,
     steps: int,
 ) -> tuple[Float[np.ndarray, "n steps"], Float[np.ndarray, "n steps"]]:
-    """ρ at positions along segments about their middle, and q of the positions.
+    """ρ at positions along segments around their middle, and q of the positions.
 
     **Arguments:** base and other image, and their pyramids; `uv`: points in the base; `level` of
-    the pyramids; windows of 2·`half` + 1 pixels of it, and as many positions as `steps`, as far
-    apart as the pixels of the window. ρ is NaN outside the other image.
+    the pyramids; windows of 2·`half` + 1 pixels of it, and `steps` positions with the spacing
+    of the window pixels. ρ is NaN outside the other image.
     """
     scale = 2.0**level
     spacing = scale * np.linalg.norm(shape.other_along, axis=1)
@@ -125,7 +125,7 @@ def correlate(
 def slide(
     template: Float[np.ndarray, "n w w"], strip: Float[np.ndarray, "n w columns"]
 ) -> Float[np.ndarray, "n steps"]:
-    """ρ of a window with all windows of a strip; −1 where one has no contrast."""
+    """ρ of a window with all windows of a strip; −1 if one has no contrast."""
     n, w, columns = strip.shape
     steps = columns - w + 1
     t = template - template.mean((1, 2), keepdims=True)
@@ -149,8 +149,8 @@ def slide(
 
 
 def top(rho: Float[np.ndarray, "n k"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The greatest ρ of each row, its fractional index, and the greatest of the others that is no
-    neighbour of it; NaN where there is none."""
+    """The largest ρ of each row, its fractional index, and the largest of the others except
+    neighbours; NaN if there is none."""
     filled = np.where(np.isfinite(rho), rho, -np.inf)
     best = filled.argmax(1)
     rows, last = np.arange(len(rho)), rho.shape[1] - 1
@@ -169,8 +169,8 @@ def top(rho: Float[np.ndarray, "n k"]) -> tuple[np.ndarray, np.ndarray, np.ndarr
 def combine(
     curves: Sequence[Float[np.ndarray, "n k"]],
 ) -> Float[np.ndarray, "n k"]:
-    """ρ of several images at common positions: the mean of the better half of them, rounded up, so
-    that an image in which the point is hidden does not spoil the others; NaN: in no image."""
+    """ρ of several images at common positions: the mean of the better half, rounded up, so
+    that an image with a hidden point does not spoil the others; NaN: in no image."""
     if len(curves) == 1:
         return curves[0]
     stacked = np.sort(np.where(np.isfinite(curves), curves, -2.0), axis=0)[::-1]
@@ -182,7 +182,7 @@ def combine(
 
 
 def _template(pyramid, uv, along, sign, half, level):
-    """Windows about places in the base, axes e and e⊥; `sign` −1 where e is turned round."""
+    """Windows around positions in the base, axes e and e⊥; `sign` −1 if e is reversed."""
     offset = 2.0**level * np.arange(-half, half + 1)
     across = sign * np.stack([-along[:, 1], along[:, 0]], 1)
     grid = (

@@ -6,12 +6,12 @@ window then follows the disparities found, R(x, y) = right(x − d(x, y), y), an
     left + v = h₀ + h₁·R + g_x·δ + g_y·ε
 
 is solved for a correction δ of the disparity, a shift ε across the rows, brightness and contrast.
-Rows are aligned, so that ε ought to be 0: what it is, in units of its σ, gives a variance factor
+Rows are aligned, so that ε should be 0: ε in units of its σ gives a variance factor
 (the median of ε²/σ² over that of χ²). Third differences of disparities farther apart than a window
-give another, with what the shape of the windows does to them; the greater of both is taken.
-Where noise leaves little, larger windows do the same again, as long as they hold one surface.
-Semi-global matching has grey values less their means over large windows, of one contrast: exposures
-differ.
+give another, which includes the effect of the window shape; the larger of both is taken.
+If noise dominates, the step is repeated with larger windows, as long as they contain one surface.
+Semi-global matching uses grey values minus their means over large windows, with equal contrast,
+since exposures differ.
 
 Sources: Hirschmüller (2008); Lucas and Kanade (1981); Ackermann (1984).
 """
@@ -31,31 +31,31 @@ from jaxbundle.system.configuration import available_cores
 BLOCK = 3
 """Side of the blocks of semi-global matching."""
 EVEN = 40
-"""Half the side of the windows whose means are taken off the grey values."""
+"""Half the side of the windows whose means are subtracted from the grey values."""
 LEAST_SPREAD = 25.0
-"""Standard deviation of the grey values that are compared, of 256, at least."""
+"""Minimum standard deviation of compared grey values, of 256."""
 MOST_COSTS = 4e8
-"""Pixels times disparities up to which all costs are held in memory, of 2 bytes and more, and
-paths from below are followed as well."""
+"""Pixels times disparities up to which all costs, of 2 bytes and more, are held in memory, and
+paths from below are also followed."""
 UNIQUE = 5
 """Percent by which the best cost must be below the second."""
 SPECKLE = 80
-"""Pixels of the smallest region of like disparities that is kept."""
+"""Pixels of the smallest region of similar disparities that is kept."""
 HALF, WIDE = 4, 7
 """Half the side of the windows of least squares; of those where the texture is weak."""
 WEAK, FEW = 0.05, 0.02
-"""σ of a disparity, pixels, from which the texture is weak; the part of an image up to which no
-larger windows are tried."""
+"""σ of a disparity, pixels, above which the texture is weak; the share of weak pixels below which
+no larger windows are tried."""
 MOST_RATIO = 5.0
 """Of the contrasts of two windows that may be alike."""
 ROUNDS = 2
 BAND, MARGIN = 128, 32
-"""Rows that are refined together, and those above and below that their windows reach over."""
+"""Rows refined together, and rows above and below covered by their windows."""
 HOLES, STEP, JUMP = 0.5, 0.3, 2.5
 """Pixels: σ that a window has of gaps, by the root of their share; and of a step in the surface,
 which is a change of disparities by more than `JUMP`. Found on rendered roofs."""
 BLOCK_SIDE, SMOOTHEST = 48, 0.25
-"""Pixels of a block whose scatter is looked at; the quantile of the blocks that is taken."""
+"""Pixels of a block for the scatter; the quantile of the blocks used."""
 COARSER, REPEATED, REPETITION, SMALL = 4, 4, 0.8, 0.02
 """At a resolution so much coarser, windows of half this side are compared with others of the image
 itself; their correlation from which a texture repeats itself; the part of the image which a surface
@@ -63,12 +63,12 @@ of such a texture must have."""
 NEAR = 0.7
 """Pixels: by so much disparities of one surface differ within a window, about."""
 MOST_CHANGE = 1.0
-"""Pixels that least squares may move a disparity."""
+"""Maximum change of a disparity by least squares, pixels."""
 LEAST_CORRELATION, SURE = 0.5, 0.9
-"""ρ of a window at least; and of one beside a step in the surface."""
+"""Minimum ρ of a window; and of one beside a step in the surface."""
 LEAST_SIGMA, MOST_SIGMA = 0.008, 0.5
-"""σ of a disparity, pixels: what interpolation and sampling add, and above which the texture does
-not determine it."""
+"""σ of a disparity, pixels: added by interpolation and sampling, and the limit above which the
+texture does not determine it."""
 INNER, SIGNIFICANT = 2, 3.0
 """By how much the window is larger than its middle, which must have texture of its own: more than
 the variance of noise by so many σ of it; else a window tells of what is beside its pixel."""
@@ -108,7 +108,7 @@ def match_dense(pair: RowPair, span: int) -> Disparities:
 
 
 def alike(left, right, inside, right_inside) -> list[Float[np.ndarray, "rows columns"]]:
-    """Grey values about 128 without what differs by exposure and light."""
+    """Grey values around 128 without differences of exposure and light."""
     cv2 = need_opencv()
     mean = lambda a: cv2.blur(a.astype(np.float32), (2 * EVEN + 1,) * 2)
     found, spread = [], 0.0
@@ -121,8 +121,8 @@ def alike(left, right, inside, right_inside) -> list[Float[np.ndarray, "rows col
 
 
 def semi_global(left, right, span: int) -> Float[np.ndarray, "rows columns"]:
-    """Disparities by OpenCV, pixels; NaN where the check of left and right, the uniqueness or the
-    speckle filter took them out."""
+    """Disparities by OpenCV, pixels; NaN if removed by the left-right check, the uniqueness or the
+    speckle filter."""
     cv2 = need_opencv()
     number = max(16, -(-(span + 1) // 16) * 16)
     matcher = cv2.StereoSGBM.create(
@@ -143,7 +143,7 @@ def ambiguous(
     left: Float[np.ndarray, "rows columns"], disparity: Float[np.ndarray, "rows columns"], span: int
 ) -> Bool[np.ndarray, "rows columns"]:
     """Pixels whose texture repeats itself along the row within the range of disparities, on a small
-    surface of its own: what one image sees alone matches the repetition in the other."""
+    separate surface: parts visible in one image only match the repetition in the other."""
     cv2 = need_opencv()
     rows, columns = (n // COARSER for n in left.shape)
     coarse = cv2.resize(left, (columns, rows), interpolation=cv2.INTER_AREA)
@@ -176,7 +176,7 @@ def _likeness(a, farthest):
 
 
 def refine_disparities(left, right, start) -> Disparities:
-    """Least squares at every pixel that has a disparity."""
+    """Least squares at every pixel with a disparity."""
     coefficients = ndimage.spline_filter(right, 3, np.float32)
     known = np.isfinite(start)
     found, stepped = _with_windows(left, coefficients, start, HALF, known)
@@ -212,7 +212,7 @@ def _with_windows(left, coefficients, start, half, wanted):
     sigma = np.sqrt(factor * sigma**2 + LEAST_SIGMA**2 + edges)
     stepped = edges >= STEP**2
     with np.errstate(invalid="ignore"):
-        # beside a step the disparities of one side reach over to the other
+        # beside a step the disparities of one side extend to the other
         good &= ~stepped | (rho >= SURE)
         good &= sigma < MOST_SIGMA
     keep = lambda a: np.where(good, a, np.nan)
@@ -267,7 +267,7 @@ def _solve(left, warped, half) -> _Solved:
     m = {"L": mean(left), "R": mean(warped)}
     product = lambda a, b, i, j: n * (mean(a * b) - m[i] * m[j])
     LL, RR = product(left, left, "L", "L"), product(warped, warped, "R", "R")
-    # gradients in grey values of the left image, whatever the exposure of the right one
+    # gradients in grey values of the left image, for any exposure of the right one
     ratio = np.sqrt(np.maximum(LL, n) / np.maximum(RR, n)).clip(1 / MOST_RATIO, MOST_RATIO)
     gradient = lambda axis: (_gradient(left, axis) + ratio * _gradient(warped, axis)) / 2
     # the disparity moves the right image against its columns: −∂R/∂x
@@ -326,7 +326,7 @@ def _gradient(a, axis):
 
 
 def _at_edges(d, known, half):
-    """The variance that a window gains which the surface leaves: where it has pixels without
+    """The added variance of a window that extends beyond the surface: with pixels without
     disparity, or of another surface."""
     cv2 = need_opencv()
     window = (2 * half + 1, 2 * half + 1)
@@ -337,7 +337,7 @@ def _at_edges(d, known, half):
 
 
 def _without_noise(disparity, known):
-    """Medians of 5 × 5, where they are near."""
+    """Medians of 5 × 5, if they are near."""
     cv2 = need_opencv()
     median = cv2.medianBlur(np.where(known, disparity, -1e3).astype(np.float32), 5)
     with np.errstate(invalid="ignore"):
@@ -345,7 +345,7 @@ def _without_noise(disparity, known):
 
 
 def _smooth(disparity, known, half):
-    """Means over a window of those disparities that are near."""
+    """Means of the similar disparities in a window."""
     cv2 = need_opencv()
     far = np.where(known, disparity, -1e3).astype(np.float32)
     smooth = cv2.bilateralFilter(far, 2 * half + 1, NEAR, float(half))

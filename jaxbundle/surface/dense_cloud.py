@@ -1,10 +1,10 @@
 """A cloud of most pixels of a base image, from rectified pairs with one or several others.
 
 In a rectified pair the inverse distance of a pixel is linear in its disparity, q = d/(f·b·l) with l
-the length of [x/f, y/f, 1]. So several pairs are averaged in q, by their σ; what disagrees is left
-out. Half of the variance of a match belongs to the base image, which all pairs share: a shift ε of
-its window, in any direction, changes the disparity of a pair by eₖ·ε, with eₖ its epipolar line. So
-the errors of pairs k and l have the covariance ½·σₖ·σₗ·eₖ·eₗ.
+the length of [x/f, y/f, 1]. So several pairs are averaged in q, weighted by σ; inconsistent values
+are left out. Half of the variance of a match is due to the base image, common to all pairs: a shift
+ε of its window, in any direction, changes the disparity of a pair by eₖ·ε, with eₖ its epipolar
+line. So the errors of pairs k and l have the covariance ½·σₖ·σₗ·eₖ·eₗ.
 """
 
 from collections.abc import Sequence
@@ -22,13 +22,13 @@ from jaxbundle.surface.rectification import Rectified, disparity_range, rectify
 from jaxbundle.surface.views import FrameView
 
 TOGETHER = 1 << 19
-"""Pixels that are looked up together."""
+"""Pixels looked up together."""
 ONE_SURFACE = 1.0
-"""Disparities of the four neighbours differ by less, pixels, where they are interpolated."""
+"""Maximum difference of the four neighbours for interpolation of disparities, pixels."""
 MOST_DISPARITIES = 320
 SPREAD = 9
 AGREE = 4.0
-"""Values of several pairs agree within so many σ of their difference."""
+"""Maximum difference of values of several pairs, in σ of the difference."""
 
 
 def dense_cloud(
@@ -36,8 +36,8 @@ def dense_cloud(
 ) -> tuple[Cloud, list[tuple[str, float]], list[str]]:
     """The cloud; name and variance factor of each image used; those that cannot be rectified.
 
-    All disparities between the bounds are searched, unless they are very many: then those about
-    what the guide has found.
+    All disparities between the bounds are searched, unless they are very many: then those near
+    the guide.
     """
     found_points, all_points = guide_points(base, guide), bound_points(base, bounds)
     pairs, partners, used, left_out = [], [], [], []
@@ -87,7 +87,7 @@ def bound_points(base: FrameView, bounds: Bounds) -> Float[np.ndarray, "n 3"]:
 
 
 def _points(views, pairs, uv):
-    """Points of pixels, their covariance, numbers of rays, and the pixels that have one."""
+    """Points, their covariance, numbers of rays, and their pixels."""
     base = views[0]
     d = base.points(uv, np.ones(len(uv))) - base.X0
     found = [_inverse_distance(base, d, *pair) for pair in pairs]
@@ -100,7 +100,7 @@ def _points(views, pairs, uv):
     uv, d, q, variance, number = (a[good] for a in (uv, d, q, variance, number))
     length = 1 / q
     along = variance / q**4
-    # across the line of sight: that part of a match's error which is the base image's
+    # across the line of sight: the part of a match's error due to the base image
     pair = pairs[0][0]
     pixel = np.sqrt(variance / 2) * pair.base * length
     dd = d[:, :, None] * d[:, None]
@@ -112,7 +112,7 @@ def _points(views, pairs, uv):
 
 
 def _inverse_distance(base, d, pair: Rectified, found: Disparities):
-    """q and its σ along directions; NaN where there is no disparity."""
+    """q and its σ along directions; NaN without disparity."""
     place = pair.places(base.X0 + d)
     rows, columns = found.disparity.shape
     inside = np.isfinite(place).all(1) & (place >= 0).all(1)
@@ -134,8 +134,8 @@ def combine(
     q: Float[np.ndarray, "pairs n"], sigma: Float[np.ndarray, "pairs n"],
     cosine: Float[np.ndarray, "pairs pairs"] | None = None,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], np.ndarray]:
-    """The weighted mean of values that agree, its variance, how many they are. NaN where two
-    disagree and no third decides. `cosine`: of the angles between epipolar lines, all one if not
+    """The weighted mean of consistent values, its variance, and their number. NaN if two
+    disagree and no third decides. `cosine`: of the angles between epipolar lines, 1 if not
     given."""
     known = np.isfinite(q) & np.isfinite(sigma)
     if len(q) == 1:

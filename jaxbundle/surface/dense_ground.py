@@ -18,7 +18,7 @@ from jaxbundle.surface.views import OrientedImage
 PIECE = 1500
 """Side of a piece of the base image, pixels."""
 TOGETHER = 1 << 17
-"""Points that are intersected together."""
+"""Points intersected together."""
 MOST_DISPARITIES = 200
 
 
@@ -28,8 +28,8 @@ def dense_ground_cloud(
 ) -> tuple[Cloud, list[tuple[str, float]], list[str]]:
     """The cloud; name and variance factor of each image used; those that could not be used.
 
-    All disparities between the bounds are searched, since houses stand between the nodes of a
-    guide; if these are very many, those about what the guide has found.
+    All disparities between the bounds are searched, since houses may be between the nodes of a
+    guide; if these are very many, only those near the guide.
     """
     clouds, used, left_out = [], [], []
     columns, rows = base.size

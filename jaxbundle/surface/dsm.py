@@ -1,10 +1,10 @@
 """A digital surface model of a cloud: heights on a grid with the σ of every cell.
 
-A cell has the weighted mean of the heights of its points, p = 1/σ_Z², after those that differ from
-their median by more than three times its spread. Its σ is that of the mean, but not less than what
-the points scatter for: σ² = max(1, χ²/(n − 1))/Σp. Small gaps are filled linearly, with σ of the
-points around and the distance to them; beside a wall from the lower surface, because what the
-photographs do not see there lies low (Hirschmüller 2008).
+A cell has the weighted mean of the heights of its points, p = 1/σ_Z², without those that differ
+from their median by more than three times its spread. Its σ is that of the mean, enlarged by the
+scatter of the points: σ² = max(1, χ²/(n − 1))/Σp. Small gaps are filled linearly, with σ from the
+points around and the distance to them; beside a wall from the lower surface, since hidden parts
+are low (Hirschmüller 2008).
 """
 
 import dataclasses
@@ -24,11 +24,11 @@ MOST_CELLS = 2e9
 ROBUST = 3.0
 """Robust standard deviations from the median beyond which a height is left out."""
 LEAST_SPREAD = 0.3
-"""Of that spread, as a part of the cell size."""
+"""Minimum spread relative to the cell size."""
 SLOPE = 0.3
-"""σ of a filled cell per cell of distance, as a part of the cell size."""
+"""σ of a filled cell per cell of distance, relative to the cell size."""
 STEP = 1.0
-"""Scatter of the heights around a gap, as a part of the cell size, beyond which they are of two
+"""Scatter of the heights around a gap, relative to the cell size, above which they are of two
 surfaces."""
 NO_DATA = -9999.0
 
@@ -37,7 +37,7 @@ NO_DATA = -9999.0
 @dataclasses.dataclass(frozen=True)
 class Dsm:
     """Heights and σ [rows, columns], north up, NaN: none; `x`, `y`: outer corner of the first cell;
-    numbers of points; coordinate system, None where there is none."""
+    numbers of points; coordinate system, or None."""
 
     height: Float[np.ndarray, "rows columns"]
     sigma: Float[np.ndarray, "rows columns"]
@@ -84,7 +84,7 @@ def make_dsm(cloud: Cloud, size: float, fill: int = 2) -> Dsm:
     left, top = column.min(), row.min()
     columns, rows = int(column.max() - left) + 1, int(row.max() - top) + 1
     if rows * columns > MOST_CELLS:
-        raise InputError(f"DSM: {rows} × {columns} cells of {size:g}; give a greater size")
+        raise InputError(f"DSM: {rows} × {columns} cells of {size:g}; give a larger size")
     cell = ((row - top) * columns + (column - left)).astype(np.int64)
     height, sigma, count = _means(cell, cloud.X[:, 2], cloud.sigma[:, 2], size, rows * columns)
     shape = rows, columns
@@ -135,7 +135,7 @@ def _means(cell, Z, sigma, size, number):
 
 
 def _sorted_medians(values, first, count):
-    """Medians of groups that are sorted and lie one after the other."""
+    """Medians of sorted, consecutive groups."""
     low, high = first + (count - 1) // 2, first + count // 2
     return (values[low] + values[high]) / 2
 
@@ -151,7 +151,7 @@ def _filled(dsm: Dsm, reach: int) -> Dsm:
     weigh = lambda a: ndimage.convolve(np.where(known, a, 0.0), kernel, mode="constant")
     weight = weigh(1.0 * known)
     gap = ~known & (distance <= reach) & (weight > 0)
-    # only what has heights on opposite sides, not the outer edge
+    # only cells with heights on opposite sides, not the outer edge
     around = ndimage.binary_closing(np.pad(known, 2 * reach), iterations=reach)
     gap &= around[2 * reach : -2 * reach, 2 * reach : -2 * reach]
     safe = np.where(weight > 0, weight, 1.0)

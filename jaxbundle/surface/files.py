@@ -21,7 +21,7 @@ TOGETHER = 1 << 16
 
 
 def write_cloud_csv(cloud: Cloud, path: str | Path) -> None:
-    """A row for each point, columns `COLUMNS`; σ that are not known are left empty."""
+    """A row for each point, columns `COLUMNS`; unknown σ are left empty."""
     names = np.array([*map(_quoted, cloud.images), ""], dtype=object)
     starts = range(0, len(cloud), TOGETHER)
     lines = (_lines(cloud, names, slice(k, k + TOGETHER)) for k in starts)
@@ -29,7 +29,7 @@ def write_cloud_csv(cloud: Cloud, path: str | Path) -> None:
 
 
 def _lines(cloud, names, part):
-    """Some points as lines of text: faster by far than the writer of the library."""
+    """Some points as lines of text: much faster than the csv library."""
     exact = lambda a: ("" if x != x else repr(x) for x in a.tolist())
     short = lambda a: ("" if x != x else f"{x:.8g}" for x in a.tolist())
     C = cloud.covariance[part]
@@ -42,14 +42,14 @@ def _lines(cloud, names, part):
 
 
 def _quoted(name):
-    """A name as csv has it."""
+    """A name in the form of csv."""
     text = io.StringIO()
     csv.writer(text, lineterminator="").writerow([name])
     return text.getvalue()
 
 
 def read_cloud_csv(path: str | Path) -> Cloud:
-    """A cloud from a table X,Y,Z[,sX,sY,sZ,rays,image,u,v]; other columns are passed over.
+    """A cloud from a table X,Y,Z[,sX,sY,sZ,rays,image,u,v]; other columns are ignored.
 
     **Raises:** `InputError` naming file, line and column.
     """
@@ -74,7 +74,7 @@ def read_cloud_csv(path: str | Path) -> Cloud:
 def report_of(
     surface: Surface, warnings: Sequence[str] = (), check: Float[np.ndarray, "n 3"] | None = None
 ) -> dict[str, Any]:
-    """Counts and accuracy, for JSON; RMS at check points, where there are any."""
+    """Counts and accuracy, for JSON; RMS at check points, if there are any."""
     cloud = surface.cloud
     number = np.bincount(cloud.rays) if len(cloud) else np.zeros(0, int)
     return {

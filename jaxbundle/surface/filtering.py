@@ -19,12 +19,12 @@ NEIGHBOURS = 8
 
 
 def thin(cloud: Cloud, size: float, least: int = 1, place: str = "mean") -> Cloud:
-    """One point for every cube of side `size` that has at least `least` of them: their `mean`
-    weighted by 1/σ², the lowest `corner` of the cube, or the `best` of them, of least σ.
+    """One point for every cube of side `size` with at least `least` points: their `mean`
+    weighted by 1/σ², the lowest `corner` of the cube, or the `best` of them, with the smallest σ.
 
-    Errors of neighbours are much alike, their windows overlap: the mean has the σ of one of its
-    points, the root of the harmonic mean of their variances. A corner has the σ of the best point.
-    Cubes stand on multiples of their side.
+    Errors of neighbours are highly correlated, since their windows overlap: the mean has the σ of
+    a single point, the root of the harmonic mean of the variances. A corner has the σ of the best
+    point. Cubes begin at multiples of their side.
 
     **Raises:** `InputError`."""
     size, least = positive("size of the cubes", size), whole("least number of points", least)
@@ -76,7 +76,7 @@ def drop_weak(
 ) -> Cloud:
     """Without points of a σ above `most_sigma` on any axis, or of fewer rays than `least_rays`.
 
-    **Raises:** `InputError` where the cloud has no σ."""
+    **Raises:** `InputError` if the cloud has no σ."""
     keep = np.ones(len(cloud), bool)
     if most_sigma is not None:
         limit = positive("greatest σ", most_sigma)

@@ -1,11 +1,11 @@
 """Rectification of any two oriented images by a surface of one parameter (a height).
 
-The base image is turned so that its epipolar lines are rows, (a, b). The other image is looked up
-where the points of the base's pixels at the parameter q₀ are in it: what lies there matches without
-a disparity. What lies at another q is along the epipolar line, beside by the disparity δ; so the
-match of (a, b) is, in the other image, where the pixel (a − δ, b) looks at q₀.
+The base image is rotated so that its epipolar lines are rows, (a, b). The other image is sampled
+at the images of the points of base pixels at the parameter q₀: points on this surface match without
+disparity. Points at another q are shifted along the epipolar line by the disparity δ; so the
+match of (a, b) is, in the other image, at the image of the point of (a − δ, b) at q₀.
 
-Lines of scanners are curved; pieces of the image small enough have straight ones.
+Epipolar lines of scanners are curved, but straight in small parts of the image.
 """
 
 import dataclasses
@@ -18,10 +18,10 @@ from jaxbundle.surface.segments import windows
 from jaxbundle.surface.views import OrientedImage
 
 ROOM, LEAST_ROOM = 0.3, 12.0
-"""Disparities beyond those of the points, for houses between them: a part of their range, and
-pixels."""
+"""Margin of the disparities beyond those of the points, for houses between them: relative to their
+range, and pixels."""
 NODES = 33
-"""Places a side at which the rows are projected; in between cubic."""
+"""Nodes per side at which the rows are projected; cubic in between."""
 
 
 @dataclasses.dataclass(frozen=True)

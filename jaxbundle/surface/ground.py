@@ -1,6 +1,6 @@
 """Images of line scanners and of rational polynomials as oriented images.
 
-Their points X are metres in the neighbourhood of a place (λ₀, φ₀) on the ellipsoid,
+Their points X are metres in the neighbourhood of an origin (λ₀, φ₀) on the ellipsoid,
 
     X = (λ − λ₀)·N·cos φ₀,    Y = (φ − φ₀)·M,    Z = h,
 
@@ -28,7 +28,7 @@ from jaxbundle.surface.views import in_lanes
 
 
 class Neighbourhood(eqx.Module):
-    """The place (λ₀, φ₀), radians, and metres per radian of longitude and latitude there."""
+    """The origin (λ₀, φ₀), radians, and metres per radian of longitude and latitude there."""
 
     longitude: Float[Array, ""]
     latitude: Float[Array, ""]
@@ -46,7 +46,7 @@ class Neighbourhood(eqx.Module):
 
 
 def neighbourhood(longitude: float, latitude: float, earth: Ellipsoid = WGS84) -> Neighbourhood:
-    """Around a place given in radians."""
+    """Around an origin given in radians."""
     a, c = float(earth.a), float(earth.c)
     e2 = 1 - (c / a) ** 2
     w = np.sqrt(1 - e2 * np.sin(latitude) ** 2)
@@ -55,10 +55,10 @@ def neighbourhood(longitude: float, latitude: float, earth: Ellipsoid = WGS84) -
 
 
 class _GroundView:
-    """What both kinds share: heights are the parameters of their lines of sight."""
+    """Common base of both kinds: heights are the parameters of their lines of sight."""
 
     shift = (0.0, 0.0)
-    """Added to projected places (u, v): the error of the orientation, as far as it was found."""
+    """Added to projected positions (u, v): the estimated error of the orientation."""
     _point: ClassVar[Callable]
 
     def __init__(self, name: str, grey, frame):
@@ -91,7 +91,7 @@ class RpcView(_GroundView):
         return in_lanes(_rpc_derivative, self._frame, X)
 
     def range(self) -> tuple[float, float]:
-        """The heights that the polynomials were made for."""
+        """The range of heights of the polynomials."""
         middle, half = float(self.rpc.height_offset), abs(float(self.rpc.height_scale))
         return middle - half, middle + half
 

@@ -1,8 +1,8 @@
-"""Depths of an image on a grid, coarse to fine: where the points of the surface are searched for.
+"""Depths of an image on a grid, coarse to fine: the search range of surface points.
 
 At the coarsest level of the pyramids all positions between the bounds are compared for all nodes,
-in all images at once, and semi-global aggregation chooses. Every finer level searches about what
-its neighbours in the coarser one have found, with windows on the plane through these.
+in all images at once, with semi-global aggregation. Every finer level searches around the result of
+its neighbours in the coarser one, with windows on the plane through these.
 
     rate = pixels of the other image per unit of q, the greatest of all images
 """
@@ -22,29 +22,29 @@ from jaxbundle.surface.views import OrientedImage
 SPACING = 4
 """Distance of nodes, pixels of the level."""
 COARSE_SIDE = 90
-"""Pixels of the shorter side of the coarsest level, at least."""
+"""Minimum pixels of the shorter side of the coarsest level."""
 COARSE_STEPS = 128
-"""Positions at the coarsest level at most, where the image is large enough for a coarser one."""
+"""Maximum positions at the coarsest level, if the image is large enough for a coarser one."""
 MOST_STEPS = 512
-"""Positions compared for a node, at most."""
+"""Maximum positions compared for a node."""
 HALF = 4
 """Half the side of the windows, pixels of the level."""
 REACH = 2.0
-"""Pixels of the coarser level that are searched beyond the neighbours' range."""
+"""Pixels of the coarser level searched beyond the neighbours' range."""
 WEAKEST = 0.35
-"""A correlation below this says nothing of a node."""
+"""Minimum correlation of a node."""
 APART = 2.0
-"""Pixels of the level that a node may be away from the median of its neighbours."""
+"""Maximum distance of a node from the median of its neighbours, pixels of the level."""
 SMOOTH = 0.7
-"""Change of position from node to node, as a part of their distance, on one plane."""
+"""Change of position from node to node on one plane, relative to their distance."""
 MOST_NODES = 60_000
-"""Of a guide; then the finest levels are left to the points."""
+"""Maximum nodes of a guide; then the finest levels are left to the points."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Guide:
-    """Nodes u = `step`·column + `first`, v likewise: `q`, the rate, ρ, normals; `good`: found at
-    the node itself, not taken over from its neighbours."""
+    """Nodes u = `step`·column + `first`, v likewise: `q`, the rate, ρ, normals; `good`: measured at
+    the node, not taken from its neighbours."""
 
     step: float
     first: float
@@ -55,7 +55,7 @@ class Guide:
     good: Bool[np.ndarray, "r c"]
 
     def around(self, uv: Float[np.ndarray, "n 2"], reach: float):
-        """q at places, its lowest and highest value among the four nodes about each, widened by
+        """q at positions, its lowest and highest value among the four nodes around each, widened by
         `reach` pixels; the normals; the rate."""
         place = (uv - self.first) / self.step
         rows, columns = self.q.shape
@@ -77,10 +77,10 @@ def make_guide(
     bounds,
     most: int = MOST_NODES,
 ) -> Guide | None:
-    """The guide of an image by others; None where no other sees what it does.
+    """The guide of an image from others; None without overlap.
 
-    **Arguments:** `bounds(uv)`: q between which every pixel's surface is, [n, 2], ascending;
-    `most`: nodes.
+    **Arguments:** `bounds(uv)`: bounds of q of the surface at every pixel, [n, 2], ascending;
+    `most`: maximum nodes.
     """
     coarsest = len(pyramids[0].levels) - 1
     guide = None
@@ -100,7 +100,7 @@ def make_guide(
 
 
 def coarsest_level(size: tuple[int, int], length: float) -> int:
-    """The level to begin with, for segments of this length in pixels."""
+    """The first level for segments of this length in pixels."""
     level = 0
     while min(size) / 2 ** (level + 1) >= COARSE_SIDE and (
         length / 2**level > COARSE_STEPS or min(size) / 2**level > 3 * COARSE_SIDE
@@ -117,7 +117,7 @@ def _nodes(base, level):
 
 
 def _search_all(base, others, pyramids, uv, q, level, shape):
-    """Every position between the bounds, at all nodes; the neighbours have a say."""
+    """Every position between the bounds, at all nodes, with semi-global aggregation."""
     looked = [visible_range(base, o, uv, q) for o in others]
     seen = [np.isfinite(r).all(1) & (r[:, 0] < r[:, 1]) for r in looked]
     if not any(s.any() for s in seen):
@@ -157,7 +157,7 @@ def _search_all(base, others, pyramids, uv, q, level, shape):
 
 
 def _at_common(base, other, pyramids, uv, segment, shape, good, level, steps, common):
-    """ρ at common parameters: those along the own segment interpolated."""
+    """ρ at common parameters, interpolated along each segment."""
     rho, q = correlate((base, other), pyramids, uv, segment, shape, level=level, half=HALF,
                        steps=steps)  # fmt: skip
     spacing = 2.0**level * np.linalg.norm(shape.other_along, axis=1)[:, None]
@@ -172,7 +172,7 @@ def _at_common(base, other, pyramids, uv, segment, shape, good, level, steps, co
 
 
 def _search_near(base, others, pyramids, uv, bounds, level, shape, guide):
-    """Positions about what the coarser guide has at the nodes."""
+    """Positions around the coarser guide at the nodes."""
     reach = REACH * 2.0 ** (level + 1)
     q0, q, normal, rate = guide.around(uv, reach)
     q = np.clip(q, bounds[:, :1], bounds[:, 1:])
@@ -182,8 +182,8 @@ def _search_near(base, others, pyramids, uv, bounds, level, shape, guide):
 
 
 def search(base, others, pyramids, uv, q, normal, level, half):
-    """The best position of each point between its bounds, in all images: q, ρ, and the greatest ρ
-    that is no neighbour of it. Points with segments of like length go together."""
+    """The best position of each point between its bounds, in all images: q, ρ, and the largest ρ
+    other than its neighbours. Points with segments of similar length are processed together."""
     middle = base.points(uv, q.mean(1))
     shapes = [windows(base, o, middle, normal) for o in others]
     parts = [segments(base, o, uv, q) for o in others]
@@ -217,7 +217,7 @@ def _taken(record, rows):
 
 
 def _smoothed(base, level, uv, shape, q, rate, rho, _):
-    """A guide of what was found: nodes that say little, or stand alone, follow their neighbours."""
+    """A guide from matches: poor or isolated nodes follow their neighbours."""
     step = SPACING * 2.0**level
     q, rate, rho = (np.asarray(a, float).reshape(shape) for a in (q, rate, rho))
     known = np.isfinite(q) & (rho > WEAKEST)
@@ -234,7 +234,7 @@ def _smoothed(base, level, uv, shape, q, rate, rho, _):
 
 
 def _median(q):
-    """Of the 3 × 3 nodes about each that are known; NaN: fewer than 3 of them."""
+    """Median of the known ones of the 3 × 3 nodes around each; NaN: fewer than 3."""
     padded = np.pad(q, 1, constant_values=np.nan)
     nine = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(*q.shape, 9)
     enough = np.isfinite(nine).sum(-1) >= 3
@@ -243,7 +243,7 @@ def _median(q):
 
 
 def _nearest_filled(q, fallback):
-    """What is unknown as its nearest known node."""
+    """Unknown nodes filled with the nearest known node."""
     known = np.isfinite(q)
     if not known.any():
         return np.where(np.isfinite(fallback), fallback, np.nanmedian(fallback))
@@ -254,8 +254,8 @@ def _nearest_filled(q, fallback):
 
 
 def _normals(base, uv, X, q, rate, step):
-    """Of the planes through neighbouring nodes; across the line of sight where these are on no
-    plane."""
+    """Normals of the planes through neighbouring nodes; across the line of sight if these are not
+    on a plane."""
     du, dv = (_difference(X, axis) for axis in (1, 0))
     normal = np.cross(du, dv)
     bent = np.zeros(q.shape, bool)

@@ -27,10 +27,10 @@ IMAGES = (*SUFFIXES, ".bmp", ".ppm", ".pgm", ".webp", ".jp2")
 def read_views(
     path: str | Path, folder: str | Path
 ) -> tuple[tuple[FrameView, ...], Network, tuple[str, ...]]:
-    """The oriented photographs of a network, the network, and what was left out.
+    """The oriented photographs of a network, the network, and messages about excluded images.
 
-    **Raises:** `InputError` where fewer than two images are oriented, a photograph is missing, or
-    is not of the size of its camera.
+    **Raises:** `InputError` if fewer than two images are oriented, a photograph is missing, or
+    does not have the size of its camera.
     """
     network = read_oriented(path)
     images = network.images
@@ -42,8 +42,8 @@ def read_views(
         network = network.replace(images=images.take(known))
     if known.sum() < 2:
         raise InputError(
-            f"{path}: {known.sum()} oriented images; a surface needs two at least: orient them by "
-            "jaxbundle adjust --out, whose folder can be given here"
+            f"{path}: {known.sum()} oriented images; a surface needs at least two: orient them by "
+            "jaxbundle adjust --out and give its folder here"
         )
     files = find_photographs(network.images.id, Path(folder))
     greys = [read_photograph(file) for file in files]
@@ -53,9 +53,9 @@ def read_views(
 
 
 def _joint(path: Path, network: Network) -> OrientationCovariance | None:
-    """The covariance of the orientations beside a project, where an adjustment has written one."""
+    """The covariance of the orientations beside a project, if an adjustment has written it."""
     folder = path if path.is_dir() else path.parent
-    # a folder of results holds its project in another
+    # a folder of results contains the folder of its project
     file = next((f / FILE for f in (folder, folder / ADJUSTED) if (f / FILE_NAME).is_file()), None)
     if file is None or not file.is_file():
         return None
@@ -63,16 +63,16 @@ def _joint(path: Path, network: Network) -> OrientationCovariance | None:
     known = {("image", id) for id in network.images.id}
     known |= {("camera", camera.id) for camera in network.cameras}
     if not known & {(kind, id) for kind, id, _ in found.unknowns}:
-        raise InputError(f"{file}: not of this project: it has none of its images; remove it")
+        raise InputError(f"{file}: not of this project: contains none of its images; remove it")
     return found
 
 
 def find_photographs(names: Sequence[str], folder: Path) -> list[Path]:
     """The files of photographs by their names, with or without suffix, in a folder or below it;
-    images before other files (masks and depths beside them have names alike), the nearest folder
+    images before other files (masks and depths may have similar names), the nearest folder
     first.
 
-    **Raises:** `InputError` that names those that are not there, or are there twice.
+    **Raises:** `InputError` naming missing or repeated ones.
     """
     if not folder.is_dir():
         raise InputError(f"--photos {folder}: no such folder")
@@ -100,19 +100,19 @@ def find_photographs(names: Sequence[str], folder: Path) -> list[Path]:
 
 
 def _foremost(files):
-    """Of files of one name the images, of these those in the nearest folder."""
+    """Among files of one name the images, and of these those in the nearest folder."""
     files = [p for p in files if p.suffix.lower() in IMAGES] or files
     near = min((len(p.parts) for p in files), default=0)
     return [p for p in files if len(p.parts) == near]
 
 
 def tie_points(network: Network) -> np.ndarray:
-    """Coordinates [n, 3] of the points of a network that have any."""
+    """Known coordinates [n, 3] of the points of a network."""
     X = network.points.position
     return X[np.isfinite(X).all(1)]
 
 
 def check_points(network: Network) -> np.ndarray:
-    """Coordinates [n, 3] of the check and control points of a network that are given."""
+    """Known coordinates [n, 3] of the check and control points of a network."""
     X = network.points.position
     return X[np.isfinite(X).all(1) & network.points.has_role("check", "control", "fixed")]

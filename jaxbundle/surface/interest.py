@@ -1,6 +1,6 @@
-"""Which points of a base image are matched: every n-th pixel, edges, corners.
+"""Selection of points of a base image for matching: every n-th pixel, edges, corners.
 
-Whole pixels, since the windows of least squares matching have a pixel in their middle.
+Whole pixels, since the windows of least squares matching are centred on a pixel.
 """
 
 import numpy as np
@@ -11,9 +11,9 @@ from jaxbundle.errors import InputError
 from jaxbundle.photographs.opencv import need_opencv
 
 TILE, SAMPLE = 2048, 1 << 20
-"""Side of the tiles of a large image; pixels of which the darkest and the brightest are found."""
+"""Side of the tiles of a large image; pixels sampled for the darkest and the brightest."""
 WEAKEST_CORNER = 1e-3
-"""Least eigenvalue of a corner, as a part of that of the strongest."""
+"""Minimum eigenvalue of a corner relative to that of the strongest."""
 
 
 def interest_points(

@@ -1,11 +1,11 @@
-"""Points of any number of rays, of images of any kind, with their full covariance.
+"""Intersection of any number of rays, of images of any kind, with full covariance.
 
     Σ vₖᵀ·Cₖ⁻¹·vₖ = min,        vₖ = projectₖ(X) − (u, v)ₖ
 
-over the base image and the others, each place with the covariance of its matching. That of a
-matching is the sum of the noise of both windows: half of it is given to the place in the other
-image, half to the one in the base, which all its matchings share. So matches in several images are
-not taken for more independent than they are.
+over the base image and the others, each position with the covariance of its match. That of a
+match is the sum of the noise of both windows: half of it is assigned to the position in the other
+image, half to that in the base, common to all matches. So the correlation of matches in several
+images is taken into account.
 """
 
 import dataclasses
@@ -41,7 +41,7 @@ def intersect(
     used: Bool[np.ndarray, "n views"],
     start: Float[np.ndarray, "n 3"],
 ) -> Intersected:
-    """Intersect rays from approximate points; NaN where fewer than two are used or they are
+    """Intersect rays from approximate points; NaN if fewer than two are used or they are
     parallel."""
     n, m = used.shape
     X = start.copy()
@@ -53,7 +53,7 @@ def intersect(
         N, g = np.zeros((n, 3, 3)), np.zeros((n, 3))
         for k, view in enumerate(views):
             rows = np.flatnonzero(used[:, k])
-            if step in (0, STEPS):  # in between they hardly change
+            if step in (0, STEPS):  # they hardly change in between
                 J[rows, k] = view.derivative(X[rows])
             v[rows, k] = view.project(X[rows]) - uv[rows, k]
             PJ = weight[rows, k] @ J[rows, k]

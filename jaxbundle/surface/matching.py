@@ -1,14 +1,14 @@
-"""Points of a base image matched in others and intersected: from pixels to points with covariance.
+"""Matching and intersection of points of a base image: from pixels to points with covariance.
 
-    guide → position in all images at once → least squares matching in each → bending taken off
+    guide → position in all images at once → least squares matching in each → bending corrected
     → checks → intersection
 
 The residuals across the epipolar lines are errors of the same matching that gives the heights: the
 median of vᵀC⁻¹v over its expectation is the variance factor by which all covariances are
-multiplied. It holds what the matching does not know of, small errors of the orientation included.
-Below 1 it tells that what the windows are unlike by is finer than what shifts them; but errors
-along the epipolar lines may be larger, by the shape of the surface, so that it is taken only as far
-as the scatter of the surface agrees (`scatter.py`).
+multiplied. It includes error sources unknown to the matching, such as small errors of orientation.
+Below 1 it means that the differences of the windows are finer than those that shift them; but
+errors along the epipolar lines may be larger, due to the shape of the surface, so that it
+is used only as far as the scatter of the surface agrees (`scatter.py`).
 """
 
 import dataclasses
@@ -32,19 +32,19 @@ from jaxbundle.surface.segments import positions, windows
 from jaxbundle.surface.views import OrientedImage, is_inside, line_of_sight
 
 SEARCH = 2.0
-"""Pixels of the full image that are searched beyond the guide's range."""
+"""Pixels of the full image searched beyond the guide's range."""
 LEAST_CORRELATION = 0.6
 LEAST_SIGMA, MOST_SIGMA = 0.012, 0.5
-"""Pixels: σ of a match, what interpolation and sampling add, and above which the texture does not
-determine it."""
+"""Pixels: σ added to a match by interpolation and sampling, and the limit above which the texture
+does not determine it."""
 UNIQUE = 0.95
-"""ρ of the second best position over that of the best, at most, where both are apart."""
+"""Maximum ratio of ρ of the second best separate position to that of the best."""
 CONSISTENT = 1.5
-"""Pixels between a point and what the guide of the other image has there."""
+"""Maximum distance of a point from the guide of the other image, pixels."""
 STRAYED = 2.5
-"""Pixels from the position of the correlation to that of least squares matching, at most."""
+"""Maximum distance of least squares matching from the position of the correlation, pixels."""
 BLOCK_SIDE, SMOOTH = 16, 0.45
-"""Points a side of a block whose scatter is looked at; the quantile of the blocks that is taken, of
+"""Points per side of a block for the scatter; the quantile of the blocks used, in
 the smoother direction."""
 SIGNIFICANCE = 1e-3
 """Of the test of a point's residuals."""
@@ -67,9 +67,9 @@ class Settings:
 @shows_itself
 @dataclasses.dataclass(frozen=True)
 class Matches:
-    """Points found from a base image: places there, points, what became of the others by reason.
+    """Points from a base image: their pixels, points, and rejected ones by reason.
 
-    `factor`: the variance factor that the covariances are multiplied by.
+    `factor`: the variance factor of the covariances.
     """
 
     uv: Float[np.ndarray, "n 2"]
@@ -92,8 +92,8 @@ def match_points(
     guides: Sequence[Guide | None],
     settings: Settings = Settings(),
 ) -> Matches:
-    """Match whole pixels of the base in the others, from its guide; `guides` of the others, where
-    there are any, say what is hidden there."""
+    """Match whole pixels of the base in the others, from its guide; `guides` of the others, if
+    any, identify hidden points."""
     lost: Counter = Counter()
     half = settings.half
     keep = is_inside(base, uv, half)
@@ -162,7 +162,7 @@ class _Rays:
 
 
 def _accepted(table, X, uv, rhos, settings, lost) -> Matches:
-    """Intersect; rays that do not fit are left out, points that do not fit are rejected."""
+    """Intersect; inconsistent rays are left out, inconsistent points are rejected."""
     found = table.intersect(X)
     factor = variance_factor(found.vtpv, found.redundancy)
     if factor < 1:
@@ -195,7 +195,7 @@ def _accepted(table, X, uv, rhos, settings, lost) -> Matches:
 def variance_factor(
     vtpv: Float[np.ndarray, " n"], redundancy: Int[np.ndarray, " n"], least: int = 30
 ) -> float:
-    """The median of vᵀPv over that of its distribution, 1 where fewer than `least` points tell."""
+    """The median of vᵀPv over that of its distribution, 1 for fewer than `least` points."""
     good = np.isfinite(vtpv) & (redundancy > 0)
     if good.sum() < least:
         return 1.0
@@ -203,7 +203,7 @@ def variance_factor(
 
 
 def _scatter(base, uv, found, settings) -> float:
-    """The variance factor of points on a grid by their scatter, 1 where they are on none."""
+    """The variance factor of points on a grid by their scatter, 1 if they are not on a grid."""
     good = np.isfinite(found.covariance).all((1, 2)) & np.isfinite(found.X).all(1)
     if good.sum() < BLOCK_SIDE**2:
         return 1.0
@@ -226,7 +226,7 @@ def _misfits(found: Intersected, factor: float) -> Bool[np.ndarray, " n"]:
 
 
 def _without_the_worst(table, found, several):
-    """The points again without the ray of the greatest residual, which is not the base's."""
+    """The points again without the ray with the largest residual, other than the base ray."""
     used = table.used.copy()
     rows = np.flatnonzero(several)
     misfit = np.where(used[rows][:, 1:], found.misfit[rows][:, 1:], -1)
@@ -244,7 +244,7 @@ def _without_the_worst(table, found, several):
 
 
 def _agrees(base, other, guide, X) -> Bool[np.ndarray, " n"]:
-    """Whether the other image's own guide has its surface at X, within pixels of the base."""
+    """Whether the guide of the other image has its surface at X, within pixels of the base."""
     if guide is None:
         return np.ones(len(X), bool)
     uv = other.project(X)

@@ -1,12 +1,12 @@
-"""What the orientation of photographs adds to the covariance of points.
+"""Contribution of the orientation of photographs to the covariance of points.
 
-A point is moved by its images' orientations θₖ = (X0, Y0, Z0, ω, φ, κ, parameters of the camera) by
+A point depends on the orientations of its images θₖ = (X0, Y0, Z0, ω, φ, κ, camera parameters) by
 
     dX = −N⁻¹·Σ Jₖᵀ·Bₖ·dθₖ,    N = Σ JₖᵀJₖ,    Jₖ = ∂(u, v)ₖ/∂X,    Bₖ = ∂(u, v)ₖ/∂θₖ,
 
-so that C = ΣΣ Sₖ·Cₖₗ·Sₗᵀ with Sₖ = N⁻¹·Jₖᵀ·Bₖ. Cₖₗ is what an adjustment says (`precision.csv`), or
-diag(σ²) for k = l by the σ of images.csv, taken as uncorrelated, which after an adjustment they are
-not: the true part may be smaller or larger. σ of 0, or none, adds nothing.
+so that C = ΣΣ Sₖ·Cₖₗ·Sₗᵀ with Sₖ = N⁻¹·Jₖᵀ·Bₖ. Cₖₗ is from an adjustment (`precision.csv`), or
+diag(σ²) for k = l by the σ of images.csv, assumed uncorrelated, which is not true after an
+adjustment: the true part may be smaller or larger. σ of 0, or none, adds nothing.
 """
 
 from collections.abc import Sequence
@@ -21,11 +21,11 @@ from jaxbundle.geometry import matrix_from_omega_phi_kappa, omega_phi_kappa_from
 from jaxbundle.surface.views import FrameView, OrientedImage, in_lanes, pixel_of
 
 PORTION = 1 << 16
-"""Points that are computed at once."""
+"""Points computed at once."""
 
 
 def is_uncertain(view: OrientedImage) -> bool:
-    """Whether an image has a σ of its orientation."""
+    """Whether an image has σ of its orientation."""
     return isinstance(view, FrameView) and bool(_covariance(view, view).any())
 
 
@@ -34,7 +34,7 @@ def orientation_covariance(
     X: Float[np.ndarray, "n 3"],
     used: Bool[np.ndarray, "n views"],
 ) -> Float[np.ndarray, "n 3 3"]:
-    """The covariance of points by that of the orientations of the images that see them."""
+    """The covariance of points due to that of the orientations of their images."""
     C = np.zeros((len(X), 3, 3))
     if any(map(is_uncertain, views)):
         for first in range(0, len(X), PORTION):
@@ -62,7 +62,7 @@ def _of_portion(views, X, used):
 
 
 def _covariance(one: FrameView, other: FrameView) -> Float[np.ndarray, "k l"]:
-    """Between the orientations of two photographs, cameras included."""
+    """Covariance between the orientations of two photographs, cameras included."""
     if one.joint is not None and one.joint is other.joint:
         rows, columns = (
             one.joint.rows(view.name, view.camera.id, view.frame.model.parameters)

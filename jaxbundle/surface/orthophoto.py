@@ -1,8 +1,8 @@
 """Orthophotos: grey values or colours of oriented images over a DSM.
 
-Every cell's point is projected into the images; what a higher part of the surface hides is left
-out, by a march along the line of sight over the DSM. Of several images each cell has the one that
-looks most steeply (`mosaic`).
+Every cell's point is projected into the images; points hidden by a higher part of the surface are
+left out, by steps along the line of sight over the DSM. Of several images each cell uses that with
+the steepest line of sight (`mosaic`).
 """
 
 from collections.abc import Callable, Sequence
@@ -17,7 +17,7 @@ from jaxbundle.surface.dsm import Dsm
 from jaxbundle.surface.views import OrientedImage, is_inside, line_of_sight
 
 MARCH = 64
-"""Places along a line of sight at which the surface is looked at."""
+"""Number of points along a line of sight compared with the surface."""
 CLEARANCE = 1.0
 """Cells by which the surface must rise above the line of sight to hide."""
 
@@ -27,10 +27,10 @@ ToViews = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n 3"]]
 def orthophoto(
     view: OrientedImage, dsm: Dsm, to_view: ToViews = lambda X: X
 ) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, "rows columns"]]:
-    """Grey values of the cells, NaN where the image does not see them; and the steepness of the
+    """Grey values of the cells, NaN if not visible in the image; and the steepness of the
     line of sight, its vertical part.
 
-    **Arguments:** `to_view`: from the coordinates of the DSM to those of the view, where they
+    **Arguments:** `to_view`: from the coordinates of the DSM to those of the view, if they
     differ.
     """
     x, y = dsm.centres()
@@ -53,7 +53,7 @@ def orthophoto(
 def mosaic(
     views: Sequence[OrientedImage], dsm: Dsm, to_view: ToViews = lambda X: X
 ) -> Float[np.ndarray, "rows columns"]:
-    """The orthophoto of several images: every cell by the one that looks most steeply."""
+    """The orthophoto of several images: every cell from that with the steepest line of sight."""
     best = np.full(dsm.height.shape, -np.inf)
     out = np.full(dsm.height.shape, np.nan)
     for view in views:

@@ -1,4 +1,4 @@
-"""Which images are matched with which: those that see the same, from directions that differ."""
+"""Selection of images to match with each other: overlapping, from different directions."""
 
 from collections.abc import Sequence
 
@@ -10,16 +10,16 @@ from jaxbundle.surface.bounds import Bounds, angle_at
 from jaxbundle.surface.views import OrientedImage, is_inside
 
 LOOKS = 9
-"""Places a side of the base image at which the overlap is looked at."""
+"""Points per side of the base image for testing the overlap."""
 LEAST_OVERLAP = 0.1
 NARROWEST, BEST, WIDEST = np.radians([1.0, 14.0, 60.0])
-"""Angles between lines of sight: useless below, best, and where windows are no longer alike."""
+"""Angles between lines of sight: minimum, best, and maximum for similar windows."""
 
 
 def choose_partners(
     views: Sequence[OrientedImage], bounds: Sequence[Bounds], most: int = 3
 ) -> dict[int, list[int]]:
-    """For every image the others it is matched with, best first; none where there are none."""
+    """For every image its matching partners, best first; may be empty."""
     found = {}
     for i, view in enumerate(views):
         scores = [(score(view, bounds[i], o), j) for j, o in enumerate(views) if j != i]
@@ -30,7 +30,7 @@ def choose_partners(
 
 
 def score(view: OrientedImage, bounds: Bounds, other: OrientedImage) -> float:
-    """Overlap times what the angle of intersection is worth, 0 to 1; 0: no pair."""
+    """Overlap times a weight of the angle of intersection, 0 to 1; 0: no pair."""
     u, v = (np.linspace(0.05, 0.95, LOOKS) * (n - 1) for n in view.size)
     uv = np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
     q = bounds(uv)

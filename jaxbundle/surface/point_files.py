@@ -32,9 +32,9 @@ MOST_DXF = 5_000_000
 
 
 def write_cloud(cloud: Cloud, path: str | Path) -> None:
-    """Write a cloud as its suffix says: .csv, .ply, .las, .laz or .dxf.
+    """Write a cloud by its suffix: .csv, .ply, .las, .laz or .dxf.
 
-    **Raises:** `InputError` for another suffix, or where a package is missing."""
+    **Raises:** `InputError` for another suffix, or if a package is missing."""
     path = Path(path)
     match path.suffix.lower():
         case ".csv":
@@ -180,7 +180,7 @@ def _read_las(path):
     laspy = _laspy()
     try:
         las = laspy.read(path)
-    except Exception as error:  # laspy and its backends raise what they like
+    except Exception as error:  # laspy and its backends raise any exception
         raise InputError(f"{path}: {' '.join(str(error).split())[:200]}") from None
     names = {*las.point_format.dimension_names}
     n = len(las.points)

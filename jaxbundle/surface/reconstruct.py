@@ -24,23 +24,23 @@ from jaxbundle.surface.segments import segments, visible_range
 from jaxbundle.surface.views import FrameView, OrientedImage
 
 KEPT = 6
-"""Pyramids kept at a time."""
+"""Maximum pyramids in memory."""
 POINTS = 40_000
-"""Points of a base image where no step is given."""
+"""Points of a base image by default."""
 DENSE_NODES = 25_000
-"""Of the guides of dense matching, which need no more than the range of depths."""
+"""Maximum nodes of the guides of dense matching, which only give the range of depths."""
 MOST_POINTS = 16_000_000
-"""Of a dense cloud where no step is given; they take 2.5 GB."""
+"""Maximum points of a dense cloud by default; they take 2.5 GB."""
 SAMPLE = 1 << 20
-"""Pixels of which the darkest and the brightest are found."""
+"""Number of pixels sampled for the darkest and the brightest."""
 
 Tell = Callable[[str, int, int], None]
 
 
 @dataclasses.dataclass(frozen=True)
 class Surface:
-    """A cloud, what became of the points of each base image, and messages; `orientation`: whether
-    the σ of the orientations are in those of the points."""
+    """A cloud, statistics of the points of each base image, and messages; `orientation`: whether
+    the σ of the orientations are included in those of the points."""
 
     cloud: Cloud
     bases: tuple[Mapping[str, Any], ...]
@@ -53,23 +53,23 @@ def find_bounds(
     tie: Float[np.ndarray, "n 3"],
     heights: tuple[float, float] | None = None,
 ) -> tuple[tuple[Bounds, ...], tuple[str, ...]]:
-    """The bounds of every image: heights, where given; tie points; else the geometry, with a
+    """The bounds of every image: heights, if given; tie points; else the geometry, with a
     message."""
     found, messages = [], []
     low, high = heights or (None, None)
     guessed = []
     for view in views:
         others = [o for o in views if o is not view]
-        # a view from among the heights is not bounded by them
+        # a view between the heights is not bounded by them
         among = heights is not None and low <= view.X0[2] <= high
         q = by_points(view, tie) if len(tie) and (heights is None or among) else None
         if q is None:
             wide = by_geometry(view, others)
             if wide is None:
                 raise InputError(
-                    f"{view.name}: all images are at one place: a surface needs a base"
+                    f"{view.name}: all images are at one position: a surface needs a base"
                 )
-            # given heights are looked for at any distance
+            # given heights are searched at any distance
             q = wide if heights is None or among else (1e-2 * wide[0], 1e2 * wide[1])
             if heights is None or among:
                 guessed.append((view.name, q))
@@ -87,7 +87,7 @@ def find_bounds(
 def ground_bounds(
     views: Sequence[OrientedImage], heights: tuple[float, float] | None
 ) -> tuple[tuple[Bounds, ...], tuple[str, ...]]:
-    """The bounds of scanner and RPC images: heights, else those the polynomials were made for.
+    """The bounds of scanner and RPC images: heights, else the range of the polynomials.
 
     **Raises:** `InputError` for scanner images without heights."""
     messages: tuple[str, ...] = ()
@@ -97,14 +97,14 @@ def ground_bounds(
             raise InputError("line scanner images need --zmin and --zmax, heights of the surface")
         heights = max(low for low, _ in ranges), min(high for _, high in ranges)
         messages = (
-            f"heights from {heights[0]:.6g} to {heights[1]:.6g} are searched, those that the "
-            "coefficients were made for; give --zmin and --zmax",
+            f"heights from {heights[0]:.6g} to {heights[1]:.6g} are searched, the range of the "
+            "coefficients; give --zmin and --zmax",
         )  # fmt: skip
     return tuple(Bounds(view, heights) for view in views), messages
 
 
 class _Pyramids:
-    """Pyramids of the images, the last few of them kept."""
+    """Pyramids of the images, the last few kept in memory."""
 
     def __init__(self, views, levels):
         self.views, self.levels, self.kept = views, levels, {}
@@ -132,17 +132,17 @@ def reconstruct(
 ) -> Surface:
     """The cloud of all base images.
 
-    **Arguments:** `partners`: indices of the images each base is matched with, chosen if not given;
+    **Arguments:** `partners`: indices of the matching partners of each base, by default selected;
     `points`, `step`: see `interest_points`; `dense`: every pixel (or every `step`-th), by rectified
     pairs; `tell(stage, done, total)`.
 
-    **Raises:** `NotSolvedError` where no images see the same, or nothing matches.
+    **Raises:** `NotSolvedError` if no images overlap, or nothing matches.
     """
     partners = dict(partners or choose_partners(views, bounds))
     if not partners:
         raise NotSolvedError(
-            "no two images see the same part of the surface from different directions: look at the "
-            "orientation and its units, and at --zmin and --zmax"
+            "no two images show the same part of the surface from different directions: check the "
+            "orientation and its units, --zmin and --zmax"
         )
     tell = tell or (lambda *_: None)
     levels = max(_level(views, bounds[i], i, others) for i, others in partners.items())
@@ -151,7 +151,7 @@ def reconstruct(
     clouds, told, messages = [], [], []
     every = step or _dense_step(views[i] for i in partners)
     if dense and not step and every > 1:
-        messages.append(f"every {every}th pixel in both directions, not to run out of memory; "
+        messages.append(f"every {every}th pixel in both directions, to limit memory; "
                         "--step 1 takes all")  # fmt: skip
     for done, (i, others) in enumerate(partners.items()):
         tell("matching", done, len(partners))
@@ -178,8 +178,8 @@ def reconstruct(
     tell("matching", len(partners), len(partners))
     if not any(len(c) for c in clouds):
         raise NotSolvedError(
-            "no point was matched: the photographs have too little texture in common, or the "
-            "orientation or the bounds of the heights are not theirs"
+            "no point was matched: the photographs have too little common texture, or the "
+            "orientation or the bounds of the heights are wrong"
         )
     uncertain = any(is_uncertain(views[j]) for i, others in partners.items() for j in (i, *others))
     return Surface(merge(clouds), tuple(told), tuple(messages), uncertain)
@@ -204,8 +204,8 @@ def _dense(views, i, others, guide, bounds, step):
 
 
 def _guides(views, bounds, partners, pyramids, tell, dense) -> dict[int, Guide]:
-    """Of every base, and of every image that one is matched with; dense matching needs those of the
-    bases only, coarser ones."""
+    """Guides of every base and its partners; dense matching needs only those of the
+    bases, coarser ones."""
     with_whom = {i: list(others) for i, others in partners.items()}
     for i, others in partners.items():
         for j in others:
@@ -225,7 +225,7 @@ def _guides(views, bounds, partners, pyramids, tell, dense) -> dict[int, Guide]:
 
 
 def _level(views, bounds, i, others):
-    """The coarsest level that a base image needs."""
+    """The coarsest level required for a base image."""
     u, v = (np.linspace(0.1, 0.9, 5) * (n - 1) for n in views[i].size)
     uv = np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
     q = bounds(uv)
@@ -239,7 +239,7 @@ def _level(views, bounds, i, others):
 
 
 def _dense_step(bases):
-    """Pixels between points, so that those of all base images can be held."""
+    """Pixels between points, so that those of all base images fit into memory."""
     pixels = sum(view.size[0] * view.size[1] for view in bases)
     return max(1, int(np.ceil(np.sqrt(pixels / MOST_POINTS))))
 

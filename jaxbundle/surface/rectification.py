@@ -1,12 +1,12 @@
-"""Epipolar rectification of two photographs: both turned, by a rotation each, to the normal case.
+"""Epipolar rectification of two photographs: both are rotated to the normal case.
 
 The x axis of the rectified cameras is the base b, z is the mean of both optical axes less its part
 along it; the principal distance f keeps the resolution of the base image. Then lines are rows, and
 
     d = x − x' = f·b/Z,        X = X0 + Z·Rᵀ·[x/f, y/f, 1].
 
-Distortion is taken out on the way: every rectified pixel is looked up by its ray. Grey values are
-interpolated by cubic splines, since a table of 1/32 pixel would be seen in the heights.
+Distortion is removed at the same time: every rectified pixel is looked up by its ray. Grey values
+are interpolated by cubic splines, since a table of 1/32 pixel would be visible in the heights.
 
 Source: Fusiello, Trucco and Verri (2000), A compact algorithm for rectification of stereo pairs.
 """
@@ -20,7 +20,7 @@ from scipy import ndimage
 from jaxbundle.surface.views import FrameView
 
 ROOM, LEAST_ROOM = 0.15, 8.0
-"""Disparities beyond those of the points: a part of their range, and pixels."""
+"""Margin of disparities beyond those of the points: relative to their range, and pixels."""
 WIDEST = 1.25
 """Radians from the axis of the rectified camera to the farthest ray."""
 LARGEST = 5.0
@@ -49,13 +49,13 @@ class Rectified:
         return np.where(z[:, None] > 0, found, np.nan)
 
     def disparity(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Columns in the left less those in the right image."""
+        """Columns in the left minus those in the right image."""
         return self.f * self.base / (self.R[2] @ (points - self.X0).T) - self.lowest
 
     def points(
         self, place: Float[np.ndarray, "n 2"], disparity: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, "n 3"]:
-        """The points of places in the left image; NaN behind infinity."""
+        """The object points of positions in the left image; NaN beyond infinity."""
         total = disparity + self.lowest
         with np.errstate(divide="ignore", invalid="ignore"):
             Z = np.where(total > 0, self.f * self.base / total, np.nan)
@@ -66,8 +66,8 @@ class Rectified:
 def rectify(
     base: FrameView, other: FrameView, X: Float[np.ndarray, "n 3"]
 ) -> tuple[Rectified, int] | None:
-    """The pair, and the range of its disparities, as wide as points X need, and some more; None
-    where one camera is before the other, or they are at one place."""
+    """The pair, and the range of its disparities, that of the points X with a margin; None
+    if one camera is in front of the other, or they are at one position."""
     b = other.X0 - base.X0
     length = float(np.linalg.norm(b))
     if not length > 0:
@@ -107,7 +107,7 @@ def rectify(
 def disparity_range(
     base: FrameView, other: FrameView, X: Float[np.ndarray, "n 3"]
 ) -> float | None:
-    """About the range of the disparities of points, pixels; None of cameras at one place."""
+    """Approximate range of the disparities of points, pixels; None for cameras at one position."""
     b = other.X0 - base.X0
     length = float(np.linalg.norm(b))
     if not length > 0:

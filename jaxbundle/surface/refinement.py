@@ -1,7 +1,7 @@
-"""Matches to a fraction of a pixel: least squares matching of many windows, from many starts.
+"""Subpixel matches: least squares matching of many windows, from many starts.
 
-Both photographs are smoothed before: what is finer than the pixels allow, and noise, shift matches
-towards the middle between pixels, and make gradients of nothing (Schreier et al., 2000).
+Both photographs are smoothed first: aliasing and noise shift matches
+towards the middle between pixels, and cause false gradients (Schreier et al., 2000).
 """
 
 from typing import NamedTuple
@@ -19,20 +19,20 @@ from jaxbundle.measure.least_squares_matching import (
 from jaxbundle.surface.views import OrientedImage, is_inside
 
 LANES = 256
-"""Windows that are matched together."""
+"""Windows matched together."""
 SPARE = 5
-"""Pixels that the piece of the other image is larger than the window at the start, each side."""
+"""Margin of the part of the other image around the window at the start, pixels."""
 STRETCH = 1.4
-"""By which a window may be longer in the other image."""
+"""Maximum ratio of lengths of a window in the other image."""
 OVER_NOISE, TOGETHER = 1.5, 4096
-"""Of the squares of gradients of half a window: three σ more than those of noise."""
+"""Minimum ratio of the squared gradients of half a window to those of noise: three σ above 1."""
 BLUR, BEYOND = 0.7, 3
-"""σ of the Gaussian, and pixels to which it reaches."""
+"""σ of the Gaussian, and its extent in pixels."""
 
 
 class Refined(NamedTuple):
-    """Places [n, 2] in the other image, A [n, 2, 2], covariance [n, 2, 2] of the place relative to
-    the window, pixels²; ρ; σ0 of a grey value; statuses, `MatchingStatus`."""
+    """Positions [n, 2] in the other image, A [n, 2, 2], covariance [n, 2, 2] of the position
+    relative to the window, pixels²; ρ; σ0 of a grey value; statuses, `MatchingStatus`."""
 
     uv: Float[np.ndarray, "n 2"]
     A: Float[np.ndarray, "n 2 2"]
@@ -50,9 +50,9 @@ def refine(
     A: Float[np.ndarray, "n 2 2"],
     half: int,
 ) -> Refined:
-    """Match windows of 2·`half` + 1 pixels about whole pixels of the base.
+    """Match windows of 2·`half` + 1 pixels around whole pixels of the base.
 
-    **Arguments:** `start`: places in the other image, within a few pixels; `A`: start of the
+    **Arguments:** `start`: positions in the other image, within a few pixels; `A`: start of the
     affine transformation, from the base to the other image.
     """
     n, reach = len(uv), int(np.ceil(STRETCH * half)) + SPARE
@@ -88,7 +88,7 @@ def has_texture(
     sigma0: Float[np.ndarray, " n"], half: int,
 ) -> Bool[np.ndarray, " n"]:
     """Whether windows have texture on all sides of their points, by the squares of its gradients
-    against those of noise; else they tell of what is beside: of the ground at the edge of a roof.
+    relative to noise; otherwise they measure a neighbour: the ground at the edge of a roof.
 
     Smoothed noise of variance σ² has σ²/4πs², twice of which are σ0²; central differences of it
     have σ²/2 on each axis.
@@ -129,7 +129,7 @@ def _match(template, piece, start):
 
 
 def _smooth(pieces):
-    """Pieces smoothed, without what is beyond them."""
+    """Smoothed pieces, without pixels beyond them."""
     side = pieces.shape[-1] - 2 * BEYOND
     away = np.arange(side + 2 * BEYOND) - np.arange(side)[:, None] - BEYOND
     weight = np.where(np.abs(away) <= BEYOND, np.exp(-(away**2) / (2 * BLUR**2)), 0.0)

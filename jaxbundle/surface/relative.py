@@ -1,10 +1,10 @@
 """The relative error of the orientation of two scanner or RPC images, across their epipolar lines.
 
-Coefficients of two images that were taken minutes apart, or years, miss each other by pixels. What
-of it lies along the epipolar lines is a height, which nothing but control tells; what lies across
-them would keep the images from being matched, and is found from the images themselves: at some
-hundred corners the best correlation along segments is sought at several distances beside them, then
-least squares matching gives the rest.
+Coefficients of two images taken minutes or years apart differ by pixels. The part
+along the epipolar lines is a height, determined only by control; the part across
+them would prevent matching, and is estimated from the images: at some
+hundred corners the best correlation along segments is searched at several distances beside them,
+then least squares matching gives the rest.
 """
 
 from collections.abc import Sequence
@@ -21,23 +21,23 @@ from jaxbundle.surface.segments import positions, visible_range, windows
 
 POINTS = 400
 REACH = 16
-"""Pixels across the epipolar lines that are tried."""
+"""Pixels searched across the epipolar lines."""
 HALF = 6
 LEVELS = 2
 WORTH_SAYING = 0.1
-"""Pixels that are said."""
+"""Minimum shift that is reported, pixels."""
 ENOUGH = 12
-"""Matches from which the rest is taken."""
+"""Minimum matches for the rest."""
 GOOD = 0.6
 LIKELY = 0.75
-"""ρ of a match that counts."""
+"""Minimum ρ of a match."""
 
 
 def align(
     base, other, pyramids: tuple[Pyramid, Pyramid], bounds: Bounds
 ) -> float | None:
-    """Shift the projections of the other image; by how many pixels, None where too little is
-    alike."""
+    """Shift the projections of the other image; returns the shift in pixels, None if too few points
+    match."""
     grey = base.grey
     spread = max(8, int(np.sqrt(grey.size / POINTS)))
     uv = interest_points(grey, "corners", spread)
@@ -93,14 +93,14 @@ def _rest(base, other, pyramids, uv, q, across) -> float | None:
 
 
 def align_all(views: Sequence, bounds: Sequence[Bounds]) -> tuple[str, ...]:
-    """Align every image with the first; what was done, in words."""
+    """Align every image with the first; returns messages."""
     said = []
     pyramids = [make_pyramid(view.grey, LEVELS) for view in views]
     for k in range(1, len(views)):
         found = align(views[0], views[k], (pyramids[0], pyramids[k]), bounds[0])
         pair = f"{views[k].name} and {views[0].name}"
         if found is None:
-            said.append(f"{pair}: too little is alike to align them across the epipolar lines")
+            said.append(f"{pair}: too few matches to align them across the epipolar lines")
         elif abs(found) > WORTH_SAYING:
             said.append(f"{pair}: {found:.3g} pixels between them across the epipolar lines, taken "
                         "off the second")  # fmt: skip

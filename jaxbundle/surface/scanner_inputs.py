@@ -2,7 +2,7 @@
 
 An image is given by a raster with RPC tags, by a raster with coefficients beside it
 (`NAME_RPC.TXT`, `NAME.RPB`, `NAME.geom`, `NAME.xml`), by the file of the coefficients, or by a
-scanner file; the raster of the last two has their name and stands beside them, or in the folder of
+scanner file; the raster of the last two has the same name and is beside them, or in the folder of
 --photos.
 """
 
@@ -31,7 +31,7 @@ ENDINGS = ("_rpc", "_RPC")
 BANDS = (0.3, 0.59, 0.11)
 """Weights of red, green and blue."""
 AT_ONCE, TOGETHER = 1 << 23, 1 << 18
-"""Pixels that are read, points that are brought to a map system together."""
+"""Pixels read together; points transformed to a map system together."""
 
 View = RpcView | ScannerView
 
@@ -39,9 +39,9 @@ View = RpcView | ScannerView
 def read_ground_views(
     files: Sequence[Path], folder: Path | None
 ) -> tuple[tuple[View, ...], Neighbourhood | None]:
-    """The oriented images and the place their coordinates refer to, None in a local frame.
+    """The oriented images and the origin of their coordinates, None in a local frame.
 
-    **Raises:** `InputError` for a file that is neither, without its raster, or of another size.
+    **Raises:** `InputError` for another kind of file, a missing raster, or another size.
     """
     found = [_orientation(path, folder) for path in files]
     earths = [None if isinstance(o, Rpc) else o[1] for o, _ in found]
@@ -58,7 +58,7 @@ def read_ground_views(
     for name, (orientation, raster), earth in zip(names, found, earths):
         grey = read_grey(raster)
         if isinstance(orientation, Rpc):
-            assert around is not None, "an RPC is no local frame"
+            assert around is not None, "an RPC is not in a local frame"
             views.append(RpcView(name, grey, orientation, around))
             continue
         image = orientation[0]
@@ -82,10 +82,10 @@ def is_ground_image(path: Path) -> bool:
 
 
 def read_grey(path: Path) -> np.ndarray:
-    """The grey values of a raster; of colours their luminance. No-data is 0.
+    """The grey values of a raster; for colours their luminance. No-data is 0.
 
-    One band of 8 or 16 bits is kept as it is, all else becomes float32; so large rasters, which are
-    read by blocks of lines, take no more memory than their pixels.
+    One band of 8 or 16 bits keeps its type, all else becomes float32; so large rasters, which are
+    read by blocks of lines, need no more memory than their pixels.
 
     **Raises:** `InputError` if it cannot be read.
     """
@@ -115,9 +115,9 @@ def _luminance(values):
 
 
 def system_of(around: Neighbourhood, crs: str | None) -> str:
-    """A coordinate system for maps: the one given, or the zone of UTM.
+    """A map coordinate system: the given one, or the UTM zone.
 
-    **Raises:** `InputError` for one that pyproj does not know."""
+    **Raises:** `InputError` for a system unknown to pyproj."""
     if crs is not None:
         return crs
     longitude, latitude = (np.degrees(float(a)) for a in (around.longitude, around.latitude))
@@ -128,9 +128,9 @@ def system_of(around: Neighbourhood, crs: str | None) -> str:
 def to_map(
     cloud: Cloud, around: Neighbourhood, crs: str
 ) -> Cloud:
-    """The cloud in a map system, its covariance turned and scaled with it.
+    """The cloud in a map system, with its covariance rotated and scaled.
 
-    **Raises:** `InputError` for a system that pyproj does not know."""
+    **Raises:** `InputError` for a system unknown to pyproj."""
     X, covariance = np.empty_like(cloud.X), np.empty_like(cloud.covariance)
     for first in range(0, len(cloud), TOGETHER):
         part = slice(first, first + TOGETHER)
@@ -160,7 +160,7 @@ def map_coordinates(
 
 
 def from_map(x, y, h, around: Neighbourhood, crs: str) -> Float[np.ndarray, "n 3"]:
-    """Points of places in a map system."""
+    """Points of map coordinates."""
     degrees = _transformer(crs).transform(x, y, direction="INVERSE")
     east, north = np.radians(degrees)
     return np.asarray(around.local(east, north, np.asarray(h, float))).T

@@ -1,10 +1,10 @@
-"""What a smooth surface tells of the σ of its points.
+"""Estimation of σ of points from the scatter on a smooth surface.
 
 Third differences of values whose windows do not overlap,
 
     d₀ − 3·d₁ + 3·d₂ − d₃,    σ² = σ₀² + 9·σ₁² + 9·σ₂² + σ₃²,
 
-are noise alone where the surface is smooth. The variance factor is a quantile of those of blocks.
+are pure noise if the surface is smooth. The variance factor is a quantile of those of blocks.
 """
 
 import numpy as np
@@ -12,12 +12,12 @@ from jaxtyping import Float
 from scipy import stats
 
 ENOUGH = 100
-"""Values from which a factor is taken."""
+"""Minimum values for a factor."""
 WEIGHTS = 1.0, -3.0, 3.0, -1.0
 
 
 def robust_factor(ratio: Float[np.ndarray, " n"], otherwise: float = 1.0) -> float:
-    """The variance factor of errors in units of their σ, by their median; of few `otherwise`."""
+    """The variance factor of errors in units of their σ, by their median; `otherwise` for few."""
     ratio = ratio[np.isfinite(ratio)]
     if len(ratio) <= ENOUGH:
         return otherwise
@@ -29,7 +29,7 @@ def scatter_factor(
     step: int, side: int, quantile: float,
 ) -> list[float]:
     """The variance factor of values on a grid (NaN: none), along columns and rows, by differences
-    over `step`, of blocks of `side`; none where no block is full enough."""
+    over `step`, of blocks of `side`; none if no block has enough values."""
     found = []
     for a, s in ((d, sigma), (d.T, sigma.T)):
         n = a.shape[1] - 3 * step

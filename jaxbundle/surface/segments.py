@@ -1,13 +1,13 @@
-"""Where a point of the base image may be in another: the segment between two ends of its line of
-sight (vertical line locus, epipolar segment), curved as distortion and scanners have it.
+"""Possible positions of a base point in another image: the segment between two ends of its line of
+sight (vertical line locus, epipolar segment), curved by distortion or the scanner.
 
     λ(x) = α·x/(1 + γ·x),    x = (q − q₁)/(q₂ − q₁)
 
-is the length along the segment; exact for perspective images, and of three of its points,
-for the others it spaces positions nearly evenly, whose places are projected each by itself.
+is the length along the segment; exact for perspective images, and otherwise from three of its
+points: positions are then nearly evenly spaced, and each is projected individually.
 
-`Windows` hold how a window of the base image lies in the other one, by way of the local plane: its
-axes are e, along the epipolar line in the base, and e⊥; the other image has them at A·e, which is
+`Windows` describe a window of the base image in the other one, through the local plane: its
+axes are e, along the epipolar line in the base, and e⊥; in the other image they are A·e,
 along its segment, and A·e⊥.
 """
 
@@ -19,17 +19,17 @@ from jaxtyping import Bool, Float
 from jaxbundle.surface.views import OrientedImage, is_inside, line_of_sight, over_plane
 
 LOOKS = 17
-"""Places along a line of sight at which it is looked whether the other image has them."""
+"""Number of points along a line of sight tested for visibility in the other image."""
 LEAST_STRETCH, MOST_STRETCH = 0.25, 4.0
-"""Ratio of lengths in the other image and in the base within which windows are compared."""
+"""Limits of the ratio of lengths in the other image and in the base for comparing windows."""
 FLATTEST = 0.2
-"""Sine of the angle between a plane and a line of sight, below which the plane is not followed."""
+"""Minimum sine of the angle between a plane and a line of sight."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Windows:
     """Axes of the windows: e [n, 2] in the base, A·e and A·e⊥ [n, 2] in the other image; `A`;
-    `usable`: the plane is seen by both, at similar scales."""
+    `usable`: the plane is visible in both, at similar scales."""
 
     along: Float[np.ndarray, "n 2"]
     other_along: Float[np.ndarray, "n 2"]
@@ -48,7 +48,7 @@ class Segments:
 
     @property
     def length(self) -> Float[np.ndarray, " n"]:
-        """Pixels of the other image; NaN where it does not see the line of sight."""
+        """Pixels of the other image; NaN if the line of sight is not visible."""
         return self.alpha / (1 + self.gamma)
 
     def parameter(self, length: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
@@ -66,7 +66,7 @@ def visible_range(
     base: OrientedImage, other: OrientedImage, uv: Float[np.ndarray, "n 2"],
     q: Float[np.ndarray, "n 2"], margin: float = 0.0,
 ) -> Float[np.ndarray, "n 2"]:
-    """The part of a range of q that the other image sees, to about 1/`LOOKS` of it; NaN: none."""
+    """The part of a range of q visible in the other image, to about 1/`LOOKS` of it; NaN: none."""
     x = np.linspace(0, 1, LOOKS)
     sampled = q[:, :1] + x * (q[:, 1:] - q[:, :1])
     places = other.project(_points(base, uv, sampled))
@@ -96,7 +96,7 @@ def positions(
     base: OrientedImage, other: OrientedImage, uv: Float[np.ndarray, "n 2"],
     q: Float[np.ndarray, "n k"],
 ) -> Float[np.ndarray, "n k 2"]:
-    """Places in the other image of points along lines of sight."""
+    """Positions in the other image of points along lines of sight."""
     return other.project(_points(base, uv, q)).reshape(*q.shape, 2)
 
 
@@ -104,7 +104,7 @@ def windows(
     base: OrientedImage, other: OrientedImage, X: Float[np.ndarray, "n 3"],
     normal: Float[np.ndarray, "n 3"] | None = None,
 ) -> Windows:
-    """How windows around points X lie in both images, on planes with these normals; None: planes
+    """Windows around points X in both images, on planes with these normals; None: planes
     across the mean of both lines of sight."""
     J, K = base.derivative(X), other.derivative(X)
     d, f = line_of_sight(J), line_of_sight(K)

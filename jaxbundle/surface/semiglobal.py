@@ -3,7 +3,7 @@
     L(p, d) = C(p, d) + min(L(p', d), L(p', d ± 1) + P₁, min L(p') + P₂) − min L(p')
 
 from node to node p' → p in eight directions, and the sum of all eight: a change of one step costs
-P₁, any greater one P₂. Where the grey values say little, the neighbours decide.
+P₁, any larger one P₂. With little texture the neighbours decide.
 
 Source: Hirschmüller (2008), Stereo processing by semiglobal matching, equation 13.
 """
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 SMALL_CHANGE, LARGE_CHANGE = 0.08, 0.5
-"""P₁ and P₂, where the costs are 1 − ρ."""
+"""P₁ and P₂ for costs 1 − ρ."""
 
 
 def aggregate(
@@ -50,7 +50,7 @@ def _sweep(cost, total, shift, small, large):
 
 
 def _moved(a, shift):
-    """Rows moved; where none comes from, costs are 0."""
+    """Shifted rows; missing costs are 0."""
     if shift == 0:
         return a
     out = np.zeros_like(a)

@@ -4,7 +4,7 @@ In the normal case, base b, flying height above the ground h, principal distance
 
     Z₀ − Z = h = c·b/p,    σ_h = h²/(c·b)·σ_p = (h/c)·(h/b)·σ_p,    σ_X = (h/c)·σ_x,
 
-and σ_p = √2·σ_x for two coordinates of the same σ_x. Of a difference of parallax Δp between two
+and σ_p = √2·σ_x for two coordinates with the same σ_x. For a difference of parallax Δp between two
 points, Δh = h·Δp/(p + Δp).
 
 Source: Kraus (2007), sections 4.6 and 6.1; seed 003.
@@ -40,15 +40,15 @@ class StereoPair:
 
     @property
     def parallax(self) -> float:
-        """Of the ground."""
+        """Parallax of the ground."""
         return self.c * self.b / self.h
 
     def height(self, parallax: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-        """Distance below the cameras of points of these parallaxes."""
+        """Distance below the cameras of points with these parallaxes."""
         return self.c * self.b / np.asarray(parallax, float)
 
     def height_difference(self, difference: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-        """Height above the ground of points whose parallax is greater than its by so much."""
+        """Height above the ground of points with this difference of parallax to the ground."""
         difference = np.asarray(difference, float)
         return self.h * difference / (self.parallax + difference)
 

@@ -1,20 +1,20 @@
-"""Oriented images of any kind by one face: photographs, line scanners, rational polynomials.
+"""A common interface of oriented images: photographs, line scanners, rational polynomials.
 
-Every pixel has a line of sight X(q), with a parameter q along which places in another image move
-about evenly: the inverse distance 1/s of a photograph, the height of a scanner's image.
+Every pixel has a line of sight X(q), with a parameter q along which positions in another image move
+about evenly: the inverse distance 1/s of a photograph, the height of a scanner image.
 
 | | photograph | line scanner, RPC |
 |---|---|---|
 | q | 1/s, s from the projection centre | height |
 | X | object coordinates | east, north of a point in the scene, height; metres |
 
-What the matching needs of a view follows from J = ∂(u, v)/∂X [2, 3]: the direction of its line of
-sight is the null vector J₁ × J₂, and the affine transformation from one image to another, by way of
+Matching uses only J = ∂(u, v)/∂X [2, 3] of a view: the direction of its line of
+sight is the null vector J₁ × J₂, and the affine transformation from one image to another, through
 a plane with the normal n, is
 
     A = J'·T,        [J; nᵀ]·T = [I; 0].
 
-Arrays go in and out as NumPy's; points are filled up to few sizes, so that few programs serve all.
+Arrays are NumPy arrays; points are padded to few sizes, so that few programs are compiled.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,7 +36,7 @@ from jaxbundle.network.tables import Camera
 
 LANES = 1 << 13
 FEW = 1 << 9
-"""Points of one call; up to so few are filled up to these: two programs serve all numbers."""
+"""Points of one call; fewer are padded to one of these sizes: two programs suffice."""
 BEYOND = 1.02
 """A ray farther from the axis than the farthest of the image, times this, is outside."""
 
@@ -45,7 +45,7 @@ Places = Float[np.ndarray, "n 2"]
 
 
 class OrientedImage(Protocol):
-    """An image whose orientation is known; (0, 0) is the centre of its upper-left pixel.
+    """An oriented image; (0, 0) is the centre of its upper-left pixel.
 
     `size`: columns, rows. `grey`: its grey values.
     """
@@ -63,7 +63,7 @@ class OrientedImage(Protocol):
         ...
 
     def project(self, X: Points) -> Places:
-        """Where points are; NaN: outside the camera's field of view."""
+        """(u, v) of points; NaN: outside the camera's field of view."""
         ...
 
     def derivative(self, X: Points) -> Float[np.ndarray, "n 2 3"]:
@@ -71,7 +71,7 @@ class OrientedImage(Protocol):
         ...
 
     def bounds(self, uv: Places, low: float, high: float) -> Float[np.ndarray, "n 2"]:
-        """q, ascending, between which the height Z is from `low` to `high`."""
+        """Bounds of q, ascending, for heights Z from `low` to `high`."""
         ...
 
 
@@ -109,7 +109,7 @@ class FrameView:
         self._farthest = BEYOND * float(np.nanmax(np.arccos(np.clip(-axis @ self.M[2], -1, 1))))
 
     def edge(self) -> Places:
-        """Places along and across the whole image, its edges included."""
+        """Positions along and across the whole image, including its edges."""
         u, v = (np.linspace(-0.5, n - 0.5, 17) for n in self.size)
         return np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
 
@@ -137,7 +137,7 @@ class FrameView:
 
 
 class _Frame(eqx.Module):
-    """What the image coordinates of a photograph depend on."""
+    """The quantities on which image coordinates of a photograph depend."""
 
     model: CameraModel = eqx.field(static=True)
     p: Float[Array, " parameters"]
@@ -151,7 +151,7 @@ def frame_views(
     network, greys: Sequence[np.ndarray], colours: Sequence[Callable | None] | None = None,
     joint: OrientationCovariance | None = None,
 ) -> tuple[FrameView, ...]:
-    """The oriented photographs of a network, a view for each of its images."""
+    """The oriented photographs of a network, a view for each image."""
     images = network.images
     M = np.asarray(jax.vmap(matrix_from_omega_phi_kappa)(jnp.asarray(images.angles)))
     colours = colours or [None] * len(images)
@@ -164,7 +164,7 @@ def frame_views(
 
 
 def line_of_sight(J: Float[np.ndarray, "n 2 3"]) -> Float[np.ndarray, "n 3"]:
-    """Directions, of length 1, in which the image of a point does not move."""
+    """Directions, of length 1, in which the image of a point does not change."""
     d = np.cross(J[:, 0], J[:, 1])
     return d / np.linalg.norm(d, axis=1, keepdims=True)
 
@@ -172,13 +172,13 @@ def line_of_sight(J: Float[np.ndarray, "n 2 3"]) -> Float[np.ndarray, "n 3"]:
 def over_plane(
     J: Float[np.ndarray, "n 2 3"], normal: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3 2"]:
-    """T: how far on a plane a step of one pixel leads."""
+    """T: the displacement on a plane for a step of one pixel."""
     stacked = np.concatenate([J, normal[:, None]], axis=1)
     return np.linalg.inv(stacked)[:, :, :2]
 
 
 def is_inside(view: OrientedImage, uv: Places, margin: float = 0.0) -> np.ndarray:
-    """Which places are in the image, at least `margin` pixels from its edge."""
+    """Which positions are in the image, at least `margin` pixels from its edge."""
     columns, rows = view.size
     with np.errstate(invalid="ignore"):
         return (
@@ -188,7 +188,7 @@ def is_inside(view: OrientedImage, uv: Places, margin: float = 0.0) -> np.ndarra
 
 
 def in_lanes(program: Callable, frame, *arrays):
-    """The program of arrays [n, …], by `LANES`, what is missing filled up."""
+    """The program for arrays [n, …], in blocks of `LANES`, padded."""
     n = len(arrays[0])
     lanes = LANES if n > FEW else FEW
     parts = []

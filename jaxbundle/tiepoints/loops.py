@@ -25,7 +25,7 @@ from jaxtyping import Float
 from jaxbundle.tiepoints.verification import Pair
 
 TURN, GAP = np.radians(5.0), 0.15
-"""Maximum rotation remaining around a loop, and maximum gap of the bases relative to the longest."""
+"""Maximum rotation remaining around a loop, and gap of the bases relative to the longest."""
 COMMON = 8
 """Minimum common features of two pairs for the ratio of their bases."""
 MOST = 12

@@ -115,7 +115,7 @@ def start_cameras(
     features: Sequence[Features],
     matches: Sequence[Matches],
 ) -> tuple[list[Camera], list[str]]:
-    """Cameras with the principal distance and K1 of consistent pairs of photographs with their lens.
+    """Cameras with the principal distance and K1 of consistent pairs of their lens.
 
     If the principal distance is unknown, the result of few pairs is compared with other
     distances by the number of matches of many pairs explained by relative orientations.
