@@ -5,7 +5,7 @@
     xi = x·(1 − dr/R) − x0,  yi = y·(1 − dr/R) − y0
 
 x, y are measured from the image ORIGIN, not from the principal point: dr is the distortion of the
-measurement, so it is taken off. F, the format factor, places the zero of dr at R = 100/F. It is a
+measurement, so it is subtracted. F, the format factor, puts the zero of dr at R = 100/F. It is a
 convention, never an unknown. dr/R is written without the division, finite at R = 0.
 
 Units: the image unit of the files (in the listings named below, 1 unit = 10 px); p25 and p26 in
@@ -37,7 +37,7 @@ def relative_distortion(p: Parameters, R: Scalar) -> Scalar:
 
 
 def correct(p: Parameters, x: Scalar, y: Scalar) -> Pair:
-    """Measured to ideal coordinates, in the image unit: the own formula of `bingo`."""
+    """Measured to ideal coordinates, in the image unit: the formula of `bingo`."""
     factor = 1 - relative_distortion(p, _radius(x, y))
     return brown.reduce(p, x * factor, y * factor)
 

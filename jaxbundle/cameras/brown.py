@@ -45,14 +45,14 @@ def unreduce(p: Parameters, x: Scalar, y: Scalar) -> Pair:
 
 
 def correct(p: Parameters, x: Scalar, y: Scalar) -> Pair:
-    """Measured to ideal coordinates, mm: the own formula of `brown`."""
+    """Measured to ideal coordinates, mm: the formula of `brown`."""
     x, y = reduce(p, x, y)
     dx, dy = polynomial(p, x, y)
     return x + dx, y + dy
 
 
 def distort(p: Parameters, xi: Scalar, yi: Scalar) -> Pair:
-    """Ideal to measured coordinates, mm: the own formula of `brown-projected`."""
+    """Ideal to measured coordinates, mm: the formula of `brown-projected`."""
     dx, dy = polynomial(p, xi, yi)
     return unreduce(p, xi + dx, yi + dy)
 

@@ -1,8 +1,8 @@
-"""The camera models by name, and a user's own, which are given as objects.
+"""The camera models by name, and own models, which are given as objects.
 
-Splines have names with numbers, as `spline-12x9-110`, of which there are many: `get_model` makes
-them. Own models are in no list: a list that grows would let one part of a program change what a
-name means in another.
+Splines have names with numbers, such as `spline-12x9-110`: `get_model` creates
+them. Own models are not registered: otherwise one part of a program could change the meaning of a
+name in another.
 """
 
 import re
@@ -50,14 +50,14 @@ _MAKERS: dict[str, Callable[..., CameraModel]] = {
     "spline-NXxNY-FOV": lambda x, y, fov: spline(int(x), int(y), float(fov)),
 }
 FAMILIES = {name: (form, _MAKERS[name]) for name, form in MODEL_FAMILIES.items()}
-"""Models whose names say numbers: how they read, and who makes them."""
+"""Models with numbers in their names: the pattern, and the function that creates them."""
 
 
 def get_model(model: str | CameraModel) -> CameraModel:
-    """The camera model of this name; an own model is itself.
+    """The camera model of this name; an own model is returned unchanged.
 
-    **Raises:** `ValueError`, with the known names and the closest one, if there is none, and for an
-    own model of the name of another.
+    **Raises:** `ValueError`, with the known names and the closest one, if it is unknown, and for an
+    own model with the name of a built-in one.
     """
     if isinstance(model, CameraModel):
         if is_own(model) and _built_in(model.name):
@@ -75,13 +75,12 @@ def get_model(model: str | CameraModel) -> CameraModel:
 
 
 def is_own(model: str | CameraModel) -> bool:
-    """Whether it is a user's own model, which only an object describes."""
+    """Whether this is an own model, which is defined only by its object."""
     return isinstance(model, CameraModel) and _built_in(model.name) != model
 
 
 def key_of(model: str | CameraModel) -> str | CameraModel:
-    """What stands for a model where models are compared: the name of a built-in one, an own one
-    itself."""
+    """The key of a model for comparisons: the name of a built-in model, or the own model."""
     return model.name if isinstance(model, CameraModel) and not is_own(model) else model
 
 
@@ -91,7 +90,7 @@ def is_known(name: str) -> bool:
 
 
 def _built_in(name: str) -> CameraModel | None:
-    """The model of a name, one of a family made; None if there is none.
+    """The model of a name, created for a family; None if it is unknown.
 
     **Raises:** `ValueError` for a name of a family whose numbers are impossible.
     """

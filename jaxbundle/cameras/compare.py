@@ -1,12 +1,13 @@
 r"""The difference of two calibrations of one camera, as a map over the image.
 
 A pixel u has the ray a(u) by calibration A; by B the ray has the image b(·). Two calibrations may
-differ by a rotation of the camera frame that no photograph shows, since every exterior orientation
-takes it up: a shift of the principal point is nearly one. The implied rotation is removed,
+differ by a rotation of the camera frame without effect on any photograph, since every exterior
+orientation absorbs it: a shift of the principal point is nearly one. The implied rotation is
+removed,
 
     d(u) = b(exp([θ]×)·a(u)) − u,        Σ |d(u)|² → min over θ
 
-and d is what remains: how far images of one object would be apart.
+and d is the remaining difference of the images of one object.
 
 Source: the differencing of mrcal (Kogan), here at infinity, by least squares over the whole image.
 """
@@ -37,9 +38,10 @@ from jaxbundle.types import Numbers
 class Comparison:
     """A difference map, in the unit and axes of the first calibration.
 
-    `x` [columns], `y` [rows] of the grid; `difference` [rows, columns, 2], NaN where one of the
+    `x` [columns], `y` [rows] of the grid; `difference` [rows, columns, 2], NaN if one of the
     calibrations has no ray or image; `rotation` θ, radians, removed; `rms` and `largest` lengths of
-    the differences, `where` the place of the largest; `covered`: the part of the grid that has one.
+    the differences, `where` the position of the largest; `covered`: the part of the grid with
+    values.
     """
 
     unit: str
@@ -87,19 +89,19 @@ def compare_cameras(
     rotate: bool = True,
     radius: float = np.inf,
 ) -> Comparison:
-    """How far the images of two calibrations are apart, the implied rotation removed.
+    """The differences between images of two calibrations, with the implied rotation removed.
 
     **Arguments:**
 
     - `a`, `b`: model and parameters by name (those left out have their defaults).
-    - `image_size` (pixels), `pixel_size` (mm): needed where the models differ in unit or axes, or
-      to know the area.
+    - `image_size` (pixels), `pixel_size` (mm): required if the models differ in unit or axes, or
+      to determine the area.
     - `area`: corners (low, high) of the part of the image to compare, in a's coordinates.
     - `rotate`: False: nothing is removed.
-    - `radius`: the rotation is fitted to what lies so near the middle of the area: where both
+    - `radius`: the rotation is fitted within this radius of the centre of the area: where both
       calibrations had measurements.
 
-    **Raises:** `ValueError` naming a size that is missing, or where nothing can be compared.
+    **Raises:** `ValueError` naming a missing size, or if nothing can be compared.
     """
     (source, values), (other, others) = (
         (model, {**default_parameters(model), **given}) for model, given in (a, b)
@@ -166,14 +168,15 @@ def difference_rings(comparison: Comparison, step: float) -> dict[str, np.ndarra
 
 @partial(jax.jit, static_argnums=0)
 def _turned(model, p, rotation, rays):
-    """Images of the turned rays [n, 2]."""
+    """Images of the rotated rays [n, 2]."""
     R = matrix_from_rotation_vector(rotation)
     return jax.vmap(lambda ray: jnp.stack(project(model, tuple(p), *(R @ ray))))(rays)
 
 
 @partial(jax.jit, static_argnums=0)
 def _best_turn(model, p, rays, xy, weight):
-    """θ that brings the images of the rays nearest to xy; rays of weight 0 may have none."""
+    """θ that minimises the distances of the images of the rays to xy; rays of weight 0 may have no
+    image."""
 
     def misclosures(rotation, rays, xy, weight):
         d = weight * (_turned(model, p, rotation, rays) - xy)

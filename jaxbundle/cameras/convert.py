@@ -1,6 +1,6 @@
-"""From one camera model to another: exactly where there is a formula, else by a fit over the image.
+"""Conversion of camera models: exact if there is a formula, else by a fit over the image.
 
-What the conversion costs is always measured: points of a grid over the image go back along the
+The difference is always measured: points of a grid over the image are projected back along the
 rays of the source and forward through the target, and their displacement is reported.
 """
 
@@ -31,17 +31,17 @@ from jaxbundle.types import Numbers
 
 Area = tuple[Numbers, Numbers]
 MEASURABLE = 0.5
-"""The part of the image that must have rays, or a fit would mean nothing."""
+"""Minimum part of the image with rays for a meaningful fit."""
 SAME_POINT = 1e-9
-"""Of the image's size: what rounding may displace a point on its way along the ray and back."""
+"""Displacement of a point by rounding along the ray and back, relative to the image size."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Conversion:
-    """A camera in its new model, and what that costs.
+    """A camera in its new model, and the differences.
 
     `largest` and `rms` are displacements in the measured image, in the target's `unit`, over the
-    area given; `where` (target's coordinates) is the place of the largest. `covered` is the part
+    given area; `where` (target's coordinates) is the position of the largest. `covered` is the part
     of the area in which the source has rays. `reason` says why the conversion is not exact.
     """
 
@@ -83,14 +83,14 @@ def convert_camera(
     **Arguments:**
 
     - `parameters`: of the source, by name; those left out have their defaults.
-    - `image_size` (pixels), `pixel_size` (mm): needed where pixels meet millimetres or image
+    - `image_size` (pixels), `pixel_size` (mm): required between pixels and millimetres or image
       centres.
-    - `area`: the corners of the image (low, high) in the source's coordinates; the whole image
-      if not given.
+    - `area`: the corners of the image (low, high) in the source's coordinates; by default the whole
+      image.
     - `r0`: of the target, mm, if it has one.
-    - `free`: what a fit may change (`convert_fit.fitted` if empty); the rest has its default.
+    - `free`: parameters of a fit (`convert_fit.fitted` if empty); others have their defaults.
 
-    **Raises:** `ValueError` naming what is missing, or why there is nothing to be fitted.
+    **Raises:** `ValueError` naming a missing argument, or the reason why a fit is impossible.
     """
     values = {**default_parameters(source), **parameters}
     sizes = (image_size, pixel_size)
@@ -131,7 +131,7 @@ def convert_camera(
 
 
 def _exact(source, values, target, sizes, r0) -> dict[str, float]:
-    """By the formulas of narrow cameras, or those of wide ones.
+    """Exact conversion by the formulas of narrow cameras, or those of wide ones.
 
     **Raises:** `NotExact`.
     """

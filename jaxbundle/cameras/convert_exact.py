@@ -1,4 +1,4 @@
-r"""Conversions between camera models that are the same function written differently.
+r"""Conversions between equivalent camera models.
 
 Two families, each with a common form; a model is converted through it.
 
@@ -57,9 +57,9 @@ def exact_parameters(
     """The parameters of the target model that describe the same camera.
 
     **Arguments:** `values` all parameters of the source by name; `sizes` image size (pixels) and
-    pixel size (mm), each None where it is not known; `r0` of the target (mm), if it has one.
+    pixel size (mm), each None if unknown; `r0` of the target (mm), if it has one.
 
-    **Raises:** `NotExact` where there are none; `ValueError` where a size is needed.
+    **Raises:** `NotExact` if there are none; `ValueError` if a size is missing.
     """
     if source == target and values.get("r0", 0.0) == (r0 if "r0" in values else 0.0):
         return dict(values)

@@ -1,10 +1,10 @@
 """A camera of one model fitted to the rays of another: least squares over the image.
 
-Points of a grid over the image have rays by the source. The target's parameters are those with
+Points of a grid over the image have rays by the source. The target's parameters minimise
 
     Σ |image of the ray by the target − point|²  →  min        in the measured image
 
-No rotation is estimated: exterior orientations stay as they are.
+No rotation is estimated: exterior orientations are unchanged.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,33 +32,33 @@ from jaxbundle.float64 import local_x64
 from jaxbundle.types import Numbers
 
 MORE_FITTED = {"brown": ("b1", "b2"), "brown-projected": ("b1", "b2"), "usgs": ("K4",)}
-"""What is fitted beside the parameters that are free if nothing is said."""
+"""Parameters fitted in addition to those free by default."""
 
 GRID = (33, 25)
 MOST_EVALUATIONS = 200
 INSIDE = 1e-3
-"""A fit stays inside the range of a parameter by this part of it."""
+"""Margin of a fit inside the range of a parameter, relative to the range."""
 
 
 def fitted(model: CameraModel) -> tuple[str, ...]:
-    """What is fitted of a model if nothing else is asked for; all of it can be told apart."""
+    """The parameters of a model fitted by default; all of them are separable."""
     return (*model.free, *MORE_FITTED.get(model.name, ()))
 
 
 def image_grid(low: Numbers, high: Numbers) -> Float[np.ndarray, "points 2"]:
-    """Points of a rectangle, its edges among them."""
+    """Points of a rectangle, including its edges."""
     columns, rows = (np.linspace(a, b, n) for a, b, n in zip(low, high, GRID))
     return np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
 
 
 def rays_of(model: CameraModel, values: Values, xy) -> Float[np.ndarray, "points 3"]:
-    """Rays of measured image points; NaN where there are none."""
+    """Rays of measured image points; NaN if there are none."""
     with local_x64():
         return np.asarray(_rays(model, _ordered(model, values), np.asarray(xy, float)))
 
 
 def images_of(model: CameraModel, values: Values, rays) -> Float[np.ndarray, "points 2"]:
-    """Measured images of rays; NaN where there are none."""
+    """Measured images of rays; NaN if there are none."""
     with local_x64():
         return np.asarray(_images(model, _ordered(model, values), np.asarray(rays, float)))
 
@@ -70,14 +70,14 @@ def fit_parameters(
     starts: Sequence[Values],
     free: Sequence[str] = (),
 ) -> dict[str, float]:
-    """The parameters of a model that bring rays nearest to their images.
+    """The parameters of a model that fit rays to their images.
 
-    Parameters that mean something only between two values (`CameraModel.ranges`) stay there.
+    Parameters with a limited range (`CameraModel.ranges`) stay in it.
 
     **Arguments:** `xy` in the model's unit and axes; `starts` complete sets of start values, the
-    best of them is taken; `free` what is fitted (`fitted` of the model if empty).
+    best of them is used; `free` fitted parameters (`fitted` of the model if empty).
 
-    **Raises:** `ValueError` if no start has an image of every ray, or the numbers are beyond it.
+    **Raises:** `ValueError` if no start has an image of every ray, or the fit fails numerically.
     """
     from scipy.optimize import least_squares
 
@@ -109,7 +109,7 @@ def fit_parameters(
 
 
 def _bounds(model: CameraModel, chosen: Sequence[int]):
-    """Between which values parameters mean something, a little inside where that is an interval."""
+    """Valid ranges of the parameters, with a small margin inside."""
     ends = [dict(model.ranges).get(model.parameters[j], (-np.inf, np.inf)) for j in chosen]
     low, high = np.array(ends, float).reshape(-1, 2).T
     width = high - low
@@ -120,8 +120,8 @@ def _bounds(model: CameraModel, chosen: Sequence[int]):
 def start_values(
     source: CameraModel, values: Values, target: CameraModel, sizes: Sizes, r0: float = 0.0
 ) -> list[dict[str, float]]:
-    """Start values of the target: without distortion, and, where the terms have counterparts, with
-    the source's to the first orders; and as a stereographic camera, which sees beyond 90°."""
+    """Start values of the target: without distortion; with that of the source to the first orders,
+    if the terms have counterparts; and as a stereographic camera, which has images beyond 90°."""
     shift, step = between_frames(source, target, *sizes)
     of = lambda names: np.array([values[name] for name in names])
     focal = of(source.principal_distance) * np.abs(step) * magnification(source, values)
@@ -161,7 +161,7 @@ def magnification(model: CameraModel, values: Values) -> float:
 
 
 def _first_orders(source, values):
-    """k1 … k3, p1, p2 of the source's own formula, for the principal distance 1 and v down."""
+    """k1 … k3, p1, p2 of the source's formula, for the principal distance 1 and v down."""
     if source.name in DISTORTIONS:
         common = distortion(source, values, sizes=((1, 1), (1, 1)))
     elif source.name in CORRECTIONS:

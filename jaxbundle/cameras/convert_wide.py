@@ -1,9 +1,9 @@
-"""Which fisheye and omnidirectional cameras are the same function written differently.
+"""Equivalent fisheye and omnidirectional camera models.
 
 **Polynomials of the angle** (`equidistant`, `kannala-brandt`, `kannala-brandt-tangential`,
 `thin-prism-fisheye`, `rad-tan-thin-prism-fisheye`, `radial-spline-…` without distortion): one
 holds another if it has all of its terms that are not 0. The decentring of
-`rad-tan-thin-prism-fisheye` is taken at the distorted radius and is a term of its own.
+`rad-tan-thin-prism-fisheye` is taken at the distorted radius and is a separate term.
 
 **A sphere and a plane** (`mei`, `eucm`, `double-sphere`, `stereographic`, `spline-…` without
 distortion, and perspective cameras with ξ = 0), in the parameters of `mei`,
@@ -46,7 +46,7 @@ ANGLE: dict[str, dict[str, str]] = {
            for name in ("p0", "p1", "s0", "s1", "s2", "s3")},
     },
 }
-"""The terms of a model by its own names."""
+"""The terms of a model by its names."""
 SPHERES = ("mei", "eucm", "double-sphere", "stereographic", *DISTORTIONS, "division")
 DIVISIONS = ("division", "scaramuzza", "eucm", "stereographic")
 
@@ -65,7 +65,7 @@ def exact_wide(
 
 
 def as_stereographic(core: Values, target: CameraModel) -> list[dict[str, float]]:
-    """The parameters of a target that is the stereographic camera; none if it cannot be."""
+    """The parameters of a target equal to the stereographic camera; none if impossible."""
     try:
         return [exact_wide(STEREOGRAPHIC, core, target, (None, None))]
     except NotExact:
@@ -88,7 +88,7 @@ def _by_angle(source, values, target, _sizes, _r0):
 
 
 def _by_division(source, values, target, _sizes, _r0):
-    """As `division`, or None where one of the two is no such model."""
+    """As `division`, or None if one of the two is not such a model."""
     pair = {source.name, target.name}
     if not (pair <= {*DIVISIONS} and pair & {"division", "scaramuzza"}):
         return None
@@ -177,7 +177,7 @@ def _of_sphere(target, name, mei, sizes, r0):
 
 
 def _plain_family(model: CameraModel, family: str, plain: str) -> str:
-    """A spline without distortion is this other model."""
+    """Conversion of a spline without distortion to an equal model."""
     return plain if model.name.startswith(family) else model.name
 
 

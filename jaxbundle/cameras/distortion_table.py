@@ -1,7 +1,7 @@
-"""The distortion of a camera in steps of the radius, as calibration reports print it.
+"""The distortion of a camera in steps of the radius, as in calibration reports.
 
-At the radius r of the MEASURED image and all around it, the displacement d = measured − ideal has a
-radial part, whose mean is the symmetric radial distortion dr, and a tangential one, of which the
+Around the circle of radius r in the MEASURED image, the displacement d = measured − ideal has a
+radial part, whose mean is the symmetric radial distortion dr, and a tangential part, whose
 first harmonic is the decentring. A correction (`brown`, `usgs`) has the opposite sign.
 """
 
@@ -31,10 +31,10 @@ def distortion_table(
 ) -> dict[str, np.ndarray]:
     """Radial distortion and decentring at step, 2·step, … to `largest`.
 
-    **Arguments:** `step` and `largest` in the model's unit; `about` what radii are counted from:
-    the image of the optical axis, or the origin of image coordinates, as BINGO has it.
+    **Arguments:** `step` and `largest` in the model's unit; `about` the origin of the radii:
+    the image of the optical axis, or the origin of image coordinates, as in BINGO.
 
-    **Returns:** columns r, radial, decentring, in the model's unit; NaN where there is no ray.
+    **Returns:** columns r, radial, decentring, in the model's unit; NaN without ray.
 
     **Raises:** `ValueError` for a step or end that is not positive.
     """

@@ -23,7 +23,7 @@ from jaxbundle.cameras.scalars import Pair, Parameters, Scalar, Triple
 
 
 def project(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
-    """The pixel of a ray: the own formula of `division`."""
+    """The pixel of a ray: the formula of `division`."""
     fx, fy, cx, cy, k = p
     X, Y, Z = r, -s, -q
     N = Z + jnp.sqrt(Z * Z - 4 * k * (X * X + Y * Y))

@@ -28,7 +28,7 @@ from jaxbundle.cameras.scalars import Pair, Parameters, Scalar, Triple
 
 
 def project(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
-    """The pixel of a ray: the own formula of `double-sphere`."""
+    """The pixel of a ray: the formula of `double-sphere`."""
     fx, fy, cx, cy, xi, alpha = p
     X, Y, Z = r, -s, -q
     square = X * X + Y * Y

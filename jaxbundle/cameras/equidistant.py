@@ -2,8 +2,8 @@
 
     xi = fx·θ·cos ψ,  yi = fy·θ·sin ψ          θ the angle to the optical axis, ψ the azimuth
 
-Smooth on the optical axis too, once it is written in even functions (below), and it holds beyond
-θ = 90°, where q > 0. Only straight backwards, at θ = 180°, has a ray no azimuth and so no image.
+Written in even functions (below) it is also smooth on the optical axis, and it is valid beyond
+θ = 90°, where q > 0. Only straight backwards, at θ = 180°, a ray has no azimuth and so no image.
 """
 
 from collections.abc import Sequence

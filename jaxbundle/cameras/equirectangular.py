@@ -3,7 +3,7 @@
     u = cx + fx·λ,  v = cy + fy·φ
     λ = atan2(X, Z),  φ = atan2(Y, √(X² + Z²))                       [X, Y, Z] = [r, −s, −q]
 
-A whole panorama of w × h pixels has fx = w/(2π), fy = h/π, its centre for principal point.
+A complete panorama of w × h pixels has fx = w/(2π), fy = h/π, and its centre as principal point.
 
 Range: all rays, −180° < λ ≤ 180° and |φ| ≤ 90°; pixels beyond have no ray, NaN. The seam lies
 straight behind: a point measured on one side of it and computed on the other has a residual of the
@@ -22,7 +22,7 @@ from jaxbundle.cameras.scalars import Pair, Parameters, Scalar, Triple
 
 
 def project(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
-    """The pixel of a ray: the own formula of `equirectangular`."""
+    """The pixel of a ray: the formula of `equirectangular`."""
     fx, fy, cx, cy = p
     X, Y, Z = r, -s, -q
     return cx + fx * jnp.arctan2(X, Z), cy + fy * jnp.arctan2(Y, jnp.sqrt(X * X + Z * Z))

@@ -27,7 +27,7 @@ from jaxbundle.cameras.scalars import Pair, Parameters, Scalar, Triple
 
 
 def project(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
-    """The pixel of a ray: the own formula of `eucm`."""
+    """The pixel of a ray: the formula of `eucm`."""
     fx, fy, cx, cy, alpha, beta = p
     X, Y, Z = r, -s, -q
     d = jnp.sqrt(beta * (X * X + Y * Y) + Z * Z)
@@ -46,7 +46,7 @@ def unproject(p: Parameters, u: Scalar, v: Scalar) -> Triple:
 
 
 def reach(alpha: Scalar) -> Scalar:
-    """w: the cosine of the angle, less 180°, to which a unified camera sees (for β = 1)."""
+    """w: minus the cosine of the largest visible angle of a unified camera (for β = 1)."""
     small = jnp.minimum(alpha, 1 - alpha)
     return small / (1 - small)
 

@@ -1,13 +1,13 @@
-"""The field of view of a camera, and what its principal distance is on a small-format camera.
+"""The field of view of a camera, and the equivalent principal distance of a small-format camera.
 
     FOV = 2·atan(d/(2c))        d: width, height or diagonal of the image
 
-and where the principal distances along and across differ (fx ≠ fy), each with its own side:
+and for different principal distances along and across (fx ≠ fy), each with its side:
 
     d/c = w/fx,  h/fy,  √((w/fx)² + (h/fy)²)
 
-the three definitions in use. By the rays themselves, distortion and principal point included, it
-is the angle between the rays through the ends of d; the two agree for an undistorted camera with
+the three definitions in use. From rays, including distortion and principal point, it
+is the angle between the rays through the ends of d; both agree for an undistorted camera with
 its principal point at the image centre.
 
 Source: Wolf, Dewitt and Wilkinson (2014), Elements of Photogrammetry, section 3-3, whose classes
@@ -51,9 +51,9 @@ def field_of_view_of_rays(
     image_size: Sequence[float],
     pixel_size: Numbers | None = None,
 ) -> FieldOfView:
-    """The angles between the rays through the middles of the edges, and the corners, of the image.
+    """The angles between the rays through the centres of the edges, and the corners, of the image.
 
-    The diagonal is the larger of the two. NaN where the model has no ray.
+    The diagonal is the larger of the two. NaN if the model has no ray.
     """
     low, high = image_area(model, image_size, pixel_size)
     x, y = (low + high) / 2
@@ -78,10 +78,10 @@ def angle_class(diagonal: float) -> str:
 def equivalent_35mm(
     c: float | Sequence[float], size: Sequence[float], by: str = "diagonal"
 ) -> float:
-    """The principal distance, mm, that has the same field of view on 36 × 24 mm.
+    """The principal distance, mm, with the same field of view on 36 × 24 mm.
 
-    **Arguments:** `c`, or (fx, fy), and `size` (width, height) in one unit; `by` diagonal (as CIPA
-    has it), width or height.
+    **Arguments:** `c`, or (fx, fy), and `size` (width, height) in one unit; `by` diagonal (as by
+    CIPA), width or height.
 
     **Raises:** `ValueError` for another definition.
     """

@@ -88,8 +88,8 @@ def check_feasible(pairs: Pairs, tried: int = TRIED) -> None:
     if hidden.any():
         ids = [pairs.problem.network.points.id[interest[k]] for k in np.flatnonzero(hidden)]
         raise InputError(
-            f"conditions: {len(ids)} of {len(interest)} targets cannot be measured from anywhere in "
-            f"the room ({len(position)} places tried): {some(ids)}. Widen the conditions, or leave "
+            f"conditions: {len(ids)} of {len(interest)} targets cannot be measured from any place "
+            f"in the room ({len(position)} tried): {some(ids)}. Widen the conditions, or leave "
             "these targets out"
         )
 

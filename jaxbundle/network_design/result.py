@@ -31,7 +31,7 @@ class State:
 
     @cached_property
     def smallest_redundancy(self) -> float:
-        """Mean redundancy number of an image coordinate; NaN if the network cannot be adjusted."""
+        """Of an image coordinate; NaN if the network cannot be adjusted."""
         problem = problem_of(self.exact)
         return np.nan if problem is None else smallest_redundancy(problem)
 

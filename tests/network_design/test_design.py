@@ -233,7 +233,7 @@ def test_what_cannot_be_designed_is_refused(network, site):
     outside = ((2.5, -4, 0.2), (4, 4, 3))
     refused(network, "all targets are hidden", conditions=conditions(room=outside, obstacles=cover))
     one = network.points.position[4]
-    refused(network, "1 of 10 targets can be measured from nowhere", conditions=conditions(
+    refused(network, "1 of 10 targets cannot be measured from any", conditions=conditions(
         room=site.room, obstacles=((tuple(one - 0.05), tuple(one + 0.05)),)))  # fmt: skip
     with pytest.raises(InputError, match="incidence needs the normals"):
         conditions(incidence=1.0)
