@@ -79,18 +79,18 @@ def run_batch(
     - `model`, `free`: as in `calibrate_batch`, for the cameras.
     - `max_iterations`: for each camera and each network.
     - `snooping`, `significance`: data snooping, `"pope"`, of every camera and every network.
-    - `board`: what is in the photographs; every folder that holds no network is then one of
-      photographs of one camera. What was found in them is kept in `FILE.corners` beside the file.
+    - `board`: the board in the photographs; every folder without a network is then one of
+      photographs of one camera. Found corners are stored in `FILE.corners` beside the file.
     - `part`: (I, N): of all cameras and networks the I-th and every N-th after it, I from 1.
     - `brief`: no poses and covariances of cameras.
-    - `retry`: compute again what has no result in the file.
-    - `renew`: compute again what the file has from other settings or other data.
+    - `retry`: compute inputs without a result in the file again.
+    - `renew`: compute inputs with results of other settings or other data again.
     - `portion`: cameras between two writes.
-    - `progress(done, total)`: called after every write, and while photographs are searched; what
-      was skipped counts as done.
+    - `progress(done, total)`: called after every write, and while photographs are searched;
+      skipped inputs count as done.
 
     **Returns:** the number of inputs by status in the file, and of those `"skipped"` because they
-    were already there.
+    were already in it.
 
     **Raises:** `InputError` before anything is computed, for a missing input or a bad `.npz`, for
     results of other settings or data in the file without `renew`, and for a file that another run
@@ -161,7 +161,7 @@ def key_of(path: str | Path, file: str | Path) -> str:
 
 
 def check_part(part: Sequence[int]) -> None:
-    """Refuse what is no (I, N), 1 ≤ I ≤ N.
+    """Refuse invalid (I, N), 1 ≤ I ≤ N.
 
     **Raises:** `InputError`."""
     if len(part) != 2 or not 1 <= whole("part", part[0]) <= whole("part", part[1]):
@@ -169,7 +169,7 @@ def check_part(part: Sequence[int]) -> None:
 
 
 def _shares(numbers: Sequence[int], part: tuple[int, int]) -> list[list[int]]:
-    """Which of so many cameras or networks of each input belong to a part."""
+    """Which cameras or networks of each input belong to a part."""
     ends = [0, *itertools.accumulate(numbers)]
     own = [range(first, last) for first, last in zip(ends, ends[1:])]
     return [[i - of.start for i in of if i % part[1] == part[0] - 1] for of in own]
@@ -180,7 +180,7 @@ Tell = Callable[[float], None]
 
 @dataclasses.dataclass(frozen=True)
 class _Work:
-    """What is to be done for an input, or for all folders of photographs.
+    """The work for an input, or for all folders of photographs.
 
     **Fields:** `keys` of its lines; their `settings`; `data`, the fingerprint of number i; `solve`,
     the rows of some, from their numbers, telling what part of them is done; `made_of`: what the
@@ -199,7 +199,7 @@ def _works(
     inputs: Sequence[str | Path], file: str | Path, board: Board | None, options: dict, brief: bool,
     held: ExitStack,
 ) -> list[_Work]:  # fmt: skip
-    """What is to be done, each input once."""
+    """The work of all inputs, without repetitions."""
     works, folders = {}, {}
     for path in map(str, inputs):
         name = key_of(path, file)
@@ -250,7 +250,7 @@ def _photographed(
 
 
 def _settings(options: dict, brief: bool) -> dict:
-    """Of the lines of cameras."""
+    """Settings of the lines of cameras."""
     free = free_parameters(pixel_model(options["model"]), options["free"])
     return options | {"model": str(options["model"]), "free": list(free), "brief": brief}
 

@@ -23,7 +23,7 @@ from jaxbundle.cameras.scalars import Pair, Parameters, Scalar, Triple
 
 
 def project(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
-    """The pixel of a ray: the own formula of `fov`."""
+    """The pixel of a ray: the formula of `fov`."""
     fx, fy, cx, cy, omega = p
     wide = 2 * jnp.tan(omega / 2)
     scale = wide / omega * angle_over_sine(wide * wide * (r * r + s * s), q)

@@ -19,7 +19,7 @@ from jaxbundle.cameras.scalars import Pair, Parameters, Scalar
 
 
 def distort(p: Parameters, xi: Scalar, yi: Scalar) -> Pair:
-    """Ideal to measured pixel coordinates: the own formula of `kannala-brandt`."""
+    """Ideal to measured pixel coordinates: the formula of `kannala-brandt`."""
     fx, fy, cx, cy, k1, k2, k3, k4 = p
     X, Y = xi / fx, yi / fy
     t2 = X * X + Y * Y

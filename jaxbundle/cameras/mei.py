@@ -44,7 +44,7 @@ _undistort = implicit_inverse(distort, lambda p, X, Y: (X, Y), 10)
 
 
 def project(p: Parameters, r: Scalar, s: Scalar, q: Scalar) -> Pair:
-    """The pixel of a ray: the own formula of `mei`."""
+    """The pixel of a ray: the formula of `mei`."""
     fx, fy, cx, cy, xi, k1, k2, _, _ = p
     X, Y, Z = r, -s, -q
     R = jnp.sqrt(X * X + Y * Y + Z * Z)

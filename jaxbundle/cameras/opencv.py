@@ -21,7 +21,7 @@ from jaxbundle.cameras.scalars import Pair, Parameters, Scalar
 
 
 def distort(p: Parameters, xi: Scalar, yi: Scalar) -> Pair:
-    """Ideal to measured pixel coordinates: the own formula of `opencv`."""
+    """Ideal to measured pixel coordinates: the formula of `opencv`."""
     fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = p
     x, y = xi / fx, yi / fy
     r2 = x * x + y * y

@@ -27,7 +27,7 @@ from jaxbundle.cameras.scalars import Pair, Parameters, Scalar, Triple
 
 
 def unproject(p: Parameters, u: Scalar, v: Scalar) -> Triple:
-    """The ray of a pixel: the own formula of `scaramuzza`."""
+    """The ray of a pixel: the formula of `scaramuzza`."""
     a0, _, _, a2, a3, a4, _, _, _ = p
     x, y = _straight(p, u, v)
     r2 = x * x + y * y

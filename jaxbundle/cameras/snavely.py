@@ -15,7 +15,7 @@ from jaxbundle.cameras.scalars import Pair, Parameters, Scalar
 
 
 def distort(p: Parameters, xi: Scalar, yi: Scalar) -> Pair:
-    """Ideal to measured coordinates, pixels: the own formula of `snavely`."""
+    """Ideal to measured coordinates, pixels: the formula of `snavely`."""
     f, k1, k2 = p
     rho2 = (xi * xi + yi * yi) / (f * f)
     factor = 1 + rho2 * (k1 + rho2 * k2)

@@ -32,7 +32,7 @@ def polynomial(p: Parameters, x: Scalar, y: Scalar) -> Pair:
 
 
 def correct(p: Parameters, x: Scalar, y: Scalar) -> Pair:
-    """Measured to ideal coordinates, mm: the own formula of `usgs`."""
+    """Measured to ideal coordinates, mm: the formula of `usgs`."""
     x, y = brown.reduce(p, x, y)
     dx, dy = polynomial(p, x, y)
     return x + dx, y + dy

@@ -13,7 +13,7 @@ Given = Mapping[str, Any]
 
 
 class File(NamedTuple):
-    """A file to take away: its name, its media type, its content."""
+    """A file to download: its name, its media type, its content."""
 
     name: str
     type: str
@@ -43,9 +43,9 @@ class View(Protocol):
 
 
 def number(given: Given, key: str, default: float, low: float = -math.inf) -> float:
-    """The number of a control; `default` where the page does not send it.
+    """The number of a control; `default` if the page does not send it.
 
-    **Raises:** `InputError` for what is no finite number, or below `low`.
+    **Raises:** `InputError` if it is not a finite number, or below `low`.
     """
     value = given.get(key, default)
     fits = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
@@ -76,7 +76,7 @@ def word(given: Given, key: str, default: str, words: Iterable[str]) -> str:
 
 
 def check_keys(given: Given, known: Iterable[str]) -> None:
-    """Refuse a value that no control has.
+    """Refuse values of unknown controls.
 
     **Raises:** `InputError`."""
     known = tuple(known)

@@ -1,9 +1,9 @@
-"""A view as a widget of a notebook: the page of the explorer, without a server.
+"""A view as a notebook widget: the page of the explorer, without a server.
 
     show(NetworkView(result))
 
-The page stands in a frame; what its controls ask goes through the notebook to the view in this
-process, and the answer back. It works wherever anywidget does: Jupyter, VS Code, Colab, marimo.
+The page is in a frame; requests of its controls go through the notebook to the view in this
+process, and answers back. It works wherever anywidget does: Jupyter, VS Code, Colab, marimo.
 """
 
 import functools
@@ -32,7 +32,7 @@ def show(view: View, *, height: int = 800) -> Any:
 
 
 def reply(view: View, asked: Any) -> tuple[dict[str, Any], list[bytes]]:
-    """The message that answers one of the page (`number`, `action`, `given`), and its content."""
+    """The answer to a message of the page (`number`, `action`, `given`), and its content."""
     number = asked.get("number") if isinstance(asked, dict) else None
     try:
         given = asked["given"]
@@ -41,7 +41,7 @@ def reply(view: View, asked: Any) -> tuple[dict[str, Any], list[bytes]]:
         file = respond(view, str(asked["action"]), given)
     except (InputError, NotSolvedError, Refused) as error:
         return {"number": number, "error": str(error)}, []
-    except Exception as error:  # A fault of the program: the page says it, the notebook goes on.
+    except Exception as error:  # A program fault: shown on the page, the notebook continues.
         return {"number": number, "error": f"{type(error).__name__}: {error}"}, []
     return {"number": number, "type": file.type}, [file.content]
 

@@ -19,8 +19,8 @@ from jaxbundle.network.tables import Network, require_network
 from jaxbundle.planning.stations import LARGEST_SEED
 
 MOST_ROUNDS, SETTLED = 50, 1e-13
-"""Of the search for the line of an image point, and the change, as a part of the largest image
-coordinate, at which it ends."""
+"""Of the search for the line of an image point, and the change that ends it, relative to the
+largest image coordinate."""
 
 
 def simulate_further(
@@ -28,18 +28,18 @@ def simulate_further(
 ) -> Network:
     """The network with its further observations simulated from a truth, with noise of their σ.
 
-    Of a rolling shutter the image points are: those of the truth are moved to where the moving
-    camera has them, and keep the noise they have in the network.
+    With a rolling shutter image points are shifted: those of the truth are moved to the image of
+    the moving camera, and keep their noise of the network.
 
-    **Arguments:** `network`: whose rows say what is measured, and how well (antennas, attitudes,
-    differences, angles: what they hold as measured does not matter); `truth`: as
-    `simulate_with_truth` gives it; `unknowns`: true values of the tables that further observations
-    bring, by name, such as `{"GNSS strip": shifts}` [strips, 6] (sorted by name); those of the
-    settings, lever arms and boresights, are true if not given, and so are the `"velocity"`
-    [images, 6] (object unit and radians a second) and the line times of a rolling shutter.
+    **Arguments:** `network`: its rows define the measurements and their σ (antennas, attitudes,
+    differences, angles: measured values are ignored); `truth`: from
+    `simulate_with_truth`; `unknowns`: true values of the tables of further observations,
+    by name, such as `{"GNSS strip": shifts}` [strips, 6] (sorted by name); those of the
+    settings, lever arms and boresights, are true by default, and so are the `"velocity"`
+    [images, 6] (object unit and radians per second) and the line times of a rolling shutter.
 
-    **Raises:** `InputError` for a table that is not there; for a rolling shutter also where network
-    and truth have other image points.
+    **Raises:** `InputError` for a missing table; for a rolling shutter also if network
+    and truth have different image points.
     """
     require_x64()
     random = np.random.default_rng(whole("seed", seed, least=0, most=LARGEST_SEED))
@@ -69,8 +69,8 @@ def simulate_further(
 
 
 def _moved_image_points(truth: Network, rows: RollingShutter, values):
-    """Where the moving camera has the image points of the truth: an image point is exposed with
-    its line, which it determines itself."""
+    """The image points of the truth in the moving camera: an image point is exposed with
+    its line, which depends on the image point."""
     truth = truth.replace(further=(rows,), residuals="measured")
     for _ in range(MOST_ROUNDS):
         declared, rays = declare(truth, np.zeros(3)), truth.observations

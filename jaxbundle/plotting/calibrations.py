@@ -29,7 +29,7 @@ COLOURS = (BLUE, RUST, GREEN, INK)
 def radial_curves(tables: Mapping[str, Mapping[str, np.ndarray]], unit: str, ax=None):
     """Radial distortion of cameras over the radius; matplotlib axes.
 
-    **Arguments:** `tables` by name, as `jaxbundle.cameras.distortion_table` gives them, all in
+    **Arguments:** `tables` by name, from `jaxbundle.cameras.distortion_table`, all in
     `unit`.
     """
     ax = axes(ax, (6.5, 4.2))
@@ -48,9 +48,9 @@ def radial_curves(tables: Mapping[str, Mapping[str, np.ndarray]], unit: str, ax=
 
 
 def difference_map(comparison: Comparison, ax=None, name: str = "Difference of two calibrations"):
-    """Lengths of the differences in colour, the differences themselves as arrows; matplotlib axes.
+    """Lengths of the differences in colour, the differences as arrows; matplotlib axes.
 
-    Every other point of the grid has an arrow; the key says how long one is.
+    Every other point of the grid has an arrow; the key gives their scale.
     """
     ax = axes(ax, (7.5, 6))
     factor, unit = micrometres(comparison.unit)
@@ -83,8 +83,8 @@ def difference_map(comparison: Comparison, ax=None, name: str = "Difference of t
 def expected_map(comparison: Comparison, covariance, ax=None, name: str = "Expected by their σ"):
     """σ of the length of a difference over the image, √(σx² + σy²); matplotlib axes.
 
-    **Arguments:** `covariance` [rows, columns, 2, 2] of the differences, as
-    `jaxbundle.statistics.difference.expected_difference` gives it.
+    **Arguments:** `covariance` [rows, columns, 2, 2] of the differences, from
+    `jaxbundle.statistics.difference.expected_difference`.
     """
     ax = axes(ax, (7.5, 6))
     factor, unit = micrometres(comparison.unit)
@@ -102,7 +102,7 @@ def expected_map(comparison: Comparison, covariance, ax=None, name: str = "Expec
 
 
 def difference_maps(comparison: Comparison, covariance, ax):
-    """The difference map, and beside it what is expected, where there is a covariance."""
+    """The difference map, and beside it the expected differences if there is a covariance."""
     if covariance is None:
         return difference_map(comparison, ax)
     figure = ax.figure

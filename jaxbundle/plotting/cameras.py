@@ -22,7 +22,8 @@ from jaxbundle.plotting.style import (
 )
 
 LEAST = 0.1
-"""The distortion axis reaches as far as ± this, in µm or px, lest rounding look like distortion."""
+"""Minimum range ± of the distortion axis, in µm or px, so that rounding does not look like
+distortion."""
 
 ANNOTATED = 20
 """Correlations are written into the cells of a matrix up to this size."""
@@ -31,14 +32,14 @@ ANNOTATED = 20
 def distortion_curve(adjustment, camera: str, ax=None):
     """Radial distortion and decentring of a camera over the radius, each with its ±σ.
 
-    measured − ideal, so that pincushion distortion is positive whatever the model; from the
-    principal point to the farthest corner of the image, where its size is known; a line marks the
+    measured − ideal, so that pincushion distortion is positive for every model; from the
+    principal point to the farthest corner of the image, if its size is known; a line marks the
     farthest measurement, beyond which the curve is extrapolated (see `distortion_profile`).
 
     **Returns:** matplotlib `Axes`; distortion in µm for a camera in mm, else in its unit.
     """
     ax = axes(ax, (6.5, 4.2))
-    adjustment.camera_parameters(camera)  # refuses what is not there
+    adjustment.camera_parameters(camera)  # refuses an unknown camera
     measured, reach = curve_reach(adjustment, camera)
     found = distortion_profile(adjustment, camera, reach=reach)
     scale, unit = micrometres(found.unit)
@@ -86,7 +87,7 @@ def correlation_matrix(adjustment, camera: str | None = None, ax=None):
 
     **Returns:** matplotlib `Axes`.
 
-    **Raises:** `ValueError` where nothing is free.
+    **Raises:** `ValueError` if no parameter is free.
     """
     names, C = _correlations(adjustment, camera)
     n = len(names)

@@ -1,4 +1,4 @@
-"""A designed network: its stations before and after, the path of the search, places tried."""
+"""A designed network: its stations before and after, the path of the search, trial positions."""
 
 import numpy as np
 
@@ -29,7 +29,7 @@ SIZE = 0.12
 
 
 def network_view(designed: Design, ax=None, after: bool = True):
-    """The stations in perspective, before or after the design, with the way they took.
+    """The stations in perspective, before or after the design, with their paths.
 
     **Returns:** matplotlib 3D `Axes`, in the object unit."""
     ax = axes_3d(ax, (7.5, 6.5))
@@ -89,7 +89,7 @@ def camera_lines(network, size: float) -> np.ndarray:
 
 
 def aim_path(designed: Design, ax=None):
-    """The aim by iteration; conditions are sharper in every round.
+    """The aim by iteration; conditions become sharper in every round.
 
     **Returns:** matplotlib `Axes`."""
     ax = axes(ax, (6.5, 4.0))
@@ -113,8 +113,8 @@ def aim_path(designed: Design, ax=None):
 
 
 def places_tried(designed: Design, ax=None):
-    """Where a further photograph was tried, from above, coloured by the aim with it; the places
-    chosen.
+    """Trial positions of a further photograph, from above, coloured by the aim; and the chosen
+    positions.
 
     **Raises:** `ValueError` for a design of another order. **Returns:** matplotlib `Axes`."""
     if designed.tried is None:

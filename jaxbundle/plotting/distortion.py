@@ -1,7 +1,7 @@
 """The distortion of a camera as a curve over the radius, with its standard deviation.
 
-Whatever the model, the image of a point is displaced by d = measured − ideal (pincushion positive).
-At the distance r from the principal point, and all around it at the azimuths α, d has a radial part
+For every model, the image of a point is displaced by d = measured − ideal (pincushion positive).
+At the distance r from the principal point, and at the azimuths α around it, d has a radial part
 d_r(α) and a tangential part d_t(α). Their harmonics separate the kinds of distortion:
 
     symmetric radial    mean of d_r(α)
@@ -25,7 +25,7 @@ from jaxbundle.statistics.validity import farthest_measurements, measured_centre
 AZIMUTHS = 12
 
 ROUNDING = 1e-13
-"""Distortion below this fraction of an image coordinate is noise of the arithmetic."""
+"""Distortion below this fraction of an image coordinate is rounding noise."""
 
 
 @shows_itself
@@ -46,11 +46,11 @@ def distortion_profile(
 ) -> DistortionProfile:
     """The distortion of a camera from its principal point to its farthest measurement.
 
-    **Arguments:** `adjustment` a solved one; `camera` its id; `radii` how many values; `reach` the
-    last radius, if not that of the farthest measurement.
+    **Arguments:** `adjustment` a solved one; `camera` its id; `radii` the number of values; `reach`
+    the last radius, by default that of the farthest measurement.
 
-    **Returns:** radial distortion and decentring, measured − ideal; σ are 0 for a camera that is
-    held, NaN where a radius has no image.
+    **Returns:** radial distortion and decentring, measured − ideal; σ are 0 for a held
+    camera, NaN for a radius without image.
     """
     parameters = adjustment.camera_parameters(camera)
     free, covariance = adjustment.camera_covariance(camera)
@@ -71,7 +71,7 @@ def farthest_measurement(adjustment, camera: str) -> float:
 
 
 def principal_point(adjustment, camera: str) -> Float[np.ndarray, "2"]:
-    """The measured image of a camera's axis, where its distortion is centred."""
+    """The measured image of a camera's axis, the centre of its distortion."""
     p = jnp.array(list(adjustment.camera_parameters(camera).values()))
     return np.asarray(measured_centre(_model(adjustment, camera), p))
 
@@ -116,10 +116,10 @@ def distortion_at(model, parameters, radius):
 
 @partial(jax.jit, static_argnums=0)
 def _harmonics(model, p, centre, ideal, radius, out):
-    """Values and derivatives, by the model's own formula alone.
+    """Values and derivatives, only by the formula of the model.
 
-    What the formula gives only as an inverse (the centre, or the ideal points) is known at p. One
-    Newton step with the Jacobian held there has its derivative by p, exactly.
+    Quantities that the formula gives only as an inverse (the centre, or the ideal points) are known
+    at p. One Newton step with the Jacobian held there has their exact derivative by p.
     """
     formula = getattr(model, model.own_formula)
 
@@ -127,7 +127,7 @@ def _harmonics(model, p, centre, ideal, radius, out):
         return jnp.stack(formula(tuple(p), xy[0], xy[1]))
 
     def moved(q, root, target):
-        """The place near `root` whose image is `target`, for parameters q near p."""
+        """The point near `root` with the image `target`, for parameters q near p."""
         return root - jnp.linalg.solve(jax.jacfwd(own, 1)(p, root), own(q, root) - target)
 
     def displacements(q, radius, ideal):

@@ -22,7 +22,7 @@ MOST_IMAGES = 12
 MOST_CAMERAS = 6
 DOTS_PER_INCH = 150
 PHOTOGRAPH = re.compile(r"\.(jpe?g|png|tiff?|bmp|webp|pgm|ppm|jp2)$", re.IGNORECASE)
-"""The end of an id that is the name of a photograph; a figure has its own."""
+"""Suffix of an id that is the name of a photograph; removed in names of figures."""
 FIGURES = ("plan.png", "perspective.png", "histogram.png",
            "residuals_*.png", "distortion_*.png", "correlations_*.png")  # fmt: skip
 """Patterns of the names of the figures of a result."""
@@ -31,18 +31,18 @@ PAIRS, TRACKS = ("match_graph.png", "overlap.png"), "tracks_*.png"
 
 
 def save_figures(adjustment, folder: str | Path, force: bool = False) -> list[Path]:
-    """Write the figures of a result into a folder, all of them or none.
+    """Write the figures of a result into a folder, all or none.
 
     plan.png, perspective.png, histogram.png, residuals_IMAGE.png of at most 12 images (those with
     the largest RMS), distortion_CAMERA.png and correlations_CAMERA.png of at most 6 cameras;
-    correlations only where two parameters are free. Ids are made safe for file names.
+    correlations only if two parameters are free. Ids are made safe for file names.
 
-    **Arguments:** `force`: replace figures that are there and were not written by this function.
+    **Arguments:** `force`: also replace existing figures not written by this function.
 
     **Returns:** the paths written.
 
-    **Raises:** `ImportError` without matplotlib, `InputError` where the folder cannot or may not be
-    written (`jaxbundle.io.writing.folders`), `NotSolvedError` where there is no result.
+    **Raises:** `ImportError` without matplotlib, `InputError` if the folder cannot or may not be
+    written (`jaxbundle.io.writing.folders`), `NotSolvedError` if there is no result.
     """
     need_matplotlib()
     with replaced_folder(folder, "save_figures", FIGURES, force) as new:
@@ -51,7 +51,7 @@ def save_figures(adjustment, folder: str | Path, force: bool = False) -> list[Pa
 
 
 def draw_figures(adjustment, folder: Path) -> list[Path]:
-    """Write the figures of a result beside what is in a folder; as `save_figures`."""
+    """Write the figures of a result into an existing folder; as `save_figures`."""
     table = adjustment.images
     worst = np.argsort(-np.nan_to_num(table["rms"]), kind="stable")[:MOST_IMAGES]
     drawings = {
@@ -104,10 +104,10 @@ def draw_tracks(adjustment, read: Callable[[str], np.ndarray], folder: Path) -> 
 
 
 def write_figures(folder: str | Path, drawings: Mapping[str, tuple]) -> list[Path]:
-    """Write figures NAME.png into a folder, each file whole or not at all.
+    """Write figures NAME.png into a folder, each file completely or not at all.
 
     **Arguments:** `drawings`: by name the size in inches, the projection (None or "3d"), and the
-    function that draws on axes given as `ax`.
+    function that draws on the axes `ax`.
 
     **Returns:** the paths written. **Raises:** as `save_figures`.
     """
@@ -135,7 +135,7 @@ def png(size, projection, draw) -> bytes:
     draw(ax=figure.add_subplot(projection=projection))
     data = io.BytesIO()
     with warnings.catch_warnings():
-        # ids in a script that the font lacks: boxes in the figure, nothing to act on
+        # ids in a script missing from the font: boxes in the figure, no action required
         warnings.filterwarnings("ignore", message="Glyph .* missing")
         figure.savefig(data, format="png", bbox_inches="tight", pad_inches=0.15)
     return data.getvalue()

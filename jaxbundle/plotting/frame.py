@@ -1,4 +1,4 @@
-"""The frame of an image: where its corners are, and what was measured in it."""
+"""The frame of an image: its corners and its measurements."""
 
 import numpy as np
 
@@ -31,10 +31,10 @@ def image_frame(adjustment, camera: str):
 
 
 def measured(adjustment, image: str):
-    """What was measured in an image: points, coordinates [n, 2], residuals [n, 2], τ [n, 2].
+    """The measurements in an image: points, coordinates [n, 2], residuals [n, 2], τ [n, 2].
 
     Coordinates and v = computed − observed in the unit of the camera's model; τ and v of a
-    coordinate that was removed are NaN.
+    removed coordinate are NaN.
     """
     problem, data = adjustment.problem, adjustment.problem.data
     i = image_index(adjustment, image)

@@ -28,8 +28,8 @@ LARGE = 3.0
 def residual_vectors(adjustment, image: str, ax=None):
     """The residuals v = computed − observed of an image as vectors, with a scale bar.
 
-    Vectors stand at the measured coordinates, in the unit of the camera's model; y is drawn as
-    the image is seen. Those with |τ| > 3 are coloured. The image frame is drawn where its size is
+    Vectors begin at the measured coordinates, in the unit of the camera's model; y is drawn as
+    in the visible image. Those with |τ| > 3 are coloured. The image frame is drawn if its size is
     known.
 
     **Returns:** matplotlib `Axes`.

@@ -1,4 +1,4 @@
-"""What photographs have in common: the match graph, the overlap, tracks in a photograph."""
+"""Common points of photographs: the match graph, the overlap, tracks in a photograph."""
 
 from collections.abc import Sequence
 
@@ -30,8 +30,8 @@ Pairs = Sequence[tuple[str, str, int, int, str]]
 
 
 def match_graph(names: Sequence[str], pairs: Pairs, alone: Sequence[str] = (), ax=None):
-    """Photographs on a circle, in their order, and a line for every verified pair: the wider, the
-    more matches; those that are in no part (`alone`) are coloured.
+    """Photographs on a circle, in their order, and a line for every verified pair, wider for
+    more matches; those in no part (`alone`) are coloured.
 
     **Returns:** matplotlib `Axes`.
     """
@@ -93,7 +93,7 @@ def overlap_matrix(names: Sequence[str], pairs: Pairs, ax=None):
 
 
 def tracks_in_photograph(adjustment, image: str, picture: UInt8[np.ndarray, "r c"], ax=None):
-    """The measurements of a photograph in its picture, coloured by how many photographs show the
+    """The measurements of a photograph in its picture, coloured by the number of photographs of the
     point; removed ones as crosses.
 
     **Arguments:** `picture`: grey values, of any size: it is stretched over the photograph.

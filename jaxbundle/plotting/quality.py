@@ -1,4 +1,4 @@
-"""How good a calibration is: where points were measured, how uncertain a projected point is."""
+"""Quality of a calibration: distribution of measured points, uncertainty of a projected point."""
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from jaxbundle.plotting.style import (
 MARGIN = 0.08
 """Labels of contours keep away from the frame by this part of the image."""
 SMALL = 0.02
-"""Scales of σ begin here, in pixels, at the least."""
+"""Minimum upper end of scales of σ, in pixels."""
 
 
 def _frame(ax, image_size):
@@ -32,7 +32,7 @@ def _frame(ax, image_size):
 
 
 def coverage_map(coverage, uv, image_size, name: str = "camera", ax=None):
-    """Points measured in all photographs [n, 2], and how many there are in each cell of the image.
+    """Points measured in all photographs [n, 2], and their number in each cell of the image.
 
     **Returns:** matplotlib `Axes`, pixels.
     """
@@ -55,7 +55,7 @@ def coverage_map(coverage, uv, image_size, name: str = "camera", ax=None):
 
 
 def _smooth(u, v, sigma, times: int = 8):
-    """σ over a finer grid: a cubic spline of its logarithm, where it is known everywhere."""
+    """σ over a finer grid: a cubic spline of its logarithm, if it is known everywhere."""
     if not (np.isfinite(sigma) & (sigma > 0)).all() or min(sigma.shape) < 4:
         return u, v, sigma
     from scipy.interpolate import RectBivariateSpline

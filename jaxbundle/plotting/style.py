@@ -1,6 +1,6 @@
-"""What all figures share: axes to draw on, colours, lengths of bars, text from files.
+"""Common parts of all figures: axes, colours, lengths of bars, text from files.
 
-matplotlib is imported by the functions that draw, so that the package does without it.
+matplotlib is imported by the drawing functions, so that the package works without it.
 """
 
 import math
@@ -21,11 +21,11 @@ ROLE_STYLE = {
     "check": {"color": GREEN, "marker": "D", "s": 26},
 }
 LABELLED = 40
-"""Ids are written beside at most so many points of a plan, half of them images."""
+"""Maximum number of points of a plan with ids, half of them images."""
 
 
 def need_matplotlib():
-    """matplotlib, or what to install."""
+    """matplotlib, or an error that says what to install."""
     try:
         import matplotlib
     except ImportError as error:
@@ -80,7 +80,7 @@ def plain(name: object) -> str:
 
 
 def legend(ax, **keywords) -> None:
-    """What is what, on a pale ground."""
+    """A legend on a pale ground."""
     keywords = {"frameon": True, "framealpha": 0.85, "edgecolor": PALE} | keywords
     ax.legend(fontsize=8, **keywords)
 
@@ -106,7 +106,7 @@ def round_number(x: float) -> float:
 
 
 def extent(xyz) -> tuple[np.ndarray, float]:
-    """Centre and size of what is to be seen: far outliers (nearly parallel rays) do not count."""
+    """Centre and size of the visible part: far outliers (nearly parallel rays) are ignored."""
     xyz = np.asarray(xyz, float)
     xyz = xyz[np.isfinite(xyz).all(1)]
     if not len(xyz):
@@ -120,5 +120,5 @@ def extent(xyz) -> tuple[np.ndarray, float]:
 
 
 def micrometres(unit: str) -> tuple[float, str]:
-    """Small lengths of an image are shown in µm where it is measured in mm."""
+    """Small image lengths are shown in µm for measurements in mm."""
     return (1e3, "µm") if unit == "mm" else (1.0, unit)

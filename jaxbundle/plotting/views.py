@@ -30,7 +30,7 @@ from jaxbundle.plotting.style import (
 LETTER, LINE, GAP = 4.9, 8.0, 4.0
 """Width of a letter, height of a line and distance from the place, of ids, in points."""
 ELLIPSES = 2000
-"""Error ellipses are drawn for at most so many points."""
+"""Maximum number of points with error ellipses."""
 
 
 def network_plan(adjustment, ax=None):
@@ -127,8 +127,8 @@ def network_perspective(adjustment, ax=None):
 def camera_pyramids(adjustment, size: float) -> np.ndarray:
     """Projection centre and the four image corners in object space [images, 5, 3].
 
-    The slanted edges have the length `size` on the average; corners by the camera's own model, so
-    that the principal point and the distortion show.
+    The slanted edges have the length `size` on average; corners by the model of the camera, so
+    that the principal point and the distortion are visible.
     """
     network, values = adjustment.problem.network, adjustment.values
     M = np.asarray(jax.vmap(matrix_from_quaternion)(values.rotation))
@@ -140,7 +140,7 @@ def camera_pyramids(adjustment, size: float) -> np.ndarray:
         chosen = [c for c, other in enumerate(models) if other == model]
         p = adjustment.values.camera[np.array(chosen), : len(model.parameters)]
         corners[chosen] = _corner_rays(model, p, frames[chosen])
-    # where a distortion turns back inside the frame there is no ray: a corner to look at instead
+    # if the distortion turns back inside the frame there is no ray: an approximate corner instead
     missing = ~np.all(np.isfinite(corners), axis=2)
     plain = np.array([(-1, -1, -1.4), (1, -1, -1.4), (1, 1, -1.4), (-1, 1, -1.4)])
     corners = np.where(missing[:, :, None], plain, corners)
@@ -169,7 +169,7 @@ def _pyramid_lines(pyramids):
 
 
 def pyramid_size(centres, size: float) -> float:
-    """Large enough to be seen, small enough to leave neighbours apart."""
+    """A visible size that keeps neighbours apart."""
     return float(np.clip(0.9 * _neighbour(centres), 0.045 * size, 0.15 * size))
 
 
@@ -187,7 +187,7 @@ def _neighbour(places, most: int = 400) -> float:
 
 
 def _points(adjustment):
-    """Ids, roles and coordinates, check points included; none at any distance."""
+    """Ids, roles and coordinates, including check points; without points at any distance."""
     table = adjustment.points
     there = ~adjustment.problem.at_any_distance
     id, role, xyz = table["id"][there], table["role"][there], adjustment.point_values[there]
@@ -200,7 +200,7 @@ def _points(adjustment):
 
 
 def _lighter(style, number: int):
-    """Smaller marks where there are many."""
+    """Smaller marks for many points."""
     return style | {"s": style["s"] / (1 if number <= 300 else 2 if number <= 3000 else 8)}
 
 
@@ -218,8 +218,8 @@ def error_ellipses(adjustment, factor: float, corners: int = 49) -> np.ndarray:
 
 
 def ellipse_factor(adjustment, size: float) -> tuple[int, float]:
-    """How many points have an error ellipse of X and Y, and the factor by which these are drawn in
-    a network of this size, to be seen and compared."""
+    """The number of points with an error ellipse of X and Y, and the exaggeration for
+    a network of this size, so that they are visible and comparable."""
     covariance = adjustment.point_covariance[:, :2, :2]
     there = ~adjustment.problem.at_any_distance
     large = np.sqrt(np.trace(covariance, axis1=1, axis2=2))[there]
@@ -232,7 +232,7 @@ def ellipse_factor(adjustment, size: float) -> tuple[int, float]:
 
 
 def _draw_ellipses(adjustment, ax, size: float) -> np.ndarray:
-    """Draw the error ellipses, in a size that can be seen and compared; what was drawn."""
+    """Draw the error ellipses in a visible, comparable size; returns the drawn artists."""
     from matplotlib.collections import LineCollection
 
     number, factor = ellipse_factor(adjustment, size)
@@ -248,8 +248,8 @@ def _draw_ellipses(adjustment, ax, size: float) -> np.ndarray:
 
 
 def _write_ids(ax, tables, places) -> None:
-    """Ids beside their places where they cover no other id, none of the places drawn and not the
-    frame; first on the far side of what the images look at. Where there is no room, no id."""
+    """Ids beside their points without covering other ids, points or the
+    frame; first on the side away from the object. Ids without room are omitted."""
     ax.figure.draw_without_rendering()  # the layout moves the axes
     frame = ax.get_window_extent()
     dots = ax.figure.dpi / 72
@@ -285,14 +285,14 @@ def _box(x, y, wide, high, gap, turn):
 
 
 def _covered(box, taken, frame) -> float:
-    """How many of the boxes taken a box covers, and whether it leaves the frame."""
+    """The number of occupied boxes that a box covers, and whether it leaves the frame."""
     left, right, low, top = box
     out = left < frame.x0 or right > frame.x1 or low < frame.y0 or top > frame.y1
     return out + sum(left <= b[1] and b[0] <= right and low <= b[3] and b[2] <= top for b in taken)
 
 
 def _inside(xyz):
-    """The corners of what is to be seen, with a margin."""
+    """The corners of the visible part, with a margin."""
     centre, size = extent(xyz)
     near = xyz[(np.abs(xyz - centre) <= 0.5 * size * (1 + 1e-9)).all(1)]
     low, high = near.min(0), near.max(0)

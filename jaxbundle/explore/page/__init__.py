@@ -1,4 +1,4 @@
-"""What the pages of the explorer have in common: controls, scripts, style, and how one is made."""
+"""Common parts of the explorer pages: controls, scripts, style, and the page itself."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
@@ -14,7 +14,7 @@ NOTHING: Mapping[str, Any] = {}
 
 
 class Number(NamedTuple):
-    """A field for a number; `low`, `high`: the ends of a slider beside it."""
+    """A number field; `low`, `high`: the ends of a slider beside it."""
 
     key: str
     label: str
@@ -25,7 +25,7 @@ class Number(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """A list to choose a word from."""
+    """A selection list."""
 
     key: str
     label: str
@@ -34,7 +34,7 @@ class Choice(NamedTuple):
 
 
 class Switch(NamedTuple):
-    """A box to tick."""
+    """A check box."""
 
     key: str
     label: str
@@ -45,7 +45,7 @@ Control = Number | Choice | Switch
 
 
 def draw_controls(controls: Iterable[Control], live: bool) -> str:
-    """Controls one below the other; in a copy they show their values only."""
+    """A column of controls; in a copy they only show their values."""
     dead = "" if live else " disabled"
     return f'<div class="controls">\n{"".join(_control(one, dead) for one in controls)}</div>\n'
 
@@ -73,8 +73,8 @@ def _control(one: Control, dead: str) -> str:
 
 
 def draw_tools(live: bool, exports: Mapping[str, str] = NOTHING) -> str:
-    """Buttons: save the page, take a file away (its name by the words on the button); and the place
-    of messages. A copy has none."""
+    """Buttons: save the page, download a file (by the label of the button); and the
+    message area. A copy has none."""
     if not live:
         return '<p class="hint">A copy: the values are those it was saved with.</p>\n'
     buttons = "".join(
@@ -92,7 +92,7 @@ def make_page(
     answer: Mapping[str, Any], tables: Mapping[str, Listing] = NOTHING,
     drawings: Mapping[str, Any] = NOTHING, given: Mapping[str, Any] = NOTHING,
 ) -> Page:  # fmt: skip
-    """A page of the explorer with what was answered to the values `given`."""
+    """A page of the explorer with the answer to the values `given`."""
     state = {"live": live, "kind": kind, "given": dict(given), "answer": dict(answer)}
     state = without_nan(state)
     return Page(
@@ -102,7 +102,7 @@ def make_page(
 
 
 def place(id: str) -> str:
-    """An empty place for a part of an answer."""
+    """An empty element for a part of an answer."""
     return f'<div id="{id}" aria-live="polite"></div>\n'
 
 
