@@ -17,7 +17,7 @@ from jaxbundle.plotting.style import (
 MARGIN = 0.08
 """Labels of contours keep away from the frame by this part of the image."""
 SMALL = 0.02
-"""Minimum upper end of scales of σ, in pixels."""
+"""Default lower end of scales of σ, in pixels; a tenth of it is the minimum."""
 
 
 def _frame(ax, image_size):

@@ -232,7 +232,7 @@ def ellipse_factor(adjustment, size: float) -> tuple[int, float]:
 
 
 def _draw_ellipses(adjustment, ax, size: float) -> np.ndarray:
-    """Draw the error ellipses in a visible, comparable size; returns the drawn artists."""
+    """Draw the error ellipses in a visible, comparable size; returns their polygons."""
     from matplotlib.collections import LineCollection
 
     number, factor = ellipse_factor(adjustment, size)
