@@ -13,15 +13,15 @@ and since the root in that rule is again this function, its second derivatives a
 The number of iterations is fixed: Newton doubles the correct digits, and points do not wait for
 one another. To be within 1e-12 of the half diagonal everywhere in the image, mapping cameras need 1
 or 2 iterations, close-range and video cameras 3, an ordinary wide-angle lens 4, a fisheye 3 to 6,
-and a fisheye whose polynomial is nearly flat at the edge 11: hence the default of 6, and what the
-models ask for beyond it. In milliseconds of CPU for 200 000 points of `brown`, value / with both
-gradients: this way 19 / 38; differentiating two Newton corrections at a frozen root 20 / 60;
+and a fisheye whose polynomial is nearly flat at the edge 11: hence the default of 6, and higher
+numbers in some models. In milliseconds of CPU for 200 000 points of `brown`, value / with both
+gradients: this method 19 / 38; differentiating two Newton corrections at a frozen root 20 / 60;
 differentiating all iterations 6 / 665. With the loop unrolled it would be 13 / 32, but for `usgs`
 XLA's fusion then compiles for many minutes.
 
 A target outside the range of g, for example beyond the radius where the distortion turns
 (`validity.py`), has no root, or only one on a foreign branch. A wrong coordinate would enter an
-adjustment unseen; NaN cannot. The root is accepted where the remainder is rounding and where J has
+adjustment unseen; NaN cannot. The root is accepted if the remainder is rounding and J has
 a positive determinant and trace: at the principal point J is near the identity, and on the branch
 that starts there its eigenvalues keep positive real parts.
 """
@@ -41,7 +41,7 @@ def implicit_inverse(g: Formula, start: Formula, iterations: int = 6) -> Formula
     **Arguments:** `g`, near the identity but for a shift; `start`, `(p, X, Y) -> (x, y)`, undoes
     the shift and begins the `iterations`.
 
-    **Returns:** a function whose result is NaN where no root was found.
+    **Returns:** a function whose result is NaN if no root was found.
     """
 
     @jax.custom_jvp

@@ -33,9 +33,9 @@ FORMULAS = ("correct", "distort", "project", "unproject")
 Image = Literal["perspective", "equidistant", "stereographic", "equisolid", "orthographic"]
 PRINCIPAL_DISTANCES = ("c",), ("fx", "fy"), ("f",)
 PRINCIPAL_POINTS = ("x0", "y0"), ("cx", "cy")
-"""The names that are known without saying."""
+"""Default names."""
 TAKEN = ("id", "model", "image_size", "pixel_size", "free", "sigma")
-"""What a camera has beside its parameters; none of these can be the name of one."""
+"""Further fields of a camera; a parameter cannot have one of these names."""
 
 
 class LocalFormula(NamedTuple):
@@ -66,28 +66,28 @@ class CameraModel:
       `(p, xi, yi) -> (x, y)`, from the ideal to the measured image; `project`,
       `(p, r, s, q) -> (x, y)`, from the ray to the measured image; or `unproject`,
       `(p, x, y) -> (r, s, q)`, from the measured image to a ray of any length. `unproject` may
-      stand beside `project`, whose inverse it then is. Ideal coordinates are relative to the
+      be given with `project` as its inverse. Ideal coordinates are relative to the
       principal point and on the scale of the principal distance.
     - `inverse`: of `correct`, `distort`, or of `project` as it maps ideal to measured coordinates;
-      found by Newton's method with implicit derivatives, in so many `iterations` from `start`,
-      `(p, X, Y) -> (x, y)`, if not given.
+      by default computed by Newton's method with implicit derivatives, in `iterations` steps from
+      `start`, `(p, X, Y) -> (x, y)`.
     - `unit`: of image coordinates, `"mm"` or `"px"`; principal distance and principal point are in
       the same unit. `axes`: `"up"`, x right and y up (of mm if not given); `"down"`, u right and
       v down, the axes of pixels (of px).
-    - `image`: the ideal image, `"perspective"`, or, of fisheyes, `"equidistant"`,
+    - `image`: the ideal image, `"perspective"`, or, for fisheyes, `"equidistant"`,
       `"stereographic"` or `"equisolid"`, whose rays may be 90° and more from the axis, or
       `"orthographic"`. `magnification`, `(p) -> number`: the scale of the image on the axis, in
-      principal distances, where it is not 1.
-    - `defaults`: values of parameters that may be left out, where they are not 0.
-    - `free`: what is estimated if nothing is said; all if not given. `never_free`: parameters that
-      are conventions, never to be estimated. `ranges`: of parameters that mean something
-      only from a lowest value to below a highest. `prior`: σ of parameters that photographs
-      alone do not determine; `calibrate` observes their start values with it.
+      principal distances, if it is not 1.
+    - `defaults`: values of optional parameters, if they are not 0.
+    - `free`: parameters estimated by default; all if not given. `never_free`: parameters that
+      are conventions, never estimated. `ranges`: of parameters that are valid
+      only from a lowest value to below a highest. `prior`: σ of parameters not determined by
+      photographs alone; `calibrate` observes their start values with it.
     - `principal_distance`: one parameter, or two, along and across, that must be given and
       positive; c, fx and fy, or f if not named. `principal_point`: two parameters, the measured
-      image of the axis; x0 and y0, or cx and cy if not named, and none where it has none of these.
-    - `local`: beside `distort`, of a model of so many parameters that each image point depends on
-      few of them.
+      image of the axis; x0 and y0, or cx and cy if not named, and none without these.
+    - `local`: in addition to `distort`, for models with many parameters of which each image point
+      depends on few.
 
     **Fields made of them:** `own_formula`, which of `to_ideal` and `from_ideal` the formula is;
     `ideal`, `(p, r, s, q) -> (xi, yi)`; `ray`, `(p, xi, yi) -> (r, s, q)`, of length 1; `to_ideal`,

@@ -1,4 +1,4 @@
-"""What a user's own camera model must satisfy, checked before anything is computed with it."""
+"""Checks of own camera models before any computation."""
 
 from collections.abc import Mapping
 from functools import lru_cache, partial
@@ -12,17 +12,17 @@ from jaxbundle.cameras.model import FORMULAS, CameraModel
 from jaxbundle.float64 import local_x64
 
 ROUND_TRIP = 1e-9
-"""So much of the principal distance an inverse may miss the point."""
+"""Tolerance of an inverse relative to the principal distance."""
 SLANT = 0.05
-"""Of the principal distance: how far from the axis a given inverse is tried."""
+"""Distance from the axis at which a given inverse is tested, relative to the principal distance."""
 
 
 def check_own(model: CameraModel, values: Mapping[str, float] | None = None) -> None:
-    """Refuse a model whose formula cannot be used, with `values` one that cannot on the axis.
+    """Refuse a model with an unusable formula, with `values` also one unusable on the axis.
 
     **Raises:** `ValueError`: the formula does not take the parameters and give two numbers, or not
     element by element; it has no derivatives on the optical axis, or mirrors the image there; its
-    inverse is none.
+    inverse is wrong.
     """
     _check_form(model)
     if values is None:

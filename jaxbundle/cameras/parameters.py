@@ -1,4 +1,4 @@
-"""Start values of a camera's parameters: what may be left out, and what cannot be right."""
+"""Start values of camera parameters: defaults and checks."""
 
 import math
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from jaxbundle.cameras.names import closest
 
 
 def default_parameters(model: CameraModel) -> dict[str, float]:
-    """The values of the parameters that may be left out: 0, or what the model says.
+    """The default values of parameters: 0, or those of the model.
 
     The principal distance has no default.
     """

@@ -1,7 +1,7 @@
-"""Radial polynomials r·(1 + k1·r² + k2·r⁴ + …), and how far out they can be trusted.
+"""Radial polynomials r·(1 + k1·r² + k2·r⁴ + …), and their valid range.
 
-Past the radius where such a polynomial turns back it gives a wrong image, silently, and farther
-out, where it rises again, another one. `rising` tells whether it rises all the way to a point.
+Beyond the radius where such a polynomial turns back it silently gives a wrong image, and farther
+out, where it rises again, another one. `rising` tests whether it rises all the way to a point.
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxbundle.cameras.scalars import Scalar
 
 SAMPLES = 8
-"""Places on the way at which a slope is looked at."""
+"""Number of radii at which the slope is tested."""
 
 
 def radial(k: Sequence[Scalar], square: Scalar) -> Scalar:

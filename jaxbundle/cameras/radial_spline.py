@@ -4,7 +4,7 @@
 
 θ the angle to the optical axis, ψ the azimuth. S is the natural cubic spline with S(0) = 0 and the
 values s1 … sN at θ² = θm²/N, 2·θm²/N, …, θm², where θm is half the field of view FOV: the
-parameters are the distortion itself, in parts of the radius, at N angles. In θ² it is smooth on the
+parameters are the distortion relative to the radius at N angles. In θ² it is smooth on the
 axis, and its knots are closer towards the edge, where lenses need them. The inverse is by the
 implicit function.
 
@@ -34,7 +34,7 @@ LEAST, MOST = 2, 40
 
 @lru_cache(maxsize=64)
 def radial_spline(number: int, degrees: float) -> CameraModel:
-    """The model with so many values over a field of view.
+    """The model with `number` values over a field of view.
 
     **Raises:** `ValueError` for a number that is not 2 to 40, a field of view not in 0° to 360°.
     """

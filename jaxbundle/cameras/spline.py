@@ -5,14 +5,14 @@
     v = cy + fy·(b + ΣΣ B((a − a_j)/h)·B((b − b_i)/h)·dy_i_j)
 
 with knots a_j = (j − (NX − 1)/2)·h and b_i = (i − (NY − 1)/2)·h, i the row from the top, and the
-spacing h = 4·tan(FOV/4)/(NX − 3): FOV is the field of view along a row, and one knot stands
-outside of it on either side. A point sees 4 × 4 knots only. The inverse is by the implicit
+spacing h = 4·tan(FOV/4)/(NX − 3): FOV is the field of view along a row, and one knot is
+outside of it on either side. A point depends on 4 × 4 knots only. The inverse is by the implicit
 function. Outside the knots' field, |a| ≤ (NX − 3)·h/2 and |b| ≤ (NY − 3)·h/2, NaN.
 
-It can follow any lens, field curvature and decentred elements included, for 2·NX·NY parameters.
-fx, fy, cx, cy are conventions: the grid takes up what they could. Knots that no point has seen,
-and the turn of the camera frame, which every pose takes up, are left to a weak prior σ of the
-knots (`PRIOR`), about the start values: in `calibrate`, the parametric lens of the start.
+It can represent any lens, including field curvature and decentred elements, with 2·NX·NY
+parameters. fx, fy, cx, cy are conventions: the grid absorbs their effect. Knots without points,
+and the rotation of the camera frame, which every pose absorbs, are determined by a weak prior σ of
+the knots (`PRIOR`) around the start values: in `calibrate`, the parametric lens of the start.
 
 `spline-12x9-110` has 12 × 9 knots and a field of view of 110°.
 

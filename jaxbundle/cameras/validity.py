@@ -1,11 +1,11 @@
-"""How far from the principal point a distortion formula can be trusted.
+"""The valid radius of a distortion formula around the principal point.
 
-A polynomial that fits a lens inside the image bends back somewhere outside. Where the determinant
+A polynomial that fits a lens inside the image turns back somewhere outside. If the determinant
 of the formula's Jacobian falls to zero, two points get the same image and the inverse ends. With K1
 alone, g = r·(1 + K1·r²), that is 1 + 3·K1·r² = 0.
 
-The formula is `to_ideal` or `from_ideal`, whichever the model states. The radius returned is always
-one of the MEASURED image, in the model's unit, so that it compares with the size of the image.
+The formula is `to_ideal` or `from_ideal`, as defined by the model. The returned radius is always
+in the MEASURED image, in the model's unit, so that it can be compared with the image size.
 """
 
 from collections.abc import Mapping, Sequence
