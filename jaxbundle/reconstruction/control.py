@@ -112,7 +112,7 @@ def _collect(path, records, system, sigmas) -> Control:
         if not np.isfinite([*X, *place, sigma]).all() or sigma <= 0:
             raise InputError(f"{path}, line {number}: coordinates and pixels must be finite")
         if name in position and position[name] != X:
-            raise InputError(f"{path}, line {number}: point {name} had other coordinates before")
+            raise InputError(f"{path}, line {number}: point {name} has other coordinates above")
         position[name] = X
         numbers.setdefault(name, number)
     X, said = to_map(np.array(list(position.values())), system, str(path))
