@@ -41,7 +41,13 @@ def compare(
     saved = [beginning(name, len(SAVED)) == SAVED for name in (a, b)]
     if any(saved):
         if not all(saved):
-            raise InputError(f"{a}, {b}: a saved adjustment is compared with another one; give two")
+            one, other = (a, b) if saved[0] else (b, a)
+            if not Path(other.partition("#")[0]).exists():
+                raise InputError(f"{other}: no such file")
+            raise InputError(
+                f"{other}: is not a saved adjustment, as {one} is; give two files that jaxbundle "
+                "adjust --save has written"
+            )
         if plot is not None:
             raise InputError("--plot: of calibrations only; --csv writes the table")
         return _compare_adjustments(a, b, csv)
