@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbundle.leastsquares.plan import Part, Plan
+from jaxbundle.leastsquares.plan import Part, Plan, Touch
 from jaxbundle.leastsquares.rows import (
     Declared,
     Laid,
@@ -23,6 +23,7 @@ from jaxbundle.leastsquares.rows import (
     over_rows,
     residual_of,
 )
+from jaxbundle.types import present
 
 ROWS_AT_ONCE = 1 << 16
 """Observations whose derivatives are looked at together where they are many."""
@@ -63,16 +64,26 @@ def differentiate(declared: Declared, plan: Plan, number: int, prepared, laid: L
 
     touches = []
     for touch in part.touches:
-        J, group = block(touch.slots, touch.start, touch.stop), plan.groups[touch.group]
-        if not group.all_free:
-            J = J * group.free[touch.row, touch.start : touch.stop][:, None, None, :]
-        touches.append(J)
-    E, e = None, plan.eliminated
-    if e is not None and part.slot is not None:
-        E, group = block(((part.slot, 0),), 0, widths[part.slot]), plan.groups[e]
-        if not group.all_free:
-            E = E * group.free[part.eliminated][:, :, None, :]
+        touches.append(without_held(plan, touch, block(touch.slots, touch.start, touch.stop)))
+    E = None
+    if plan.eliminated is not None and part.slot is not None:
+        E = block(((part.slot, 0),), 0, widths[part.slot])
+        E = eliminated_without_held(plan, part, E)
     return jnp.stack(r, -1), tuple(touches), E
+
+
+def without_held(plan: Plan, touch: Touch, J):
+    """The block of a touch with zeros in the columns of held unknowns."""
+    group = plan.groups[touch.group]
+    if group.all_free:
+        return J
+    return J * group.free[touch.row, touch.start : touch.stop][:, None, None, :]
+
+
+def eliminated_without_held(plan: Plan, part: Part, E):
+    """The block of the eliminated rows of a part with zeros in the columns of held unknowns."""
+    group = plan.groups[present(plan.eliminated)]
+    return E if group.all_free else E * group.free[part.eliminated][:, :, None, :]
 
 
 def differentiate_rows(function, widths, part: Part, blocks, measured, weight):

@@ -19,7 +19,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxbundle.leastsquares.declarations import Kind
-from jaxbundle.leastsquares.linearise import differentiate_rows, widths_of
+from jaxbundle.leastsquares.linearise import (
+    differentiate_rows,
+    eliminated_without_held,
+    widths_of,
+    without_held,
+)
 from jaxbundle.leastsquares.plan import Part, Plan
 from jaxbundle.leastsquares.rows import Declared, Laid, look_up, over_rows, weighted
 from jaxbundle.leastsquares.spaces import Space, Vector
@@ -80,21 +85,18 @@ def differentiate_locally(
     found = []
     for number_of, one in enumerate(part.touches):
         J = jnp.concatenate([blocks[slot] for slot, _ in one.slots], -1)
-        of = plan.groups[one.group]
         if number_of == touch:
             mask = jnp.take_along_axis(
                 jnp.broadcast_to(free, (*columns.shape[:2], group.width)), columns, -1,
                 mode="fill", fill_value=0.0,
             )  # fmt: skip
             J = J * mask[:, :, None, :]
-        elif not of.all_free:
-            J = J * of.free[one.row, one.start : one.stop][:, None, None, :]
+        else:
+            J = without_held(plan, one, J)
         found.append(J)
-    E, e = None, plan.eliminated
-    if e is not None and part.slot is not None:
-        E = blocks[part.slot]
-        if not plan.groups[e].all_free:
-            E = E * plan.groups[e].free[part.eliminated][:, :, None, :]
+    E = None
+    if plan.eliminated is not None and part.slot is not None:
+        E = eliminated_without_held(plan, part, blocks[part.slot])
     return LocalJacobian(r, tuple(found), E, touch, columns)
 
 

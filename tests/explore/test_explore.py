@@ -540,7 +540,6 @@ def test_the_page_of_a_widget_is_answered_by_its_view():
 
 
 def test_a_widget_is_one_of_anywidget():
-    pytest.importorskip("anywidget")
     widget = show(Doubling(), height=300)
     assert "doubling" in widget.page and widget.height == 300
     sent = []
