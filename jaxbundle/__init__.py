@@ -11,7 +11,7 @@ Importing configures nothing. `enable_x64` switches JAX to the required 64-bit f
 uses all cores for large networks, `keep_programs` keeps compiled programs.
 """
 
-import importlib
+from jaxbundle.lazy import import_on_use
 
 TYPE_CHECKING = False  # avoids importing typing
 
@@ -76,7 +76,11 @@ _HOME = {
     "jaxbundle.batch.calibrate": ("BatchCalibration", "calibrate_batch"),
     "jaxbundle.bundle.adjust": ("adjust",),
     "jaxbundle.calibration": (
-        "Board", "BoardViews", "Calibration", "calibrate", "calibrate_cameras",
+        "Board",
+        "BoardViews",
+        "Calibration",
+        "calibrate",
+        "calibrate_cameras",
     ),
     "jaxbundle.cameras": ("CameraModel",),
     "jaxbundle.system.configuration": ("join_processes", "keep_programs", "use_cores"),
@@ -95,7 +99,10 @@ _HOME = {
     "jaxbundle.planning.simulate": ("simulate", "simulate_with_truth"),
     "jaxbundle.planning.simulate_further": ("simulate_further",),
     "jaxbundle.planning.stations": (
-        "aerial_block", "cloud_of_targets", "grid_of_targets", "ring_of_stations",
+        "aerial_block",
+        "cloud_of_targets",
+        "grid_of_targets",
+        "ring_of_stations",
         "stations_looking_at",
     ),
     "jaxbundle.orientation.network": ("Oriented",),
@@ -107,26 +114,8 @@ _HOME = {
     "jaxbundle.bundle.influence": ("Influence", "influence"),
     "jaxbundle.statistics.precision": ("Precision", "precision", "redundancy"),
 }
-_MODULE = {name: module for module, names in _HOME.items() for name in names}
-__all__ = [*_MODULE]  # pyright: ignore[reportUnsupportedDunderAll]: the names above
-
-
-def __getattr__(name: str):
-    """Import public names on first use (PEP 562), so that the command line can configure JAX and
-    the linear algebra library before they start."""
-    if name not in _MODULE:
-        from difflib import get_close_matches  # here: interrupts are handled before other imports
-
-        close = [] if name.startswith("_") else get_close_matches(name, __all__, 1)
-        mean = f"; did you mean {close[0]!r}?" if close else ""
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}{mean}")
-    value = getattr(importlib.import_module(_MODULE[name]), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted(set(globals()) | set(__all__))
-
+# Imported on first use, so that the command line can configure JAX and the linear algebra library
+# before they start.
+__getattr__, __dir__, __all__ = import_on_use(globals(), _HOME)  # pyright: ignore[reportUnsupportedDunderAll]
 
 __version__ = "0.2.0"

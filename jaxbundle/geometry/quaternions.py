@@ -146,6 +146,20 @@ def quaternion_difference(q1: Float[AnyArray, "4"], q0: Float[AnyArray, "4"]) ->
     return rotation_vector_from_quaternion(quaternion_multiply(q1, quaternion_conjugate(q0)))
 
 
+@traced_once
+def small_difference(q1: Float[AnyArray, "4"], q0: Float[AnyArray, "4"]) -> Float[Array, "3"]:
+    """2 tan(θ/2)·n of the rotation from q₀ to q₁ (Gibbs, 1884), which equals q₁ ⊟ q₀ to second
+    order and has fewer operations: for first derivatives at q₁ = q₀."""
+    w, *u = quaternion_multiply(q1, quaternion_conjugate(q0))
+    return 2 * jnp.stack(u) / w
+
+
+@traced_once
+def turn_object_slightly(q: Float[AnyArray, "4"], v: Float[AnyArray, "3"]) -> Float[Array, "4"]:
+    """The quaternion of M(q)·exp([v]×)ᵀ to first order in v, in radians; not of unit length."""
+    return quaternion_multiply(q, jnp.concatenate([jnp.ones(1), -v / 2]))
+
+
 def _normalise(q: AnyArray) -> Array:
     q = jnp.asarray(q)
     return q / jnp.sqrt(jnp.sum(q * q))

@@ -108,4 +108,4 @@ def _transform(motion, value):
     return value.at[:3].set(jnp.where(far & (value[3] > 0), turned, moved))
 
 
-move_at_any_distance = Together(_transform, transform_point, 3)
+move_at_any_distance = Together(_transform, _transform, transform_point, 3)

@@ -15,6 +15,7 @@ from jaxbundle.leastsquares.declarations import Motions
 from jaxbundle.leastsquares.normal import Tangent
 from jaxbundle.leastsquares.plan import Plan
 from jaxbundle.leastsquares.rows import Declared, Values
+from jaxbundle.system.compilation import QUICK
 from jaxbundle.types import present
 
 HERE = "table"
@@ -28,6 +29,10 @@ def directions_of_motions(declared: Declared, values: Values) -> Tangent:
     found, given = {}, present(declared.motions)
     for name, value in values.items():
         action = tuple((HERE, act) for table, act in given.actions if table == name)
+        if not action:
+            rows = len(jax.tree.leaves(value)[0])
+            found[name] = np.zeros((rows, declared.spaces[name].width, len(given.names)))
+            continue
         motions = Motions(given.names, action)
         one = Declared((), ((HERE, declared.spaces[name]),), motions)
         of_rows = lambda rows, one=one: _generators(one, {HERE: rows})[HERE]
@@ -81,12 +86,12 @@ def _moved(declared, free, motion, values):
     return moved
 
 
-@eqx.filter_jit
+@partial(eqx.filter_jit, compiler_options=QUICK)
 def _difference(space, values, origin):
     return jax.vmap(space.difference)(values, origin)
 
 
-@eqx.filter_jit
+@partial(eqx.filter_jit, compiler_options=QUICK)
 def _move(space, act, motion, values, free):
     one = lambda value, f: space.hold(act(motion, value), value, f)
     return jax.vmap(one)(values, free)
@@ -100,6 +105,6 @@ def _of_rows(program, *given):
     return jax.tree.map(lambda x: np.asarray(x)[:rows], program(*jax.tree.map(wide, given)))
 
 
-_generators = eqx.filter_jit(datum.generators)
+_generators = eqx.filter_jit(datum.generators, compiler_options=QUICK)
 _leave_held = eqx.filter_jit(datum.leave_held)
 _free = eqx.filter_jit(datum.free_of_tables)

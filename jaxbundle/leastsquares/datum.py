@@ -50,7 +50,8 @@ def generators(declared: Declared, values: Values) -> Tangent:
             rows = jax.tree.leaves(values[name])[0].shape[0]
             return jnp.zeros((rows, space.width, motions))
         act = getattr(act, "near", act)
-        change = lambda value, m: space.difference(act(m, value), value)
+        difference = getattr(space, "small_difference", space.difference)
+        change = lambda value, m: difference(act(m, value), value)
         return jax.vmap(jax.jacfwd(change, 1), (0, None))(values[name], jnp.zeros(motions))
 
     return {name: of_table(name) for name in values}

@@ -4,7 +4,7 @@ Computed once at the start values, on the host, from one compiled survey of the 
 table and their effect on observations.
 """
 
-from functools import reduce
+from functools import partial, reduce
 from typing import NamedTuple
 
 import equinox as eqx
@@ -20,8 +20,11 @@ from jaxbundle.leastsquares.linearise import differentiate
 from jaxbundle.leastsquares.normal import Tangent
 from jaxbundle.leastsquares.plan import Datum, Plan
 from jaxbundle.leastsquares.rows import Data, Declared, lay_out_data, prepare
+from jaxbundle.system.compilation import QUICK
 from jaxbundle.types import present
 
+ROWS = 10_000
+"""Rows of J·G in one factorisation."""
 OPEN = 1e-10
 """Relative size of J·G below which a direction counts as open (rounding gives about 1e-14)."""
 
@@ -59,7 +62,7 @@ def survey_motions(
     return _survey(declared, plan, data, real, moves)
 
 
-@eqx.filter_jit
+@partial(eqx.filter_jit, compiler_options=QUICK)
 def _survey(declared, plan, data, real, moves) -> Survey:
     laid, prepared = lay_out_data(plan, data), prepare(declared, data.start)
     motions = len(present(declared.motions).names)
@@ -106,7 +109,10 @@ def find_open_motions(survey: Survey) -> Float[np.ndarray, "motions defect"]:
     size = np.linalg.norm(held, axis=1, keepdims=True)
     # Singular values of a QR, not of the Gram matrix, which would lose half of the digits.
     R = np.zeros((len(scale), len(scale)))
-    products = (np.asarray(rows) / scale for rows in survey.products)
+    products = (
+        np.asarray(rows)[begin : begin + ROWS] / scale
+        for rows in survey.products for begin in range(0, len(rows), ROWS)
+    )  # fmt: skip
     for rows in (held / np.where(size > 0, size, 1.0), *products):
         R = np.linalg.qr(np.concatenate([R, rows]), mode="r")
     _, singular, directions = np.linalg.svd(R)

@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbundle.geometry import transform_point, transform_pose
+from jaxbundle.geometry.quaternions import turn_object_slightly
+from jaxbundle.geometry.similarity import displacement
 from jaxbundle.leastsquares.declarations import Motions, Table
 from jaxbundle.leastsquares.spaces import Pose, PoseValue, Vector
 
@@ -54,22 +56,29 @@ def likely_motions(tables: Sequence[Table]) -> Motions | None:
 @dataclasses.dataclass(frozen=True)
 class Together:
     """`move(motion, value)` of motions whose shift follows rotation and scale, for simultaneous
-    motions; `transform(motion, place)` for the shifts, which are the first `size` numbers."""
+    motions; `near`: the same to first order, for the directions of the motions;
+    `transform(motion, place)` for the shifts, which are the first `size` numbers."""
 
     move: Callable
+    near: Callable
     transform: Callable
     size: int
 
     def __call__(self, motion, value):
         return self.move(_together(self.transform, motion, self.size), value)
 
-    def near(self, motion, value):
-        """The same to first order, for the directions of the motions."""
-        return self.move(motion, value)
-
 
 def _transform_pose(motion, value: PoseValue) -> PoseValue:
     return PoseValue(*transform_pose(motion, *value))
+
+
+def _displace_point(motion, value):
+    return value + displacement(motion, value)
+
+
+def _displace_pose(motion, value: PoseValue) -> PoseValue:
+    position = _displace_point(motion, value.position)
+    return PoseValue(position, turn_object_slightly(value.rotation, motion[3:6]))
 
 
 def _transform_in_plane(motion, value):
@@ -78,10 +87,10 @@ def _transform_in_plane(motion, value):
     return jnp.stack([c * value[0] - s * value[1] + x, s * value[0] + c * value[1] + y])
 
 
-_move_point = Together(transform_point, transform_point, 3)
-move_pose = Together(_transform_pose, transform_point, 3)
+_move_point = Together(transform_point, _displace_point, transform_point, 3)
+move_pose = Together(_transform_pose, _displace_pose, transform_point, 3)
 """A pose, or a frame, that moves with space."""
-_move_in_plane = Together(_transform_in_plane, _transform_in_plane, 2)
+_move_in_plane = Together(_transform_in_plane, _transform_in_plane, _transform_in_plane, 2)
 
 
 def _together(transform, motion, size: int):

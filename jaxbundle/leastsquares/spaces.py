@@ -3,8 +3,9 @@
 A space defines, for ONE row, the number of directions (`width`), the block of scalars that an
 observation receives (`prepare`), the effect of a small change δ on that block (`moved`, correct to
 second order at δ = 0, where all derivatives are taken), the application of a finite change
-(`retract`), and the change between two values (`difference`). `hold` is a value
-with its held part taken from another; `chart` gives the unknowns of the damping metric,
+(`retract`), and the change between two values (`difference`; `small_difference`, if there is one,
+has the same first derivatives where both are equal). `hold` is a value with its held part taken
+from another; `chart` gives the unknowns of the damping metric,
 T = ∂(chart)/∂δ and T⁻¹.
 
 Blocks consist of scalars, not of small arrays: under `vmap` every scalar becomes one long array,
@@ -24,6 +25,7 @@ from jaxbundle.geometry import (
     quaternion_difference,
     retract_quaternion,
 )
+from jaxbundle.geometry.quaternions import small_difference
 from jaxbundle.types import AnyArray, Scalar
 
 Change = tuple[Scalar, ...]
@@ -215,6 +217,10 @@ class Pose:
 
     def difference(self, value, origin):
         turn = quaternion_difference(value.rotation, origin.rotation)
+        return jnp.concatenate([value.position - origin.position, turn])
+
+    def small_difference(self, value, origin):
+        turn = small_difference(value.rotation, origin.rotation)
         return jnp.concatenate([value.position - origin.position, turn])
 
     def hold(self, value, given, free):

@@ -82,5 +82,5 @@ def batched(function, rows, shape, result_shape):
         for begin in range(0, len(rows), AT_ONCE):
             part = rows[begin : begin + AT_ONCE]
             batch = np.concatenate([part, np.zeros((AT_ONCE - len(part), *shape))])
-            results[begin : begin + AT_ONCE] = _batch(function, batch)[: len(part)]
+            results[begin : begin + AT_ONCE] = np.asarray(_batch(function, batch))[: len(part)]
     return results

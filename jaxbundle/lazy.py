@@ -1,0 +1,27 @@
+"""Public names of a package that are imported on first use (PEP 562)."""
+
+import importlib
+from collections.abc import Callable, Mapping
+
+
+def import_on_use(
+    package: dict, homes: Mapping[str, tuple[str, ...]]
+) -> tuple[Callable, Callable, list[str]]:
+    """`__getattr__`, `__dir__` and `__all__` of a package, given its `globals()` and the names of
+    each module."""
+    module = {name: home for home, names in homes.items() for name in names}
+
+    def get(name: str):
+        if name not in module:
+            from difflib import get_close_matches  # here: interrupts are handled before it
+
+            title, close = package["__name__"], []
+            if not name.startswith("_"):
+                close = get_close_matches(name, module, 1)
+            mean = f"; did you mean {close[0]!r}?" if close else ""
+            raise AttributeError(f"module {title!r} has no attribute {name!r}{mean}")
+        value = getattr(importlib.import_module(module[name]), name)
+        package[name] = value
+        return value
+
+    return get, lambda: sorted({*package, *module}), [*module]
