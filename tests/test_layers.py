@@ -10,6 +10,7 @@ import pytest
 LAYERS = (
     "errors",
     "choices",
+    "lazy",
     "types",
     "display",
     "arguments",
