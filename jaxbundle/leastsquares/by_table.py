@@ -15,7 +15,6 @@ from jaxbundle.leastsquares.declarations import Motions
 from jaxbundle.leastsquares.normal import Tangent
 from jaxbundle.leastsquares.plan import Plan
 from jaxbundle.leastsquares.rows import Declared, Values
-from jaxbundle.system.compilation import QUICK
 from jaxbundle.types import present
 
 HERE = "table"
@@ -86,12 +85,12 @@ def _moved(declared, free, motion, values):
     return moved
 
 
-@partial(eqx.filter_jit, compiler_options=QUICK)
+@eqx.filter_jit
 def _difference(space, values, origin):
     return jax.vmap(space.difference)(values, origin)
 
 
-@partial(eqx.filter_jit, compiler_options=QUICK)
+@eqx.filter_jit
 def _move(space, act, motion, values, free):
     one = lambda value, f: space.hold(act(motion, value), value, f)
     return jax.vmap(one)(values, free)
@@ -105,6 +104,6 @@ def _of_rows(program, *given):
     return jax.tree.map(lambda x: np.asarray(x)[:rows], program(*jax.tree.map(wide, given)))
 
 
-_generators = eqx.filter_jit(datum.generators, compiler_options=QUICK)
+_generators = eqx.filter_jit(datum.generators)
 _leave_held = eqx.filter_jit(datum.leave_held)
 _free = eqx.filter_jit(datum.free_of_tables)

@@ -4,7 +4,7 @@ Computed once at the start values, on the host, from one compiled survey of the 
 table and their effect on observations.
 """
 
-from functools import partial, reduce
+from functools import reduce
 from typing import NamedTuple
 
 import equinox as eqx
@@ -20,7 +20,6 @@ from jaxbundle.leastsquares.linearise import differentiate
 from jaxbundle.leastsquares.normal import Tangent
 from jaxbundle.leastsquares.plan import Datum, Plan
 from jaxbundle.leastsquares.rows import Data, Declared, lay_out_data, prepare
-from jaxbundle.system.compilation import QUICK
 from jaxbundle.types import present
 
 ROWS = 10_000
@@ -62,7 +61,7 @@ def survey_motions(
     return _survey(declared, plan, data, real, moves)
 
 
-@partial(eqx.filter_jit, compiler_options=QUICK)
+@eqx.filter_jit
 def _survey(declared, plan, data, real, moves) -> Survey:
     laid, prepared = lay_out_data(plan, data), prepare(declared, data.start)
     motions = len(present(declared.motions).names)
