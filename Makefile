@@ -1,7 +1,8 @@
-# `make demo`, `make test` (`make test-all`: with the further cases of its dear tests), `make test-oldest`, `make docs` and
-# `make bench` (or a part of it, below). All make .venv first (uv where installed, else venv and pip)
-# and install the package with what the tests need; `docs` also Sphinx, `bench` also what it compares
-# with. More problems: make bench-bal BAL="problem-16-22106-pre.txt.bz2 …" PEERS="--ceres …"
+# `make demo`, `make test` (`make test-all`: with the further cases of its dear tests), `make test-oldest`,
+# `make test-newest`, `make docs` and `make bench` (or a part of it, below). All make .venv first (uv where
+# installed, else venv and pip) and install the package with what the tests need; `docs` also Sphinx,
+# `bench` also what it compares with; `test-oldest` and `test-newest` have environments of their own.
+# More problems: make bench-bal BAL="problem-16-22106-pre.txt.bz2 …" PEERS="--ceres …"
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -11,12 +12,14 @@ WORKERS ?= 2
 # Many small matrices: one BLAS thread a process.
 export OPENBLAS_NUM_THREADS ?= 1
 
+BOUNDS = oldest newest
 BENCHES = block batch bal first
 MORE_BENCHES = large pushbroom orientation measuring blunders
 BAL ?=
 PEERS ?=
 
-.PHONY: demo test test-all test-oldest bench docs install clean $(BENCHES:%=bench-%) $(MORE_BENCHES:%=bench-%)
+.PHONY: demo test test-all bench docs install install-docs clean \
+  $(BOUNDS:%=install-%) $(BOUNDS:%=test-%) $(BENCHES:%=bench-%) $(MORE_BENCHES:%=bench-%)
 
 install: $(VENV)/installed
 
@@ -38,15 +41,23 @@ test test-all: install
 	$(BIN)/basedpyright --pythonpath $(BIN)/python
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(CASES)
 
-# The oldest versions that pyproject.toml allows, in an environment of their own, on some tests.
-OLDEST = out/oldest
-test-oldest:
-	$(PYTHON) -m venv $(OLDEST)
-	$(OLDEST)/bin/python tests/oldest_versions.py > $(OLDEST)/versions.txt
-	$(OLDEST)/bin/python -m pip install --quiet --disable-pip-version-check -c $(OLDEST)/versions.txt \
+# Some tests with the oldest versions that pyproject.toml allows, and with the newest ones on another
+# Python (make test-newest PYTHON=python3.13), each in an environment of its own.
+SOME = tests/test_saved.py tests/cli/test_first_touch.py tests/adjustment/test_solve.py
+
+out/oldest/installed: VERSIONS = -c out/oldest/versions.txt
+$(BOUNDS:%=out/%/installed): out/%/installed: pyproject.toml
+	$(PYTHON) -m venv --clear out/$*
+	$(PYTHON) tests/oldest_versions.py > out/$*/versions.txt
+	out/$*/bin/python -m pip install --quiet --disable-pip-version-check $(VERSIONS) \
 	  ".[tables]" pytest beartype hypothesis
-	$(OLDEST)/bin/python -m pytest -q -p no:cacheprovider tests/test_saved.py tests/cli/test_first_touch.py \
-	  tests/adjustment/test_solve.py -W ignore::DeprecationWarning
+	@touch $@
+
+$(BOUNDS:%=install-%): install-%: out/%/installed
+
+$(BOUNDS:%=test-%): test-%: install-%
+	out/$*/bin/python -m jaxbundle --version
+	out/$*/bin/python -m pytest -q -p no:cacheprovider $(SOME) -W ignore::DeprecationWarning
 
 $(VENV)/documented: $(VENV)/installed
 	@if command -v uv >/dev/null 2>&1; then \
@@ -56,8 +67,10 @@ $(VENV)/documented: $(VENV)/installed
 	fi
 	@touch $@
 
+install-docs: $(VENV)/documented
+
 # The site, in out/docs; a warning, such as of a link that leads nowhere, is an error.
-docs: $(VENV)/documented
+docs: install-docs
 	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going -c docs . out/docs
 	@echo "out/docs/index.html"
 
