@@ -50,7 +50,7 @@ def explore(
     server = Server(view, port, tell)
     print(server.address, flush=True)
     if not quiet:
-        tell("the first change compiles programs, once per size; Ctrl-C ends")
+        tell("programs are compiled once per size; Ctrl-C ends")
     if browser:
         webbrowser.open(server.address)
     server.serve_forever()

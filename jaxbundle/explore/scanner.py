@@ -19,6 +19,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,6 +35,16 @@ from jaxbundle.explore.page import (
     draw_tools,
     make_page,
     place,
+)
+from jaxbundle.explore.tracks import (
+    ORBIT,
+    STRAIGHT,
+    Tracks,
+    choose_track,
+    idle_controls,
+    rounded,
+    track_controls,
+    tracks_of,
 )
 from jaxbundle.explore.view import File, Given, check_keys, number, switch, word
 from jaxbundle.geometry.ellipsoid import Ellipsoid, earth_fixed, geodetic
@@ -56,7 +67,7 @@ from jaxbundle.pushbroom.noise import Noise, no_errors
 from jaxbundle.pushbroom.simulate import Flight, measured_image, true_image, with_errors_in_rows
 from jaxbundle.pushbroom.study import altitude_and_view
 from jaxbundle.pushbroom.surfaces import Ground, Height, Plane, Surface
-from jaxbundle.pushbroom.trajectory import Attitude, Trajectory
+from jaxbundle.pushbroom.trajectory import Attitude, Trajectory, trajectory_in_pieces
 from jaxbundle.report.layout import clean, significant
 from jaxbundle.report.page import UNKNOWN, Origin, Page, Section, describe_origin
 from jaxbundle.report.page.charts import Curve, draw_field, draw_plan
@@ -74,19 +85,13 @@ POSITIVE = ("altitude", "speed", "height")
 FLIGHT_FILE, TABLE_FILE, PICTURE_FILE = "flight.zip", "accuracy.csv", "error_map.png"
 
 
-TRACK = {
-    "height": ("height of the orbit", "m"), "inclination": ("inclination", "°"),
-    "node": ("right ascension of the node", "°"), "argument": ("argument of latitude", "°"),
-    "altitude": ("altitude of the track", "m"), "speed": ("speed over ground", "m/s"),
-    "heading": ("heading, clockwise from y", "°"),
-}  # fmt: skip
-"""What an orbit, or a straight track, is chosen by: label and unit."""
-
 
 class Chosen(NamedTuple):
-    """An image with what was chosen, the surface it is located on, and the image that is true."""
+    """An image with what was chosen, the ellipsoid (None in a local frame), the surface it is
+    located on, and the image that is true."""
 
     image: PushbroomImage
+    earth: Ellipsoid | None
     surface: Surface
     truth: PushbroomImage
 
@@ -109,7 +114,9 @@ class ScannerView:
             self.image if self.flight is None else true_image(self.flight)
         )
         self.known = truth is not None or self.flight is not None
-        self.track = {} if self.flight is None else _track_values(self.flight.track)
+        self.tracks = (
+            None if self.flight is None else tracks_of(self.flight.track, self.image, earth)
+        )
 
     # --- values -----------------------------------------------------------------------------
 
@@ -128,10 +135,10 @@ class ScannerView:
         found += [
             Number(name, f"error of {name}", 0.0, "°", -0.2, 0.2) for name in ANGLES
         ]
-        if self.flight is not None:
-            found += [Number(name, TRACK[name][0], value, TRACK[name][1])
-                      for name, value in self.track.items()]  # fmt: skip
+        if self.flight is not None and self.tracks is not None:
             found += [
+                Choice("track", "trajectory", self.tracks.kind, (ORBIT, STRAIGHT)),
+                *track_controls(self.tracks),
                 Number("position_rate", "samples of the orbit", self.flight.position_rate, "Hz"),
                 Number("attitude_rate", "samples of the attitude", self.flight.attitude_rate, "Hz"),
                 Number("attitude_white", "σ of every attitude row",
@@ -139,7 +146,7 @@ class ScannerView:
                 Number("position_white", "σ of every position row",
                        _one(self.flight.noise.position_white), "m"),
             ]  # fmt: skip
-        if self.earth is not None:
+        if self.earth is not None or self.tracks is not None:
             found += [
                 Switch(name, name.replace("_", " "), on)
                 for name, on in zip(Corrections._fields, self.image.corrections)
@@ -168,17 +175,20 @@ class ScannerView:
         """The image with these values.
 
         **Raises:** `InputError`."""
-        image, truth = self.image, self.truth
-        if self.flight is not None:
-            flight = self._flight_with(values)
+        image, truth, earth = self.image, self.truth, self.earth
+        if self.flight is not None and self.tracks is not None:
+            flight = self._flight_with(self.flight, self.tracks, values)
             image = measured_image(flight)
             if flight.track != self.flight.track:
                 truth = true_image(flight)
+            earth = self.tracks.earth if values["track"] == ORBIT else None
         trajectory = Trajectory(
             _table_with(image.trajectory.position, values["position_interpolation"]),
             _attitude_with(image.trajectory.attitude, values["attitude_interpolation"]),
         )
-        corrections = Corrections(*(values.get(name, False) for name in Corrections._fields))
+        corrections = Corrections(*(
+            earth is not None and values.get(name, False) for name in Corrections._fields
+        ))  # fmt: skip
         image = make_image(
             trajectory, image.times, image.optics, image.lines, image.pixels, image.mounting,
             corrections,
@@ -189,11 +199,10 @@ class ScannerView:
         if error.any():
             errors = no_errors(image)._replace(attitude_bias=jnp.asarray(error))
             image = with_errors_in_rows(image, errors)
-        return Chosen(image, self._surface(values["ground"]), truth)
+        return Chosen(image, earth, _surface_at(values["ground"], earth), truth)
 
-    def _flight_with(self, values) -> Flight:
-        assert self.flight is not None
-        noise = self.flight.noise
+    def _flight_with(self, flight: Flight, tracks: Tracks, values) -> Flight:
+        noise = flight.noise
         for name, unit in (("attitude_white", np.pi / 180), ("position_white", 1.0)):
             # A σ for every axis stays as the file has it until it is changed.
             if values[name] != _control(self.controls, name).value:
@@ -201,24 +210,17 @@ class ScannerView:
         names = ("position_interpolation", "attitude_interpolation", "position_rate",
                  "attitude_rate")  # fmt: skip
         return dataclasses.replace(
-            self.flight, noise=noise, track=_track_with(self.flight.track, self.track, values),
+            flight, noise=noise, track=choose_track(tracks, values),
             **{n: values[n] for n in names},
         )  # fmt: skip
-
-    def _surface(self, height: float) -> Surface:
-        if self.earth is None:
-            return Plane(level=height)
-        if height == 0 or self.earth.a != self.earth.b:
-            return Ground(self.earth)
-        return Height(level=height, earth=self.earth)
 
     # --- what the server asks ---------------------------------------------------------------
 
     def answer(self, given: Given) -> dict[str, Any]:
         """`parts`; `rms`, `ce90`, `largest` of the errors on the ground, metres; `errors` by place
-        [lines, pixels], `expected`: rows of the accuracy table."""
+        [lines, pixels], `expected`: rows of the accuracy table; `idle`: controls without effect."""
         values = self.values(given)
-        chosen = self.choose(values)
+        chosen = _in_pieces(self.choose(values))
         errors = self._errors(chosen)
         length = np.hypot(*errors.T)
         if not np.isfinite(length).all():
@@ -235,6 +237,7 @@ class ScannerView:
                 "accuracy": self._list(told, errors, expected),
             },
             **told, "errors": field.tolist(), "expected": expected,
+            "idle": [] if self.tracks is None else idle_controls(self.tracks, values["track"]),
         }  # fmt: skip
 
     def export(self, name: str, given: Given) -> File:
@@ -244,7 +247,7 @@ class ScannerView:
         values = self.values(given)
         chosen = self.choose(values)
         if name == FLIGHT_FILE:
-            return File(name, "application/zip", self._zip(chosen.image))
+            return File(name, "application/zip", self._zip(chosen))
         if name == TABLE_FILE:
             return File(name, "text/csv", self._csv(chosen).encode())
         if name == PICTURE_FILE:
@@ -253,7 +256,8 @@ class ScannerView:
                          f"{PICTURE_FILE} are")  # fmt: skip
 
     def page(self, given: Given, live: bool) -> Page:
-        """Controls, the ground, the error map, the table."""
+        """Controls, the ground, the error map, the table; a live page asks for them itself, since
+        the first answer compiles programs."""
         values = self.values(given)
         controls = [_with_value(control, values[control.key]) for control in self.controls]
         image = self.image
@@ -276,7 +280,7 @@ class ScannerView:
         title = f"{clean(self.name)}: explorer"
         rows = [(key.replace("_", " "), value) for key, value in values.items()]
         return make_page(title, sections, describe_origin(rows, self.origin), live, "scanner",
-                         self.answer(given), given=values)  # fmt: skip
+                         {} if live else self.answer(given), given=values)  # fmt: skip
 
     # --- numbers ----------------------------------------------------------------------------
 
@@ -292,7 +296,7 @@ class ScannerView:
 
     def _expected(self, chosen: Chosen) -> list[dict[str, float]]:
         """RMS and CE90 of attitudes with given σ about every axis, one error an image."""
-        image, surface, _ = chosen
+        image, surface = chosen.image, chosen.surface
         altitude, view = altitude_and_view(image, surface)
         rows = []
         for level in LEVELS:
@@ -305,34 +309,33 @@ class ScannerView:
             })  # fmt: skip
         return rows
 
-    def _map(self, truth: PushbroomImage, X) -> np.ndarray:
-        """East and north [km] of points [3, n] from the middle of the image on the ground."""
-        surface = self._surface(0.0)
-        middle = np.array([(self.image.lines - 1) / 2]), np.array([(self.image.pixels - 1) / 2])
-        O = np.asarray(_locate(truth, surface, *middle))[:, 0]
-        axes = np.asarray(east_north(surface, tuple(O)))
-        return 1e-3 * axes @ (np.asarray(X) - O[:, None])
-
     def _draw_ground(self, chosen: Chosen) -> str:
-        image, surface, truth = chosen
-        curves = []
-        for one, label, kind in ((truth, "footprint, reference", "second"),
-                                 (image, "footprint", "first")):  # fmt: skip
-            X = np.asarray(_locate(one, surface, *_outline(one)))
-            east, north = self._map(truth, X)
-            curves.append(Curve(label, east, north, None, kind))
+        image, earth, surface, truth = chosen
+        # The last place is the middle of the image, from which east and north are counted.
+        size = self.image.lines, self.image.pixels
+        outline = [np.append(v, (n - 1) / 2) for v, n in zip(_outline(self.image), size)]
+        reference = np.asarray(_locate(truth, surface, *outline))
+        O = reference[:, -1]
+        axes = np.asarray(_east_north(surface, tuple(O)))
+
+        def curve(label: str, X, kind: str) -> Curve:
+            east, north = 1e-3 * axes @ (np.asarray(X) - O[:, None])
+            return Curve(label, east, north, None, kind)
+
+        curves = [
+            curve(label, X[:, :-1], kind)
+            for X, label, kind in (
+                (reference, "footprint, reference", "second"),
+                (np.asarray(_locate(image, surface, *outline)), "footprint", "first"),
+            )
+        ]
         lines = np.linspace(0, image.lines - 1, 4 * EDGE)
-        P = np.asarray(_positions(image, jnp.asarray(lines))).T
-        if self.earth is not None and self.earth.a == self.earth.b:
-            longitude, latitude, _ = _geodetic(self.earth, tuple(P))
-            below = _earth_fixed(self.earth, (longitude, latitude, 0 * longitude))
-            east, north = self._map(truth, np.stack(below))
-            curves.append(Curve("ground track, below the platform", east, north, None, "given"))
-        elif self.earth is None:
-            P = np.array(P)
+        P = np.array(_positions(image, jnp.asarray(lines))).T
+        if earth is None:
             P[2] = 0.0
-            east, north = self._map(truth, P)
-            curves.append(Curve("track, from above", east, north, None, "given"))
+            curves.append(curve("track, from above", P, "given"))
+        elif earth.a == earth.b:
+            curves.append(curve("ground track, below the platform", _below(earth, P), "given"))
         return figure(draw_plan(curves, "east [km]", "north [km]"),
                       "Relative to the image centre; both axes at one scale")  # fmt: skip
 
@@ -363,11 +366,13 @@ class ScannerView:
 
     # --- files ------------------------------------------------------------------------------
 
-    def _zip(self, image: PushbroomImage) -> bytes:
+    def _zip(self, chosen: Chosen) -> bytes:
         """`scanner.toml` with its tables."""
         data = io.BytesIO()
         with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(data, "w") as archive:
-            write_scanner_image(folder, "scanner", image, self.earth, prefix="", angle_unit="deg")
+            write_scanner_image(
+                folder, "scanner", chosen.image, chosen.earth, prefix="", angle_unit="deg"
+            )
             for path in sorted(Path(folder).iterdir()):
                 archive.write(path, path.name, zipfile.ZIP_DEFLATED)
         return data.getvalue()
@@ -396,35 +401,21 @@ class ScannerView:
             raise InputError(str(error)) from None
 
 
-def _track_values(track: Mapping[str, Any]) -> dict[str, float]:
-    """The orbit, or the straight track, by the numbers of its controls (degrees); none of one state
-    vector."""
-    if "start" in track:
-        x, y, _ = velocity = np.asarray(track["velocity"], float)
-        heading = float(np.degrees(np.arctan2(x, y)))
-        return {"altitude": float(track["start"][2]), "speed": float(np.linalg.norm(velocity)),
-                "heading": float(f"{heading:.12g}")}  # fmt: skip
-    if "height" not in track:
-        return {}
-    angles = {name: _degrees(track.get(name, 0.0)) for name in ("inclination", "node", "argument")}
-    return {"height": float(track["height"]), **angles}
+def _surface_at(height: float, earth: Ellipsoid | None) -> Surface:
+    if earth is None:
+        return Plane(level=height)
+    if height == 0 or earth.a != earth.b:
+        return Ground(earth)
+    return Height(level=height, earth=earth)
 
 
-def _track_with(
-    track: Mapping[str, Any], known: Mapping[str, float], values: Mapping[str, Any]
-) -> Mapping[str, Any]:
-    """The track with the values of its controls; as it was where none is changed."""
-    if all(values[name] == value for name, value in known.items()):
-        return track
-    if "start" in track:
-        heading = np.radians(values["heading"])
-        velocity = np.array(track["velocity"], float)
-        level = np.sqrt(max(values["speed"] ** 2 - velocity[2] ** 2, 0.0))
-        start = [*track["start"][:2], values["altitude"]]
-        turned = [level * np.sin(heading), level * np.cos(heading), float(velocity[2])]
-        return {"start": start, "velocity": turned}
-    angles = {name: float(np.radians(values[name])) for name in known if name != "height"}
-    return {**track, "height": values["height"], **angles}
+def _in_pieces(chosen: Chosen) -> Chosen:
+    """With images whose interpolation is data of the same programs."""
+    image, truth = (
+        eqx.tree_at(lambda i: i.trajectory, image, _pieces(image.trajectory))
+        for image in (chosen.image, chosen.truth)
+    )
+    return chosen._replace(image=image, truth=truth)
 
 
 def _table_with(table: Table, method: str) -> Table:
@@ -475,13 +466,18 @@ def _one(sigma) -> float:
 
 
 def _degrees(sigma) -> float:
-    """The shortest form: 0.01, not 0.010000000000000002."""
-    return float(f"{np.degrees(_one(sigma)):.12g}")
+    return rounded(np.degrees(_one(sigma)))
 
 
 _locate = jax.jit(locate_points)
-_geodetic = jax.jit(geodetic)
-_earth_fixed = jax.jit(earth_fixed)
+_east_north = jax.jit(east_north)
+_pieces = jax.jit(trajectory_in_pieces)
 _positions = jax.jit(
     lambda image, lines: jax.vmap(lambda line: pose_at(image, image.times.time(line)).P)(lines)
 )
+
+
+@jax.jit
+def _below(earth, P):
+    longitude, latitude, _ = geodetic(earth, tuple(P))
+    return jnp.stack(earth_fixed(earth, (longitude, latitude, 0 * longitude)))

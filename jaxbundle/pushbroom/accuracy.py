@@ -59,7 +59,12 @@ def propagated(
     noise: Noise,
 ) -> GroundAccuracy:
     """The accuracy by propagation of covariances, exact to first order."""
-    covariance = np.asarray(_covariances(image, surface, lines, pixels, sigmas(image, noise)))
+    sigma = {
+        name: values
+        for name, values in sigmas(image, noise)._asdict().items()
+        if np.any(getattr(noise, name))
+    }
+    covariance = np.asarray(_covariances(image, surface, lines, pixels, sigma))
     rms = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
     ce90 = np.array([circular_error(c) for c in covariance])
     return GroundAccuracy(covariance, rms, ce90, circular_error(covariance))
@@ -126,17 +131,22 @@ def circular_error(covariance: Float[np.ndarray, "*n 2 2"], part: float = 0.9) -
 
 @jax.jit
 def _covariances(image, surface, lines, pixels, sigma):
-    zero = no_errors(image)
+    """`sigma` by the kinds of errors that there are."""
+    no_rows = jnp.zeros((0, 3))
+    nothing = no_errors(image)._replace(attitude_white=no_rows, position_white=no_rows)
+    zero = jax.tree.map(jnp.zeros_like, sigma)
 
     def of_place(line, pixel):
         X0 = locate_point(image, surface, line, pixel)
         axes = east_north(surface, X0)
         move = lambda errors: horizontal(
-            axes, X0, locate_point(disturbed(image, errors), surface, line, pixel)
-        )
+            axes, X0, locate_point(
+                disturbed(image, nothing._replace(**errors)), surface, line, pixel
+            ),
+        )  # fmt: skip
         J = jax.jacrev(move)(zero)
-        parts = [(j * s).reshape(2, -1) for j, s in zip(J, sigma)]
-        return sum(part @ part.T for part in parts)
+        parts = [(J[name] * sigma[name]).reshape(2, -1) for name in sigma]
+        return sum((part @ part.T for part in parts), jnp.zeros((2, 2)))
 
     return jax.vmap(of_place)(lines, pixels)
 

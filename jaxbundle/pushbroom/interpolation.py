@@ -14,8 +14,13 @@ with h₀₁ = τ²(3 − 2τ), h₀₀ = 1 − h₀₁, h₁₀ = τ(1 − τ)�
 spaced. In a step longer than `gap`, and outside the table by more than `extrapolate` seconds (none
 unless it is given), the value is NaN; splines end there. Within `extrapolate` the first and last
 interval continue, which is a straight line for `usgscsm`.
+
+Every one of them is a polynomial of degree 7 at most (`order`, if that is higher) in each interval:
+`in_pieces` keeps its values at the nodes of Chebyshev there, from which Lagrange's formula gives it
+back. Tables of all methods are then data of one compiled program.
 """
 
+from collections.abc import Callable
 from typing import Literal, get_args
 
 import equinox as eqx
@@ -29,6 +34,8 @@ from jaxbundle.types import AnyArray, Scalar
 
 Method = Literal["linear", "lagrange", "usgscsm", "hermite", "spline"]
 METHODS: tuple[str, ...] = get_args(Method)
+LEAST_DEGREE = 3
+"""Of a piece, for the cubic ones."""
 
 
 class Table(eqx.Module):
@@ -36,7 +43,8 @@ class Table(eqx.Module):
 
     `times` in seconds; `gap` the longest interpolated step between two rows, in seconds;
     `order` the degree of Lagrange's polynomial, the highest one of `usgscsm`; `extrapolate` the
-    seconds beyond its ends that the table still covers.
+    seconds beyond its ends that the table still covers. `pieces`, where given, replace `values` and
+    `method` (`in_pieces`).
     """
 
     times: Float[AnyArray, " rows"]
@@ -46,11 +54,14 @@ class Table(eqx.Module):
     method: Method = eqx.field(static=True, default="lagrange")
     order: int = eqx.field(static=True, default=7)
     extrapolate: float = eqx.field(static=True, default=0.0)
+    pieces: Float[AnyArray, "intervals nodes k"] | None = None
 
 
 def interpolate(table: Table, t: Scalar) -> Float[Array, " k"]:
     """The values at the time t, in seconds; NaN outside the table and in gaps."""
     i = interval(table, t)
+    if table.pieces is not None:
+        return jnp.where(covers(table, i, t), _of_pieces(table, i, t), jnp.nan)
     match table.method:
         case "linear":
             value = _linear(table, i, t)
@@ -65,6 +76,21 @@ def interpolate(table: Table, t: Scalar) -> Float[Array, " k"]:
         case _:
             raise ValueError(f"Unknown interpolation {table.method!r}; known: {METHODS}")
     return jnp.where(covers(table, i, t), value, jnp.nan)
+
+
+def in_pieces(table: Table, value: Callable[[Scalar], Float[Array, " k"]]) -> Table:
+    """The table with `value(t)`, its interpolation, as polynomials (`pieces`).
+
+    They are exact for the methods of a table; of another smooth function, such as `slerp`, to order
+    + 1 powers of an interval.
+    """
+    nodes = max(table.order, LEAST_DEGREE) + 1
+    t = table.times[:-1, None] + jnp.diff(table.times)[:, None] * _chebyshev(nodes)
+    pieces = jax.vmap(jax.vmap(value))(t)
+    return Table(
+        table.times, table.values, None, table.gap, "lagrange", table.order, table.extrapolate,
+        pieces,
+    )  # fmt: skip
 
 
 def rate(table: Table, t: Scalar) -> Float[Array, " k"]:
@@ -151,6 +177,19 @@ def _end_rows(step, slope, first, last):
         two[:, None], s0, jnp.where(three[:, None], parabola, knot)
     ))  # fmt: skip
     return jnp.where(short, 1.0, h1), jnp.where(short, 0.0, both), right
+
+
+def _chebyshev(nodes: int) -> np.ndarray:
+    """Places between 0 and 1."""
+    return (1 - np.cos(np.pi * (np.arange(nodes) + 0.5) / nodes)) / 2
+
+
+def _of_pieces(table, i, t):
+    nodes = _chebyshev(table.pieces.shape[1])
+    same = np.eye(len(nodes), dtype=bool)
+    spans = nodes[:, None] - nodes + same
+    tau = fraction(table, i, t)
+    return jnp.prod(jnp.where(same, 1.0, (tau - nodes) / spans), axis=1) @ table.pieces[i]
 
 
 def _linear(table, i, t):

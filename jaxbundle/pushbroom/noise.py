@@ -42,7 +42,8 @@ class Noise(NamedTuple):
 
 
 class Errors(NamedTuple):
-    """Errors of an image's ancillary data, in the order of `Noise`."""
+    """Errors of an image's ancillary data, in the order of `Noise`; no rows [0, 3]:
+    none in the rows."""
 
     attitude_bias: Float[AnyArray, "3"]
     attitude_drift: Float[AnyArray, "3"]
@@ -74,8 +75,14 @@ def draw(sigma: Errors, key: AnyArray) -> Errors:
 
 
 def disturbed(image: PushbroomImage, errors: Errors) -> PushbroomImage:
-    """The image with these errors in its trajectory; differentiable in them."""
+    """The image with these errors in its trajectory; differentiable in them.
+
+    **Raises:** `ValueError` for errors of the rows of a table in pieces, which no longer has
+    them."""
     attitude, position = image.trajectory.attitude.table, image.trajectory.position
+    for table, white in ((attitude, errors.attitude_white), (position, errors.position_white)):
+        if len(white) and table.pieces is not None:
+            raise ValueError("a table in pieces has no rows that errors could be added to")
     turn = _turned_angles if attitude.values.shape[1] == 3 else _turned_quaternion
     offsets = image.offsets
     return eqx.tree_at(
@@ -83,8 +90,10 @@ def disturbed(image: PushbroomImage, errors: Errors) -> PushbroomImage:
             i.trajectory.attitude.table.values, i.trajectory.position.values, i.offsets.attitude,
             i.offsets.attitude_rate, i.offsets.position, i.offsets.position_rate,
         ), image, (
-            jax.vmap(turn)(attitude.values, errors.attitude_white),
-            position.values + errors.position_white,
+            jax.vmap(turn)(attitude.values, errors.attitude_white)
+            if len(errors.attitude_white) else attitude.values,
+            position.values + errors.position_white
+            if len(errors.position_white) else position.values,
             offsets.attitude + errors.attitude_bias, offsets.attitude_rate + errors.attitude_drift,
             offsets.position + errors.position_bias, offsets.position_rate + errors.position_drift,
         ),

@@ -33,6 +33,7 @@ from jaxbundle.explore.network import NetworkView
 from jaxbundle.explore.page import Number, draw_controls, draw_tools, make_page, place
 from jaxbundle.explore.scanner import FLIGHT_FILE, PICTURE_FILE, TABLE_FILE, ScannerView
 from jaxbundle.explore.server import MOST_BYTES, Server, page_file
+from jaxbundle.explore.tracks import ORBIT, STRAIGHT, USUAL, choose_track
 from jaxbundle.explore.view import File, check_keys, number
 from jaxbundle.explore.widget import reply, show
 from jaxbundle.io.scanner.flight import read_flight
@@ -40,6 +41,7 @@ from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.network.tables import Camera
 from jaxbundle.pushbroom.accuracy import ground_errors
 from jaxbundle.pushbroom.simulate import measured_image, true_image
+from jaxbundle.pushbroom.surfaces import Plane
 from jaxbundle.report.page import Section
 from jaxbundle.report.page.scene import describe_network
 from jaxbundle.statistics.expected import expected_precision
@@ -376,7 +378,7 @@ def scanner(flight):
 def test_errors_on_the_ground_are_those_of_the_library(scanner, flight):
     """Those of linear interpolation, which the spline does not leave; and of an error of roll, as
     an offset of the attitude."""
-    truth, ground = scanner.truth, scanner._surface(0.0)
+    truth, ground = scanner.truth, Plane(level=0.0)
     places = scanner._places()
     found = scanner.answer({})
     image = measured_image(flight.flight)
@@ -409,6 +411,27 @@ def test_the_flight_file_holds_what_was_chosen(scanner, tmp_path):
     assert scanner.export(PICTURE_FILE, given).content.startswith(b"\x89PNG")
 
 
+def test_a_flight_has_an_orbit_and_a_straight_track(scanner, flight):
+    """The other track begins at usual values; the given one is that of the file."""
+    values = scanner.values({})
+    assert values["track"] == STRAIGHT and values["height"] == 500e3
+    assert choose_track(scanner.tracks, values) is flight.flight.track
+    turned = choose_track(scanner.tracks, values | {"heading": 90.0, "altitude": 900.0})
+    assert turned["start"] == [300.0, 200.0, 900.0]
+    speed = np.hypot(5.0, 60.0)
+    assert_allclose(turned["velocity"], [speed, 0, 0], atol=1e-12)
+    orbit = choose_track(scanner.tracks, values | {"track": ORBIT, "inclination": 90.0})
+    assert orbit["height"] == 500e3 and orbit["inclination"] == np.pi / 2
+    found = scanner.answer({"track": ORBIT})
+    chosen = scanner.choose(scanner.values({"track": ORBIT}))
+    assert chosen.earth is not None and {"altitude", "speed", "heading"} == set(found["idle"])
+    direct = ground_errors(chosen.image, chosen.truth, chosen.surface, *scanner._places())
+    assert_allclose(np.ravel(found["errors"]), np.hypot(*direct.T), atol=1e-6)
+    # From 500 km rather than 800 m: an error of roll grows with it.
+    rolled = scanner.answer({"track": ORBIT, "roll": 0.1})
+    assert 500e3 * np.radians(0.1) < rolled["largest"]
+
+
 def test_an_image_that_was_read_is_its_own_reference(flight):
     view = ScannerView("aircraft", measured_image(flight.flight), None)
     assert view.answer({})["rms"] == 0
@@ -420,7 +443,7 @@ def test_an_image_that_was_read_is_its_own_reference(flight):
 @pytest.mark.parametrize("given, words", [
     ({"attitude_interpolation": "splin"}, "did you mean 'spline'"),
     ({"roll": "x"}, "roll must be a finite number"), ({"attitude_rate": 0}, "above 0"),
-    ({"attitude_white": -1}, "at least 0"), ({"aberration": True}, "no value 'aberration'"),
+    ({"attitude_white": -1}, "at least 0"), ({"aberation": True}, "no value 'aberation'"),
     ({"roll": 89.9}, "ground"), ({"position_interpolation": "slerp"}, "position_interpolation"),
 ])  # fmt: skip
 def test_a_choice_that_means_nothing_is_refused(scanner, given, words):
@@ -498,8 +521,12 @@ def test_in_a_browser_a_control_changes_the_numbers(kind, network, scanner, tmp_
     try:
         with Browser(tmp_path) as browser:
             browser.open(server.address)
+            browser.until(f"document.getElementById('{part}').innerText !== ''")
             before = browser.value(f"document.getElementById('{part}').innerText")
-            assert before
+            idle = browser.value(
+                "[...document.querySelectorAll('input:disabled')].map(one => one.dataset.key)"
+            )
+            assert idle == (list(USUAL) if kind == "scanner" else [])
             if kind == "network":
                 browser.value("""(() => { const field = document.getElementById("move-Z0");
                     field.value = Number(field.value) + 0.3;
@@ -508,6 +535,7 @@ def test_in_a_browser_a_control_changes_the_numbers(kind, network, scanner, tmp_
                 browser.value(f"""(() => {{
                     const slider = document.querySelector('[data-slides="{key}"]');
                     slider.value = {value}; slider.dispatchEvent(new Event("input")); }})()""")
+                assert browser.value("document.getElementById('explore-said').textContent")
             browser.until(f"document.getElementById('{part}').innerText !== {json.dumps(before)}")
             browser.until("document.getElementById('explore-said').textContent === ''")
             assert browser.value(f"document.getElementById('{part}').innerText") != before

@@ -18,6 +18,7 @@ from jaxbundle.pushbroom.trajectory import (
     matrix_from_pitch_roll_yaw,
     orbital_frame,
     rotation_at,
+    trajectory_in_pieces,
 )
 
 rng = np.random.default_rng(1)
@@ -27,6 +28,10 @@ RATES = np.stack([np.cos(TIMES), -0.7 * np.sin(0.7 * TIMES), 2 * TIMES], 1)
 BETWEEN = np.r_[TIMES[0], rng.uniform(TIMES[0], TIMES[-1], 40), TIMES[5], TIMES[-1]]
 at = jax.jit(jax.vmap(interpolate, (None, 0)))
 turned = jax.jit(jax.vmap(attitude_at, (None, 0)))
+
+
+rates = jax.jit(jax.vmap(rate, (None, 0)))
+pieces = jax.jit(trajectory_in_pieces)
 
 
 @jax.jit
@@ -155,6 +160,23 @@ def test_normalised_polynomials(method, oracle):
     table = attitude_table(TIMES, signs * QUATERNIONS, method=method)
     peer = Rotation.from_quat(np.roll(oracle(continuous(QUATERNIONS))(BETWEEN), -1, axis=1))
     np.testing.assert_allclose(turned(table, BETWEEN), peer.as_matrix(), atol=1e-14)
+
+
+@pytest.mark.parametrize("name", [*ORACLES, "slerp"])
+def test_pieces_are_the_interpolation_itself(name):
+    """Values, rates, gaps and what is beyond the ends, of all methods by one program."""
+    method, *_ = name.split()
+    position = table_of(name if name != "slerp" else "linear", gap=1.4, extrapolate=0.1)
+    method = "spline" if method == "hermite" else method
+    attitude = attitude_table(TIMES, QUATERNIONS, method=method, gap=1.4, extrapolate=0.1)
+    given = Trajectory(position, attitude)
+    found = pieces(given)
+    ends = TIMES[0] - 0.05, TIMES[-1] + 0.05, TIMES[0] - 0.2
+    t, scale = np.r_[ends, BETWEEN][: len(BETWEEN)], np.abs(VALUES).max()
+    np.testing.assert_allclose(at(found.position, t), at(position, t), atol=1e-13 * scale)
+    np.testing.assert_allclose(rates(found.position, t), rates(position, t), atol=1e-12 * scale)
+    # A polynomial instead of sines, over steps of the given size.
+    np.testing.assert_allclose(turned(found.attitude, t), turned(attitude, t), atol=2e-9)
 
 
 def test_angles_of_the_published_order():

@@ -2,7 +2,7 @@
 
 const explored = readData("explore");
 // `collect()` gives the values, `show` what else is done with an answer.
-const explorer = { collect: readControls, show: [], busy: false, waiting: false };
+const explorer = { collect: readControls, show: [], busy: false, waiting: false, clock: 0 };
 
 function readControls() {
   const fields = document.querySelectorAll("[data-key]");
@@ -20,7 +20,22 @@ function say(words) {
   if (place !== null) place.textContent = words;
 }
 
+// Whether the program computes; what is shown is then still of the values before.
+function showWork(busy) {
+  explorer.busy = busy;
+  document.querySelector("main").setAttribute("aria-busy", busy);
+  clearInterval(explorer.clock);
+  if (!busy) return;
+  const start = Date.now();
+  say("computing …");
+  explorer.clock = setInterval(() =>
+    say(`computing … ${Math.round((Date.now() - start) / 1000)} s`), 1000);
+}
+
 function putAnswer(answer) {
+  for (const field of document.querySelectorAll("[data-key]")) {
+    if (explored.live) field.disabled = (answer.idle ?? []).includes(field.dataset.key);
+  }
   for (const [id, html] of Object.entries(answer.parts ?? {})) {
     document.getElementById(id).innerHTML = html;
   }
@@ -64,15 +79,15 @@ async function ask() {
     explorer.waiting = true;
     return;
   }
-  explorer.busy = true;
-  say("computing …");
+  showWork(true);
+  let words = "";
   try {
     putAnswer(await (await send("answer", explorer.collect())).json());
-    say("");
   } catch (error) {
-    say(error.message === "Failed to fetch" ? "the program has ended" : error.message);
+    words = error.message === "Failed to fetch" ? "the program has ended" : error.message;
   }
-  explorer.busy = false;
+  showWork(false);
+  say(words);
   if (explorer.waiting) {
     explorer.waiting = false;
     ask();

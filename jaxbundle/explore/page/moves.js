@@ -156,4 +156,5 @@ function distanceTo([x, y], [ax, ay], [bx, by]) {
 
 if (explored.kind === "network") new Moves(shown);
 connectControls();
-putAnswer(explored.answer);
+if (explored.answer.parts === undefined) ask();
+else putAnswer(explored.answer);
