@@ -110,11 +110,14 @@ def test_the_reference_of_commands_has_every_one(generated):
 
 
 def commands_of(path):
-    """The lines of code blocks that call the program, up to a pipe, a comment, or an ellipsis."""
+    """The lines of code blocks that call the program, up to a pipe or a comment; without lines that
+    show a syntax, with options in brackets."""
     text = path.read_text(encoding="utf-8")
-    for block in re.findall(r"^```(?:console|bash|sh)?\n(.*?)^```$", text, re.M | re.S):
-        for line in re.findall(r"^(?:\$ )?jaxbundle (.*)", block.replace("\\\n", " "), re.M):
-            yield re.split(r" [|>&]|  +#|…", line)[0]
+    for kind, block in re.findall(r"^```([^\n`]*)\n(.*?)^```$", text, re.M | re.S):
+        if kind in ("", "console", "bash", "sh"):
+            for line in re.findall(r"^(?:\$ )?jaxbundle (.*)", block.replace("\\\n", " "), re.M):
+                if " [" not in line:
+                    yield re.split(r" [|>&]|  +#|…", line)[0]
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))

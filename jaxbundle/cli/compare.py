@@ -15,7 +15,10 @@ SAVED = b"PK\x03\x04"
 """How a saved adjustment begins, which no file of cameras does."""
 
 
-@app.command(example="cameras.toml#1-indoor cameras.toml#1-outdoor --plot out/difference.png")
+PAIR = "examples/video_cameras/cameras.toml#1-indoor examples/video_cameras/cameras.toml#1-outdoor"
+
+
+@app.command(example=PAIR)
 def compare(
     a: Annotated[
         str, typer.Argument(

@@ -14,7 +14,10 @@ FILES = ("cloud.csv", "cloud.ply", "surface.json", "report.txt", "dsm.tif", "dsm
          "orthophoto.tif")  # fmt: skip
 
 
-@app.command(example="PROJECT.toml --photos PHOTOS --dsm 0.05 --out out/surface")
+EXAMPLE = "examples/four_photographs --photos examples/four_photographs/photos --out out/surface"
+
+
+@app.command(example=EXAMPLE)
 def surface(
     input: Annotated[
         list[Path],

@@ -11,7 +11,7 @@ from jaxbundle.errors import InputError
 OVER = "found beyond a place without height"
 
 
-@pushbroom.command(example="out/flight/scanner.toml --grid 3x3")
+@pushbroom.command(example="out/flight/scanner.toml --grid 3x3 --csv out/points.csv")
 def locate(
     scanner: ScannerFile,
     points: Annotated[Path | None, typer.Option(help="table line,pixel[,id]")] = None,

@@ -12,7 +12,7 @@ MOST = 4
 """Largest number of lines reported for one point."""
 
 
-@pushbroom.command(example="out/flight/scanner.toml --points points.csv")
+@pushbroom.command(example="out/flight/scanner.toml --points out/points.csv")
 def project(
     scanner: ScannerFile,
     points: Annotated[

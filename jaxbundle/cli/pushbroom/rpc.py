@@ -81,7 +81,7 @@ def fit(
     tell(head, json, found.check)
 
 
-@rpc.command(example="image_RPC.TXT --points points.csv")
+@rpc.command(example="out/image_RPC.TXT --points out/points.csv")
 def apply(
     coefficients: RpcFile,
     points: Annotated[
@@ -131,7 +131,7 @@ def apply(
     write_rows({"id": ids, **columns, "status": meaning}, csv, json)
 
 
-@rpc.command(example="image_RPC.TXT --control control.csv --out out/image_RPC.TXT")
+@rpc.command(example="out/image_RPC.TXT --control control.csv --out out/shifted_RPC.TXT")
 def compensate(
     coefficients: RpcFile,
     control: Annotated[
