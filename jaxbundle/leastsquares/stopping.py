@@ -35,9 +35,9 @@ NOISE_FLOOR, NOISE_FLOOR_WITHOUT_REDUNDANCY = 1e-14, 1e-12
 
 Without redundancy all residuals vanish and there is no σ0 for stopping: this wider floor is used.
 """
-NEAR = 1e-3
+NEAR = 0.1
 """Near the solution: the last step was predicted to decrease vᵀPv by less than this fraction."""
-KEPT, FALLING = 0.95, 0.1
+KEPT, FALLING = 0.95, 0.5
 """The fraction of its prediction that it must achieve, and its limit relative to the one before."""
 REFUSALS = 2
 """Number of rejected undamped steps, after damped ones settled, that means (nearly) singular."""
