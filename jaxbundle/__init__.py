@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from jaxbundle.adjustment.gradients import check_gradients as check_gradients
     from jaxbundle.batch.calibrate import BatchCalibration as BatchCalibration
     from jaxbundle.batch.calibrate import calibrate_batch as calibrate_batch
+    from jaxbundle.batch.calibrate_rigs import RigBatch as RigBatch
+    from jaxbundle.batch.calibrate_rigs import calibrate_rigs as calibrate_rigs
     from jaxbundle.bundle.adjust import adjust as adjust
     from jaxbundle.bundle.compare import AdjustmentComparison as AdjustmentComparison
     from jaxbundle.bundle.compare import compare as compare
@@ -74,6 +76,7 @@ if TYPE_CHECKING:
 _HOME = {
     "jaxbundle.adjustment": ("Problem", "make_problem", "solve"),
     "jaxbundle.batch.calibrate": ("BatchCalibration", "calibrate_batch"),
+    "jaxbundle.batch.calibrate_rigs": ("RigBatch", "calibrate_rigs"),
     "jaxbundle.bundle.adjust": ("adjust",),
     "jaxbundle.calibration": (
         "Board",

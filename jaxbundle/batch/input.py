@@ -204,8 +204,10 @@ def _usable(numbers: np.ndarray) -> np.ndarray:
     return np.abs(numbers) < LARGEST
 
 
-def pixel_model(name: str | CameraModel) -> CameraModel:
-    """The camera model with this name, or a user-defined one, if its unit is the pixel."""
+def any_model(name: str | CameraModel) -> CameraModel:
+    """The camera model with this name, or a user-defined one.
+
+    **Raises:** `InputError`."""
     if not isinstance(name, str | CameraModel):
         raise InputError(
             f"model must be a name, such as 'opencv', or a CameraModel, but is {name!r}"
@@ -216,14 +218,28 @@ def pixel_model(name: str | CameraModel) -> CameraModel:
             check_own(model)
     except ValueError as error:
         raise InputError(str(error)) from None
+    return model
+
+
+def is_plain(model: CameraModel) -> bool:
+    """Whether `calibrate_batch` has its layout: pixels, and no priors."""
+    return model.unit == "px" and not model.prior
+
+
+def pixel_model(name: str | CameraModel) -> CameraModel:
+    """The same, if `calibrate_batch` has its layout.
+
+    **Raises:** `InputError`."""
+    model = any_model(name)
     if model.unit != "px":
         raise InputError(
-            f"model {model.name!r} is in {model.unit}; a batch needs a camera in pixels"
+            f"model {model.name!r} is in {model.unit}; calibrate_batch needs a camera in pixels; "
+            "calibrate_rigs takes any"
         )
     if model.prior:
         raise InputError(
-            f"model {model.name!r} needs priors of its parameters, which a batch does not support; "
-            "calibrate it by itself"
+            f"model {model.name!r} needs priors of its parameters, which calibrate_batch does not "
+            "support; calibrate_rigs does"
         )
     return model
 

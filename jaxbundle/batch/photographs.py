@@ -23,18 +23,36 @@ from jaxbundle.io.formats import recognised_format
 from jaxbundle.io.writing.fingerprints import of_words
 from jaxbundle.measure.boards import Board
 from jaxbundle.measure.views import (
+    SUFFIXES,
     BoardViews,
     Look,
     collect_views,
     name_photographs,
     photographs,
 )
+from jaxbundle.network.columns import some
 from jaxbundle.system.workers import Failed, Workers
 
 
 def is_photograph_folder(path: str | Path) -> bool:
     """Whether an input is a folder, and none that holds a network."""
     return os.path.isdir(path) and recognised_format(Path(path)) is None
+
+
+def has_photographs(path: str | Path) -> bool:
+    """Whether a folder holds photographs itself."""
+    try:
+        return any(one.suffix.lower() in SUFFIXES for one in Path(path).iterdir())
+    except OSError:
+        return False
+
+
+def camera_folders(path: str | Path) -> list[Path]:
+    """The folders of photographs in a folder, by name."""
+    try:
+        return sorted(one for one in Path(path).iterdir() if one.is_dir() and has_photographs(one))
+    except OSError:
+        return []
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +93,7 @@ class PhotographFolders:
 
     def _views(self, folder, files, contents, died) -> BoardViews | str:
         if not files:
-            return f"{self.folders[folder]}: no photographs in this folder"
+            return _why_empty(self.folders[folder])
         looks: dict[str, Look] = {}
         first: dict[str, str] = {}
         for name, path in files.items():
@@ -96,6 +114,14 @@ class PhotographFolders:
             return name_photographs(photographs([self.folders[folder]]))
         except (InputError, OSError):
             return {}
+
+
+def _why_empty(folder) -> str:
+    inside = [one.name for one in camera_folders(folder)]
+    if not inside:
+        return "no photographs in this folder"
+    return (f"no photographs in this folder, but in {some(inside, 3, str)} in it: give --rig for "
+            "cameras on one mounting, or these folders")  # fmt: skip
 
 
 def calibrate_views(

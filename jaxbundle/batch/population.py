@@ -199,8 +199,9 @@ def _row(row: Mapping) -> dict:
 
 
 def _of_network(row: Mapping) -> dict[str, dict]:
-    """Estimates of a network that belong to no single image: free parameters of its cameras (with
-    the camera's id where there are several), mountings, boresights and the like."""
+    """Estimates of a network that are not held and belong to no single image: free parameters of
+    its cameras (with the camera's id where there are several), mountings, boresights and the
+    like."""
     found, cameras = {}, row.get("cameras") or {}
     for id, camera in cameras.items():
         for name, one in camera["parameters"].items():
@@ -209,7 +210,8 @@ def _of_network(row: Mapping) -> dict[str, dict]:
     for table, unknowns in (row.get("further_unknowns") or {}).items():
         for of, estimates in unknowns.items():
             if of not in row.get("images", {}):
-                found |= {f"{table} {of} {name}": one for name, one in estimates.items()}
+                found |= {f"{table} {of} {name}": one for name, one in estimates.items()
+                          if one["sigma"] != 0}  # fmt: skip
     return found
 
 

@@ -7,11 +7,10 @@ so that a run can be interrupted at any time. Each line contains its `settings`
 and the fingerprint of its `data`; lines with other ones are not accepted as results.
 """
 
-import dataclasses
 import itertools
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -19,35 +18,14 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxbundle.arguments import one_of, whole
-from jaxbundle.batch.calibrate import calibrate_batch
+from jaxbundle.arguments import whole
 from jaxbundle.batch.camera import LIMIT, SOLVED, STATUS
-from jaxbundle.batch.input import free_parameters, pixel_model
-from jaxbundle.batch.photographs import (
-    PhotographFolders,
-    calibrate_views,
-    is_photograph_folder,
-    of_photographs,
-)
-from jaxbundle.batch.snooping import TESTS
-from jaxbundle.batch.stacks import is_camera_stack, read_camera_stack
-from jaxbundle.bundle.adjust import adjust
-from jaxbundle.errors import InputError, NotSolvedError
-from jaxbundle.io import read_network
-from jaxbundle.io.boards.kept_corners import KeptCorners
+from jaxbundle.batch.work import WHERE_GIVEN, BatchSettings, Tell, Work, plan_works
+from jaxbundle.errors import InputError
 from jaxbundle.io.results.json_lines import JsonLines
-from jaxbundle.io.results.result_json import result_dict
-from jaxbundle.io.writing.fingerprints import of_input
 from jaxbundle.io.writing.locks import locked
-from jaxbundle.leastsquares.snooping import check_test
-from jaxbundle.measure.boards import Board, require_board
-from jaxbundle.measure.views import search_alone
-from jaxbundle.photographs.opencv import need_opencv
-from jaxbundle.system.configuration import available_cores
-from jaxbundle.system.workers import Workers
+from jaxbundle.measure.boards import Board
 
-SNOOPING = ("snooping", "significance")
-"""Settings present only in lines computed with data snooping."""
 CAMERAS_A_WRITE = 256
 NETWORKS_A_CACHE = 50
 """Compiled programs are dropped after this number of networks, to free memory."""
@@ -63,15 +41,20 @@ def run_batch(
     snooping: str | None = None,
     significance: float = 0.001,
     board: Board | None = None,
+    rig: bool = False,
+    pixel_size: float | None = None,
+    settings: Sequence[str] = (),
     part: tuple[int, int] = (1, 1),
     brief: bool = False,
     retry: bool = False,
     renew: bool = False,
     portion: int = CAMERAS_A_WRITE,
+    known: str | Path | None = None,
+    compute: bool = True,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Counter:
-    """Calibrate the cameras of `.npz` files and of folders of photographs, and adjust all other
-    inputs as networks.
+    """Calibrate the cameras and rigs of `.npz` files and of folders of photographs, and adjust all
+    other inputs as networks.
 
     **Arguments:**
 
@@ -81,11 +64,18 @@ def run_batch(
     - `snooping`, `significance`: data snooping, `"pope"`, of every camera and every network.
     - `board`: the board in the photographs; every folder without a network is then one of
       photographs of one camera. Found corners are stored in `FILE.corners` beside the file.
+    - `rig`: such a folder has a folder for every camera of a rig; photographs of one moment have
+      equal names or last numbers.
+    - `pixel_size`: mm, for a model in mm.
+    - `settings`: KEY=VALUE, of a project as with `jaxbundle adjust`; of cameras and rigs
+      `rolling_shutter.KEY` and `rig.KEY` (`calibrate_rigs`).
     - `part`: (I, N): of all cameras and networks the I-th and every N-th after it, I from 1.
     - `brief`: no poses and covariances of cameras.
     - `retry`: compute inputs without a result in the file again.
     - `renew`: compute inputs with results of other settings or other data again.
     - `portion`: cameras between two writes.
+    - `known`: another file of results; inputs in it are skipped.
+    - `compute`: False: only check, drop and count the lines of the file.
     - `progress(done, total)`: called after every write, and while photographs are searched;
       skipped inputs count as done.
 
@@ -98,22 +88,16 @@ def run_batch(
     continues.
     """
     portion = whole("portion", portion)
-    max_iterations = whole("max_iterations", max_iterations)
-    one_of("snooping", snooping, TESTS, none=True)
-    check_test(snooping, significance)
-    if board is not None:
-        require_board(board)
-        need_opencv()
     check_part(part)
+    asked = BatchSettings.of(
+        model, free, board, rig, pixel_size, settings, max_iterations, snooping, significance, brief
+    )
     for path in inputs:
         if not os.path.exists(path):
             raise InputError(f"{path}: no such file or folder")
-    options = dict(model=model, free=free, max_iterations=max_iterations)
-    if snooping is not None:
-        options |= dict(snooping=snooping, significance=significance)
     with ExitStack() as held:
         held.enter_context(locked(file))
-        works = _works(inputs, file, board, options, brief, held)
+        works = plan_works({key_of(path, file): str(path) for path in inputs}, file, asked, held)
         ours = _shares([len(work.keys) for work in works], part)
         total = sum(map(len, ours))
         lines = JsonLines(file)
@@ -122,13 +106,15 @@ def run_batch(
         if again:
             lines.drop(again)
         counts, done, networks = Counter(), 0, 0
-        for work, share in zip(works, ours):
-            chosen = np.array([i for i in share if work.keys[i] not in lines], int)
+        have = {*lines.heads} | ({*JsonLines(known).heads} if known is not None else set())
+        for work, share in zip(works, ours) if compute else ():
+            chosen = np.array([i for i in share if work.keys[i] not in have], int)
             counts["skipped"] += len(share) - len(chosen)
             done += len(share) - len(chosen)
             progress(done, total)
-            for first in range(0, len(chosen), portion):
-                some = chosen[first : first + portion].tolist()
+            step = min(portion, work.portion)
+            for first in range(0, len(chosen), step):
+                some = chosen[first : first + step].tolist()
                 rows = _rows(work, some, partial(_tell, progress, done, len(some), total))
                 lines.append(rows)
                 done += len(rows)
@@ -136,7 +122,8 @@ def run_batch(
                 networks += work.is_network
                 if work.is_network and networks % NETWORKS_A_CACHE == 0:
                     jax.clear_caches()
-    heads = (lines.heads[work.keys[i]] for work, share in zip(works, ours) for i in share)
+    keys = (work.keys[i] for work, share in zip(works, ours) for i in share)
+    heads = (lines.heads[key] for key in keys if key in lines)
     return Counter(str(head.get("status", "unknown")) for head in heads) + counts
 
 
@@ -175,98 +162,12 @@ def _shares(numbers: Sequence[int], part: tuple[int, int]) -> list[list[int]]:
     return [[i - of.start for i in of if i % part[1] == part[0] - 1] for of in own]
 
 
-Tell = Callable[[float], None]
-
-
-@dataclasses.dataclass(frozen=True)
-class _Work:
-    """The work for an input, or for all folders of photographs.
-
-    **Fields:** `keys` of its lines; their `settings`; `data`, the fingerprint of number i; `solve`,
-    the rows of some, from their numbers, telling what part of them is done; `made_of`: what the
-    fingerprint is of, in words.
-    """
-
-    keys: tuple[str, ...]
-    settings: dict
-    data: Callable[[int], str]
-    solve: Callable[[Sequence[int], Tell], Iterable[dict]]
-    made_of: str = "the measurements"
-    is_network: bool = False
-
-
-def _works(
-    inputs: Sequence[str | Path], file: str | Path, board: Board | None, options: dict, brief: bool,
-    held: ExitStack,
-) -> list[_Work]:  # fmt: skip
-    """The work of all inputs, without repetitions."""
-    works, folders = {}, {}
-    for path in map(str, inputs):
-        name = key_of(path, file)
-        if name in works or name in folders:
-            continue
-        if is_camera_stack(path):
-            works[name] = _cameras(path, name, options, brief)
-        elif board is not None and is_photograph_folder(path):
-            folders[name] = path
-        else:
-            works[name] = _network(path, name, options)
-    if board is not None and folders:
-        regular = os.path.isfile(file) or not os.path.exists(file)
-        kept = held.enter_context(KeptCorners(f"{file}.corners" if regular else ":memory:"))
-        workers = held.enter_context(Workers(search_alone, available_cores()))
-        found = PhotographFolders(tuple(folders.values()), board, kept, workers)
-        works["photographs"] = _photographed(found, tuple(folders), options, brief)
-    return [*works.values()]
-
-
-def _cameras(path: str, name: str, options: dict, brief: bool) -> _Work:
-    stack = read_camera_stack(path)
-
-    def solve(chosen, _):
-        batch = calibrate_batch(**stack.arguments(chosen), **options)
-        return [batch.row(i, brief) for i in range(len(chosen))]
-
-    keys = tuple(f"{name}#{camera}" for camera in stack.ids)
-    return _Work(keys, _settings(options, brief), stack.fingerprint, solve)
-
-
-def _photographed(
-    found: PhotographFolders, keys: tuple[str, ...], options: dict, brief: bool
-) -> _Work:
-    settings = _settings(options, brief) | {"board": repr(found.board)}
-
-    def solve(chosen, tell):
-        measured = found.measure(chosen, tell)
-        rows = {i: {"status": "bad input", "error": why}
-                for i, why in measured.items() if isinstance(why, str)}  # fmt: skip
-        views = {i: one for i, one in measured.items() if not isinstance(one, str)}
-        for i, batch, place in calibrate_views(views, options):
-            rows[i] = batch.row(place, brief, len(views[i]))
-            rows[i] |= of_photographs(views[i], brief)
-        return [rows[i] for i in chosen]
-
-    return _Work(keys, settings, found.fingerprint, solve, "its photographs")
-
-
-def _settings(options: dict, brief: bool) -> dict:
-    """Settings of the lines of cameras."""
-    free = free_parameters(pixel_model(options["model"]), options["free"])
-    return options | {"model": str(options["model"]), "free": list(free), "brief": brief}
-
-
-def _network(path: str, name: str, options: dict) -> _Work:
-    options = {key: value for key, value in options.items() if key not in ("model", "free")}
-    solve = lambda chosen, _: [network_row(path, **options) for _ in chosen]
-    return _Work((name,), options, lambda i: of_input(path), solve, "its files", True)
-
-
 def _tell(progress, done: int, number: int, total: int, part: float) -> None:
     """Of so many that are being computed a part is done."""
     progress(done + int(part * number), total)
 
 
-def _rows(work: _Work, chosen: Sequence[int], tell: Tell) -> list[dict]:
+def _rows(work: Work, chosen: Sequence[int], tell: Tell) -> list[dict]:
     # Before the computation, so that later changes are detected.
     data = [work.data(i) for i in chosen]
     return [
@@ -276,7 +177,7 @@ def _rows(work: _Work, chosen: Sequence[int], tell: Tell) -> list[dict]:
 
 
 def _again(
-    work: _Work, share: Sequence[int], lines: JsonLines, retry: bool, renew: bool
+    work: Work, share: Sequence[int], lines: JsonLines, retry: bool, renew: bool
 ) -> list[str]:
     """The keys of an input that are in the file and must be recomputed.
 
@@ -301,12 +202,12 @@ def _again(
     return [*again, *other]
 
 
-def _difference(head: dict, work: _Work, i: int) -> str:
+def _difference(head: dict, work: Work, i: int) -> str:
     """Differences in settings or data of a line, in words; empty if none."""
     old = head.get("settings")
     if not isinstance(old, dict) or "data" not in head:
         return "its line does not say what it was made of (an earlier version wrote it)"
-    for name in {**work.settings, **dict.fromkeys(SNOOPING)}:
+    for name in {**work.settings, **dict.fromkeys(WHERE_GIVEN)}:
         value = work.settings.get(name)
         # A minimum does not depend on the iteration limit.
         matters = name != "max_iterations" or head.get("status") == STATUS[LIMIT]
@@ -317,17 +218,3 @@ def _difference(head: dict, work: _Work, i: int) -> str:
 
 def _shown(value) -> str:
     return ",".join(map(str, value)) if isinstance(value, list) else str(value)
-
-
-def network_row(path: str, **options) -> dict:
-    """The status and brief result of one network (`options` of `adjust`), or the reason for a
-    failure."""
-    try:
-        result = adjust(read_network(path), **options)
-        status = "converged" if result.converged else result.termination
-        return {"status": status} | result_dict(result, brief=True)
-    except (InputError, NotSolvedError) as error:
-        status = "bad input" if isinstance(error, InputError) else "not solved"
-        return {"status": status, "error": str(error)}
-    except (ValueError, ArithmeticError, RuntimeError, OSError, MemoryError) as error:
-        return {"status": "failed", "error": f"{type(error).__name__}: {error}"}

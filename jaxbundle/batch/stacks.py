@@ -7,19 +7,26 @@
 | `image_size` | [2] | width, height |
 | `visible` | [cameras, views, points] | optional: measured points; NaN is not visible either |
 | `ids` | [cameras] | optional: names; otherwise 0, 1, 2, … |
+
+Of rigs, as of `calibrate_rigs`, with an axis more: `image_points` [rigs, cameras, epochs, points,
+2], `visible` [rigs, cameras, epochs, points], `ids` [rigs]; `image_size` [2] or [cameras, 2];
+`cameras` [cameras], optional: their names.
 """
 
 import dataclasses
 import os
 import zipfile
 import zlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
 from jaxbundle.arguments import numeric_array
+from jaxbundle.batch.calibrate_rigs import check_rigs, rigs_of_arrays
 from jaxbundle.batch.input import check_shapes, once
+from jaxbundle.batch.rigs import Rig
 from jaxbundle.errors import InputError
 from jaxbundle.io.text.stored_rows import StoredRows, find_stored_rows
 from jaxbundle.io.text.unpacking import most_unpacked
@@ -32,9 +39,9 @@ UNREADABLE = (
 """Errors of numpy and zipfile for truncated, damaged or oversized archives."""
 
 NEEDED = ("object_points", "image_points", "image_size")
-KNOWN = (*NEEDED, "visible", "ids")
-BY_CAMERA = {"object_points": 3, "image_points": 4, "visible": 3}
-"""Number of axes of arrays with one row per camera."""
+KNOWN = (*NEEDED, "visible", "ids", "cameras")
+BY_CAMERA = {"object_points": (3,), "image_points": (4, 5), "visible": (3, 4)}
+"""Numbers of axes of arrays with one row per camera, or per rig."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,8 +51,23 @@ class CameraStack:
     ids: tuple[str, ...]
     object_points: np.ndarray | StoredRows
     image_points: np.ndarray | StoredRows
-    image_size: tuple[float, ...]
+    image_size: np.ndarray
     visible: np.ndarray | StoredRows | None
+    cameras: tuple[str, ...] | None = None
+
+    @property
+    def of_rigs(self) -> bool:
+        """Whether its rows are rigs, not cameras."""
+        return self.image_points.ndim == 5
+
+    def rigs(self, chosen: Sequence[int]) -> list[Rig]:
+        """Some of the rigs; a camera is a rig of one."""
+        given = self.arguments(np.asarray(chosen))
+        xy, visible = given["image_points"], given["visible"]
+        if not self.of_rigs:
+            xy, visible = xy[:, None], None if visible is None else visible[:, None]
+        X = np.asarray(given["object_points"], float)
+        return rigs_of_arrays(X, xy.astype(float), self.image_size, visible, self.cameras)
 
     def arguments(self, chosen: np.ndarray) -> dict:
         """Arguments of `calibrate_batch` for some of the cameras."""
@@ -53,7 +75,7 @@ class CameraStack:
         return dict(
             object_points=X[chosen] if isinstance(X, StoredRows) or X.ndim == 3 else X,
             image_points=self.image_points[chosen],
-            image_size=self.image_size,
+            image_size=tuple(self.image_size.ravel().tolist()),
             visible=None if self.visible is None else self.visible[chosen],
         )
 
@@ -65,9 +87,8 @@ class CameraStack:
         xy = self.image_points[camera]
         seen = ~np.isnan(xy).any(-1) & ~np.isnan(X).any(-1)
         seen = seen if self.visible is None else seen & (self.visible[camera] != 0)
-        return of_arrays(
-            np.argwhere(seen), xy[seen], X[seen.any(0)], np.array(self.image_size)
-        )
+        shown = seen.reshape(-1, len(X)).any(0)
+        return of_arrays(np.argwhere(seen), xy[seen], X[shown], np.array(self.image_size.tolist()))
 
 
 def is_camera_stack(path: str | Path) -> bool:
@@ -99,37 +120,52 @@ def read_camera_stack(path: str | Path) -> CameraStack:
             "visible and ids"
         )
     X, xy, size = (arrays[name] for name in NEEDED)
-    visible = arrays.get("visible")
+    visible, cameras = arrays.get("visible"), _names(path, arrays, "cameras")
     try:
         for name in [n for n, array in arrays.items() if isinstance(array, np.ndarray)]:
-            if name == "ids":
+            if name in ("ids", "cameras"):
                 continue
             mask = name == "visible"
             numeric_array(name, arrays[name], "true or false" if mask else "numbers", truths=mask)
         if isinstance(X, StoredRows) and X.shape[:2] != xy.shape[:3:2]:
             X = X[np.arange(len(X))]  # the points of a view each
-        X = X if isinstance(X, StoredRows) else once(X, xy)
-        every = np.broadcast_to(np.True_, xy.shape[:3])
-        check_shapes(X, xy, size, every if visible is None else visible)
+        if xy.ndim == 5:
+            cameras, _ = check_rigs(X, xy, size, visible, cameras)
+        else:
+            X = X if isinstance(X, StoredRows) else once(X, xy)
+            every = np.broadcast_to(np.True_, xy.shape[:3])
+            check_shapes(X, xy, size, every if visible is None else visible)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    ids = arrays.get("ids", np.arange(len(xy)))
-    if ids.shape != (len(xy),):
-        raise InputError(f"{path}: ids must have the shape ({len(xy)},), but has {ids.shape}")
-    if ids.dtype.kind not in "biufUS":
-        raise InputError(f"{path}: ids must be texts or numbers, but are {ids.dtype}")
-    # Bytes become the text they are in ASCII.
-    names = np.char.decode(ids, "ascii", "replace") if ids.dtype.kind == "S" else ids
-    names = tuple(map(str, names.tolist()))
+    names = _names(path, arrays, "ids")
+    names = tuple(map(str, range(len(xy)))) if names is None else names
+    if len(names) != len(xy):
+        raise InputError(f"{path}: ids must have the shape ({len(xy)},), but has ({len(names)},)")
     if len({*names}) < len(xy):
         raise InputError(f"{path}: ids must differ, but some occur twice")
-    return CameraStack(names, X, xy, tuple(size.tolist()), visible)
+    return CameraStack(names, X, xy, size, visible, cameras)
+
+
+def _names(path: str | Path, arrays: Mapping[str, np.ndarray], name: str):
+    """An array of names, if it is there.
+
+    **Raises:** `InputError` for another one."""
+    found = arrays.get(name)
+    if found is None:
+        return None
+    if found.ndim != 1:
+        raise InputError(f"{path}: {name} must be a list, but has the shape {found.shape}")
+    if found.dtype.kind not in "biufUS":
+        raise InputError(f"{path}: {name} must be texts or numbers, but are {found.dtype}")
+    # Bytes become the text they are in ASCII.
+    texts = np.char.decode(found, "ascii", "replace") if found.dtype.kind == "S" else found
+    return tuple(map(str, texts.tolist()))
 
 
 def _rows(path: str | Path, name: str, file) -> Any:
     """An array, or on demand the rows of a large uncompressed one with one row per camera."""
     found = find_stored_rows(path, name) if name in BY_CAMERA else None
-    cameras = found is not None and found.ndim == BY_CAMERA[name]
+    cameras = found is not None and found.ndim in BY_CAMERA[name]
     truths = name == "visible"
     if found is None or not cameras or (found.dtype.kind == "b") != truths:
         return file[name]

@@ -76,7 +76,7 @@ def adjust(
     from jaxbundle.bundle.sensitivity import sensitivity
     from jaxbundle.cli.budget_given import held_of
     from jaxbundle.cli.outputs import check_targets, trace_origin, why_not, write_targets
-    from jaxbundle.cli.processes import check_sameness, join_processes
+    from jaxbundle.cli.processes import join_for_one_task
     from jaxbundle.cli.progress import iterating
     from jaxbundle.io import read_network
     from jaxbundle.io.writing.fingerprints import of_input
@@ -85,13 +85,11 @@ def adjust(
 
     jaxbundle.use_cores(cores)
     if join or cluster:
-        if join and cluster:
-            raise InputError("--join with --cluster: give one of them")
         if json in ("-", "/dev/stdout", "/dev/fd/1"):
             raise InputError(f"--json {json} with --join or --cluster: give a file; the connection "
                              "of the processes is reported on standard output")  # fmt: skip
-        first = join_processes(join, quiet)
-        check_sameness(
+        first = join_for_one_task(
+            join, cluster, quiet,
             of_input(input), control and of_input(control), set, format, max_iterations, method,
             reduction, robust, snooping, significance, eliminate, components, budget,
         )  # fmt: skip

@@ -2,6 +2,7 @@
 
 import os
 import re
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -38,6 +39,19 @@ def batch(
     kind: Annotated[str, choice(BOARDS)] = "chessboard",
     marker: Annotated[float | None, typer.Option(help="side of a charuco marker")] = None,
     dictionary: Annotated[str, typer.Option(help="of charuco markers")] = "DICT_4X4_50",
+    rig: Annotated[
+        bool,
+        typer.Option("--rig", help="folders of rigs: in each a folder of photographs a camera"),
+    ] = False,
+    pixel_size: Annotated[float | None, typer.Option(help="mm, for models in mm")] = None,
+    set: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KEY=VALUE",
+            help="of projects as of adjust; of cameras and rigs sigma_image, rig.KEY, "
+            "rolling_shutter.KEY, such as rolling_shutter.line_time=2e-5; repeatable",
+        ),
+    ] = None,
     part: Annotated[
         str, typer.Option(help="I/N: the I-th of N parts of the inputs; each has its own file")
     ] = "",
@@ -71,6 +85,16 @@ def batch(
             "--force", help="let --html and --summary replace files that are not HTML or JSON"
         ),
     ] = False,
+    join: Annotated[
+        tuple[str, int, int] | None,
+        typer.Option(
+            metavar="HOST:PORT NUMBER INDEX",
+            help="join NUMBER processes at the address of the first; each computes a part",
+        ),
+    ] = None,
+    cluster: Annotated[
+        bool, typer.Option("--cluster", help="join the processes started by srun (SLURM)")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Calibrate many cameras and adjust many networks; an interrupted run resumes.
@@ -82,6 +106,7 @@ def batch(
     refused, or recomputed with --renew. Status 0 means that every input has a line, whatever its
     status. Only one run at a time may write the file.
     """
+    from jaxbundle.batch.joined import run_joined
     from jaxbundle.batch.page import compose_batch
     from jaxbundle.batch.photographs import is_photograph_folder
     from jaxbundle.batch.population import Population, read_against
@@ -90,6 +115,7 @@ def batch(
     from jaxbundle.cli.batch_outputs import check_outputs, write_outputs
     from jaxbundle.cli.board_given import board_given
     from jaxbundle.cli.outputs import check_page, trace_files
+    from jaxbundle.cli.processes import join_for_one_task
     from jaxbundle.cli.progress import counting
     from jaxbundle.io.text.csv_tables import read_csv, write_text
 
@@ -114,15 +140,27 @@ def batch(
     if not all(is_camera_stack(one) or known and is_photograph_folder(one) for one in inputs):
         # Cameras already use the cores by threads; devices gain nothing.
         jaxbundle.use_cores()
+    compute = partial(run_batch, part=_part(part))
+    if join or cluster:
+        if part:
+            raise InputError("--part with --join or --cluster: each process computes its part")
+        compute = run_joined
+        first = join_for_one_task(
+            join, cluster, quiet, inputs, json_lines, model, free, max_iterations, snooping,
+            significance, board, square, kind, marker, dictionary, rig, pixel_size, set,
+        )  # fmt: skip
+        if not first:
+            html, table, summary, asked, quiet = "", None, None, [], True
     advise("run the same command again to resume")
     with counting(quiet) as bar:
         task = bar.add_task("batch", total=None)
-        counts = run_batch(
+        counts = compute(
             inputs, json_lines, model=model,
             free=[name.strip() for name in free.split(",")] if free else None,
             max_iterations=max_iterations,
             snooping=None if snooping == "none" else snooping, significance=significance,
-            board=known, part=_part(part), portion=portion, brief=brief, retry=retry, renew=renew,
+            board=known, rig=rig, pixel_size=pixel_size, settings=set or (),
+            portion=portion, brief=brief, retry=retry, renew=renew,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )  # fmt: skip
     if asked:
@@ -133,7 +171,8 @@ def batch(
         origin = trace_files(inputs, {
             "--model": model, "--free": free, "--max-iterations": max_iterations,
             "--snooping": snooping, "--significance": significance, "--board": board,
-            "--square": square, "--kind": kind if board else "", "--part": part,
+            "--square": square, "--kind": kind if board else "", "--rig": rig,
+            "--pixel-size": pixel_size, "--set": ", ".join(set or ()), "--part": part,
             "--against": "" if against is None else str(against),
         })  # fmt: skip
         write_text(Path(html), compose_batch(found, origin, beside))
@@ -142,11 +181,17 @@ def batch(
         said = ", ".join(f"{number} {status}" for status, number in counts.most_common() if number)
         print(f"{json_lines}: {said}" + f" ({skipped} skipped, already computed)" * bool(skipped))
         if os.path.isfile(json_lines) and any(counts[status] for status in WITH_REASON):
-            reasons = [f"{row['key']}: {row['error']}" for row in result_rows(inputs, json_lines)
-                       if row.get("error")]  # fmt: skip
+            reasons = [_reason(row) for row in result_rows(inputs, json_lines) if row.get("error")]
             print(*reasons[:MOST_REASONS], sep="\n")
             if len(reasons) > MOST_REASONS:
                 print(f'and {len(reasons) - MOST_REASONS} more: see "error" in {json_lines}')
+
+
+def _reason(row: dict) -> str:
+    """The error of a line, with its key unless it begins with the file."""
+    key, error = row["key"], row["error"]
+    named = key.rpartition("/")[2] in error.partition(":")[0]
+    return error if named else f"{key}: {error}"
 
 
 def _part(text: str) -> tuple[int, int]:

@@ -17,6 +17,18 @@ def join_processes(join: tuple[str, int, int] | None, quiet: bool) -> bool:
     return jaxbundle.join_processes(address, processes, process)
 
 
+def join_for_one_task(
+    join: tuple[str, int, int] | None, cluster: bool, quiet: bool, *given: object
+) -> bool:
+    """Join the processes of --join or --cluster, check that they are `given` the same, and return
+    whether this one writes."""
+    if join and cluster:
+        raise InputError("--join with --cluster: give one of them")
+    first = join_processes(join, quiet)
+    check_sameness(*given)
+    return first
+
+
 def check_sameness(*given: object) -> None:
     """Refuse, in all processes, inputs or options that differ between them."""
     import jax

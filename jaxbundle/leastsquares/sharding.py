@@ -8,7 +8,9 @@ GPUs, and in several processes after `jax.distributed.initialize`.
 """
 
 import dataclasses
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
 import equinox as eqx
@@ -28,6 +30,7 @@ from jaxbundle.leastsquares.solver import LeastSquares, Minimum, minimise
 from jaxbundle.types import present
 
 AXIS = "devices"
+_ALONE = ContextVar("alone", default=False)
 OBSERVATION = 3.0
 """Cost of an observation, in units of a pair of incidences."""
 
@@ -45,9 +48,24 @@ class Shards:
     mesh: Mesh
 
 
+@contextmanager
+def alone() -> Iterator[None]:
+    """Problems solved inside are those of this process only: its own devices share them."""
+    before = _ALONE.set(True)
+    try:
+        yield
+    finally:
+        _ALONE.reset(before)
+
+
+def sharing_devices() -> list:
+    """The devices that share a problem."""
+    return jax.local_devices() if _ALONE.get() else jax.devices()
+
+
 def distribute(problem: Problem, devices=None) -> Shards:
-    """Cut a problem with an eliminated table into a part for every device (all of JAX's)."""
-    devices = jax.devices() if devices is None else devices
+    """Cut a problem with an eliminated table into a part for every device."""
+    devices = sharing_devices() if devices is None else devices
     rows, seen = _cut(problem, len(devices))
     planned = [_plan_part(problem, *part) for part in zip(rows, seen)]
     sizes = common((sizes for _, sizes in planned), rounder(problem.observations))

@@ -38,7 +38,7 @@ from jaxbundle.leastsquares.rows import (
     prepare,
     residuals,
 )
-from jaxbundle.leastsquares.sharding import distribute, find_minimum_of_shards
+from jaxbundle.leastsquares.sharding import distribute, find_minimum_of_shards, sharing_devices
 from jaxbundle.leastsquares.solver import LeastSquares, Minimum, find
 from jaxbundle.leastsquares.stopping import converged
 
@@ -98,7 +98,7 @@ def _on_all_devices(problem: Problem, solver: LeastSquares):
 
 def _worth_sharing(problem: Problem, start: Values) -> bool:
     """Whether there are several devices, and rows to distribute over them."""
-    if len(jax.devices()) == 1 or problem.plan.eliminated is None:
+    if len(sharing_devices()) == 1 or problem.plan.eliminated is None:
         return False
     if sum(o.number for o in problem.observations) < TO_SHARE:
         return False

@@ -131,7 +131,7 @@ def test_what_cannot_be_compared(fisheye):
         compare_models(fisheye, models=["opencv"])
     with pytest.raises(InputError, match="Unknown camera model 'fish'"):
         compare_models(fisheye, models=["opencv", "fish"])
-    with pytest.raises(InputError, match="'spline-8x6-90' needs priors .* calibrate it by itself"):
+    with pytest.raises(InputError, match="'spline-8x6-90' needs priors .* calibrate_rigs does"):
         calibrate_batch(BOARD.points, fisheye.xy[None], SIZE, model="spline-8x6-90")
     with pytest.raises(InputError, match="4 to 40 knots either way"):
         calibrate(fisheye, model="spline-3x3-90")

@@ -11,7 +11,7 @@ import pytest
 from batch_cameras import images_of, write_cameras
 from pyarrow.parquet import read_table
 
-from jaxbundle.batch import run as batches
+from jaxbundle.batch import work
 from jaxbundle.batch.run import key_of, run_batch
 from jaxbundle.errors import InputError
 from jaxbundle.io.writing.fingerprints import of_input
@@ -155,7 +155,7 @@ def test_lines_of_odd_content_are_no_results_of_these(start):
 
 
 def test_a_rewritten_network_is_seen(tmp_path, monkeypatch):
-    monkeypatch.setattr(batches, "network_row", lambda path, **options: {"status": "converged"})
+    monkeypatch.setattr(work, "network_row", lambda *path, **options: {"status": "converged"})
     project = shutil.copytree(EXAMPLE, tmp_path / "block") / "project.toml"
     file = tmp_path / "results.jsonl"
     assert run_batch([project, project.parent], file) == {"converged": 2}
@@ -258,11 +258,10 @@ def test_a_table_as_parquet(start, command):
     assert table["fx"] == [row["parameters"]["fx"]["value"] for row in rows]
 
 
-@pytest.mark.parametrize("model", ["brown", "spline-8x6-60"])
-def test_models_a_batch_cannot_have_are_refused_by_name(images, tmp_path, model):
+def test_a_model_in_millimetres_needs_the_size_of_a_pixel(images, tmp_path):
     path = write_cameras(tmp_path / "cameras.npz", images)
-    with pytest.raises(InputError, match=f"model '{model}'"):
-        run_batch([path], tmp_path / "results.jsonl", model=model)
+    with pytest.raises(InputError, match="model 'brown' is in mm: give .*--pixel-size"):
+        run_batch([path], tmp_path / "results.jsonl", model="brown")
 
 
 @pytest.mark.further

@@ -12,7 +12,7 @@ import pytest
 import render
 from board_photographs import poses
 
-from jaxbundle.batch import run as batches
+from jaxbundle.batch import work as batches
 from jaxbundle.batch.run import run_batch
 from jaxbundle.errors import InputError
 from jaxbundle.io.boards.kept_corners import KeptCorners

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxbundle
 from jaxbundle.batch.population import Population
-from jaxbundle.batch.run import network_row
+from jaxbundle.batch.work import network_row
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa, omega_phi_kappa_from_matrix
 from jaxbundle.network.build import make_further

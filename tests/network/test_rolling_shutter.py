@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxbundle
 from jaxbundle.batch.population import Population
-from jaxbundle.batch.run import network_row
+from jaxbundle.batch.work import network_row
 from jaxbundle.cameras import get_model, project
 from jaxbundle.errors import InputError
 from jaxbundle.geometry import matrix_from_omega_phi_kappa

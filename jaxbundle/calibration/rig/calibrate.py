@@ -12,13 +12,13 @@ mounting reveals.
 """
 
 import dataclasses
-import re
 from collections.abc import Mapping
 
 import jax
 import numpy as np
 
 from jaxbundle.arguments import shown
+from jaxbundle.batch.epochs import FEWEST, contradicting, epoch_keys
 from jaxbundle.calibration.pixels import unit_size
 from jaxbundle.calibration.quality import kept_rays
 from jaxbundle.calibration.result import Calibration
@@ -31,15 +31,6 @@ from jaxbundle.leastsquares import Result
 from jaxbundle.leastsquares.snooping import check_test
 from jaxbundle.leastsquares.spaces import PoseValue
 from jaxbundle.network.columns import some
-
-FEWEST = 3
-"""Minimum number of epochs shared by two cameras."""
-CONTRADICTS, LEAST_CONTRADICTION = 3.0, 1.0
-"""An epoch is excluded if its RMS exceeds this multiple of the median of all, and this many
-pixels."""
-WORST = 0.5
-"""One round excludes epochs with an RMS above this fraction of the largest: the worst affect
-others."""
 
 
 def calibrate_rig(
@@ -109,42 +100,6 @@ def require_solved(found: Result) -> Result:
             list(names),
         )  # fmt: skip
     return found
-
-
-def epoch_keys(names: Mapping[str, tuple[str, ...]]) -> dict[str, list[str]]:
-    """The epoch of every photograph of every camera: equal file names, or equal last numbers.
-
-    **Raises:** `InputError` if neither pairs them.
-    """
-    whole = lambda name: re.sub(r"\.\w+$", "", name.rsplit("/", 1)[-1])
-
-    def number(name):
-        found = re.findall(r"\d+", whole(name))
-        return found[-1].lstrip("0") or "0" if found else ""
-
-    for key in (whole, number):
-        keys = {camera: [key(name) for name in given] for camera, given in names.items()}
-        once = all("" not in k and len({*k}) == len(k) for k in keys.values())
-        first, *others = ({*k} for k in keys.values())
-        if once and all(len(first & other) >= min(FEWEST, len(first)) for other in others):
-            return keys
-        if once and len(keys) > 2 and _connected(keys):
-            return keys
-    shown = "; ".join(f"{camera}: {some(given, 2)}" for camera, given in names.items())
-    raise InputError(
-        f"the photographs of the cameras cannot be paired by their names ({shown}): name those of "
-        "one moment alike, or give them the same last number"
-    )
-
-
-def _connected(keys) -> bool:
-    """Whether every camera shares epochs with the first, directly or through others."""
-    sets = {name: {*k} for name, k in keys.items()}
-    reached = [next(iter(sets))]
-    for name in reached:
-        reached += [other for other in sets if other not in reached
-                    and len(sets[name] & sets[other]) >= FEWEST]  # fmt: skip
-    return len(reached) == len(sets)
 
 
 def _poses(calibrations, keys):
@@ -230,7 +185,5 @@ def _contradictions(rig: Rig, found, size):
     np.add.at(number, (rig.epoch, rig.camera), used_rays(rig, found.problem))
     rays = number.sum(1)
     rms = np.sqrt(np.bincount(rig.epoch, (v**2).sum(1), len(rays)) / np.maximum(rays, 1))
-    limit = max(CONTRADICTS * float(np.median(rms[rays > 0])), LEAST_CONTRADICTION)
-    rms = np.where((number > 0).sum(1) > 1, rms, 0.0)
-    bad = np.flatnonzero(rms > max(limit, WORST * rms.max()))
+    bad = contradicting(rms, rays > 0, (number > 0).sum(1) > 1)
     return {int(e): float(rms[e]) for e in bad}

@@ -1,0 +1,73 @@
+"""Epochs of a rig: which photographs are simultaneous, and which contradict the mounting.
+
+Simultaneous photographs have equal file names, or else equal last numbers in them (left_017.jpg,
+right_017.jpg).
+"""
+
+import re
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxbundle.errors import InputError
+from jaxbundle.network.columns import some
+
+FEWEST = 3
+"""Minimum number of epochs shared by two cameras."""
+CONTRADICTS, LEAST_CONTRADICTION = 3.0, 1.0
+"""An epoch is excluded if its RMS exceeds this multiple of the median of all, and this many
+pixels."""
+WORST = 0.5
+"""One round excludes epochs with an RMS above this fraction of the largest: the worst affect
+others."""
+
+
+def contradicting(
+    rms: Float[np.ndarray, " epochs"],
+    seen: Bool[np.ndarray, " epochs"],
+    shared: Bool[np.ndarray, " epochs"],
+) -> Int[np.ndarray, " bad"]:
+    """Epochs that contradict the mounting; `rms` in pixels, `seen` by any camera, `shared` by
+    several."""
+    if not shared.any():
+        return np.zeros(0, int)
+    limit = max(CONTRADICTS * float(np.median(rms[seen])), LEAST_CONTRADICTION)
+    rms = np.where(shared, rms, 0.0)
+    return np.flatnonzero(rms > max(limit, WORST * rms.max()))
+
+
+def epoch_keys(names: Mapping[str, tuple[str, ...]]) -> dict[str, list[str]]:
+    """The epoch of every photograph of every camera: equal file names, or equal last numbers.
+
+    **Raises:** `InputError` if neither pairs them.
+    """
+    whole = lambda name: re.sub(r"\.\w+$", "", name.rsplit("/", 1)[-1])
+
+    def number(name):
+        found = re.findall(r"\d+", whole(name))
+        return found[-1].lstrip("0") or "0" if found else ""
+
+    for key in (whole, number):
+        keys = {camera: [key(name) for name in given] for camera, given in names.items()}
+        once = all("" not in k and len({*k}) == len(k) for k in keys.values())
+        first, *others = ({*k} for k in keys.values())
+        if once and all(len(first & other) >= min(FEWEST, len(first)) for other in others):
+            return keys
+        if once and len(keys) > 2 and _connected(keys):
+            return keys
+    shown = "; ".join(f"{camera}: {some(given, 2)}" for camera, given in names.items())
+    raise InputError(
+        f"the photographs of the cameras cannot be paired by their names ({shown}): name those of "
+        "one moment alike, or give them the same last number"
+    )
+
+
+def _connected(keys) -> bool:
+    """Whether every camera shares epochs with the first, directly or through others."""
+    sets = {name: {*k} for name, k in keys.items()}
+    reached = [next(iter(sets))]
+    for name in reached:
+        reached += [other for other in sets if other not in reached
+                    and len(sets[name] & sets[other]) >= FEWEST]  # fmt: skip
+    return len(reached) == len(sets)

@@ -1,0 +1,130 @@
+"""A batch in several processes that JAX's own distribution has joined, on one machine or several
+that see the same folder.
+
+JAX tells every process its number, and ends all of them when one is lost. Each computes its part of
+the inputs (`run_batch`) into a file of its own beside that of the results; the first adds the parts
+to the results, in the order of the inputs, and removes them. Parts of a run that was ended are
+added by the next one, whatever the number of its processes. The processes wait for each other by
+files, since a collective waits for half a minute only.
+"""
+
+import glob
+import os
+import re
+import shutil
+import time
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import ExitStack
+from itertools import chain, zip_longest
+from pathlib import Path
+
+import jax
+import numpy as np
+from jax.experimental.multihost_utils import broadcast_one_to_all
+
+from jaxbundle.batch.run import run_batch
+from jaxbundle.errors import InputError, NotSolvedError
+from jaxbundle.io.results.json_lines import JsonLines
+from jaxbundle.io.writing.locks import locked
+from jaxbundle.leastsquares.sharding import alone
+
+ROWS_AT_ONCE = 256
+PAUSE = 0.2
+"""Seconds between two looks for the files of other processes."""
+
+
+def run_joined(inputs: Sequence[str | Path], file: str | Path, **options) -> Counter:
+    """As `run_batch`, in processes joined by `jaxbundle.join_processes`, which have the same
+    arguments and see the same folder of results; afterwards they are no longer joined.
+
+    **Returns:** in the first process as `run_batch`; in the others nothing.
+
+    **Raises:** also `NotSolvedError` if another process has failed.
+    """
+    if os.path.exists(file) and not os.path.isfile(file):
+        raise InputError(f"{file}: joined processes write parts beside it; a file is expected")
+    number, index = jax.process_count(), jax.process_index()
+    token = int(broadcast_one_to_all(np.array(time.time_ns() % 10**9)))
+    waiting = f"{file}.joined-{token}"
+    own = {key: value for key, value in options.items() if key not in ("retry", "renew")}
+    failed, counts = None, Counter()
+    if index == 0:
+        _clear(file, waiting)
+    try:
+        if index == 0:
+            _add_parts(file)
+            run_batch(inputs, file, compute=False, **options)
+            _tell(waiting, "begin")
+        if not _wait(waiting, ["begin"])["begin"]:
+            part = f"{file}.part-{index + 1}-of-{number}"
+            with alone():
+                run_batch(inputs, part, part=(index + 1, number), known=file, **own)
+    except Exception as error:
+        failed = error
+        if index == 0:
+            _tell(waiting, "begin", str(error))
+    _tell(waiting, str(index), str(failed or ""))
+    others = _wait(waiting, list(map(str, range(number))))
+    jax.distributed.shutdown()  # A barrier: from here every process is on its own.
+    if index == 0:
+        shutil.rmtree(waiting, ignore_errors=True)
+    if failed is not None:
+        raise failed
+    for other, why in others.items():
+        if why:
+            raise NotSolvedError(f"process {other} of the joined ones has failed: {why}")
+    if index == 0:
+        _add_parts(file)
+        counts = run_batch(inputs, file, compute=False, **own)
+    return counts
+
+
+def _clear(file: str | Path, waiting: str) -> None:
+    """Remove what a run that was ended has left, and make the folder of this one."""
+    for path in glob.glob(f"{glob.escape(str(file))}.joined-*"):
+        shutil.rmtree(path, ignore_errors=True)
+    try:
+        os.mkdir(waiting)
+    except OSError as error:
+        raise InputError(f"{waiting}: cannot be made: {error.strerror}") from None
+
+
+def _tell(waiting: str, name: str, words: str = "") -> None:
+    path = Path(waiting, f".{name}")
+    path.write_text(words)
+    path.rename(Path(waiting, name))
+
+
+def _wait(waiting: str, names: Sequence[str]) -> dict[str, str]:
+    """What each of these has told, when all have."""
+    while True:
+        found = {name: Path(waiting, name).read_text() for name in names
+                 if Path(waiting, name).exists()}  # fmt: skip
+        if len(found) == len(names):
+            return found
+        time.sleep(PAUSE)
+
+
+def _add_parts(file: str | Path) -> None:
+    """Add the lines of all parts beside a file of results to it, and remove the parts.
+
+    **Raises:** `InputError` while a run writes one of them."""
+    found = [(int(end[1]), path) for path in glob.glob(f"{glob.escape(str(file))}.part-*")
+             if (end := re.search(r"\.part-(\d+)-of-\d+$", path))]  # fmt: skip
+    with ExitStack() as held:
+        held.enter_context(locked(file))
+        for _, path in found:
+            held.enter_context(locked(path))
+        parts = [JsonLines(path) for _, path in sorted(found)]
+        lines, some = JsonLines(file), []
+        in_turn = chain.from_iterable(zip_longest(*(part.rows(part.heads) for part in parts)))
+        for row in in_turn:
+            if row is not None and row["key"] not in lines:
+                some.append(row)
+            if len(some) == ROWS_AT_ONCE:
+                lines.append(some)
+                some = []
+        lines.append(some)
+        for _, path in found:
+            os.remove(path)
