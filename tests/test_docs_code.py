@@ -12,10 +12,10 @@ import jaxbundle
 ROOT = Path(__file__).parents[1]
 
 
-def run_page(name: str) -> dict:
-    """The names that the Python blocks of a page leave behind."""
+def run_page(name: str, **given) -> dict:
+    """The names that the Python blocks of a page leave behind; `given`: the reader's own."""
     text = (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
-    names: dict = {}
+    names: dict = dict(given)
     blocks = re.findall(r"^```python\n(.*?)^```$", text, re.M | re.S)
     assert blocks
     for code in blocks:
@@ -41,6 +41,29 @@ def test_statistics():
 def test_start():
     page = run_page("start")
     assert page["result"].redundancy == 23
+
+
+@pytest.mark.further
+def test_coming_from():
+    """Views projected by OpenCV come back with its camera and its poses."""
+    import cv2
+
+    board = np.zeros((54, 3), np.float32)
+    board[:, :2] = 0.03 * np.mgrid[:9, :6].reshape(2, -1).T
+    K, k = np.array([[800.0, 0, 321], [0, 805, 243], [0, 0, 1]]), np.array([-0.2, 0.05, 0, 0, 0])
+    turns = [(0.3, -0.2, 0.1), (-0.4, 0.1, 1.5), (0.1, 0.5, -0.2), (0.5, 0.4, 0.0), (-0.2, -0.5, 3)]
+    tvecs = [(-0.1 + 0.02 * i, -0.08, 0.5 + 0.05 * i) for i in range(5)]
+    views = [cv2.projectPoints(board, np.array(r, float), np.array(t), K, k)[0]
+             for r, t in zip(turns, tvecs)]  # fmt: skip
+    page = run_page(
+        "howto/coming_from", objpoints=[board] * 5, imgpoints=views, image_size=(640, 480)
+    )
+    values = dict(zip(page["found"].parameters, page["found"].values[0]))
+    assert [values[n] for n in ("fx", "fy", "cx", "cy", "k1")] == pytest.approx(
+        [800, 805, 321, 243, -0.2], rel=1e-3
+    )
+    assert page["tvecs"] == pytest.approx(np.array(tvecs), abs=1e-4)
+    assert page["R"][1] == pytest.approx(cv2.Rodrigues(np.array(turns[1]))[0], abs=1e-4)
 
 
 @pytest.mark.further

@@ -14,7 +14,8 @@ SHELLS = ("bash", "zsh", "fish")
 
 
 class Place(NamedTuple):
-    """A command: the words that lead to it, the commands below it, its options and their words."""
+    """A command: the words that lead to it, the commands below it (or the words that an argument is
+    one of), its options."""
 
     words: tuple[str, ...]
     below: tuple[str, ...]
@@ -43,8 +44,11 @@ def walk(command: Any, context: Any, words: tuple[str, ...]) -> Iterator[Place]:
     """All commands, from the program down."""
     options: dict[str, tuple[str, ...]] = {}
     flags, helps = set(), {}
+    below = dict(getattr(command, "commands", {}))
+    named = list(below)
     for parameter in command.get_params(context):
         if parameter.param_type_name != "option":
+            named += [i.value for i in parameter.shell_complete(context, "") if i.type == "plain"]
             continue
         for name in (*parameter.opts, *parameter.secondary_opts):
             words_of = () if parameter.is_flag else parameter.shell_complete(context, "")
@@ -52,8 +56,7 @@ def walk(command: Any, context: Any, words: tuple[str, ...]) -> Iterator[Place]:
             helps[name] = (parameter.help or "").split("; ")[0]
             if parameter.is_flag:
                 flags.add(name)
-    below = dict(getattr(command, "commands", {}))
-    yield Place(words, tuple(below), options, frozenset(flags), helps)
+    yield Place(words, tuple(named), options, frozenset(flags), helps)
     for name, one in below.items():
         yield from walk(one, type(context)(one, parent=context, info_name=name), (*words, name))
 

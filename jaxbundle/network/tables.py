@@ -86,6 +86,18 @@ def units_of(cameras: Iterable[Camera]) -> str:
     return "/".join(sorted({get_model(camera.model).unit for camera in cameras}))
 
 
+def _fill_masked(table: Any) -> None:
+    """Masked numbers become NaN, which the checks refuse with their row."""
+    for field in dataclasses.fields(table):
+        value = getattr(table, field.name)
+        if not isinstance(value, np.ma.MaskedArray):
+            continue
+        if value.dtype.kind != "f" and np.ma.is_masked(value):
+            raise InputError(f"{table.source.name}: {field.name} has masked values; give all")
+        filled = value.filled(np.nan) if value.dtype.kind == "f" else value.data
+        object.__setattr__(table, field.name, filled)
+
+
 @shows_itself
 @dataclasses.dataclass(frozen=True)
 class Images:
@@ -97,6 +109,7 @@ class Images:
     angles: Float[np.ndarray, "images 3"]
     sigma: Float[np.ndarray, "images 6"]
     source: Source = Source("images")
+    __post_init__ = _fill_masked
 
     def __len__(self) -> int:
         return len(self.id)
@@ -120,6 +133,7 @@ class Points:
     position: Float[np.ndarray, "points 3"]
     sigma: Float[np.ndarray, "points 3"]
     source: Source = Source("points")
+    __post_init__ = _fill_masked
 
     def __len__(self) -> int:
         return len(self.id)
@@ -147,6 +161,7 @@ class Observations:
     xy: Float[np.ndarray, "rays 2"]
     sigma: Float[np.ndarray, "rays 2"]
     source: Source = Source("observations")
+    __post_init__ = _fill_masked
 
     def __len__(self) -> int:
         return len(self.image)
@@ -168,6 +183,7 @@ class Distances:
     value: Float[np.ndarray, " distances"]
     sigma: Float[np.ndarray, " distances"]
     source: Source = Source("distances")
+    __post_init__ = _fill_masked
 
     def __len__(self) -> int:
         return len(self.value)

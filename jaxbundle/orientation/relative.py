@@ -11,7 +11,7 @@ to first order the least corrections of all four coordinates (Sampson, 1982).
 
 Two simpler explanations are tried. If a rotation alone explains the rays with a variance less than
 `SIMPLER` times that of the relative orientation (and of a homography), there is no significant
-base; if a homography does, the object is a plane, of which eight points say nothing.
+base; if a homography does, the object is a plane, on which eight points do not suffice.
 """
 
 import equinox as eqx

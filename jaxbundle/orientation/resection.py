@@ -48,7 +48,7 @@ def resection(
     **Returns:** the cofactors times σ0² are the covariance. `status`: `COLLINEAR_POINTS`,
     `NO_SOLUTION`, `DANGER_CYLINDER` (the normal matrix is singular: the centre is on the right
     cylinder over the circle of three points, or on one cubic curve of such a cylinder with all of
-    more), `BEHIND_THE_CAMERA`. A centre near it is told by its cofactors.
+    more), `BEHIND_THE_CAMERA`. The cofactors of a centre near it show this.
     """
     p = ones_unless(weights, xy)
     chosen = wide_triangle(xy, p)

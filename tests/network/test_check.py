@@ -172,6 +172,17 @@ def test_an_empty_table_an_index_outside_and_a_wrong_shape_are_refused():
         check_network(good.replace(points=short))
 
 
+def test_masked_numbers_given_directly_are_missing_ones():
+    """Without a warning of numpy, which the tests would raise."""
+    valid = network()
+    rays = valid.observations
+    hidden = np.ma.masked_array(rays.xy, np.arange(rays.xy.size).reshape(rays.xy.shape) == 3)
+    with pytest.raises(InputError, match="observations, row 2: y of point 'p1'.* is nan"):
+        check_network(valid.replace(observations=dataclasses.replace(rays, xy=hidden)))
+    with pytest.raises(InputError, match="observations: point has masked values"):
+        dataclasses.replace(rays, point=np.ma.masked_equal(rays.point, 2))
+
+
 def test_control_points_without_sigma_become_fixed_and_without_axes_tie():
     given = tables()
     given["points"][0].update(CONTROL)

@@ -120,15 +120,16 @@ def _whole(result, used) -> str:
 
 def _unknowns(result) -> Section:
     """The changes of the unknowns with σ and prior, and their correlations."""
-    rows = []
-    for name, value, s, p in zip(
-        result.names, result.estimate, result.inspection.sigma, result.prior_sigma
+    rows, shows_matrix = [], 1 < len(result.names) <= MOST_CORRELATED
+    numbered = [f"{i}: {name}" if shows_matrix else str(name)
+                for i, name in enumerate(result.names, 1)]  # fmt: skip
+    for said, name, value, s, p in zip(
+        numbered, result.names, result.estimate, result.inspection.sigma, result.prior_sigma
     ):
         prior = "free" if np.isinf(p) else f"{p * name.factor:.4g}"
-        rows.append((str(name), *estimate(value * name.factor, s * name.factor), prior, name.unit))
+        rows.append((said, *estimate(value * name.factor, s * name.factor), prior, name.unit))
     parts = [grid(("unknown", "change", "σ", "σ of prior", "unit"), rows)]
-    if 1 < len(rows) <= MOST_CORRELATED:
-        numbered = [f"{i}: {name}" for i, name in enumerate(result.names, 1)]
+    if shows_matrix:
         parts += ["<h3>Correlations in %</h3>\n",
                   show_correlations(numbered, result.correlation, range(1, len(rows) + 1))]
     return Section("unknowns", "Unknowns of the images", "".join(parts), "Unknowns", True)

@@ -96,14 +96,14 @@ def _distortion(adjustment, camera: str) -> str:
 
 
 def show_correlations(
-    names: Sequence[str], correlations: np.ndarray, columns: Sequence[object] = ()
+    names: Sequence[str], correlations: np.ndarray, short: Sequence[object] = ()
 ) -> str:
-    """The lower triangle of a correlation matrix in %, and a list of those over 90 %; `columns`:
-    shorter names, for the header."""
-    C = 100 * np.asarray(correlations)
+    """The lower triangle of a correlation matrix in %, and a list of those over 90 %; `short`:
+    names for the matrix, such as numbers."""
+    C, short = 100 * np.asarray(correlations), short or names
     rows = [
         (name, *(fixed(C[i, j], 0) for j in range(i + 1)), *[""] * (len(names) - i - 1))
-        for i, name in enumerate(names)
+        for i, name in enumerate(short)
     ]
     strong = [
         f"{names[i]} and {names[j]} {fixed(C[i, j], 1)} %"
@@ -111,7 +111,7 @@ def show_correlations(
         if abs(C[i, j]) > 90
     ]  # fmt: skip
     note = f"Over 90 %: {', '.join(strong)}." if strong else "None is over 90 %."
-    return grid(("", *(columns or names)), rows, "matrix") + paragraph(note)
+    return grid(("", *short), rows, "matrix") + paragraph(note)
 
 
 def residuals(adjustment) -> Section:
