@@ -26,7 +26,7 @@ from jaxbundle.leastsquares.reduction import FACTORS
 from jaxbundle.leastsquares.reliability import reliability
 from jaxbundle.leastsquares.retraction import retract
 from jaxbundle.leastsquares.rows import Data, Declared, Values, fill_places, lay_out_data
-from jaxbundle.types import AnyArray
+from jaxbundle.types import AnyArray, present
 
 
 class Precision(eqx.Module):
@@ -57,10 +57,15 @@ def precision(
     declared, plan, data = problem.declared, problem.plan, given_data(problem, data)
 
     def functions(change):
-        moved = without_filling(problem, retract(declared, plan, data.start, change))
-        return jnp.zeros(0) if of is None else jnp.ravel(of(moved))
+        return jnp.ravel(
+            present(of)(without_filling(problem, retract(declared, plan, data.start, change)))
+        )
 
-    rows = jax.jacrev(functions)(zero_tangent(plan))
+    still = zero_tangent(plan)
+    if of is None:
+        rows = jax.tree.map(lambda x: jnp.zeros((0, *x.shape)), still)
+    else:
+        rows = jax.jacrev(functions)(still)
     own, covariance = covariances(declared, plan, data, rows)
     found = Precision(without_filling(problem, own), covariance)
     return jax.tree.map(lambda C: sigma0**2 * C, found)

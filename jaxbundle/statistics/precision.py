@@ -12,6 +12,8 @@ Source: Grafarend (1974), Bollettino di Geodesia 33: design of first order (conf
 second order (weights, P).
 """
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -129,28 +131,35 @@ def redundancy(problem: Problem, data: Data | None = None) -> Rows:
 
 def predicted(problem: Problem, data: Data) -> Data:
     """The data with image coordinates predicted from the given values."""
-    space, values, xy = Pose(), data.start, data.image_xy
-    poses = PoseValue(values.position, values.rotation)
+    xy = data.image_xy
     for table in problem.layout.cameras:
-        model = cameras.get_model(table.model)
         rows = np.flatnonzero(np.isin(problem.camera, table.cameras))
-
-        def one(pose, interior, point, model=model):
-            return jnp.stack(cameras.project(model, interior, *space.prepare(pose).ray(point)))
-
-        at = lambda x, index, rows=rows: jax.tree.map(lambda x: x[index[rows]], x)
-        interior = values.camera[problem.camera[rows], : len(table.parameters)]
-        found = jax.vmap(one)(at(poses, problem.image), interior, at(values.point, problem.point))
-        xy = jnp.asarray(xy).at[rows].set(found)
+        touched = (index[rows] for index in (problem.image, problem.camera, problem.point))
+        xy = _projected(cameras.get_model(table.model), data.start, xy, rows, *touched)
     return eqx.tree_at(lambda d: d.image_xy, data, xy)
 
 
-def _root(variance):
-    """σ, with derivative 0 where it is 0; NaN stays NaN."""
-    none = variance <= ROUNDING * jax.lax.stop_gradient(jnp.max(variance, initial=0.0))
+@partial(jax.jit, static_argnums=0)
+def _projected(model, values: Values, xy, rows, image, camera, point):
+    """The image coordinates with those of `rows` computed."""
+
+    def one(pose, interior, X):
+        interior = interior[: len(model.parameters)]
+        return jnp.stack(cameras.project(model, interior, *Pose().prepare(pose).ray(X)))
+
+    poses = PoseValue(values.position[image], values.rotation[image])
+    found = jax.vmap(one)(poses, values.camera[camera], values.point[point])
+    return jnp.asarray(xy).at[rows].set(found)
+
+
+@jax.jit
+def _root(variance, rounding=ROUNDING):
+    """σ, with derivative 0 where it is 0; NaN stays NaN. `rounding`: see `ROUNDING`."""
+    none = variance <= rounding * jax.lax.stop_gradient(jnp.max(variance, initial=0.0))
     return jnp.where(none, 0.0, jnp.sqrt(jnp.where(none, 1.0, variance)))
 
 
+@jax.jit
 def image_variances(angles, rotation, Q):
     """Variances [images, 6] of X0, Y0, Z0 and of ω, φ, κ near `angles`, by the Jacobian of the
     angles; `Q`: cofactors of the poses, `rotation`: their quaternions."""
@@ -164,8 +173,13 @@ def image_variances(angles, rotation, Q):
 def _camera_sigma(problem: Problem, values: Values, own):
     sigma = jnp.zeros_like(values.camera)
     for table in problem.layout.cameras:
-        variance = jnp.diagonal(own[table.name], axis1=1, axis2=2)
-        root = jnp.where(variance <= 0, 0.0, jnp.sqrt(jnp.where(variance <= 0, 1.0, variance)))
-        columns, of = map(list, problem.system.table(table.name).vector.moves)
-        sigma = sigma.at[table.cameras[:, None], columns].set(root[:, of])
+        moves = map(np.array, problem.system.table(table.name).vector.moves)
+        sigma = _with_cameras(sigma, own[table.name], np.asarray(table.cameras), *moves)
     return sigma
+
+
+@jax.jit
+def _with_cameras(sigma, Q, rows, columns, of):
+    """σ of all cameras with those of a table."""
+    root = _root(jnp.diagonal(Q, axis1=1, axis2=2), 0.0)
+    return sigma.at[rows[:, None], columns].set(root[:, of])
