@@ -1,9 +1,12 @@
 """The population of a batch: distribution of its cameras, outliers, correlations of parameters.
 
 A parameter of a camera is outlying if it is more than `APART` robust standard deviations
-(1.4826 times the median absolute deviation) from the median of the converged cameras; likewise a
-high RMS. Correlation with a serial number or a date is Spearman's rank correlation (1904), with the
-p-value from
+from the median of the converged cameras; likewise a high RMS. The robust standard deviation s is
+1.4826 times the median absolute deviation; for a camera known worse than most it is
+√(s² + σ² − σ_m²), with its σ and their median σ_m: it may be as far off by its measurements.
+
+Correlation with a serial number or a date is Spearman's rank correlation (1904), with the p-value
+from
 
     t = r·√((n − 2)/(1 − r²))   ~   Student's t with n − 2 degrees of freedom.
 """
@@ -63,8 +66,9 @@ class Population:
         of = lambda name, what: numbers(row["parameters"].get(name, {}).get(what) for row in kept)
         self.values = {name: of(name, "value") for name in names}
         self.sigma = {name: of(name, "sigma") for name in names}
-        self.apart = {name: np.abs(self._apart(values)) for name, values in self.values.items()}
-        self.rms_apart = self._apart(self.numbers["rms"])
+        self.apart = {name: np.abs(self._apart(values, self.sigma[name]))
+                      for name, values in self.values.items()}  # fmt: skip
+        self.rms_apart = self._apart(self.numbers["rms"], np.zeros(len(kept)))
 
     def __len__(self) -> int:
         return len(self.keys)
@@ -87,10 +91,13 @@ class Population:
         middle = float(np.median(found))
         return middle, OF_DEVIATION * float(np.median(np.abs(found - middle)))
 
-    def _apart(self, values: np.ndarray) -> np.ndarray:
+    def _apart(self, values: np.ndarray, sigma: np.ndarray) -> np.ndarray:
         middle, deviation = self.spread(values)
-        known = np.isfinite(values).sum() >= FEWEST and deviation > 0
-        return (values - middle) / deviation if known else np.full(len(values), np.nan)
+        if np.isfinite(values).sum() < FEWEST or not deviation > 0:
+            return np.full(len(values), np.nan)
+        usual = np.nan_to_num(self.spread(sigma)[0])
+        worse = np.maximum(np.nan_to_num(sigma) ** 2 - usual**2, 0.0)
+        return (values - middle) / np.sqrt(deviation**2 + worse)
 
     @property
     def farthest(self) -> np.ndarray:

@@ -32,6 +32,9 @@ from jaxbundle.geometry import matrix_from_rotation_vector
 from jaxbundle.leastsquares.small import minimise
 from jaxbundle.types import Numbers
 
+SAME_RAY = 1e-6
+"""Directions that differ by less, radians, are the same."""
+
 
 @shows_itself
 @dataclasses.dataclass(frozen=True)
@@ -111,7 +114,7 @@ def compare_cameras(
     shift, step = between_frames(other, source, image_size, pixel_size)
     rays = rays_of(source, values, xy)
     back = np.abs(images_of(source, values, rays) - xy).max(1) < 1e-9 * np.ptp(xy)
-    seen = back & np.isfinite(images_of(other, others, rays)).all(1)
+    seen = back & _unfolded(other, others, rays)
     if seen.sum() < 3:
         raise ValueError("no part of the image has a ray in both calibrations")
     near = seen & (np.linalg.norm(xy - xy.mean(0), axis=1) <= radius)
@@ -164,6 +167,16 @@ def difference_rings(comparison: Comparison, step: float) -> dict[str, np.ndarra
         "tangential": of(np.mean, tangential), "rms": of(lambda v: np.sqrt(np.mean(v**2)), length),
         "largest": of(np.max, length), "points": of(len, length),
     }  # fmt: skip
+
+
+def _unfolded(model: CameraModel, values: Mapping[str, float], rays) -> np.ndarray:
+    """Which rays have an image that belongs to no other ray: a polynomial turns back, and beyond
+    that radius its images are those of rays nearer to the axis."""
+    images = images_of(model, values, rays)
+    there = np.all(np.isfinite(images), axis=1)
+    back = rays_of(model, values, np.where(there[:, None], images, np.nan))
+    unit = lambda v: v / np.linalg.norm(v, axis=1, keepdims=True)
+    return there & (np.linalg.norm(unit(back) - unit(rays), axis=1) < SAME_RAY)
 
 
 @partial(jax.jit, static_argnums=0)

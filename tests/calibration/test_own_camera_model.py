@@ -91,7 +91,7 @@ def test_start_values_of_any_formula():
 def test_what_is_refused():
     views = simulated()
     model = CameraModel("division-mm", ("c", "x0", "y0", "L"), correct=division)
-    with pytest.raises(InputError, match="model 'division-mm' is in mm; a batch needs"):
+    with pytest.raises(InputError, match="model 'division-mm' is in mm; calibrate_batch needs"):
         calibrate_batch(taken.BOARD.points, views.xy[None], (480, 360), model=model)
     with pytest.raises(InputError, match="'wrong': distort.*must take the parameters"):
         calibrate(views, model=CameraModel("wrong", ("f",), distort=lambda x: x, unit="px"))

@@ -99,3 +99,18 @@ def test_rings():
 def test_sizes_that_are_needed():
     with pytest.raises(ValueError, match="image_size is needed"):
         compare_cameras((OPENCV, A), (OPENCV, A))
+
+
+def test_where_a_polynomial_turns_back_there_is_no_difference():
+    """g = r·(1 + k1·r²) turns back at r² = −1/(3·k1): rays beyond have an image of others. A second
+    camera whose polynomial turns back inside the image has no values beyond, and as large a
+    difference elsewhere as the formula says."""
+    a = dict(fx=500.0, fy=500.0, cx=639.5, cy=359.5)
+    folds = dict(a, k1=-0.3)
+    found = compare_cameras((OPENCV, a), (OPENCV, folds), image_size=SIZE, rotate=False)
+    r = np.hypot(*np.meshgrid(found.x - 639.5, found.y - 359.5)) / 500
+    turn = np.sqrt(1 / 0.9)
+    known = np.isfinite(found.length)
+    assert known[r < 0.98 * turn].all() and not known[r > 1.001 * turn].any()
+    assert_allclose(found.length[known], 500 * 0.3 * r[known] ** 3, rtol=1e-9, atol=1e-9)
+    assert found.covered == known.mean() < 1

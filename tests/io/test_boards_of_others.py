@@ -70,7 +70,7 @@ def test_a_target_by_hand(tmp_path):
     path.write_text(CHECKERBOARD)
     assert read_target(path) == Board(6, 7, 0.06)
     for old, new, message in [
-        ("'checkerboard'", "aprilgrid", "target_type aprilgrid: a grid of AprilTags"),
+        ("'checkerboard'", "aprilgrid", "target_type aprilgrid: a grid of AprilTags is no"),
         ("colSpacingMeters: 0.06", "colSpacingMeters: 0.05", "squares are expected"),
         ("targetRows", "rows", "targetRows is missing"), ("Cols: 6", "Cols: 6.5", "targetCols is"),
     ]:  # fmt: skip

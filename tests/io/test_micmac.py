@@ -1,7 +1,9 @@
 """Calibrations and orientations of MicMac: its formula for one point, by hand, there and back."""
 
 import dataclasses
+import re
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from exchange_cases import ANGLES, POSITION, matrix, network
@@ -14,6 +16,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.io import convert, read_cameras, read_network
 from jaxbundle.io.networks.assemble import all_parameters
 from jaxbundle.io.networks.micmac import write_micmac
+from jaxbundle.io.networks.micmac_unified import FORMULAS
 
 F, PP, SIZE = 4037.1, (3036.5, 1998.75), (6000, 4000)
 R = [-5.2e-9, 1.1e-16, -2e-24]
@@ -144,7 +147,7 @@ BROKEN = {
     "row": ("Orientation-0.jpg.xml", "L2>", "X2>", "L2 is missing"),
     "turn": ("Orientation-0.jpg.xml", "<L1>", "<L1>9", "CodageMatr is not a rotation"),
     "centre": ("Orientation-0.jpg.xml", "<Centre>-1.5 ", "<Centre>", "Centre has 2 numbers"),
-    "kind": ("AutoCal_cam.xml", "ModPhgrStd", "ModUnif", "CalibDistortion ModUnif"),
+    "kind": ("AutoCal_cam.xml", "ModPhgrStd", "ModUnif", "ModUnif without TypeModele"),
     "F": ("AutoCal_cam.xml", "<F>4", "<F>-4", "F and SzIm must be positive"),
     "no F": ("AutoCal_cam.xml", "F>", "G>", "F is missing; a calibration of MicMac"),
     "NaN": ("AutoCal_cam.xml", "<P1>", "<P1>x", "P1 is 'x"),
@@ -161,3 +164,107 @@ def test_broken_folders(tmp_path, name):
     path.write_text(path.read_text().replace(old, new))
     with pytest.raises(InputError, match=f"{file}.*{message}"):
         read_network(tmp_path / "Ori-Test")
+
+
+def unified(kind: str, V, S) -> str:
+    numbers = "".join(f"<Params>{v!r}</Params>" for v in (*V, 0.0, 0.0))
+    numbers += "".join(f"<Etats>{s!r}</Etats>" for s in S)
+    text = calibration(kind="ModNoDist").replace(
+        "<ModNoDist></ModNoDist>",
+        f"<ModUnif><TypeModele>{kind}</TypeModele>{numbers}</ModUnif>",
+    )
+    return f"<ExportAPERO>{text}</ExportAPERO>"
+
+
+def term_by_term(kind: str, V, S, X, Y, Z):
+    """The image as the formulas of MicMac have it, sums of monomials x^i·y^j written as a list."""
+    q = np.array([PP[0] + F * X / Z, PP[1] + F * Y / Z])
+    if "FishEye" in kind:
+        a = (q - V[:2]) / S[0]
+        theta = np.arctan(np.hypot(*a))
+        rho = 2 * np.sin(theta / 2) if "EquiSolid" in kind else theta
+        x, y = u = a * rho / np.hypot(*a)
+        r2 = rho**2
+        out = u * (1 + sum(V[2 + i] * r2 ** (i + 1) for i in range(10)))
+        out = out + np.array([V[22] * x + V[23] * y, V[23] * x])
+        for k in range(5):
+            P, Q = V[12 + 2 * k], V[13 + 2 * k]
+            n = 2 * k + 2
+            out = out + r2**k * np.array([P * (r2 + n * x * x) + Q * n * x * y,
+                                          Q * (r2 + n * y * y) + P * n * x * y])  # fmt: skip
+        return np.array(V[:2]) + S[0] * out
+    if "PPaEqPPs" in kind:
+        P1, P2, b1, b2 = (*V[5:], 0, 0, 0, 0)[:4]
+        return published(X, Y, Z, R=V[:5], P1=P1, P2=P2, b1=b1, b2=b2)
+    x, y = q
+    if kind == "eModeleEbner":
+        s, t = x * x - S[0] ** 2 / 1.5, y * y - S[0] ** 2 / 1.5
+        dx = np.dot([x, y, -2 * s, x * y, t, 0, x * t, 0, y * s, 0, s * t, 0], V)
+        dy = np.dot([-y, x, x * y, -2 * t, 0, s, 0, y * s, 0, x * t, 0, s * t], V)
+        return q + [dx, dy]
+    if kind == "eModeleDCBrown":
+        s, t = x * x, y * y
+        f = V[12] * s * t / S[0] + V[13] * (s + t)
+        dx = np.dot([x, y, x * y, t, s * y, x * t, s * t], V[:7]) + x * f
+        dy = np.dot([x * y, s, s * y, x * t, s * t], V[7:12]) + y * f
+        return q + [dx, dy]
+    x, y = (q - S[1:]) / S[0]
+    dx = np.dot([x, y, -2 * x * x, x * y, y * y, 0], V[:6])
+    dy = np.dot([-y, x, x * y, -2 * y * y, 0, x * x], V[:6])
+    cubic = [x**3, x * x * y, x * y * y, y**3]
+    return q + S[0] * np.array([dx + np.dot(cubic, V[6:10]), dy + np.dot(cubic, V[10:14])])
+
+
+UNIFIED = {
+    "eModelePolyDeg3": ([2e-3, -1e-3, 3e-4, 2e-4, -1e-4, 2e-4, 1e-3, 2e-4, 9e-4, 1e-4, -2e-4, 1e-3,
+                         1e-4, 8e-4], [F, 3000.0, 2000.0]),
+    "eModele_DRad_PPaEqPPs": ([*R, 1e-33, 1e-41], []),
+    "eModele_Fraser_PPaEqPPs": ([*R, 0.0, 0.0, 3e-7, -2e-7, 1e-3, -4e-4], []),
+    "eModele_FishEye_10_5_5": ([3030.0, 2005.0, -0.02, 3e-3, -4e-4, *[0.0] * 7, 2e-4, -1e-4, 3e-5,
+                                *[0.0] * 7, 1e-4, -2e-4], [F - 3]),
+    "eModele_EquiSolid_FishEye_10_5_5": ([*PP, -0.02, 3e-3, *[0.0] * 18, 1e-4, 0.0], [F]),
+    "eModeleEbner": ([1e-4, 2e-5, 1e-9, 2e-9, -1e-9, 1e-9, 1e-13, 2e-13, 1e-13, -1e-13, 1e-17,
+                      2e-17], [2000.0]),
+    "eModeleDCBrown": ([1e-4, 2e-5, 1e-9, 2e-9, 1e-13, 2e-13, 1e-17, 1e-9, 2e-9, 1e-13, 2e-13,
+                        1e-17, 1e-14, -1e-10], [F]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", UNIFIED)
+def test_unified_distortions(tmp_path, kind):
+    """The formula term by term; the fitted camera has the image it says, in ours."""
+    V, S = UNIFIED[kind]
+    rays = np.array([[0.5, 0.3, 1.0], [-0.4, 0.2, 1.0], [0.1, -0.35, 1.0], [0.02, 0.01, 1.0]])
+    expected = np.array([term_by_term(kind, np.array(V), S, *ray) for ray in rays])
+    formula, states, most = FORMULAS[kind]
+    given = {"fx": F, "fy": F, "cx": PP[0], "cy": PP[1], "V": jnp.array((V + [0.0] * most)[:most]),
+             "S": jnp.array(S)}  # fmt: skip
+    assert states == len(S) and len(V) == most
+    assert_allclose([formula(given, *ray) for ray in rays], expected, atol=1e-8)
+    path = tmp_path / "AutoCal_cam.xml"
+    path.write_text(unified(kind, V, S))
+    (camera,) = read_cameras(path)
+    largest = float(re.search(r"largest difference ([\d.e+-]+) px", camera.told)[1])
+    assert kind in camera.told and largest < 12
+    found = images_of(get_model(camera.model), all_parameters(camera), rays * [1, -1, -1])
+    if get_model(camera.model).unit == "mm":
+        found = np.array(camera.image_size) / 2 - 0.5 + found / camera.pixel_size * [1, -1]
+    assert np.linalg.norm(found - expected, axis=1).max() < 1.05 * largest + 1e-3
+    if "Fraser" in kind or "DRad" in kind:
+        assert largest < 0.05
+
+
+@pytest.mark.parametrize("given, said", [
+    (("eModeleRadFour7x2", [0.0], [1.0]), "eModeleRadFour7x2 is not supported; one of eModelePoly"),
+    (("eModeleEbner", [0.0], []), "eModeleEbner needs 1 Etats, but has 0"),
+    (("eModelePolyDeg2", [0.0], [-1.0, 0.0, 0.0]), "the first of Etats must be positive"),
+    (("eModele_FishEye_10_5_5", [1.0] * 25, [1.0]), "only the first 24 Params are supported"),
+])  # fmt: skip
+def test_unified_distortions_that_are_refused(tmp_path, given, said):
+    path = tmp_path / "AutoCal_cam.xml"
+    path.write_text(unified(*given))
+    with pytest.raises(InputError, match=said):
+        read_cameras(path)
+    path.write_text(unified(*given).replace("M2C", "C2M"))
+    with pytest.raises(InputError, match="ModUnif with KnownConv eConvApero_DistC2M"):
+        read_cameras(path)

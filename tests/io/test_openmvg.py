@@ -153,3 +153,33 @@ def test_broken_scenes(tmp_path, name):
     with pytest.raises(InputError, match=message) as caught:
         read(tmp_path, document)
     assert "sfm_data.json" in str(caught.value)
+
+
+def test_a_scene_of_spherical_cameras(tmp_path):
+    """Image points by openMVG's formula, in its mirrored frame: the network read fits them."""
+    document = scene()
+    size = (1000, 500)
+    document["intrinsics"] = [{"key": 0, "value": {
+        "polymorphic_id": 2**31 + 1, "polymorphic_name": "spherical",
+        "ptr_wrapper": {"id": 2**31 + 9, "data": {"value0": {"width": size[0], "height": size[1]}}},
+    }}]  # fmt: skip
+    document["views"] = document["views"][:3]
+    for view in document["views"]:
+        view["value"]["ptr_wrapper"]["data"]["id_intrinsic"] = 0
+    document["control_points"] = []
+    R, X0 = (np.array([one["value"][name] for one in document["extrinsics"]])
+             for name in ("rotation", "center"))  # fmt: skip
+    for point in document["structure"]:
+        for row in point["value"]["observations"]:
+            i = row["key"]
+            x, y, z = R[i] @ (np.array(point["value"]["X"]) - X0[i])
+            angles = np.arctan2(x, z), np.arctan2(-y, np.hypot(x, z))
+            row["value"]["x"] = [n / 2 + 1000 * a / (2 * np.pi) for n, a in zip(size, angles)]
+    net = read(tmp_path, document)
+    assert net.cameras[0].model == "equirectangular" and "mirror image" in " ".join(net.warnings)
+    assert_allclose(net.points.position, POINTS * [1, -1, 1], atol=1e-12)
+    result = jaxbundle.adjust(net)
+    assert result.converged and result.sigma0 < 1e-6
+    document["intrinsics"][0]["value"]["ptr_wrapper"]["data"] = {}
+    with pytest.raises(InputError, match="width is missing"):
+        read(tmp_path, document)

@@ -84,3 +84,20 @@ def test_the_summary_has_distributions_and_what_is_outlying(population):
 def test_tables_that_cannot_be_used_are_refused(population, table, said):
     with pytest.raises(InputError, match=said):
         read_against(table, population.keys, "table")
+
+
+def test_a_camera_known_worse_than_others_may_be_farther_off():
+    """Eight robust σ of the population off: outlying with the usual σ, not if its own σ is four of
+    them."""
+    given = rows()
+    spread = Population(given).spread(Population(given).values["k1"])[1]
+    for row in given:
+        if "parameters" in row:
+            row["parameters"]["k1"]["sigma"] = 0.1 * spread
+    given[20]["parameters"]["k1"]["value"] = -0.1 + 8 * spread
+    given[21]["parameters"]["k1"] = {"value": -0.1 + 8 * spread, "sigma": 4 * spread}
+    found = Population(given)
+    odd = {found.keys[i]: why for i, why in found.outlying()}
+    assert "k1" in odd["c.npz#20"] and "c.npz#21" not in odd
+    assert found.apart["k1"][20] == pytest.approx(8, rel=0.1)
+    assert found.apart["k1"][21] == pytest.approx(8 / np.sqrt(17), rel=0.1)

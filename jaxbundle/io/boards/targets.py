@@ -3,7 +3,7 @@
     target_type: checkerboard    targetCols, targetRows: inner corners; rowSpacingMeters,
                                  colSpacingMeters, which must be equal
     target_type: circlegrid      targetCols, targetRows, spacingMeters, asymmetricGrid
-    target_type: aprilgrid       tagCols, tagRows, tagSize, tagSpacing: refused, not found here
+    target_type: aprilgrid       tagCols, tagRows, tagSize, tagSpacing: refused by name
 
 The spacing of an asymmetric grid is between neighbouring rows, as `Board.square`. Metres.
 
@@ -31,7 +31,8 @@ def read_target(path: str | Path) -> Board:
     fields = JsonFields(path, parse_yaml(path, read_text(Path(path))))
     kind = fields.text("target_type")
     if kind not in TYPES:
-        more = "a grid of AprilTags is not found here; " if kind == "aprilgrid" else ""
+        more = "a grid of AprilTags is no board of calibrate, but reconstruct --targets aprilgrid "
+        more = f"{more}measures it; " if kind == "aprilgrid" else ""
         raise InputError(f"{path}: target_type {kind}: {more}{' or '.join(TYPES)} is expected")
     columns, rows = (fields.whole(key, least=1) for key in ("targetCols", "targetRows"))
     if kind == "circlegrid":

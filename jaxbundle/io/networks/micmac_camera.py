@@ -20,8 +20,8 @@ three coefficients or fewer is exactly `opencv`, with fx and fy tied,
 With an affinity b1, b2 it is `brown-projected`, and C2M is `brown`, exactly, P2 and b2 with the
 other sign. These are in mm: the pixel size, missing from the file, is taken as `PIXEL`; another
 would scale c and coefficients, and change nothing in pixels. With more coefficients, or C different
-from PP, the nearest of our models is fitted. ModUnif (Ebner, Brown's 14 parameters, fisheyes) is
-refused by name, and so is a separate affine part (OrIntGlob). Which point of the first pixel is
+from PP, the nearest of our models is fitted, as for ModUnif (`micmac_unified`). A separate affine
+part (OrIntGlob) is refused by name. Which point of the first pixel is
 (0, 0) is not published; its centre is assumed. Another choice would shift image points and
 principal point alike, so that no ray changes.
 
@@ -41,6 +41,7 @@ from jaxbundle.errors import InputError
 from jaxbundle.io.cameras.nearest_camera import FittedCamera, Foreign, fitted_camera
 from jaxbundle.io.networks.assemble import all_parameters
 from jaxbundle.io.networks.losses import one_focal_length, size_of, the_rest_is_0
+from jaxbundle.io.networks.micmac_unified import unified_camera
 from jaxbundle.io.text.csv_tables import write_text
 from jaxbundle.io.text.xml_fields import XmlFields, number_in, read_xml
 from jaxbundle.network.tables import Camera
@@ -93,6 +94,13 @@ def calibration(path: Path, root: ET.Element, id: str) -> Camera:
     if not (f > 0 and w > 0 and h > 0 and w.is_integer() and h.is_integer()):
         raise InputError(f"{path}: F and SzIm must be positive, SzIm whole, not {f:g}, {w:g} {h:g}")
     core = {"fx": f, "fy": f, "cx": float(cx), "cy": float(cy)}
+    kinds = [kind for part in xml.root.iter("CalibDistortion") for kind in part]
+    if [kind.tag for kind in kinds if kind.tag != "ModNoDist"] == ["ModUnif"]:
+        if direction in C2M:
+            raise InputError(f"{path}: ModUnif with KnownConv {direction} is not supported; "
+                             f"{M2C[0]} is expected")  # fmt: skip
+        unified = next(kind for kind in kinds if kind.tag == "ModUnif")
+        return unified_camera(id, xml, unified, core, (int(w), int(h)), PIXEL)
     p = core | _distortion(xml, core)
     start = core | {f"k{i}": p[f"R{i}"] * f ** (2 * i) for i in (1, 2, 3)}
     start |= {"p1": p["P2"] * f, "p2": p["P1"] * f}
@@ -134,7 +142,7 @@ def _distortion(xml: XmlFields, core: Mapping[str, float]) -> dict[str, float]:
             name = kind.findtext("TypeModele", "").strip()
             raise InputError(
                 f"{xml.path}: CalibDistortion {kind.tag} {name}".rstrip()
-                + f" of {len(kinds)}; one of ModNoDist, ModRad, ModPhgrStd is expected"
+                + f" of {len(kinds)}; one of ModNoDist, ModRad, ModPhgrStd, ModUnif is expected"
             )
     if not kinds:
         return none | {"x": core["cx"], "y": core["cy"]}

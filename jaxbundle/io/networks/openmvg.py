@@ -16,7 +16,14 @@ wrap the fields inherited from another kind in "value0". Of the kinds
     fisheye                                          fisheye: k1 … k4
 
 the first are `opencv` with p1 = t1, p2 = t2, the last `kannala-brandt`; fx = fy = focal_length.
-Views of a spherical camera are left out. x_camera = R·(X − center), x right, y down, z forward.
+x_camera = R·(X − center), x right, y down, z forward. A spherical camera,
+
+    u = w/2 + s·λ/2π    v = h/2 + s·φ/2π    λ = atan2(x, z), φ = atan2(−y, √(x² + z²))
+
+with s = max(w, h),
+has y up in a frame that is rotated without reflection: its scene is a mirror image. A scene of
+spherical cameras only is mirrored back (y of world and cameras negated) and read as
+`equirectangular`; beside other cameras the views of spherical ones are left out.
 Which point of the first pixel is (0, 0) is not published; its centre is assumed. Another
 choice would shift image points and principal point alike, so that no ray changes.
 
@@ -61,6 +68,7 @@ KINDS = {
 }
 """Our model, the field of the coefficients, and their names here."""
 SPHERICAL = "spherical"
+MIRROR = np.array([1.0, -1.0, 1.0])
 NONE = 2**32 - 1
 """openMVG's index of a missing entry."""
 FIRST = 2**31
@@ -86,6 +94,9 @@ def read_openmvg(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     scene = JsonFields(path, read_object(path, read_text(path), "openMVG's scene"))
     scene.text("sfm_data_version")
     cameras, spherical = _cameras(scene)
+    mirror = MIRROR if spherical and not cameras else np.ones(3)
+    if spherical and not cameras:
+        cameras, spherical = {key: _sphere(key, data) for key, data in spherical.items()}, {}
     views, left = _views(scene, cameras, spherical)
     poses = {key: pose for key, pose in _entries(scene, "extrinsics").items()}
     tie, rays = _structure(scene, "structure", views)
@@ -103,12 +114,14 @@ def read_openmvg(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     ) if ids]  # fmt: skip
     if any(view.get("use_pose_center_prior") for view in views.values()):
         told.append("priors of projection centres (use_pose_center_prior) are not read")
+    if mirror is MIRROR:
+        told.append("the scene of spherical cameras is a mirror image: its Y is negated")
     labels = unique_labels([_name(view) for view in views.values()], list(views))
     image_ids = dict(zip(views, labels))
     network = assemble(
         path, foreign_document(path.stem, cameras.values()), overrides,
-        _images(path, views, image_ids, poses),
-        _points(path, tie, [names[key] for key in control]),
+        _images(path, views, image_ids, poses, mirror),
+        _points(path, tie, [names[key] for key in control], mirror),
         Columns({
             "image": [image_ids[view] for view, *_ in (*rays, *clicks)],
             "point": [*(str(key) for _, key, _ in rays), *(names[key] for _, key, _ in clicks)],
@@ -118,6 +131,7 @@ def read_openmvg(path: str | Path, overrides: Sequence[str] = ()) -> Network:
     )  # fmt: skip
     if control and len(network.points):
         at = stacked(list(control.values()), 3, lambda k: (f"{path}, control_points[{k}]", "X"))
+        at = at * mirror
         datum = any(text.partition("=")[0].strip() == "datum" for text in overrides)
         unknown = np.full((len(control), 3), np.nan)
         table = Points(tuple(names.values()), ("control",) * len(control), at, unknown,
@@ -147,17 +161,17 @@ def _data(value: JsonFields) -> JsonFields:
     return JsonFields(data.path, fields)
 
 
-def _cameras(scene: JsonFields) -> tuple[dict[int, dict], set[int]]:
-    """The entries of cameras by number, and the numbers of spherical ones."""
+def _cameras(scene: JsonFields) -> tuple[dict[int, dict], dict[int, JsonFields]]:
+    """The entries of cameras by number, and the fields of spherical ones."""
     names: dict[int, str] = {}
-    cameras, spherical = {}, set()
+    cameras, spherical = {}, {}
     for key, value in _entries(scene, "intrinsics").items():
         number = value.whole("polymorphic_id", ALIKE)
         if value.get("polymorphic_name") is not None:
             names[number % FIRST] = value.text("polymorphic_name")
         name = names.get(number % FIRST, "")
         if name == SPHERICAL:
-            spherical.add(key)
+            spherical[key] = _data(value)
             continue
         if name not in KINDS:
             raise InputError(
@@ -176,7 +190,15 @@ def _cameras(scene: JsonFields) -> tuple[dict[int, dict], set[int]]:
     return cameras, spherical
 
 
-def _views(scene: JsonFields, cameras: Mapping, spherical: set[int]):
+def _sphere(key: int, data: JsonFields) -> dict:
+    """The entry of a spherical camera."""
+    w, h = data.whole("width", least=1), data.whole("height", least=1)
+    f = max(w, h) / (2 * np.pi)
+    return {"id": str(key), "model": "equirectangular", "image_size": [w, h], "fx": f, "fy": f,
+            "cx": w / 2, "cy": h / 2}  # fmt: skip
+
+
+def _views(scene: JsonFields, cameras: Mapping, spherical: Mapping):
     """The views with a camera, by number, and the names of the others."""
     views, left = {}, []
     for key, value in _entries(scene, "views").items():
@@ -197,7 +219,9 @@ def _name(view: JsonFields) -> str:
     return "/".join(filter(None, (view.get("local_path"), view.text("filename"))))
 
 
-def _images(path: Path, views: Mapping, names: Mapping, poses: Mapping) -> Columns:
+def _images(
+    path: Path, views: Mapping, names: Mapping, poses: Mapping, mirror: np.ndarray
+) -> Columns:
     R, X0 = (np.full((len(views), *shape), np.nan) for shape in ((3, 3), (3,)))
     for k, view in enumerate(views.values()):
         pose = poses.get(view.get("id_pose"))
@@ -206,7 +230,8 @@ def _images(path: Path, views: Mapping, names: Mapping, poses: Mapping) -> Colum
             check_rotations(R[k], f"{pose.path}: rotation")
     cameras = [view.whole("id_intrinsic") for view in views.values()]
     source = Source(str(path), np.array(list(views)), "view")
-    return image_columns(source, list(names.values()), cameras, flip_rows(R), X0)
+    R = mirror[:, None] * R * mirror
+    return image_columns(source, list(names.values()), cameras, flip_rows(R), X0 * mirror)
 
 
 def _structure(scene: JsonFields, name: str, views: Mapping):
@@ -228,9 +253,11 @@ def _image_points(path: Path, rays: Sequence) -> np.ndarray:
     return stacked([x for *_, x in rays], 2, place).reshape(-1, 2)
 
 
-def _points(path: Path, tie: Mapping, control: Sequence[str]) -> Columns:
+def _points(
+    path: Path, tie: Mapping, control: Sequence[str], mirror: np.ndarray
+) -> Columns:
     place = lambda k: (f"{path}, structure[{k}]", "X")
-    known = stacked(list(tie.values()), 3, place).reshape(-1, 3)
+    known = stacked(list(tie.values()), 3, place).reshape(-1, 3) * mirror
     position = np.concatenate([known, np.full((len(control), 3), np.nan)])
     columns = {"id": [*map(str, tie), *control], "role": ["tie"] * len(position)}
     return Columns(columns | dict(zip("XYZ", position.T)), Source(str(path), None, "point"))

@@ -98,7 +98,7 @@ def draw_histogram(
     tallest = max(counted.max(initial=1), 0 if expected is None else expected.max(initial=1))
     y = _scale(np.array([0.0, tallest]), HIGH - BOTTOM, TOP)
     base = float(y(0))
-    parts = [_axes(x, y, x_label, things)]
+    parts = [_axes(x, y, x_label, things, whole=True)]
     parts += [
         f'<rect class="bar" x="{x(a):.1f}" y="{y(n):.1f}" width="{x(b) - x(a):.1f}" '
         f'height="{base - y(n):.1f}"/>\n'
@@ -155,7 +155,9 @@ def _ticks(scale: Scale, whole: bool = False) -> np.ndarray:
     return step * np.arange(first, np.floor(scale.high / step + 1e-9) + 1)
 
 
-def _axes(x: Scale, y: Scale, x_label: str, y_label: str, logarithmic: str = "") -> str:
+def _axes(x: Scale, y: Scale, x_label: str, y_label: str, logarithmic: str = "",
+          whole: bool = False) -> str:  # fmt: skip
+    """Axes with their ticks; `whole`: y counts."""
     parts = []
     for tick in _ticks(x, "x" in logarithmic):
         at = float(x(tick))
@@ -163,7 +165,7 @@ def _axes(x: Scale, y: Scale, x_label: str, y_label: str, logarithmic: str = "")
                      f'y2="{HIGH - BOTTOM}"/>\n'
                      f'<text x="{at:.1f}" y="{HIGH - BOTTOM + 16}" text-anchor="middle">'
                      f"{_name(tick, 'x' in logarithmic)}</text>\n")  # fmt: skip
-    for tick in _ticks(y, "y" in logarithmic):
+    for tick in _ticks(y, whole or "y" in logarithmic):
         at, name = float(y(tick)), _name(tick, "y" in logarithmic)
         parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDE - RIGHT}" y1="{at:.1f}" '
                      f'y2="{at:.1f}"/>\n'
