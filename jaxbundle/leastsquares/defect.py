@@ -106,16 +106,22 @@ def find_open_motions(survey: Survey) -> Float[np.ndarray, "motions defect"]:
     scale = np.where(scale > 0, scale, 1.0)
     held = held / scale
     size = np.linalg.norm(held, axis=1, keepdims=True)
-    # Singular values of a QR, not of the Gram matrix, which would lose half of the digits.
-    R = np.zeros((len(scale), len(scale)))
-    products = (
-        np.asarray(rows)[begin : begin + ROWS] / scale
-        for rows in survey.products for begin in range(0, len(rows), ROWS)
-    )  # fmt: skip
-    for rows in (held / np.where(size > 0, size, 1.0), *products):
-        R = np.linalg.qr(np.concatenate([R, rows]), mode="r")
-    _, singular, directions = np.linalg.svd(R)
+    rows = [held / np.where(size > 0, size, 1.0), *map(np.asarray, survey.products)]
+    scales = [np.ones_like(scale), *[scale] * len(survey.products)]
+    _, singular, directions = np.linalg.svd(_triangle(rows, scales))
     return directions[singular < OPEN].T / scale[:, None]
+
+
+def _triangle(parts, scales) -> Float[np.ndarray, "n n"]:
+    """R of the QR of all rows of the parts, their columns divided by the scales: it has their
+    singular values, of which a Gram matrix would lose half of the digits."""
+    n = parts[0].shape[1]
+    R = np.zeros((n, n))
+    for rows, scale in zip(parts, scales):
+        for begin in range(0, len(rows), ROWS):
+            part = rows[begin : begin + ROWS] / scale
+            R = np.asarray(np.linalg.qr(np.concatenate([R, part]), mode="r"))
+    return R
 
 
 def make_datum(
@@ -130,20 +136,22 @@ def make_datum(
     moves, free = along(survey.moves), {t: np.asarray(f) for t, f in survey.free.items()}
     weight = {name: np.asarray(w) * free[name] for name, w in weight.items()}
     defect = gauge.shape[1]
-    directions = np.concatenate([moves[t].reshape(-1, defect) for t in weight])
-    candidates = np.concatenate([w.ravel() for w in weight.values()])
-    chosen = directions * candidates[:, None]
-    if np.isfinite(chosen).all():  # otherwise the solver will report it
-        singular = np.linalg.svd(chosen / np.linalg.norm(directions, axis=0), compute_uv=False)
-        if len(singular) < defect or singular[-1] < HELD * singular[0]:
+    directions = [moves[t].reshape(-1, defect) for t in weight]
+    candidates = [w.ravel() for w in weight.values()]
+    size = np.sqrt(sum((rows**2).sum(0) for rows in directions))
+    chosen = [rows * c[:, None] for rows, c in zip(directions, candidates)]
+    R = _triangle(chosen, [size] * len(chosen))
+    if np.isfinite(R).all():  # otherwise the solver will report it
+        singular = np.linalg.svd(R, compute_uv=False)
+        if singular[-1] <= HELD * singular[0]:
             raise CannotHold(defect)
     if minimal:
-        picked = _pick_rows(directions, candidates)
+        picked = _pick_rows(np.concatenate(directions), np.concatenate(candidates))
         cuts = np.cumsum([w.size for w in weight.values()])[:-1]
         weight = {
             t: part.reshape(weight[t].shape) for t, part in zip(weight, np.split(picked, cuts))
         }
-    pins = _choose_pins(plan, along(survey.of_groups))
+    pins = _choose_pins(plan, along({name: survey.of_groups[name] for name in plan.kept}))
     held = {t: (1 - free[t]) * real[t][:, None] for t, rows in moves.items() if rows.any()}
     held = {t: mask for t, mask in held.items() if mask.any()}
     return Datum(*jax.device_put((gauge, weight, pins, held)))
