@@ -39,6 +39,7 @@ from jaxtyping import Float
 from jaxbundle.geometry.quaternions import (
     matrix_from_quaternion,
     quaternion_from_matrix,
+    quaternion_multiply,
     traced_once,
 )
 from jaxbundle.types import AnyArray, Scalar
@@ -75,6 +76,21 @@ def matrix_from_omega_phi_kappa(angles: Float[AnyArray, "3"]) -> Float[Array, "3
     """
     omega, phi, kappa = angles
     return R3(kappa) @ R2(phi) @ R1(omega)
+
+
+def quaternion_from_omega_phi_kappa(angles: Float[AnyArray, "3"]) -> Float[Array, "4"]:
+    """The unit quaternion, w ≥ 0, of M = R3(κ)·R2(φ)·R1(ω); (ω, φ, κ) in radians.
+
+    The product of those of the elementary rotations, (cos ½α, −sin ½α·e)."""
+
+    def about(axis, angle):
+        c, s = jnp.cos(angle / 2), jnp.sin(angle / 2)
+        return jnp.stack([c, *(-s if i == axis else jnp.zeros_like(s) for i in range(3))])
+
+    omega, phi, kappa = angles
+    q = quaternion_multiply(about(1, phi), about(0, omega))
+    q = quaternion_multiply(about(2, kappa), q)
+    return jnp.where(q[0] < 0, -q, q)
 
 
 @traced_once

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxbundle.leastsquares import datum
 from jaxbundle.leastsquares.declarations import Motions
+from jaxbundle.leastsquares.motions import Together, move_at_once
 from jaxbundle.leastsquares.normal import Tangent
 from jaxbundle.leastsquares.plan import Plan
 from jaxbundle.leastsquares.rows import Declared, Values
@@ -80,7 +81,10 @@ def _moved(declared, free, motion, values):
     """All tables moved, except held values."""
     moved = dict(values)
     for name, act in present(declared.motions).actions:
-        of_rows = partial(_move, declared.spaces[name], act, motion)
+        by = motion
+        if isinstance(act, Together):
+            act, by = act.move, _move_at_once(act.transform, motion, act.size)
+        of_rows = partial(_move, declared.spaces[name], act, by)
         moved[name] = _of_rows(of_rows, values[name], free[name])
     return moved
 
@@ -107,3 +111,4 @@ def _of_rows(program, *given):
 _generators = eqx.filter_jit(datum.generators)
 _leave_held = eqx.filter_jit(datum.leave_held)
 _free = eqx.filter_jit(datum.free_of_tables)
+_move_at_once = eqx.filter_jit(move_at_once)

@@ -65,7 +65,7 @@ class Together:
     size: int
 
     def __call__(self, motion, value):
-        return self.move(_together(self.transform, motion, self.size), value)
+        return self.move(move_at_once(self.transform, motion, self.size), value)
 
 
 def _transform_pose(motion, value: PoseValue) -> PoseValue:
@@ -93,7 +93,7 @@ move_pose = Together(_transform_pose, _displace_pose, transform_point, 3)
 _move_in_plane = Together(_transform_in_plane, _transform_in_plane, _transform_in_plane, 2)
 
 
-def _together(transform, motion, size: int):
+def move_at_once(transform, motion, size: int):
     """The motion with shift after rotation and scale that equals a simultaneous one: ∫₀¹ A(u)·t du,
     A(u) the rotation and scale after the time u (Gauss–Legendre, to rounding up to two turns and a
     scale of e⁵)."""

@@ -16,7 +16,7 @@ from jax.core import Tracer
 from jaxtyping import Float, Int
 
 from jaxbundle.cameras import get_model
-from jaxbundle.geometry import matrix_from_omega_phi_kappa, quaternion_from_matrix
+from jaxbundle.geometry.rotations import quaternion_from_omega_phi_kappa
 from jaxbundle.leastsquares import declarations as ls
 from jaxbundle.leastsquares.any_distance import AnyDistance, derivative
 from jaxbundle.leastsquares.indices import rounded
@@ -281,10 +281,7 @@ def _quaternions(angles):
     return np.asarray(_quaternions_of(wide))[: len(angles)]
 
 
-@jax.jit
-@jax.vmap
-def _quaternions_of(angles):
-    return quaternion_from_matrix(matrix_from_omega_phi_kappa(angles))
+_quaternions_of = jax.jit(jax.vmap(quaternion_from_omega_phi_kappa))
 
 
 def _data(network: Network, origin):

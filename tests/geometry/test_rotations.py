@@ -16,6 +16,7 @@ from geometry_checks import (
 from scipy.spatial.transform import Rotation
 
 from jaxbundle import geometry
+from jaxbundle.geometry.rotations import quaternion_from_omega_phi_kappa
 
 # A system of angles: both functions, the oracle, the middle angle at the two locks, and an
 # interval of it in which the three angles are unique.
@@ -108,6 +109,14 @@ def test_matrix_is_the_rotation_of_scipy(name):
     M = batch(matrix)(angles)
     assert_rotations(M)
     np.testing.assert_allclose(M, oracle(angles).as_matrix(), atol=1e-14)
+
+
+def test_the_quaternion_of_angles_is_that_of_the_matrix():
+    angles = random_angles("omega_phi_kappa")
+    q = batch(quaternion_from_omega_phi_kappa)(angles)
+    assert np.all(q[:, 0] >= 0)
+    M = batch(geometry.matrix_from_omega_phi_kappa)(angles)
+    np.testing.assert_allclose(batch(geometry.matrix_from_quaternion)(q), M, atol=2e-15)
 
 
 @systems
