@@ -11,7 +11,7 @@ from jaxbundle.arguments import numeric_array, one_of, positive, shown, vector, 
 from jaxbundle.batch.camera import SOLVED
 from jaxbundle.batch.input import any_model, free_parameters
 from jaxbundle.batch.population import Population
-from jaxbundle.batch.rigs import SIGMA, Rig, RigSettings, solve_rigs
+from jaxbundle.batch.rigs import SIGMA, Rig, RigSettings, solve_rigs, with_free
 from jaxbundle.batch.snooping import TESTS
 from jaxbundle.bundle.result import Adjustment
 from jaxbundle.cameras import CameraModel
@@ -19,6 +19,7 @@ from jaxbundle.display import shows_itself
 from jaxbundle.errors import InputError
 from jaxbundle.float64 import require_x64
 from jaxbundle.leastsquares.snooping import check_test
+from jaxbundle.network.build import make_further
 from jaxbundle.network.columns import did_you_mean
 
 SECTIONS = ("rolling_shutter", "rig")
@@ -136,8 +137,12 @@ def rig_settings(
             raise InputError(f"unknown section {name!r}{did_you_mean(name, SECTIONS)}")
         if not isinstance(given, Mapping):
             raise InputError(f"{name} is {shown(given)}; a table of settings is expected")
-    if "rolling_shutter" in sections:
-        positive("rolling_shutter: line_time", sections["rolling_shutter"].get("line_time"))
+    if moves := sections.get("rolling_shutter"):
+        positive("rolling_shutter: line_time", moves.get("line_time"))
+        make_further({"velocities": {"image": ["1"]}, "rolling_shutter": with_free(moves)}, 1.0)
+    if unstable := sections.get("rig"):
+        row = {"rig": ["1"], "epoch": ["1"], "image": ["1"]}
+        make_further({"rigs": row, "rig": unstable}, 1.0)
     size = None
     if pixel_size is not None:
         pair = vector("pixel_size", pixel_size, 2, "a positive length in mm, or two")

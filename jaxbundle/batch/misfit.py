@@ -31,6 +31,8 @@ NEGLIGIBLE = 0.01
 """A smaller RMS is never a misfit, pixels."""
 FAR = 1.0
 """Points farther outside the image, in image sizes, are not measurements."""
+TINY = 0.05
+"""If the image points span less of the image, they are probably no pixels."""
 OUTSIDE = 0.5
 """If a larger fraction of image points is outside the image, their axes are probably wrong."""
 
@@ -112,6 +114,12 @@ def axes_remark(
     """
     low = _corner(size, down)
     part = _beyond(xy, size, down, 0).mean() if len(xy) else 0.0
+    if len(xy) and np.ptp(xy, axis=0).max() < TINY * size.max():
+        wide, high = np.ptp(xy, axis=0)
+        return (
+            f"the image points of all views span {wide:.3g} × {high:.3g} of {size[0]:g} × "
+            f"{size[1]:g} pixels: are they in pixels, and is image_size right?"
+        )
     if part <= OUTSIDE:
         far = int(_beyond(xy, size, down, FAR).sum())
         points = "image point is" if far == 1 else "image points are"

@@ -223,6 +223,11 @@ def declare_rig(rig: Rig, firsts: Sequence[FirstCamera | None], settings: RigSet
     return _network_of(rig, cameras, images, np.array(rays), sigma, settings)
 
 
+def with_free(moves: Mapping[str, Any]) -> dict[str, Any]:
+    """The section `rolling_shutter`: every velocity is free unless it says which."""
+    return {"free": VELOCITY, **moves}
+
+
 def _network_of(rig: Rig, cameras, images, rays, sigma, settings: RigSettings) -> Network:
     """The network of images (camera, epoch, pose) and rays (image, point, x, y)."""
     ids = np.array([rig.images[c][e] for c, e, *_ in images], dtype=object)
@@ -239,7 +244,7 @@ def _network_of(rig: Rig, cameras, images, rays, sigma, settings: RigSettings) -
         further["rig"] = {"reference": rig.cameras[0], **settings.sections.get("rig", {})}
     if moves := settings.sections.get("rolling_shutter"):
         further["velocities"] = {"image": ids}
-        further["rolling_shutter"] = {"free": VELOCITY, **moves}
+        further["rolling_shutter"] = with_free(moves)
     return make_network(
         cameras,
         {"id": ids, "camera": names}

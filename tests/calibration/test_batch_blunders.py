@@ -269,3 +269,11 @@ def test_other_axes_are_remarked(clean):
 def test_options_that_are_none(clean, bad):
     with pytest.raises(jaxbundle.InputError, match=list(bad)[-1]):
         jaxbundle.calibrate_batch(BOARD, clean, SIZE, **bad)
+
+
+def test_image_points_that_are_no_pixels_are_remarked():
+    """In mm of a sensor, counted from its corner: all in the upper left corner of the image."""
+    xy = np.random.default_rng(0).uniform(0, [6.4, 4.8], (50, 2))
+    said = axes_remark(xy, np.array([1280.0, 960.0]), True)
+    assert "of 1280 × 960 pixels: are they in pixels" in said
+    assert not axes_remark(200 * xy, np.array([1280.0, 960.0]), True)

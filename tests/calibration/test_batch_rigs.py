@@ -193,7 +193,9 @@ def test_models_that_calibrate_batch_refuses():
     (dict(cameras=["left"]), "cameras must be 2 different names"),
     (dict(visible=np.ones((5, 2))), "visible must have the shape"),
     (dict(rolling_shutter=3), "rolling_shutter is 3; a table of settings"),
-    (dict(rolling_shutter={}), "rolling_shutter: line_time"),
+    (dict(rolling_shutter={"free": ["vX"]}), "rolling_shutter: line_time"),
+    (dict(rolling_shutter={"line_time": 1e-5, "sigma": {"vx": 1}}), "unknown 'vx'.*'vX'"),
+    (dict(rig={"sigma_posit": 1}), "sigma_posit"),
     (dict(pixel_size=-1), "pixel size -1"),
     (dict(snooping="baarda"), "snooping"),
 ])  # fmt: skip
