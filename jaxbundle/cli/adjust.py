@@ -11,7 +11,7 @@ from jaxbundle.cli.app import Control, Force, Format, Html, Input, Quiet, Settin
 from jaxbundle.errors import InputError, NotSolvedError
 
 
-@app.command(example="examples/convergent4/project.toml --out out/convergent4")
+@app.command(example="examples/convergent4/project.toml --out out/convergent4", once=True)
 def adjust(
     input: Input,
     json: Annotated[str, typer.Option(help="write the result as JSON; - prints only JSON")] = "",

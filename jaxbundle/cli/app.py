@@ -16,6 +16,7 @@ import jaxbundle
 from jaxbundle.choices import CAMERA_MODELS, FORMATS, MODEL_FAMILIES
 from jaxbundle.cli.habits import Quiet as Quiet
 from jaxbundle.cli.habits import add_habits
+from jaxbundle.cli.small_inputs import is_small
 from jaxbundle.errors import InputError, NotSolvedError
 from jaxbundle.system.configuration import leave
 
@@ -36,12 +37,14 @@ class Command(TyperCommand):
     example: str = ""
     """An example call."""
     computes: bool = True
+    once: bool = False
 
     def invoke(self, ctx):
         if self.computes:
             if ctx.obj is not None:
                 ctx.obj()
-            jaxbundle.enable_x64()
+            small = self.once and is_small(ctx.params["input"])
+            jaxbundle.enable_x64(compile_quickly=small)
         return super().invoke(ctx)
 
     def get_short_help_str(self, limit: int = 0) -> str:
@@ -67,11 +70,14 @@ class Application(typer.Typer):
         )  # fmt: skip
 
     def command(
-        self, name: str | None = None, *, example: str, computes: bool = True, **options: Any
-    ):
+        self, name: str | None = None, *, example: str, computes: bool = True, once: bool = False,
+        **options: Any,
+    ):  # fmt: skip
         """As of typer, with --quiet and --verbose. `example`: the arguments of a line that calls
-        it, for its help; `computes`: whether it works with JAX."""
-        kind = type("Command", (Command,), {"example": example, "computes": computes})
+        it, for its help; `computes`: whether it works with JAX; `once`: whether its time depends on
+        its input, so that programs of a small input are compiled quickly."""
+        fields = {"example": example, "computes": computes, "once": once}
+        kind = type("Command", (Command,), fields)
         register = super().command(name, cls=kind, **options)
 
         def add(function):

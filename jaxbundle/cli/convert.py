@@ -11,7 +11,7 @@ from jaxbundle.cli.app import Control, Format, Input, Quiet, Settings, app, choi
 from jaxbundle.errors import InputError
 
 
-@app.command(example="examples/convergent4/project.toml out/network.ply")
+@app.command(example="examples/convergent4/project.toml out/network.ply", once=True)
 def convert(
     input: Input,
     output: Annotated[Path, typer.Argument(help="file or folder to write")],

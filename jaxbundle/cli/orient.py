@@ -9,7 +9,7 @@ import jaxbundle
 from jaxbundle.cli.app import Control, Force, Format, Input, Quiet, Settings, app
 
 
-@app.command(example="examples/convergent4/project.toml --out out/oriented")
+@app.command(example="examples/convergent4/project.toml --out out/oriented", once=True)
 def orient(
     input: Input,
     out: Annotated[
