@@ -13,12 +13,20 @@ from jaxbundle.types import AnyArray, Scalar
 Triple = tuple[Scalar, Scalar, Scalar]
 Vector = Triple | Float[AnyArray, "3 ..."]
 """What unpacks into three components; functions return a `Triple`."""
+Matrix = tuple[Triple, Triple, Triple] | Float[AnyArray, "3 3"]
 
 
 def unpacked(v: Vector | tuple[Scalar, ...]) -> Triple:
     """The three components, read once."""
     x, y, z = v
     return x, y, z
+
+
+def read(M: Float[AnyArray, "3 3"]) -> tuple[Triple, Triple, Triple]:
+    """The rows of a matrix as triples, for `turned` and `turned_back`: every access of an array
+    component costs time of compilation."""
+    first, second, third = M
+    return unpacked(first), unpacked(second), unpacked(third)
 
 
 def dot(u: Vector, v: Vector) -> Scalar:
@@ -56,12 +64,12 @@ def unit(v: Vector) -> Triple:
     return scaled(1 / length(v), v)
 
 
-def turned(M: Float[AnyArray, "3 3"], v: Vector) -> Triple:
+def turned(M: Matrix, v: Vector) -> Triple:
     """M·v."""
     return dot(M[0], v), dot(M[1], v), dot(M[2], v)
 
 
-def turned_back(M: Float[AnyArray, "3 3"], v: Vector) -> Triple:
+def turned_back(M: Matrix, v: Vector) -> Triple:
     """Mᵀ·v."""
     x, y, z = (M[0][k] * v[0] + M[1][k] * v[1] + M[2][k] * v[2] for k in range(3))
     return x, y, z

@@ -62,6 +62,17 @@ def five_points(
     not valid has the real part of a complex solution. Without derivatives: those of a refined
     relative orientation are exact.
     """
+    E, valid = five_solutions(xy1, xy2, weights)
+    return jax.vmap(_nearest_essential)(E), valid
+
+
+def five_solutions(
+    xy1: Float[AnyArray, "n 2"],
+    xy2: Float[AnyArray, "n 2"],
+    weights: Float[AnyArray, " n"] | None = None,
+) -> tuple[Float[Array, "10 3 3"], Bool[Array, "10"]]:
+    """As `five_points`, of any length, and essential only to rounding, or not at all if invalid:
+    sufficient for `orientations`."""
     p = ones_unless(weights, xy1)
     a1, a2 = jax.vmap(ray_of)(stop_gradient(xy1)), jax.vmap(ray_of)(stop_gradient(xy2))
     space = null_space(_coplanarity(a1, a2, stop_gradient(p)), 4).reshape(4, 3, 3)
@@ -76,11 +87,11 @@ def five_points(
     valid = usable & (jnp.max(jnp.abs(xyz.imag), 0) < REAL * size)
     xyzw = jnp.concatenate([xyz.real, jnp.ones_like(xyz.real[:1])])
     E = jnp.einsum("as,aij->sij", jnp.where(usable, xyzw, 1), space)
-    return jax.vmap(_nearest_essential)(E), valid
+    return E, valid
 
 
 def orientations(E: Float[AnyArray, "3 3"]) -> tuple[Float[Array, "4 3 3"], Float[Array, "4 3"]]:
-    """The four pairs (M, b), |b| = 1, of an essential matrix: ±E = M·[b]×."""
+    """The four pairs (M, b), |b| = 1, of the nearest essential matrix: ±E = M·[b]×."""
     U, _, Vt = jnp.linalg.svd(E)
     U, Vt = U * jnp.linalg.det(U), Vt * jnp.linalg.det(Vt)
     W = jnp.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])

@@ -22,9 +22,10 @@ from jax.lax import stop_gradient
 from jaxtyping import Bool, Float, Int
 
 from jaxbundle.geometry import matrix_from_quaternion, matrix_from_rotation_vector
+from jaxbundle.geometry.vectors import dot, read, turned, turned_back, unpacked
 from jaxbundle.leastsquares.small import finish, minimise
 from jaxbundle.orientation.absolute import rotation_between
-from jaxbundle.orientation.essential import eight_points, five_points, orientations
+from jaxbundle.orientation.essential import eight_points, five_solutions, orientations
 from jaxbundle.orientation.homography import apply_homography, homography
 from jaxbundle.orientation.linear import ones_unless
 from jaxbundle.orientation.pose import Pose, image_of, ray_of
@@ -82,7 +83,7 @@ def relative_orientation(
     if method == "five":
         held = _after(E, held)
         # with noise, a solution that is not quite real is a good start
-        E = jnp.concatenate([E, five_points(*held)[0]])
+        E = jnp.concatenate([E, five_solutions(*held)[0]])
     M, b = (a.reshape(-1, *a.shape[2:]) for a in jax.vmap(orientations)(E))
     data = (xy1, xy2, jnp.sqrt(p))
     chosen, score = _refined_best(M, b, stop_gradient(data), p)
@@ -108,10 +109,11 @@ def sampson_distance(
     xy2: Float[AnyArray, "2"],
 ) -> Float[Array, ""]:
     """Misclosure of coplanarity of one point as a length in the image, c = 1, with a sign."""
-    a1, a2 = ray_of(xy1), ray_of(xy2)
-    line2, line1 = M @ jnp.cross(b, a1), jnp.cross(M.T @ a2, b)
-    length = jnp.sum(line2[:2] ** 2) + jnp.sum(line1[:2] ** 2)
-    return jnp.dot(a2, line2) / jnp.sqrt(jnp.where(length > 0, length, 1))
+    a1, a2 = _rays(xy1, xy2)
+    E = read(jnp.cross(M, b))  # M·[b]×
+    line2, line1 = turned(E, a1), turned_back(E, a2)
+    length = line2[0] ** 2 + line2[1] ** 2 + line1[0] ** 2 + line1[1] ** 2
+    return dot(a2, line2) / jnp.sqrt(jnp.where(length > 0, length, 1))
 
 
 def distances_along_rays(
@@ -121,11 +123,19 @@ def distances_along_rays(
     xy2: Float[AnyArray, "2"],
 ) -> Float[Array, "2"]:
     """(s₁, s₂) of the nearest points s₁·a₁ and b + s₂·Mᵀ·a₂ of two rays; positive: in front."""
-    a1, a2 = ray_of(xy1), M.T @ ray_of(xy2)
-    aa, cc, dot = a1 @ a1, a2 @ a2, a1 @ a2
-    determinant = aa * cc - dot * dot
-    s = jnp.stack([cc * (b @ a1) - dot * (b @ a2), dot * (b @ a1) - aa * (b @ a2)])
+    a1, a2 = _rays(xy1, xy2)
+    a2, b = turned_back(read(M), a2), unpacked(b)
+    aa, cc, both = dot(a1, a1), dot(a2, a2), dot(a1, a2)
+    first, second = dot(b, a1), dot(b, a2)
+    determinant = aa * cc - both * both
+    s = jnp.stack([cc * first - both * second, both * first - aa * second])
     return s / jnp.where(determinant > 0, determinant, 1)
+
+
+def _rays(xy1, xy2):
+    """Of one point in two images, as scalars: over 1500 models of 64 points a twelfth of the time
+    of products of small matrices."""
+    return (*xy1, -1.0), (*xy2, -1.0)
 
 
 def _refined_best(M, b, data, p):
@@ -188,8 +198,8 @@ def _simpler(points, vtpv):
     variance = vtpv / jnp.where(redundancy > 0, redundancy, 1)
     unit = lambda a: a / jnp.linalg.norm(a)
     rays1, rays2 = (jax.vmap(lambda xy: unit(ray_of(xy)))(xy) for xy in (xy1, xy2))
-    turned = Pose(jnp.zeros(3), matrix_from_quaternion(rotation_between(rays1, rays2, p)))
-    by_rotation = jax.vmap(image_of, (None, 0))(turned, rays1)
+    rotation = Pose(jnp.zeros(3), matrix_from_quaternion(rotation_between(rays1, rays2, p)))
+    by_rotation = jax.vmap(image_of, (None, 0))(rotation, rays1)
     H, _ = homography(*_after(by_rotation, (xy1, xy2, p)))
     by_plane = jax.vmap(apply_homography, (None, 0))(H, xy1)
 

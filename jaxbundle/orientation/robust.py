@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, PyTree
 from jaxbundle.geometry import transform_point
 from jaxbundle.orientation.absolute import AbsoluteOrientation, absolute_orientation
 from jaxbundle.orientation.dlt import direct_linear_transformation
-from jaxbundle.orientation.essential import five_points, orientations
+from jaxbundle.orientation.essential import five_solutions, orientations
 from jaxbundle.orientation.homography import apply_homography, homography
 from jaxbundle.orientation.intersection import Intersection, intersection
 from jaxbundle.orientation.linear import ones_unless
@@ -167,7 +167,7 @@ def robust_relative_orientation(
             best = jnp.argmax(jnp.sum(jax.vmap(along)(*pairs) > 0, (1, 2)))
             return jax.tree.map(lambda a: a[best], pairs)
 
-        E, valid = five_points(xy1, xy2)
+        E, valid = five_solutions(xy1, xy2)
         return jax.vmap(in_front)(E), valid
 
     found = consensus(key, solve, errors, (xy1, xy2), 5, samples, threshold, p)
@@ -289,16 +289,14 @@ def _repeated(again, good, model=None, model_of=lambda found: None):
 
     `again(model, good)`: the solution by the good ones, from a model, and which are good then.
     """
-    shapes = eqx.filter_eval_shape(lambda: again(model, good)[0])
-    empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
-    def once(_, state):
-        _, model, _, good = state
+    def once(state, _):
+        model, good = state
         found, better = again(model, good)
-        return found, model_of(found), good, better
+        return (model_of(found), better), (found, good)
 
-    found, _, good, _ = jax.lax.fori_loop(0, ROUNDS + 1, once, (empty, model, good, good))
-    return found, good
+    _, found = jax.lax.scan(once, (model, good), length=ROUNDS + 1)
+    return jax.tree.map(lambda rounds: rounds[-1], found)
 
 
 def _status(found):
