@@ -41,12 +41,13 @@ UNCONTROLLED = 1e-8
 
 
 class Reliability(eqx.Module):
-    """By set of observations, [n, r]: v/σ, redundancy number, Baarda's w (NaN if r is zero), and
-    the part of h = 1 − r due to the eliminated row of the observation alone."""
+    """By set of observations, [n, r]: v/σ, redundancy number, Baarda's w (NaN if r is zero), `hat`
+    h = 1 − r, and its part due to the eliminated row of the observation alone."""
 
     residual: Mapping[int, Float[AnyArray, "n r"]]
     redundancy: Mapping[int, Float[AnyArray, "n r"]]
     w: Mapping[int, Float[AnyArray, "n r"]]
+    hat: Mapping[int, Float[AnyArray, "n r"]]
     own: Mapping[int, Float[AnyArray, "n r"]]
 
 
@@ -61,7 +62,7 @@ def reliability(
     number = lambda h, weight: jnp.where(weight > 0, jnp.clip(1.0 - h, 0.0, 1.0), 0.0)
     r = {o: number(h, diagonal_of(data.weight[o])) for o, h in hat.items()}
     test = lambda v, r: jnp.where(r > UNCONTROLLED, v / jnp.sqrt(jnp.maximum(r, 1e-300)), jnp.nan)
-    return Reliability(residual, r, {o: test(residual[o], r[o]) for o in r}, own)
+    return Reliability(residual, r, {o: test(residual[o], r[o]) for o in r}, hat, own)
 
 
 def hat_diagonal(declared: Declared, plan: Plan, values: Values, laid: Laid, Q: Cofactors):

@@ -28,7 +28,7 @@ from jaxbundle.leastsquares.problem import (
     pad_values,
     without_filling,
 )
-from jaxbundle.leastsquares.reliability import Reliability, hat_diagonal, reliability
+from jaxbundle.leastsquares.reliability import Reliability, reliability
 from jaxbundle.leastsquares.rows import (
     Data,
     Declared,
@@ -211,7 +211,9 @@ class Solution:
         """v/√(1 + h) of all observations with the weights of `data`: the normalised residuals of
         excluded observations."""
         given = (*self.given[:3], pad_data(self.problem, data))
-        return self._rows(_held_against(*given, self.cofactors))
+        found = reliability(*given, self.cofactors)  # a program that is there already
+        v, h = self._rows(found.residual), self._rows(found.hat)
+        return {o: v[o] / np.sqrt(1 + h[o]) for o in v}
 
     @functools.cached_property
     def by_eliminated(self) -> Rows:
@@ -274,13 +276,6 @@ def with_plan(factor: Factor, plan: Plan) -> Factor:
 
 _cofactors = eqx.filter_jit(cofactors)
 _of_tables = eqx.filter_jit(blocks_of_tables)
-
-
-@eqx.filter_jit
-def _held_against(declared, plan, values, data, Q):
-    v, h, _ = hat_diagonal(declared, plan, values, lay_out_data(plan, data), Q)
-    v, h = in_given_order(plan, v), in_given_order(plan, h)
-    return {o: v[o] / jnp.sqrt(1 + h[o]) for o in v}
 
 
 @eqx.filter_jit

@@ -113,7 +113,7 @@ def sampson_distance(
     E = read(jnp.cross(M, b))  # M·[b]×
     line2, line1 = turned(E, a1), turned_back(E, a2)
     length = line2[0] ** 2 + line2[1] ** 2 + line1[0] ** 2 + line1[1] ** 2
-    return dot(a2, line2) / jnp.sqrt(jnp.where(length > 0, length, 1))
+    return jnp.divide(dot(a2, line2), jnp.sqrt(jnp.where(length > 0, length, 1)))
 
 
 def distances_along_rays(
@@ -124,9 +124,9 @@ def distances_along_rays(
 ) -> Float[Array, "2"]:
     """(s₁, s₂) of the nearest points s₁·a₁ and b + s₂·Mᵀ·a₂ of two rays; positive: in front."""
     a1, a2 = _rays(xy1, xy2)
-    a2, b = turned_back(read(M), a2), unpacked(b)
+    a2, base = turned_back(read(M), a2), unpacked(b)
     aa, cc, both = dot(a1, a1), dot(a2, a2), dot(a1, a2)
-    first, second = dot(b, a1), dot(b, a2)
+    first, second = dot(base, a1), dot(base, a2)
     determinant = aa * cc - both * both
     s = jnp.stack([cc * first - both * second, both * first - aa * second])
     return s / jnp.where(determinant > 0, determinant, 1)
