@@ -5,14 +5,18 @@ For photographs i, j, k, each two of which are a pair with M and a base b of len
     M_jk·M_ij = M_ik,        β_ij·b_ij + β_jk·M_ijᵀ·b_jk = β_ik·b_ik
 
 with the lengths β of the bases; their ratios follow from the depths of features common to two
-pairs (a depth s of a pair is s·β). A row of windows matched one window further keeps
-the rotation, and moves the camera: only the bases do not close.
+pairs (a depth s of a pair is s·β). Without such features b_ik must still lie between b_ij and
+M_ijᵀ·b_jk. A row of windows matched one window further keeps the rotation, and moves the camera:
+only the bases do not close.
 
 Pairs are accepted one after another, sure ones first, and among these those with many matches and
 closing loops. A pair that contradicts accepted pairs in more loops than it agrees with is
 left out. A pair that alone connects photographs has no loop: it stays, unless it is not sure
 and its photographs are already connected: any two photographs of a long row of windows match, even
 distant ones as if they were neighbours, and such pairs are consistent.
+
+A photograph most of whose pairs are left out so shows mostly what moves or repeats itself, and its
+other pairs may do so unnoticed: only those with half the matches of its best pair, or more, stay.
 
 Zach, Klopschitz and Pollefeys (2010), Disambiguating visual relations using loop constraints.
 """
@@ -26,6 +30,11 @@ from jaxbundle.tiepoints.verification import Pair
 
 TURN, GAP = np.radians(5.0), 0.15
 """Maximum rotation remaining around a loop, and gap of the bases relative to the longest."""
+ASIDE, NARROW = 0.5, 0.03
+"""Maximum distance of a base of unknown length from the angle between the two others; and angle of
+intersection, radians, below which its direction is uncertain."""
+FEW = 1 / 3
+"""Share of accepted pairs of a photograph below which only its best are used."""
 COMMON = 8
 """Minimum common features of two pairs for the ratio of their bases."""
 MOST = 12
@@ -57,7 +66,23 @@ def split_contradicted(
         if found.count(False) <= found.count(True) and (needed or any(found)):
             taken.add((i, j))
             group = {k: group[i] if g == group[j] else g for k, g in group.items()}
+    taken -= _beside_the_best(pairs, taken)
     return ([p for p in pairs if p.images in taken], [p for p in pairs if p.images not in taken])
+
+
+def _beside_the_best(pairs: Sequence[Pair], taken: set[tuple[int, int]]) -> set[tuple[int, int]]:
+    """The weaker pairs of photographs most of whose pairs contradict others, except the only pair
+    of another photograph."""
+    every = {k for pair in pairs for k in pair.images}
+    of = {k: [p for p in pairs if k in p.images] for k in every}
+    left = {k: [p for p in of[k] if p.images in taken] for k in every}
+    alone = {p.images for found in left.values() if len(found) == 1 for p in found}
+    weak = set()
+    for k in every:
+        if len(left[k]) < FEW * len(of[k]):
+            most = max(map(len, left[k]), default=0)
+            weak |= {p.images for p in left[k] if 2 * len(p) < most}
+    return weak - alone
 
 
 def _pair(i: int, j: int) -> tuple[int, int]:
@@ -100,7 +125,8 @@ class _Loops:
         at_j, at_i = self._ratio((i, j), (j, k), 1, 0), self._ratio((i, j), (i, k), 0, 0)
         at_k = self._ratio((j, k), (i, k), 1, 1)
         if np.isnan([at_j, at_i, at_k]).sum() > 1:
-            return None
+            between = _between(ij.b, ij.M.T @ jk.b, ik.b)
+            return None if between or ik.angle < NARROW else False
         of_jk = at_i - at_k if np.isnan(at_j) else at_j
         of_ik = at_j + at_k if np.isnan(at_i) else at_i
         second, third = np.exp(of_jk) * ij.M.T @ jk.b, np.exp(of_ik) * ik.b
@@ -116,6 +142,14 @@ class _Loops:
         ratio = depth[rows] / far[columns]
         ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
         return float(np.log(np.median(ratio))) if len(ratio) >= COMMON else np.nan
+
+
+def _between(one, other, b) -> bool:
+    """Whether a direction is a sum of two others with positive factors, to `ASIDE`."""
+    from scipy.optimize import nnls
+
+    factors, miss = nnls(np.stack([one, other], 1), b)
+    return bool(miss < ASIDE and factors.any())
 
 
 def _depths(pair: Pair, ideal):

@@ -121,8 +121,8 @@ def test_what_is_there_once_orients_a_pair_of_repeated_windows(cloud, windows):
     assert everything.b @ shifted / np.linalg.norm(shifted) > 0.999
 
 
-def test_a_pair_that_does_not_close_around_three_photographs_is_found(cloud, windows):
-    views, X, T = cloud[2], windows[1], windows[2]
+def test_a_pair_that_does_not_close_around_three_photographs_is_found(windows):
+    views, X, T = list(stations(8, np.random.default_rng(5))), windows[1], windows[2]
     ideal = [seen(X, *view) for view in views]
     every = np.arange(len(X))
 
@@ -139,6 +139,19 @@ def test_a_pair_that_does_not_close_around_three_photographs_is_found(cloud, win
     kept, wrong = split_contradicted(pairs, ideal)
     assert [p.images for p in wrong] == [shifted] and len(kept) == 9
     assert split_contradicted(pairs[3:4], ideal) == ([pairs[3]], [])
+    # without common features the directions of the bases decide
+    third = [dataclasses.replace(p, matches=p.matches[k::3], clarity=p.clarity[k::3])
+             for k, p in enumerate(pair(i, j, 0) for i, j in ((0, 1), (0, 3), (1, 3)))]  # fmt: skip
+    back = dataclasses.replace(third[1], b=-third[1].b)
+    assert split_contradicted(third, ideal) == (third, [])
+    assert [len(p) for p in split_contradicted([third[0], back, third[2]], ideal)] == [2, 1]
+    # of a photograph with few accepted pairs only the best ones are used
+    about = lambda angle: Rotation.from_rotvec([0, 0, angle]).as_matrix()
+    turned = [dataclasses.replace(pair(k, 7, 0), M=about(k + 1.0)) for k in range(5)]
+    weak = dataclasses.replace(pair(5, 7, 0), matches=np.stack([every[:30]] * 2, 1))
+    others = [pair(i, j, 0) for i in range(7) for j in range(i + 1, 7)]
+    kept, wrong = split_contradicted([*turned, weak, pair(6, 7, 0), *others], ideal)
+    assert [p.images for p in kept if 7 in p.images] == [(6, 7)] and len(wrong) == 6
     chain = [pair(0, 1, 0), pair(1, 3, 0), pair(3, 4, 0)]
     far = dataclasses.replace(pair(0, 4, 0), sure=False)
     assert split_contradicted([*chain, far], ideal) == (chain, [far])
