@@ -127,19 +127,22 @@ class ScannerView:
         quaternions = attitude.table.values.shape[1] == 4
         ways = [m for m in METHODS if m != "hermite" or position.rates is not None]
         turns = [m for m in METHODS if m != "hermite"] + ["slerp"] * quaternions
-        found: list[Control] = [
-            Choice("position_interpolation", "interpolation of the orbit", position.method, ways),
+        found: list[Control] = []
+        if self.tracks is not None:
+            found += [Choice("track", "trajectory", self.tracks.kind, (ORBIT, STRAIGHT)),
+                      *track_controls(self.tracks)]  # fmt: skip
+        found += [
+            Choice("position_interpolation", "interpolation of the position", position.method,
+                   ways),
             Choice("attitude_interpolation", "interpolation of the attitude",
                    "slerp" if attitude.slerp else attitude.table.method, turns),
         ]  # fmt: skip
         found += [
             Number(name, f"error of {name}", 0.0, "°", -0.2, 0.2) for name in ANGLES
         ]
-        if self.flight is not None and self.tracks is not None:
+        if self.flight is not None:
             found += [
-                Choice("track", "trajectory", self.tracks.kind, (ORBIT, STRAIGHT)),
-                *track_controls(self.tracks),
-                Number("position_rate", "samples of the orbit", self.flight.position_rate, "Hz"),
+                Number("position_rate", "samples of the position", self.flight.position_rate, "Hz"),
                 Number("attitude_rate", "samples of the attitude", self.flight.attitude_rate, "Hz"),
                 Number("attitude_white", "σ of every attitude row",
                        _degrees(self.flight.noise.attitude_white), "°"),
@@ -237,8 +240,15 @@ class ScannerView:
                 "accuracy": self._list(told, errors, expected),
             },
             **told, "errors": field.tolist(), "expected": expected,
-            "idle": [] if self.tracks is None else idle_controls(self.tracks, values["track"]),
+            "idle": self._idle(values),
         }  # fmt: skip
+
+    def _idle(self, values: Mapping[str, Any]) -> list[str]:
+        """The controls without effect: those of the other track, corrections without an Earth."""
+        if self.tracks is None:
+            return []
+        corrections = Corrections._fields if values["track"] == STRAIGHT else ()
+        return [*idle_controls(self.tracks, values["track"]), *corrections]
 
     def export(self, name: str, given: Given) -> File:
         """The flight file with its tables (zip), the accuracy table (CSV), the error map (PNG).

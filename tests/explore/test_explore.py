@@ -40,6 +40,7 @@ from jaxbundle.io.scanner.flight import read_flight
 from jaxbundle.io.scanner.read import read_scanner
 from jaxbundle.network.tables import Camera
 from jaxbundle.pushbroom.accuracy import ground_errors
+from jaxbundle.pushbroom.corrections import Corrections
 from jaxbundle.pushbroom.simulate import measured_image, true_image
 from jaxbundle.pushbroom.surfaces import Plane
 from jaxbundle.report.page import Section
@@ -526,7 +527,7 @@ def test_in_a_browser_a_control_changes_the_numbers(kind, network, scanner, tmp_
             idle = browser.value(
                 "[...document.querySelectorAll('input:disabled')].map(one => one.dataset.key)"
             )
-            assert idle == (list(USUAL) if kind == "scanner" else [])
+            assert idle == ([*USUAL, *Corrections._fields] if kind == "scanner" else [])
             if kind == "network":
                 browser.value("""(() => { const field = document.getElementById("move-Z0");
                     field.value = Number(field.value) + 0.3;
