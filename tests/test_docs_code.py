@@ -4,6 +4,7 @@ import dataclasses
 import re
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -12,11 +13,15 @@ import jaxbundle
 ROOT = Path(__file__).parents[1]
 
 
+def blocks_of(path: Path) -> list[str]:
+    """The Python blocks of a page."""
+    return re.findall(r"^```python\n(.*?)^```$", path.read_text(encoding="utf-8"), re.M | re.S)
+
+
 def run_page(name: str, **given) -> dict:
     """The names that the Python blocks of a page leave behind; `given`: the reader's own."""
-    text = (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
     names: dict = dict(given)
-    blocks = re.findall(r"^```python\n(.*?)^```$", text, re.M | re.S)
+    blocks = blocks_of(ROOT / "docs" / f"{name}.md")
     assert blocks
     for code in blocks:
         exec(code, names)
@@ -43,27 +48,36 @@ def test_start():
     assert page["result"].redundancy == 23
 
 
-@pytest.mark.further
-def test_coming_from():
-    """Views projected by OpenCV come back with its camera and its poses."""
-    import cv2
+SIZE = (1920, 1080)
 
+
+@pytest.fixture(scope="module")
+def views():
+    """A board, its images by OpenCV, and their rotation vectors and translations."""
     board = np.zeros((54, 3), np.float32)
     board[:, :2] = 0.03 * np.mgrid[:9, :6].reshape(2, -1).T
-    K, k = np.array([[800.0, 0, 321], [0, 805, 243], [0, 0, 1]]), np.array([-0.2, 0.05, 0, 0, 0])
-    turns = [(0.3, -0.2, 0.1), (-0.4, 0.1, 1.5), (0.1, 0.5, -0.2), (0.5, 0.4, 0.0), (-0.2, -0.5, 3)]
-    tvecs = [(-0.1 + 0.02 * i, -0.08, 0.5 + 0.05 * i) for i in range(5)]
-    views = [cv2.projectPoints(board, np.array(r, float), np.array(t), K, k)[0]
-             for r, t in zip(turns, tvecs)]  # fmt: skip
+    K, k = np.array([[1600.0, 0, 961], [0, 1610, 541], [0, 0, 1]]), np.array([-0.2, 0.05, 0, 0, 0])
+    turns = np.array([
+        (0.3, -0.2, 0.1), (-0.4, 0.1, 1.5), (0.1, 0.5, -0.2), (0.5, 0.4, 0.0), (-0.2, -0.5, 3)
+    ])  # fmt: skip
+    shifts = np.array([(-0.1 + 0.02 * i, -0.08, 0.5 + 0.05 * i) for i in range(5)])
+    images = [cv2.projectPoints(board, *pose, K, k)[0] for pose in zip(turns, shifts)]
+    return board, images, turns, shifts
+
+
+@pytest.mark.further
+def test_coming_from(views):
+    """Views projected by OpenCV come back with its camera and its poses."""
+    board, images, turns, shifts = views
     page = run_page(
-        "howto/coming_from", objpoints=[board] * 5, imgpoints=views, image_size=(640, 480)
+        "howto/coming_from", objpoints=[board] * 5, imgpoints=images, image_size=SIZE
     )
     values = dict(zip(page["found"].parameters, page["found"].values[0]))
     assert [values[n] for n in ("fx", "fy", "cx", "cy", "k1")] == pytest.approx(
-        [800, 805, 321, 243, -0.2], rel=1e-3
+        [1600, 1610, 961, 541, -0.2], rel=1e-3
     )
-    assert page["tvecs"] == pytest.approx(np.array(tvecs), abs=1e-4)
-    assert page["R"][1] == pytest.approx(cv2.Rodrigues(np.array(turns[1]))[0], abs=1e-4)
+    assert page["tvecs"] == pytest.approx(shifts, abs=1e-4)
+    assert page["R"][1] == pytest.approx(cv2.Rodrigues(turns[1])[0], abs=1e-4)
 
 
 @pytest.mark.further
@@ -88,3 +102,50 @@ def test_derivatives():
     ends = [page["sigma_of_sigma"](moved(t))[0] for t in (-h, h)]
     difference = (ends[1] - ends[0]) / (2 * h)
     assert slopes.image_xy[page["ray"], 0] == pytest.approx(float(difference), rel=1e-4)
+
+
+@pytest.mark.further
+def test_result(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    page = run_page("result")
+    found = page["found"].to_pandas()
+    assert {name for name, row in zip(found.index, found.differs) if row} != set()
+    assert float(page["sigma_c"](page["start"].position)) > 0
+    assert "bent board" in str(page["budget"]) and "c" in str(page["influence"])
+
+
+@pytest.mark.further
+def test_measure():
+    assert len(run_page("measure")["points"]) == 54
+
+
+@pytest.mark.further
+@pytest.mark.slow
+def test_readme(convergent4, views):
+    """Its blocks in their order, with a reader's own tables and arrays."""
+    first, second, third, fourth = blocks_of(ROOT / "README.md")
+    given = convergent4.problem.network
+    rays = zip(given.observations.image, given.observations.point, given.observations.xy)
+    names = {
+        "cameras": given.cameras, "images": [{"id": i, "camera": "cam"} for i in given.images.id],
+        "points": [{"id": p} for p in given.points.id],
+        "observations": [
+            {"image": given.images.id[i], "point": given.points.id[p], "x": x, "y": y}
+            for i, p, (x, y) in rays
+        ],
+        "stations": jaxbundle.ring_of_stations(4, radius=3.0, height=2.0, roll_every=2),
+        "targets": jaxbundle.grid_of_targets(4, 3, 0.5, relief=0.3),
+        "camera": jaxbundle.Camera("cam", "brown", {"c": 24.0}, free=("c", "x0", "y0")),
+    }  # fmt: skip
+    exec(first, names)
+    assert names["result"].redundancy == convergent4.redundancy
+    exec(second.replace('datum="inner")', 'datum="inner"); made = network', 1), names)
+    assert len(names["made"].observations) == len(given.observations)
+    held = jaxbundle.simulate(
+        names["stations"], names["targets"], names["camera"], noise=0.0005, control=range(4)
+    )
+    names["problem"] = jaxbundle.make_problem(jaxbundle.check_network(held))
+    exec(third, names)
+    assert np.isfinite(names["values"].position).all()
+    board, images, *_ = views
+    exec(fourth, names | {"board": board, "images": np.reshape(images, (1, 5, -1, 2))})

@@ -12,7 +12,7 @@ from jaxbundle.cli.app import Force, Quiet, app, choice
 SIX = "Xmin,Ymin,Zmin,Xmax,Ymax,Zmax"
 
 
-@app.command(example="examples/convergent4/project.toml --out out/designed")
+@app.command(example="PROJECT.toml --distance 1,6 --out out/designed")
 def design(
     project: Annotated[Path, typer.Argument(help="cameras, targets and start stations")],
     aim: Annotated[str, choice(AIMS, "quantity to minimise")] = "mean",

@@ -14,7 +14,10 @@ FILES = ("cloud.csv", "cloud.ply", "surface.json", "report.txt", "dsm.tif", "dsm
          "orthophoto.tif")  # fmt: skip
 
 
-EXAMPLE = "examples/four_photographs --photos examples/four_photographs/photos --out out/surface"
+EXAMPLE = (
+    "examples/four_photographs --photos examples/four_photographs/photos --zmin -1.5 --zmax 3 "
+    "--dense --out out/surface"
+)
 
 
 @app.command(example=EXAMPLE)

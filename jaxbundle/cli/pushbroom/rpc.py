@@ -81,7 +81,7 @@ def fit(
     tell(head, json, found.check)
 
 
-@rpc.command(example="out/image_RPC.TXT --points out/points.csv")
+@rpc.command(example="out/image_RPC.TXT --points points.csv")
 def apply(
     coefficients: RpcFile,
     points: Annotated[
