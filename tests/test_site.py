@@ -84,7 +84,7 @@ def test_every_name_of_a_room_is_in_the_reference_with_a_docstring(generated):
     offering = [
         f"jaxbundle.{path.parent.name}"
         for path in (ROOT / "jaxbundle").glob("*/__init__.py")
-        if re.search(r"^from .* import .*\b(\w+) as \1\b", path.read_text(encoding="utf-8"), re.M)
+        if re.search(r"^ *from .* import .*\b(\w+) as \1\b", path.read_text(encoding="utf-8"), re.M)
     ]
     assert sorted(described) == sorted(offering)
     for module in described:

@@ -14,7 +14,7 @@ from jaxbundle.cli import COMMANDS
 from jaxbundle.cli.progress import iterating
 
 HEAVY = {"jax", "jaxlib", "numpy", "scipy", "equinox", "rich", "matplotlib", "cv2"}
-LIGHT_ROOMS = {"choices", "cli", "errors", "system"}
+LIGHT_ROOMS = {"choices", "cli", "errors", "lazy", "system"}
 SCANNER = ("accuracy", "correct", "locate", "project", "refine", "simulate")
 HELPS = [
     ["--help"], ["--version"], *([command, "--help"] for command in COMMANDS),
