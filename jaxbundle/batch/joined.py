@@ -53,7 +53,6 @@ def run_joined(inputs: Sequence[str | Path], file: str | Path, **options) -> Cou
         _clear(file, waiting)
     try:
         if index == 0:
-            _add_parts(file)
             run_batch(inputs, file, compute=False, **options)
             _tell(waiting, "begin")
         if not _wait(waiting, ["begin"])["begin"]:
@@ -75,15 +74,14 @@ def run_joined(inputs: Sequence[str | Path], file: str | Path, **options) -> Cou
         if why:
             raise NotSolvedError(f"process {other} of the joined ones has failed: {why}")
     if index == 0:
-        _add_parts(file)
+        add_parts(file)
         counts = run_batch(inputs, file, compute=False, **own)
     return counts
 
 
 def _clear(file: str | Path, waiting: str) -> None:
-    """Remove what a run that was ended has left, and make the folder of this one."""
-    for path in glob.glob(f"{glob.escape(str(file))}.joined-*"):
-        shutil.rmtree(path, ignore_errors=True)
+    """Add the parts that a run that was ended has left, and make the folder of this one."""
+    add_parts(file)
     try:
         os.mkdir(waiting)
     except OSError as error:
@@ -106,12 +104,16 @@ def _wait(waiting: str, names: Sequence[str]) -> dict[str, str]:
         time.sleep(PAUSE)
 
 
-def _add_parts(file: str | Path) -> None:
-    """Add the lines of all parts beside a file of results to it, and remove the parts.
+def add_parts(file: str | Path) -> None:
+    """Add the lines of all parts beside a file of results to it, and remove what joined processes
+    have left.
 
     **Raises:** `InputError` while a run writes one of them."""
     found = [(int(end[1]), path) for path in glob.glob(f"{glob.escape(str(file))}.part-*")
              if (end := re.search(r"\.part-(\d+)-of-\d+$", path))]  # fmt: skip
+    waited = glob.glob(f"{glob.escape(str(file))}.joined-*")
+    if not found and not waited:
+        return
     with ExitStack() as held:
         held.enter_context(locked(file))
         for _, path in found:
@@ -128,3 +130,5 @@ def _add_parts(file: str | Path) -> None:
         lines.append(some)
         for _, path in found:
             os.remove(path)
+    for path in waited:
+        shutil.rmtree(path, ignore_errors=True)

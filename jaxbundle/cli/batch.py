@@ -106,7 +106,7 @@ def batch(
     refused, or recomputed with --renew. Status 0 means that every input has a line, whatever its
     status. Only one run at a time may write the file.
     """
-    from jaxbundle.batch.joined import run_joined
+    from jaxbundle.batch.joined import add_parts, run_joined
     from jaxbundle.batch.page import compose_batch
     from jaxbundle.batch.photographs import is_photograph_folder
     from jaxbundle.batch.population import Population, read_against
@@ -151,6 +151,8 @@ def batch(
         )  # fmt: skip
         if not first:
             html, table, summary, asked, quiet = "", None, None, [], True
+    elif not part:
+        add_parts(json_lines)  # of joined processes that were ended
     advise("run the same command again to resume")
     with counting(quiet) as bar:
         task = bar.add_task("batch", total=None)

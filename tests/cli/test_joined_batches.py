@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from batch_cameras import images_of, write_cameras
 
-from jaxbundle.batch.joined import _add_parts
+from jaxbundle.batch.joined import add_parts
 from jaxbundle.batch.run import run_batch
 
 ROOT = Path(__file__).parents[2]
@@ -70,7 +70,7 @@ def test_parts_of_a_run_that_was_ended_are_added(cameras, tmp_path):
     for i in range(3):
         text = "".join(lines[i::3]) if i < 2 else ""
         (tmp_path / f"results.jsonl.part-{i + 1}-of-3").write_text(text[:-30] if i else text)
-    _add_parts(file)
+    add_parts(file)
     assert file.read_text() == "".join(lines[i] for i in (0, 1, 3, 4, 6))
     assert sorted(os.listdir(tmp_path)) == ["cameras.npz", "one.jsonl", "results.jsonl"]
     assert run_batch([cameras], file, free=FREE) == {"converged": CAMERAS, "skipped": 5}
